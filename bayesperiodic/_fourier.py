@@ -96,7 +96,7 @@ def sums(values: np.ndarray, phase: np.ndarray, harmonics: int) -> np.ndarray:
 
 
 def _fine(harmonics: int) -> int:
-    """Return the number of grid points, a power of two, from which Taylor series of all harmonics are exact to rounding."""
+    """Return how many grid points, a power of two, make Taylor series of all harmonics exact to rounding."""
     return 256 << max(harmonics - 1, 1).bit_length()
 
 

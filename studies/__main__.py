@@ -36,6 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--missing", action="store_true", help="landing-gear: what missing_terms finds, only that")
     parser.add_argument("--scaling", action="store_true", help="calibration: measure what two workers gain, only that")
     parser.add_argument("--guard", action="store_true", help="benchmark: a quick run's ratios against those kept")
+    parser.add_argument("--cold-start", action="store_true", help="benchmark: times in new environments, only that")
     options = parser.parse_args(arguments)
     known = {path.parent.name.replace("_", "-"): path for path in Path(studies.__path__[0]).glob("*/run.py")}
     if options.name is None:

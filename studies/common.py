@@ -12,6 +12,7 @@ import operator
 import os
 import pickle
 import platform
+import textwrap
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -121,7 +122,9 @@ def workers() -> ProcessPoolExecutor:
 
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "corner", "matplotlib", "xarray")
 DOTS_PER_INCH = 100
-COLOURS = 64
+COLOURS = 128
+# Of titles of corner plots: characters per inch, and the height of a line [inches].
+CHARACTERS_PER_INCH, LINE = 12.0, 0.2
 WITHOUT_TIME = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 
@@ -215,6 +218,21 @@ def save_figures(folder: Path, figures: dict[str, Figure]) -> list[Path]:
             draft.replace(target)
             paths.append(target)
     return paths
+
+
+def titled(figure: Figure, title: str) -> Figure:
+    """Return a corner plot with a title above its panels, in lines that fit."""
+    width, height = figure.get_size_inches()
+    lines = textwrap.wrap(title, int(width * CHARACTERS_PER_INCH))
+    scale = height / (height + LINE * len(lines) + 0.08)
+    for axes in figure.axes:
+        x, y, across, up = axes.get_position().bounds
+        axes.set_position((x, scale * y, across, scale * up))
+    for legend in figure.legends:
+        legend.set_bbox_to_anchor((0.0, 0.0, 1.0, scale))
+    figure.set_size_inches(width, height / scale)
+    figure.suptitle("\n".join(lines), y=1.0 - 0.08 * scale / height, va="top", fontsize="medium")
+    return figure
 
 
 def _shrink(path: Path) -> None:

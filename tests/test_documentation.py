@@ -91,7 +91,7 @@ def arguments(function: Any) -> set[str]:
 
 def raised(function: Any, cls: type | None = None, seen: set[Any] | None = None) -> set[str]:
     """Return the exceptions, and "warns", that a function and the private helpers that it calls raise."""
-    seen = set() if seen is None else seen
+    function, seen = inspect.unwrap(function), set() if seen is None else seen
     if function in seen:
         return set()
     seen.add(function)

@@ -7,8 +7,9 @@ from tests import layout
 # The package had 25,000 lines when it was last shortened; the rest is room for the statistics and the checks of input
 # that were missing then, of the evidence and comparison of models, of proposals for curved posteriors, and of errors of
 # the inputs, integrated out, as parameters, and correlated with those of the outputs; of the search for missing terms,
-# its candidates, with memory too, tests, units and figure; of the test of response periods; and a model of a circuit.
-MOST_FILES, MOST_LINES, LONGEST_FILE = 114, 32_770, 600
+# its candidates, with memory too, tests, units and figure; of the test of response periods; a model of a circuit; and
+# of the regions of corner plots and the summary on one page.
+MOST_FILES, MOST_LINES, LONGEST_FILE = 117, 33_550, 600
 MOST_PARAMETERS = 8
 REASONS = {
     "Experiment": "one field per measured quantity; four are required, the rest are keywords with defaults",
@@ -17,6 +18,7 @@ REASONS = {
     "Problem": "model, experiments, parameters and noise; two and the priors are required, the rest are keywords",
     "Recording.from_csv": "the columns of a file, gaps in them and several records; path and outputs are required",
     "calibrate": "the settings of a campaign and of the estimates in it; three are required",
+    "plot.corner": "options of a figure, those of the package corner among them; one argument is required",
     "plot.branch": "options of a figure; one argument is required",
     "missing_terms": "settings of the search; two arguments are required, the rest are keywords with defaults",
     "report": "results that are computed where they are not given; four arguments are required, the rest are keywords",

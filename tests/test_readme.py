@@ -77,7 +77,7 @@ def variables(page):
     return dict(tour()[0]) | {"scipy": scipy}
 
 
-@pytest.mark.parametrize("page", [page for page in BLOCKS if page not in (TOUR, CLUSTER)])
+@pytest.mark.parametrize("page", [page for page in BLOCKS if page not in ("README.md", TOUR, CLUSTER)])
 def test_code_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = variables(page)
@@ -92,9 +92,12 @@ def test_tour_runs():
     assert names["fit"].converged and names["posterior"].converged
 
 
-def test_fifteen_lines_of_the_readme_are_fifteen():
-    (code, shown) = BLOCKS["README.md"][0]
+def test_fifteen_lines_of_the_readme(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ((code, shown),) = BLOCKS["README.md"]
     assert shown and len([line for line in code.splitlines() if line]) <= EXAMPLE
+    assert_same_output(printed("README.md", code, {}), shown)
+    assert Path("report.html").stat().st_size > 1000
 
 
 def test_readme_is_within_its_limits():
@@ -115,6 +118,12 @@ def test_linked_files_exist(page):
             copied = file.suffix == ".ipynb" and (ROOT / "studies" / "notebooks" / file.name).exists()
             missing += [] if copied else [target]
     assert not missing
+
+
+def test_every_figure_is_in_the_gallery():
+    shown = (DOCS / "gallery.md").read_text("utf-8")
+    figures = [f"../{name(file)}" for file in sorted((ROOT / "figures").rglob("*.png")) if "quick" not in file.parts]
+    assert [file for file in figures if f"({file})" not in shown] == []
 
 
 class Links(HTMLParser):

@@ -262,11 +262,11 @@ def _from_draw(objective: Objective, first: Iterate, theta: np.ndarray, progress
 
 
 def _climb(objective: Objective, first: Iterate, progress: bool) -> End:
-    with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress) as bar:
+    with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress, delay=2.0) as bar:
 
         def report(iterate: Iterate, size: float) -> None:
+            bar.set_postfix_str(f"objective {iterate.objective:.6g}, step {size:.2g} sd", refresh=False)
             bar.update()
-            bar.set_postfix_str(f"objective {iterate.objective:.6g}, step {size:.2g} sd")
 
         return climb(objective, first, report=report)
 

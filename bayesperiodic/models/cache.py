@@ -1,4 +1,4 @@
-"""Disk cache of compiled kernels: one folder per source text and constants, private to its user.
+"""Compiled kernels and their cache on disk: one folder per source text and constants, private to its user.
 
 An entry is built in a temporary folder and renamed, so that several processes can fill the cache at once. Before an
 entry is executed, the folder must belong to the user and be closed to others, the source must equal the expected one,
@@ -7,6 +7,7 @@ and built again; if the folder cannot be used, the kernels are compiled in memor
 """
 
 import hashlib
+import inspect
 import json
 import os
 import platform
@@ -17,14 +18,17 @@ import tempfile
 import time
 import types
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-import llvmlite
+import llvmlite.binding
 import numba
 import platformdirs
+from numba.core import sigutils, typing
+from numba.core.extending import _Intrinsic
 from numba.core.registry import cpu_target
 
 SOURCE, MANIFEST, BUILDING = "kernels.py", "manifest.json", "building-"
@@ -112,11 +116,17 @@ def _private_folder() -> Path:
     return folder
 
 
+@cache
+def _announce() -> None:
+    print("compiling kernels (once per machine) …", file=sys.stderr, flush=True)
+
+
 def _build(source: str, names: Mapping[str, Any], entry: Path) -> types.ModuleType:
     for other in entry.parent.glob(f"{BUILDING}*"):
         with suppress(OSError):
             if other.stat().st_mtime < time.time() - ABANDONED:
                 shutil.rmtree(other)
+    _announce()
     workshop = Path(tempfile.mkdtemp(prefix=BUILDING, dir=entry.parent))
     try:
         (workshop / SOURCE).write_text(source, encoding="utf-8")
@@ -159,3 +169,44 @@ def _execute(source: str, names: Mapping[str, Any], path: Path, cache: bool) -> 
     finally:
         settings.CACHE_DIR = elsewhere
     return module
+
+
+class Kernel(_Intrinsic):  # type: ignore[misc]
+    """A compiled function that Python calls as usual, and compiled code by its address.
+
+    Numba copies a called function into every caller and optimises it there again, which took two thirds of the compile
+    time of the periodic solver. A kernel is called through a symbol instead, whose address the process knows once it is
+    compiled or loaded; errors are propagated as usual. The symbol is the name in its module, whose name is a digest of
+    its contents (see `load`): it stands for the same code in every process. A call takes some nanoseconds, so functions
+    that are called at every point of a grid are compiled with ``njit``.
+    """
+
+    def __init__(self, function: Callable[..., Any], signature: Any, options: dict[str, Any]):
+        self.compiled = numba.njit(signature, **options)(function)
+        arguments, result = sigutils.normalize_signature(signature)
+        code, names = self.compiled.get_compile_result(result(*arguments)), [f"a{k}" for k in range(len(arguments))]
+        symbol = f"{function.__module__}.{function.__name__}"
+        llvmlite.binding.add_symbol(symbol, code.library.get_pointer_to_function(code.fndesc.llvm_func_name))
+        called = types.SimpleNamespace(
+            mangled_name=symbol, restype=result, argtypes=arguments, args=names, noalias=False, inline=False
+        )
+
+        def typed(_: Any, *given: Any) -> Any:
+            def call(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+                return context.call_internal(builder, called, signature, values)
+
+            return (typing.signature(result, *arguments), call) if len(given) == len(arguments) else None
+
+        places = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY) for name in ("context", *names)]
+        typed.__signature__ = inspect.Signature(places)  # type: ignore[attr-defined]
+        super().__init__(function.__name__, typed)
+        self._register()
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Run the compiled function."""
+        return self.compiled(*arguments)
+
+
+def kernel(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Kernel]:
+    """Return a decorator that compiles a function with a signature as a `Kernel`, with options of ``numba.njit``."""
+    return lambda function: Kernel(function, signature, options)

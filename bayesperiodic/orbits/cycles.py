@@ -27,7 +27,8 @@ AGREEMENT, SIZES, WIDENED = 2.5, 6, 2.0**0.5
 DEGREE = 3
 # Smallest bandwidth in standard deviations of the noise.
 ROOM = 2.5
-REFINING_STEPS, REFINED = 12, 1e-6
+# Refinement ends below this step, or this fraction of the noise.
+REFINING_STEPS, REFINED, REFINED_NOISE = 12, 1e-6, 1e-3
 # The bias of slopes is proportional to the third power of the bandwidth. That of values is in theory to the fourth;
 # measured, the error is two thirds of the difference between the points.
 SLOPE_GROWTH, VALUE_GROWTH = WIDENED**3 - 1.0, 1.5
@@ -95,7 +96,8 @@ def eigenvalues(jacobian: np.ndarray) -> np.ndarray:
 
 def shift_between(one: np.ndarray, other: np.ndarray, wrap: Wrap) -> tuple[float, int]:
     """Return the smallest distance of two cycles (p, 2) under cyclic shifts of the other, and that shift."""
-    distances = [np.abs(wrap(np.roll(other, -shift, axis=0) - one)).max() for shift in range(len(one))]
+    steps = np.arange(len(one))
+    distances = np.abs(wrap(other[(steps[:, None] + steps) % len(one)] - one)).max((1, 2))
     best = int(np.argmin(distances))
     return float(distances[best]), best
 
@@ -103,7 +105,8 @@ def shift_between(one: np.ndarray, other: np.ndarray, wrap: Wrap) -> tuple[float
 def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool:
     """Return whether the points (p, 2) repeat after a divisor of p."""
     p = len(points)
-    return any(p % d == 0 and np.abs(wrap(np.roll(points, -d, axis=0) - points)).max() < tolerance for d in range(1, p))
+    divisors = [d for d in range(1, p) if p % d == 0]
+    return any(np.abs(wrap(np.concatenate([points[d:], points[:d]]) - points)).max() < tolerance for d in divisors)
 
 
 def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) -> list[Candidate]:
@@ -113,10 +116,12 @@ def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) 
     step, heir = _converge(maps, atlas, chains)
     kept = np.array([k for k in np.unique(heir) if step[k] < NEARLY], dtype=int)
     members = [np.concatenate([members[i] for i in np.flatnonzero(heir == k)]) for k in kept]
-    chains = chains[kept]
+    chains, step = chains[kept], step[kept]
     # The maps of the atlas are discontinuous between centres, so the last steps fit about the points themselves.
     for _ in range(EXACT_STEPS):
         step = _newton(maps, chains, atlas.exactly)[0]
+        near = np.flatnonzero(step < NEARLY)
+        chains, step, members = chains[near], step[near], [members[k] for k in near]
     return _distinct(maps, section, chains, step, members)
 
 
@@ -228,9 +233,9 @@ def _turns(maps: ReturnMap, run: np.ndarray) -> float:
 
 def _close(maps: ReturnMap, points: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, list[LocalFit]] | None:
     """Return the points at which the chained fits close, and the fits; None without convergence."""
-    cycle, last = points.copy(), np.inf
+    cycle, last, refined = points.copy(), np.inf, max(REFINED, REFINED_NOISE * float(maps.noise.max()))
     for step in range(REFINING_STEPS):
-        final = last < REFINED or step == REFINING_STEPS - 1
+        final = last < refined or step == REFINING_STEPS - 1
         fits = [maps.fit(point[None], int(n), DEGREE, influence=final) for point, n in zip(cycle, counts, strict=True)]
         defect = maps.wrap(np.concatenate([fit.value for fit in fits]) - np.roll(cycle, -1, axis=0))
         correction = newton_step(defect[None], np.concatenate([fit.jacobian for fit in fits])[None])[0]
@@ -251,13 +256,14 @@ def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndar
     ladder = smallest[:, None] * WIDENED ** np.arange(SIZES)
     counts = [maps.count_within(points, bandwidths) for bandwidths in ladder.T]
     most = len(maps.arguments) // 8
-    start = np.concatenate([maps.fit(p[None], n, DEGREE).jacobian for p, n in zip(points, counts[0], strict=True)])
-    right, left = _eigenvectors(start, 0)
+    narrowest = [maps.fit(point[None], int(n), DEGREE) for point, n in zip(points, counts[0], strict=True)]
+    right, left = _eigenvectors(np.concatenate([fit.jacobian for fit in narrowest]), 0)
     chosen = []
     for j, point in enumerate(points):
         accepted: list[tuple[np.ndarray, np.ndarray]] = []
         for count in (int(n[j]) for n in counts if n[j] <= most):
-            target, sd = _along(maps.fit(point[None], count, DEGREE), left[j : j + 1], right[j : j + 1])
+            fit = maps.fit(point[None], count, DEGREE) if accepted else narrowest[j]
+            target, sd = _along(fit, left[j : j + 1], right[j : j + 1])
             if any(np.any(np.abs(target - other) > AGREEMENT * other_sd) for other, other_sd in accepted):
                 break
             accepted.append((target, sd))

@@ -34,6 +34,7 @@ class _ScaledSection(NamedTuple):
     points: np.ndarray  # (count, 2)
     size: np.ndarray  # the unit, (2,)
     maps: ReturnMap
+    extent: np.ndarray  # range of the recorded motion, of an angle at most a turn, (2,)
 
 
 @in_one_thread
@@ -129,7 +130,9 @@ def _scaled(section: PoincareSection, neighbours: int) -> _ScaledSection:
     check_chaos(maps, points)
     if section.noise is None:
         maps.noise = estimate_noise(maps, neighbours)
-    return _ScaledSection(points, size, maps)
+    motion = section.points if section.signals is None else section.signals
+    extent = np.array([np.ptp(column) for column in motion.T])
+    return _ScaledSection(points, size, maps, np.where(maps.angle, np.minimum(extent, 2.0 * np.pi), extent))
 
 
 def _search_count(maps: ReturnMap, neighbours: int) -> int:
@@ -209,10 +212,7 @@ def _orbit(
 
 def _at_rest(section: PoincareSection, scaled: _ScaledSection, cycle: dict[str, np.ndarray]) -> bool:
     """Return whether a measured cycle moves no more than by noise and its distance to the orbit."""
-    assert section.signals is not None
-    extent = np.ptp(section.signals, axis=0)
-    extent = np.where(scaled.maps.angle, np.minimum(extent, 2.0 * np.pi), extent)
-    limit = (STILL + SPREAD * scaled.maps.noise) * extent
+    limit = (STILL + SPREAD * scaled.maps.noise) * scaled.extent
     return all(np.ptp(cycle[name]) < limit[k] for k, name in enumerate(section.coordinates))
 
 
@@ -236,19 +236,18 @@ def _finished(orbits: list[Orbit], scaled: _ScaledSection) -> tuple[Orbit, ...]:
     """Return the orbits with names, and with the positions of their mirror images under the change of all signs."""
     result: list[Orbit] = []
     counts: Counter[tuple[int, int | None]] = Counter()
-    for orbit in orbits:
+    points = [orbit.points / scaled.size for orbit in orbits]
+    sds = [np.sqrt(np.diag(o.covariance).reshape(-1, 2).max(0) / scaled.size**2).max() for o in orbits]
+    for number, orbit in enumerate(orbits):
         partner, closest = None, np.inf
         for k, other in enumerate(orbits):
             if other.period != orbit.period:
                 continue
-            distance, _ = cycles.shift_between(
-                orbit.points / scaled.size, -other.points / scaled.size, scaled.maps.wrap
-            )
-            sd = np.sqrt([np.diag(o.covariance).reshape(-1, 2).max(0) / scaled.size**2 for o in (orbit, other)]).max()
-            if distance < max(2e-3, 4.0 * sd) and distance < closest:
+            distance, _ = cycles.shift_between(points[number], -points[k], scaled.maps.wrap)
+            if distance < max(2e-3, 4.0 * sds[number], 4.0 * sds[k]) and distance < closest:
                 partner, closest = k, distance
         # Without a measured cycle, a symmetric fixed point is taken for a state of rest.
-        rest = orbit.equilibrium or (orbit.cycle is None and orbit.period == 1 and partner == len(result))
+        rest = orbit.equilibrium or (orbit.cycle is None and orbit.period == 1 and partner == number)
         counts[orbit.period, orbit.winding] += 1
         winding = "" if orbit.winding is None else f", winding {orbit.winding}"
         name = f"period {orbit.period}{winding}, orbit {counts[orbit.period, orbit.winding]}"

@@ -16,12 +16,13 @@ from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.section import PoincareSection
 from bayesperiodic.periodic.continuation import FOLD, PERIOD_DOUBLING, Branch
 from bayesperiodic.periodic.solution import PeriodicSolution
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, styled
 
 MEASURES = ("amplitude", "maximum", "section", "period")
 MARKERS = {FOLD: "o", PERIOD_DOUBLING: "D"}
 
 
+@styled
 def branch(
     branch: Branch | BranchPrediction,
     *more: Branch | BranchPrediction,
@@ -191,6 +192,7 @@ CYCLES: dict[str, dict[str, Any]] = {
 POINTS: dict[str, Any] = {"color": ENSEMBLES[1], "marker": "o", "ls": "", "mec": "black", "mew": 0.6}
 
 
+@styled
 def section(
     section: PoincareSection,
     orbits: Orbits | Sequence[Orbit] = (),
@@ -248,6 +250,7 @@ def section(
     return cast(Figure, ax.figure)
 
 
+@styled
 def orbits(
     orbits: Orbits | Sequence[Orbit], *, units: Mapping[str, str] | None = None, figure: Figure | None = None
 ) -> Figure:

@@ -18,7 +18,7 @@ from bayesperiodic.diagnostics.model_comparison import DECISIVE, SMALLEST_GAIN, 
 from bayesperiodic.diagnostics.verdicts import END_SHIFT, ERRORS, FINE, LEVELS
 from bayesperiodic.estimation.profile import CLOSED, Profile
 from bayesperiodic.plot import style
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, LAPLACE, axis_label, chosen, wrapped_label
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, LAPLACE, axis_label, chosen, styled, wrapped_label
 
 LEVEL = 0.99
 # Factor on the height of the histogram axes, for the legend.
@@ -34,6 +34,7 @@ LINES = {"mcmc": "-", "laplace": "--"}
 BAND: dict[str, Any] = {"color": "grey", "alpha": 0.25, "lw": 0}
 
 
+@styled
 def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
     """Draw rank histograms, empirical distribution functions and coverage of every quantity, for MCMC and Laplace.
 
@@ -110,6 +111,7 @@ LOOKS = [(colour, style) for style in ("-", "-.") for colour in ENSEMBLES if col
 LIMIT = 4.0
 
 
+@styled
 def comparison(comparison: Comparison, *, names: Sequence[str] | None = None, figure: Figure | None = None) -> Figure:
     """Draw a comparison of Laplace with MCMC: marginals, quantile-quantile plot, and coverage of the ellipsoids.
 
@@ -208,6 +210,7 @@ PROFILE_LEGEND = ("profile", "MAP", "Laplace", "solve failed")
 AT_90, DEEPEST = -0.5 * 1.6449**2, -4.2
 
 
+@styled
 def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Figure | None = None) -> Figure:
     """Draw each profile with the parabola of the Laplace approximation and the level of a 90 % interval.
 
@@ -266,7 +269,7 @@ def _profile_panel(axes: Axes, profile: Profile, name: str) -> None:
         axes.plot(values[~found], low, "x", color=COLOURS["measured"], ms=5, label=failed)
     axes.axhline(AT_90, color="grey", lw=0.8, ls=":", zorder=1)
     places = ("axes fraction", "data"), "offset points"
-    axes.annotate("90%", (1, AT_90), (-3, 1), *places, color="grey", ha="right", va="bottom")
+    axes.annotate("90 %", (1, AT_90), (-3, 1), *places, color="grey", ha="right", va="bottom")
     if profile.shape[name] != CLOSED:
         axes.annotate(profile.shape[name], (0.5, 0.03), xycoords="axes fraction", ha="center", va="bottom")
     if wide:
@@ -289,6 +292,7 @@ def _laplace_range(profile: Profile, name: str) -> np.ndarray:
     return np.linspace(start, max(values[-1], min(high, values[-1] + margin, at + reach)), 400)
 
 
+@styled
 def models(comparison: ModelComparison, *, figure: Figure | None = None) -> Figure:
     """Draw a comparison of models: differences of evidence, leave-one-out prediction and held-out experiments.
 

@@ -1,12 +1,15 @@
 """Colours, labels and panels of all figures; each colour has one meaning everywhere."""
 
+import functools
+import re
 import textwrap
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, ParamSpec
 
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, FigureBase
 from scipy.stats import norm
 
 from bayesperiodic import _checks
@@ -18,6 +21,22 @@ COLOURS = {"measured": "#000000", "map": "#0072B2", "laplace": "#D55E00", "mcmc"
 ENSEMBLES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 LAPLACE: dict[str, Any] = {"color": COLOURS["laplace"], "lw": 1.6, "ls": "--"}
 LABEL_LENGTH, ACROSS = 24, 4
+SHEET = "bayesperiodic.plot.figures"
+Arguments = ParamSpec("Arguments")
+
+
+def styled(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
+    """Return a function that draws in the style of the package, without a change of matplotlib's settings."""
+
+    @functools.wraps(draw)
+    def wrapped(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Figure:
+        with plt.style.context(SHEET):
+            figure = draw(*args, **kwargs)
+            for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+                axis.get_major_ticks()  # matplotlib would make them when it saves the figure, with its own settings
+            return figure
+
+    return wrapped
 
 
 def caveats_of(posterior: Posterior) -> str:
@@ -30,19 +49,25 @@ def caveats(synthetic: bool, converged: bool) -> str:
     return ", ".join((["synthetic data"] if synthetic else []) + ([] if converged else ["NOT CONVERGED"]))
 
 
-def draws_label(posterior: Posterior, name: str) -> str:
+def draws_label(posterior: Posterior, name: str, length: int = LABEL_LENGTH) -> str:
     """Return the label of a quantity by its full name."""
-    return wrapped_label(name, unit(posterior.tree["posterior"].to_dataset(), name))
+    return wrapped_label(name, unit(posterior.tree["posterior"].to_dataset(), name), length)
 
 
-def wrapped_label(name: str, unit: str) -> str:
-    """Return a label in short lines, with the unit on the last one."""
-    return axis_label(textwrap.fill(name, LABEL_LENGTH), unit).replace(" [", "\n[")
+def wrapped_label(name: str, unit: str, length: int = LABEL_LENGTH) -> str:
+    """Return a label in short lines, broken also at _ and [, with the unit on the last one."""
+    breakable = re.sub(r"(?<=_)(?=\w)|(?=\[)", "\v", name)
+    lines = textwrap.fill(breakable, length, replace_whitespace=False).replace("\v", "")
+    return axis_label(lines, unit).replace(" [", "\n[")
+
+
+SUPERSCRIPTS = str.maketrans("-−0123456789", "⁻⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def axis_label(name: str, unit: str = "") -> str:
-    """Return a name with its unit, escaped for matplotlib."""
-    text = f"{name} [{unit}]" if unit else name
+    """Return a name with its unit, escaped for matplotlib; powers in the unit are superscripts."""
+    powers = re.sub(r"(?:\^|\*\*)\(?(-?\d+)\)?(?![\d./])", lambda found: found[1].translate(SUPERSCRIPTS), unit)
+    text = f"{name} [{powers}]" if unit else name
     return text.replace("$", r"\$")
 
 

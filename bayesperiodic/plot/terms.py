@@ -15,7 +15,7 @@ from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.score_tests import along_orbit
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot import style
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, styled
 from bayesperiodic.posterior.description import check_results, fingerprint
 from bayesperiodic.posterior.problem import Problem
 
@@ -26,6 +26,7 @@ HELD_OUT: dict[str, Any] = {"color": "grey", "ls": ":", "marker": "s", "ms": 4, 
 ROOM = 0.5
 
 
+@styled
 def missing_terms(problem: Problem, fit: MapEstimate, found: MissingTerms, *, figure: Figure | None = None) -> Figure:
     """Draw what each term leaves unexplained, and the residual before and after.
 

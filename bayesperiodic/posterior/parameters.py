@@ -230,6 +230,14 @@ def unit(group: xr.Dataset, name: str) -> str:
     return str(group[variable].attrs.get(key, ""))
 
 
+def support(group: xr.Dataset, name: str) -> tuple[float, float]:
+    """Return the support of what has this full name; of draws without it the positive half-line if all are positive."""
+    variable, _ = places(group)[name]
+    given = group[variable].attrs.get(f"support of {name}")
+    low, high = (0.0 if (column(group, name) > 0.0).all() else -np.inf, np.inf) if given is None else given
+    return float(low), float(high)
+
+
 def squared(unit: str) -> str:
     """Return the unit of a variance: N², (m/s)², or 1."""
     return unit if unit == "1" else f"{unit}²" if unit.isalpha() else f"({unit})²"

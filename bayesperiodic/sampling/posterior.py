@@ -60,19 +60,20 @@ class Posterior(Result):
         with its fixed value where it is not free. ``variance``, ``lengthscale`` and ``floor`` have the dim ``channel``,
         then ``experiment`` if each has its own; ``scale`` has at most the latter. Known noise parameters are included
         with their values; NaN marks missing ones, such as the variance of a channel in an experiment without it.
-        Attributes: ``units``, or ``units of <channel>`` of ``variance``; ``noise``, the name of the noise model, on its
-        parameters. Group ``sample_stats``: lp, the log-density in sampling coordinates; the status of the draw's
-        solves; acceptance_rate, with emcee 1 where the proposal of the step was accepted, else 0; mode, the row of
-        `MapEstimate.modes` whose Laplace approximation is the densest there, if there are several. Group
-        ``proposal``: the mixture from which emcee proposed, in sampling coordinates: weight, degrees of freedom, mean
-        and scale matrix of its Student t components; attributes acceptance and burn_in [steps]. Group
-        ``log_likelihood``, for ``arviz.loo``: at some draws, the terms of independent observations, which sum to the
-        log-likelihood without the factor (2π)^(−n/2) and other constants of the data: values of the mean period at
-        equally spaced instants, or its harmonics if the noise is coloured; with the coordinates experiment, channel,
-        harmonic (NaN at an instant) and weight, the independent values per value. Group ``posterior_predictive``: for
-        some draws, replicates of the measured outputs, noise included, and largest_multiplier, the modulus of each
-        orbit's largest Floquet multiplier. Group ``orbits``: states of every experiment, turns included, at the draw
-        with the highest density. Groups ``observed_data`` and ``constant_data``: outputs and inputs.
+        Attributes: ``units``, or ``units of <channel>`` of ``variance``; ``support of <full name>``, that of the prior;
+        ``noise``, the name of the noise model, on its parameters. Group ``sample_stats``: lp, the log-density in
+        sampling coordinates; the status of the draw's solves; acceptance_rate, with emcee 1 where the proposal of the
+        step was accepted, else 0; mode, the row of `MapEstimate.modes` whose Laplace approximation is the densest
+        there, if there are several. Group ``proposal``: the mixture from which emcee proposed, in sampling coordinates:
+        weight, degrees of freedom, mean and scale matrix of its Student t components; attributes acceptance and burn_in
+        [steps]. Group ``log_likelihood``, for ``arviz.loo``: at some draws, the terms of independent observations,
+        which sum to the log-likelihood without the factor (2π)^(−n/2) and other constants of the data: values of the
+        mean period at equally spaced instants, or its harmonics if the noise is coloured; with the coordinates
+        experiment, channel, harmonic (NaN at an instant) and weight, the independent values per value. Group
+        ``posterior_predictive``: for some draws, replicates of the measured outputs, noise included, and
+        largest_multiplier, the modulus of each orbit's largest Floquet multiplier. Group ``orbits``: states of every
+        experiment, turns included, at the draw with the highest density. Groups ``observed_data`` and
+        ``constant_data``: outputs and inputs.
     converged : bool
         True if the stop rule was met.
     reason : str
@@ -521,7 +522,7 @@ def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr
     dims = {name.partition("[")[0]: _dims(problem, name) for name in (*problem.names, *problem.noise_names)}
     coords = {CHANNEL: list(problem.channels), EXPERIMENT: [e.name for e in problem.experiments]}
     noises = {name.partition("[")[0] for name in problem.noise_names}
-    attributes = {v: (_noise_attributes if v in noises else _unit)(problem, v) for v in dims}
+    attributes = {v: _noise_attributes(problem, v) if v in noises else _attributes(problem, v) for v in dims}
     packed = pack(columns, dims, coords)
     return xr.Dataset({v: (*values, attributes[v]) for v, values in packed.items()}, coords=coords)
 
@@ -545,8 +546,11 @@ def _dims(problem: Description, name: str) -> tuple[str, ...]:
     return (CHANNEL,) if problem.noise.per == CHANNEL else (CHANNEL, EXPERIMENT)
 
 
-def _unit(problem: Description, parameter: str) -> dict[str, str]:
-    return {"units": "s" if parameter == SHIFT else problem.model.units.get(parameter, "")}
+def _attributes(problem: Description, parameter: str) -> dict[str, Any]:
+    """Return the unit of a parameter, and the support of its prior, one for each experiment that has its own."""
+    supports = problem.joint_prior.supports.items()
+    each = {f"support of {name}": list(ends) for name, ends in supports if name.partition("[")[0] == parameter}
+    return {"units": "s" if parameter == SHIFT else problem.model.units.get(parameter, "")} | each
 
 
 def _noise_attributes(problem: Description, variable: str) -> dict[str, str]:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
+from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 import bayesperiodic as bp
 from studies import common
-from studies.benchmark import contenders, peers, posteriors, scaling, targets
+from studies.benchmark import cold_start, contenders, peers, posteriors, scaling, targets
 from studies.benchmark import floor as floors
 from studies.benchmark import problems as made
 from studies.benchmark.integration import PREDICTED, SHOOTING, refer
@@ -41,12 +41,17 @@ PERIOD, SAMPLES = 3, 800
 ORBITS, TOLERANCE = 12, 1e-12
 # Distance at which the orbit counts as left [rad], with 5 rad/s counted as 1 rad.
 LEFT = 0.1
-SIZE, MARKERS, COLOURS = (18.0, 10.0), "osD^vP*X", [colormaps["tab20"](k) for k in range(20)]
+SIZE, HEIGHTS, MARKERS = (14.0, 8.4), [3.0, 1.0], "osD^vP*X"
+# Those of Okabe and Ito, then greys.
+COLOURS = "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "0.5", "0.8", "0.2"
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def run(options: argparse.Namespace) -> None:
-    """Run the study."""
+    """Run the study, or with ``--cold-start`` measure first results in new environments."""
+    if options.cold_start:
+        cold_start.run(options)
+        return
     before = read_kept(KEPT) if options.guard else None
     if options.guard:
         options.quick, options.out = True, KEPT.parent.parent / "quick" / "benchmark"
@@ -202,16 +207,18 @@ def account(found: dict[str, Any]) -> str:
 
 def draw(found: Mapping[str, Any]) -> Figure:
     """Return the figure: methods relative to one warm log-posterior, and its stages relative to the floor."""
-    figure = Figure(SIZE, layout="constrained")
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.15, 1.0])[0]
-    if found["problems"]:
-        _contenders(left.subplots(), found["problems"])
-    drawn = [part for part in ("floor", "posterior") if found.get(part)]
-    places = dict(zip(drawn, right.subplots(max(len(drawn), 1), 1, squeeze=False)[:, 0], strict=False))
-    if made.FORCE in found["floor"]:
-        _floor(places["floor"], found["floor"][made.FORCE])
-    if "posterior" in places:
-        _posterior(places["posterior"], found["posterior"])
+    with plt.style.context("bayesperiodic.plot.figures"):
+        figure = Figure(SIZE, layout="constrained")
+        left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.0, 1.0])[0]
+        if found["problems"]:
+            _contenders(left.subplots(), found["problems"])
+        drawn = [part for part in ("posterior", "floor") if found.get(part)]
+        rows: Any = right.subplots(max(len(drawn), 1), 1, squeeze=False, height_ratios=HEIGHTS[: max(len(drawn), 1)])
+        places = dict(zip(drawn, rows[:, 0], strict=False))
+        if made.FORCE in found["floor"]:
+            _floor(places["floor"], found["floor"][made.FORCE])
+        if "posterior" in places:
+            _posterior(places["posterior"], found["posterior"])
     return figure
 
 
@@ -224,40 +231,48 @@ def _contenders(ax: Axes, problems: Mapping[str, Any]) -> None:
         y = [names.index(e["name"]) for e in entries]
         x = np.array([[e["ratio"][key] for key in ("median", "least", "largest")] for e in entries]).T
         kind = " (synthetic)" if problems[problem]["synthetic"] else ""
-        ax.errorbar(x[0], y, xerr=[x[0] - x[1], x[2] - x[0]], fmt=marker, markersize=5, label=f"{problem}{kind}")
+        bars = [x[0] - x[1], x[2] - x[0]]
+        ax.errorbar(x[0], y, xerr=bars, fmt=marker, markersize=5, mec="black", mew=0.5, label=f"{problem}{kind}")
     ax.axvline(1.0, color="0.6", linewidth=1.0, zorder=0)
     ax.set(xscale="log", xlabel="time / one warm log-posterior of this package [1]")
-    ax.set_yticks(range(len(names)), names, fontsize=8)
+    ax.set_yticks(range(len(names)), names)
     ax.invert_yaxis()
     ax.grid(axis="x", alpha=0.3)
-    ax.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=2)
-    ax.set_title("One log-posterior at equal accuracy: median and range over the repeats")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=2)
+    ax.set_title("Time of one log-posterior at equal accuracy (median, range), relative to this package")
 
 
 def _floor(ax: Axes, found: Mapping[str, Any]) -> None:
     bars: dict[str, dict[str, float]] = {}
     for scheme, entry in found["schemes"].items():
-        bars[f"floor\n{scheme}"] = {k: v["median"] for k, v in entry["floor_us"].items() if k != "sum"}
-        bars[f"warm\n{scheme}"] = dict(entry["stages_us"])
-        bars[f"64 walkers\n{scheme}"] = {
+        bars[f"floor, {scheme}"] = {k: v["median"] for k, v in entry["floor_us"].items() if k != "sum"}
+        bars[f"warm, {scheme}"] = dict(entry["stages_us"])
+        bars[f"64 walkers, {scheme}"] = {
             "batched, all stages": entry["us"]["batched"]["median"], "emcee itself": found["emcee_us"]["median"]
         }  # fmt: skip
     parts = list(dict.fromkeys(part for bar in bars.values() for part in bar))
-    below = np.zeros(len(bars))
+    rows, left = range(len(bars)), np.zeros(len(bars))
     for part, colour in zip(sorted(parts, key=lambda p: p in floors.STAGES), COLOURS, strict=False):
-        height = np.array([max(bar.get(part, 0.0), 0.0) for bar in bars.values()])
-        ax.bar(range(len(bars)), height, bottom=below, label=part, color=colour)
-        below += height
-    ax.set_xticks(range(len(bars)), list(bars), fontsize=8)
-    ax.set(ylabel="time of one log-posterior [µs]", title=f"{made.FORCE}: stages")
-    ax.set_ylim(0.0, 1.05 * below.max())
-    ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        width = np.array([max(bar.get(part, 0.0), 0.0) for bar in bars.values()])
+        ax.barh(rows, width, left=left, label=part, color=colour, edgecolor="black", linewidth=0.4)
+        left += width
+    ax.set_yticks(rows, list(bars))
+    ax.invert_yaxis()
+    ax.set(xlabel="time of one log-posterior [µs]", title=f"Where the time goes ({made.FORCE})")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.2, -0.3), ncols=3)
 
 
 def _posterior(ax: Axes, found: Mapping[str, Any]) -> None:
     values = {name: e["ess_per_second"] for name, e in found["samplers"].items() if "ess_per_second" in e}
     values |= {f"emcee, {name}": entry["ess_per_second"] for name, entry in found["emcee_around"].items()}
     names = sorted(values, key=lambda name: values[name])
-    ax.barh(range(len(names)), [values[name] for name in names])
-    ax.set_yticks(range(len(names)), names, fontsize=6)
-    ax.set(xscale="log", xlabel="effective samples per second [1/s]", title="Duffing (synthetic): posterior")
+    own = [name.startswith("sample") for name in names]
+    colours = [bp.plot.COLOURS["map"] if one else "0.75" for one in own]
+    ax.barh(range(len(names)), [values[name] for name in names], color=colours, edgecolor="black", linewidth=0.4)
+    ax.set_yticks(range(len(names)), names)
+    ax.set_ylim(-0.6, len(names) - 0.4)
+    ax.set(
+        xscale="log",
+        xlabel="effective samples per second [1/s]",
+        title="Sampling rate, Duffing (synthetic); blue: this package",
+    )

@@ -79,7 +79,10 @@ def run(options: argparse.Namespace) -> None:
         figures = {
             "fit": bp.plot.fit(problem, fit, bp.predict(problem, posterior)),
             "loops": bp.plot.loops(problem, fit),
-            "corner": bp.plot.corner(posterior, laplace=fit),
+            "corner": common.titled(
+                bp.plot.corner(posterior, laplace=fit, problem=problem),
+                "Magnetorheological damper: posterior of Dahl's model",
+            ),
             "traces": bp.plot.traces(posterior),
             "harmonics": _harmonics_figure(choices, synthetic=data["synthetic"]),
             "missing_terms": bp.plot.missing_terms(problem, fit, found),

@@ -260,7 +260,10 @@ def all_of(
         "portraits": portraits(experiments, speeds, fit),
         "contraction": contractions(fits, _kind(experiments)),
     }
-    return figures if posterior is None else figures | {"corner": bp.plot.corner(posterior, laplace=fit)}
+    if posterior is None:
+        return figures
+    corner = bp.plot.corner(posterior, laplace=fit, names=list(fit.theta))
+    return figures | {"corner": common.titled(corner, f"Flutter rig{_kind(experiments)}: posterior of the parameters")}
 
 
 def amplitudes(values: Mapping[str, float]) -> dict[tuple[str, bool], np.ndarray]:

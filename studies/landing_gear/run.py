@@ -196,8 +196,9 @@ def _figures(runs: Sequence[Run], every: Mapping[str, OfTruth], quick: bool) -> 
     for stroke, name in chosen.items():
         for truth, by_run in verdicts.items():
             one = by_run[name].identified
-            corner = bp.plot.corner(one.posterior, laplace=one.fit, names=list(PRIORS))
-            drawn[f"corner_{stroke}_{truth}"] = corner
+            truths = {parameter: GEAR[parameter] for parameter in PRIORS}
+            corner = bp.plot.corner(one.posterior, laplace=one.fit, names=list(PRIORS), truths=truths)
+            drawn[f"corner_{stroke}_{truth}"] = common.titled(corner, f"Landing gear, truth {truth}, {stroke} stroke")
     return drawn
 
 

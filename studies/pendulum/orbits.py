@@ -8,14 +8,17 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.integrate import solve_ivp
 from scipy.stats import binom
+from tqdm import tqdm
 
 import bayesperiodic as bp
 from studies import shooting
 from studies.pendulum.recording import COORDINATES, OMEGA, TRUTH
 from studies.shooting import TURN
 
-TOLERANCE, ACCURACY = 1e-12, 1e-9
+# Tolerances of the integration, and of that which counts the turns; accuracy of the orbit.
+TOLERANCE, ROUGH, ACCURACY = 1e-12, 1e-6, 1e-9
 
 
 class Shot(NamedTuple):
@@ -39,7 +42,7 @@ def shoot(parameters: Mapping[str, float], omega: float, points: np.ndarray) -> 
     changes |= {f"c{i}": p[f"k{i}"] / inertia for i in (1, 2, 3)}
     slope, jacobian, period = shooting.pendulum(omega, **changes)
     times = period * np.arange(len(states) + 1)
-    ends = [shooting.flow(slope, jacobian, 0.0, period, state, TOLERANCE)[0][0] for state in states]
+    ends = [solve_ivp(slope, (0.0, period), state, "DOP853", rtol=ROUGH, atol=ROUGH).y[0, -1] for state in states]
     turns = np.round((np.array(ends) - np.roll(states[:, 0], -1)) / TURN)
     states[1:, 0] += TURN * np.cumsum(turns)[:-1]
     winding = int(turns.sum())
@@ -89,15 +92,23 @@ class Reference:
     off: float  # By how much the polished orbit's section points differ [rad, 5 rad/s]
 
 
-def true_orbits(orbits: bp.Orbits) -> tuple[bp.Orbits, list[Reference], list[str]]:
-    """Return polished orbits, those to which shooting from them converges, and the names of unconfirmed ones.
+class Confirmed(NamedTuple):
+    """Polished orbits, those to which shooting from them converges, and the names of unconfirmed ones."""
+
+    polished: bp.Orbits
+    truths: list[Reference]
+    refuted: list[str]
+
+
+def true_orbits(orbits: bp.Orbits) -> Confirmed:
+    """Return polished orbits and those that shooting confirms.
 
     Of a pair of symmetric partners one is integrated and the other mirrored.
     """
     polished = bp.polish_orbits(bp.models.pendulum, orbits, TRUTH, samples=SAMPLES)
     found: dict[int, Reference] = {}
     refuted = []
-    for number, orbit in enumerate(polished):
+    for number, orbit in enumerate(tqdm(polished, desc="shooting", unit="orbit")):
         assert orbit.solution is not None
         points = np.stack([orbit.solution.outputs[c][:: orbit.solution.samples] for c in COORDINATES], axis=-1)
         if orbit.partner is not None and orbit.partner in found:
@@ -111,7 +122,7 @@ def true_orbits(orbits: bp.Orbits) -> tuple[bp.Orbits, list[Reference], list[str
             found[number] = Reference(orbit.period, shot.winding, shot.points, shot.multipliers, equilibrium, off)
         else:
             refuted.append(orbit.name)
-    return polished, list(found.values()), refuted
+    return Confirmed(polished, list(found.values()), refuted)
 
 
 def _nearest(truth: Reference, points: np.ndarray) -> Reference:

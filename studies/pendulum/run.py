@@ -10,6 +10,7 @@ import argparse
 import time
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,16 +35,35 @@ class Found(NamedTuple):
     boxes: bp.Orbits  # By the paper's recipe
 
 
-def search(recording: bp.Recording, noises: Sequence[float], seed: int, periods: Sequence[int]) -> dict[float, Found]:
-    """Return the orbits found with each noise level added to the recording, as a fraction of the attractor's size."""
+def search(
+    recording: bp.Recording, noises: Sequence[float], seed: int, periods: Sequence[int], watch: common.Stopwatch
+) -> tuple[dict[float, Found], orbits.Confirmed | None]:
+    """Return the orbits by noise level, a fraction of the attractor's size, and those without noise against shooting.
+
+    Noisy recordings are searched in other processes meanwhile. A measured recording is not compared with shooting.
+    """
     # The noisiest takes longest, and comes first.
-    levels = list(dict.fromkeys(noises))[::-1]
-    tasks = [(recording, noise, seed, tuple(periods)) for noise in levels]
-    found = dict(zip(levels, common.each(_found, tasks, here=len(tasks) == 1), strict=True))
-    return {noise: found[noise] for noise in noises}
+    noisy = sorted({noise for noise in noises if noise > 0.0}, reverse=True)
+    levels = ", ".join(f"{noise:.2%}" for noise in sorted(set(noises)))
+    with ExitStack() as stack:
+        with watch.part("orbits", f"finding orbits without a model, noise {levels}"):
+            pool = stack.enter_context(common.workers()) if noisy else None
+            others = {noise: pool.submit(_found, recording, noise, seed, periods) for noise in noisy} if pool else {}
+            clean = _found(recording, 0.0, seed, periods)
+            print(f"  without noise: {len(clean.chained)} candidates", flush=True)
+        confirmed = None
+        if recording.synthetic:
+            with watch.part("reference", "the same orbits by shooting"):
+                confirmed = orbits.true_orbits(clean.chained)
+        with watch.part("orbits", "finding orbits in the noisy recordings"):
+            found = {0.0: clean}
+            for noise, other in reversed(others.items()):
+                found[noise] = other.result()
+                print(f"  noise {noise:.2%}: {len(found[noise].chained)} candidates", flush=True)
+    return {noise: found[noise] for noise in noises}, confirmed
 
 
-def _found(recording: bp.Recording, noise: float, seed: int, periods: tuple[int, ...]) -> Found:
+def _found(recording: bp.Recording, noise: float, seed: int, periods: Sequence[int]) -> Found:
     section = section_of(with_noise(recording, noise, seed) if noise > 0.0 else recording)
     return Found(section, *(bp.find_orbits(section, periods=periods, method=m) for m in orbits.METHODS))
 
@@ -67,12 +87,10 @@ def run(options: argparse.Namespace) -> None:
     print(f"  {kind} recording: {about['drive_periods']} drive periods, {about['values']} numbers")
     noise = options.noise if about["synthetic"] else 0.0
     levels = (0.0, noise) if options.quick or not about["synthetic"] else (*NOISE_LEVELS, noise)
-    with watch.part("orbits", f"finding orbits without a model, noise {', '.join(f'{n:.2%}' for n in set(levels))}"):
-        found = search(recording, levels, options.seed, QUICK_PERIODS if options.quick else PERIODS)
+    found, confirmed = search(recording, levels, options.seed, QUICK_PERIODS if options.quick else PERIODS, watch)
     results: dict[str, Any] = {"recording": about, "noise": noise, "seed": options.seed, "quick": options.quick}
-    if about["synthetic"]:
-        with watch.part("reference", "the same orbits by shooting"):
-            results |= _against_shooting(found)
+    if confirmed is not None:
+        results |= _against_shooting(found, confirmed)
         print(_orbit_account(results))
     with watch.part("estimates", "m and l, k3, and all five, from the paper's start"):
         identified = pendulum_estimates.identify(found[noise].chained)
@@ -92,13 +110,12 @@ def run(options: argparse.Namespace) -> None:
     common.finish(options.out, results, watch, paths, synthetic=about["synthetic"])
 
 
-def _against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
+def _against_shooting(found: Mapping[float, Found], confirmed: orbits.Confirmed) -> dict[str, Any]:
     """Return the orbits found without noise, compared with shooting, and the multipliers by noise level and method."""
-    clean = found[0.0].chained
-    polished, truths, refuted = orbits.true_orbits(clean)
+    polished, truths, refuted = confirmed
     return {
         "found_without_noise": {
-            "candidates": len(clean),
+            "candidates": len(found[0.0].chained),
             "polished": len(polished),
             "rejected": [[orbit.name, reason] for orbit, reason in polished.rejected],
             "classes": orbits.classes(polished),
@@ -302,15 +319,23 @@ def figures(
     drawn = {
         "section": bp.plot.section(section, found.polished, units=UNITS),
         "orbits": bp.plot.orbits(found.selected, units=UNITS),
-        "corner": bp.plot.corner(ridge.posterior, laplace=ridge.fit, names=pendulum_estimates.NATURAL),
+        "corner": corner(ridge, truth=section.synthetic),
         "ridge": marginals(ridge, truth=section.synthetic),
     }
-    if section.synthetic:
-        drawn["section"].suptitle(SYNTHETIC, fontsize="medium")
-        drawn["orbits"].suptitle(SYNTHETIC, x=0.99, ha="right", fontsize="medium")
+    kind = f" ({SYNTHETIC})" * section.synthetic
+    drawn["section"].suptitle(f"Unstable orbits found in the pendulum's chaotic motion{kind}", fontsize="medium")
+    drawn["orbits"].suptitle(f"Unstable orbits of the pendulum{kind}", x=0.01, ha="left", fontsize="medium")
     if table:
         drawn["eigenvalues"] = eigenvalues(table)
     return drawn
+
+
+def corner(ridge: Ridge, *, truth: bool) -> Figure:
+    """Draw the posterior of all five parameters."""
+    names = pendulum_estimates.NATURAL
+    truths = {name: TRUTH[name] for name in names} if truth else None
+    figure = bp.plot.corner(ridge.posterior, laplace=ridge.fit, names=names, truths=truths)
+    return common.titled(figure, "m, k1, k2 and k3 are determined only up to a common factor; l by itself")
 
 
 def marginals(ridge: Ridge, *, truth: bool) -> Figure:

@@ -116,17 +116,24 @@ def account_of_replicates(found: Mapping[str, Any]) -> str:
 
 
 BINS, SHOWN = 50, (0.0005, 0.9995)
-RIDGES = {"product_ridge": None, "sum_ridge": None, "scaling_symmetry": ["m", "k1", "k2", "k3", "l"]}
+RIDGES = {
+    "product_ridge": "Only a·b is determined: the draws follow a hyperbola, the Laplace ellipse its tangent",
+    "sum_ridge": "Only a + b is determined: the draws follow a line, and so does the Laplace ellipse",
+    "scaling_symmetry": "A pendulum's m, k1, k2, k3 are determined only up to a common factor: ridges from the origin",
+}
+SHOWN_OF = {"scaling_symmetry": ["m", "k1", "k2", "k3", "l"]}
 WIDTH = 72
 
 
 def _figures(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
     found = {"gallery": _gallery(outcomes)}
-    for name, names in RIDGES.items():
+    for name, title in RIDGES.items():
         if name in outcomes:
-            outcome = outcomes[name]
-            shown = list(outcome.problem.names) if names is None else names
-            found[name] = bp.plot.corner(outcome.posterior, laplace=outcome.fit, names=shown)
+            o = outcomes[name]
+            names = SHOWN_OF.get(name, list(o.problem.names))
+            truths = {n: o.case.truth[n] for n in names}
+            drawn = bp.plot.corner(o.posterior, laplace=o.fit, problem=o.problem, names=names, truths=truths)
+            found[name] = common.titled(drawn, title)
     return found
 
 
@@ -166,7 +173,7 @@ def _marginal(axes: Axes, outcome: Outcome) -> None:
 def _words(axes: Axes, outcome: Outcome) -> None:
     case, verdicts = outcome.case, outcome.verdicts
     axes.set_axis_off()
-    axes.text(0.0, 1.0, textwrap.fill(f"wrong: {case.title}", WIDTH), va="top", fontsize=11, weight="bold")
+    axes.text(0.0, 1.0, textwrap.fill(heading(case.title), WIDTH), va="top", fontsize=11, weight="bold")
     rows = {
         IDENTIFIABILITY: _grouped(verdicts[IDENTIFIABILITY]),
         COMPARE: _grouped(verdicts[COMPARE]),
@@ -178,6 +185,11 @@ def _words(axes: Axes, outcome: Outcome) -> None:
         axes.text(0.19, place, textwrap.fill(text, WIDTH), va="center", fontsize=9, weight=weight)
     mark = "as expected" if not outcome.wrong else "NOT AS EXPECTED"
     axes.text(1.0, 0.14, mark, va="center", ha="right", fontsize=10, style="italic")
+
+
+def heading(title: str) -> str:
+    """Return a fault as a sentence."""
+    return "Nothing is wrong" if title == "nothing" else title[0].upper() + title[1:]
 
 
 def _grouped(verdicts: Mapping[str, str]) -> str:

@@ -7,15 +7,15 @@ from bayesperiodic.models.code_generation import GRID_SIGNATURE
 
 MATRIX, VECTOR = "float64[:,::1]", "float64[::1]"
 FUNCTION = f"FunctionType({GRID_SIGNATURE})"
-OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
+OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
 @njit(
     f"boolean({FUNCTION}, {VECTOR}, float64, {VECTOR}, float64, int64[::1], {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, "
-    f"{VECTOR})",
+    f"{MATRIX}, {VECTOR})",
     **OPTIONS,
 )
-def slope(residual_jacobian, y, time, parameters, frequency, orders, states, row, columns, tau, rate):
+def slope(residual_jacobian, y, time, parameters, frequency, orders, states, row, columns, tau, system, rate):
     """Fill ẏ; the equations are solved for the highest derivatives, in which they are linear."""
     count = orders.size
     extra = count
@@ -26,8 +26,7 @@ def slope(residual_jacobian, y, time, parameters, frequency, orders, states, row
             extra += 1
     tau[0, 0] = time
     residual_jacobian(states, row, parameters, tau[0], frequency, columns)
-    g = np.empty(count)
-    highest = np.empty((count, count))
+    highest, g = system[:count], system[count]
     for e in range(count):
         g[e] = -columns[0, e]
         for s in range(count):
@@ -70,6 +69,7 @@ def runge_kutta(residual_jacobian, start, inputs, samples, parameters, frequency
     size, count = start.size, orders.size
     states, row = np.empty((1, 3 * count)), np.empty((1, inputs.shape[1]))
     columns, tau = np.empty((1, count * (1 + 3 * count))), np.empty((1, 1))
+    system = np.empty((count + 1, count))
     y, trial, rates = start.copy(), np.empty(size), np.empty((4, size))
     step = 1.0 / (samples * frequency)
     first = steps - path.shape[0]
@@ -87,8 +87,9 @@ def runge_kutta(residual_jacobian, start, inputs, samples, parameters, frequency
                 row[0, u] = inputs[half % inputs.shape[0], u]
             time = 0.5 * half / samples
             if not slope(
-                residual_jacobian, trial, time, parameters, frequency, orders, states, row, columns, tau, rates[stage]
-            ):
+                residual_jacobian, trial, time, parameters, frequency, orders, states, row, columns, tau, system,
+                rates[stage],
+            ):  # fmt: skip
                 return False
         for i in range(size):
             y[i] += step / 6.0 * (rates[0, i] + 2.0 * rates[1, i] + 2.0 * rates[2, i] + rates[3, i])
@@ -100,6 +101,8 @@ def runge_kutta(residual_jacobian, start, inputs, samples, parameters, frequency
 @njit(f"void(complex128[:,::1], float64, {MATRIX})", **OPTIONS)
 def fill_inputs(amplitudes, time, row):
     """Fill u, u̇, ü (1, 3·inputs) at a time in forcing periods, from amplitudes (harmonics, 3·inputs)."""
+    if row.size == 0:
+        return
     turn = np.exp(2j * np.pi * (time - np.floor(time)))
     wave = 1.0 + 0.0j
     row[0, :] = 0.0
@@ -126,10 +129,13 @@ def dormand_prince(
     size, count, stages = path.shape[1], orders.size, c.size - 1
     states, row = np.empty((1, 3 * count)), np.empty((1, amplitudes.shape[1]))
     columns, tau = np.empty((1, count * (1 + 3 * count))), np.empty((1, 1))
+    system = np.empty((count + 1, count))
     y, trial, rates = path[0].copy(), np.empty(size), np.empty((stages + 1, size))
     step = 1e-3
     fill_inputs(amplitudes, time[0], row)
-    if not slope(residual_jacobian, y, time[0], parameters, frequency, orders, states, row, columns, tau, rates[0]):
+    if not slope(
+        residual_jacobian, y, time[0], parameters, frequency, orders, states, row, columns, tau, system, rates[0]
+    ):
         return 1
     for k in range(1, time.size):
         now, left = time[k - 1], trials
@@ -150,7 +156,7 @@ def dormand_prince(
                 at = now + c[stage] * used
                 fill_inputs(amplitudes, at, row)
                 if not slope(
-                    residual_jacobian, trial, at, parameters, frequency, orders, states, row, columns, tau,
+                    residual_jacobian, trial, at, parameters, frequency, orders, states, row, columns, tau, system,
                     rates[stage],
                 ):  # fmt: skip
                     finite = False

@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
     from bayesperiodic.periodic._kernels.batch import *
 
 
-@njit(types.void(GRID, FACTORS, MATRIX), **OPTIONS)
+@kernel(types.void(GRID, FACTORS, MATRIX), **OPTIONS)
 def back_substitute_transposed(grid, factors, right):
     """Solve (∂g/∂z)ᵀ·x = b in place, b (points, states), with the factors of `factorise`."""
     inverses, gains, transfer, ends, lead = factors.inverses, factors.gains, factors.transfer, factors.ends, grid.lead
@@ -80,7 +80,7 @@ def concatenate(states, others, both):
             out[np.uint64((first + second) * i + first + s)] = other[np.uint64(second * i + s)]
 
 
-@njit(types.void(PLACES, GRID, SETS, MATRIX, CUBE, CUBE, FACTORS, COUNT, COUNT, MATRIX), **OPTIONS)
+@kernel(types.void(PLACES, GRID, SETS, MATRIX, CUBE, CUBE, FACTORS, COUNT, COUNT, MATRIX), **OPTIONS)
 def vjp_many(addresses, grid, sets, parameters, z, weights, factors, start, stop, gradients):
     """Fill Σ weights · ∂ŷ/∂θ (sets, moving) of the input sets start … stop at one solution each; NaN where singular.
 

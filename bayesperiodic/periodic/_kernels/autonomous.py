@@ -14,7 +14,7 @@ MAX_SECANTS, SECANT_RATE = 12, 0.5
 ANCHOR = types.Tuple([VECTOR, MATRIX, NUMBER, CUBE, VECTOR])
 
 
-@njit(
+@kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
         FUNCTIONS, GRID, SETTING, MATRIX, PLACES, BORDER, NUMBER, MATRIX, MATRIX, MATRIX
     ),
@@ -97,7 +97,7 @@ def has_leapt(z, predicted, start, frequency, expected):
     return has_shrunk(z, start) or has_shorter_period(z)
 
 
-@njit(
+@kernel(
     types.Tuple([COUNT, COUNT, NUMBER])(FUNCTIONS, GRID, SETTING, ANCHOR, NUMBER, BORDER, MATRIX, MATRIX, WORKSPACE),
     **OPTIONS,
 )
@@ -154,7 +154,7 @@ def continue_from_anchor(functions, grid, setting, anchor, orientation, border, 
     return CONVERGED, used, now
 
 
-@njit(types.void(FUNCTIONS, GRID, SETS, ORBITS, CUBE, COUNT, COUNT, FLAG, WORKSPACE, SOLUTION), **OPTIONS)
+@kernel(types.void(FUNCTIONS, GRID, SETS, ORBITS, CUBE, COUNT, COUNT, FLAG, WORKSPACE, SOLUTION), **OPTIONS)
 def follow_many(functions, grid, sets, orbits, parameters, start, stop, whole, work, solution):
     """Follow every orbit to its parameter vectors start … stop: by `broyden`, or else by `continue_from_anchor`.
 

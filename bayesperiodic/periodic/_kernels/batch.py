@@ -27,7 +27,7 @@ def in_units(reached, amplitude):
     return result
 
 
-@njit(
+@kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
         FUNCTIONS, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, FACTORS, MATRIX, MATRIX
     ),
@@ -95,7 +95,7 @@ def was_damped(history, iterations):
     return False
 
 
-@njit(
+@kernel(
     types.Tuple([COUNT, COUNT])(
         FUNCTIONS, GRID, COUNT, SETTING, UNKNOWNS, BORDER, VECTOR, MATRIX, CUBE, FLAG, MATRIX, MATRIX, WORKSPACE
     ),
@@ -137,7 +137,7 @@ def continue_from_anchor(
     return CONVERGED, used
 
 
-@njit(types.void(FUNCTIONS, GRID, COUNT, SETS, ANCHORS, CUBE, COUNT, COUNT, FLAG, FLAG, SOLUTION), **OPTIONS)
+@kernel(types.void(FUNCTIONS, GRID, COUNT, SETS, ANCHORS, CUBE, COUNT, COUNT, FLAG, FLAG, SOLUTION), **OPTIONS)
 def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop, polish, rates, solution):
     """Solve for input sets times parameter vectors, those of the flat indices start … stop (vectors run fastest).
 
@@ -259,7 +259,7 @@ def substitute_transposed(flat, pivots, below, reach, x):
         x[pivot] = value
 
 
-@njit(types.void(MATRIX, COUNT, COUNT, PLACES, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, COUNT, COUNT, PLACES, MATRIX), **OPTIONS)
 def solve_transposed(band, lower, upper, pivots, right):
     """Solve Aᵀ·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
     flat = band.reshape(band.size)

@@ -25,7 +25,7 @@ def determinant_sign(band, pivots):
     return sign
 
 
-@njit(NUMBER(MATRIX, PLACES, BORDER), **OPTIONS)
+@kernel(NUMBER(MATRIX, PLACES, BORDER), **OPTIONS)
 def factor_bordered(band, pivots, border):
     """Factor [∂g/∂z, B; C, D] in place; return the sign of its determinant, 0 where it is singular.
 
@@ -73,7 +73,7 @@ def factor_bordered(band, pivots, border):
     return -determinant_sign(band, pivots) * determinant_sign(small, border.pivots) * last
 
 
-@njit(types.void(MATRIX, PLACES, BORDER, MATRIX, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, PLACES, BORDER, MATRIX, MATRIX), **OPTIONS)
 def solve_bordered(band, pivots, border, right, below):
     """Solve [∂g/∂z, B; C, D]·(x, y) = (right, below) in place with the factors of `factor_bordered`.
 
@@ -98,7 +98,7 @@ def solve_bordered(band, pivots, border, right, below):
             right[r, i] += known[0, borders] * columns[borders, i]
 
 
-@njit(NUMBER(MATRIX, MATRIX, GRID, VECTOR), **OPTIONS)
+@kernel(NUMBER(MATRIX, MATRIX, GRID, VECTOR), **OPTIONS)
 def phase_row(z, states, grid, row):
     """Fill the row (size,), folded, of the phase condition ∫ q_z'·(q − q_z) dτ = 0 against z; return row · z.
 
@@ -135,7 +135,7 @@ def scale_rates(inputs, ratio, result):
             result[i, 2 * count + k] = inputs[i, 2 * count + k] * ratio**2
 
 
-@njit(NUMBER(SETTING, UNKNOWNS, VECTOR, MATRIX, VECTOR), **OPTIONS)
+@kernel(NUMBER(SETTING, UNKNOWNS, VECTOR, MATRIX, VECTOR), **OPTIONS)
 def fill_setting(setting, unknowns, values, inputs, parameters):
     """Fill inputs and parameters at values of the unknowns, from the setting at zeros; return the frequency."""
     frequency = setting.frequency
@@ -155,7 +155,7 @@ def fill_setting(setting, unknowns, values, inputs, parameters):
     return frequency
 
 
-@njit(types.void(FUNCTIONS, GRID, SETTING, UNKNOWNS, MATRIX, MATRIX, MATRIX, MATRIX), **OPTIONS)
+@kernel(types.void(FUNCTIONS, GRID, SETTING, UNKNOWNS, MATRIX, MATRIX, MATRIX, MATRIX), **OPTIONS)
 def fill_slopes(functions, grid, setting, unknowns, states, columns, table, slopes):
     """Fill the first rows of `slopes` with ∂g/∂(unknowns), z held as a function of tau, folded.
 
@@ -194,7 +194,7 @@ def folded_product(z, row, grid):
     return total
 
 
-@njit(
+@kernel(
     types.Tuple([NUMBER, NUMBER])(
         FUNCTIONS, GRID, SETTING, UNKNOWNS, BORDER, MATRIX, MATRIX, MATRIX, MATRIX, WORKSPACE, VECTOR
     ),
@@ -250,7 +250,7 @@ def power(z, harmonic):
     return total
 
 
-@njit(FLAG(MATRIX), **OPTIONS)
+@kernel(FLAG(MATRIX), **OPTIONS)
 def has_shorter_period(z):
     """Return whether only every k-th harmonic is present, for a k of 2 or more."""
     points, whole = z.shape[0], 0.0

@@ -15,6 +15,7 @@ period:
 import numpy as np
 from numba import njit, types
 
+from bayesperiodic.models.cache import kernel
 from bayesperiodic.periodic.compiled import *
 
 STATES, REACH, WIDTH, HALF = globals().get("SIZES", (0, 0, 0, 0))  # 0: any number, taken from the arrays
@@ -22,7 +23,7 @@ LOWER = HALF * STATES + STATES - 1 if HALF > 0 else 0  # half-width of the folde
 NARROW = 5
 GROWTH, TOO_MUCH_GROWTH = 1e4, 1e8
 CHECK_EVERY = 8
-OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
+OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
 @njit(types.void(MATRIX, MATRIX), **OPTIONS)
@@ -82,7 +83,7 @@ def factor_narrow(flat, stop, pivots):
     return True
 
 
-@njit(FLAG(MATRIX, COUNT, COUNT, PLACES), **OPTIONS)
+@kernel(FLAG(MATRIX, COUNT, COUNT, PLACES), **OPTIONS)
 def factor(band, lower, upper, pivots):
     """Factor in place, P·A = L·U; return False for a pivot that is zero or not finite.
 
@@ -166,7 +167,7 @@ def substitute(flat, pivots, below, reach, x):
         x[i] = value * flat[diagonal]
 
 
-@njit(types.void(MATRIX, COUNT, COUNT, PLACES, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, COUNT, COUNT, PLACES, MATRIX), **OPTIONS)
 def solve(band, lower, upper, pivots, right):
     """Solve A·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
     flat = band.reshape(band.size)
@@ -177,7 +178,7 @@ def solve(band, lower, upper, pivots, right):
             substitute(flat, pivots, np.uint64(lower), np.uint64(lower + upper), right[c])
 
 
-@njit(types.void(MATRIX, GRID, COUNT, NUMBER, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, GRID, COUNT, NUMBER, MATRIX), **OPTIONS)
 def assemble(columns, grid, states, frequency, band):
     """Fill the folded band of ∂g/∂z from the columns g, ∂g/∂(q, q̇, q̈) of the model's grid function."""
     first, second, shift, place = grid.first, grid.second, grid.shift, grid.place
@@ -231,7 +232,7 @@ def invert(matrix, inverse, size):
     return True
 
 
-@njit(FLAG(MATRIX, GRID, NUMBER, VECTOR, FACTORS), **OPTIONS)
+@kernel(FLAG(MATRIX, GRID, NUMBER, VECTOR, FACTORS), **OPTIONS)
 def condense_segments(columns, grid, frequency, amplitude, factors):
     """Express every point by the start points of its segment; return False if the march grows or is singular.
 
@@ -296,7 +297,7 @@ def condense_segments(columns, grid, frequency, amplitude, factors):
     return start == points
 
 
-@njit(FLAG(FACTORS), **OPTIONS)
+@kernel(FLAG(FACTORS), **OPTIONS)
 def factor_interface(factors):
     """Factor the cyclic system that couples the start points of the segments; return False if it is singular."""
     transfer, ends = factors.transfer, factors.ends
@@ -317,7 +318,7 @@ def factor_interface(factors):
     return factor(matrix, size - 1, size - 1, factors.interface_pivots)
 
 
-@njit(FLAG(MATRIX, GRID, NUMBER, VECTOR, FACTORS), **OPTIONS)
+@kernel(FLAG(MATRIX, GRID, NUMBER, VECTOR, FACTORS), **OPTIONS)
 def factorise(columns, grid, frequency, amplitude, factors):
     """Factor ∂g/∂z by segments, or else in the folded order; return False if it is singular or not finite."""
     if grid.lead >= 0 and condense_segments(columns, grid, frequency, amplitude, factors):
@@ -330,7 +331,7 @@ def factorise(columns, grid, frequency, amplitude, factors):
     return factor(factors.band, lower, lower, factors.pivots)
 
 
-@njit(types.void(GRID, FACTORS, MATRIX), **OPTIONS)
+@kernel(types.void(GRID, FACTORS, MATRIX), **OPTIONS)
 def back_substitute(grid, factors, right):
     """Solve ∂g/∂z·x = b in place, b (points, states), with the factors of `factorise`."""
     inverses, gains, transfer, ends, lead = factors.inverses, factors.gains, factors.transfer, factors.ends, grid.lead

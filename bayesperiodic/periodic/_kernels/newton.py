@@ -28,7 +28,7 @@ FAR = 0.3
 SMALLEST_PART = 1.0 / 256.0  # smallest step of a continuation from an anchor
 
 
-@njit(types.void(MATRIX, VECTOR, GRID, NUMBER, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, VECTOR, GRID, NUMBER, MATRIX), **OPTIONS)
 def differentiate(z, drift, grid, frequency, states):
     """Fill `states` (points, 3·states) with q = z + drift·tau and its time derivatives by the scheme."""
     first, second, neighbours, tau = grid.first, grid.second, grid.neighbours, grid.tau
@@ -62,7 +62,7 @@ def differentiate(z, drift, grid, frequency, states):
             states[i, 2 * count + s] = acceleration * squared
 
 
-@njit(types.void(MATRIX, MATRIX, GRID, VECTOR, NUMBER, VECTOR, VECTOR, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, MATRIX, GRID, VECTOR, NUMBER, VECTOR, VECTOR, MATRIX), **OPTIONS)
 def scales(columns, states, grid, amplitude, frequency, size, rounding, weight):
     """Fill, for each equation, the size of its terms and the rounding error that its residual cannot fall below.
 
@@ -167,7 +167,7 @@ def scaled_step(z, step, resting):
     return result
 
 
-@njit(COUNT(GRID, FACTORS, VECTOR, VECTOR, types.boolean[::1], MATRIX, MATRIX), **OPTIONS)
+@kernel(COUNT(GRID, FACTORS, VECTOR, VECTOR, types.boolean[::1], MATRIX, MATRIX), **OPTIONS)
 def ending(grid, factors, rounding, reached, resting, z, change):
     """Set the states at rest to zero, and return the status of a settled iteration: "singular" if undetermined.
 
@@ -191,7 +191,7 @@ def ending(grid, factors, rounding, reached, resting, z, change):
     return CONVERGED
 
 
-@njit(
+@kernel(
     types.Tuple([COUNT, COUNT, NUMBER])(FUNCTIONS, GRID, SETTING, UNKNOWNS, BORDER, COUNT, MATRIX, MATRIX, WORKSPACE),
     **OPTIONS,
 )
@@ -298,7 +298,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     return STALLED, MAX_ITERATIONS, orientation
 
 
-@njit(types.void(MATRIX, CUBE, VECTOR, VECTOR, NUMBER, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, CUBE, VECTOR, VECTOR, NUMBER, MATRIX), **OPTIONS)
 def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fraction, z):
     """Fill z with the anchor's linear prediction, at a fraction of the way from the anchor's parameters."""
     copy(anchor_z, z)
@@ -310,7 +310,7 @@ def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fract
                 flat[k] += slope[k] * change
 
 
-@njit(FLAG(MATRIX, MATRIX, MATRIX), **OPTIONS)
+@kernel(FLAG(MATRIX, MATRIX, MATRIX), **OPTIONS)
 def is_far(z, predicted, anchor_z):
     """Return whether z is off the prediction by more than `FAR` of the anchor's range and of the change.
 
@@ -353,7 +353,7 @@ def is_large(z, s, energy, share):
     return energy > max(variation, z.shape[0] * (10.0 * STEP_TOLERANCE * reached) ** 2)
 
 
-@njit(FLAG(MATRIX, MATRIX), **OPTIONS)
+@kernel(FLAG(MATRIX, MATRIX), **OPTIONS)
 def is_jagged(z, inputs):
     """Return whether a state has energy at the grid's highest harmonics that the inputs (points, 3·inputs) lack.
 
@@ -381,7 +381,7 @@ def is_jagged(z, inputs):
     return jagged
 
 
-@njit(COUNT(MATRIX, COUNT), **OPTIONS)
+@kernel(COUNT(MATRIX, COUNT), **OPTIONS)
 def repetitions(z, periods):
     """Return how often z repeats itself in a number of forcing periods: once if that is its shortest period."""
     points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]

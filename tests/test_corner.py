@@ -1,0 +1,268 @@
+"""Regions of corner plots contain their share of the draws, and are as large as those of the true density."""
+
+import re
+from dataclasses import replace
+
+import corner
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.contour import ContourSet
+from scipy.stats import multivariate_normal, norm
+
+import bayesperiodic as bp
+from bayesperiodic.plot import pairs, regions
+from bayesperiodic.plot.style import ENSEMBLES
+from bayesperiodic.posterior.parameters import support
+from bayesperiodic.sampling.convergence import arviz
+from tests.drawn import posterior_of
+
+COUNT = 20_000
+REAL, POSITIVE = (-np.inf, np.inf), (0.0, np.inf)
+
+
+def quadrature_area(density, x, y, probability):
+    """Return the area of the region of highest density with this probability, by the midpoint rule."""
+    cell = (x[1] - x[0]) * (y[1] - y[0])
+    values = np.sort(density(*np.meshgrid(x, y, indexing="ij")), axis=None)[::-1]
+    shares = np.cumsum(values) * cell
+    assert shares[-1] == pytest.approx(1.0, abs=1e-3)
+    return np.searchsorted(shares, probability) * cell
+
+
+def product_ridge(generator, spread, width):
+    """Return a = exp(s), b = exp(w − s) for normal s and w; dA = exp(w) ds dw."""
+    s, w = spread * generator.standard_normal(COUNT), width * generator.standard_normal(COUNT)
+    x, y = np.linspace(-6 * spread, 6 * spread, 1501), np.linspace(-6 * width, 6 * width, 1501)
+    across, along = np.meshgrid(x, y, indexing="ij")
+    density = norm.pdf(across, scale=spread) * norm.pdf(along, scale=width) * np.exp(-along)
+    order, cell = np.argsort(density, axis=None)[::-1], (x[1] - x[0]) * (y[1] - y[0])
+    areas = np.exp(along).ravel()[order] * cell
+    shares = np.cumsum(density.ravel()[order] * areas)
+
+    def area(probability):
+        return areas[: np.searchsorted(shares, probability)].sum()
+
+    return np.stack([np.exp(s), np.exp(w - s)], axis=-1), area
+
+
+def banana(generator, width):
+    """Return x and y = x² + w; the map from the normal x and w keeps areas."""
+    x, w = generator.standard_normal((2, COUNT))
+    return np.stack([x, x**2 + width * w], axis=-1), lambda p: -2.0 * np.log(1.0 - p) * np.pi * width
+
+
+def two_normals(generator, centres, sds):
+    """Return draws of two normal distributions with round contours, each with half of the mass."""
+    which = generator.integers(2, size=COUNT)
+    points = np.array(centres)[which] + np.array(sds)[which, None] * generator.standard_normal((COUNT, 2))
+
+    def density(x, y):
+        at = np.stack([x, y], axis=-1)
+        return sum(0.5 * multivariate_normal(c, s**2).pdf(at) for c, s in zip(centres, sds, strict=True))
+
+    reach = [np.linspace(*ends, 1201) for ends in ((-6.0, 11.0), (-6.0, 6.0))]
+    return points, lambda p: quadrature_area(density, *reach, p)
+
+
+def mirrored(generator, sd):
+    """Return two small normal distributions at (1, 1) and (−1, −1)."""
+    sign = np.where(generator.integers(2, size=COUNT) == 1, 1.0, -1.0)
+    points = sign[:, None] * (1.0 + sd * generator.standard_normal((COUNT, 2)))
+    return points, lambda p: 2.0 * -2.0 * np.log(1.0 - p) * np.pi * sd**2
+
+
+def truncated(generator, both):
+    """Return half or a quarter of a normal distribution."""
+    x, y = generator.standard_normal((2, COUNT))
+    points = np.stack([np.abs(x), np.abs(y) if both else y + 0.5 * np.abs(x)], axis=-1)
+    return points, lambda p: -2.0 * np.log(1.0 - p) * np.pi / (4 if both else 2)
+
+
+def exponential(generator):
+    """Return two exponential variables: the region is x + y < c, with 1 − (1 + c)·exp(−c) = p."""
+    edges = {0.5: 1.678346990016661, 0.9: 3.889720169867429}
+    return generator.exponential(size=(COUNT, 2)), lambda p: 0.5 * edges[p] ** 2
+
+
+def correlated(generator, correlation):
+    x, y = generator.standard_normal((2, COUNT))
+    width = np.sqrt(1.0 - correlation**2)
+    points = 5.0 + np.stack([x, correlation * x + width * y], axis=-1)
+    return points, lambda p: -2.0 * np.log(1.0 - p) * np.pi * width
+
+
+CASES = {
+    "product ridge over one decade": (lambda g: product_ridge(g, 0.5, 0.02), POSITIVE, POSITIVE),
+    "product ridge over three decades": (lambda g: product_ridge(g, 1.5, 0.002), POSITIVE, POSITIVE),
+    "product ridge sampled in natural values": (lambda g: product_ridge(g, 0.5, 0.02), REAL, REAL),
+    "banana": (lambda g: banana(g, 0.2), REAL, REAL),
+    "thin banana": (lambda g: banana(g, 0.02), REAL, REAL),
+    "two modes": (lambda g: two_normals(g, [(0.0, 0.0), (5.0, 1.0)], (1.0, 1.0)), REAL, REAL),
+    "two modes of different widths": (lambda g: two_normals(g, [(0.0, 0.0), (5.0, 0.0)], (1.0, 0.2)), REAL, REAL),
+    "mirrored sign": (lambda g: mirrored(g, 0.05), REAL, REAL),
+    "mirrored sign, narrow": (lambda g: mirrored(g, 0.01), REAL, REAL),
+    "truncated": (lambda g: truncated(g, both=False), (0.0, 9.0), REAL),
+    "truncated twice": (lambda g: truncated(g, both=True), (0.0, np.inf), (0.0, 9.0)),
+    "exponential": (exponential, POSITIVE, POSITIVE),
+    "round": (lambda g: correlated(g, 0.0), REAL, REAL),
+    "straight ridge": (lambda g: correlated(g, 0.9999), POSITIVE, POSITIVE),
+}
+
+
+CURVED = ("product ridge sampled in natural values", "thin banana")
+
+
+def shoelace(polygon):
+    x, y = polygon.T
+    return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_regions_contain_their_share_of_the_draws_and_have_the_true_area(case):
+    make, *supports = CASES[case]
+    draws, area = make(np.random.default_rng(7))
+    names = dict(zip("ab", draws.T, strict=True))
+    figure = bp.plot.corner(posterior_of(names, dict(zip("ab", supports, strict=True))))
+    for region, probability in zip(contours(figure.axes[2]), (0.9, 0.5), strict=True):
+        (path,) = region.get_paths()
+        assert path.contains_points(draws).mean() == pytest.approx(probability, abs=0.01)
+        found = abs(sum(map(shoelace, path.to_polygons())))
+        assert found == pytest.approx(area(probability), rel=0.15)
+        assert len(path.to_polygons()) == 1 or case not in CURVED
+
+
+@pytest.mark.parametrize("case", ["truncated twice", "exponential", "round"])
+def test_marginal_densities_reach_the_end_of_the_support(case):
+    make, first, _ = CASES[case]
+    draws, _ = make(np.random.default_rng(3))
+    found = regions.density(draws[:, :1], [first])
+    exact = {"truncated twice": lambda x: 2.0 * norm.pdf(x), "exponential": lambda x: np.exp(-x)}
+    density = exact.get(case, lambda x: norm.pdf(x, 5.0))(found.nodes[0])
+    assert np.abs(found.values - density).max() < 0.08 * density.max()
+    assert np.trapezoid(found.values, found.nodes[0]) == pytest.approx(1.0, abs=0.01)
+
+
+def contours(axes):
+    """Return the filled regions of a panel."""
+    return [c for c in axes.collections if isinstance(c, ContourSet) and c.filled]
+
+
+def test_each_optimum_has_its_own_regions_colour_and_number():
+    draws, area = mirrored(np.random.default_rng(5), 1e-3)
+    modes = (draws[:, 0] < 0.0).astype(np.int8)
+    figure = bp.plot.corner(posterior_of({"a": draws[:, 0], "b": draws[:, 1]}, modes=modes))
+    panel, first, second = figure.axes[2], *contours(figure.axes[2])[::2]
+    assert not np.array_equal(first.get_facecolor(), second.get_facecolor())
+    for region, mode in ((first, 0), (second, 1)):
+        inside = region.get_paths()[0].contains_points(draws)
+        assert inside[modes == mode].mean() == pytest.approx(0.9, abs=0.01) and not inside[modes != mode].any()
+        found = abs(sum(map(shoelace, region.get_paths()[0].to_polygons())))
+        assert found == pytest.approx(0.5 * area(0.9), rel=0.15)
+    marks = {line.get_marker(): line.get_xydata()[0] for line in panel.lines if str(line.get_marker()).startswith("$")}
+    assert marks["$0$"] == pytest.approx([1.0, 1.0], abs=1e-3) and marks["$1$"] == pytest.approx([-1, -1], abs=1e-3)
+    legend = [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
+    share = 100.0 * np.mean(modes == 0)
+    assert legend[0].startswith(f"optimum 0: {share:.1f} ±") and len(legend) == 2
+
+
+def positions(axes, colour):
+    """Return where lines of a colour cross the axes."""
+    lines = [line for line in axes.lines if line.get_color() == colour]
+    across = [line.get_xdata()[0] for line in lines if list(line.get_ydata()) == [0, 1]]
+    return across, [line.get_ydata()[0] for line in lines if list(line.get_xdata()) == [0, 1]]
+
+
+def test_zero_is_marked_where_the_sign_matters_and_truths_are_shown_also_beyond_the_draws():
+    x, y = np.random.default_rng(2).standard_normal((2, 2000))
+    figure = bp.plot.corner(posterior_of({"a": x, "b": 50.0 + y}), truths={"b": 70.0})
+    top, _, panel, below = figure.axes
+    assert positions(panel, "0.75") == ([0.0], []) and positions(top, "0.75") == ([0.0], [])
+    assert positions(panel, "#000000") == ([], [70.0]) and positions(below, "#000000") == ([70.0], [])
+    assert panel.get_ylim()[1] > 70.0 > 55.0 > panel.get_ylim()[0] > 40.0
+    assert "truth" in [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
+
+
+def test_priors_are_thin_lines_on_the_diagonal(solved):
+    problem, _, posterior = solved
+    axes = bp.plot.corner(posterior, problem=problem, names=["k", "variance[force]"]).axes
+    x, density = axes[0].lines[-1].get_data()
+    assert density == pytest.approx(norm.pdf(x, 800.0, 60.0)) and axes[0].lines[-1].get_linewidth() < 1.0
+    assert len(axes[3].lines) == 1
+    with pytest.raises(ValueError, match="posterior: must be a result of this problem"):
+        bp.plot.corner(posterior, problem=problem.with_experiments([replace(problem.experiments[0], name="other")]))
+
+
+def test_labels_quantiles_and_titles_are_those_of_corner():
+    x = np.random.default_rng(2).standard_normal(20_000)
+    draws = {"a": 10.0 + 0.1 * x, "b": -x}
+    figure = bp.plot.corner(posterior_of(draws), labels=["one", "two"], quantiles=[0.16, 0.84], show_titles=True)
+    assert [figure.axes[k].get_xlabel() for k in (2, 3)] == ["one", "two"]
+    dashed = [line.get_xdata()[0] for line in figure.axes[0].lines if line.get_linestyle() == "--"]
+    assert dashed == pytest.approx(np.quantile(draws["a"], [0.16, 0.84]))
+    value, more, less = map(float, re.findall(r"[\d.]+", figure.axes[0].get_title()))
+    assert [value, value + more, value - less] == pytest.approx(np.quantile(draws["a"], [0.5, 0.95, 0.05]), abs=0.006)
+    for arguments, message in (
+        ({"labels": ["one"]}, "labels: must be 2, one per name, got 1"),
+        ({"quantiles": [16]}, r"quantiles: must be between 0 and 1, got \[16\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            bp.plot.corner(posterior_of(draws), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("interval", "title"),
+    [
+        ((1.0, 2.0, 4.5), "$2.0^{+2.5}_{-1.0}$"),
+        ((4.361e3, 9.912e3, 22.263e3), "$9900^{+12400}_{-5600}$"),
+        ((-0.0016, -0.00001, 0.0016), "$0.0000^{+0.0016}_{-0.0016}$"),
+        ((1.2e-9, 1.5e-9, 1.9e-9), r"$1.50^{+0.40}_{-0.30}$ $\times\,10^{-9}$"),
+    ],
+)
+def test_titles_have_two_digits_of_the_shorter_error(interval, title):
+    assert pairs.with_errors(*interval) == title
+
+
+def test_many_quantities_need_a_choice():
+    draws = {f"p{k}": values for k, values in enumerate(np.random.default_rng(1).standard_normal((9, 400)))}
+    with pytest.warns(UserWarning, match=r"names: 9 quantities are many for one figure; choose some, such as names="):
+        bp.plot.corner(posterior_of(draws))
+    assert len(bp.plot.corner(posterior_of(draws), names=[*draws]).axes) == 81
+
+
+def test_figures_and_draws_work_with_corner_and_arviz(solved):
+    _, _, posterior = solved
+    names = ["k", "c"]
+    figure = bp.plot.corner(posterior, names=names)
+    corner.overplot_lines(figure, [800.0, None], color="C1")
+    corner.overplot_points(figure, np.array([[800.0, 30.0]]), color="C1")
+    assert positions(figure.axes[0], "C1")[0] == [800.0]
+    assert figure.axes[2].lines[-1].get_xydata().tolist() == [[800.0, 30.0]]
+    theirs = corner.corner(posterior.data, var_names=names, bins=10)
+    assert [theirs.axes[k].get_xlabel() for k in (2, 3)] == names
+    assert arviz().plot_pair(posterior.data, var_names=names) is not None
+
+
+def test_supports_are_stored_with_the_draws_and_guessed_without(solved):
+    _, _, posterior = solved
+    group = posterior.tree["posterior"].to_dataset()
+    assert [support(group, name) for name in posterior.names] == [REAL, POSITIVE, REAL, POSITIVE]
+    old = posterior_of({"a": np.arange(1.0, 9.0), "b": np.arange(-4.0, 4.0)}).tree["posterior"].to_dataset()
+    assert [support(old, name) for name in "ab"] == [POSITIVE, REAL]
+
+
+def test_quantities_that_do_not_vary_and_few_draws_are_drawn():
+    draws = {"a": np.full(40, 3.0), "b": np.linspace(0.0, 1.0, 40)}
+    bp.plot.corner(posterior_of(draws)).canvas.draw()
+
+
+def test_the_style_is_applied_in_figures_only():
+    before = dict(plt.rcParams)
+    figure = bp.plot.marginals(posterior_of({"a": np.linspace(1.0, 2.0, 100)}))
+    assert dict(plt.rcParams) == before
+    figure.canvas.draw()
+    sizes = {label.get_size() for label in figure.axes[0].get_xticklabels()}
+    assert sizes == {8.0} != {plt.rcParams["font.size"]}
+    with plt.style.context("bayesperiodic.plot.figures"):
+        colours = {entry["color"].upper() for entry in plt.rcParams["axes.prop_cycle"]}
+    assert colours == {*ENSEMBLES}
