@@ -63,8 +63,7 @@ WITHOUT_RESULTS = {
     "docs/studies/calibration.md": {
         DEFINITION: ("90 % intervals, MCMC",),
         "computed in tests/diagnostics/test_calibration.py": (
-            "variances that are a fifth too small come out in 99.2 % of calibrations with 1000 replicates, by the "
-            "latter alone in 76 %",
+            "detected in 99.2 % of calibrations with 1000 replicates, with the latter alone in 76 %",
         ),
     },
     "docs/studies/damper.md": {ELSEWHERE: ("doi 10.5281/zenodo.4445334",)},

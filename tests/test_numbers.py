@@ -84,19 +84,19 @@ def pendulum():
     yield f"Errors of m, l and k3 over {low['recordings']} recordings"
     yield (
         f"the median errors of m, l and k3 are {percents([low[n]['median_error'] for n in names], 3)} %, and the 90 % "
-        f"intervals hold {listed(covered[0])} truths"
+        f"intervals contain {listed(covered[0])} true values"
     )
     yield (
-        f"with noise of 1 % they are {percents([high[n]['median_error'] for n in names], 2)} %, and hold "
+        f"with noise of 1 % they are {percents([high[n]['median_error'] for n in names], 2)} %, and contain "
         f"{listed(covered[1])}"
     )
     inside = all(band["band_low"] <= cover <= band["band_high"] for both in covered for cover in both)
     assert inside, "the sentence on the band says that all are inside"
     yield f"All are within the 99 % band, {band['band_low']:.0f} to {band['band_high']:.0f}."
     bars = low["eigenvalue_bars"]
-    yield f"The error bars of the unstable eigenvalues hold {bars['cover']:,} of {bars['bars']:,} at 0.1 %."
+    yield f"The error bars of the unstable eigenvalues contain {bars['cover']:,} of {bars['bars']:,} at 0.1 %."
     paper = d["paper_errors"]
-    yield f"The paper's experiment came to {percents([paper[n] for n in names], 1)} %."
+    yield f"The errors of the paper's experiment are {percents([paper[n] for n in names], 1)} %."
 
 
 @on("docs/explanation/paper.md")
@@ -136,8 +136,8 @@ def landing_gear():
     off = {truth: 1e3 * one["largest_error_of_the_median"] for truth, one in early.items()}
     yield (
         f"stays within {off['A']:.3f} mm of the prediction, and within its 90 % band for {share['A']:.0f} % of the "
-        f"first 2.5 s; for the other it is off by {off['B']:.2f} mm, and the band, right for a right model, holds it "
-        f"for {share['B']:.1f} %."
+        f"first 2.5 s; for the other the error reaches {off['B']:.2f} mm, and the band contains it for "
+        f"{share['B']:.1f} %."
     )
     kinds = d["quality"]["kinds"]
     assert all(one["units_with_any"] == one["units"] for kind, one in kinds.items() if kind != "good")
@@ -233,7 +233,7 @@ def damper():
     assert (first["term"], second["term"]) == ("w*displacement**2", "ddisplacement**3")
     assert "w*displacement in force" in first["alternatives"] and second["verdict"] == "misspecified"
     yield f"lowers the unexplained variance from {100 * d['fvu']:.2f} % to {100 * first['unexplained']:.2f} %"
-    yield f"do not tell it from {len(first['alternatives'])} other terms"
+    yield f"do not distinguish it from {len(first['alternatives'])} other terms"
     yield (
         f"in the equation of w it is {100 * second['unexplained']:.2f} %, and still no white noise "
         f"(p = {second['p_white']:.3f})"
@@ -246,8 +246,8 @@ def silverbox():
     repeats = d["repetition"]
     yield f"{WORDS[d['cycles']]} measured periods with {d['input_harmonics']} lines"
     yield (
-        f"leaves {100 * d['residual_fraction']:.3f} % of the response's standard deviation; what repeats of it is "
-        f"{repeats['repeats'] / repeats['does_not']:.1f} times what does not"
+        f"leaves {100 * d['residual_fraction']:.3f} % of the response's standard deviation. The part that repeats "
+        f"in every period is {repeats['repeats'] / repeats['does_not']:.1f} times the rest"
     )
     yield f"{100 * d['beyond_drive']['share_of_residual_power']:.0f} % of its power lies above the drive's last line"
     independent, circulant = (
@@ -482,7 +482,7 @@ def verdicts():
     yield (
         f"of {right['data']['replicates']} problems without a fault {WORDS[right['data']['warned']]} gets a "
         f"warning, of {faulty['two_modes']['data']['replicates']} with each fault all are named (one of those with two "
-        f"modes is also called misspecified, wrongly), and over {right['sampler']['replicates']} seeds of the "
+        f"modes is also falsely called misspecified), and over {right['sampler']['replicates']} seeds of the "
         "sampler no verdict changes"
     )
 
