@@ -19,7 +19,7 @@ DOCUMENTS = ("README.md", *(path.relative_to(ROOT).as_posix() for path in sorted
 # Code, formulas, addresses and the titles of the paper's equations and figures contain no measured numbers.
 NO_TEXT = (
     r"^```.*?^```", r"`[^`]*`", r"\$\$.*?\$\$|\$[^$]*\$", r"\]\([^)]*\)", r"^(## |\| )?\d+(\. | \| )", r"\(8\)",
-    r"\b(eq\.|figures?|tables?|section) [\d(), and]*\d\)?",
+    r"\b(eq\.|figures?|tables?|section)\s[\d(), and]*\d\)?",
 )  # fmt: skip
 NUMBER = re.compile(r"(?<![\w.,])\d[\d.,]*(?:e-?\d+)?")
 WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
