@@ -3,6 +3,7 @@
 from . import models as models
 from . import plot as plot
 from ._io import load as load
+from ._versions import show_versions as show_versions
 from .data.experiment import Experiment as Experiment
 from .data.recording import Recording as Recording
 from .diagnostics.branch_prediction import BranchPrediction as BranchPrediction

@@ -1,7 +1,7 @@
-"""Configuration of Sphinx: pages from the docstrings, the README and the texts in this folder."""
+"""Configuration of Sphinx: pages from the docstrings, the notebooks and the texts in this folder."""
 
 import importlib.metadata
-import re
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,16 +10,23 @@ from numpydoc.xref import DEFAULT_LINKS
 
 import bayesperiodic as bp
 
-README = Path(__file__).parents[1] / "README.md"
+HERE = Path(__file__).parent
+# Sphinx reads pages from this folder only. Copies keep their times, so that unchanged notebooks are not read again.
+for notebook in (HERE.parent / "studies" / "notebooks").glob("*.ipynb"):
+    shutil.copy2(notebook, HERE / "tutorials" / notebook.name)
 # A public name whose module is elsewhere in the package.
 sys.modules["bayesperiodic.noise"] = bp.noise
 
 project, author = "bayesperiodic", "the bayesperiodic authors"
 release = importlib.metadata.version("bayesperiodic")
 
-extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.mathjax", "myst_parser", "numpydoc"]
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.mathjax", "myst_nb", "numpydoc"]
 templates_path, exclude_patterns = ["_templates"], ["_build"]
 default_role, nitpicky, add_module_names, smartquotes = "autolink", True, False, False
+
+# The notebooks are shown with the outputs that they store; `pytest -m document` executes them.
+nb_execution_mode, nb_merge_streams = "off", True
+myst_enable_extensions, myst_heading_anchors = ["dollarmath"], 3
 
 html_theme, html_title = "furo", f"bayesperiodic {release}"
 html_show_sourcelink = html_copy_source = False
@@ -33,12 +40,6 @@ numpydoc_show_class_members = False
 numpydoc_xref_param_type, numpydoc_xref_ignore = True, "all"
 numpydoc_xref_aliases = {name: name for name in DEFAULT_LINKS}
 numpydoc_xref_aliases |= {n: f"bayesperiodic.{n}" for n in bp.__all__ if isinstance(getattr(bp, n), type)}
-
-
-def landing_page(app: Any, page: str, source: list[str]) -> None:
-    """Insert the README as the first page, with links to files relative to this folder."""
-    if page == "index":
-        source[0] = re.sub(r"\]\((?!\w+:|#)", "](../", README.read_text("utf-8")) + source[0]
 
 
 def typeset(app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
@@ -55,6 +56,5 @@ def typeset(app: Any, what: str, name: str, value: Any, options: Any, lines: lis
 
 
 def setup(app: Any) -> None:
-    """Connect the functions above to Sphinx."""
-    app.connect("source-read", landing_page)
+    """Connect the function above to Sphinx."""
     app.connect("autodoc-process-docstring", typeset)

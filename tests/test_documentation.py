@@ -205,5 +205,5 @@ def test_docstrings_of_models_are_complete(name):
 
 
 def test_every_name_is_in_the_reference_once():
-    listed = (Path(__file__).parents[1] / "docs" / "api.rst").read_text("utf-8").split()
+    listed = (Path(__file__).parents[1] / "docs" / "reference" / "api.rst").read_text("utf-8").split()
     assert [name for name in NAMES if listed.count(name) != 1] == []

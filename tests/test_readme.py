@@ -1,115 +1,164 @@
-"""The README's code: every block runs, which takes minutes (``pytest -m document``)."""
+"""README and documentation pages: their code runs, their output is real, their links exist, the site builds.
 
+The blocks of a page run in order in an empty folder with the file run.csv of the tour. Pages whose code continues the
+tour (`docs/start/tour.md`) get the variables that its blocks define. Run by ``pytest -m document``, in minutes.
+"""
+
+import contextlib
+import importlib.util
+import io
 import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from functools import cache
+from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote
 
-import numpy as np
-import pandas as pd
 import pytest
 
-import bayesperiodic as bp
-from studies.flutter import rig
-from studies.pendulum import recording as pendulum_recording
-from tests.known import LINEAR, linear_experiment
-
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
+README, DOCS = ROOT / "README.md", ROOT / "docs"
+TOUR = "docs/start/tour.md"
+PAGES = [README, *sorted(DOCS.rglob("*.md"))]
+# A block of code, and the output that the page shows below it.
+BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:\n```text\n(.*?)^```)?", re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r"(?<![\w])-?\d[\d,]*\.?\d*(?:e[+-]?\d+)?")
+SAME = {"rel": 0.25, "abs": 0.1}
+# Code that is shown but does not run here.
+CLUSTER = "docs/how_to/running.md"
+LINES, WORDS, PICTURES, EXAMPLE = 150, 1200, 4, 15
 pytestmark = pytest.mark.document
 
 
-def blocks():
-    """Return the headings that have code in Python, with their blocks."""
-    found: dict[str, list[str]] = {}
-    for part in re.split(r"^## ", README.read_text("utf-8"), flags=re.MULTILINE)[1:]:
-        code = re.findall(r"^```python\n(.*?)^```", part, flags=re.MULTILINE | re.DOTALL)
-        if code:
-            found[part.splitlines()[0]] = code
-    return found
+def name(page):
+    return page.relative_to(ROOT).as_posix()
 
 
-BLOCKS = blocks()
+BLOCKS = {name(page): BLOCK.findall(page.read_text("utf-8")) for page in PAGES}
+BLOCKS = {page: blocks for page, blocks in BLOCKS.items() if blocks}
 
 
-def damper_file():
-    """Write run.csv as a rig would have."""
-    x = {"displacement": 0.0126 * np.cos(2 * np.pi * np.arange(64) / 64)}
-    true = {"Kx": 770, "K": 300, "F0": 4, "Kw": 57, "rho": 27_000}
-    run = bp.simulate(
-        bp.models.dahl, true, x, frequency=0.84, duration=30, sampling_rate=100, noise={"force": 4.0}, seed=1
-    )
-    table = {"t": run.time, "x_mm": 1e3 * run.inputs["displacement"], "F": run.outputs["force"]}
-    pd.DataFrame(table).to_csv("run.csv", index=False)
-    return {"bp": bp}
+def printed(page, code, names):
+    """Execute a block and return what it prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as output:
+        exec(compile(code, page, "exec"), names)
+    return output.getvalue()
 
 
-def pendulum():
-    recording = pendulum_recording.with_noise(pendulum_recording.simulate(3000, 1), 1e-3, 1)
-    truth = pendulum_recording.TRUTH
-    known = {name: value for name, value in truth.items() if name not in ("m", "l")}
-    priors = {name: bp.LogNormal(1.1 * truth[name], 0.3) for name in ("m", "l")}
-    return {"bp": bp, "recording": recording, "f": pendulum_recording.FREQUENCY, "known": known, "priors": priors}
+@cache
+def tour():
+    """Return the variables of the tour and the content of its file."""
+    names: dict[str, object] = {}
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        for code, shown in BLOCKS[TOUR]:
+            assert_same_output(printed(TOUR, code, names), shown)
+        for file in ("corner.png", "fit.png", "report.html", "posterior.nc"):
+            assert Path(file).stat().st_size > 1000
+        return names, Path("run.csv").read_text("utf-8")
 
 
-def gear():
-    """Two experiments of the landing gear and its known parameters."""
-    from studies.landing_gear.rig import GEAR
-
-    model, wave = bp.models.landing_gear("displacement"), np.cos(2 * np.pi * np.arange(200) / 200)
-    found = []
-    for name, frequency, stroke in (("run 1", 0.2, 0.08), ("run 2", 1.0, 0.018)):
-        x = {"displacement": 0.12 + stroke * wave}
-        outputs = bp.solve_periodic(model, GEAR, x, frequency=frequency, samples=200).outputs
-        noisy = {n: y + 3e-3 * np.ptp(y) * np.random.default_rng(1).standard_normal(200) for n, y in outputs.items()}
-        found.append(bp.Experiment(name, frequency, noisy, x, samples=200, synthetic=True))
-    known = {name: value for name, value in GEAR.items() if name not in ("theta4", "theta11", "theta16", "theta17")}
-    return {"bp": bp, "model": model, "experiments": found, "known": known}
+def assert_same_output(output, shown):
+    """Compare words strictly and numbers within a tolerance, as processors and versions round differently."""
+    if shown:
+        assert NUMBER.sub("#", output).split() == NUMBER.sub("#", shown).split()
+        values = [[float(value.replace(",", "")) for value in NUMBER.findall(text)] for text in (output, shown)]
+        assert values[0] == pytest.approx(values[1], **SAME)
 
 
-def linear(noise="independent"):
-    priors = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}
-    problem = bp.Problem(LINEAR, [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)], priors=priors, noise=noise)
-    return {"bp": bp, "problem": problem, "fit": bp.map_estimate(problem, progress=False)}
+def variables(page):
+    """Return what a page's code starts from."""
+    if "does not need the tour" in (ROOT / page).read_text("utf-8") or not page.startswith("docs/how_to/"):
+        return {}
+    import scipy.io
+
+    return dict(tour()[0]) | {"scipy": scipy}
 
 
-def linear_draws():
-    names = linear()
-    return names | {"posterior": bp.sample(names["problem"], names["fit"], seed=1, progress=False)}
-
-
-# Variables defined before the first block of each heading, and shortened versions of slow blocks.
-BEFORE = {
-    "Fifteen lines": dict,
-    "Your recording, your model": damper_file,
-    "A chaotic pendulum": pendulum,
-    "A flutter rig's unstable cycles": lambda: {
-        "bp": bp, "values": rig.RIG | rig.AUTHORS | rig.SENSORS,
-    },
-    "The periodic solver": dict,
-    "More than one experiment, and more than histories": gear,
-    "Draws that can be trusted": linear,
-    "What the data cannot tell you": linear_draws,
-    "Are the intervals what they say?": lambda: linear(bp.noise.Independent(prior=bp.InverseGamma(3.0, 20.0))),
-}  # fmt: skip
-SHORTER = {"replicates=1000": "replicates=2", "range(1, 6)": "range(1, 3)"}
-
-
-def test_every_heading_with_code_has_its_setup():
-    assert set(BLOCKS) == set(BEFORE)
-
-
-@pytest.mark.parametrize("heading", BLOCKS)
-def test_runs(heading, tmp_path, monkeypatch):
+@pytest.mark.parametrize("page", [page for page in BLOCKS if page not in ("README.md", TOUR, CLUSTER)])
+def test_code_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    names = BEFORE[heading]()
-    for code in BLOCKS[heading]:
-        for printed, short in SHORTER.items():
-            code = code.replace(printed, short)
-        exec(compile(code, f"README, {heading}", "exec"), names)
-    if heading == "Fifteen lines":
-        assert names["fit"].converged and names["posterior"].converged
-        assert Path("corner.png").stat().st_size > 1000 and Path("report.html").stat().st_size > 1000
-        assert len([line for line in code.splitlines() if line]) <= 15
+    names = variables(page)
+    if names:
+        (tmp_path / "run.csv").write_text(tour()[1], "utf-8")
+    for code, shown in BLOCKS[page]:
+        assert_same_output(printed(page, code, names), shown)
 
 
-def test_code_of_shortened_readme_examples_exists():
-    text = "".join(code for codes in BLOCKS.values() for code in codes)
-    assert all(text.count(printed) == 1 for printed in SHORTER)
+def test_tour_runs():
+    names, _ = tour()
+    assert names["fit"].converged and names["posterior"].converged
+
+
+def test_fifteen_lines_of_the_readme(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ((code, shown),) = BLOCKS["README.md"]
+    assert shown and len([line for line in code.splitlines() if line]) <= EXAMPLE
+    assert_same_output(printed("README.md", code, {}), shown)
+    assert Path("report.html").stat().st_size > 1000
+
+
+def test_readme_is_within_its_limits():
+    text = README.read_text("utf-8")
+    assert len(text.splitlines()) <= LINES
+    assert len(text.split()) <= WORDS
+    assert len(re.findall(r"!\[", text)) <= PICTURES
+
+
+@pytest.mark.parametrize("page", [name(page) for page in PAGES])
+def test_linked_files_exist(page):
+    text = re.sub(r"^```.*?^```", "", (ROOT / page).read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+    missing = []
+    for target in re.findall(r"\]\(([^)#\s]+)", text):
+        file = (ROOT / page).parent / target
+        if not re.match(r"\w+:", target) and not file.exists():
+            # The build copies the notebooks to the tutorials.
+            copied = file.suffix == ".ipynb" and (ROOT / "studies" / "notebooks" / file.name).exists()
+            missing += [] if copied else [target]
+    assert not missing
+
+
+def test_every_figure_is_in_the_gallery():
+    shown = (DOCS / "gallery.md").read_text("utf-8")
+    figures = [f"../{name(file)}" for file in sorted((ROOT / "figures").rglob("*.png")) if "quick" not in file.parts]
+    assert [file for file in figures if f"({file})" not in shown] == []
+
+
+class Links(HTMLParser):
+    """The addresses and the anchors of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.links, self.anchors = [], set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        """Collect the addresses and anchors of an element."""
+        found = dict(attrs)
+        self.anchors |= {found[key] for key in ("id", "name") if key in found}
+        self.links += [found[key] for key in ("href", "src") if key in found]
+
+
+def test_site_builds_without_warnings_and_broken_links(tmp_path):
+    for package in ("sphinx", "furo", "myst_nb", "numpydoc"):
+        if importlib.util.find_spec(package) is None:
+            pytest.skip('building the site needs pip install -e ".[docs]"')
+    shutil.copytree(ROOT, tmp_path / "clone", ignore=shutil.ignore_patterns(".*", "tests", "_build", "generated"))
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-n", "docs", "site"]
+    done = subprocess.run(command, cwd=tmp_path / "clone", capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    site = tmp_path / "clone" / "site"
+    pages = {file: Links(file.read_text("utf-8")) for file in site.rglob("*.html")}
+    assert len(pages) > 100
+    broken = []
+    for page, found in pages.items():
+        for link in found.links:
+            path, _, anchor = link.partition("#")
+            if re.match(r"\w+:|//|$", path) and (path or not anchor):
+                continue
+            target = (page.parent / unquote(path.partition("?")[0])).resolve() if path else page
+            lost = not target.exists() or (anchor and target in pages and unquote(anchor) not in pages[target].anchors)
+            broken += [f"{page.relative_to(site)}: {link}"] if lost else []
+    assert not broken, "\n".join(broken[:20])

@@ -1,0 +1,78 @@
+"""Numbers on the pages that no results.json contains: phrases by page and by the reason why not."""
+
+SETTING, DEFINITION, ELSEWHERE, UNSTORED, DATE = (
+    "a setting in the code of the study",
+    "part of a definition or of a level that is stated, not measured",
+    "published by others",
+    "measured once, by a command that stores no results",
+    "a date of results that are older than the code",
+)
+WITHOUT_RESULTS = {
+    "README.md": {
+        ELSEWHERE: ("van de Wouw (1997)", "Kluwer, 1997, 191-198", "BSD-3-Clause"),
+        SETTING: ("Python ≥ 3.11",),
+    },
+    "docs/benchmarks.md": {
+        SETTING: (
+            "Duffing, ζ = 0.5 %", "two ensembles of 64 walkers", "of 64 walkers on two cores", "not 50 times",
+            "A value above 1 means",
+        ),
+    },
+    "docs/explanation/adequacy.md": {
+        DEFINITION: ("by Holm's method, is below 1 %", "is called misspecified is at most 1 %"),
+    },
+    "docs/explanation/identifiability.md": {
+        DEFINITION: ("have a probability above 2.5 %", "has more than 1 % of the mass", "have less than 1 % of the"),
+    },
+    "docs/explanation/independent_values.md": {SETTING: ("A mean period on 800 grid points",)},
+    "docs/explanation/laplace_mcmc.md": {
+        DEFINITION: (
+            "both ends of the 90 % interval", "above 0.7 Laplace is", "is 50 autocorrelation times long",
+            "is at most 1.005 and their 5, 50 and 95 % quantiles",
+        ),
+    },
+    "docs/explanation/paper.md": {
+        ELSEWHERE: ("A. de Kraker, G. Verbeek, N. van de Wouw (1997)",),
+        DEFINITION: ("schemes of order 2 and 4", "parameters of (7)"),
+    },
+    "docs/explanation/why_periodic.md": {ELSEWHERE: ("used this in 1997",)},
+    "docs/how_to/calibrate.md": {
+        DEFINITION: ("A 90 % interval should", "(above 1: intervals too narrow)", "coverage at 50, 80, 90 and 95 %"),
+    },
+    "docs/how_to/chaotic_recordings.md": {SETTING: ("a recording of 3,000 drive periods",)},
+    "docs/how_to/export.md": {ELSEWHERE: ("0.23 with Python 3.11 and 1.x with later versions",)},
+    "docs/how_to/noisy_inputs.md": {DEFINITION: ("warns from 0.3 on", "false-alarm rate of 1 %")},
+    "docs/how_to/period_doubled.md": {SETTING: ("response periods of 1 to 8 drive periods",)},
+    "docs/how_to/priors.md": {DEFINITION: ("a spread of 0.7 is a factor of two",)},
+    "docs/how_to/read_my_data.md": {SETTING: ("version 5 and 7.3", "grid points per period, 800 by default")},
+    "docs/how_to/running.md": {
+        SETTING: ("the scheduler's own address instead of 127.0.0.1", "128 processes"),
+        UNSTORED: (
+            "a replicate takes 0.8 to 1.3 s of one core, an empty task 5 ms, and the pickled problem has 5 kB",
+            "At 5 ms a task it handles 200 tasks a second, which is enough for 160 to 260 workers",
+            "10,000 replicates would take 50 s instead of 8 to 13 s",
+            "(5 MB in total) and writing 200 lines a second (0.8 kB each)",
+        ),
+    },
+    "docs/how_to/solve_periodic.md": {
+        UNSTORED: ("on 800 points: a batch takes twice as long, and errors are 300 to 1000 times smaller",),
+    },
+    "docs/reference/messages.md": {DEFINITION: ("more than 1 % of the posterior mass",)},
+    "docs/start/install.md": {SETTING: ("Python 3.11 or newer",)},
+    "docs/start/tour.md": {SETTING: ("one mean period with 1600 grid points",)},
+    "docs/studies/calibration.md": {
+        DEFINITION: ("90 % intervals, MCMC",),
+        "computed in tests/diagnostics/test_calibration.py": (
+            "detected in 99.2 % of calibrations with 1000 replicates, with the latter alone in 76 %",
+        ),
+    },
+    "docs/studies/damper.md": {ELSEWHERE: ("doi 10.5281/zenodo.4445334",)},
+    "docs/studies/diode.md": {SETTING: ("Alternations of less than 1 % of the variance",)},
+    "docs/studies/flutter.md": {ELSEWHERE: ("K. H. Lee, D. A. W. Barton, L. Renson, 2023",)},
+    "docs/studies/landing_gear.md": {
+        SETTING: ("a gas charge lower by 2 %, friction by 20 % and oil leaked by 1 %",),
+    },
+    "docs/studies/noisy_inputs.md": {SETTING: ("noise of 1, 3 and 10 % of the input's rms",)},
+    "docs/studies/silverbox.md": {ELSEWHERE: ("T. Wigren, J. Schoukens, 2013",)},
+    "docs/studies/verdicts.md": {DATE: ("(counted on 21 November 2026)",)},
+}  # fmt: skip
