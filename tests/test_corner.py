@@ -161,7 +161,7 @@ def test_each_optimum_has_its_own_regions_colour_and_number():
         assert found == pytest.approx(0.5 * area(0.9), rel=0.15)
     marks = {line.get_marker(): line.get_xydata()[0] for line in panel.lines if str(line.get_marker()).startswith("$")}
     assert marks["$0$"] == pytest.approx([1.0, 1.0], abs=1e-3) and marks["$1$"] == pytest.approx([-1, -1], abs=1e-3)
-    legend = [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
     share = 100.0 * np.mean(modes == 0)
     assert legend[0].startswith(f"optimum 0: {share:.1f} ±") and len(legend) == 2
 
@@ -180,7 +180,7 @@ def test_zero_is_marked_where_the_sign_matters_and_truths_are_shown_also_beyond_
     assert positions(panel, "0.75") == ([0.0], []) and positions(top, "0.75") == ([0.0], [])
     assert positions(panel, "#000000") == ([], [70.0]) and positions(below, "#000000") == ([70.0], [])
     assert panel.get_ylim()[1] > 70.0 > 55.0 > panel.get_ylim()[0] > 40.0
-    assert "truth" in [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
+    assert "truth" in [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def test_priors_are_thin_lines_on_the_diagonal(solved):

@@ -174,11 +174,11 @@ def _execute(source: str, names: Mapping[str, Any], path: Path, cache: bool) -> 
 class Kernel(_Intrinsic):  # type: ignore[misc]
     """A compiled function that Python calls as usual, and compiled code by its address.
 
-    Numba copies a called function into every caller and optimises it there again, which took two thirds of the compile
-    time of the periodic solver. A kernel is called through a symbol instead, whose address the process knows once it is
-    compiled or loaded; errors are propagated as usual. The symbol is the name in its module, whose name is a digest of
-    its contents (see `load`): it stands for the same code in every process. A call takes some nanoseconds, so functions
-    that are called at every point of a grid are compiled with ``njit``.
+    Numba copies a called function into every caller and optimises it there again, which took more than a third of the
+    compile time of the driven solver. A kernel is called through a symbol instead, whose address the process knows once
+    it is compiled or loaded; errors are propagated as usual. The symbol is the name in its module, whose name is a
+    digest of its contents (see `load`): it stands for the same code in every process. A call takes some nanoseconds, so
+    functions that are called at every point of a grid are compiled with ``njit``.
     """
 
     def __init__(self, function: Callable[..., Any], signature: Any, options: dict[str, Any]):

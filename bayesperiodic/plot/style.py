@@ -31,10 +31,7 @@ def styled(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
     @functools.wraps(draw)
     def wrapped(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Figure:
         with plt.style.context(SHEET):
-            figure = draw(*args, **kwargs)
-            for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
-                axis.get_major_ticks()  # matplotlib would make them when it saves the figure, with its own settings
-            return figure
+            return draw(*args, **kwargs)
 
     return wrapped
 
