@@ -126,6 +126,15 @@ def test_every_figure_is_in_the_gallery():
     assert [file for file in figures if f"({file})" not in shown] == []
 
 
+def test_listed_messages_are_those_of_the_package():
+    sources = "".join(file.read_text("utf-8") for file in (ROOT / "bayesperiodic").rglob("*.py"))
+    # Messages are written over several lines, with values in braces.
+    joined = re.sub(r"\"\s*\n\s*f?\"", "", sources)
+    rows = re.findall(r"^\| `([^|]*)` \|", (DOCS / "reference" / "messages.md").read_text("utf-8"), flags=re.MULTILINE)
+    parts = [part.strip(" ,:()[]") for row in rows for part in row.split("…")]
+    assert len(rows) > 20 and [part for part in parts if part not in joined] == []
+
+
 class Links(HTMLParser):
     """The addresses and the anchors of a page."""
 
