@@ -55,6 +55,8 @@ INFORMED = 0.01
 MOST_UNEXPLAINED = 0.5
 # Most linearisations of errors of the inputs, and the change [sds] that ends them.
 MOST_ROUNDS, SETTLED = 30, 1e-5
+# Seconds after which the progress bar is shown.
+SHOWN_AFTER = 2.0
 # Value of a field of MapEstimate that is computed at its first use.
 deferred: Any = partial
 
@@ -262,7 +264,7 @@ def _from_draw(objective: Objective, first: Iterate, theta: np.ndarray, progress
 
 
 def _climb(objective: Objective, first: Iterate, progress: bool) -> End:
-    with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress, delay=2.0) as bar:
+    with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress, delay=SHOWN_AFTER) as bar:
 
         def report(iterate: Iterate, size: float) -> None:
             bar.set_postfix_str(f"objective {iterate.objective:.6g}, step {size:.2g} sd", refresh=False)
