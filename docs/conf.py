@@ -14,6 +14,7 @@ HERE = Path(__file__).parent
 # Sphinx reads pages from this folder only. Copies keep their times, so that unchanged notebooks are not read again.
 for notebook in (HERE.parent / "studies" / "notebooks").glob("*.ipynb"):
     shutil.copy2(notebook, HERE / "tutorials" / notebook.name)
+shutil.copytree(HERE.parent / "studies" / "notebooks" / "sketches", HERE / "tutorials" / "sketches", dirs_exist_ok=True)
 # A public name whose module is elsewhere in the package.
 sys.modules["bayesperiodic.noise"] = bp.noise
 

@@ -269,7 +269,7 @@ def by_powers(direction: np.ndarray, theta: np.ndarray, names: Sequence[str]) ->
     """Return a relative direction as powers, such as "a → a·t, b → b·t^-2", and such a θ; "" if none fit."""
     shown = np.flatnonzero(direction)
     simple = exponents(direction[shown]) if np.all(theta[shown]) else None
-    if simple is None:
+    if simple is None or not all(simple):
         return "", theta
     powers = np.zeros(theta.size)
     powers[shown] = np.array(simple, dtype=float) / float(simple[0])

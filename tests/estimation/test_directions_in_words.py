@@ -104,8 +104,8 @@ def test_powers_of_a_factor_change_the_largest_by_ten_percent():
     text, there = by_powers(np.array([1.0, -2.0, 0.0]), theta, NAMES)
     assert text == "a → a·t, b → b·t^-2"
     assert there == pytest.approx([2.0 * 1.1**0.5, -3.0 / 1.1, 5.0])
-    for unfit in (np.array([1.0, 0.14, 0.0]), np.array([1.0, 0.0, 1.0])):
-        text, there = by_powers(unfit, np.array([2.0, 3.0, 0.0]), NAMES)
+    for unfit in ([1.0, 0.14, 0.0], [1.0, 0.0, 1.0], [1e-9, 1.0, 0.0]):
+        text, there = by_powers(np.array(unfit), np.array([2.0, 3.0, 0.0]), NAMES)
         assert text == "" and there.tolist() == [2.0, 3.0, 0.0]
 
 
