@@ -33,7 +33,7 @@ def test_progress_is_shown_unless_disabled(capsys, monkeypatch):
     bp.map_estimate(problem, progress=False)
     assert capsys.readouterr().err == ""
     bp.map_estimate(problem)
-    assert "objective" in capsys.readouterr().err
+    assert "MAP" in capsys.readouterr().err
 
 
 def test_independent_values_set_the_weight_of_the_samples():
