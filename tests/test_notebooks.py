@@ -10,7 +10,8 @@ import bayesperiodic as bp
 from tests.notebooks import NOTEBOOKS, execute
 
 IMPORTED = {
-    "bayesperiodic", "dataclasses", "matplotlib.pyplot", "numpy", "pandas", "pathlib", "sympy", "tempfile", "warnings",
+    "bayesperiodic", "dataclasses", "ipywidgets", "matplotlib.pyplot", "numpy", "pandas", "pathlib", "sympy",
+    "tempfile", "warnings",
 }  # fmt: skip
 LARGEST = 300_000
 

@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import matplotlib.pyplot as plt
@@ -400,3 +403,16 @@ def test_missing_terms_without_any_or_of_another_problem(lacking, solved):
     assert right.get_xlabel() == "time in the period [s]" and len(left.get_yticks()) == 1
     with pytest.raises(ValueError, match="found: must be what missing_terms.* returns for this problem"):
         bp.plot.missing_terms(*solved[:2], found)
+
+
+def test_a_backend_that_switches_on_the_display_of_figures_when_it_is_loaded_keeps_it_on(tmp_path):
+    backend = "import matplotlib\nfrom matplotlib.backends.backend_agg import *\nmatplotlib.interactive(True)\n"
+    (tmp_path / "late_backend.py").write_text(backend, "utf-8")
+    code = (
+        "import matplotlib.pyplot as plt\nfrom bayesperiodic.plot.style import styled\n"
+        "styled(plt.figure)()\nprint(plt.isinteractive())"
+    )
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    environment = os.environ | {"MPLBACKEND": "module://late_backend", "PYTHONPATH": path}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True"

@@ -30,6 +30,8 @@ def styled(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
 
     @functools.wraps(draw)
     def wrapped(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Figure:
+        # Loads the backend: Jupyter's switches the display of figures on, which the end of the context would undo.
+        plt.draw_if_interactive()
         with plt.style.context(SHEET):
             return draw(*args, **kwargs)
 
