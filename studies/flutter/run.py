@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
+from scipy.interpolate import CubicSpline
 
 import bayesperiodic as bp
 from studies import common
@@ -242,7 +243,10 @@ def _tables(results: dict[str, Any]) -> str:
 
 MEASURED, MODEL, THEIRS = "black", {True: "#0072B2", False: "#D55E00"}, "#999999"
 KIND = {True: "stable", False: "unstable"}
-GRID, COARSE = np.linspace(13.0, 19.0, 241), np.linspace(13.0, 19.0, 41)
+# Parameters of the corner plot.
+SHOWN = ("k_alpha", "k_alpha2", "k_alpha3", "gain_pitch")
+# Points of a curve, wind speeds of the bands, and those above a fold [m/s].
+FINE, COARSE, ABOVE_FOLD = 500, np.linspace(13.0, 19.0, 41), (0.005, 0.02, 0.05, 0.1)
 
 
 def all_of(
@@ -262,26 +266,33 @@ def all_of(
     }
     if posterior is None:
         return figures
-    corner = bp.plot.corner(posterior, laplace=fit, names=list(fit.theta))
-    return figures | {"corner": common.titled(corner, f"Flutter rig{_kind(experiments)}: posterior of the parameters")}
+    corner = bp.plot.corner(posterior, laplace=fit, names=list(SHOWN))
+    title = f"Flutter rig{_kind(experiments)}: posterior of the springs and of the gain of the pitch sensor"
+    return figures | {"corner": common.titled(corner, title)}
 
 
-def amplitudes(values: Mapping[str, float]) -> dict[tuple[str, bool], np.ndarray]:
-    """Return the amplitude of each channel over the grid of wind speeds, by branch; NaN where there is no cycle."""
-    found = {(channel, kind): np.full(GRID.size, np.nan) for channel in CHANNELS for kind in KIND}
+def curves(values: Mapping[str, float]) -> dict[tuple[str, bool], np.ndarray]:
+    """Return wind speeds and amplitudes (2, points) along the branch, by channel and stability; NaN for the other one.
+
+    Splines over the arc length, through all solutions, are smooth at folds.
+    """
     try:
         branches = cycles(values).branches
     except ValueError:
-        return found
+        return {(channel, kind): np.empty((2, 0)) for channel in CHANNELS for kind in KIND}
     orbits = [orbit for along in branches for orbit in along]
-    for kind in KIND:
-        own = sorted((o for o in orbits if o.stable == kind), key=lambda orbit: orbit.parameters["U"])
-        if len(own) > 1:
-            speed = [orbit.parameters["U"] for orbit in own]
-            for channel in CHANNELS:
-                size = [sizes(orbit.outputs)[channel] for orbit in own]
-                found[channel, kind] = np.interp(GRID, speed, size, left=np.nan, right=np.nan)
-    return found
+    at = np.array([[o.parameters["U"], *(sizes(o.outputs)[c] for c in CHANNELS)] for o in orbits])
+    steps = np.linalg.norm(np.diff(at, axis=0) / np.ptp(at, axis=0), axis=1)
+    new = np.r_[True, steps > 0.0]
+    length = np.r_[0.0, np.cumsum(steps)][new]
+    fine = np.linspace(0.0, length[-1], FINE)
+    speed, *amplitudes = CubicSpline(length, at[new])(fine).T
+    stable = np.interp(fine, length, np.array([o.stable for o in orbits])[new]) > 0.5
+    return {
+        (channel, kind): np.array([speed, np.where(stable == kind, size, np.nan)])
+        for channel, size in zip(CHANNELS, amplitudes, strict=True)
+        for kind in KIND
+    }
 
 
 def bands(theta: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> dict[tuple[str, bool], np.ndarray]:
@@ -291,7 +302,8 @@ def bands(theta: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> dict[t
     """
     along = cycles(RIG | dict(theta))
     found: dict[tuple[str, bool], list[tuple[float, float, float]]] = {(c, k): [] for c in CHANNELS for k in KIND}
-    for speed in COARSE:
+    folds = [fold.parameters["U"] for branch in along.branches for fold in branch.folds]
+    for speed in np.unique([*COARSE, *(fold + more for fold in folds for more in ABOVE_FOLD)]):
         for kind in KIND:
             try:
                 orbit = along.at(KIND[kind], speed)
@@ -308,16 +320,16 @@ def bifurcation(
 ) -> Figure:
     """Draw amplitudes over wind speed: posterior bands of both branches, the authors' values, measurements."""
     drawn = bands(fit.theta, draws)
-    best, theirs = amplitudes(RIG | fit.theta), amplitudes(RIG | AUTHORS | SENSORS)
+    best, theirs = curves(RIG | fit.theta), curves(RIG | AUTHORS | SENSORS)
     figure = plt.figure(figsize=(9.0, 8.0), layout="constrained")
     for axes, channel in zip(figure.subplots(2, 1, sharex=True), CHANNELS, strict=True):
         for kind in (True, False):
             colour, style = MODEL[kind], "-" if kind else "--"
             at, low, high = drawn[channel, kind]
             axes.fill_between(at, low, high, color=colour, alpha=0.25, lw=0, label=f"{KIND[kind]}, 90 % of draws")
-            axes.plot(GRID, best[channel, kind], color=colour, ls=style, label=f"{KIND[kind]}, MAP")
+            axes.plot(*best[channel, kind], color=colour, ls=style, label=f"{KIND[kind]}, MAP")
             label = "authors' values" if kind else None
-            axes.plot(GRID, theirs[channel, kind], color=THEIRS, lw=1.0, ls=style, label=label)
+            axes.plot(*theirs[channel, kind], color=THEIRS, lw=1.0, ls=style, label=label)
         for kind in (True, False):
             names = [name for name in experiments if name.startswith("unstable") != kind]
             axes.errorbar(
@@ -368,7 +380,7 @@ def contractions(fits: Mapping[str, Fitted], kind_of_data: str) -> Figure:
     axes.invert_yaxis()
     axes.set_xlabel("Laplace sd over the prior's sd [1]")
     common.shared_legend(figure, 4)
-    figure.suptitle(f"Flutter rig{kind_of_data}: information on each parameter")
+    figure.suptitle(f"Flutter rig{kind_of_data}: how far each kind of cycles narrows the priors")
     return figure
 
 
