@@ -274,7 +274,10 @@ def test_units_and_the_noise_model_are_attributes():
     experiment = bp.Experiment("a", 2.0, {"rate": np.sin(2 * np.pi * tau)}, {"x": np.cos(2 * np.pi * tau)}, samples=40)
     priors = {"k": bp.Normal(1.0, 1.0), "c": bp.Normal(1.0, 1.0), "shift": bp.Normal(0.0, 1.0)}
     group = drawn(bp.Problem(TWO, [experiment], priors=priors, noise="circulant"))[0].tree["posterior"].to_dataset()
-    assert [group[name].attrs for name in ("k", "shift")] == [{"units": "N/m"}, {"units": "s"}]
+    units, support = ("N/m", "s"), [-np.inf, np.inf]
+    names = ("k", "shift[a]")
+    expected = [{"units": u, f"support of {n}": support} for n, u in zip(names, units, strict=True)]
+    assert [group[name].attrs for name in ("k", "shift")] == expected
     assert group["variance"].attrs == {"noise": "circulant", "units of rate": "(m/s)²"}
     assert group["floor"].attrs == group["lengthscale"].attrs == {"noise": "circulant"}
 

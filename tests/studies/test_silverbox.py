@@ -47,6 +47,7 @@ def has_the_promised_keys(results):
     return True
 
 
+@pytest.mark.slow
 def test_synthetic_data_are_labelled_and_the_truth_is_recovered(quick):
     folder, results, printed = quick
     assert "SYNTHETIC" in printed and silverbox.SHA256 in printed and "nonlinearbenchmark.org" in printed
@@ -58,6 +59,7 @@ def test_synthetic_data_are_labelled_and_the_truth_is_recovered(quick):
     assert sorted(path.name for path in folder.glob("*.png")) == ["estimates.png", "spectrum.png"]
 
 
+@pytest.mark.slow
 def test_residual_of_synthetic_data_is_their_noise(quick):
     _, results, _ = quick
     assert results["residual_fraction"] == pytest.approx(0.0017, rel=0.1)
@@ -66,6 +68,7 @@ def test_residual_of_synthetic_data_is_their_noise(quick):
     assert results["repetition"]["repeats"] < 0.5 * results["repetition"]["does_not"]
 
 
+@pytest.mark.slow
 def test_another_start_leads_to_the_same_estimates_and_stalls_are_overcome(quick):
     _, results, _ = quick
     assert results["other_start"]["status"] == "converged"
