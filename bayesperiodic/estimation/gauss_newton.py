@@ -183,20 +183,21 @@ def climb(
     start: Iterate,
     held: np.ndarray | None = None,
     report: Callable[[Iterate, float], None] | None = None,
+    most: int = MAX_ITERATIONS,
 ) -> End:
-    """Increase the objective from an anchored start until the steps are small.
+    """Increase the objective from an anchored start until the steps are small, at most so many steps in a row.
 
     Where H is not positive definite (convex log-priors that outweigh the data) steps take its negative curvature with
     the opposite sign; directions without curvature are left out. Each solve starts from the previous iterate and is
     checked to lie on the same branch, so that a step cannot change to another periodic solution; steps whose solve
-    fails are halved. A parameter at the end of its prior's support is fixed while the gradient points outwards.
+    fails are halved, and the next one begins with twice as much of it. A parameter at the end of its prior's support is fixed while the gradient points outwards.
 
     Parameters `held` (names,) are fixed; report(iterate, step in standard deviations) is called for every new iterate.
     """
     always = np.zeros(start.theta.size, dtype=bool) if held is None else held
     now, resting, history = start, always, [start.objective]
     for _ in range(MAX_ROUNDS):
-        now, status, objectives = _ascend(objective, now, resting, report)
+        now, status, objectives = _ascend(objective, now, resting, report, most)
         history += objectives
         ends = at_ends(objective, now)
         inwards = ends * objective.hessian_and_gradient(now)[1] < 0.0
@@ -216,19 +217,19 @@ def at_ends(objective: Objective, iterate: Iterate) -> np.ndarray:
 
 
 def _ascend(
-    objective: Objective, start: Iterate, held: np.ndarray, report: Callable[[Iterate, float], None] | None
+    objective: Objective, start: Iterate, held: np.ndarray, report: Callable[[Iterate, float], None] | None, most: int
 ) -> tuple[Iterate, str, list[float]]:
     """Climb with the same parameters fixed; return the end, the status, and the objectives of all steps."""
-    now = start
+    now, damping = start, 1.0
     history: list[float] = []
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(most):
         hessian, gradient = objective.hessian_and_gradient(now)
         if not np.isfinite(hessian).all() or not np.isfinite(gradient).all():
             return now, "singular", history
         step, size = _step(_curved(objective, now, hessian), gradient, held)
         if size < SCALED_STEP:
             return now, "converged", history
-        damping = 1.0
+        damping, trial = min(1.0, 2.0 * damping), None
         for _ in range(MAX_HALVINGS):
             trial = objective.at(objective.moved(now.theta, damping * step), now.here, now.noise)
             if trial is not None and trial.objective > now.objective:

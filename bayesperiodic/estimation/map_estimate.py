@@ -24,6 +24,7 @@ from bayesperiodic.estimation.covariance import (
     with_uncertain_noise,
 )
 from bayesperiodic.estimation.gauss_newton import (
+    MAX_ITERATIONS,
     End,
     Iterate,
     Objective,
@@ -53,8 +54,8 @@ SHOWN = 3
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
 MOST_UNEXPLAINED = 0.5
-# Most linearisations of errors of the inputs, and the change [sds] that ends them.
-MOST_ROUNDS, SETTLED = 30, 1e-5
+# Most linearisations of errors of the inputs, the steps between two, and the change [sds] that ends them.
+MOST_ROUNDS, BETWEEN, SETTLED = 40, 5, 1e-5
 # Seconds after which the progress bar is shown.
 SHOWN_AFTER = 2.0
 # Value of a field of MapEstimate that is computed at its first use.
@@ -158,12 +159,13 @@ def map_estimate(
     for draw in problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0))):
         ends.append(_from_draw(objective, end.iterate, draw, progress))
     best = max((end for end in ends if end), key=preference)
-    noisy, best = _with_noisy_inputs(problem, best, progress)
+    noisy, moved = _with_noisy_inputs(problem, best, progress)
     if noisy is not problem:
-        objective = _objective(noisy, best.iterate.here)
-        ends, problem = [best, *(_moved(noisy, end) for end in ends)], noisy
-    objective, _ = corrected(objective, best)
-    ends = [end and resumed(objective, end) for end in ends]
+        objective = _objective(noisy, moved.iterate.here)
+        ends, problem = [moved if end is best else _moved(noisy, end) for end in ends], noisy
+        best = moved
+    objective, found = corrected(objective, best)
+    ends = [found if end is best else end and resumed(objective, end) for end in ends]
     modes = with_images(objective, [end for end in ends if end], partial(_climb, objective, progress=progress))
     result = _describe(problem, objective, modes, tuple(_outcome(problem, end) for end in ends))
     for text in estimation_warnings(problem, result):
@@ -195,7 +197,7 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
         objective, first = _of_problem(problem, now)
         if first is None:
             break
-        end = _climb(objective, first, progress)
+        end = _climb(objective, first, progress, BETWEEN)
         step = end.iterate.theta - now.theta
         moved = [own.expected - (before[n].expected if n in before else np.inf) for n, own in errors.items()]
         still = all(np.abs(own).max(initial=0.0) < SETTLED for own in moved)
@@ -263,14 +265,14 @@ def _from_draw(objective: Objective, first: Iterate, theta: np.ndarray, progress
         return None if other is None else _climb(objective, objective.anchored(other), progress)
 
 
-def _climb(objective: Objective, first: Iterate, progress: bool) -> End:
+def _climb(objective: Objective, first: Iterate, progress: bool, most: int = MAX_ITERATIONS) -> End:
     with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress, delay=SHOWN_AFTER) as bar:
 
         def report(iterate: Iterate, size: float) -> None:
             bar.set_postfix_str(f"objective {iterate.objective:.6g}, step {size:.2g} sd", refresh=False)
             bar.update()
 
-        return climb(objective, first, report=report)
+        return climb(objective, first, report=report, most=most)
 
 
 def _on_measured_orbits(problem: Problem, start: np.ndarray, end: End, progress: bool) -> End:

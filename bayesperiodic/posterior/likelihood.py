@@ -405,11 +405,11 @@ class Likelihood:
 
     @cached_property
     def _alike(self) -> list[list[int]]:
-        """The indices of blocks whose components have the same variances: whole periods, their harmonics the same."""
+        """The indices of blocks whose components have the same variances: whole periods, averaged over as much data."""
         groups: dict[Any, list[int]] = {}
         for b, (block, columns) in enumerate(zip(self.blocks, self._columns, strict=True)):
             measured = block.measured if self.model.needs_scatter else None
-            key = (tuple(columns), block.weight, measured, block.harmonic.tobytes())
+            key = (tuple(columns), block.weight, block.averaged, block.points, measured, block.harmonic.tobytes())
             groups.setdefault(key if block.kind == SPECTRAL else b, []).append(b)
         return list(groups.values())
 
