@@ -189,8 +189,9 @@ def climb(
 
     Where H is not positive definite (convex log-priors that outweigh the data) steps take its negative curvature with
     the opposite sign; directions without curvature are left out. Each solve starts from the previous iterate and is
-    checked to lie on the same branch, so that a step cannot change to another periodic solution; steps whose solve
-    fails are halved, and the next one begins with twice as much of it. A parameter at the end of its prior's support is fixed while the gradient points outwards.
+    checked to lie on the same branch, so that a step cannot change to another periodic solution. A step whose solve
+    fails is halved, and the first trial of the next step is twice its fraction. A parameter at the end of its prior's
+    support is fixed while the gradient points outwards.
 
     Parameters `held` (names,) are fixed; report(iterate, step in standard deviations) is called for every new iterate.
     """

@@ -23,7 +23,7 @@ FOLLOWED = 16
 # Records of the search for missing terms [kHz], and how many terms are tried.
 SEARCHED, KEPT = (110.0, 170.0, 230.0), 2
 # The term that is added to each model, of those that the search cannot tell apart, for its physical meaning.
-FIRST, *_ = rig.STEPS_OF_MODEL
+FIRST, *_, LAST = rig.STEPS_OF_MODEL
 CHOSEN = dict(zip(rig.STEPS_OF_MODEL, ("i*m in equation of m", "dsource in resistor"), strict=False))
 # Period doublings: the orbit's record [kHz], and the frequency [kHz] up to which it is followed.
 DOUBLINGS = ((110.0, 130.0), (170.0, 200.0), (230.0, 290.0))
@@ -44,29 +44,26 @@ def run(options: argparse.Namespace) -> None:
           f"periodic and {len(used)} are fitted; {rig.RULE_OF_CHOICE}")  # fmt: skip
     if data["synthetic"]:
         print(f"  the measured file was not found; it is at {rig.ADDRESS}, sha256 {rig.SHA256}; true values {rig.TRUE}")
-    fits = {}
-    for step, free in rig.STEPS_OF_MODEL.items():
-        with watch.part(f"map {step}", f"finding the MAP point of the model: {step}"):
-            fits[step] = rig.estimate(used, free, share)
-    with watch.part("missing terms", "searching for the term that each model lacks"):
-        three = list(
-            {r.frequency: r for r in (min(used, key=lambda u: abs(u.frequency - 1e3 * f)) for f in SEARCHED)}.values()
-        )
-        searches = {
-            model: _searched(rig.estimate(three, free, share, fits[model].fit.theta), model)
-            for model, free in list(rig.STEPS_OF_MODEL.items())[:-1]
-        }
-    final = fits[list(fits)[-1]]
-    with watch.part("predict", f"integrating {draws} draws at the frequencies of all records"):
-        sample = prediction.draws_of(final, draws, options.seed)
-        frequencies, sources = [r.frequency for r in records], [prediction.source_of(r) for r in records]
-        swept = common.in_threads(lambda draw: prediction.sweep(draw, frequencies, sources), sample)
-        motions = [[prediction.period_of(v) for v in own] for own in swept]
-    with watch.part("orbits", "solving the orbits of periodic records that were not fitted, and their multipliers"):
-        table = _records(records, used, final, motions, sample[:FOLLOWED])
-        doublings = _doublings(records, final, sample[:FOLLOWED])
-    with watch.part("chaos", "finding unstable orbits in the records without a period"):
-        unstable = _unstable(records, final)
+    with common.workers() as pool:
+        # The last model first: the predictions wait for it.
+        order = dict.fromkeys((LAST, *rig.STEPS_OF_MODEL))
+        jobs = {step: pool.submit(_identified, step, used, share) for step in order}
+        with watch.part("map", "finding the MAP points of three models, and what two of them lack"):
+            final, _ = jobs[LAST].result()
+        with watch.part("predict", f"integrating {draws} draws at the frequencies of all records"):
+            sample = prediction.draws_of(final, draws, options.seed)
+            frequencies, sources = [r.frequency for r in records], [prediction.source_of(r) for r in records]
+            swept = common.in_threads(lambda draw: prediction.sweep(draw, frequencies, sources), sample)
+            motions = [[prediction.period_of(v) for v in own] for own in swept]
+        with watch.part("orbits", "solving the orbits of periodic records that were not fitted, and their multipliers"):
+            table = _records(records, used, final, motions, sample[:FOLLOWED])
+            doublings = _doublings(records, final, sample[:FOLLOWED])
+        with watch.part("chaos", "finding unstable orbits in the records without a period"):
+            unstable = _unstable(records, final)
+        with watch.part("missing terms", "waiting for the search for missing terms"):
+            found = {step: jobs[step].result() for step in rig.STEPS_OF_MODEL}
+    fits = {step: own for step, (own, _) in found.items()}
+    searches = {step: search for step, (_, search) in found.items() if search is not None}
     with watch.part("figures", "drawing"):
         drawn = {
             "bifurcation": figures.bifurcation(records, used, final, sample, synthetic=data["synthetic"]),
@@ -171,9 +168,19 @@ def _summary(own: rig.Fitted) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _searched(own: rig.Fitted, model: str) -> bp.MissingTerms:
-    """Return the search for a term that a model lacks; the second search ranks the candidates only."""
-    return bp.missing_terms(own.problem, own.fit, max_terms=int(model == FIRST), keep=KEPT)
+def _identified(model: str, used: Sequence[rig.Record], share: float) -> tuple[rig.Fitted, bp.MissingTerms | None]:
+    """Return the MAP point of a model, and the search for a term that it lacks; none for the last model.
+
+    The search takes three records. The second model's only ranks the candidates.
+    """
+    free = rig.STEPS_OF_MODEL[model]
+    whole = rig.estimate(used, free, share)
+    if model == LAST:
+        return whole, None
+    nearest = [min(used, key=lambda record: abs(record.frequency - 1e3 * f)) for f in SEARCHED]
+    three = list({record.frequency: record for record in nearest}.values())
+    own = rig.estimate(three, free, share, whole.fit.theta)
+    return whole, bp.missing_terms(own.problem, own.fit, max_terms=int(model == FIRST), keep=KEPT)
 
 
 def _missing(model: str, found: bp.MissingTerms) -> dict[str, Any]:

@@ -44,6 +44,20 @@ def test_independent_values_set_the_weight_of_the_samples():
     assert fit.covariance.to_numpy() == pytest.approx(covariance, rel=1e-10)
 
 
+def test_experiments_of_unequal_length_weigh_as_their_numbers_of_samples():
+    """The mean periods of 1 and 25 cycles have the variances 9 and 9/25."""
+    one, long = (
+        replace(linear_experiment(TRUTH, sd, seed=seed), name=f"{cycles} cycles", cycles=cycles)
+        for seed, (cycles, sd) in enumerate([(1, 3.0), (25, 0.6)])
+    )
+    fit = bp.map_estimate(bp.Problem(LINEAR, [one, long], priors=PRIORS, fixed={"variance[force]": 9.0}))
+    weight = np.repeat([1.0, 5.0], 40)
+    values = weight * np.concatenate([e.outputs["force"] for e in (one, long)])
+    mean, covariance = normal_posterior(weight[:, None] * np.tile(DESIGN, (2, 1)), values, 9.0, MEAN, COVARIANCE)
+    assert list(fit.theta.values()) == pytest.approx(mean, rel=1e-10)
+    assert fit.covariance.to_numpy() == pytest.approx(covariance, rel=1e-10)
+
+
 def taken(design: np.ndarray, variance: float) -> float:
     """Return tr(XᵀX C)/v with C = (XᵀX/v + P)⁻¹: the values that parameters with the priors PRIORS take up."""
     return float(np.trace(np.linalg.solve(design.T @ design + variance * np.linalg.inv(COVARIANCE), design.T @ design)))

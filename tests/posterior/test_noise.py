@@ -315,6 +315,7 @@ MODELS = [
 BLOCKS = [
     block(),
     block(count=6.5, experiment="other", measured=0.3, averaged=50.0),
+    block(experiment="longer", averaged=200.0),
     block(POINTS, size=7),
     block(POINTS, size=5, count=3.5, channel="rate"),
     block(CORRELATED, size=4, channel="scale", measured=np.nan),
