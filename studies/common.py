@@ -115,9 +115,9 @@ def _run_task(work: Callable[..., Value], task: Task) -> bytes:
     return cloudpickle.dumps(work(*task))
 
 
-def workers() -> ProcessPoolExecutor:
-    """Return a pool with one new process per core."""
-    return ProcessPoolExecutor(available_cores(), mp_context=multiprocessing.get_context("spawn"))
+def workers(count: int | None = None) -> ProcessPoolExecutor:
+    """Return a pool with so many new processes, by default one per core."""
+    return ProcessPoolExecutor(count or available_cores(), mp_context=multiprocessing.get_context("spawn"))
 
 
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "corner", "matplotlib", "xarray")

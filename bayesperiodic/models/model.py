@@ -224,8 +224,9 @@ class Model:
         found = set().union(*(e.atoms(sp.tanh, sp.atan) for e in self.equations))
         return tuple(sorted((sign for sign in found if sign.free_symbols & moving), key=sp.default_sort_key))
 
+    @cached_property
     def softened(self) -> "Model":
-        """Return the model with an additional last parameter that multiplies the arguments of all smooth signs."""
+        """The model with an additional last parameter that multiplies the arguments of all smooth signs."""
         sharpness = sp.Symbol("p_sharpness_of_signs", real=True)
         softer = {sign: sign.func(sharpness * sign.args[0]) for sign in self.smooth_signs}
         other = copy(self)
@@ -306,7 +307,7 @@ class Model:
         return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
 
     def __getstate__(self) -> dict[str, Any]:
-        compiled = ("kernels", "_vjp_kernels", "jacobian_change", "smooth_signs")
+        compiled = ("kernels", "_vjp_kernels", "jacobian_change", "smooth_signs", "softened")
         return {key: value for key, value in self.__dict__.items() if key not in compiled}
 
     def __repr__(self) -> str:

@@ -46,7 +46,7 @@ def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndar
     """Solve with softened signs first and sharpen them step by step; None if that fails or there are none."""
     if not equations.model.smooth_signs:
         return None
-    soft = replace(equations, model=equations.model.softened())
+    soft = replace(equations, model=equations.model.softened)
     sharpness, factor, z = SOFTEST, SHARPENING, guess
     solved = soft.solve(np.append(parameters, sharpness), z)
     if solved.code != CONVERGED:

@@ -191,7 +191,7 @@ def estimate(
     priors = {name: prior for name, prior in PRIORS.items() if name not in TERMS or name in free}
     fixed = {"R": RESISTOR, "R_s": share * RESISTOR} | {name: 0.0 for name in TERMS if name not in free}
     problem = bp.Problem(MODEL, experiments, priors=priors, fixed=fixed, local=["offset"])
-    return Fitted(problem, bp.map_estimate(problem, start=start), share)
+    return Fitted(problem, bp.map_estimate(problem, start=start, progress=False), share)
 
 
 def values_of(final: Fitted) -> dict[str, float]:

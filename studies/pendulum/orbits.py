@@ -3,6 +3,7 @@
 The shooting reference of `studies.shooting` is independent of the package.
 """
 
+import multiprocessing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -107,8 +108,8 @@ def true_orbits(orbits: bp.Orbits) -> Confirmed:
     """
     polished = bp.polish_orbits(bp.models.pendulum, orbits, TRUTH, samples=SAMPLES)
     found: dict[int, Reference] = {}
-    refuted = []
-    for number, orbit in enumerate(tqdm(polished, desc="shooting", unit="orbit")):
+    refuted, in_worker = [], multiprocessing.parent_process() is not None
+    for number, orbit in enumerate(tqdm(polished, desc="shooting", unit="orbit", disable=in_worker)):
         assert orbit.solution is not None
         points = np.stack([orbit.solution.outputs[c][:: orbit.solution.samples] for c in COORDINATES], axis=-1)
         if orbit.partner is not None and orbit.partner in found:

@@ -10,7 +10,6 @@ import argparse
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,37 +34,15 @@ class Found(NamedTuple):
     boxes: bp.Orbits  # By the paper's recipe
 
 
-def search(
-    recording: bp.Recording, noises: Sequence[float], seed: int, periods: Sequence[int], watch: common.Stopwatch
-) -> tuple[dict[float, Found], orbits.Confirmed | None]:
-    """Return the orbits by noise level, a fraction of the attractor's size, and those without noise against shooting.
-
-    Noisy recordings are searched in other processes meanwhile. A measured recording is not compared with shooting.
-    """
-    # The noisiest takes longest, and comes first.
-    noisy = sorted({noise for noise in noises if noise > 0.0}, reverse=True)
-    levels = ", ".join(f"{noise:.2%}" for noise in sorted(set(noises)))
-    with ExitStack() as stack:
-        with watch.part("orbits", f"finding orbits without a model, noise {levels}"):
-            pool = stack.enter_context(common.workers()) if noisy else None
-            others = {noise: pool.submit(_found, recording, noise, seed, periods) for noise in noisy} if pool else {}
-            clean = _found(recording, 0.0, seed, periods)
-            print(f"  without noise: {len(clean.chained)} candidates", flush=True)
-        confirmed = None
-        if recording.synthetic:
-            with watch.part("reference", "the same orbits by shooting"):
-                confirmed = orbits.true_orbits(clean.chained)
-        with watch.part("orbits", "finding orbits in the noisy recordings"):
-            found = {0.0: clean}
-            for noise, other in reversed(others.items()):
-                found[noise] = other.result()
-                print(f"  noise {noise:.2%}: {len(found[noise].chained)} candidates", flush=True)
-    return {noise: found[noise] for noise in noises}, confirmed
-
-
 def _found(recording: bp.Recording, noise: float, seed: int, periods: Sequence[int]) -> Found:
     section = section_of(with_noise(recording, noise, seed) if noise > 0.0 else recording)
     return Found(section, *(bp.find_orbits(section, periods=periods, method=m) for m in orbits.METHODS))
+
+
+def _clean(recording: bp.Recording, seed: int, periods: Sequence[int]) -> tuple[Found, orbits.Confirmed]:
+    """Return the orbits found without noise, and the same by shooting."""
+    found = _found(recording, 0.0, seed, periods)
+    return found, orbits.true_orbits(found.chained)
 
 
 NOISE_LEVELS = (0.0, 0.001, 0.01)
@@ -86,26 +63,37 @@ def run(options: argparse.Namespace) -> None:
     kind = "SYNTHETIC" if about["synthetic"] else "measured"
     print(f"  {kind} recording: {about['drive_periods']} drive periods, {about['values']} numbers")
     noise = options.noise if about["synthetic"] else 0.0
-    levels = (0.0, noise) if options.quick or not about["synthetic"] else (*NOISE_LEVELS, noise)
-    found, confirmed = search(recording, levels, options.seed, QUICK_PERIODS if options.quick else PERIODS, watch)
+    periods = QUICK_PERIODS if options.quick else PERIODS
     results: dict[str, Any] = {"recording": about, "noise": noise, "seed": options.seed, "quick": options.quick}
-    if confirmed is not None:
-        results |= _against_shooting(found, confirmed)
-        print(_orbit_account(results))
-    with watch.part("estimates", "m and l, k3, and all five, from the paper's start"):
-        identified = pendulum_estimates.identify(found[noise].chained)
-        eigenvalue_fits = {
-            which: pendulum_estimates.with_eigenvalues(identified.selected, names) for which, names in FREE.items()
-        }
-    results |= estimates(about, found[noise], identified, eigenvalue_fits)
+    with common.workers(1) as pool:
+        # Meanwhile, in another process: the orbits of the other noise levels, and those without noise by shooting.
+        clean = pool.submit(_clean, recording, options.seed, periods) if about["synthetic"] else None
+        levels = sorted({noise} if options.quick or not clean else {noise, *NOISE_LEVELS})
+        others = {level: pool.submit(_found, recording, level, options.seed, periods) for level in levels
+                  if level not in (0.0, noise)}  # fmt: skip
+        with watch.part("orbits", f"finding orbits without a model, noise {noise:.2%}"):
+            found = clean.result()[0] if clean and noise == 0.0 else _found(recording, noise, options.seed, periods)
+            print(f"  {len(found.chained)} candidates", flush=True)
+        with watch.part("estimates", "m and l, k3, and all five, from the paper's start"):
+            identified = pendulum_estimates.identify(found.chained)
+            eigenvalue_fits = {
+                which: pendulum_estimates.with_eigenvalues(identified.selected, names) for which, names in FREE.items()
+            }
+        with watch.part("ridge", "sampling the posterior of all five with emcee"):
+            ridge = pendulum_estimates.sample(identified, options.seed, options.quick)
+        if clean:
+            with watch.part("reference", "waiting for the orbits at other noise levels, and by shooting"):
+                without, confirmed = clean.result()
+                every = {0.0: without, noise: found} | {level: other.result() for level, other in others.items()}
+            results |= _against_shooting(dict(sorted(every.items())), confirmed)
+            print(_orbit_account(results))
+    results |= estimates(about, found, identified, eigenvalue_fits)
     print(_estimate_account(results))
-    with watch.part("ridge", "sampling the posterior of all five with emcee"):
-        ridge = pendulum_estimates.sample(identified, options.seed, options.quick)
     results["all_five"] = pendulum_estimates.collect(ridge)
     print(f"  {ridge.posterior.reason}\n{ridge.identifiability}\n{ridge.natural}\n{ridge.combinations}")
     with watch.part("figures", "drawing"):
         table = results.get("eigenvalues", {})
-        drawn = figures(found[noise].section, identified, ridge, table)
+        drawn = figures(found.section, identified, ridge, table)
         paths = common.save_figures(options.out, drawn)
     common.finish(options.out, results, watch, paths, synthetic=about["synthetic"])
 
