@@ -238,8 +238,7 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
     rows = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
     for axes, name in zip(rows, names, strict=True):
         for e, paths in enumerate(posterior.by_step(posterior.draws(name))[:, shown]):
-            colour = ENSEMBLES[e % len(ENSEMBLES)]
-            axes.plot(shown, paths[:, :walkers], color=colour, lw=0.4, alpha=0.6, rasterized=True)
+            axes.plot(shown, paths[:, :walkers], color=ENSEMBLES[e % len(ENSEMBLES)], lw=0.4, alpha=0.6)
         axes.set_ylabel(draws_label(posterior, name), fontsize=8)
         text = f"tau {posterior.tau[name]:.0f} steps, R-hat {posterior.rhat[name]:.3f}"
         place: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top"}
