@@ -25,8 +25,9 @@ from studies.landing_gear.rig import GEAR, RUNS, Run
 CHANNELS = {
     "displacement": (1e3, "displacement [mm]"), "force": (1e-3, "force [kN]"), "pressure": (1e-6, "pressure [MPa]"),
 }  # fmt: skip
-# Factors of the errors in the drop test, and the first time shown there [s].
+# Factors of the errors in the drop test, the first time shown there [s], and the number of times.
 ERRORS, EARLIEST = {"displacement": (1e3, "mm"), "force": (1.0, "N"), "pressure": (1e-3, "kPa")}, 0.05
+DROP_POINTS = 700
 TITLE = "SYNTHETIC data"
 NORMAL_90 = 1.6448536269514722
 SIGNS = {POSITIVE: ("#009E73", "o"), UNDETERMINED: ("#999999", "D"), NEGATIVE: ("#CC79A7", "v")}
@@ -122,19 +123,21 @@ def drops(dropped: Mapping[str, Dropped]) -> Figure:
     figure, grid = _columns(dropped, ["displacement [mm]", *errors])
     colours = bp.plot.COLOURS
     for column, found in zip(grid.T, dropped.values(), strict=True):
-        later = found.true.time >= EARLIEST
-        time, true, band = found.true.time[later], found.true.outputs, found.band
-        displacement = [1e3 * signals["displacement"][later] for signals in (true, band.median)]
+        time, true, band = found.true.time, found.true.outputs, found.band
+        early, last = time <= SHORT, time.size - 1
+        at = np.unique(np.geomspace(np.searchsorted(time, EARLIEST), last, DROP_POINTS).astype(int))
+        time = time[at]
+        displacement = [1e3 * signals["displacement"][at] for signals in (true, band.median)]
         column[0].plot(time, displacement[0], color=colours["measured"], lw=2.6, label="true")
         column[0].plot(time, displacement[1], "--", color=colours["mcmc"], lw=1.4, label="posterior median")
         for axes, (channel, (scale, _)) in zip(column[1:], ERRORS.items(), strict=True):
             low, off, high = (
-                scale * (signals[channel] - band.median[channel])[later] for signals in (band.low, true, band.high)
+                scale * (signals[channel] - band.median[channel])[at] for signals in (band.low, true, band.high)
             )
             axes.fill_between(time, low, high, color=colours["mcmc"], alpha=0.4, lw=0, label="90 % band")
             axes.axhline(0.0, color=colours["mcmc"], ls="--", lw=1.4)
             axes.plot(time, off, color=colours["measured"], lw=1.2)
-            inside, early = (off >= low) & (off <= high), time <= SHORT
+            inside = (true[channel] >= band.low[channel]) & (true[channel] <= band.high[channel])
             shares = f"{100 * inside[early].mean():.0f} % of the first {SHORT:g} s, {100 * inside[~early].mean():.0f} %"
             axes.set_title(f"within the band: {shares} later", fontsize=9, loc="right")
         column[1].set_title("true − median", fontsize=9, loc="left")
