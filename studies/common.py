@@ -121,7 +121,8 @@ def workers(count: int | None = None) -> ProcessPoolExecutor:
 
 
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "corner", "matplotlib", "xarray")
-DOTS_PER_INCH = 100
+# Of PNG files, and of the clouds of points in vector files.
+DOTS_PER_INCH, DOTS_OF_CLOUDS = 100, 300
 COLOURS = 128
 # Of titles of corner plots: characters per inch, and the height of a line [inches].
 CHARACTERS_PER_INCH, LINE = 12.0, 0.2
@@ -212,7 +213,8 @@ def save_figures(folder: Path, figures: dict[str, Figure]) -> list[Path]:
     for name, figure in figures.items():
         for suffix in dict.fromkeys(("png", wanted)):
             target, draft = folder / f"{name}.{suffix}", folder / f".{name}.part.{suffix}"
-            figure.savefig(draft, dpi=DOTS_PER_INCH, metadata=WITHOUT_TIME.get(suffix))
+            dots = DOTS_PER_INCH if suffix == "png" else DOTS_OF_CLOUDS
+            figure.savefig(draft, dpi=dots, metadata=WITHOUT_TIME.get(suffix))
             if suffix == "png":
                 _shrink(draft)
             draft.replace(target)

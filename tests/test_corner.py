@@ -223,6 +223,12 @@ def test_titles_have_two_digits_of_the_shorter_error(interval, title):
     assert pairs.with_errors(*interval) == title
 
 
+def test_the_density_of_one_quantity_vanishes_in_the_tails():
+    draws = np.exp(0.5 * np.random.default_rng(0).standard_normal(8000))[:, None]
+    values = regions.density(draws, [POSITIVE]).values
+    assert max(values[0], values[-1]) < 0.015 * values.max()
+
+
 def test_many_quantities_need_a_choice():
     draws = {f"p{k}": values for k, values in enumerate(np.random.default_rng(1).standard_normal((9, 400)))}
     with pytest.warns(UserWarning, match=r"names: 9 quantities are many for one figure; choose some, such as names="):

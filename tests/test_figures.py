@@ -1,14 +1,17 @@
 """No text of a figure is clipped or overlaps another, whatever the number of parameters."""
 
 import inspect
+import io
 from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.colors import to_rgb
 
 import bayesperiodic as bp
+from bayesperiodic.plot import style
 from bayesperiodic.posterior.description import fingerprint
 from tests.drawn import faults, posterior_of, texts
 from tests.problems import quadratic_damping
@@ -166,6 +169,30 @@ def test_every_public_figure_is_looked_at():
 @pytest.mark.parametrize("drawer", DRAWERS)
 def test_no_text_is_clipped_or_overlaps_another(drawer, count, draws, results):
     assert not faults(drawer(count, draws, results))
+
+
+@pytest.mark.parametrize("drawer", DRAWERS)
+def test_vector_files_are_small(drawer, draws, results):
+    file = io.BytesIO()
+    drawer(2, draws, results).savefig(file, format="svg")
+    assert file.tell() < 250_000
+
+
+def lightness(colour):
+    """Return the lightness L* (CIE 1976) of a colour, 0 for black and 100 for white; a step of 2 can just be seen."""
+    rgb = np.array(to_rgb(colour))
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return 116.0 * np.cbrt(max(linear @ [0.2126, 0.7152, 0.0722], (4 / 29) ** 3)) - 16.0
+
+
+def test_colours_can_be_told_apart_in_grey():
+    """The lightness of colours of lines differs by 9, of the others by 8, and Laplace is dashed besides."""
+    with plt.style.context(style.SHEET):
+        cycle = plt.rcParams["axes.prop_cycle"].by_key()["color"]
+    assert cycle == [*style.ENSEMBLES]
+    for least, colours in ((9.0, style.ENSEMBLES), (8.0, style.COLOURS.values())):
+        assert np.diff(np.sort([lightness(colour) for colour in colours])).min() > least
+    assert style.LAPLACE["ls"] == "--"
 
 
 def test_clipped_and_overlapping_texts_are_found():

@@ -240,8 +240,10 @@ def section(
     for period, marker, colour in zip(periods, cycle(PERIOD_MARKERS), cycle(ENSEMBLES), strict=False):
         members = [orbit for orbit in orbits if orbit.period == period]
         points = np.concatenate([orbit.points for orbit in members])
-        look: dict[str, Any] = {"marker": marker, "color": colour, "ls": "", "ms": 5, "mec": "black", "mew": 0.5}
-        ax.plot(*points.T, zorder=3, **look)
+        size = max(6.5 - period, 3.0)
+        look: dict[str, Any] = {"marker": marker, "color": colour, "ls": "", "ms": size, "mec": "black", "mew": 0.4}
+        # Longer orbits have many points, and cover none of the shorter ones.
+        ax.plot(*points.T, zorder=3 + 1 / period, **look)
         noun = "orbit" if len(members) == 1 else "orbits"
         handles.append(plt.Line2D([], [], label=f"period {period}: {len(members)} {noun}", **look))
     across, up = _coordinate_labels(section, units)
@@ -282,8 +284,8 @@ def orbits(
     _checks.instance("orbits", orbits, (Orbits, list, tuple))
     if not len(orbits):
         raise ValueError("orbits: must be at least one, got none.")
-    columns = min(COLUMNS, len(orbits))
-    rows = -(-len(orbits) // columns)
+    rows = -(-len(orbits) // COLUMNS)
+    columns = -(-len(orbits) // rows)
     figure = figure or plt.figure(figsize=(1.9 * columns + 0.6, 1.85 * rows + 0.7), layout="constrained")
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for number, (orbit, ax) in enumerate(zip(orbits, axes.flat, strict=False)):

@@ -206,7 +206,7 @@ class _Panels:
         for group in self.groups:
             for axes, pair in self.pairs():
                 own = self.draws[group.members][:, pair]
-                _draw_regions(axes, own, [self.supports[k] for k in pair], group.colour)
+                draw_regions(axes, own, [self.supports[k] for k in pair], group.colour)
                 if group.mark:
                     axes.plot(*own.mean(axis=0), marker=f"${group.mark}$", color="black", ms=6, zorder=6)
             for k, axes in enumerate(np.diag(self.grid)):
@@ -236,7 +236,7 @@ class _Panels:
             axes.set_ylim(0.0, min(max(highest, 1.08 * norm.pdf(0.0) / sd), TALLEST * highest))
         for axes, pair in self.pairs():
             if known[pair].all():
-                _draw_ellipses(axes, mean[pair], covariance[np.ix_(pair, pair)])
+                draw_ellipses(axes, mean[pair], covariance[np.ix_(pair, pair)])
         yield plt.Line2D([], [], label=f"Laplace, {LEVELS_TEXT}", **LAPLACE)
 
     def draw_priors(self, problem: Problem) -> Iterator[Any]:
@@ -318,7 +318,8 @@ def _groups(posterior: Posterior) -> list[_Group]:
     ]
 
 
-def _draw_regions(axes: Axes, draws: np.ndarray, supports: list[regions.Support], colour: str) -> None:
+def draw_regions(axes: Axes, draws: np.ndarray, supports: list[regions.Support], colour: str) -> None:
+    """Draw the regions that contain 50 and 90 % of the draws (n, 2)."""
     found = regions.density(draws, supports)
     half, most = found.levels(LEVELS)
     shown = found.values >= most
@@ -332,7 +333,7 @@ def _draw_regions(axes: Axes, draws: np.ndarray, supports: list[regions.Support]
     axes.contour(*mesh, levels=[most, max(half, np.nextafter(most, np.inf))], colors=[colour], linewidths=0.9)
 
 
-def _draw_ellipses(axes: Axes, mean: np.ndarray, covariance: np.ndarray) -> None:
+def draw_ellipses(axes: Axes, mean: np.ndarray, covariance: np.ndarray) -> None:
     """Draw the ellipses of the probability levels of a bivariate normal distribution."""
     sds = np.sqrt(np.diag(covariance))
     correlation = covariance[0, 1] / np.prod(sds)

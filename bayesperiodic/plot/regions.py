@@ -29,6 +29,8 @@ ENDS, ROOM, NARROWEST, WIDEST, WIDTHS = (0.0003, 0.9997), 0.08, 0.7, 0.6, 32
 TOLERANCE = 0.001, 2.0, -0.8
 # Factors on the width of the kernels, where the density is high and low.
 FACTORS = np.geomspace(0.7, 10.0, 8)
+# Half-width [sds] that no kernel in the tails exceeds, unless all do: wider ones would pile up at the ends of the mesh.
+IN_TAILS = 0.3
 # Ends of supports that are nearer than this many sds to a draw are edges of the mesh.
 NEAR = 0.5
 # Quantiles, and their ratio below which the density of a positive quantity does not vanish at zero.
@@ -201,7 +203,7 @@ class KernelEstimate:
         pilot = counter.smooth(0.5 * (halves[0] + halves[1]), width)
         places = places[inside]
         at = np.maximum(pilot[tuple(places.T)], 1e-9 * pilot.max())
-        factor = np.sqrt(at.mean() / at)
+        factor = np.minimum(np.sqrt(at.mean() / at), max(IN_TAILS / width, 1.0))
         group = np.clip(np.log(factor / FACTORS[0]) / np.log(FACTORS[1] / FACTORS[0]), 0.0, len(FACTORS) - 1.0)
         whole: Any = 0.0
         for number, own in enumerate(FACTORS):

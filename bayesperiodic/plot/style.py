@@ -18,7 +18,8 @@ from bayesperiodic.sampling.posterior import Posterior
 
 #: Colours of measurements, of the MAP estimate, of the Laplace approximation and of MCMC, in all figures.
 COLOURS = {"measured": "#000000", "map": "#0072B2", "laplace": "#D55E00", "mcmc": "#56B4E9"}
-ENSEMBLES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
+#: Colours of Okabe and Ito, and of Tol, of different lightness: they can be told apart in grey too.
+ENSEMBLES = ("#0072B2", "#E69F00", "#009E73", "#882255", "#DDCC77", "#332288")
 LAPLACE: dict[str, Any] = {"color": COLOURS["laplace"], "lw": 1.6, "ls": "--"}
 LABEL_LENGTH, ACROSS = 24, 4
 SHEET = "bayesperiodic.plot.figures"
@@ -64,9 +65,9 @@ SUPERSCRIPTS = str.maketrans("-−0123456789", "⁻⁻⁰¹²³⁴⁵⁶⁷⁸�
 
 
 def axis_label(name: str, unit: str = "") -> str:
-    """Return a name with its unit, escaped for matplotlib; powers in the unit are superscripts."""
+    """Return a name with its unit, if any, escaped for matplotlib; powers in the unit are superscripts."""
     powers = re.sub(r"(?:\^|\*\*)\(?(-?\d+)\)?(?![\d./])", lambda found: found[1].translate(SUPERSCRIPTS), unit)
-    text = f"{name} [{powers}]" if unit else name
+    text = f"{name} [{powers}]" if unit not in ("", "1") else name
     return text.replace("$", r"\$")
 
 

@@ -20,7 +20,7 @@ from bayesperiodic.posterior.description import check_results, fingerprint
 from bayesperiodic.posterior.problem import Problem
 
 # Colours without another meaning, one for each channel; and that of the residual with the terms.
-CHANNELS, AFTER = ("#E69F00", "#009E73", "#CC79A7"), ENSEMBLES[2]
+CHANNELS, AFTER = ENSEMBLES[1:4], ENSEMBLES[2]
 HELD_OUT: dict[str, Any] = {"color": "grey", "ls": ":", "marker": "s", "ms": 4, "mfc": "white"}
 # Part of the axis to the left of the points, for their values.
 ROOM = 0.5
@@ -119,9 +119,10 @@ def _residuals(panels: list[Axes], problem: Problem, found: MissingTerms, shown:
         axes.axhline(0.0, color="grey", lw=0.8, zorder=0)
         if others:
             colour = others[0][1][mask]
-            points = axes.scatter(x[mask], residual[mask], 10, colour, cmap="coolwarm", linewidths=0)
+            points = axes.scatter(x[mask], residual[mask], 10, colour, cmap="coolwarm", linewidths=0, rasterized=True)
         else:
-            axes.plot(x[mask], residual[mask], ".", ms=4, color=AFTER if number else COLOURS["measured"])
+            look = AFTER if number else COLOURS["measured"]
+            axes.plot(x[mask], residual[mask], ".", ms=4, color=look, rasterized=True)
         axes.set(xlabel=across, ylim=(-reach, reach))
         axes.set_title(axis_label(title), fontsize="medium")
         axes.locator_params(axis="x", nbins=4)

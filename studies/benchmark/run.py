@@ -234,7 +234,7 @@ def _contenders(ax: Axes, problems: Mapping[str, Any]) -> None:
         bars = [x[0] - x[1], x[2] - x[0]]
         ax.errorbar(x[0], y, xerr=bars, fmt=marker, markersize=5, mec="black", mew=0.5, label=f"{problem}{kind}")
     ax.axvline(1.0, color="0.6", linewidth=1.0, zorder=0)
-    ax.set(xscale="log", xlabel="time / one warm log-posterior of this package [1]")
+    ax.set(xscale="log", xlabel="time / one warm log-posterior of this package")
     ax.set_yticks(range(len(names)), names)
     ax.invert_yaxis()
     ax.grid(axis="x", alpha=0.3)

@@ -16,6 +16,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
+from bayesperiodic.plot.style import ENSEMBLES
 from studies import common
 
 FILE = "mr_damper/mr_damper_4.1.csv"
@@ -76,15 +77,16 @@ def run(options: argparse.Namespace) -> None:
     print(f"  {posterior.reason}")
     with watch.part("figures", "drawing"):
         comparison = bp.compare(problem, fit, posterior)
+        off = ", ".join(f"{name} {v}" for name, v in comparison.table["verdict"].items() if v != "fine")
         figures = {
             "fit": bp.plot.fit(problem, fit, bp.predict(problem, posterior)),
             "loops": bp.plot.loops(problem, fit),
             "corner": common.titled(
                 bp.plot.corner(posterior, laplace=fit, problem=problem),
-                "Magnetorheological damper: posterior of Dahl's model",
+                f"Magnetorheological damper, verdicts on Laplace: {off or 'all'}{', the others' * bool(off)} fine",
             ),
             "traces": bp.plot.traces(posterior),
-            "harmonics": _harmonics_figure(choices, synthetic=data["synthetic"]),
+            "harmonics": _harmonics_figure(choices, default, synthetic=data["synthetic"]),
             "missing_terms": bp.plot.missing_terms(problem, fit, found),
         }
         paths = common.save_figures(options.out, figures)
@@ -135,25 +137,26 @@ def _with_harmonics(recording: bp.Recording, kept: int) -> dict[str, Any]:
     return found
 
 
-def _harmonics_figure(choices: list[dict[str, Any]], *, synthetic: bool) -> Figure:
-    """Return rho and Kw ± a standard deviation by the number of harmonics of the displacement."""
+def _harmonics_figure(choices: list[dict[str, Any]], default: int, *, synthetic: bool) -> Figure:
+    """Return rho and Kw ± a standard deviation by the number of harmonics of the displacement, the default marked."""
     figure, axes = plt.subplots(1, 2, figsize=(7.2, 3.0), layout="constrained")
     kept = np.array([choice["kept"] for choice in choices])
     for ax, name, scale, label in zip(axes, SHARP, (1e-3, 1.0), ("ρ [1/mm]", "Kw [N]"), strict=True):
-        for ending, text, marker, shift in (
-            ("_exact", "displacement taken as exact", "o", 0.98), ("", "its noise integrated out", "s", 1.02)
-        ):  # fmt: skip
+        ax.axvline(default, color="0.6", lw=0.9, ls=":", label="kept by the rule")
+        for ending, text, marker, shift, colour in (
+            ("_exact", "displacement taken as exact", "o", 0.98, ENSEMBLES[0]),
+            ("", "its noise integrated out", "s", 1.02, ENSEMBLES[1]),
+        ):
             values, sd = (
                 scale * np.array([c[key] for c in choices]) for key in (f"{name}{ending}", f"{name}_sd{ending}")
             )
-            ax.errorbar(shift * kept, values, sd, fmt=marker, markersize=4, capsize=2, label=text)
+            ax.errorbar(shift * kept, values, sd, fmt=marker, color=colour, markersize=4, capsize=2, label=text)
         ax.set(xlabel="harmonics of the displacement", ylabel=label, xscale="log")
         ax.set_xticks(kept, [str(count) for count in kept])
         ax.minorticks_off()
-    shown = axes[0].get_legend_handles_labels()
-    figure.legend(*shown, loc="outside lower center", ncols=2)
-    if synthetic:
-        figure.suptitle("synthetic data")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    kind = ", synthetic data" * synthetic
+    figure.suptitle(f"How sharply the displacement may reverse: estimates ± sd{kind}", fontsize="medium")
     return figure
 
 

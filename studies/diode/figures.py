@@ -38,7 +38,9 @@ def bifurcation(
         kind = "fitted" if record.frequency in fitted else "periodic, not fitted" if record.period else "not periodic"
         colour = {"fitted": "#0072B2", "periodic, not fitted": "#56B4E9", "not periodic": "#555555"}[kind]
         values = rig.stroboscopic(record)
-        axes[1].plot(np.full(values.size, 1e-3 * record.frequency), values, ".", ms=3, color=colour, label=kind)
+        axes[1].plot(
+            np.full(values.size, 1e-3 * record.frequency), values, ".", ms=3, color=colour, label=kind, rasterized=True
+        )
         for ax in axes if record.frequency in fitted else ():
             ax.axvline(1e-3 * record.frequency, color="#0072B2", lw=0.6, alpha=0.5, zorder=0)
     axes[0].set_title(f"Predicted from {len(used)} periodic records (black: MAP point, orange: draws)")

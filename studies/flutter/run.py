@@ -378,7 +378,7 @@ def contractions(fits: Mapping[str, Fitted], kind_of_data: str) -> Figure:
     axes.set_xscale("log")
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
-    axes.set_xlabel("Laplace sd over the prior's sd [1]")
+    axes.set_xlabel("Laplace sd over the prior's sd")
     common.shared_legend(figure, 4)
     figure.suptitle(f"Flutter rig{kind_of_data}: how far each kind of cycles narrows the priors")
     return figure

@@ -8,15 +8,26 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from studies.common import shared_legend
+from studies.common import shared_legend, titled
 from studies.landing_gear.drop import SHORT, Dropped
-from studies.landing_gear.identification import CONDUCTION, NEGATIVE, POSITIVE, UNDETERMINED, Identified, Verdict
+from studies.landing_gear.identification import (
+    CONDUCTION,
+    NEGATIVE,
+    POSITIVE,
+    PRIORS,
+    UNDETERMINED,
+    Identified,
+    Verdict,
+)
 from studies.landing_gear.quality import FALSE_ALARM, LIMIT, MEANINGS, Unit, deviations
 from studies.landing_gear.rig import GEAR, RUNS, Run
 
 CHANNELS = {
     "displacement": (1e3, "displacement [mm]"), "force": (1e-3, "force [kN]"), "pressure": (1e-6, "pressure [MPa]"),
 }  # fmt: skip
+# Factors of the errors in the drop test, the first time shown there [s], and the number of times.
+ERRORS, EARLIEST = {"displacement": (1e3, "mm"), "force": (1.0, "N"), "pressure": (1e-3, "kPa")}, 0.05
+DROP_POINTS = 700
 TITLE = "SYNTHETIC data"
 NORMAL_90 = 1.6448536269514722
 SIGNS = {POSITIVE: ("#009E73", "o"), UNDETERMINED: ("#999999", "D"), NEGATIVE: ("#CC79A7", "v")}
@@ -24,25 +35,26 @@ SIGNS = {POSITIVE: ("#009E73", "o"), UNDETERMINED: ("#999999", "D"), NEGATIVE: (
 LINEAR_TO, TICKS = 3.0, (-100, -50, -20, -10, -5, -3, -2, -1, 0, 1, 2, 3, 5, 10, 20)
 STYLES: dict[str, dict[str, Any]] = {
     "eq. (9)": {"color": "#0072B2", "lw": 3.0}, "pressure line": {"color": "#E69F00", "ls": "--"},
-    "lost motion": {"color": "#CC79A7"}, "all four": {"color": "#009E73"},
+    "lost motion": {"color": "#CC79A7", "ls": "-."}, "all four": {"color": "#009E73"},
 }  # fmt: skip
 TRUTH_NAMES = {"A": "truth A: eq. (9) holds", "B": "truth B: lost motion, line lag, convection, friction heat"}
 
 
-def _columns(truths: Mapping[str, Any], height: float, last: str, **options: Any) -> tuple[Figure, np.ndarray]:
-    """Return a figure with a column per truth: displacement, force, pressure, and a last row."""
-    figure = plt.figure(figsize=(5.0 * len(truths) + 1.0, height), layout="constrained")
-    grid = figure.subplots(4, len(truths), squeeze=False, sharey="row", **options)
+def _columns(truths: Mapping[str, Any], labels: Sequence[str]) -> tuple[Figure, np.ndarray]:
+    """Return a figure with a column per truth, a row per ordinate, and the time across."""
+    figure = plt.figure(figsize=(5.0 * len(truths) + 1.0, 8.5), layout="constrained")
+    grid = figure.subplots(len(labels), len(truths), squeeze=False, sharex=True, sharey="row")
     for axes, truth in zip(grid[0], truths, strict=True):
         axes.set_title(TRUTH_NAMES[truth], fontsize=10)
-    for axes, label in zip(grid[:, 0], (*(label for _, label in CHANNELS.values()), last), strict=True):
+    for axes, label in zip(grid[:, 0], labels, strict=True):
         axes.set_ylabel(label)
+    figure.align_ylabels()
     return figure, grid
 
 
 def histories(shown: Mapping[str, tuple[bp.Recording, Identified]]) -> Figure:
     """Draw recorded and fitted displacement, force and pressure of one experiment, one column per truth."""
-    figure, grid = _columns(shown, 8.5, "residual force [N]", sharex=True)
+    figure, grid = _columns(shown, [*(label for _, label in CHANNELS.values()), "residual force [N]"])
     for column, (recording, identified) in zip(grid.T, shown.values(), strict=True):
         (experiment,), fit = identified.problem.experiments, identified.fit
         residuals = fit.residuals[experiment.name]
@@ -52,7 +64,8 @@ def histories(shown: Mapping[str, tuple[bp.Recording, Identified]]) -> Figure:
         signals = {**recording.inputs, **recording.outputs}
         for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
             colours, recorded = bp.plot.COLOURS, scale * signals[channel][kept]
-            axes.plot(recording.time[kept], recorded, ".", ms=2, color=colours["measured"], label="recorded")
+            dots: dict[str, Any] = {"ms": 2, "color": colours["measured"], "label": "recorded", "rasterized": True}
+            axes.plot(recording.time[kept], recorded, ".", **dots)
             if channel in residuals:
                 fitted = experiment.outputs[channel] - residuals[channel]
                 axes.plot(time, scale * np.tile(fitted, 2), color=bp.plot.COLOURS["map"], lw=1.4, label="MAP")
@@ -77,7 +90,8 @@ def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict
         axes.vlines(at - 0.1, low, high, color=bp.plot.COLOURS["mcmc"], lw=5, label="draws, 90 %")
         axes.vlines(at + 0.1, *laplace, color=bp.plot.COLOURS["laplace"], lw=2, label="Laplace, 90 %")
         axes.axhline(GEAR[CONDUCTION], color="black", lw=0.9, ls="--", label="true value 2 W/K")
-        axes.axhline(0.0, color="black", lw=0.6)
+        axes.axhline(0.0, color="black", lw=1.4)
+        axes.axhspan(-1e9, 0.0, color="0.93", lw=0, zorder=0, label="wrong sign")
         for sign, (colour, marker) in SIGNS.items():
             axes.plot([], [], marker, color=colour, label=f"sign: {sign}")
             for i in (i for i, v in enumerate(judged) if v.sign == sign):
@@ -85,47 +99,67 @@ def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict
                 value = judged[i].identified.fit.theta[CONDUCTION]
                 axes.plot(i, value, marker, color=colour, mfc=face, ms=8, mew=1.8, zorder=5)
         axes.set_yscale("symlog", linthresh=LINEAR_TO, linscale=1.5)
-        axes.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS])
+        axes.set_yticks(TICKS, [f"{tick:g}".replace("-", "−") for tick in TICKS])
         axes.minorticks_off()
         ends = np.concatenate([low, high, *laplace, [-0.5, GEAR[CONDUCTION] + 0.5]])
         axes.set_ylim(1.2 * ends.min(), 1.2 * ends.max())
         axes.set_ylabel("theta16 [W/K]")
         axes.set_xlim(-0.6, len(judged) - 0.4)
-        axes.set_title(TRUTH_NAMES[truth], fontsize=11)
+        counts = ", ".join(f"{sign} in {sum(v.sign == sign for v in judged)}" for sign in SIGNS)
+        axes.set_title(f"{TRUTH_NAMES[truth]}\nsign found: {counts} of {len(judged)} experiments", fontsize=10)
     names = [f"{run.frequency:g} Hz\n±{1e3 * run.stroke:g} mm" for run in runs]
     grid[-1].set_xticks(range(len(runs)), names, fontsize=9)
     shared_legend(figure, 4, fontsize=9)
     figure.suptitle(
-        f"Heat conduction theta16 by experiment, {drive} given, SYNTHETIC data\n"
+        f"Do the data determine the sign of the heat conduction theta16? {drive.capitalize()} given, {TITLE}\n"
         "(filled: model adequate, open: misspecified)"
     )
     return figure
 
 
 def drops(dropped: Mapping[str, Dropped]) -> Figure:
-    """Draw the drop test, a column per truth: the first 2.5 s, and by how much the displacement is off over 30 s."""
-    figure, grid = _columns(dropped, 9.0, "displacement minus\npredicted median [mm]")
+    """Draw the drop test, a column per truth: the displacement, and the errors of all outputs with the 90 % band."""
+    errors = [f"{channel}\nerror [{unit}]" for channel, (_, unit) in ERRORS.items()]
+    figure, grid = _columns(dropped, ["displacement [mm]", *errors])
+    colours = bp.plot.COLOURS
     for column, found in zip(grid.T, dropped.values(), strict=True):
-        time, band, colours = found.true.time, found.band, bp.plot.COLOURS
-        early = time <= SHORT
-        for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
-            true, low, median, high = (
-                scale * signals[channel][early] for signals in (found.true.outputs, band.low, band.median, band.high)
+        time, true, band = found.true.time, found.true.outputs, found.band
+        early, last = time <= SHORT, time.size - 1
+        at = np.unique(np.geomspace(np.searchsorted(time, EARLIEST), last, DROP_POINTS).astype(int))
+        time = time[at]
+        displacement = [1e3 * signals["displacement"][at] for signals in (true, band.median)]
+        column[0].plot(time, displacement[0], color=colours["measured"], lw=2.6, label="true")
+        column[0].plot(time, displacement[1], "--", color=colours["mcmc"], lw=1.4, label="posterior median")
+        for axes, (channel, (scale, _)) in zip(column[1:], ERRORS.items(), strict=True):
+            low, off, high = (
+                scale * (signals[channel] - band.median[channel])[at] for signals in (band.low, true, band.high)
             )
-            axes.plot(time[early], true, color=colours["measured"], lw=2.6, label="true")
-            axes.plot(time[early], median, "--", color=colours["mcmc"], lw=1.4, label="posterior median")
-            axes.fill_between(time[early], low, high, color=colours["mcmc"], alpha=0.3, lw=0, label="90 % band")
-            axes.tick_params(labelbottom=channel == "pressure")
-        column[2].set_xlabel("time [s]")
-        median = band.median["displacement"]
-        low, high = 1e3 * (band.low["displacement"] - median), 1e3 * (band.high["displacement"] - median)
-        column[3].fill_between(time, low, high, color=colours["mcmc"], alpha=0.3, lw=0)
-        column[3].plot(time, 1e3 * (found.true.outputs["displacement"] - median), color=colours["measured"], lw=1.2)
-        column[3].axhline(0.0, color=colours["mcmc"], ls="--", lw=1.0)
-        column[3].set_xlabel("time [s], until the gas has cooled")
+            axes.fill_between(time, low, high, color=colours["mcmc"], alpha=0.4, lw=0, label="90 % band")
+            axes.axhline(0.0, color=colours["mcmc"], ls="--", lw=1.4)
+            axes.plot(time, off, color=colours["measured"], lw=1.2)
+            inside = (true[channel] >= band.low[channel]) & (true[channel] <= band.high[channel])
+            shares = f"{100 * inside[early].mean():.0f} % of the first {SHORT:g} s, {100 * inside[~early].mean():.0f} %"
+            axes.set_title(f"within the band: {shares} later", fontsize=9, loc="right")
+        column[1].set_title("true − median", fontsize=9, loc="left")
+        column[-1].set(xscale="log", xlim=(time[0], time[-1]), xlabel="time after the release [s]")
+        column[-1].set_xticks([0.1, 0.3, 1, 3, 10, 30], ["0.1", "0.3", "1", "3", "10", "30"])
     shared_legend(figure, 3)
-    figure.suptitle(f"Drop test, predicted from the shaker's experiments, {TITLE}")
+    figure.suptitle(
+        f"Drop test predicted from periodic motions, {TITLE}\n"
+        "The band includes the uncertainty of the parameters, but not the errors of the model",
+        fontsize=11,
+    )
     return figure
+
+
+def corner(verdict: Verdict, truth: str) -> Figure:
+    """Draw the posterior of one experiment; the title says what it tells of the sign of theta16."""
+    one = verdict.identified
+    truths = {name: GEAR[name] for name in PRIORS}
+    figure = bp.plot.corner(one.posterior, laplace=one.fit, problem=one.problem, names=[*PRIORS], truths=truths)
+    name, model = one.problem.experiments[0].name.replace(" Hz ", " Hz, ±"), TRUTH_NAMES[truth].partition(":")[0]
+    adequate = "model misspecified" if verdict.misspecified else "model adequate"
+    return titled(figure, f"{name}, {model}: sign of theta16 {verdict.sign}, {adequate}")
 
 
 def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
@@ -155,7 +189,7 @@ def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
     grid[-1].set_xlabel("unit")
     shared_legend(figure, 2)
     figure.suptitle(
-        "Deviation from the reference gear, in common standard deviations [1], SYNTHETIC data\n"
+        "Deviation from the reference gear, in common standard deviations, SYNTHETIC data\n"
         f"(grey: ±{LIMIT:.2f}, a false alarm in {FALSE_ALARM:.0%} of good units)"
     )
     return figure

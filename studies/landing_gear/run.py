@@ -195,10 +195,7 @@ def _figures(runs: Sequence[Run], every: Mapping[str, OfTruth], quick: bool) -> 
     )
     for stroke, name in chosen.items():
         for truth, by_run in verdicts.items():
-            one = by_run[name].identified
-            truths = {parameter: GEAR[parameter] for parameter in PRIORS}
-            corner = bp.plot.corner(one.posterior, laplace=one.fit, names=list(PRIORS), truths=truths)
-            drawn[f"corner_{stroke}_{truth}"] = common.titled(corner, f"Landing gear, truth {truth}, {stroke} stroke")
+            drawn[f"corner_{stroke}_{truth}"] = landing_gear_figures.corner(by_run[name], truth)
     return drawn
 
 

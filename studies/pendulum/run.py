@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
+from bayesperiodic.plot.style import axis_label
 from studies import common
 from studies.pendulum import estimates as pendulum_estimates
 from studies.pendulum import orbits
@@ -312,7 +313,8 @@ def figures(
     }
     kind = f" ({SYNTHETIC})" * section.synthetic
     drawn["section"].suptitle(f"Unstable orbits found in the pendulum's chaotic motion{kind}", fontsize="medium")
-    drawn["orbits"].suptitle(f"Unstable orbits of the pendulum{kind}", x=0.01, ha="left", fontsize="medium")
+    drawn["orbits"].legends[0].set_title(f"Unstable orbits of the pendulum{kind}")
+    drawn["orbits"].legends[0].get_title().set_fontsize("medium")
     if table:
         drawn["eigenvalues"] = eigenvalues(table)
     return drawn
@@ -331,16 +333,15 @@ def marginals(ridge: Ridge, *, truth: bool) -> Figure:
     figure = plt.figure(figsize=(11.0, 5.4), layout="constrained")
     grid = figure.subplots(2, 5)
     for axes, name in zip(grid[0], pendulum_estimates.NATURAL, strict=True):
-        unit = bp.models.pendulum.units[name]
         _marginal(axes, ridge.posterior.draws(name), ridge.fit.theta[name], ridge.fit.sd[name], TRUTH[name], truth)
-        axes.set_xlabel(f"{name} [{unit}]")
+        axes.set_xlabel(axis_label(name, bp.models.pendulum.units[name]))
     draws = pendulum_estimates.combinations({name: ridge.posterior.draws(name) for name in pendulum_estimates.NATURAL})
     truths = pendulum_estimates.combinations(TRUTH)
     for axes, name in zip(grid[1], pendulum_estimates.DETERMINED, strict=False):
         value, sd = (float(ridge.combinations[column].loc[name]) for column in ("value", "laplace_sd"))
         _marginal(axes, draws[name], value, sd, truths[name], truth)
         text = name if name == "l" else f"{name} = k{name[1]}/(m l²)"
-        axes.set_xlabel(f"{text} [{pendulum_estimates.DETERMINED_UNITS[name]}]")
+        axes.set_xlabel(axis_label(text, pendulum_estimates.DETERMINED_UNITS[name]))
     handles, labels = grid[0, 0].get_legend_handles_labels()
     grid[1, 4].set_axis_off()
     grid[1, 4].legend(handles, labels, loc="center", frameon=False)
@@ -381,7 +382,7 @@ def eigenvalues(table: Mapping[str, Any]) -> Figure:
         top.set_title(f"noise {float(noise):.1%} of the attractor")
         bottom.set_xlabel("period [forcing periods]")
     above[0].set_ylabel("median error of the\nunstable eigenvalue [%]")
-    below[0].set_ylabel("candidates found [1]\n(filled: true orbits)")
+    below[0].set_ylabel("candidates found\n(filled: true orbits)")
     above[-1].legend(frameon=False)
     figure.suptitle(f"Local fits, chained, and the paper's boxes ({SYNTHETIC})")
     return figure

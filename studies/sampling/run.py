@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 from scipy import stats
 
 from studies import common
@@ -25,7 +24,7 @@ FALSE_ALARM = 0.01
 TRUTH, DRAWS, HISTOGRAM = "#000000", "#0072B2", "#56B4E9"
 SHOWN = 1500
 FARTHEST = 4.0
-NEUTRAL = "#BBBBBB"
+OTHERS, MARKERS = "#D55E00", "osD^"
 
 
 def run(options: argparse.Namespace) -> None:
@@ -162,7 +161,8 @@ def draw_ridge(runs: Mapping[str, Any]) -> Figure:
         some = np.linspace(0, draws["a"].size - 1, SHOWN).astype(int)
         curve = np.linspace(1.0 / FARTHEST, FARTHEST, 400)
         top.plot(curve, 1.0 / curve, color="0.6", lw=6.0, alpha=0.5, label="a·b = 1", zorder=1)
-        top.plot(draws["a"][some], draws["b"][some], ".", color=DRAWS, ms=2.5, label=f"{SHOWN} of the draws")
+        label = f"{SHOWN} of the draws"
+        top.plot(draws["a"][some], draws["b"][some], ".", color=DRAWS, ms=2.5, label=label, rasterized=True)
         length = f"{run.length:.0f} tau long" + ("" if run.length >= efficiency.LONG else ", too short")
         top.set_title(f"{title}:\n{run.calls} evaluations, {length}", fontsize=11)
         bins = np.linspace(0.0, FARTHEST, 81)
@@ -170,40 +170,42 @@ def draw_ridge(runs: Mapping[str, Any]) -> Figure:
         bottom.plot(a[inside], density[inside], color=TRUTH, lw=1.4, label="by quadrature")
         spread = f"sd(a) of the draws {draws['a'].std():.3f}\nby quadrature {truth:.3f}"
         bottom.text(0.97, 0.55, spread, transform=bottom.transAxes, ha="right", va="top")
-        bottom.set_xlabel("a [1]")
+        bottom.set_xlabel("a")
         for axes in (top, bottom):
             axes.legend(frameon=False, loc="upper right", markerscale=3)
-    above[0].set(xlim=(0.0, FARTHEST), ylim=(0.0, FARTHEST), ylabel="b [1]")
-    below[0].set_ylabel("density of a [1]")
+    above[0].set(xlim=(0.0, FARTHEST), ylim=(0.0, FARTHEST), ylabel="b")
+    below[0].set_ylabel("density of a")
     figure.suptitle("The ridge a·b = 1 ± 2 %, priors N(1, 1) cut at zero")
     return figure
 
 
 def draw_samplers(found: Mapping[str, Any]) -> Figure:
-    """Draw effective samples per evaluation and per second, sorted by the medians of the former over the cases."""
-    figure = plt.figure(figsize=(10.0, 6.0), layout="constrained")
-    grid = figure.subplots(2, len(found), squeeze=False, sharey=True, sharex="row")
+    """Draw effective samples per evaluation and per second, a row per sampler and a marker per posterior."""
+    figure = plt.figure(figsize=(10.0, 4.6), layout="constrained")
     of = {name: [e["samplers"].get(name) for e in found.values()] for name in efficiency.CONTENDERS}
-    medians = {
-        name: np.median([e["ess_per_1000"] for e in entries if e]) for name, entries in of.items() if any(entries)
-    }
+    medians = {name: np.median([e["ess_per_1000"] for e in own if e]) for name, own in of.items() if any(own)}
     order = sorted(medians, key=medians.__getitem__)
     units = {"ess_per_1000": "per 1000 evaluations", "ess_per_second": "per second"}
-    for line, (key, unit) in zip(grid, units.items(), strict=True):
-        for column, (axes, case) in enumerate(zip(line, found, strict=True)):
-            for at, name in enumerate(order):
-                entry = of[name][column]
-                if entry is None:
-                    continue
-                colour = NEUTRAL if entry["length"] < efficiency.LONG else DRAWS if name in OURS else HISTOGRAM
-                bar = axes.barh(at, entry[key], color=colour, edgecolor="black", lw=0.6)
-                axes.bar_label(bar, [f"{entry[key]:.2g}" if entry[key] < 10 else f"{entry[key]:.0f}"], padding=2)
-            axes.set(xscale="log", xlabel=unit, yticks=range(len(order)), yticklabels=order)
-            axes.set_title(case if key == "ess_per_1000" else "", fontsize=11)
-        values = [entry[key] for entries in of.values() for entry in entries if entry]
-        line[0].set_xlim(0.4 * min(values), 25.0 * max(values))
-    kinds = {"this package": DRAWS, "other packages": HISTOGRAM, f"shorter than {efficiency.LONG:.0f} tau": NEUTRAL}
-    handles = [Patch(facecolor=colour, edgecolor="black", label=kind) for kind, colour in kinds.items()]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
-    figure.suptitle("Effective samples of the slowest quantity", fontsize=11)
+    for axes, (key, unit) in zip(figure.subplots(1, 2, sharey=True), units.items(), strict=True):
+        for at, name in enumerate(order):
+            colour = DRAWS if name in OURS else OTHERS
+            for entry, marker in zip(of[name], MARKERS, strict=False):
+                if entry is not None:
+                    face = "white" if entry["length"] < efficiency.LONG else colour
+                    axes.plot(entry[key], at, marker, color=colour, mfc=face, ms=7.5, mew=1.4)
+        theirs = [own for name, own in of.items() if name not in OURS and all(own)]
+        gains = [e[key] / max(own[k][key] for own in theirs) for k, e in enumerate(of[OURS[0]])] if theirs else []
+        if gains:
+            axes.set_title(f"bp.sample: {min(gains):.2g} to {max(gains):.2g} times the best other package", fontsize=10)
+        axes.set(xscale="log", xlabel=f"effective samples {unit}", yticks=range(len(order)), yticklabels=order)
+        axes.grid(color="0.9", zorder=0)
+        axes.set_axisbelow(True)
+    looks: list[dict[str, Any]] = [
+        {"marker": m, "color": "0.4", "label": c} for c, m in zip(found, MARKERS, strict=False)
+    ]
+    looks += [{"marker": "s", "color": c, "label": k} for k, c in (("this package", DRAWS), ("others", OTHERS))]
+    looks += [{"marker": "o", "color": "0.4", "mfc": "white", "label": f"shorter than {efficiency.LONG:.0f} tau"}]
+    handles = [plt.Line2D([], [], ls="", ms=7, **look) for look in looks]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, handletextpad=0.2)
+    figure.suptitle("Effective samples of the slowest quantity, by sampler and posterior", fontsize=11)
     return figure

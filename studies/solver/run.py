@@ -372,10 +372,10 @@ def draw_orders(forced: dict[str, Any], periods: dict[str, Any]) -> Figure:
     for (mu, marker), scheme in product(SHOWN.items(), ("central4", "fourier")):
         draw(right, periods[str(mu)][scheme], "relative_errors", scheme, marker, f"{scheme}, mu = {mu:g}")
     for axes in (left, right):
-        axes.set_xlabel("points per period n [1]")
+        axes.set_xlabel("points per period n")
         axes.legend(frameon=False, fontsize=9)
-    left.set(ylabel="largest error / largest displacement [1]", title="Duffing, smooth forcing: displacement")
-    right.set(ylabel="relative error of the period [1]", title="van der Pol: period of the free oscillation")
+    left.set(ylabel="largest error / largest displacement", title="Duffing, smooth forcing: displacement")
+    right.set(ylabel="relative error of the period", title="van der Pol: period of the free oscillation")
     right.set_ylim(top=1.0)
     return figure
 

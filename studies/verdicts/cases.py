@@ -99,13 +99,13 @@ def _one_run(
 STIFFNESS = bp.Normal(8e3, 4e3)
 
 
-def product_ridge() -> Case:
-    """Return a·b, measured to 1 %, of two factors known to a factor of two."""
+def product_ridge(noise: float = 4.0) -> Case:
+    """Return a·b, measured to 1 % (noise 4 N), of two factors known to a factor of two."""
     return _one_run(
         "only the product of a and b is identifiable", "a", PRODUCT, {"a": 1.0, "b": 1e4},
         {"a": bp.LogNormal(1.0, 0.7), "b": bp.LogNormal(1e4, 0.7)},
         _expected(identifiability={"a": COMBINATION, "b": COMBINATION}, compare={"a": SHAPE, "b": SHAPE}),
-        {IDENTIFIABILITY: ("a", "b")}, noise=4.0,
+        {IDENTIFIABILITY: ("a", "b")}, noise=noise,
     )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
+from bayesperiodic.plot.style import axis_label
 from studies import common
 from studies.verdicts import cases
 from studies.verdicts.cases import CASES, COMPARE, FINE, IDENTIFIABILITY, PREDICT, Outcome, examine
@@ -166,8 +167,7 @@ def _marginal(axes: Axes, outcome: Outcome) -> None:
     axes.set_yticks([])
     axes.locator_params(axis="x", nbins=5, steps=[1, 2, 5, 10])
     axes.spines[["left", "right", "top"]].set_visible(False)
-    unit = outcome.problem.model.units.get(name, "1")
-    axes.set_xlabel(name if unit == "1" else f"{name} [{unit}]")
+    axes.set_xlabel(axis_label(name, outcome.problem.model.units.get(name, "")))
 
 
 def _words(axes: Axes, outcome: Outcome) -> None:
