@@ -1,6 +1,7 @@
 """Configuration of Sphinx: pages from the docstrings, the notebooks and the texts in this folder."""
 
 import importlib.metadata
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -62,8 +63,11 @@ def typeset(app: Any, what: str, name: str, value: Any, options: Any, lines: lis
 def formula(writer: Any, node: nodes.Element) -> None:
     """Write a formula as MathML, which browsers show without scripts and without the network."""
     block = isinstance(node, nodes.math_block)
-    markup = tex2mathml(node.astext(), as_block=block)
-    writer.body.append(f'<div class="math" style="overflow-x: auto">{markup}</div>' if block else markup)
+    text = re.sub(r"\\ln(?=\s)", r"\\ln\,", node.astext())  # the converter leaves no space after names of functions
+    markup = tex2mathml(text, as_block=block)
+    writer.body.append(
+        f'<div class="math" style="overflow: auto hidden; padding: 0.2em 0">{markup}</div>' if block else markup
+    )
     raise nodes.SkipNode
 
 
