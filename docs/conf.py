@@ -63,7 +63,8 @@ def typeset(app: Any, what: str, name: str, value: Any, options: Any, lines: lis
 def formula(writer: Any, node: nodes.Element) -> None:
     """Write a formula as MathML, which browsers show without scripts and without the network."""
     block = isinstance(node, nodes.math_block)
-    text = re.sub(r"\\ln(?=\s)", r"\\ln\,", node.astext())  # the converter leaves no space after names of functions
+    # The converter leaves no space after names of functions, and sets the index of a letter with an accent below it.
+    text = re.sub(r"\\ln(?=\s)", r"\\ln\,", node.astext()).replace(r"\hat{y}_", r"\hat{y}{}_")
     markup = tex2mathml(text, as_block=block)
     writer.body.append(
         f'<div class="math" style="overflow: auto hidden; padding: 0.2em 0">{markup}</div>' if block else markup
