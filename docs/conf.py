@@ -1,11 +1,14 @@
 """Configuration of Sphinx: pages from the docstrings, the notebooks and the texts in this folder."""
 
 import importlib.metadata
+import re
 import shutil
 import sys
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 from numpydoc.xref import DEFAULT_LINKS
 
 import bayesperiodic as bp
@@ -21,7 +24,7 @@ sys.modules["bayesperiodic.noise"] = bp.noise
 project, author = "bayesperiodic", "the bayesperiodic authors"
 release = importlib.metadata.version("bayesperiodic")
 
-extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.mathjax", "myst_nb", "numpydoc"]
+extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "myst_nb", "numpydoc"]
 templates_path, exclude_patterns = ["_templates"], ["_build"]
 default_role, nitpicky, add_module_names, smartquotes = "autolink", True, False, False
 
@@ -31,6 +34,7 @@ myst_enable_extensions, myst_heading_anchors = ["dollarmath"], 3
 
 html_theme, html_title = "furo", f"bayesperiodic {release}"
 html_show_sourcelink = html_copy_source = False
+html_math_renderer = "mathml"
 # On file systems without case these names equal those of classes.
 autosummary_filename_map = {f"bayesperiodic.{n}": f"bayesperiodic.{n}_function" for n in ("profile", "structure")}
 
@@ -56,6 +60,19 @@ def typeset(app: Any, what: str, name: str, value: Any, options: Any, lines: lis
     lines[below:below] = [*equations, *units]
 
 
+def formula(writer: Any, node: nodes.Element) -> None:
+    """Write a formula as MathML, which browsers show without scripts and without the network."""
+    block = isinstance(node, nodes.math_block)
+    # The converter leaves no space after names of functions, and sets the index of a letter with an accent below it.
+    text = re.sub(r"\\ln(?=\s)", r"\\ln\,", node.astext()).replace(r"\hat{y}_", r"\hat{y}{}_")
+    markup = tex2mathml(text, as_block=block)
+    writer.body.append(
+        f'<div class="math" style="overflow: auto hidden; padding: 0.2em 0">{markup}</div>' if block else markup
+    )
+    raise nodes.SkipNode
+
+
 def setup(app: Any) -> None:
-    """Connect the function above to Sphinx."""
+    """Connect the functions above to Sphinx."""
     app.connect("autodoc-process-docstring", typeset)
+    app.add_html_math_renderer("mathml", (formula, None), (formula, None))

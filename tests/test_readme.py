@@ -159,7 +159,11 @@ def test_site_builds_without_warnings_and_broken_links(tmp_path):
     done = subprocess.run(command, cwd=tmp_path / "clone", capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     site = tmp_path / "clone" / "site"
-    pages = {file: Links(file.read_text("utf-8")) for file in site.rglob("*.html")}
+    texts = {file: file.read_text("utf-8") for file in site.rglob("*.html")}
+    loaded = re.compile(r'<(?:script|img|link(?! rel="canonical"))[^>]*(?:src|href)="https?:')
+    assert [file for file, text in texts.items() if loaded.search(text)] == []
+    assert "<math" in texts[site / "explanation" / "method.html"]
+    pages = {file: Links(text) for file, text in texts.items()}
     assert len(pages) > 100
     broken = []
     for page, found in pages.items():

@@ -22,8 +22,8 @@ MISSING = [
     "", "nan", "NaN", "NAN", "-nan", "-NaN", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None", "1.#IND",
     "-1.#IND", "1.#QNAN", "-1.#QNAN",
 ]  # fmt: skip
-# Lines among which the header is searched for.
-PREAMBLE = 1000
+# Lines among which the header is searched for, and separators of fields, in the order in which they are tried.
+PREAMBLE, SEPARATORS = 1000, (",", ";", "\t")
 
 # Bytes of an array, against files that unpack to more than the memory.
 LARGEST = 2**31
@@ -59,9 +59,10 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
     columns, file = [*columns], existing(path)
     _refuse_zeros(file)
     try:
-        names, lines, more = _header(file, columns)
+        names, lines, more, separator = _header(file, columns)
+        places = {column: _place(path, names, column) for column in columns}
         with file.open(encoding="utf-8-sig", newline="") as text, warnings.catch_warnings():
-            _skip(text, lines)
+            _skip(text, lines, separator)
             warnings.simplefilter("error", pd.errors.ParserWarning)
             # More columns than names hold the fields after trailing commas.
             # The only column of a file may have empty cells, which are empty lines, but not at the end.
@@ -70,6 +71,7 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
             table = pd.read_csv(
                 io.StringIO(text.read().rstrip()) if alone else text,
                 skip_blank_lines=not alone,
+                sep=separator,
                 header=None,
                 names=range(len(names) + surplus),
                 index_col=False,
@@ -79,17 +81,17 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
                 na_values=missing,
             )
     except (pd.errors.ParserError, pd.errors.ParserWarning) as error:
-        _check_fields(file, names, lines)
+        _check_fields(file, names, lines, separator)
         raise ValueError(f"path: must be a CSV file with a header line, got {str(path)!r} ({error}).") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"path: must be a CSV file with a header line, got {str(path)!r} ({error}).") from None
     if table.empty:
         raise ValueError(f"path: must be a CSV file with rows of data, got {str(path)!r}, which has none.")
     if table.iloc[:, len(names) :].notna().any(axis=None) or table[len(names) - 1].isna().any():
-        _check_fields(file, names, lines)
+        _check_fields(file, names, lines, separator)
     result = {}
-    for column in columns:
-        values = table[_place(path, names, column)]
+    for column, place in places.items():
+        values = table[place]
         if column == label:
             result[column] = values.to_numpy()
             continue
@@ -113,10 +115,29 @@ def _refuse_zeros(file: Path) -> None:
             )
 
 
-def _header(file: Path, columns: list[str]) -> tuple[list[str], int, int]:
-    """Return the names of the columns of a CSV file, the number of lines up to there, and of fields that follow."""
+def _header(file: Path, columns: list[str]) -> tuple[list[str], int, int, str]:
+    """Return the names of the columns of a CSV file and three facts: lines up to there, surplus fields, separator.
+
+    The separator is the first one for which a line contains all columns, or else that with most of them.
+    """
+    found: list[tuple[list[str], int, int, str]] = []
+    for separator in SEPARATORS:
+        found.append((*_line_of_names(file, columns, separator), separator))
+        if {*columns} <= {*found[-1][0]}:
+            return found[-1]
+    best = max(found, key=lambda header: len({*columns} & {*header[0]}))
+    if _is_no_header(best[0]):
+        raise ValueError(
+            "path: must be a CSV file whose first line names the columns, separated by commas, semicolons or tabs, got "
+            f"{str(file)!r}, whose first line is read as {best[0]}. Numbers must have a decimal point."
+        )
+    return best
+
+
+def _line_of_names(file: Path, columns: list[str], separator: str) -> tuple[list[str], int, int]:
+    """Return the names in the line with most columns, the number of lines up to there, and of fields that follow."""
     with file.open(encoding="utf-8-sig", newline="") as lines:
-        rows = csv.reader(lines, skipinitialspace=True)
+        rows = csv.reader(lines, delimiter=separator, skipinitialspace=True)
         found = [([name.strip() for name in row], rows.line_num) for row in itertools.islice(rows, PREAMBLE) if row]
     if not found:
         raise ValueError(f"path: must be a CSV file with a header line, got {str(file)!r}, which is empty.")
@@ -124,20 +145,14 @@ def _header(file: Path, columns: list[str]) -> tuple[list[str], int, int]:
     place = max(range(len(found)), key=lambda i: len({*columns} & {*found[i][0]}))
     names, number = found[place]
     names = names[: max((i for i, name in enumerate(names, 1) if name), default=len(names))]  # no trailing commas
-    if not {*columns} <= {*names} and _is_no_header(names):
-        raise ValueError(
-            f"path: must be a CSV file whose first line names the columns, separated by commas, got {str(file)!r}, "
-            f"whose first line is read as {names}. Numbers must have a decimal point."
-        )
     return names, number, max((len(row) - len(names) for row, _ in found[place + 1 : place + 2]), default=0)
 
 
-def _check_fields(file: Path, names: list[str], lines: int) -> None:
+def _check_fields(file: Path, names: list[str], lines: int, separator: str) -> None:
     """Raise a ValueError unless each row has one field per name, and equally many empty ones after them."""
     with file.open(encoding="utf-8-sig", newline="") as text:
-        _skip(text, lines)
-        fields = None
-        data = (row for row in csv.reader(text, skipinitialspace=True) if any(field.strip() for field in row))
+        fields, rows = None, _skip(text, lines, separator)
+        data = (row for row in rows if any(field.strip() for field in row))
         for number, row in enumerate(data, 1):
             fields = fields or len(row)
             if len(row) < len(names) or len(row) != fields or any(field.strip() for field in row[len(names) :]):
@@ -147,11 +162,12 @@ def _check_fields(file: Path, names: list[str], lines: int) -> None:
                 )
 
 
-def _skip(text: TextIO, lines: int) -> None:
-    """Read a file up to the end of its header."""
-    rows = csv.reader(text, skipinitialspace=True)
+def _skip(text: TextIO, lines: int, separator: str) -> Iterator[list[str]]:
+    """Read a file up to the end of its header, and return an iterator over the rows that follow."""
+    rows = csv.reader(text, delimiter=separator, skipinitialspace=True)
     while rows.line_num < lines:
         next(rows)
+    return rows
 
 
 def _place(path: str | Path, names: list[str], column: str) -> int:

@@ -130,14 +130,14 @@ class BranchPrediction(Result):
 
     def __repr__(self) -> str:
         unit = self.units.get(self.vary, "")
-        folds = "".join(
-            f"\n  fold at {f['median']:.6g} {unit} (90 %: {f['low']:.6g} to {f['high']:.6g}) in {f['draws']:.0f} draws"
-            for _, f in self.folds.iterrows()
-        )
+        folds = self.folds[["median", "low", "high", "draws"]].astype(float)
+        table = folds.set_axis([f"fold at [{unit or '-'}]", "5 %", "95 %", "draws"], axis=1)
         span = f"{self.curves['value'].min():.6g} to {self.curves['value'].max():.6g} {unit}"
         return (
-            f"Branches of {self.experiment!r}, {self.vary} {span}, from {self.draws} draws, {self.failed} without an "
-            f"orbit at the start, {self.incomplete} that end before{folds}"
+            f"Branches of {self.experiment!r}, {self.vary} {span}"
+            + (f"\n{table.to_string(float_format='{:.6g}'.format, index=False)}" if len(folds) else "\nNo folds.")
+            + f"\nOf {self.draws} draws, {self.failed} have no orbit at the start, and {self.incomplete} branches end "
+            "before the last value."
         )
 
 

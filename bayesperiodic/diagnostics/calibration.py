@@ -172,12 +172,13 @@ class Calibration(Result):
 
     def __repr__(self) -> str:
         failed = ", ".join(f"{kind} {count}" for kind, count in self.failures.items()) or "none"
-        head = (
-            f"Calibration over {self.replicates} synthetic campaigns (failed: {failed}; ranks among {self.draws:.0f} "
-            f"independent draws, R-hat at most {self.rhat:.3f}; stop rule of sample passed by {self.stop_rule}, failed "
-            f"solves {self.failed_solves:.2%})"
+        return (
+            f"Calibration over {self.replicates} synthetic campaigns\n"
+            f"{self.table.to_string(float_format='{:.3g}'.format, index=False)}\n"
+            f"Failed campaigns: {failed}. The ranks are among {self.draws:.0f} independent draws, with R-hat at most "
+            f"{self.rhat:.3f}.\n"
+            f"The stop rule of sample was passed by {self.stop_rule}; {self.failed_solves:.2%} of the solves failed."
         )
-        return f"{head}\n{self.table.to_string(float_format='{:.3g}'.format, index=False)}"
 
 
 @in_one_thread

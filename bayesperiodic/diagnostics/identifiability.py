@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -128,6 +129,8 @@ MONTE_CARLO_ERRORS = 3.0
 UNINFORMED_GAIN = 1e-13
 PRIOR_DRAWS = 20_000
 BOTH_SIGNS = "both signs fit the data: use a prior of one sign, or measure an output that is odd in it"
+# Columns of the printed table, by their titles.
+PRINTED = {"data sd": "together", "others known": "alone", "prior sensitivity": "prior_sensitivity"}
 OTHER_VALUES = "give a prior that excludes the other value, or measure an output that differs between them"
 
 
@@ -146,7 +149,8 @@ class Identifiability(Result):
         NaN for positive parameters. ``other_values``: values at other optima, or at images under discrete symmetries,
         with more than 1 % of the mass, see `MapEstimate.modes`, if they are further away than a standard deviation.
         ``prior_sensitivity`` and ``likelihood_sensitivity``: distance per doubling of the prior or the likelihood
-        (power-scaling). ``evidence`` and ``remedy``: summary and recommendation.
+        (power-scaling). ``evidence``, the ``remarks`` in it that are not numbers, and ``remedy``: summary and
+        recommendation.
     directions : DataFrame
         One row per direction in parameter space, in ascending order of information: information of the data over that
         of the prior, contraction, the direction in words, its parameters, and combinations invariant along it.
@@ -187,10 +191,23 @@ class Identifiability(Result):
         return dict(self.table["verdict"])
 
     def __repr__(self) -> str:
-        lines = ["Identifiability of the parameters"]
-        for name, row in self.table.iterrows():
-            lines.append(f"{name}: {row['verdict']}; {row['evidence']}.")
-            lines += [f"    Recommendation: {row['remedy']}."] if row["remedy"] else []
+        table = self.table
+        columns: dict[str, Any] = {"verdict": table["verdict"]}
+        for name, column in {"contraction": "contraction", "P(negative)": "p_negative"}.items():
+            values = zip(table[column], table[f"{column}_mcse"], strict=True)
+            columns[name] = [f"{v:.3f}" + (f" ± {error:.3f}" if error else "") for v, error in values]
+        columns |= {title: table[column].map("{:.2g}".format) for title, column in PRINTED.items()}
+        columns["profile"] = table["profile"]
+        shown = pd.DataFrame(columns, index=table.index).replace({"nan": "", "nan ± nan": ""})
+        shown = shown.loc[:, (shown != "").any()].replace("", "-")
+        lines = ["Identifiability of the parameters (data sd: left by the data alone, in prior sds)", shown.to_string()]
+        known = [name for name, verdict in self.verdicts.items() if verdict == DETERMINED]
+        names = " and ".join(filter(None, [", ".join(known[:-1]), *known[-1:]]))
+        lines += [f"The data determine {names or 'no parameter'}."]
+        for (verdict, remarks, remedy), own in table.groupby(["verdict", "remarks", "remedy"], sort=False):
+            if verdict != DETERMINED or remarks or remedy:
+                advice = f" Recommendation: {remedy}." if remedy else ""
+                lines.append(f"{', '.join(own.index)}: {verdict}{remarks and f', {remarks}'}.{advice}")
         lines.append(f"The condition number of the Fisher information is {self.condition:.3g}.")
         lines.append(self.basis)
         lines += [] if self.converged else ["The draws have NOT CONVERGED; these results are provisional."]
@@ -286,12 +303,14 @@ def identifiability(
         conflict, size_known = name in fit.prior_conflict.members, signed and _size_known(problem, fit, posterior, name)
         row["verdict"] = CONFLICT if conflict else _verdict(row, size_known, within)
         both = row["verdict"] == SIGN and abs(fit.theta[name]) > 2.0 * fit.sd[name]
-        row["evidence"] = (_against_the_prior(fit, row) + ", " if conflict else "") + _evidence(row)
+        remarks = ([_against_the_prior(fit, row)] if conflict else []) + _remarks(row)
         row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments, structure)
         if advice := orbit_advice(fit):
             row["verdict"] = NOTHING if row["verdict"] == DETERMINED else row["verdict"]
-            row["evidence"] += f", at another orbit than the measured one in {', '.join(map(repr, fit.other_orbits))}"
+            remarks.append(f"at another orbit than the measured one in {', '.join(map(repr, fit.other_orbits))}")
             row["remedy"] = advice
+        row["remarks"] = ", ".join(remarks)
+        row["evidence"] = ", ".join([*_numbers(row), *remarks])
     return Identifiability(
         pd.DataFrame.from_dict(rows, orient="index"),
         directions,
@@ -432,26 +451,30 @@ def _against_the_prior(fit: MapEstimate, row: dict) -> str:
     )
 
 
-def _evidence(row: dict) -> str:
-    text = f"contraction {row['contraction']:.3g}"
-    text += f" ± {row['contraction_mcse']:.2g}" if row["contraction_mcse"] else ""
+def _numbers(row: dict) -> list[str]:
+    """Return the numbers behind a verdict, in words."""
+    error = f" ± {row['contraction_mcse']:.2g}" if row["contraction_mcse"] else ""
+    found = [f"contraction {row['contraction']:.3g}{error}"]
     if row["collinearity"] >= COLLINEAR:
         factor = "infinitely" if not row["collinearity"] < 1e6 else f"{row['collinearity']:.3g} times"
-        text += f", the other parameters widen it {factor}"
-    if row["structural"]:
-        text += ", by a structural symmetry"
+        found.append(f"the other parameters widen it {factor}")
     if row["alone"] > DETERMINED_SD and row["profile"] != ONE_SIDED:
-        text += f", the data alone would leave {row['alone']:.3g} prior sds with all other parameters known"
+        found.append(f"the data alone would leave {row['alone']:.3g} prior sds with all other parameters known")
     if row["profile"] and row["profile"] != "closed":
-        text += f", profile {row['profile']}"
-    if row["other_values"]:
-        text += f", {row['other_values']} at another optimum with more than 1 % of the mass"
+        found.append(f"profile {row['profile']}")
     if np.isfinite(row["p_negative"]):
-        text += f", P(negative) = {row['p_negative']:.3g}"
-        text += f" ± {row['p_negative_mcse']:.2g}" if row["p_negative_mcse"] else ""
+        error = f" ± {row['p_negative_mcse']:.2g}" if row["p_negative_mcse"] else ""
+        found.append(f"P(negative) = {row['p_negative']:.3g}{error}")
     if np.isfinite(row["prior_sensitivity"]) and row["prior_sensitivity"] > NOTICEABLE:
-        text += f", sensitive to the prior ({row['prior_sensitivity']:.2g} per doubling)"
-    return text
+        found.append(f"sensitive to the prior ({row['prior_sensitivity']:.2g} per doubling)")
+    return found
+
+
+def _remarks(row: dict) -> list[str]:
+    """Return the causes of a verdict that are not numbers."""
+    found = ["by a structural symmetry"] if row["structural"] else []
+    others = row["other_values"]
+    return found + ([f"{others} at another optimum with more than 1 % of the mass"] if others else [])
 
 
 def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame, structure: Structure) -> str:

@@ -435,30 +435,35 @@ class MapEstimate(Result):
         status = self.status if self.converged else f"NOT CONVERGED: {self.status}; try another start, or starts=8"
         if self.without_noise:
             status = f"{self.status}; {', '.join(self.without_noise)} without noise"
-        lines = [f"MapEstimate ({status}), estimate ± Laplace sd (robust sd):"]
-        lines += [
-            f"  {name:12s} {value:12.6g} ± {self.sd[name]:.3g} ({self.robust_sd[name]:.3g})"
+        rows = {
+            name: (f"{value:.6g}", f"{self.sd[name]:.3g}", f"{self.robust_sd[name]:.3g}")
             for name, value in self.theta.items()
-        ]
-        lines += [f"  {name} = {value:.4g}" for name, value in self.noise.items()]
-        lines[-1] += f" ({self.noise_prior})" if self.noise else ""
+        } | {name: (f"{value:.4g}", "-", "-") for name, value in self.noise.items()}
+        estimates = pd.DataFrame.from_dict(rows, orient="index", columns=["estimate", "Laplace sd", "robust sd"])
+        channels = {}
         for channel, rms in self.rms.items():
-            line = f"  rms of {channel}: {rms:.4g}, unexplained variance {self.fvu[channel]:.2%}"
-            if channel in self.noise_split and np.isfinite(self.noise_split[channel].measurement):
-                split = self.noise_split[channel]
-                line += f", measurement noise {split.measurement:.3g}, model error {split.model:.3g}"
-            if np.isfinite(self.whiteness[channel].p):
-                line += f", whiteness p = {self.whiteness[channel].p:.2g}"
-            lines.append(line)
+            split = self.noise_split.get(channel, NoiseSplit(np.nan, np.nan, np.nan))
+            known, p = np.isfinite(split.measurement), self.whiteness[channel].p
+            channels[channel] = {
+                "rms": f"{rms:.4g}",
+                "unexplained variance": f"{self.fvu[channel]:.2%}",
+                "measurement noise": f"{split.measurement:.3g}" if known else "-",
+                "model error": f"{split.model:.3g}" if known else "-",
+                "whiteness p": f"{p:.2g}" if np.isfinite(p) else "-",
+            }
+        residuals = pd.DataFrame.from_dict(channels, orient="index")
+        lines = [f"MapEstimate ({status})", estimates.to_string(), "Residuals", residuals.to_string()]
+        lines += [f"The noise has the {self.noise_prior}."] if self.noise else []
         if self.input_errors:
             caused = ", ".join(f"{sd:.3g} in {channel}" for channel, sd in self.input_noise.items())
-            lines.append(f"  noise of the inputs, included in the covariance, causes {caused}")
+            lines.append(f"The noise of the inputs, included in the covariance, causes {caused}.")
         lines += [
-            f"  other orbit than the recorded one in {name!r}: {text}" for name, text in self.other_orbits.items()
+            f"The orbit is another one than the recorded one in {name!r}: {text}."
+            for name, text in self.other_orbits.items()
         ]
-        lines += [f"  {self.prior_conflict.text}"] if self.prior_conflict.text else []
-        lines += [f"  not determined by the data: {text}" for text in self.undetermined]
-        lines += [f"  another optimum: {mode!r}" for mode in notable(self.other_modes)]
+        lines += [f"{self.prior_conflict.text}."] if self.prior_conflict.text else []
+        lines += [f"Not determined by the data: {text}." for text in self.undetermined]
+        lines += [f"Another optimum: {mode!r}." for mode in notable(self.other_modes)]
         return "\n".join(lines)
 
 

@@ -9,7 +9,7 @@ each orbit on its own branch.
 References
 ----------
 .. [1] H. G. Bock, Recent advances in parameter identification techniques for ordinary differential equations, in:
-   Numerical Treatment of Inverse Descriptions in Differential and Integral Equations, Birkhäuser, 1983, 95-121.
+   Numerical Treatment of Inverse Problems in Differential and Integral Equations, Birkhäuser, 1983, 95-121.
 """
 
 from __future__ import annotations

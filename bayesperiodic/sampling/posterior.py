@@ -335,12 +335,16 @@ class Posterior(Result):
         return MultivariateNormal(draws.mean(axis=1), np.cov(draws).reshape(len(key), len(key)))
 
     def __repr__(self) -> str:
-        state = "converged" if self.converged else "NOT CONVERGED"
-        failed = ", ".join(f"{status} {share:.2%}" for status, share in self.failures.items())
-        solves = f"; failed solves of {self.log_posterior_calls} proposals: {failed or 'none'}"
+        failed = ", ".join(f"{share:.2%} {status}" for status, share in self.failures.items())
         tables = [self.summary(), self.modes]
-        text = "\n".join(t.to_string(float_format="{:.5g}".format) for t in tables if not t.empty)
-        return f"Posterior ({state}: {self.reason}{solves})\n{text}"
+        return "\n".join(
+            [
+                f"Posterior ({'converged' if self.converged else 'NOT CONVERGED'})",
+                *(t.to_string(float_format="{:.5g}".format) for t in tables if not t.empty),
+                f"Sampling ended: {self.reason}.",
+                f"Failed solves of {self.log_posterior_calls} proposals: {failed or 'none'}.",
+            ]
+        )
 
 
 def _described(draws: np.ndarray, ess: float) -> dict[str, float]:

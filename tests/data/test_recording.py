@@ -82,12 +82,28 @@ def test_error_for_other_files_names_the_right_reader(csv, tmp_path):
         bp.Recording.from_npz(tmp_path / "force.npy", sampling_rate=50.0, outputs={"force": "force"})
 
 
-@pytest.mark.parametrize("text", ["t;x;F\n0,5;1,5;2,5\n1,0;1,0;2,0\n", "t\tx\n0\t1\n1\t2\n", "0.0,1.5\n0.1,2.5\n"])
-def test_error_for_csv_without_commas_or_header_states_the_expected_format(tmp_path, text):
+@pytest.mark.parametrize("text", ["0.0,1.5\n0.1,2.5\n", "0.0;1.5\n0.1;2.5\n", "0.0\t1.5\n0.1\t2.5\n"])
+def test_error_for_csv_without_header_states_the_expected_format(tmp_path, text):
     (tmp_path / "run.csv").write_text(text)
-    with pytest.raises(
-        ValueError, match=r"whose first line names the columns, separated by commas, got .* first line is read as"
-    ):
+    with pytest.raises(ValueError, match=r"separated by commas, semicolons or tabs, got .* first line is read as"):
+        bp.Recording.from_csv(tmp_path / "run.csv", time="t", outputs={"x": "x"})
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_fields_are_separated_by_commas_semicolons_or_tabs(tmp_path, separator):
+    """A title with commas above the header, a text with the other separators in it, an empty cell, a surplus column."""
+    rows = ["t [s]{}x [mm]{}note", "0.0{}1.5{}'a; b'", "0.1{}{}c", "0.2{}2.5{}d"]
+    lines = ["Test 14, J. Doe, 11 March", *(row.format(separator, separator).replace("'", '"') for row in rows)]
+    (tmp_path / "run.csv").write_text("\n".join(lines))
+    run = bp.Recording.from_csv(
+        tmp_path / "run.csv", time="t [s]", outputs={"x": "x [mm]"}, units={"x": ("mm", "m")}, missing="drop"
+    )
+    assert run.time.tolist() == [0.0, 0.2] and run.outputs["x"] == pytest.approx([0.0015, 0.0025])
+
+
+def test_decimal_commas_are_refused(tmp_path):
+    (tmp_path / "run.csv").write_text("t;x;F\n0,5;1,5;2,5\n1,0;1,0;2,0\n")
+    with pytest.raises(ValueError, match="must contain numbers, with a decimal point, got '0,5' in data row 1"):
         bp.Recording.from_csv(tmp_path / "run.csv", time="t", outputs={"x": "x"})
 
 

@@ -56,7 +56,7 @@ def test_folds_of_a_hardening_spring():
     assert by_part["value"].agg(["min", "max"]).to_numpy() == pytest.approx(
         np.array([[0.1, 0.3034], [0.2421, 0.3034], [0.2421, 0.4]]), abs=1e-4
     )
-    assert "fold at 0.303382 Hz" in repr(found)
+    assert "fold at [Hz]" in repr(found) and "0.303382" in repr(found)
     axes = bp.plot.branch(found).axes[0]
     assert {line.get_linestyle() for line in axes.lines if len(line.get_xdata()) > 2} == {"-", "--"}
     assert len(axes.collections) >= 3

@@ -163,6 +163,15 @@ def test_parameter_with_two_values_is_not_determined():
     assert 0.2 < np.mean(posterior.draws("a") > 2.0) < 0.8
     drawn = bp.identifiability(problem, fit, posterior, profile=False)
     assert drawn.verdicts == found.verdicts and "effective draws" in drawn.basis
+    header, titles, a, b, determined, several, *_ = repr(found).split("\n")
+    assert header.startswith("Identifiability of the parameters (data sd")
+    assert titles.split() == ["verdict", "contraction", "P(negative)", "data", "sd", "others", "known", "profile"]
+    assert a.startswith("a  several values") and b.startswith("b      determined       1.000")
+    assert determined == "The data determine b."
+    assert several == (
+        f"a: several values, {found.table.loc['a', 'other_values']} at another optimum with more than 1 % of the mass. "
+        "Recommendation: give a prior that excludes the other value, or measure an output that differs between them."
+    )
     single = bp.identifiability(problem, bp.map_estimate(problem, start={"a": 2.9, "b": 2.0}, **QUIET), profile=False)
     assert single.verdicts["a"] == "determined"
     assert "one mode was looked at, from one start" in repr(single)

@@ -135,7 +135,7 @@ def test_directions_without_information_are_named():
         "shift_a → shift_a + t, shift_b → shift_b − 0.5·t",
     }
     assert fit.theta["idle"] == pytest.approx(5.0) and fit.sd["idle"] == pytest.approx(2.0)
-    assert "not determined by the data: idle" in repr(fit)
+    assert "Not determined by the data: idle" in repr(fit)
     assert fit.correlations.loc["shift_a", "shift_b"] == pytest.approx(-1.0, abs=0.05)
 
 

@@ -214,15 +214,19 @@ def test_a_printed_estimate_lists_what_is_known_of_it():
         noise={"variance[y]": 4.0, "variance[z]": 0.25}, noise_prior="prior 1/v", fvu={"y": 0.1234, "z": 0.5},
         whiteness=white, noise_split={"y": NoiseSplit(1.5, 1.25, 2.0), "z": NoiseSplit(np.nan, 1.0, 1.0)},
     )  # fmt: skip
-    expected = [
-        "MapEstimate (converged), estimate ± Laplace sd (robust sd):",
-        "  a                    1.25 ± 0.0512 (0.0612)",
-        "  b                       3 ± 0.3 (0.4)",
-        "  variance[y] = 4",
-        "  variance[z] = 0.25 (prior 1/v)",
-        "  rms of y: 2, unexplained variance 12.34%, measurement noise 1.5, model error 1.25, whiteness p = 0.032",
-        "  rms of z: 0.5, unexplained variance 50.00%",
+    table = [
+        "            estimate Laplace sd robust sd",
+        "a               1.25     0.0512    0.0612",
+        "b                  3        0.3       0.4",
     ]
+    noise = ["variance[y]        4          -         -", "variance[z]     0.25          -         -"]
+    residuals = [
+        "Residuals",
+        "   rms unexplained variance measurement noise model error whiteness p",
+        "y    2               12.34%               1.5        1.25       0.032",
+        "z  0.5               50.00%                 -           -           -",
+    ]
+    expected = ["MapEstimate (converged)", *table, *noise, *residuals, "The noise has the prior 1/v."]
     assert MapEstimate.__repr__(fit).split("\n") == expected
     fit.converged, fit.status, fit.noise = False, "stalled", {}
     fit.other_orbits, fit.prior_conflict.text = {"run": "half the period"}, "Prior and data disagree"
@@ -232,16 +236,16 @@ def test_a_printed_estimate_lists_what_is_known_of_it():
         Mode({"a": 3.0}, {"a": 0.1}, -1.0, 0.001, {}, pd.DataFrame()),
     )
     assert MapEstimate.__repr__(fit).split("\n") == [
-        "MapEstimate (NOT CONVERGED: stalled; try another start, or starts=8), estimate ± Laplace sd (robust sd):",
-        *expected[1:3],
-        *expected[5:],
-        "  other orbit than the recorded one in 'run': half the period",
-        "  Prior and data disagree",
-        "  not determined by the data: a: no output depends on it",
-        "  another optimum: a = 2 (objective -1, 20.0% of the mass)",
+        "MapEstimate (NOT CONVERGED: stalled; try another start, or starts=8)",
+        *["  estimate Laplace sd robust sd", "a     1.25     0.0512    0.0612", "b        3        0.3       0.4"],
+        *residuals,
+        "The orbit is another one than the recorded one in 'run': half the period.",
+        "Prior and data disagree.",
+        "Not determined by the data: a: no output depends on it.",
+        "Another optimum: a = 2 (objective -1, 20.0% of the mass).",
     ]
     fit.without_noise = ("y", "z")
-    assert MapEstimate.__repr__(fit).startswith("MapEstimate (stalled; y, z without noise), estimate")
+    assert MapEstimate.__repr__(fit).startswith("MapEstimate (stalled; y, z without noise)\n")
 
 
 def test_channels_of_rounding_errors_are_without_noise_if_their_variance_is_unknown():

@@ -35,7 +35,7 @@ def test_both_roots_of_a_square_are_found_by_default_and_named():
     assert sorted(fit.modes["a"]) == pytest.approx([1.0, 3.0], rel=1e-6)
     assert fit.modes["mass"].tolist() == pytest.approx([0.5, 0.5])
     assert np.ptp(fit.modes["objective"]) < 1e-6
-    assert "another optimum: a = " in repr(fit) and len(fit.starts) == 8
+    assert "Another optimum: a = " in repr(fit) and len(fit.starts) == 8
 
 
 def test_masses_are_those_of_quadrature():
@@ -88,7 +88,7 @@ def test_one_optimum_is_not_counted_twice(value):
     """A value near zero has one optimum that covers both signs; one at 1 ± 0.1 has none at −1."""
     fit = bp.map_estimate(measured(lambda p: p.a, value, 0.1, a=bp.Normal(0.0, 2.0)), **QUIET)
     assert fit.other_modes == () and fit.modes["mass"].tolist() == [1.0]
-    assert "another optimum" not in repr(fit)
+    assert "Another optimum" not in repr(fit)
 
 
 @pytest.mark.filterwarnings("error")

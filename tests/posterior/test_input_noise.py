@@ -351,12 +351,12 @@ def test_results_say_in_words_that_the_covariance_includes_the_noise_of_inputs()
     problem = bp.Problem(GAIN, [noisy_gain(1)], priors={"a": bp.Normal(0.0, 10.0)})
     fit = bp.map_estimate(problem, starts=1, **QUIET)
     assert repr(problem).endswith("independent noise, noise of x integrated out)")
-    assert f"noise of the inputs, included in the covariance, causes {fit.input_noise['y']:.3g} in y" in repr(fit)
+    assert f"The noise of the inputs, included in the covariance, causes {fit.input_noise['y']:.3g} in y" in repr(fit)
     found = bp.predict(problem, bp.sample(problem, fit, seed=1, ensembles=2, max_steps=300, **QUIET))
     assert "the noise of the inputs" in found.note and found.note in repr(found) and found.verdict == "adequate"
     exact = bp.Problem(GAIN, problem.experiments, priors=problem.priors, input_noise="exact")
     assert repr(exact).endswith("independent noise)")
-    assert "noise of the inputs" not in repr(bp.map_estimate(exact, starts=1, **QUIET))
+    assert "The noise of the inputs" not in repr(bp.map_estimate(exact, starts=1, **QUIET))
 
 
 def test_errors_as_parameters_give_the_same_estimate():
