@@ -276,19 +276,26 @@ def _climb(objective: Objective, first: Iterate, progress: bool, most: int = MAX
 
 
 def _on_measured_orbits(problem: Problem, start: np.ndarray, end: End, progress: bool) -> End:
-    """Return the end of a climb, or that of one from the measured orbits if fewer of its orbits are others."""
-    others = end.iterate.here.other_orbits
-    for near in _near_measured_orbits(problem, end.iterate, start) if others else ():
+    """Return the end of a climb; if its orbits are not the measured ones, the best of those from the measured orbits.
+
+    They are not if they differ in kind, or leave most of the variance of a channel unexplained.
+    """
+    if not _doubtful(problem, end):
+        return end
+    for near in _near_measured_orbits(problem, end.iterate, start):
         objective = _objective(problem, near)
         first = objective.iterate(near, problem.likelihood.guess())
-        if first is None:
-            continue
-        again = _climb(objective, first, progress)
-        if len(again.iterate.here.other_orbits) < len(others):
-            end, others = again, again.iterate.here.other_orbits
-        if not others:
-            return end
+        if first is not None:
+            end = max(end, _climb(objective, first, progress), key=preference)
+        if not _doubtful(problem, end):
+            break
     return end
+
+
+def _doubtful(problem: Problem, end: End) -> bool:
+    here = end.iterate.here
+    left = _fractions_left(problem, here.compared()).values()
+    return bool(here.other_orbits) or max(left, default=0.0) > MOST_UNEXPLAINED
 
 
 def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> Iterator[Linearisation]:
@@ -336,7 +343,6 @@ def _describe(
     others = [joint_laplace(sampled, end.iterate) for end in modes[1:]]
     noise = dict(zip(problem.noise_names, best.noise.tolist(), strict=True))
     rms = {c: _pooled(problem, c, residuals) for c in problem.channels}
-    measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} for e in problem.experiments}
     return MapEstimate(
         status=STATUSES[OTHER_ORBIT] if best.here.other_orbits else status,
         theta=dict(zip(names, best.theta.tolist(), strict=True)),
@@ -353,7 +359,7 @@ def _describe(
         solutions=solutions,
         residuals=residuals,
         rms=rms,
-        fvu={c: rms[c] ** 2 / max(_pooled(problem, c, measured) ** 2, np.finfo(float).tiny) for c in problem.channels},
+        fvu=_fractions_left(problem, residuals),
         whiteness=channel_whiteness(problem, best),
         noise_split=noise_split(problem, found.residuals, objective.log_variance_factor),
         input_noise=caused_by_inputs(problem, loadings),
@@ -511,6 +517,13 @@ def _tied_slopes(problem: Problem, theta: np.ndarray) -> dict[str, dict[str, flo
     every = next(iter(problem.parameter_maps.values())).parameters
     slopes = dict(zip(every, common.tolist(), strict=True))
     return {name: dict(zip(problem.names, slopes[name], strict=True)) for name in problem.tied}
+
+
+def _fractions_left(problem: Problem, residuals: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, float]:
+    """Return the fraction of each channel's variance that is left in residuals."""
+    measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} for e in problem.experiments}
+    power = {c: max(_pooled(problem, c, measured) ** 2, np.finfo(float).tiny) for c in problem.channels}
+    return {c: _pooled(problem, c, residuals) ** 2 / whole for c, whole in power.items()}
 
 
 def _pooled(problem: Problem, channel: str, signals: Mapping[str, Mapping[str, np.ndarray]]) -> float:

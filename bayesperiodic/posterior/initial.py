@@ -243,6 +243,9 @@ class _SimultaneousFit:
             theta, orbits, blocked = self._moved(linear, orbits, theta, step)
             if blocked:
                 return InitialEstimate(theta, {}, blocked)
+        # Where the data leave a direction open, θ moves on along it while the orbits solve the equations.
+        if off[worst] < SMALL_STEP:
+            return InitialEstimate(theta, {name: self._states(name, z) for name, z in orbits.items()}, "")
         return InitialEstimate(theta, {}, worst)
 
     def _linearise(self, name: str, z: np.ndarray, theta: np.ndarray) -> Linear | None:

@@ -183,6 +183,38 @@ def diode_run(kilohertz: int, periods: int) -> bp.Experiment:
     return replace(run, guess={"q": np.fft.irfft(spectrum, run.outputs["resistor"].size)})
 
 
+@pytest.fixture(scope="module")
+def upper_branch():
+    """Return a record of a Duffing oscillator, integrated in time, on the upper of its two stable branches."""
+    frequency, truth = 4.2, np.array([2.1, 1.5, 900.0, 4e5])
+
+    def rates(t, y):
+        return [y[1], (6.0 * np.cos(2 * np.pi * frequency * t) - truth[1:] @ [y[1], y[0], y[0] ** 3]) / truth[0]]
+
+    time = np.arange(0.0, 112.2 / frequency, 1.0 / 800.0)
+    x = solve_ivp(rates, (0.0, time[-1]), [-0.02, 0.5], t_eval=time, rtol=1e-8, atol=1e-12).y[0]
+    assert np.ptp(x[-800:]) > 0.09  # the lower branch has 0.03
+    steady, generator = time > 60.0 / frequency, np.random.default_rng(1)
+    noisy = x[steady] + 2e-4 * generator.standard_normal(steady.sum())
+    force = 6.0 * np.cos(2 * np.pi * frequency * time[steady])
+    return bp.Recording.from_arrays(time[steady], {"displacement": noisy}, {"force": force})
+
+
+@pytest.mark.parametrize("guess", [None, "data"])
+@pytest.mark.parametrize("sd", [3e5, 1e6])
+def test_a_stiffness_of_unknown_sign_ends_on_the_measured_branch(upper_branch, guess, sd):
+    """From the prior's median, k3 = 0, all eight starts ended on the lower branch, with 123 % unexplained."""
+    priors = {
+        "m": bp.LogNormal(2.0, 0.5), "c": bp.LogNormal(2.0, 1.0), "k": bp.LogNormal(1000.0, 0.7),
+        "k3": bp.Normal(0.0, sd),
+    }  # fmt: skip
+    run = upper_branch.fold(100, guess=guess) if guess else upper_branch.fold(100)
+    fit = bp.map_estimate(bp.Problem(bp.models.duffing, [run], priors=priors), progress=False)
+    assert fit.converged and fit.fvu["displacement"] < 1e-4
+    # The work of the force is that of the damper; one frequency determines only a combination of the others.
+    assert fit.theta["c"] == pytest.approx(1.5, rel=0.01)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_file(), reason="needs the recordings of an RL-diode circuit")
 @pytest.mark.filterwarnings("ignore")
