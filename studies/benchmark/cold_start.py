@@ -146,24 +146,29 @@ def run(options: argparse.Namespace) -> None:
         with watch.part("commands", f"the README's first command, {repeats} times each way"):
             command = [str(python), "-m", "studies", "pendulum", "--out", str(folder / "figures")]
             found["first_command"] = _both_ways(command, folder, repeats)
-        if not options.quick:
-            with watch.part("tests", "the README's second command"):
-                tester, found["installation_of_tests"] = _environment(folder / "tests", ["-e", f"{ROOT}[dev]"])
-                found["tests"] = _both_ways([str(tester), "-m", "pytest", "-q"], folder, 1)
         found["peers"] = {}
         for name, (package, code) in PEERS.items():
             with watch.part(name, f"installing {name}, and its first evaluation of a posterior, {repeats} times"):
                 found["peers"][name] = _peer(folder / package, package, code, repeats)
         with watch.part("large", "folding long recordings, and orbits in large sections"):
             found["large"] = large.measure(quick=options.quick)
+        paths = common.save_figures(options.out, {"large": large.draw(found["large"])})
+        print(f"figures (synthetic data): {paths[0]}")
+        _write(options.out / FILE, found, watch)
+        if not options.quick:
+            with watch.part("tests", "the README's second command"):
+                tester, found["installation_of_tests"] = _environment(folder / "tests", ["-e", f"{ROOT}[dev]"])
+                found["tests"] = _both_ways([str(tester), "-m", "pytest", "-q"], folder, 1)
+            _write(options.out / FILE, found, watch)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _write(path: Path, found: dict[str, Any], watch: common.Stopwatch) -> None:
+    """Print and write what was measured so far."""
     found["targets"] = _targets(found)
     print(common.table_of_rows(found["targets"]))
     print(common.shown("other packages", found["peers"]))
-    paths = common.save_figures(options.out, {"large": large.draw(found["large"])})
-    print(f"figures (synthetic data): {paths[0]}")
-    path = options.out / FILE
     path.write_text(json.dumps(found | {"seconds": watch.total(), "versions": common.versions()}, indent=2) + "\n")
     print(f"results: {path}")
 
@@ -237,6 +242,9 @@ def _targets(found: Mapping[str, Any]) -> list[dict[str, Any]]:
         "new model's first solve": first["new model"]["first solve"],
         "new model's first MAP": first["new model"]["first MAP"],
     }
+    for what in ("fold", "orbits"):
+        sizes = dict(zip(found["large"][what]["sizes"], found["large"][what]["s"], strict=True))
+        values |= {name: sizes[n] for n in sizes if (name := f"{what}, {n:,}") in TARGETS}
     if "tests" in found:
         values |= {f"tests, {way} cache": found["tests"][way][0] for way in ("empty", "full")}
     return [common.row(f"{what} [s]", value, 0.0, TARGETS[what]) for what, value in values.items()]
