@@ -83,7 +83,8 @@ def test_a_sign_needs_a_size_and_several_values_need_one_that_is_determined():
     ],
 )
 def test_evidence_in_words(changes, expected):
-    assert identifiability._evidence(ROW | changes) == expected
+    row = ROW | changes
+    assert ", ".join([*identifiability._numbers(row), *identifiability._remarks(row)]) == expected
 
 
 @pytest.mark.parametrize(

@@ -411,4 +411,5 @@ def test_failed_solves_are_counted_by_cause():
     assert posterior.draws("a").min() > 0.0
     assert sum(posterior.failures.values()) > 0.05
     assert posterior.summary().attrs["failures"] == posterior.failures
-    assert f"{next(iter(posterior.failures))} " in repr(posterior)
+    cause, share = next(iter(posterior.failures.items()))
+    assert f"{share:.2%} {cause}" in repr(posterior)

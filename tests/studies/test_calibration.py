@@ -38,7 +38,7 @@ def test_results_and_figures_are_written(found):
         assert all(sum(counts) == 2 for by_name in case["histograms"].values() for counts in by_name.values())
         assert len((folder / name / "replicates.jsonl").read_text().splitlines()) == 2
     assert {path.name for path in folder.glob("*.png")} == {"duffing.png", "miscounted.png"}
-    assert "SYNTHETIC" in printed and "ranks among" in printed
+    assert "SYNTHETIC" in printed and "ranks are among" in printed
 
 
 def test_second_run_recomputes_nothing(found, monkeypatch):
