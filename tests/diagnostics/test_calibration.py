@@ -147,7 +147,8 @@ def test_failures_are_counted_by_kind():
     counted = summary(lines, ["k"])
     assert counted.failures == {"draws not usable": 1, "estimate not converged": 1} and counted.failed_solves == 0.25
     assert "Failed campaigns: draws not usable 1, estimate not converged 1." in repr(counted)
-    assert "ranks among 30 independent draws, R-hat at most 1.020; stop rule of sample passed by 0" in repr(counted)
+    assert "The ranks are among 30 independent draws, with R-hat at most 1.020." in repr(counted)
+    assert "The stop rule of sample was passed by 0;" in repr(counted)
 
 
 @pytest.mark.parametrize(
