@@ -27,6 +27,7 @@ def drawn(problem: bp.Problem, k: np.ndarray) -> bp.Posterior:
     return posterior_of(problem, k[:, None], np.full((k.size, 1), VARIANCE))
 
 
+@pytest.mark.slow
 def test_band_of_a_linear_resonance_is_that_of_the_closed_form():
     """The amplitude is 1/|k − ω² + i c ω|; interpolation over 1/100 of the way is 0.3 % at the peak."""
     problem, k = problem_of(0.0, 0.1), np.random.default_rng(0).normal(1.0, 0.05, 40)

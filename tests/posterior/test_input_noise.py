@@ -194,6 +194,7 @@ def test_a_white_covariance_is_that_of_its_standard_deviation():
     assert np.mean(prior[0] ** 2) * white[0, 0] + np.sum(np.diag(white)[1:]) / 2 == pytest.approx(X_SD**2)
 
 
+@pytest.mark.slow
 def test_attenuation_is_corrected_and_the_intervals_cover():
     """100 recordings of y = a·x + c·x³ with noise of 14 % of the input; 90 % intervals, 99.9 % band 0.79 to 0.98."""
     covered, ends = [], {"exact": [], "joint": []}
@@ -285,6 +286,7 @@ def test_noise_of_inputs_is_integrated_out_by_default_from_five_cycles_on():
     assert problem.input_noise == "exact" and problem.with_experiments([run]).noisy_inputs == {"run": ["x"]}
 
 
+@pytest.mark.slow
 def test_correlated_noise_of_input_and_output_is_found_and_used():
     """Of 60 recordings with independent noise at most 5 show a correlation at the level 1 % (false alarm 4e-4).
 
