@@ -190,8 +190,7 @@ def climb(
     Where H is not positive definite (convex log-priors that outweigh the data) steps take its negative curvature with
     the opposite sign; directions without curvature are left out. Each solve starts from the previous iterate and is
     checked to lie on the same branch, so that a step cannot change to another periodic solution. A step whose solve
-    fails is halved, and the first trial of the next step is twice its fraction. A parameter at the end of its prior's
-    support is fixed while the gradient points outwards.
+    fails is halved. A parameter at the end of its prior's support is fixed while the gradient points outwards.
 
     Parameters `held` (names,) are fixed; report(iterate, step in standard deviations) is called for every new iterate.
     """
@@ -221,7 +220,7 @@ def _ascend(
     objective: Objective, start: Iterate, held: np.ndarray, report: Callable[[Iterate, float], None] | None, most: int
 ) -> tuple[Iterate, str, list[float]]:
     """Climb with the same parameters fixed; return the end, the status, and the objectives of all steps."""
-    now, damping = start, 1.0
+    now = start
     history: list[float] = []
     for _ in range(most):
         hessian, gradient = objective.hessian_and_gradient(now)
@@ -230,7 +229,7 @@ def _ascend(
         step, size = _step(_curved(objective, now, hessian), gradient, held)
         if size < SCALED_STEP:
             return now, "converged", history
-        damping, trial = min(1.0, 2.0 * damping), None
+        damping, trial = 1.0, None
         for _ in range(MAX_HALVINGS):
             trial = objective.at(objective.moved(now.theta, damping * step), now.here, now.noise)
             if trial is not None and trial.objective > now.objective:
