@@ -60,15 +60,14 @@ def run(options: argparse.Namespace) -> None:
             doublings = _doublings(records, final, sample[:FOLLOWED])
         with watch.part("chaos", "finding unstable orbits in the records without a period"):
             unstable = _unstable(records, final)
+        with watch.part("figures", "drawing the bifurcation diagram"):
+            drawn = {"bifurcation": figures.bifurcation(records, used, final, sample, synthetic=data["synthetic"])}
         with watch.part("missing terms", "waiting for the search for missing terms"):
             found = {step: jobs[step].result() for step in rig.STEPS_OF_MODEL}
     fits = {step: own for step, (own, _) in found.items()}
     searches = {step: search for step, (_, search) in found.items() if search is not None}
     with watch.part("figures", "drawing"):
-        drawn = {
-            "bifurcation": figures.bifurcation(records, used, final, sample, synthetic=data["synthetic"]),
-            "steps": figures.steps(fits, used, synthetic=data["synthetic"]),
-        }
+        drawn["steps"] = figures.steps(fits, used, synthetic=data["synthetic"])
         if unstable:
             drawn["chaos"] = figures.unstable_orbits(records, unstable, synthetic=data["synthetic"])
         paths = common.save_figures(options.out, drawn)
