@@ -30,6 +30,10 @@ from PIL import Image
 import bayesperiodic as bp
 from bayesperiodic import _parallel
 from bayesperiodic._parallel import TaskPool, available_cores
+from bayesperiodic.plot.pairs import draw_ellipses as draw_ellipses
+from bayesperiodic.plot.pairs import draw_regions as draw_regions
+from bayesperiodic.plot.style import ENSEMBLES as ENSEMBLES
+from bayesperiodic.plot.style import axis_label as axis_label
 
 Row = dict[str, Any]
 

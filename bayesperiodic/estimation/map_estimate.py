@@ -202,7 +202,7 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
         moved = [own.expected - (before[n].expected if n in before else np.inf) for n, own in errors.items()]
         still = all(np.abs(own).max(initial=0.0) < SETTLED for own in moved)
         if still and step @ objective.hessian_and_gradient(end.iterate)[0] @ step < SETTLED**2:
-            return problem, end
+            return problem, resumed(objective, end) or end
     if problem.noisy_inputs:
         warnings.warn(
             "The errors of the inputs could not be linearised: estimate or inputs still move when this is repeated, by "

@@ -16,7 +16,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from bayesperiodic.plot.style import ENSEMBLES
 from studies import common
 
 FILE = "mr_damper/mr_damper_4.1.csv"
@@ -144,8 +143,8 @@ def _harmonics_figure(choices: list[dict[str, Any]], default: int, *, synthetic:
     for ax, name, scale, label in zip(axes, SHARP, (1e-3, 1.0), ("ρ [1/mm]", "Kw [N]"), strict=True):
         ax.axvline(default, color="0.6", lw=0.9, ls=":", label="kept by the rule")
         for ending, text, marker, shift, colour in (
-            ("_exact", "displacement taken as exact", "o", 0.98, ENSEMBLES[0]),
-            ("", "its noise integrated out", "s", 1.02, ENSEMBLES[1]),
+            ("_exact", "displacement taken as exact", "o", 0.98, common.ENSEMBLES[0]),
+            ("", "its noise integrated out", "s", 1.02, common.ENSEMBLES[1]),
         ):
             values, sd = (
                 scale * np.array([c[key] for c in choices]) for key in (f"{name}{ending}", f"{name}_sd{ending}")

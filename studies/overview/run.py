@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 import bayesperiodic as bp
-from bayesperiodic.plot.pairs import draw_ellipses, draw_regions
 from studies import common
 from studies.pendulum import recording as pendulum_recording
 from studies.verdicts.cases import product_ridge
@@ -74,8 +73,8 @@ def judge(ax: Axes, seed: int, steps: int) -> dict[str, str | bool]:
     posterior = bp.sample(problem, fit, seed=seed, progress=False, **{**case.sampling, "max_steps": steps})
     names, colours = list(problem.names), bp.plot.COLOURS
     draws = np.stack([posterior.draws(name) for name in names], axis=-1)
-    draw_regions(ax, draws, [(0.0, np.inf)] * 2, colours["mcmc"])
-    draw_ellipses(ax, np.array([fit.theta[name] for name in names]), fit.covariance.loc[names, names].to_numpy())
+    common.draw_regions(ax, draws, [(0.0, np.inf)] * 2, colours["mcmc"])
+    common.draw_ellipses(ax, np.array([fit.theta[name] for name in names]), fit.covariance.loc[names, names].to_numpy())
     ax.plot(*case.truth.values(), "x", ms=9, mew=2.5, color="black", zorder=6)
     for line in (ax.axhline, ax.axvline):
         line(0.0, color="0.6", lw=0.8, zorder=0.5)

@@ -18,7 +18,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from bayesperiodic.plot.style import axis_label
 from studies import common
 from studies.pendulum import estimates as pendulum_estimates
 from studies.pendulum import orbits
@@ -334,14 +333,14 @@ def marginals(ridge: Ridge, *, truth: bool) -> Figure:
     grid = figure.subplots(2, 5)
     for axes, name in zip(grid[0], pendulum_estimates.NATURAL, strict=True):
         _marginal(axes, ridge.posterior.draws(name), ridge.fit.theta[name], ridge.fit.sd[name], TRUTH[name], truth)
-        axes.set_xlabel(axis_label(name, bp.models.pendulum.units[name]))
+        axes.set_xlabel(common.axis_label(name, bp.models.pendulum.units[name]))
     draws = pendulum_estimates.combinations({name: ridge.posterior.draws(name) for name in pendulum_estimates.NATURAL})
     truths = pendulum_estimates.combinations(TRUTH)
     for axes, name in zip(grid[1], pendulum_estimates.DETERMINED, strict=False):
         value, sd = (float(ridge.combinations[column].loc[name]) for column in ("value", "laplace_sd"))
         _marginal(axes, draws[name], value, sd, truths[name], truth)
         text = name if name == "l" else f"{name} = k{name[1]}/(m l²)"
-        axes.set_xlabel(axis_label(text, pendulum_estimates.DETERMINED_UNITS[name]))
+        axes.set_xlabel(common.axis_label(text, pendulum_estimates.DETERMINED_UNITS[name]))
     handles, labels = grid[0, 0].get_legend_handles_labels()
     grid[1, 4].set_axis_off()
     grid[1, 4].legend(handles, labels, loc="center", frameon=False)

@@ -18,7 +18,6 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from bayesperiodic.plot.style import axis_label
 from studies import common
 from studies.timing import timed
 
@@ -433,7 +432,7 @@ def _estimates(choices: Mapping[str, Mapping[str, bp.MapEstimate]], truth: Mappi
         axes.tick_params(axis="x", labelsize=9)
         axes.ticklabel_format(axis="y", useOffset=False)
         axes.set_xlim(-0.5, len(noises) - 0.5)
-        axes.set_ylabel(axis_label(name, bp.models.silverbox.units[name]))
+        axes.set_ylabel(common.axis_label(name, bp.models.silverbox.units[name]))
     common.shared_legend(figure, 5)
     figure.suptitle(f"Silverbox{'' if truth is None else ', synthetic data'}: estimates by noise model")
     return figure

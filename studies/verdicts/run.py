@@ -18,7 +18,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from bayesperiodic.plot.style import axis_label
 from studies import common
 from studies.verdicts import cases
 from studies.verdicts.cases import CASES, COMPARE, FINE, IDENTIFIABILITY, PREDICT, Outcome, examine
@@ -167,7 +166,7 @@ def _marginal(axes: Axes, outcome: Outcome) -> None:
     axes.set_yticks([])
     axes.locator_params(axis="x", nbins=5, steps=[1, 2, 5, 10])
     axes.spines[["left", "right", "top"]].set_visible(False)
-    axes.set_xlabel(axis_label(name, outcome.problem.model.units.get(name, "")))
+    axes.set_xlabel(common.axis_label(name, outcome.problem.model.units.get(name, "")))
 
 
 def _words(axes: Axes, outcome: Outcome) -> None:
