@@ -7,11 +7,10 @@ import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from studies import common
 from studies.diode import chaos, prediction, rig
 
 # The model's diagram: frequencies [Hz], periods that are drawn, draws.
-FINE, DRAWN, SHOWN = 2_000.0, 40, 6
+FINE, DRAWN, SHOWN = 2_000.0, 40, 7
 
 
 def bifurcation(
@@ -26,9 +25,7 @@ def bifurcation(
     estimate = rig.values_of(final)
     figure, axes = plt.subplots(2, 1, figsize=(8.0, 6.6), sharex=True, sharey=True, layout="constrained")
     drawn = [*sample[:SHOWN], estimate]
-    swept = common.in_threads(
-        lambda draw: prediction.sweep(draw, fine.tolist(), [tuple(row) for row in sources], DRAWN), drawn
-    )
+    swept = prediction.sweep(drawn, fine.tolist(), [tuple(row) for row in sources], DRAWN)
     for values, draw in zip(swept, drawn, strict=True):
         colour = "#000000" if draw is estimate else "#E69F00"
         at = np.repeat(1e-3 * fine, DRAWN)

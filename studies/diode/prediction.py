@@ -7,6 +7,7 @@ import pandas as pd
 from numba import njit
 
 import bayesperiodic as bp
+from studies import common
 from studies.diode import rig
 
 # Longest step of the integration [s]: the diode blocks within R·C_j.
@@ -29,7 +30,7 @@ def draws_of(final: rig.Fitted, count: int, seed: int) -> list[dict[str, float]]
     relative = np.array([fit.robust_sd[name] for name in names]) / estimate
     correlation = covariance / np.outer(sd, sd)
     generator = np.random.default_rng(seed)
-    normal = generator.multivariate_normal(np.zeros(len(names)), correlation, size=count, method="eigh")
+    normal = generator.multivariate_normal(np.zeros(len(names)), correlation, size=count, method="cholesky")
     values = estimate * np.exp(normal * relative)
     return [dict(zip(names, row.tolist(), strict=True)) | {n: known[n] for n in ("R", "R_s")} for row in values]
 
@@ -44,60 +45,74 @@ def source_of(record: rig.Record) -> tuple[float, float]:
 
 
 def sweep(
-    draw: Draw, frequencies: Sequence[float], sources: Sequence[tuple[float, float]], kept: int = KEPT
+    draws: Sequence[Draw], frequencies: Sequence[float], sources: Sequence[tuple[float, float]], kept: int = KEPT
 ) -> np.ndarray:
-    """Return the resistor's voltage [V] in successive periods of the source (frequencies, kept, phases).
+    """Return the resistor's voltage [V] in successive periods of the source (draws, frequencies, kept, phases).
 
     The first phase is that of the largest source. The mean over these periods is subtracted, as by the instrument. Each
     motion starts from the end of the one at the frequency before, as in a sweep in the laboratory; the first from that
     at 90 % of its frequency.
     """
-    values = tuple(float(draw[name]) for name in ORDER)
-    found = np.empty((len(frequencies), kept, PHASES))
-    state, _ = _run(values, 0.9 * frequencies[0], *sources[0], (0.0, 0.0, 0.0, 0.0), TRANSIENT, found[0])
-    for row, frequency, (mean, amplitude) in zip(found, frequencies, sources, strict=True):
-        state, average = _run(values, frequency, mean, amplitude, state, TRANSIENT, row)
-        row -= average
+    values = np.array([[draw[name] for name in ORDER] for draw in draws])
+    found = np.empty((len(draws), len(frequencies), kept, PHASES))
+
+    def part(numbers: np.ndarray) -> None:
+        own, states, rows = np.ascontiguousarray(values[numbers].T), np.zeros((4, numbers.size)), found[numbers]
+        _run(own, 0.9 * frequencies[0], *sources[0], states, TRANSIENT, rows[:, 0])
+        for number, (frequency, (mean, amplitude)) in enumerate(zip(frequencies, sources, strict=True)):
+            average = _run(own, frequency, mean, amplitude, states, TRANSIENT, rows[:, number])
+            rows[:, number] -= average[:, None, None]
+        found[numbers] = rows
+
+    common.in_threads(part, np.array_split(np.arange(len(draws)), min(common.available_cores(), len(draws))))
     return found
 
 
 @njit(cache=True, inline="always")
-def _rates(values, source, i, v, q, m):
-    """Return the rates of the four states, and the resistor's voltage; numbers, for arrays would be allocated."""
-    resistor, internal, coil, losses, winding, forward, junction, corner, transit, lifetime, drift = values
-    root = np.sqrt(q * q + corner * corner)
-    current = (source - v - forward + 0.5 * (root - q) / junction) / (resistor + internal)
-    flow = (0.5 * (root + q) - m) / transit
+def _rates(values, draw, source, i, v, q, m):
+    """Return the rates of the four states, and the resistor's voltage."""
+    root = np.sqrt(q * q + values[7, draw] * values[7, draw])
+    blocked = 0.5 * (root - q) / values[6, draw]
+    current = (source - v - values[5, draw] + blocked) / (values[0, draw] + values[1, draw])
+    flow = (0.5 * (root + q) - m) / values[8, draw]
     return (
-        (v - losses * i) / coil, (current - i) / winding, current - flow, flow - m / lifetime - drift * i * m,
-        current * resistor,
+        (v - values[3, draw] * i) / values[2, draw], (current - i) / values[4, draw], current - flow,
+        flow - m / values[9, draw] - values[10, draw] * i * m, current * values[0, draw],
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
-def _run(values, frequency, mean, amplitude, state, transient, found):
-    """Fill values (periods, phases) after a transient by the classical Runge-Kutta method; return state, mean."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _step(values, h, source, i, v, q, m, output):
+    """Take a step of the classical Runge-Kutta method in all draws; the loop over them becomes vector instructions."""
+    half = 0.5 * h
+    for n in range(i.size):
+        i0, v0, q0, m0 = i[n], v[n], q[n], m[n]
+        a1, b1, c1, d1, output[n] = _rates(values, n, source[0], i0, v0, q0, m0)
+        a2, b2, c2, d2, _ = _rates(values, n, source[1], i0 + half * a1, v0 + half * b1, q0 + half * c1, m0 + half * d1)
+        a3, b3, c3, d3, _ = _rates(values, n, source[1], i0 + half * a2, v0 + half * b2, q0 + half * c2, m0 + half * d2)
+        a4, b4, c4, d4, _ = _rates(values, n, source[2], i0 + h * a3, v0 + h * b3, q0 + h * c3, m0 + h * d3)
+        i[n] = i0 + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+        v[n] = v0 + h / 6.0 * (b1 + 2.0 * b2 + 2.0 * b3 + b4)
+        q[n] = q0 + h / 6.0 * (c1 + 2.0 * c2 + 2.0 * c3 + c4)
+        m[n] = m0 + h / 6.0 * (d1 + 2.0 * d2 + 2.0 * d3 + d4)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _run(values, frequency, mean, amplitude, states, transient, found):
+    """Fill outputs (draws, periods, phases) after a transient, move states (4, draws), and return means (draws,)."""
     steps = PHASES * int(np.ceil(1.0 / (frequency * STEP * PHASES)))
     h = 1.0 / (frequency * steps)
     source = mean + amplitude * np.cos(np.pi * np.arange(2 * steps + 1) / steps)
-    i, v, q, m = state
-    total = 0.0
-    for period in range(transient + len(found)):
+    output, total = np.zeros(states.shape[1]), np.zeros(states.shape[1])
+    for period in range(transient + found.shape[1]):
         for j in range(steps):
-            a1, b1, c1, d1, output = _rates(values, source[2 * j], i, v, q, m)
+            here = source[2 * j], source[2 * j + 1], source[2 * j + 2]
+            _step(values, h, here, states[0], states[1], states[2], states[3], output)
             if period >= transient:
                 total += output
                 if j * PHASES % steps == 0:
-                    found[period - transient, j * PHASES // steps] = output
-            half, s = 0.5 * h, source[2 * j + 1]
-            a2, b2, c2, d2, _ = _rates(values, s, i + half * a1, v + half * b1, q + half * c1, m + half * d1)
-            a3, b3, c3, d3, _ = _rates(values, s, i + half * a2, v + half * b2, q + half * c2, m + half * d2)
-            a4, b4, c4, d4, _ = _rates(values, source[2 * j + 2], i + h * a3, v + h * b3, q + h * c3, m + h * d3)
-            i += h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-            v += h / 6.0 * (b1 + 2.0 * b2 + 2.0 * b3 + b4)
-            q += h / 6.0 * (c1 + 2.0 * c2 + 2.0 * c3 + c4)
-            m += h / 6.0 * (d1 + 2.0 * d2 + 2.0 * d3 + d4)
-    return (i, v, q, m), total / (steps * len(found))
+                    found[:, period - transient, j * PHASES // steps] = output
+    return total / (steps * found.shape[1])
 
 
 def period_of(values: np.ndarray) -> int | None:

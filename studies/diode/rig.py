@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -81,10 +82,10 @@ class Record(NamedTuple):
         return self.experiment.periods if self.experiment else None
 
 
-def read(given: Path | None, seed: int) -> tuple[list[Record], dict[str, Any], float]:
+def read(given: Path | None, seed: int, pool: Executor) -> tuple[list[Record], dict[str, Any], float]:
     """Return all records by frequency, folded where periodic, the file's description, and the source's resistance.
 
-    The latter is relative to the resistor; the source is its voltage without load.
+    The latter is relative to the resistor; the source is its voltage without load. The pool folds the records.
     """
     found = common.find_data(given, FILE)
     if found is None:
@@ -103,9 +104,11 @@ def read(given: Path | None, seed: int) -> tuple[list[Record], dict[str, Any], f
                     data["frequency_Hz"], data["interval_s"], data["source_V"], data["resistor_V"], strict=True
                 )
             ]  # fmt: skip
-    under_load = [folded(frequency, own) for frequency, own in sorted(recordings, key=lambda one: one[0])]
+    frequencies, loaded = zip(*sorted(recordings, key=lambda one: one[0]), strict=True)
+    under_load = pool.map(folded, frequencies, loaded)
     share = internal_share([record.experiment for record in under_load if record.experiment])
-    return [folded(r.frequency, unloaded(r.recording, share)) for r in under_load], common.described(found), share
+    records = pool.map(folded, frequencies, [unloaded(own, share) for own in loaded])
+    return list(records), common.described(found), share
 
 
 def internal_share(experiments: Sequence[bp.Experiment]) -> float:
@@ -173,14 +176,11 @@ def fitted_records(records: Sequence[Record]) -> list[Record]:
     return [record for record in periodic if record.frequency in chosen]
 
 
-def estimate(
-    records: Sequence[Record], free: Sequence[str], share: float, near: Mapping[str, float] | None = None
-) -> Fitted:
-    """Return the MAP point of some records with some of the model's two further terms; it starts near given values."""
+def estimate(records: Sequence[Record], free: Sequence[str], share: float) -> Fitted:
+    """Return the MAP point of some records with some of the model's two further terms."""
     values = START | dict.fromkeys(TERMS, 0.0) | {"R_s": share * RESISTOR}
     if free:
         values |= {name: value for name, value in STARTS.items() if name in START or name in free}
-    values |= near or {}
     start = {name: value for name, value in values.items() if name in START or name in free}
     experiments = []
     for record in records:

@@ -17,7 +17,7 @@ import bayesperiodic as bp
 from studies import common
 from studies.diode import chaos, figures, prediction, rig
 
-DRAWS, QUICK_DRAWS = 40, 8
+DRAWS, QUICK_DRAWS = 100, 8
 # Draws whose orbits are followed to their period doublings.
 FOLLOWED = 16
 # Records of the search for missing terms [kHz], and how many terms are tried.
@@ -36,24 +36,29 @@ RULE = (
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
     watch, draws = common.Stopwatch(), QUICK_DRAWS if options.quick else DRAWS
-    with watch.part("read", "reading the records, testing their periods and folding the periodic ones"):
-        records, data, share = rig.read(options.data, options.seed)
-        used = rig.fitted_records(records)
-    kind = "SYNTHETIC" if data["synthetic"] else "measured"
-    print(f"  {kind} records {data['path']}: {len(records)}, of which {sum(r.period is not None for r in records)} are "
-          f"periodic and {len(used)} are fitted; {rig.RULE_OF_CHOICE}")  # fmt: skip
-    if data["synthetic"]:
-        print(f"  the measured file was not found; it is at {rig.ADDRESS}, sha256 {rig.SHA256}; true values {rig.TRUE}")
     with common.workers() as pool:
-        # The last model first: the predictions wait for it.
-        order = dict.fromkeys((LAST, *rig.STEPS_OF_MODEL))
-        jobs = {step: pool.submit(_identified, step, used, share) for step in order}
+        with watch.part("read", "reading the records, testing their periods and folding the periodic ones"):
+            records, data, share = rig.read(options.data, options.seed, pool)
+            used = rig.fitted_records(records)
+        kind = "SYNTHETIC" if data["synthetic"] else "measured"
+        print(f"  {kind} records {data['path']}: {len(records)}, of which {sum(r.period is not None for r in records)} "
+              f"are periodic and {len(used)} are fitted; {rig.RULE_OF_CHOICE}")  # fmt: skip
+        if data["synthetic"]:
+            print(f"  the measured file was not found; it is at {rig.ADDRESS}, sha256 {rig.SHA256}; "
+                  f"true values {rig.TRUE}")  # fmt: skip
+        # The last model first, for the predictions wait for it; then the search that takes longest.
+        estimates = {LAST: pool.submit(rig.estimate, used, rig.STEPS_OF_MODEL[LAST], share)}
+        searches = {model: pool.submit(_search, model, used, share) for model in CHOSEN}
+        estimates |= {
+            model: pool.submit(rig.estimate, used, free, share)
+            for model, free in rig.STEPS_OF_MODEL.items() if model != LAST
+        }  # fmt: skip
         with watch.part("map", "finding the MAP points of three models, and what two of them lack"):
-            final, _ = jobs[LAST].result()
+            final = estimates[LAST].result()
         with watch.part("predict", f"integrating {draws} draws at the frequencies of all records"):
             sample = prediction.draws_of(final, draws, options.seed)
             frequencies, sources = [r.frequency for r in records], [prediction.source_of(r) for r in records]
-            swept = common.in_threads(lambda draw: prediction.sweep(draw, frequencies, sources), sample)
+            swept = prediction.sweep(sample, frequencies, sources)
             motions = [[prediction.period_of(v) for v in own] for own in swept]
         with watch.part("orbits", "solving the orbits of periodic records that were not fitted, and their multipliers"):
             table = _records(records, used, final, motions, sample[:FOLLOWED])
@@ -63,9 +68,8 @@ def run(options: argparse.Namespace) -> None:
         with watch.part("figures", "drawing the bifurcation diagram"):
             drawn = {"bifurcation": figures.bifurcation(records, used, final, sample, synthetic=data["synthetic"])}
         with watch.part("missing terms", "waiting for the search for missing terms"):
-            found = {step: jobs[step].result() for step in rig.STEPS_OF_MODEL}
-    fits = {step: own for step, (own, _) in found.items()}
-    searches = {step: search for step, (_, search) in found.items() if search is not None}
+            fits = {model: estimates[model].result() for model in rig.STEPS_OF_MODEL}
+            found = {model: own.result() for model, own in searches.items()}
     with watch.part("figures", "drawing"):
         drawn["steps"] = figures.steps(fits, used, synthetic=data["synthetic"])
         if unstable:
@@ -76,12 +80,12 @@ def run(options: argparse.Namespace) -> None:
         "internal_resistance": share,
         "records": table,
         "steps": {step: _summary(own) for step, own in fits.items()},
-        "missing_terms": [_missing(model, found) for model, found in searches.items()],
+        "missing_terms": [_missing(model, own) for model, own in found.items()],
         "doublings": doublings,
         "unstable_orbits": [{key: value for key, value in row.items() if key != "orbit"} for row in unstable],
         "score": _score(table),
     }
-    print("\n" + _tables(results, final, searches) + "\n")
+    print("\n" + _tables(results, final, found) + "\n")
     common.finish(options.out, results, watch, paths, synthetic=data["synthetic"])
 
 
@@ -167,19 +171,12 @@ def _summary(own: rig.Fitted) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _identified(model: str, used: Sequence[rig.Record], share: float) -> tuple[rig.Fitted, bp.MissingTerms | None]:
-    """Return the MAP point of a model, and the search for a term that it lacks; none for the last model.
-
-    The search takes three records. The second model's only ranks the candidates.
-    """
-    free = rig.STEPS_OF_MODEL[model]
-    whole = rig.estimate(used, free, share)
-    if model == LAST:
-        return whole, None
+def _search(model: str, used: Sequence[rig.Record], share: float) -> bp.MissingTerms:
+    """Return what a model lacks by three of the records; the second model's search only ranks the candidates."""
     nearest = [min(used, key=lambda record: abs(record.frequency - 1e3 * f)) for f in SEARCHED]
     three = list({record.frequency: record for record in nearest}.values())
-    own = rig.estimate(three, free, share, whole.fit.theta)
-    return whole, bp.missing_terms(own.problem, own.fit, max_terms=int(model == FIRST), keep=KEPT)
+    own = rig.estimate(three, rig.STEPS_OF_MODEL[model], share)
+    return bp.missing_terms(own.problem, own.fit, max_terms=int(model == FIRST), keep=KEPT)
 
 
 def _missing(model: str, found: bp.MissingTerms) -> dict[str, Any]:

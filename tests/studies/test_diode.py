@@ -36,9 +36,11 @@ def test_stroboscopic_values_are_those_of_an_adaptive_implicit_integration():
     v, q = path[1], 1e-9 * path[2]
     depleted = 0.5 * (np.hypot(q, p["Q_0"]) - q)
     expected = (MEAN + AMPLITUDE - v - p["V_f"] + depleted / p["C_j"]) * p["R"] / (p["R"] + p["R_s"])
-    found, values = np.empty((4, prediction.PHASES)), tuple(p[name] for name in prediction.ORDER)
-    prediction._run(values, FREQUENCY, MEAN, AMPLITUDE, (0.0, 0.0, 0.0, 0.0), prediction.TRANSIENT, found)
-    assert np.allclose(found[:, 0], expected, atol=2e-3)
+    # The second of five draws, of which four are integrated in one vector.
+    draws = np.array([p[name] for name in prediction.ORDER])[:, None] * (1.0 + 0.05 * np.arange(-1.0, 4.0))
+    found = np.empty((5, 4, prediction.PHASES))
+    prediction._run(draws, FREQUENCY, MEAN, AMPLITUDE, np.zeros((4, 5)), prediction.TRANSIENT, found)
+    assert np.allclose(found[1, :, 0], expected, atol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -141,12 +143,14 @@ def test_an_unstable_orbit_is_found_in_a_synthetic_record_of_chaos():
     mean, amplitude = prediction.source_of(record)
     guess = rig.guessed(chaos._part(record, own["index"] // chaos.PHASES * chaos.PHASES, 1), values)[0]
     solution = rig.solve(guess, frequency, values, guess.guess)
-    numbers = tuple(values[name] for name in prediction.ORDER)
+    numbers = np.array([[values[name]] for name in prediction.ORDER])
     start = np.array([solution.states[name][0] for name in ("i", "v", "q", "m")])
-    found = np.empty((1, prediction.PHASES))
+    found = np.empty((1, 1, prediction.PHASES))
 
     def after(state):
-        return np.array(prediction._run(numbers, frequency, mean, amplitude, tuple(state), 0, found)[0])
+        states = np.array(state)[:, None]
+        prediction._run(numbers, frequency, mean, amplitude, states, 0, found)
+        return states[:, 0]
 
     scale = np.array([1e-3, 1.0, 1e-10, 1e-10])
     columns = [
