@@ -415,7 +415,7 @@ def directional_sensitivities(
 ) -> Sensitivities | None:
     """Return derivatives along directions (directions, parameters) of the parameters; None if singular."""
     d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
-    g, f = np.einsum("nep,dp->dne", d.g_theta, directions), np.einsum("ncp,dp->dnc", d.f_theta, directions)
+    g, f = np.tensordot(directions, d.g_theta, (1, 2)), np.tensordot(directions, d.f_theta, (1, 2))
     return respond(equations, z, columns, d, g, f)
 
 
@@ -439,9 +439,12 @@ def input_sensitivities(
 ) -> Sensitivities | None:
     """Return derivatives along perturbations (directions, points, 3·inputs) of (u, u̇, ü); None if singular."""
     d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
-    g = np.einsum("neu,dnu->dne", d.g_u, directions)
-    f = np.einsum("ncu,dnu->dnc", d.f_u, directions)
-    return respond(equations, z, columns, d, g, f)
+    return respond(equations, z, columns, d, along(d.g_u, directions), along(d.f_u, directions))
+
+
+def along(derivatives: np.ndarray, changes: np.ndarray) -> np.ndarray:
+    """Return the derivatives (points, values, variables) times changes (directions, points, variables)."""
+    return np.ascontiguousarray(np.moveaxis(derivatives @ np.moveaxis(changes, 0, 2), 2, 0))
 
 
 def frequency_derivatives(
@@ -473,4 +476,4 @@ def respond(
         if not regular.regular:
             return None
         z_change, frequency = regular.solve(-g), np.zeros(len(g))
-    return Sensitivities(z_change, f + np.einsum("ncq,dnq->dnc", d.f_q, equations.changes(z_change)), frequency)
+    return Sensitivities(z_change, f + along(d.f_q, equations.changes(z_change)), frequency)

@@ -21,7 +21,7 @@ import numpy as np
 
 from bayesperiodic._linalg import hessian_eigh, in_one_thread, scaled
 from bayesperiodic.data.experiment import DATA, Experiment
-from bayesperiodic.periodic.equations import CyclicFactors, PeriodicEquations
+from bayesperiodic.periodic.equations import CyclicFactors, PeriodicEquations, along
 from bayesperiodic.posterior.description import Description
 from bayesperiodic.posterior.likelihood import Likelihood
 from bayesperiodic.posterior.noise_estimate import estimate_noise
@@ -180,7 +180,7 @@ class _SimultaneousFit:
             d, columns = equations.derivatives(z, at), equations.residual_jacobian(z, at)
             by_q = columns[:, count:].reshape(points, count, -1)
             here = Response(equations.outputs(z, at), np.array(equations.frequency), none[:0], parameters[-1])
-            moved = Response(np.einsum("ncq,dnq->dnc", d.f_q, changes), none, none[:, None][:, :0], none)
+            moved = Response(along(d.f_q, changes), none, none[:, None][:, :0], none)
             g = _weighed(equations, columns[:, :count, None])[..., 0]
             dg = _weighed(equations, np.einsum("neq,dnq->ned", by_q, changes))
             parts = [
@@ -257,10 +257,10 @@ class _SimultaneousFit:
         factors = equations.factors(columns)
         if not np.isfinite(columns).all() or not factors.regular:
             return None
-        g = np.concatenate([np.einsum("nep,pt->tne", d.g_theta, by), columns[None, :, : equations.count]])
+        g = np.concatenate([np.tensordot(by, d.g_theta, (0, 2)), columns[None, :, : equations.count]])
         dz = factors.solve(-g)
-        outputs = np.einsum("ncq,dnq->dnc", d.f_q, equations.changes(dz))
-        outputs[:-1] += np.einsum("ncp,pt->tnc", d.f_theta, by)
+        outputs = along(d.f_q, equations.changes(dz))
+        outputs[:-1] += np.tensordot(by, d.f_theta, (0, 2))
         frequency, none = np.array(equations.frequency), np.zeros(0)
         here = Response(equations.outputs(z, at) + outputs[-1], frequency, none, parameters[-1])
         directions = Response(outputs[:-1], np.zeros(theta.size), np.zeros((theta.size, 0)), slopes[-1])
