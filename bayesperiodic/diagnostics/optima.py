@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -68,12 +69,12 @@ class Optimum:
     iterate: Iterate
     names: tuple[str, ...]  # of the terms' coefficients
 
-    @property
+    @cached_property
     def solutions(self) -> dict[str, PeriodicSolution]:
         """The periodic solutions by experiment."""
         return self.iterate.here.simulator.solutions(self.iterate.theta)
 
-    @property
+    @cached_property
     def orbits(self) -> dict[str, dict[str, np.ndarray]]:
         """The states of the periodic solutions by experiment."""
         return {name: solution.states for name, solution in self.solutions.items()}

@@ -54,6 +54,8 @@ SHOWN = 3
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
 MOST_UNEXPLAINED = 0.5
+# Step [sds] at which the search for the optimum of a model with a candidate term ends.
+ENOUGH = 0.01
 # Most linearisations of errors of the inputs, the steps between two, and the change [sds] that ends them.
 MOST_ROUNDS, BETWEEN, SETTLED = 40, 5, 1e-5
 # Seconds after which the progress bar is shown.
@@ -179,12 +181,13 @@ def nearest_optimum(
 ) -> tuple[Objective, End] | None:
     """Return objective and end of the iteration from θ and orbits near it, errors of inputs as the problem has them.
 
-    None if there is no orbit or no finite density.
+    The iteration ends at a step of `ENOUGH` standard deviations, where the objective is exact to ENOUGH². None if there
+    is no orbit or no finite density.
     """
     near = LogPosterior(problem, Simulator.start(problem, theta, guesses)).linearise(theta)
     objective = _objective(problem, near)
     first = objective.iterate(near, problem.likelihood.guess())
-    return None if first is None else (objective, climb(objective, first))
+    return None if first is None else (objective, climb(objective, first, enough=ENOUGH))
 
 
 def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Problem, End]:

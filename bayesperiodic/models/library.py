@@ -149,7 +149,7 @@ van_der_pol = Model(
 
 _RL_DIODE_UNITS = {
     "L": "H", "R": "ohm", "R_s": "ohm", "R_L": "ohm", "C_L": "F", "V_f": "V", "C_j": "F", "Q_0": "C", "transit": "s",
-    "lifetime": "s", "drift": "1/C", "C_s": "F", "offset": "V",
+    "lifetime": "s", "drift": "1/C", "C_s": "F", "bypass": "1", "offset": "V",
 }  # fmt: skip
 
 
@@ -177,7 +177,9 @@ rl_diode = Model(
     parameters=_RL_DIODE_UNITS,
     units={"i": "A", "v": "V", "q": "C", "m": "C", "source": "V", "resistor": "V"},
     equations=_rl_diode_equations,
-    outputs=lambda s, p, u: {"resistor": p.R * (_rl_diode(s, p, u)[1] + p.C_s * u.dsource) + p.offset},
+    outputs=lambda s, p, u: {
+        "resistor": p.R * (_rl_diode(s, p, u)[1] - p.bypass * s.dq + p.C_s * u.dsource) + p.offset
+    },
     description="""A resistor, a coil and a diode in series with a voltage source: period doubling, windows and chaos.
 
     The current I of the source charges the diode, which is described by two charges (P. O. Lauritzen, C. L. Ma, IEEE
@@ -192,14 +194,15 @@ rl_diode = Model(
         ṁ = (q⁺ − m)/transit − m/lifetime − drift i m
 
     transit is the time of diffusion into the base, lifetime that of recombination. The last term is empirical: current
-    carries stored charge away. The output is R I + R C_s d(source)/dt + offset, with a stray capacitance C_s of the
-    instrument. R_s is zero if the source is its voltage under load; for stability and other motions it has to be the
-    voltage without load. Only ratios to R follow from voltages. The diode blocks within R C_j, far below a period.
+    carries stored charge away. The output is R (I − bypass q̇ + C_s d(source)/dt) + offset, with a stray capacitance C_s
+    of the instrument, and a part bypass of the current that charges the junction, which is not measured; it is
+    empirical, too. R_s is zero if the source is its voltage under load; for stability and other motions it has to be
+    the voltage without load. Only ratios to R follow from voltages. The diode blocks within R C_j, far below a period.
 
     Examples
     --------
     >>> theta = {"L": 4.5e-3, "R": 1e3, "R_s": 0, "R_L": 55, "C_L": 6.4e-12, "V_f": 0.7, "C_j": 4.3e-12, "Q_0": 1.6e-11,
-    ...          "transit": 5.7e-7, "lifetime": 2.8e-6, "drift": 3.4e8, "C_s": 0, "offset": 0}
+    ...          "transit": 5.7e-7, "lifetime": 2.8e-6, "drift": 3.4e8, "C_s": 0, "bypass": 0, "offset": 0}
     >>> wave = 10.6 * np.cos(2 * np.pi * np.arange(16) / 16)
     >>> run = bp.simulate(bp.models.rl_diode, theta, {"source": wave}, frequency=1.4e5, duration=1e-3,
     ...                   sampling_rate=1.4e5)

@@ -88,7 +88,8 @@ def steps(fits: Mapping[str, rig.Fitted], used: Sequence[rig.Record], *, synthet
     """Return the unexplained variance of the fitted records by model."""
     figure, ax = plt.subplots(figsize=(6.4, 3.4), layout="constrained")
     names = [f"{record.frequency / 1e3:g} kHz\nP = {record.period}" for record in used]
-    for (step, own), marker, colour in zip(fits.items(), "osD", ("#D55E00", "#E69F00", "#0072B2"), strict=False):
+    styles = zip("osD^", ("#D55E00", "#E69F00", "#009E73", "#0072B2"), strict=True)
+    for (step, own), (marker, colour) in zip(fits.items(), styles, strict=True):
         values = [100 * rig.unexplained(e, own.fit.solutions[e.name]) for e in own.problem.experiments]
         ax.plot(names, values, marker, ls="-", lw=0.8, color=colour, label=step)
     floor = [100 * (1.0 - record.experiment.periodicity) for record in used if record.experiment]

@@ -16,22 +16,27 @@ TRANSIENT, KEPT, LONGEST = 120, 64, 8
 # Instants a period at which motions are compared, and the share of the variance that a period may leave: smaller
 # alternations are not counted, for they begin at zero.
 PHASES, LEFT = 16, 1e-2
-ORDER = ("R", "R_s", "L", "R_L", "C_L", "V_f", "C_j", "Q_0", "transit", "lifetime", "drift")
+ORDER = ("R", "R_s", "L", "R_L", "C_L", "V_f", "C_j", "Q_0", "transit", "lifetime", "drift", "bypass")
 Draw = Mapping[str, float]
 
 
 def draws_of(final: rig.Fitted, count: int, seed: int) -> list[dict[str, float]]:
-    """Return draws of the parameters: log-normal with the robust standard deviations and Laplace's correlations."""
+    """Return draws of the parameters with the robust standard deviations and Laplace's correlations.
+
+    They are log-normal, but for the bypass, which can be zero: it is normal.
+    """
     fit, known = final.fit, rig.values_of(final)
     names = [name for name in ORDER if name in fit.theta]
     covariance = fit.covariance.loc[names, names].to_numpy()
     sd = np.sqrt(np.diag(covariance))
     estimate = np.array([fit.theta[name] for name in names])
-    relative = np.array([fit.robust_sd[name] for name in names]) / estimate
+    robust_sd = np.array([fit.robust_sd[name] for name in names])
     correlation = covariance / np.outer(sd, sd)
     generator = np.random.default_rng(seed)
     normal = generator.multivariate_normal(np.zeros(len(names)), correlation, size=count, method="cholesky")
-    values = estimate * np.exp(normal * relative)
+    values = np.where(
+        np.array(names) == "bypass", estimate + normal * robust_sd, estimate * np.exp(normal * robust_sd / estimate)
+    )
     return [dict(zip(names, row.tolist(), strict=True)) | {n: known[n] for n in ("R", "R_s")} for row in values]
 
 
@@ -75,9 +80,11 @@ def _rates(values, draw, source, i, v, q, m):
     blocked = 0.5 * (root - q) / values[6, draw]
     current = (source - v - values[5, draw] + blocked) / (values[0, draw] + values[1, draw])
     flow = (0.5 * (root + q) - m) / values[8, draw]
+    charging = current - flow
     return (
-        (v - values[3, draw] * i) / values[2, draw], (current - i) / values[4, draw], current - flow,
-        flow - m / values[9, draw] - values[10, draw] * i * m, current * values[0, draw],
+        (v - values[3, draw] * i) / values[2, draw], (current - i) / values[4, draw], charging,
+        flow - m / values[9, draw] - values[10, draw] * i * m,
+        (current - values[11, draw] * charging) * values[0, draw],
     )  # fmt: skip
 
 

@@ -24,18 +24,20 @@ START = {
     "L": 4.5e-3, "R_L": 80.0, "C_L": 6e-12, "V_f": 0.5, "C_j": 3e-12, "Q_0": 2e-11, "transit": 8e-7, "lifetime": 3e-6,
 }  # fmt: skip
 # Terms that the first model lacks, and where their estimation starts.
-STARTS = {"drift": 3e8, "C_s": 0.0, "R_L": 60.0, "C_j": 4e-12, "Q_0": 1.6e-11, "transit": 6e-7}
-TERMS = ("drift", "C_s")
+STARTS = {"drift": 3e8, "C_s": 0.0, "bypass": 0.0, "R_L": 60.0, "C_j": 4e-12, "Q_0": 1.6e-11, "transit": 6e-7}
+TERMS = ("drift", "C_s", "bypass")
 STEPS_OF_MODEL = {
     "two charges": (),
-    "with drift of the stored charge": ("drift",),
-    "with drift and a stray capacitance": ("drift", "C_s"),
+    "with drift of the stored charge": TERMS[:1],
+    "with drift and a stray capacitance": TERMS[:2],
+    "with drift, capacitance and bypass": TERMS,
 }
 PRIORS: dict[str, Any] = {name: bp.LogNormal(value, 0.7) for name, value in START.items()} | {
     # The instrument removes the mean of the current.
     "offset": bp.Normal(0.0, 1.0),
     "drift": bp.LogNormal(2e8, 1.0),
     "C_s": bp.Normal(0.0, 1e-11),
+    "bypass": bp.Normal(0.0, 0.3),
 }
 # Frequencies [kHz] near which periodic records are fitted; the others are predicted.
 FITTED = (110.0, 140.0, 170.0, 210.0, 230.0, 350.0)
@@ -47,6 +49,7 @@ TRUE = START | {
     "drift": 3.4e8,
     "R": RESISTOR,
     "C_s": 0.0,
+    "bypass": 0.0,
     "offset": 0.0,
     "transit": 5.7e-7,
     "C_j": 4.3e-12,

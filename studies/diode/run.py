@@ -24,7 +24,7 @@ FOLLOWED = 16
 SEARCHED, KEPT = (110.0, 170.0, 230.0), 2
 # The term that is added to each model, of those that the search cannot tell apart, for its physical meaning.
 FIRST, *_, LAST = rig.STEPS_OF_MODEL
-CHOSEN = dict(zip(rig.STEPS_OF_MODEL, ("i*m in equation of m", "dsource in resistor"), strict=False))
+CHOSEN = dict(zip(rig.STEPS_OF_MODEL, ("i*m in equation of m", "dsource in resistor", "dq in resistor"), strict=False))
 # Period doublings: the orbit's record [kHz], and the frequency [kHz] up to which it is followed.
 DOUBLINGS = ((110.0, 130.0), (170.0, 200.0), (230.0, 290.0))
 RULE = (
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> None:
             model: pool.submit(rig.estimate, used, free, share)
             for model, free in rig.STEPS_OF_MODEL.items() if model != LAST
         }  # fmt: skip
-        with watch.part("map", "finding the MAP points of three models, and what two of them lack"):
+        with watch.part("map", "finding the MAP points of four models, and what three of them lack"):
             final = estimates[LAST].result()
         with watch.part("predict", f"integrating {draws} draws at the frequencies of all records"):
             sample = prediction.draws_of(final, draws, options.seed)
@@ -172,7 +172,7 @@ def _summary(own: rig.Fitted) -> dict[str, Any]:
 
 
 def _search(model: str, used: Sequence[rig.Record], share: float) -> bp.MissingTerms:
-    """Return what a model lacks by three of the records; the second model's search only ranks the candidates."""
+    """Return what a model lacks by three of the records; but for the first model, candidates are only ranked."""
     nearest = [min(used, key=lambda record: abs(record.frequency - 1e3 * f)) for f in SEARCHED]
     three = list({record.frequency: record for record in nearest}.values())
     own = rig.estimate(three, rig.STEPS_OF_MODEL[model], share)

@@ -51,7 +51,7 @@ TYPICAL = {
 }
 DIODE = {
     "L": 4.5e-3, "R": 1e3, "R_s": 250.0, "R_L": 60.0, "C_L": 6e-12, "V_f": 0.7, "C_j": 4e-12, "Q_0": 1e-9,
-    "transit": 6e-7, "lifetime": 3e-6, "drift": 3e8, "C_s": -5e-12, "offset": 0.3,
+    "transit": 6e-7, "lifetime": 3e-6, "drift": 3e8, "C_s": -5e-12, "bypass": 0.2, "offset": 0.3,
 }  # fmt: skip
 TYPICAL["rl_diode"] = DIODE, {"i": 1e-3, "v": 5.0, "q": 2e-9, "m": 2e-9, "source": 10.0}
 POINTS, FREQUENCY = 20, 1.4
@@ -100,7 +100,7 @@ def by_hand_rl_diode(q, u, p, tau):
         p["C_L"] * q[5] - (current - i),
         q[6] - (current - to_base),
         q[7] - (to_base - base / p["lifetime"] - p["drift"] * i * base),
-    ], [p["R"] * current + p["R"] * p["C_s"] * u[1] + p["offset"]]
+    ], [p["R"] * (current - p["bypass"] * q[6] + p["C_s"] * u[1]) + p["offset"]]
 
 
 def by_hand_van_der_pol(q, u, p, tau):

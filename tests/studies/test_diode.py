@@ -16,7 +16,7 @@ FREQUENCY, MEAN, AMPLITUDE = 140e3, 0.1, 10.5
 
 
 def test_stroboscopic_values_are_those_of_an_adaptive_implicit_integration():
-    p = VALUES
+    p = VALUES | {"bypass": 0.14}
 
     def rates(t, y):
         i, v, q, m = np.array([1e-3, 1.0, 1e-9, 1e-9]) * y
@@ -33,9 +33,10 @@ def test_stroboscopic_values_are_those_of_an_adaptive_implicit_integration():
     periods = prediction.TRANSIENT + 4
     at = np.arange(prediction.TRANSIENT, periods) / FREQUENCY
     path = solve_ivp(rates, (0.0, at[-1]), np.zeros(4), "Radau", at, rtol=1e-8, atol=1e-8).y
-    v, q = path[1], 1e-9 * path[2]
+    v, q, m = path[1], 1e-9 * path[2], 1e-9 * path[3]
     depleted = 0.5 * (np.hypot(q, p["Q_0"]) - q)
-    expected = (MEAN + AMPLITUDE - v - p["V_f"] + depleted / p["C_j"]) * p["R"] / (p["R"] + p["R_s"])
+    current = (MEAN + AMPLITUDE - v - p["V_f"] + depleted / p["C_j"]) / (p["R"] + p["R_s"])
+    expected = p["R"] * (current - p["bypass"] * (current - (depleted + q - m) / p["transit"]))
     # The second of five draws, of which four are integrated in one vector.
     draws = np.array([p[name] for name in prediction.ORDER])[:, None] * (1.0 + 0.05 * np.arange(-1.0, 4.0))
     found = np.empty((5, 4, prediction.PHASES))
