@@ -582,16 +582,26 @@ def diode():
     yield f"of {', '.join(map(str, some))} and {longest} periods of the source"
     unseen = d["score"]["largest_unexplained"]["not_used"]
     yield (
-        f"The first model leaves {low[0]} to {high[0]} % of the variance of the resistor's voltage, with two further "
-        f"terms {low[1]} to {high[1]} %, about what the cycles of a record differ by, and at most "
+        f"The first model leaves {low[0]} to {high[0]} % of the variance of the resistor's voltage, with three further "
+        f"terms {low[1]} to {high[1]} %, no more than the cycles of a record differ by, and at most "
         f"{100 * unseen:.2f} % of periodic records that were not fitted."
     )
-    first, second = d["missing_terms"]
+    first, second, third = d["missing_terms"]
     yield f"which is number {first['rank_of_chosen']} of the {first['candidates']} candidates of `bp.missing_terms`"
     yield (
         f"stray capacitance of the instrument, number {second['rank_of_chosen']} of {second['candidates']} in the "
         f"search for what the second model lacks"
     )
+    yield f"number {third['rank_of_chosen']} of {third['candidates']} in the search for what the third model lacks"
+    before, after = list(d["steps"].values())[-2:]
+    yield f"{100 * after['map']['bypass']:.0f} % of the current"
+    smaller = max(before["robust_sd"][n] / after["robust_sd"][n] for n in before["map"] if "[" not in n)
+    yield f"up to {smaller:.1f} times smaller"
+    *most, one = (
+        f"{row['frequency_Hz'] / 1e3:.0f}" for row in d["records"]
+        if row["measured_period"] is None and row["predicted"].get("4", 0.0) > 0.5
+    )  # fmt: skip
+    yield f"predicted at {', '.join(most)} and {one} kHz too"
     right = d["score"]["right"]
     yield (
         f"The most probable motion over the draws is the measured one in {right['periodic'][0]} of "

@@ -362,6 +362,7 @@ class _Search:
         self.refused: dict[str, str] = {}
         self.widths: dict[str, float] = {}
         self.compiled: tuple[Model, dict[str, Candidate]] = self.model, {}
+        self.fitted: dict[tuple[str, ...], Optimum] = {}
 
     def run(self, fit: MapEstimate, max_terms: int) -> MissingTerms:
         """Return what was found from the estimate of the model without terms on."""
@@ -480,10 +481,12 @@ class _Search:
         curved, vague = state.curved, False
         for key in tried:
             names = (*chosen, self.names[key])
-            problem = self.with_terms(names).with_input_errors(state.problem.input_errors)
-            after = state.with_problem(problem, names)
+            after = self.fitted.get(names)
+            if after is None:
+                problem = self.with_terms(names).with_input_errors(state.problem.input_errors)
+                after = state.with_problem(problem, names)
             if after is not None and (after.curved or not curved):
-                fitted[key] = after
+                self.fitted[names] = fitted[key] = after
             else:
                 self.refused[key] = VANISHED if after is None else VAGUE
                 vague = vague or after is not None

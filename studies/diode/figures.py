@@ -75,6 +75,8 @@ def unstable_orbits(records: Sequence[rig.Record], unstable: Sequence[Mapping[st
             fontsize="medium",
         )
         ax.set_ylabel("voltage [V]")
+    low, high = np.atleast_1d(axes)[0].get_ylim()
+    np.atleast_1d(axes)[0].set_ylim(top=high + 0.25 * (high - low))
     np.atleast_1d(axes)[0].legend(frameon=False, fontsize="small", loc="upper right", ncols=3)
     np.atleast_1d(axes)[-1].set_xlabel("time from the start of the passage [periods of the source]")
     kind = "SYNTHETIC" if synthetic else "measured"
@@ -94,7 +96,7 @@ def steps(fits: Mapping[str, rig.Fitted], used: Sequence[rig.Record], *, synthet
         ax.plot(names, values, marker, ls="-", lw=0.8, color=colour, label=step)
     floor = [100 * (1.0 - record.experiment.periodicity) for record in used if record.experiment]
     ax.plot(names, floor, "_", ms=14, color="#555555", label="between the cycles of the record")
-    ax.set(yscale="log", ylabel="unexplained variance [%]")
+    ax.set(yscale="log", ylabel="unexplained variance [%]", ylim=(None, 9.0))
     ax.set_title("What each term explains" + (" (synthetic data)" if synthetic else ""))
-    ax.legend(frameon=False, fontsize="small")
+    ax.legend(frameon=False, fontsize="small", loc="upper left")
     return figure

@@ -16,6 +16,8 @@ TRANSIENT, KEPT, LONGEST = 120, 64, 8
 # Instants a period at which motions are compared, and the share of the variance that a period may leave: smaller
 # alternations are not counted, for they begin at zero.
 PHASES, LEFT = 16, 1e-2
+# Fewest draws a thread: so many are integrated in hardly more time than one.
+TOGETHER = 12
 ORDER = ("R", "R_s", "L", "R_L", "C_L", "V_f", "C_j", "Q_0", "transit", "lifetime", "drift", "bypass")
 Draw = Mapping[str, float]
 
@@ -69,7 +71,8 @@ def sweep(
             rows[:, number] -= average[:, None, None]
         found[numbers] = rows
 
-    common.in_threads(part, np.array_split(np.arange(len(draws)), min(common.available_cores(), len(draws))))
+    parts = min(common.available_cores(), max(1, len(draws) // TOGETHER))
+    common.in_threads(part, np.array_split(np.arange(len(draws)), parts))
     return found
 
 

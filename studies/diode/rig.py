@@ -180,7 +180,7 @@ def fitted_records(records: Sequence[Record]) -> list[Record]:
 
 
 def estimate(records: Sequence[Record], free: Sequence[str], share: float) -> Fitted:
-    """Return the MAP point of some records with some of the model's two further terms."""
+    """Return the MAP point of some records with some of the model's three further terms."""
     values = START | dict.fromkeys(TERMS, 0.0) | {"R_s": share * RESISTOR}
     if free:
         values |= {name: value for name, value in STARTS.items() if name in START or name in free}

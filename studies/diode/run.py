@@ -20,8 +20,8 @@ from studies.diode import chaos, figures, prediction, rig
 DRAWS, QUICK_DRAWS = 100, 8
 # Draws whose orbits are followed to their period doublings.
 FOLLOWED = 16
-# Records of the search for missing terms [kHz], and how many terms are tried.
-SEARCHED, KEPT = (110.0, 170.0, 230.0), 2
+# Records of the searches for missing terms [kHz], also of the last one, and how many terms are tried.
+SEARCHED, SEARCHED_LAST, KEPT = (110.0, 170.0, 230.0), (170.0, 230.0, 350.0), 2
 # The term that is added to each model, of those that the search cannot tell apart, for its physical meaning.
 FIRST, *_, LAST = rig.STEPS_OF_MODEL
 CHOSEN = dict(zip(rig.STEPS_OF_MODEL, ("i*m in equation of m", "dsource in resistor", "dq in resistor"), strict=False))
@@ -173,7 +173,8 @@ def _summary(own: rig.Fitted) -> dict[str, Any]:
 
 def _search(model: str, used: Sequence[rig.Record], share: float) -> bp.MissingTerms:
     """Return what a model lacks by three of the records; but for the first model, candidates are only ranked."""
-    nearest = [min(used, key=lambda record: abs(record.frequency - 1e3 * f)) for f in SEARCHED]
+    searched = SEARCHED_LAST if model == list(CHOSEN)[-1] else SEARCHED
+    nearest = [min(used, key=lambda record: abs(record.frequency - 1e3 * f)) for f in searched]
     three = list({record.frequency: record for record in nearest}.values())
     own = rig.estimate(three, rig.STEPS_OF_MODEL[model], share)
     return bp.missing_terms(own.problem, own.fit, max_terms=int(model == FIRST), keep=KEPT)
