@@ -311,7 +311,7 @@ def _portrait(ax: Axes, orbit: Orbit) -> None:
         jump = np.flatnonzero(np.abs(np.diff(x)) > np.pi) + 1 if orbit.angles else np.empty(0, dtype=int)
         ax.plot(np.insert(x, jump, np.nan), np.insert(y, jump, np.nan), **CYCLES[label])
     ax.plot(*orbit.points.T, ms=4.5, zorder=4, **POINTS)
-    turns = "" if orbit.winding is None else f", winding {orbit.winding}"
+    turns = "" if orbit.winding is None else f", winding {orbit.winding}".replace("-", "−")
     ax.set_title(f"period {orbit.period}{turns}\n$\\mu$ = {_multiplier(orbit)}", fontsize="x-small")
     ax.tick_params(labelsize="x-small")
 

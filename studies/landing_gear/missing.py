@@ -8,6 +8,7 @@ deviations and less what the parameters can do instead, that the term explains (
 
 import time
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -61,9 +62,7 @@ def counted(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
                 effect: sum(_nearest(line)[0] == effect and _nearest(line)[1] >= SAME for line in own)
                 for effect in STRENGTHS
             },
-            "terms": {
-                text: sum(line["first"] == text for line in own) for text in {line["first"] or "" for line in own}
-            },
+            "terms": dict(Counter(line["first"] for line in own if line["first"] is not None)),
         }
         for truth in TRUTHS
         if (own := [line for line in lines if line["truth"] == truth])

@@ -19,7 +19,7 @@ from studies.missing_terms.cases import ALTERNATIVE, CASES, ERROR, NONE, OTHER, 
 REPLICATES, QUICK, FILE = 50, 2, "replicates.jsonl"
 # Wanted shares of data sets in which the true term comes first, and in which a right model is left alone.
 FOUND, LEFT_ALONE = 0.9, 0.95
-COLOURS = {RIGHT: "C2", ALTERNATIVE: "C8", OTHER: "C3", NONE: "0.75", ERROR: "k"}
+COLOURS = {RIGHT: "#009E73", ALTERNATIVE: "#E69F00", OTHER: "#D55E00", NONE: "0.75", ERROR: "k"}
 
 
 def run(options: argparse.Namespace) -> None:
@@ -100,6 +100,6 @@ def draw(found: dict[str, Any]) -> Figure:
     axes.set_yticks(place, [name if found[name]["missing"] else f"{name}: model is right" for name in names])
     count = max(one["count"] for one in found.values())
     axes.set(xlim=(0.0, 1.0), xlabel=f"share of {count} synthetic data sets a case")
-    axes.set_title("first term that the search adds")
+    axes.set_title("The first term that the search adds")
     common.shared_legend(figure, 6, handlelength=1.2, columnspacing=1.0)
     return figure
