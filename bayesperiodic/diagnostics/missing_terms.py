@@ -481,10 +481,9 @@ class _Search:
         curved, vague = state.curved, False
         for key in tried:
             names = (*chosen, self.names[key])
-            after = self.fitted.get(names)
-            if after is None:
-                problem = self.with_terms(names).with_input_errors(state.problem.input_errors)
-                after = state.with_problem(problem, names)
+            after = self.fitted.get(names) or state.with_problem(
+                self.with_terms(names).with_input_errors(state.problem.input_errors), names
+            )
             if after is not None and (after.curved or not curved):
                 self.fitted[names] = fitted[key] = after
             else:

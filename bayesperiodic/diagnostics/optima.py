@@ -23,8 +23,6 @@ DISTINCT = 2.0
 FEWEST_EXPERIMENTS = 3
 # Where the search for an optimum ends by itself; "stalled" steps are limited by the accuracy of the periodic solutions.
 ENDED = ("converged", "stalled")
-
-
 # Robust standard deviations from zero of a coefficient.
 SIGNIFICANT = 2.0
 # Fraction by which a coefficient may change on twice as many points.

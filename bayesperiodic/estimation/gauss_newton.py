@@ -36,6 +36,10 @@ class Iterate:
     objective: float
 
 
+# Called for every new iterate with it and the step [standard deviations].
+Report = Callable[[Iterate, float], None] | None
+
+
 class End(NamedTuple):
     """End of an iteration, its status, as in `MapEstimate`, and the objective at each iterate."""
 
@@ -147,9 +151,7 @@ def bias_correction(problem: Description, iterate: Iterate) -> np.ndarray:
     return result
 
 
-def corrected(
-    objective: Objective, found: End, report: Callable[[Iterate, float], None] | None = None
-) -> tuple[Objective, End]:
+def corrected(objective: Objective, found: End, report: Report = None) -> tuple[Objective, End]:
     """Climb again from the end of a climb with `bias_correction` at each new end, until its factors settle.
 
     Returns the last objective and end.
@@ -166,7 +168,7 @@ def corrected(
     return objective, found
 
 
-def resumed(objective: Objective, end: End, report: Callable[[Iterate, float], None] | None = None) -> End | None:
+def resumed(objective: Objective, end: End, report: Report = None) -> End | None:
     """Climb on from the end of a climb with another objective; None if that is not finite there.
 
     Earlier values in the history are shifted so that it goes on where the objective changes.
@@ -179,23 +181,16 @@ def resumed(objective: Objective, end: End, report: Callable[[Iterate, float], N
 
 
 def climb(
-    objective: Objective,
-    start: Iterate,
-    held: np.ndarray | None = None,
-    report: Callable[[Iterate, float], None] | None = None,
-    most: int = MAX_ITERATIONS,
-    enough: float = 0.0,
-) -> End:
+    objective: Objective, start: Iterate, held: np.ndarray | None = None, report: Report = None,
+    most: int = MAX_ITERATIONS, enough: float = 0.0,
+) -> End:  # fmt: skip
     """Increase the objective from an anchored start until the steps are small, at most so many steps in a row.
 
-    A full step below `enough` [standard deviations] ends it too.
-
-    Where H is not positive definite (convex log-priors that outweigh the data) steps take its negative curvature with
-    the opposite sign; directions without curvature are left out. Each solve starts from the previous iterate and is
-    checked to lie on the same branch, so that a step cannot change to another periodic solution. A step whose solve
-    fails is halved. A parameter at the end of its prior's support is fixed while the gradient points outwards.
-
-    Parameters `held` (names,) are fixed; report(iterate, step in standard deviations) is called for every new iterate.
+    A full step below `enough` [standard deviations] ends it too. Where H is not positive definite (convex log-priors
+    that outweigh the data) steps take its negative curvature with the opposite sign; directions without curvature are
+    left out. Each solve starts from the previous iterate and is checked to lie on the same branch, so that a step
+    cannot change to another periodic solution. A step whose solve fails is halved. A parameter at the end of its
+    prior's support is fixed while the gradient points outwards. Parameters `held` (names,) are fixed.
     """
     always = np.zeros(start.theta.size, dtype=bool) if held is None else held
     now, resting, history = start, always, [start.objective]
@@ -220,19 +215,14 @@ def at_ends(objective: Objective, iterate: Iterate) -> np.ndarray:
 
 
 def _ascend(
-    objective: Objective,
-    start: Iterate,
-    held: np.ndarray,
-    report: Callable[[Iterate, float], None] | None,
-    most: int,
-    enough: float,
+    objective: Objective, start: Iterate, held: np.ndarray, report: Report, most: int, enough: float
 ) -> tuple[Iterate, str, list[float]]:
     """Climb with the same parameters fixed; return the end, the status, and the objectives of all steps."""
     now = start
     history: list[float] = []
     for _ in range(most):
         hessian, gradient = objective.hessian_and_gradient(now)
-        if not np.isfinite(hessian).all() or not np.isfinite(gradient).all():
+        if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
             return now, "singular", history
         step, size = _step(_curved(objective, now, hessian), gradient, held)
         if size < SCALED_STEP:

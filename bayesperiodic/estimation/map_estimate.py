@@ -54,8 +54,7 @@ SHOWN = 3
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
 MOST_UNEXPLAINED = 0.5
-# Step [sds] at which the search for the optimum of a model with a candidate term ends.
-ENOUGH = 0.01
+ENOUGH = 0.01  # Step [sds] that ends the fit of a model with a candidate term.
 # Most linearisations of errors of the inputs, the steps between two, and the change [sds] that ends them.
 MOST_ROUNDS, BETWEEN, SETTLED = 40, 5, 1e-5
 # Seconds after which the progress bar is shown.

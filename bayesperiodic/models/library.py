@@ -194,10 +194,10 @@ rl_diode = Model(
         ṁ = (q⁺ − m)/transit − m/lifetime − drift i m
 
     transit is the time of diffusion into the base, lifetime that of recombination. The last term is empirical: current
-    carries stored charge away. The output is R (I − bypass q̇ + C_s d(source)/dt) + offset, with a stray capacitance C_s
-    of the instrument, and a part bypass of the current that charges the junction, which is not measured; it is
-    empirical, too. R_s is zero if the source is its voltage under load; for stability and other motions it has to be
-    the voltage without load. Only ratios to R follow from voltages. The diode blocks within R C_j, far below a period.
+    carries stored charge away. The output is offset + R (I − bypass q̇ + C_s d(source)/dt): C_s is a stray capacitance
+    of the instrument, and a part bypass of the current into the junction is not measured (empirical). R_s is zero if
+    the source is its voltage under load; for stability and other motions it has to be the voltage without load. Only
+    ratios to R follow from voltages. The diode blocks within R C_j, far below a period.
 
     Examples
     --------
