@@ -294,8 +294,7 @@ def stiffness_gradient(
         small = min(small, SMALL * abs(parameters[p])) if parameters[p] != 0.0 else small
         ends = []
         for step in (small, -small):
-            moved = parameters.copy()
-            moved[p] += step
+            moved = parameters + step * (np.arange(parameters.size) == p)
             columns = equations.residual_jacobian(z + step * sensitivities[p], moved)
             ends.append(weights @ columns[:, equations.count :].ravel())
         result[p] = (ends[0] - ends[1]) / (2.0 * small)

@@ -444,7 +444,8 @@ def input_sensitivities(
 
 def along(derivatives: np.ndarray, changes: np.ndarray) -> np.ndarray:
     """Return the derivatives (points, values, variables) times changes (directions, points, variables)."""
-    return np.ascontiguousarray(np.moveaxis(derivatives @ np.moveaxis(changes, 0, 2), 2, 0))
+    with np.errstate(over="ignore", invalid="ignore"):  # Where outputs overflow the result is not finite.
+        return np.ascontiguousarray(np.moveaxis(derivatives @ np.moveaxis(changes, 0, 2), 2, 0))
 
 
 def frequency_derivatives(
