@@ -271,7 +271,7 @@ def smallest_singular_vectors(
     left = left / terms**2
     change = equations.changes(right[None])[0]
     g_q = columns[:, equations.count :].reshape(len(z), equations.count, -1)
-    return left / np.sum(left * np.einsum("neq,nq->ne", g_q, change)), change
+    return left / np.dot(left.ravel(), np.einsum("neq,nq->ne", g_q, change).ravel()), change
 
 
 def stiffness_gradient(
@@ -288,7 +288,7 @@ def stiffness_gradient(
     """
     amplitude, result = np.abs(z).max(axis=0), np.zeros(parameters.size)
     units = np.where(amplitude > 0.0, amplitude, 1.0)
-    weights = (left[:, :, None] * right[:, None, :]).ravel()
+    weights = np.einsum("ne,nq->neq", left, right).ravel()
     for p in np.flatnonzero(sensitivities.any(axis=(1, 2))):
         small = SMALL / np.max(np.abs(sensitivities[p]) / units)
         small = min(small, SMALL * abs(parameters[p])) if parameters[p] != 0.0 else small
@@ -296,6 +296,6 @@ def stiffness_gradient(
         for step in (small, -small):
             moved = parameters + step * (np.arange(parameters.size) == p)
             columns = equations.residual_jacobian(z + step * sensitivities[p], moved)
-            ends.append(weights @ columns[:, equations.count :].ravel())
+            ends.append(np.dot(weights, columns[:, equations.count :].ravel()))
         result[p] = (ends[0] - ends[1]) / (2.0 * small)
     return result
