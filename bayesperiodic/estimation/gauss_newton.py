@@ -182,11 +182,11 @@ def resumed(objective: Objective, end: End, report: Report = None) -> End | None
 
 def climb(
     objective: Objective, start: Iterate, held: np.ndarray | None = None, report: Report = None,
-    most: int = MAX_ITERATIONS, enough: float = 0.0,
+    most: int = MAX_ITERATIONS,
 ) -> End:  # fmt: skip
     """Increase the objective from an anchored start until the steps are small, at most so many steps in a row.
 
-    A full step below `enough` [standard deviations] ends it too. Where H is not positive definite (convex log-priors
+    Where H is not positive definite (convex log-priors
     that outweigh the data) steps take its negative curvature with the opposite sign; directions without curvature are
     left out. Each solve starts from the previous iterate and is checked to lie on the same branch, so that a step
     cannot change to another periodic solution. A step whose solve fails is halved. A parameter at the end of its
@@ -195,7 +195,7 @@ def climb(
     always = np.zeros(start.theta.size, dtype=bool) if held is None else held
     now, resting, history = start, always, [start.objective]
     for _ in range(MAX_ROUNDS):
-        now, status, objectives = _ascend(objective, now, resting, report, most, enough)
+        now, status, objectives = _ascend(objective, now, resting, report, most)
         history += objectives
         ends = at_ends(objective, now)
         inwards = ends * objective.hessian_and_gradient(now)[1] < 0.0
@@ -215,7 +215,7 @@ def at_ends(objective: Objective, iterate: Iterate) -> np.ndarray:
 
 
 def _ascend(
-    objective: Objective, start: Iterate, held: np.ndarray, report: Report, most: int, enough: float
+    objective: Objective, start: Iterate, held: np.ndarray, report: Report, most: int
 ) -> tuple[Iterate, str, list[float]]:
     """Climb with the same parameters fixed; return the end, the status, and the objectives of all steps."""
     now = start
@@ -241,7 +241,7 @@ def _ascend(
         history.append(now.objective)
         if report is not None:
             report(now, damping * size)
-        if size < enough or (size < SMALL_STEP and gain < SMALL_GAIN):
+        if size < SMALL_STEP and gain < SMALL_GAIN:
             return now, "converged", history
     return now, "iterations", history
 

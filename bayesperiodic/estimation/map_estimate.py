@@ -54,7 +54,6 @@ SHOWN = 3
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
 MOST_UNEXPLAINED = 0.5
-ENOUGH = 0.01  # Step [sds] that ends the fit of a model with a candidate term.
 # Most linearisations of errors of the inputs, the steps between two, and the change [sds] that ends them.
 MOST_ROUNDS, BETWEEN, SETTLED = 40, 5, 1e-5
 # Seconds after which the progress bar is shown.
@@ -180,13 +179,12 @@ def nearest_optimum(
 ) -> tuple[Objective, End] | None:
     """Return objective and end of the iteration from θ and orbits near it, errors of inputs as the problem has them.
 
-    The iteration ends at a step of `ENOUGH` standard deviations, where the objective is exact to ENOUGH². None if there
-    is no orbit or no finite density.
+    None if there is no orbit or no finite density.
     """
     near = LogPosterior(problem, Simulator.start(problem, theta, guesses)).linearise(theta)
     objective = _objective(problem, near)
     first = objective.iterate(near, problem.likelihood.guess())
-    return None if first is None else (objective, climb(objective, first, enough=ENOUGH))
+    return None if first is None else (objective, climb(objective, first))
 
 
 def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Problem, End]:

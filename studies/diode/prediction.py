@@ -36,9 +36,8 @@ def draws_of(final: rig.Fitted, count: int, seed: int) -> list[dict[str, float]]
     correlation = covariance / np.outer(sd, sd)
     generator = np.random.default_rng(seed)
     normal = generator.multivariate_normal(np.zeros(len(names)), correlation, size=count, method="cholesky")
-    values = np.where(
-        np.array(names) == "bypass", estimate + normal * robust_sd, estimate * np.exp(normal * robust_sd / estimate)
-    )
+    values, positive = estimate + normal * robust_sd, np.array(names) != "bypass"
+    values[:, positive] = (estimate * np.exp(normal * robust_sd / np.where(positive, estimate, np.inf)))[:, positive]
     return [dict(zip(names, row.tolist(), strict=True)) | {n: known[n] for n in ("R", "R_s")} for row in values]
 
 

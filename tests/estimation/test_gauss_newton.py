@@ -54,25 +54,6 @@ def test_a_gain_below_the_errors_of_the_objective_ends_the_iteration(error, dist
     assert status == "stalled" or abs(end.iterate.theta[0]) < 1e-3
 
 
-class Slow(Inexact):
-    """The same with twice the curvature, so that each step goes half of the way."""
-
-    def hessian_and_gradient(self, iterate):
-        """Return twice the curvature, and the gradient."""
-        return 2.0 * np.eye(1), -iterate.theta
-
-
-@pytest.mark.parametrize("enough", [0.1, 0.01])
-def test_an_iteration_that_may_end_early_is_as_near_as_its_last_step(enough):
-    """Where each step goes half of the way, the last one and what is left are equal."""
-    start = Iterate(np.ones(1), None, np.zeros(0), -0.5)
-    early, precise = climb(Slow(0.0), start, enough=enough), climb(Slow(0.0), start)
-    assert early.status == precise.status == "converged"
-    assert 0.0 < early.iterate.theta[0] < enough
-    assert -(enough**2) < early.iterate.objective
-    assert early.history.size < 0.5 * precise.history.size
-
-
 def test_residuals_whose_squares_overflow_are_refused():
     """A step of the estimate by the data alone may lead to them; noise parameters cannot be estimated there."""
     problem = bp.Problem(
