@@ -186,11 +186,11 @@ def climb(
 ) -> End:  # fmt: skip
     """Increase the objective from an anchored start until the steps are small, at most so many steps in a row.
 
-    Where H is not positive definite (convex log-priors
-    that outweigh the data) steps take its negative curvature with the opposite sign; directions without curvature are
-    left out. Each solve starts from the previous iterate and is checked to lie on the same branch, so that a step
-    cannot change to another periodic solution. A step whose solve fails is halved. A parameter at the end of its
-    prior's support is fixed while the gradient points outwards. Parameters `held` (names,) are fixed.
+    Where H is not positive definite (convex log-priors that outweigh the data) steps take its negative curvature with
+    the opposite sign; directions without curvature are left out. Each solve starts from the previous iterate and is
+    checked to lie on the same branch, so that a step cannot change to another periodic solution. A step whose solve
+    fails is halved. A parameter at the end of its prior's support is fixed while the gradient points outwards.
+    Parameters `held` (names,) are fixed.
     """
     always = np.zeros(start.theta.size, dtype=bool) if held is None else held
     now, resting, history = start, always, [start.objective]
