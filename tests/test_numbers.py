@@ -472,7 +472,7 @@ def calibration():
 
 @on("docs/studies/verdicts.md")
 def verdicts():
-    found = results("verdicts")["replicates"]
+    found = results("verdicts/replicates")["cases"]
     right = found["linear"]
     faulty = {name: one for name, one in found.items() if name != "linear"}
     assert all(one["data"]["named"] == one["data"]["replicates"] for one in faulty.values())

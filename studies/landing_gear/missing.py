@@ -37,7 +37,7 @@ SAME = 0.95
 def replicate(task: tuple[str, int]) -> dict[str, Any]:
     """Return the first step of the search in the data of a seed, and the share of each missing effect in it."""
     truth, seed = task
-    found = search(truth, seed, quick=False, most=1)
+    found = search(truth, seed, quick=False, most=1, shown=1)
     step = found["steps"][0] if found["steps"] else {"term": None}
     shares = {effect: own["steps_shares"][0] for effect, own in found["effects"].items() if own["steps_shares"]}
     return {
@@ -75,7 +75,9 @@ def _nearest(line: Mapping[str, Any]) -> tuple[str, float]:
     return max(single.items(), key=lambda item: item[1], default=("", 0.0))
 
 
-def search(truth: str, seed: int, *, quick: bool, runs: Sequence[Run] = RUNS, most: int = MOST) -> dict[str, Any]:
+def search(
+    truth: str, seed: int, *, quick: bool, runs: Sequence[Run] = RUNS, most: int = MOST, shown: int = SHOWN
+) -> dict[str, Any]:
     """Return the ranking, the steps, and what they have in common with the terms that the truth has."""
     experiments = [fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT) for run in runs]
     with warnings.catch_warnings():
@@ -84,7 +86,7 @@ def search(truth: str, seed: int, *, quick: bool, runs: Sequence[Run] = RUNS, mo
         begin = time.perf_counter()
         found = bp.missing_terms(start.problem, start.fit, max_terms=0 if quick else most, keep=KEEP)
         seconds = time.perf_counter() - begin
-        table = found.ranking.head(QUICK_SHOWN if quick else SHOWN)
+        table = found.ranking.head(QUICK_SHOWN if quick else shown)
         rows = [(row["place"], row["term"], row["lag"]) for _, row in table.iterrows()]
         steps = [(step.place, step.term, step.lag) for step in found.steps]
         matches = compare(start, rows, steps) if truth == "B" else {}

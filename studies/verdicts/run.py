@@ -1,7 +1,8 @@
 """Gallery of cases with known answers, and the verdicts of identifiability, compare and predict on each.
 
-All data are synthetic, with noise. ``--replicates N`` repeats every case on N data sets and samples the first data set
-with up to 20 seeds. Each replicate is saved in replicates.jsonl as it ends, and the same command computes missing ones.
+All data are synthetic, with noise. ``--replicates N`` repeats every case on N data sets instead, and samples the first
+data set with up to 20 seeds. Each replicate is saved in replicates.jsonl as it ends, and the same command computes
+missing ones.
 """
 
 import argparse
@@ -65,14 +66,14 @@ def replicates(folder: Path, names: Sequence[str], count: int, seed: int) -> lis
     return common.resumed(folder / FILE, tasks, replicate, lambda line: tuple(line[key] for key in keys), source())
 
 
-def summary(lines: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
+def summary(lines: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, Any]:
     """Return the counts of each case: other data, and other sampler seeds on the first data set."""
     found = {}
-    for name, outcome in outcomes.items():
+    for name in names:
         own = [line for line in lines if line["case"] == name]
         by_kind = {kind: [line for line in own if line["kind"] == kind] for kind in (DATA, SAMPLER)}
         found[name] = {kind: _counts(members) for kind, members in by_kind.items()}
-        found[name][SAMPLER]["verdicts_that_flip"] = _flips(by_kind[SAMPLER], outcome)
+        found[name][SAMPLER]["verdicts_that_flip"] = _flips(by_kind[SAMPLER], CASES[name]())
     return found
 
 
@@ -93,11 +94,11 @@ def _counts(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return counts | {"wrong": dict(wrong), "seconds_each": round(float(np.mean(seconds)), 2) if seconds else None}
 
 
-def _flips(lines: Sequence[Mapping[str, Any]], outcome: Outcome) -> dict[str, list[str]]:
+def _flips(lines: Sequence[Mapping[str, Any]], case: cases.Case) -> dict[str, list[str]]:
     """Return the expected verdicts that differ between sampler seeds."""
     by_name: dict[str, set[str]] = {}
     for line in lines:
-        for tool, rows in outcome.case.expected.items():
+        for tool, rows in case.expected.items():
             for name in rows if tool in line.get("verdicts", {}) else ():
                 by_name.setdefault(f"{tool} {name}", set()).add(line["verdicts"][tool][name])
     return {what: sorted(verdicts) for what, verdicts in by_name.items() if len(verdicts) > 1}
@@ -202,22 +203,25 @@ QUICK = ("product_ridge", "linear", "prior_dominated", "misspecified")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the study."""
-    watch = common.Stopwatch()
+    """Run the study, or with ``--replicates`` the cases on other data."""
+    watch, names = common.Stopwatch(), QUICK if options.quick else tuple(CASES)
     print("All data are SYNTHETIC: simulated from the stated truths, with noise.")
+    if options.replicates:
+        folder = options.out / "replicates"
+        folder.mkdir(parents=True, exist_ok=True)
+        with watch.part("replicates", f"{options.replicates} replicates of every case"):
+            counts = summary(replicates(folder, names, options.replicates, options.seed), names)
+        print(account_of_replicates(counts))
+        common.finish(folder, {"synthetic": True, "seed": options.seed, "cases": counts}, watch, synthetic=True)
+        return
     outcomes: dict[str, Outcome] = {}
-    for name in QUICK if options.quick else CASES:
+    for name in names:
         with watch.part(name, name.replace("_", " ")):
             outcomes[name] = examine(name, STRIDE * options.seed, options.seed)
         print(_account(outcomes[name]))
     with watch.part("figures", "drawing"):
         paths = common.save_figures(options.out, _figures(outcomes))
     results: dict[str, Any] = {name: _collect(outcome) for name, outcome in outcomes.items()}
-    if options.replicates:
-        with watch.part("replicates", f"{options.replicates} replicates of every case"):
-            lines = replicates(options.out, tuple(outcomes), options.replicates, options.seed)
-        results["replicates"] = summary(lines, outcomes)
-        print(account_of_replicates(results["replicates"]))
     about = {"synthetic": True, "seed": options.seed, "quick": options.quick, "monte_carlo": "pairs: value, error"}
     results["study"] = about | {"seconds": watch.total(), "versions": common.versions()}
     path = common.write_results(options.out, results)
