@@ -239,7 +239,7 @@ def _contenders(ax: Axes, problems: Mapping[str, Any]) -> None:
     ax.invert_yaxis()
     ax.grid(axis="x", alpha=0.3)
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=2)
-    ax.set_title("Time of one log-posterior at equal accuracy (median, range), relative to this package")
+    ax.set_title("Time of one log-posterior at equal accuracy,\nrelative to this package (median, range)")
 
 
 def _floor(ax: Axes, found: Mapping[str, Any]) -> None:
@@ -274,5 +274,5 @@ def _posterior(ax: Axes, found: Mapping[str, Any]) -> None:
     ax.set(
         xscale="log",
         xlabel="effective samples per second [1/s]",
-        title="Sampling rate, Duffing (synthetic); blue: this package",
+        title="Sampling rate, Duffing (synthetic)\n(blue: this package)",
     )

@@ -44,12 +44,12 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "kernels"
 
 
-def start() -> subprocess.Popen:
+ROOT = Path(__file__).parents[2]
+
+
+def start(root: Path = ROOT) -> subprocess.Popen:
     return subprocess.Popen(
-        [sys.executable, "-W", "error::RuntimeWarning", "-c", PROGRAM],
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=Path(__file__).parents[2],
+        [sys.executable, "-W", "error::RuntimeWarning", "-c", PROGRAM], stdout=subprocess.PIPE, text=True, cwd=root
     )
 
 
@@ -68,6 +68,19 @@ def test_second_start_loads_all_functions_from_the_cache(folder):
     first = start()
     assert first.communicate()[0] == "0\n"
     second = start()
+    assert second.communicate()[0] == f"{len(FUNCTIONS)}\n"
+
+
+def test_an_upgrade_that_keeps_the_sources_loads_the_entries_of_the_version_before(folder, tmp_path):
+    first = start()
+    assert first.communicate()[0] == "0\n"
+    for part in ("bayesperiodic", "tests"):
+        shutil.copytree(ROOT / part, tmp_path / "upgraded" / part, ignore=shutil.ignore_patterns("__pycache__"))
+    package = tmp_path / "upgraded" / "bayesperiodic"
+    for path in ("__init__.py", "models/cache.py", "models/model.py", "models/code_generation.py"):
+        with (package / path).open("a", encoding="utf-8") as file:
+            file.write("\n# changed\n")
+    second = start(package.parent)
     assert second.communicate()[0] == f"{len(FUNCTIONS)}\n"
 
 
