@@ -60,6 +60,7 @@ def test_linear_algebra_has_one_thread_inside_and_as_many_as_before_outside(two_
         in_one_thread(lambda: 1 / 0)()
 
 
+@pytest.mark.slow
 def test_estimates_and_draws_are_computed_with_one_thread(two_threads):
     found = set()
 

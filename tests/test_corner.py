@@ -229,6 +229,7 @@ def test_the_density_of_one_quantity_vanishes_in_the_tails():
     assert max(values[0], values[-1]) < 0.015 * values.max()
 
 
+@pytest.mark.slow
 def test_many_quantities_need_a_choice():
     draws = {f"p{k}": values for k, values in enumerate(np.random.default_rng(1).standard_normal((9, 400)))}
     with pytest.warns(UserWarning, match=r"names: 9 quantities are many for one figure; choose some, such as names="):

@@ -171,6 +171,7 @@ def test_no_text_is_clipped_or_overlaps_another(drawer, count, draws, results):
     assert not faults(drawer(count, draws, results))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drawer", DRAWERS)
 def test_vector_files_are_small(drawer, draws, results):
     file = io.BytesIO()

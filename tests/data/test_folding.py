@@ -100,6 +100,7 @@ def test_scatter_is_that_of_one_cycle_within_the_kept_harmonics():
     assert np.mean(values) == pytest.approx(0.05 * np.sqrt(11 / 119.37), rel=0.05)
 
 
+@pytest.mark.slow
 def test_variance_of_the_mean_amplitudes_is_the_observed_one():
     experiments = [recording(seed=s, cycles=12.1).fold(100, frequency=FREQUENCY, harmonics=5) for s in range(300)]
     amplitudes = np.array([np.fft.rfft(e.outputs["y"])[1:6] * 2 / 100 for e in experiments])

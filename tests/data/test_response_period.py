@@ -68,6 +68,7 @@ def test_chaos_is_refused_with_what_to_do(motions):
             recorded(motions[0.5], seed).fold(64, periods="auto", frequency=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["white", "slow", "drift"])
 def test_false_alarm_rate_is_the_nominal_one(noise):
     """Of 400 recordings of period 1 at most 9 have another one (binomial, 99 % at 1 %), also with 20 % of drift."""

@@ -136,6 +136,7 @@ def rubbing():
 FRICTION = {"force": ["lag(tanh(10*dx)) - tanh(10*dx)", "tanh(10*dx)"]}
 
 
+@pytest.mark.slow
 def test_a_term_without_memory_comes_before_one_of_the_same_fit(rubbing, monkeypatch):
     """Of the difference, friction is left; its evidence seems larger, but see the next test."""
     monkeypatch.setattr(Optimum, "curved", True)

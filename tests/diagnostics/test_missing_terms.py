@@ -177,6 +177,7 @@ def test_given_candidates_are_texts_or_functions(damped, term):
     assert abs(step.coefficient * scale - C2) < 0.4 * C2
 
 
+@pytest.mark.slow
 def test_terms_and_places_are_left_out(damped):
     problem, fit = damped
     quiet = {"max_terms": 0}

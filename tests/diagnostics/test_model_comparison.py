@@ -236,6 +236,7 @@ def test_what_would_tell_comes_from_the_predictions_at_half_once_and_twice_the_d
         assert variance.sum() == pytest.approx(exact.sum(), rel=0.8) and noise == pytest.approx(SD**2)
 
 
+@pytest.mark.slow
 def test_a_preferred_model_that_is_misspecified_is_only_relatively_better():
     """The data have a force of the third harmonic that neither model has."""
     runs = [

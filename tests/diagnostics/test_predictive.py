@@ -183,6 +183,7 @@ def test_the_right_model_is_adequate(seed):
     assert prediction.table.loc["run displacement", "model_error_share"] < 0.3
 
 
+@pytest.mark.slow
 def test_power_against_a_missing_stiffness():
     """With k2 = 5 % of k and noise of 1 % of the peak-to-peak value, 95 % are named; 19 of 20 or more, at least."""
     verdicts = [bp.predict(*duffing_posterior(0.05, seed), draws=20).verdict for seed in range(20)]

@@ -138,6 +138,7 @@ def test_a_combination_that_the_data_determine_is_tested_where_its_parameters_ar
         assert found.members == members
 
 
+@pytest.mark.slow
 def test_the_fit_without_the_prior_is_found_from_a_local_maximum_and_the_model_is_not_blamed():
     """Duffing, k = 150 against a prior of 200 ± 0.5: the estimate leaves 12 % unexplained, the model is right."""
     generator, runs = np.random.default_rng(0), []

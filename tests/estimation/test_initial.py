@@ -92,6 +92,7 @@ def test_all_orbits_but_one_survive_a_continuation_to_the_papers_start_and_back(
             assert np.ptp([solution.states["phi"] for solution in path], axis=0).max() > 0.05
 
 
+@pytest.mark.slow
 def test_only_combinations_of_the_five_pendulum_parameters_are_well_determined():
     """The combinations in the equations, k/(m l²), are determined far better than the parameters themselves."""
     names = ("m", "l", "k1", "k2", "k3")

@@ -71,6 +71,7 @@ def test_second_start_loads_all_functions_from_the_cache(folder):
     assert second.communicate()[0] == f"{len(FUNCTIONS)}\n"
 
 
+@pytest.mark.slow
 def test_an_upgrade_that_keeps_the_sources_loads_the_entries_of_the_version_before(folder, tmp_path):
     first = start()
     assert first.communicate()[0] == "0\n"
@@ -92,6 +93,7 @@ def test_numba_settings_of_the_user_do_not_move_the_files(folder, tmp_path, monk
     assert cache.numba.config.CACHE_DIR == str(tmp_path / "elsewhere")
 
 
+@pytest.mark.slow
 def test_two_processes_may_fill_the_cache_at_once(folder):
     both = [start(), start()]
     for process in both:
@@ -176,6 +178,7 @@ print(cache.load(SMALL).four_times(1.5), convergence.arviz().rhat)
 """
 
 
+@pytest.mark.slow
 def test_unwritable_home_is_a_warning(tmp_path):
     """A file in the place of the home folder, which no user can write below, not even root; ArviZ 0.23 would fail."""
     (tmp_path / "home").write_text("")

@@ -86,6 +86,7 @@ def test_the_henon_map_has_the_known_numbers_of_cycles():
         assert orbit.cycle is None
 
 
+@pytest.mark.slow
 def test_intervals_have_nominal_coverage_at_a_tenth_of_a_percent_of_noise():
     """Nominal 90 % intervals; false alarms: 1 % for log|eigenvalue| (two-sided binomial band), 0.5 % for the points.
 
@@ -106,6 +107,7 @@ def test_intervals_have_nominal_coverage_at_a_tenth_of_a_percent_of_noise():
     assert binom.ppf(0.005, values, 0.9) <= points <= 0.98 * values
 
 
+@pytest.mark.slow
 def test_intervals_hold_where_the_density_of_returns_varies():
     """Both fixed points with |μ| = 11.119 in six recordings; twelve squared standardised errors, false-alarm rate 1 %.
 

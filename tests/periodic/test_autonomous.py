@@ -208,6 +208,7 @@ def test_error_estimate_is_the_error(scheme, mu, tolerance):
     assert estimate["frequency"] == pytest.approx(true, rel=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [200, 400, 401, 601])
 def test_fourier_error_estimate_of_an_unresolved_stiff_cycle_has_the_size_of_the_error(samples):
     """Relaxation oscillation, μ = 20: jumps of 1/400 of the period, errors of 0.2 to 0.6 against central4 at 12,800."""

@@ -250,6 +250,7 @@ def chain(masses):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["central2", "central4", "backward2", "fourier"])
 @pytest.mark.parametrize("stiffness", [1.0, 3.7, 100.3])
 def test_mass_that_symmetry_keeps_at_rest_does_not_prevent_convergence(stiffness, scheme):

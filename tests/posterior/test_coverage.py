@@ -139,6 +139,7 @@ def splits(amplitude: float) -> list[NoiseSplit]:
     return [fitted(run).noise_split["force"] for run in runs]
 
 
+@pytest.mark.slow
 def test_measurement_noise_is_that_of_the_mean_of_20_cycles():
     """Each sd of 19 · 41 degrees of freedom is within four standard errors, of 100 (a false-alarm rate of 0.6 %)."""
     expected = SD * np.sqrt(COUNT / (20 * PER_CYCLE))
@@ -146,6 +147,7 @@ def test_measurement_noise_is_that_of_the_mean_of_20_cycles():
         assert split.measurement == pytest.approx(expected, rel=4.0 / np.sqrt(2 * 19 * COUNT))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [0.0, 4.0])
 def test_model_error_is_the_excess_over_measurement_noise(amplitude):
     """The mean of total² less measured² over 100 recordings is amplitude²/2 within four standard errors.

@@ -335,6 +335,7 @@ def test_robust_sd_is_at_least_what_noise_of_the_inputs_causes():
     assert fit.sd["b"] == pytest.approx(0.4, rel=0.1) and fit.robust_sd["b"] == pytest.approx(0.4, rel=0.1)
 
 
+@pytest.mark.slow
 def test_noise_of_inputs_is_no_misfit_of_the_model_and_a_wrong_model_is_one():
     """60 recordings of the right model at the level 1 %: more than 4 rejections have a probability of 3e-4."""
     priors = {"a": bp.Normal(0.0, 10.0)}

@@ -217,6 +217,7 @@ def test_constants_make_the_likelihood_a_density_of_the_data(case):
     assert found == pytest.approx(data_density(case, problem, np.array(theta)), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_evidence_is_the_same_from_every_sampler_and_in_all_coordinates():
     noise = bp.noise.Independent(prior="jeffreys")
     problem = line(bp.LogNormal(0.7, 0.5), noise=noise, fixed=None)

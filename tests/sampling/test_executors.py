@@ -79,6 +79,7 @@ def test_chains_do_not_depend_on_the_pieces_of_an_executor(posed, serial, monkey
     assert set(kept["accepted"] - moved) <= {0.0, 1.0}, "the first step has no predecessor in the chain"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["processes", "dask", "threads"])
 def test_chains_are_identical_for_any_executor(posed, serial, which, request, tmp_path):
     """Chains, log-densities, accepted counts and random states, in the result and in the checkpoint."""
@@ -97,6 +98,7 @@ def test_chains_with_integrated_variances_are_identical_for_any_executor(posed, 
     assert alike(*(sampled(posed, executor=e, variances="collapsed", max_steps=50) for e in (None, processes)))
 
 
+@pytest.mark.slow
 def test_chains_from_the_prior_with_failing_solves_are_identical(processes):
     """A softening spring, measured badly, which has no periodic solution for many draws of its prior."""
     priors = {"k": bp.Normal(1.0, 0.5), "k3": bp.Normal(0.0, 1.0)}
@@ -107,6 +109,7 @@ def test_chains_from_the_prior_with_failing_solves_are_identical(processes):
     assert alike(one, other) and one.failures
 
 
+@pytest.mark.slow
 def test_run_can_be_resumed_with_another_executor(posed, serial, processes, dask, tmp_path):
     path = tmp_path / "run.h5"
     for steps, executor in ((50, processes), (100, None), (150, dask)):
@@ -133,6 +136,7 @@ def killed(pool: ProcessPoolExecutor) -> None:
         process.join()
 
 
+@pytest.mark.slow
 def test_draws_before_the_death_of_a_worker_are_kept(posed, serial, tmp_path, monkeypatch):
     """Interrupted before the first result, then after it, then completed without workers."""
     path = tmp_path / "run.h5"
@@ -161,6 +165,7 @@ def test_draws_before_an_interrupt_are_kept(posed, serial, processes, tmp_path, 
     assert alike(sampled(posed, executor=processes, checkpoint=path), serial[0])
 
 
+@pytest.mark.slow
 def test_dask_repeats_the_tasks_of_a_dead_worker(posed, serial, dask, monkeypatch):
     """Both workers die, one with the only copy of the problem; new ones take their place."""
 
@@ -172,6 +177,7 @@ def test_dask_repeats_the_tasks_of_a_dead_worker(posed, serial, dask, monkeypatc
     assert alike(sampled(posed, executor=dask, progress=True), serial[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["processes", "dask"])
 def test_profiles_do_not_depend_on_the_executor(posed, which, request):
     here, there = (bp.profile(*posed, ["c", "k3"], executor=e) for e in (None, request.getfixturevalue(which)))

@@ -26,6 +26,7 @@ def posed(**priors):
     return problem, bp.map_estimate(problem, progress=False)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs the limits of Unix")
 @pytest.mark.parametrize("which", ["processes", "dask"])
 def test_full_disk_is_an_error_after_which_the_run_goes_on(which, request, tmp_path):

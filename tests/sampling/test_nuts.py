@@ -138,6 +138,7 @@ def test_nuts_and_emcee_agree_on_the_damper():
             assert np.hypot(error_a, error_b) < 0.05 * one.std()
 
 
+@pytest.mark.slow
 @needs_nutpie
 def test_same_seed_gives_identical_draws_and_another_seed_others(linear, briefly):
     first, again, other = (bp.sample(*linear, seed=s, **briefly) for s in (5, 5, 6))

@@ -24,6 +24,7 @@ def iterates():
     return newton.iterate()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["newton", "section"])
 def test_animations_are_small_and_have_every_frame(quick, name):
     folder, results = quick
@@ -39,6 +40,7 @@ def test_animations_are_small_and_have_every_frame(quick, name):
     assert milliseconds * film.FRAMES_PER_SECOND / 1000 == pytest.approx(results[name]["frames"])
 
 
+@pytest.mark.slow
 def test_quick_runs_draw_every_eighth_frame(quick):
     _, results = quick
     assert results["section"]["frames"] == -(-section.FRAMES // 8)
@@ -53,6 +55,7 @@ def test_the_committed_animations_are_small():
         assert 100_000 < Path(f"figures/animations/{name}.gif").stat().st_size < LARGEST
 
 
+@pytest.mark.slow
 def test_newton_decreases_the_residual_at_last_quadratically(iterates):
     residuals = iterates.residuals
     assert (np.diff(residuals) < 0.0).all() and residuals[-1] < newton.ACCURACY < 1e-9 * residuals[0]
@@ -61,16 +64,19 @@ def test_newton_decreases_the_residual_at_last_quadratically(iterates):
     assert small.size and (residuals[small + 1] < 10.0 * residuals[small] ** 2).all()
 
 
+@pytest.mark.slow
 def test_velocities_are_the_derivative_of_displacements(iterates):
     omega = 2 * np.pi * newton.FREQUENCY
     expected = -omega * (1.8 * np.sin(newton.TAU - 2.7) + 0.75 * np.sin(5 * newton.TAU))
     assert np.allclose(iterates.rate[0], expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_newton_ends_at_the_solution_of_the_package(quick):
     assert quick[1]["newton"]["difference_from_solve_periodic_m"] < 1e-9
 
 
+@pytest.mark.slow
 def test_the_integration_departs_by_the_multiplier(quick):
     results = quick[1]["newton"]
     assert results["multiplier"] > 1.5
@@ -81,6 +87,7 @@ def test_the_integration_departs_by_the_multiplier(quick):
     assert distances[0] < 1e-3 and distances[-1] > 1.0
 
 
+@pytest.mark.slow
 def test_the_two_other_solutions_are_stable(iterates):
     solutions = newton.stable_solutions()
     assert all(solution.converged and solution.stable for solution in solutions)
@@ -88,6 +95,7 @@ def test_the_two_other_solutions_are_stable(iterates):
     assert low < np.ptp(iterates.x[-1]) < high
 
 
+@pytest.mark.slow
 def test_points_of_the_section_follow_the_orbit_and_leave_it(quick):
     results = quick[1]["section"]
     spread = np.array(results["spread"])

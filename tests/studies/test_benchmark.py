@@ -103,6 +103,7 @@ def test_elimination_uses_pivoting():
     assert right == pytest.approx(exact, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_integration_shooting_and_scipy_agree_on_the_orbit(setting):
     case = setting.cases[0]
     p, one = case.estimate, Discretised(case, 400)
@@ -204,6 +205,7 @@ def test_targets_are_reported_as_met_or_missed():
     assert met == {"LSODA": True, "Radau": None, "solve_bvp": False}
 
 
+@pytest.mark.slow
 def test_a_quick_run_writes_table_and_figure(tmp_path, capsys, setting, monkeypatch):
     monkeypatch.setattr(benchmark, "problems", lambda options: {problems.FORCE: lambda: setting})
     monkeypatch.setattr(benchmark_floor, "with_all_free", lambda one, scheme: (one.schemed(scheme), one.theta[0]))

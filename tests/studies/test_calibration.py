@@ -26,6 +26,7 @@ def found(tmp_path_factory):
         return folder, *run(folder, "--replicates", "2")
 
 
+@pytest.mark.slow
 def test_results_and_figures_are_written(found):
     folder, results, printed = found
     assert set(results) - {"null"} == {"duffing", "miscounted", "study"} and results["study"]["synthetic"]
@@ -41,6 +42,7 @@ def test_results_and_figures_are_written(found):
     assert "SYNTHETIC" in printed and "ranks are among" in printed
 
 
+@pytest.mark.slow
 def test_second_run_recomputes_nothing(found, monkeypatch):
     folder, results, _ = found
     monkeypatch.setattr(calibration, "CASES", {"duffing": calibration.CASES["duffing"]})

@@ -49,6 +49,7 @@ def quick(short_recording, tmp_path_factory):
         return folder, run(folder, "--quick"), printed.getvalue()
 
 
+@pytest.mark.slow
 def test_synthetic_data_are_labelled_and_the_truth_is_recovered(quick):
     folder, results, printed = quick
     assert "SYNTHETIC" in printed and damper.SHA256 in printed and "github.com/labcontrol-data" in printed
@@ -71,6 +72,7 @@ def test_same_seed_same_results_but_for_seconds_and_versions(quick, synthetic, t
         assert (folder / f"{name}.png").read_bytes() == (tmp_path / f"{name}.png").read_bytes()
 
 
+@pytest.mark.slow
 def test_quick_run_converges(quick):
     results = quick[1]
     assert results["converged"] is True and "stop rule passed" in results["reason"]

@@ -15,6 +15,7 @@ VALUES = rig.TRUE | {"C_s": 0.0, "V_f": rig.TRUE["V_f"] - rig.MEAN}
 FREQUENCY, MEAN, AMPLITUDE = 140e3, 0.1, 10.5
 
 
+@pytest.mark.slow
 def test_stroboscopic_values_are_those_of_an_adaptive_implicit_integration():
     p = VALUES | {"bypass": 0.14}
 

@@ -201,6 +201,7 @@ def test_wrong_spread_of_the_natural_chain_passes_only_without_claimed_convergen
         assert [r["met"] for r in sampling_ridge.rows(ridge) if "natural" in r["what"]] == [met]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="only Linux holds a process on one core")
 def test_overhead_of_a_worker_is_measured():
     found = sampling_cost.pool_overhead(1, ("process",), 1e-5)
