@@ -79,8 +79,7 @@ def test_replicates_are_saved_one_by_one_and_resumed(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The data do not change under")
-def test_counts_report_wrong_and_changed_verdicts(quick):
-    folder, results, _ = quick
+def test_counts_report_wrong_and_changed_verdicts():
     outcome = examine("scaling_symmetry", 0, 0, drawless=True)
     assert outcome.posterior is None and not outcome.wrong and outcome.named
     line = {"case": "scaling_symmetry", "kind": "data", "number": 0, "seed": 1} | outcome.line()
@@ -89,9 +88,7 @@ def test_counts_report_wrong_and_changed_verdicts(quick):
         "wrong": {"identifiability m": "determined"},
         "verdicts": {"identifiability": line["verdicts"]["identifiability"] | {"m": "determined"}},
     }  # fmt: skip
-    found = verdicts.summary([line, line | {"kind": "sampler"}, other], {"scaling_symmetry": outcome})[
-        "scaling_symmetry"
-    ]
+    found = verdicts.summary([line, line | {"kind": "sampler"}, other], ["scaling_symmetry"])["scaling_symmetry"]
     assert found["data"]["right_share"] == [1.0, pytest.approx(0.47, abs=0.01)]
     assert found["sampler"]["right"] == 1 and found["sampler"]["wrong"] == {"identifiability m: determined": 1}
     assert found["sampler"]["verdicts_that_flip"] == {"identifiability m": ["determined", "only in combination"]}
