@@ -66,6 +66,11 @@ def test_replicates_are_saved_one_by_one_and_resumed(tmp_path, monkeypatch):
             or dict(zip(("case", "kind", "number", "seed"), task, strict=True)) | {"source": verdicts.source()} | fake
         ),
     )
+    assert main(["verdicts", "--out", str(tmp_path), "--quick", "--replicates", "2"]) == 0
+    counts = json.loads((tmp_path / "replicates" / "results.json").read_text(encoding="utf-8"))["cases"]
+    assert set(counts) == set(verdicts.QUICK)
+    assert all(one[kind]["right"] == one[kind]["replicates"] == 2 for one in counts.values() for kind in one)
+    calls.clear()
     first = verdicts.replicates(tmp_path, ("linear",), 2, 1)
     assert len(first) == len(calls) == 4
     path = tmp_path / verdicts.FILE
