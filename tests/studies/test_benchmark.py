@@ -311,7 +311,7 @@ def test_guard_times_the_draws_of_the_full_run():
 
 def test_exponents_of_power_laws_are_recovered():
     def seconds(size):
-        return 1e-3 * size**1.5 * float(np.ones(100_000 * size).mean())
+        return 1e-3 * size**1.5 * float(np.ones(1_000_000 * size).mean())
 
     sizes = (2, 4, 7)
     growth = scaling._fitted(sizes, [partial(seconds, size) for size in sizes], 3)
