@@ -359,12 +359,7 @@ def predict(
     recorded = None if run is None else _transient(problem, points, run, experiment)
     note = _note(problem, posterior, table)
     return Prediction(
-        **vars(predicted),
-        table=table,
-        transient=recorded,
-        note=note,
-        other_orbits=others,
-        prior_conflict=conflict,
+        **vars(predicted), table=table, transient=recorded, note=note, other_orbits=others, prior_conflict=conflict
     )
 
 

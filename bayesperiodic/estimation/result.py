@@ -51,8 +51,7 @@ def of_periodogram(power: np.ndarray) -> Whiteness:
     cumulative = np.cumsum(power)[:-1] / power.sum()
     lag = 2.0 * np.pi / (2 * power.size + 1)
     return Whiteness(
-        float(kstest(cumulative, "uniform").pvalue),
-        float(np.sum(power * np.cos(lag * harmonic)) / power.sum()),
+        float(kstest(cumulative, "uniform").pvalue), float(np.sum(power * np.cos(lag * harmonic)) / power.sum())
     )
 
 

@@ -6,6 +6,7 @@ and every compiled file must have the digest recorded when it was written. A dam
 and built again; if the folder cannot be used, the kernels are compiled in memory.
 """
 
+import gc
 import hashlib
 import inspect
 import json
@@ -163,11 +164,14 @@ def _execute(source: str, names: Mapping[str, Any], path: Path, cache: bool) -> 
     module.__dict__.update(own, __file__=str(path), CACHE=cache)
     sys.modules[module.__name__] = module
     settings: Any = numba.config
-    elsewhere, settings.CACHE_DIR = settings.CACHE_DIR, ""  # beside the source, where its digests are kept
+    elsewhere, thresholds = settings.CACHE_DIR, gc.get_threshold()
+    settings.CACHE_DIR = ""  # beside the source, where its digests are kept
+    gc.set_threshold(0)  # looking for garbage takes a fifth of the compiler's time
     try:
         exec(compile(source, str(path), "exec"), module.__dict__)
     finally:
         settings.CACHE_DIR = elsewhere
+        gc.set_threshold(*thresholds)
     return module
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import sympy as sp
 from numba import types
 from numba.core import cgutils, sigutils
+from numba.core.imputils import impl_ret_borrowed
 from numba.extending import intrinsic
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympy.printing.pycode import PythonCodePrinter
@@ -27,8 +28,10 @@ from bayesperiodic.models.cache import load
 GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
 FUNCTIONS = ("residual", "residual_jacobian", "outputs", "derivatives", "transitions")
 MANY_ZEROS = 30
-GATHERS = "from bayesperiodic.models.code_generation import without_gathers"
+IMPORTS = "from bayesperiodic.models.code_generation import as_vector, without_gathers"
 NO_GATHER, FIRST_LLVM = "+prefer-no-gather", 17  # and the first version of LLVM that has this feature
+_arguments, _result = sigutils.normalize_signature(GRID_SIGNATURE)
+GRID_FUNCTION = types.FunctionType(_result(*_arguments))
 
 
 class GridFunction(types.WrapperAddressProtocol):
@@ -40,11 +43,9 @@ class GridFunction(types.WrapperAddressProtocol):
     """
 
     def __init__(self, compiled: Any):
-        arguments, result = sigutils.normalize_signature(GRID_SIGNATURE)
-        self._signature = result(*arguments)
-        self._numba_type_ = types.FunctionType(self._signature)
+        self._numba_type_ = GRID_FUNCTION
         self._compiled = compiled
-        code = compiled.get_compile_result(self._signature)
+        code = compiled.get_compile_result(GRID_FUNCTION.signature)
         self.address = code.library.get_pointer_to_function(code.fndesc.llvm_cfunc_wrapper_name)
 
     def __wrapper_address__(self) -> int:
@@ -52,7 +53,7 @@ class GridFunction(types.WrapperAddressProtocol):
 
     def signature(self) -> Any:
         """Return the Numba signature."""
-        return self._signature
+        return GRID_FUNCTION.signature
 
     def __call__(self, *arguments: Any) -> None:
         """Run the compiled function."""
@@ -62,15 +63,13 @@ class GridFunction(types.WrapperAddressProtocol):
 @intrinsic
 def grid_function_at(typing_context: Any, address: Any) -> Any:
     """Return the grid function at an address; for use in compiled code."""
-    arguments, result = sigutils.normalize_signature(GRID_SIGNATURE)
-    kind = types.FunctionType(result(*arguments))
 
     def structure(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        function = cgutils.create_struct_proxy(kind)(context, builder)
+        function = cgutils.create_struct_proxy(GRID_FUNCTION)(context, builder)
         function.c_addr = builder.inttoptr(values[0], context.get_value_type(types.voidptr))
         return function._getvalue()
 
-    return kind(types.int64), structure
+    return GRID_FUNCTION(types.int64), structure
 
 
 @intrinsic
@@ -92,6 +91,22 @@ def without_gathers(typing_context: Any) -> Any:
     return types.void(), attribute
 
 
+@intrinsic
+def as_vector(typing_context: Any, array: Any) -> Any:
+    """Return a C-contiguous array as a vector, for use in compiled code; `reshape` compiles for three times as long."""
+    vector = types.Array(array.dtype, 1, "C")
+
+    def view(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        own = context.make_array(array)(context, builder, values[0])
+        result, size = context.make_array(vector)(context, builder), own.itemsize
+        context.populate_array(
+            result, data=own.data, shape=[own.nitems], strides=[size], itemsize=size, meminfo=own.meminfo
+        )
+        return impl_ret_borrowed(context, builder, vector, result._getvalue())
+
+    return vector(array), view
+
+
 @dataclass(frozen=True)
 class Kernels:
     """The compiled grid functions of one model, and the numbers of its variables."""
@@ -100,13 +115,13 @@ class Kernels:
     residual_jacobian: GridFunction  # g, then ∂g/∂(q, q̇, q̈) row by row (states × 3·states)
     outputs: GridFunction  # ŷ (channels)
     derivatives: GridFunction  # see `split_derivatives`, each row by row
-    transitions: GridFunction  # arguments of the smooth signs in g, whose transitions are within −1 … 1
     states: int
     inputs: int
     parameters: int
     channels: int
     smooth_signs: int
     output_rates: bool  # whether the outputs depend on q̇ or q̈
+    transitions: GridFunction | None = None  # arguments of the smooth signs in g, whose transitions are within −1 … 1
 
     def evaluate(
         self, name: str, states: np.ndarray, inputs: np.ndarray, theta: np.ndarray, tau: np.ndarray, frequency: float
@@ -170,8 +185,9 @@ class SymbolicModel:
     def kernels(self) -> Kernels:
         """Return the compiled residual, Jacobian, outputs and derivatives."""
         rates = set(self.states[len(self.equations) :])
+        needed = FUNCTIONS if self.transitions else FUNCTIONS[:-1]
         return Kernels(
-            **dict(zip(FUNCTIONS, grid_functions(self.kernel_source(), FUNCTIONS), strict=True)),
+            **dict(zip(needed, grid_functions(self.kernel_source(), needed), strict=True)),
             states=len(self.equations),
             inputs=len(self.inputs) // 3,
             parameters=len(self.parameters),
@@ -189,11 +205,11 @@ class SymbolicModel:
             "residual": [*g],
             "residual_jacobian": [*g, *_jacobian(g, q)],
             "outputs": [*f],
-            "transitions": [*self.transitions],
             "derivatives": [entry for rows, columns in blocks for entry in _jacobian(rows, columns)],
+            "transitions": [*self.transitions],
         }
         arguments = self._arguments(q, u, theta)
-        return _module([_function(name, needed, arguments) for name, needed in expressions.items()])
+        return _module([_function(name, needed, arguments) for name, needed in expressions.items() if needed])
 
     def jacobian_change_source(self) -> str:
         """Return the module of the directional derivative of ∂g/∂(q, q̇, q̈), row by row (states × 3·states), as text.
@@ -259,7 +275,7 @@ def _module(functions: list[str]) -> str:
         name = block.partition("def ")[2].partition("(")[0]
         if f"{name}(" in body:
             body = f"{block}\n\n\n{body}"
-    return f"{header}\n{GATHERS}\n\n\n{body}"
+    return f"{header}\n{IMPORTS}\n\n\n{body}"
 
 
 def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str], summed: int = 0) -> str:
@@ -276,7 +292,7 @@ def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, 
     before, own, after = _sums(reduced[columns:], columns)
     lines = [
         "    without_gathers()",
-        *(f"    flat_{a} = {a}.reshape({a}.size)" for a in ("states", "inputs", "out")),
+        *(f"    flat_{a} = as_vector({a})" for a in ("states", "inputs", "out")),
         *(f"    {symbol} = {place}" for symbol, place in places.items() if symbol not in varying),
         *before,
         "    for i in range(states.shape[0]):",

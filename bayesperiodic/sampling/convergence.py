@@ -143,12 +143,7 @@ def stop_rule(
     return np.concatenate([tau, of_modes]), missing + weights
 
 
-def unmet_criteria(
-    kept: np.ndarray,
-    tau: np.ndarray,
-    last: np.ndarray,
-    labels: Sequence[str],
-) -> list[str]:
+def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: Sequence[str]) -> list[str]:
     """Return the criteria of the stop rule that are not met, in words.
 
     An ensemble of 32 walkers that is 50 autocorrelation times long contains 1600 independent draws, a single walker

@@ -22,10 +22,7 @@ from bayesperiodic.posterior.priors import LOG_ROOT_TWO_PI, Uniform
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.posterior import Posterior
-from bayesperiodic.sampling.proposals import (
-    AffineTransform,
-    fit_mixture,
-)
+from bayesperiodic.sampling.proposals import AffineTransform, fit_mixture
 
 # Draws of the posterior and of the mixture for each of the two estimates.
 DRAWS = 4000

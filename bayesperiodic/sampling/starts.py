@@ -10,12 +10,7 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.posterior.density import LogPosterior, SamplingCoordinates
 from bayesperiodic.posterior.noise_estimate import estimate_noise
-from bayesperiodic.sampling.proposals import (
-    HEAVY,
-    AffineTransform,
-    CallCount,
-    StudentMixture,
-)
+from bayesperiodic.sampling.proposals import HEAVY, AffineTransform, CallCount, StudentMixture
 
 LAPLACE, PRIOR, OVERDISPERSED = "laplace", "prior", "overdispersed"
 STARTS = (LAPLACE, PRIOR, OVERDISPERSED)

@@ -15,8 +15,8 @@ PROGRAM = """
 import numba
 from bayesperiodic.models.cache import load
 from bayesperiodic.models.code_generation import FUNCTIONS
-from tests.known import LINEAR
-kernels = load(LINEAR.symbolic.kernel_source())
+from bayesperiodic.models.library import pendulum
+kernels = load(pendulum.symbolic.kernel_source())
 print(sum(sum(getattr(kernels, name).stats.cache_hits.values()) for name in FUNCTIONS))
 """
 

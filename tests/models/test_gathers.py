@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from bayesperiodic.models.code_generation import without_gathers
-from bayesperiodic.models.library import duffing
+from bayesperiodic.models.code_generation import as_vector, without_gathers
+from bayesperiodic.models.library import duffing, pendulum
 
 
 def quotient(rows, out):
@@ -44,3 +44,25 @@ def test_generated_functions_take_no_gathers():
         assert (
             source.count("without_gathers()") == source.count("(states, inputs, parameters, tau, frequency, out)") > 0
         )
+
+
+def test_a_vector_has_the_entries_of_its_array_and_keeps_their_memory():
+    @njit("float64(float64[:,::1], float64[::1])")
+    def total(rows, zeros):
+        own = rows + 1.0
+        vector = as_vector(own)  # `own` ends here
+        total = 0.0
+        for _ in range(20):
+            other = zeros.copy()  # takes any memory that is free
+            for k in range(vector.size):
+                total += vector[k] * (k + 1.0) + other[k]
+        return total
+
+    rows = np.random.default_rng(2).uniform(size=(50, 20))
+    expected = 20 * np.sum((rows.ravel() + 1.0) * np.arange(1, 1001))
+    assert total(rows, np.zeros(1000)) == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_model_without_smooth_signs_compiles_no_function_for_them():
+    assert "def transitions(" not in duffing.symbolic.kernel_source()
+    assert "def transitions(" in pendulum.symbolic.kernel_source()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit, types
 
-from bayesperiodic.models.code_generation import grid_function_at
+from bayesperiodic.models.code_generation import as_vector, grid_function_at
 
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
     from bayesperiodic.periodic._kernels.batch import *
@@ -72,7 +72,7 @@ def back_substitute_transposed(grid, factors, right):
 def concatenate(states, others, both):
     """Fill `both` with the columns of `states` (q, q̇, q̈), then those of `others`."""
     first, second = 3 * STATES if STATES > 0 else states.shape[1], others.shape[1]
-    one, other, out = states.reshape(states.size), others.reshape(others.size), both.reshape(both.size)
+    one, other, out = as_vector(states), as_vector(others), as_vector(both)
     for i in range(states.shape[0]):
         for s in range(first):
             out[np.uint64((first + second) * i + s)] = one[np.uint64(first * i + s)]

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit, types
 
-from bayesperiodic.models.code_generation import grid_function_at
+from bayesperiodic.models.code_generation import as_vector, grid_function_at
 
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
     from bayesperiodic.periodic._kernels.newton import *
@@ -56,8 +56,8 @@ def newton_chord(
     residual = grid_function_at(functions.residual)
     inputs, parameters, frequency, drift = setting
     count = STATES if STATES > 0 else z.shape[1]
-    position, step, reached = z.reshape(z.size), change.reshape(z.size), np.empty(count)
-    weights, direction = left.reshape(left.size), right.reshape(right.size)
+    position, step, reached = as_vector(z), as_vector(change), np.empty(count)
+    weights, direction = as_vector(left), as_vector(right)
     if not (stiffness > LEAST_STIFFNESS and stiffness < MOST_STIFFNESS):
         return False, 0, 0.0
     correction, tolerance = 1.0 / stiffness - 1.0, STEP_TOLERANCE * min(1.0, stiffness)
@@ -262,7 +262,7 @@ def substitute_transposed(flat, pivots, below, reach, x):
 @kernel(types.void(MATRIX, COUNT, COUNT, PLACES, MATRIX), **OPTIONS)
 def solve_transposed(band, lower, upper, pivots, right):
     """Solve Aᵀ·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
-    flat = band.reshape(band.size)
+    flat = as_vector(band)
     for c in range(right.shape[0]):
         if LOWER > 0 and lower == LOWER and upper == LOWER:
             substitute_transposed(flat, pivots, np.uint64(LOWER), np.uint64(2 * LOWER), right[c])

@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit, types
 
 from bayesperiodic.models.cache import kernel
+from bayesperiodic.models.code_generation import as_vector
 from bayesperiodic.periodic.compiled import *
 
 STATES, REACH, WIDTH, HALF = globals().get("SIZES", (0, 0, 0, 0))  # 0: any number, taken from the arrays
@@ -29,7 +30,7 @@ OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model":
 @njit(types.void(MATRIX, MATRIX), **OPTIONS)
 def copy(source, target):
     """Copy one array into another of the same shape; compiles faster than a slice assignment."""
-    one, other = source.reshape(source.size), target.reshape(target.size)
+    one, other = as_vector(source), as_vector(target)
     for k in range(one.size):
         other[k] = one[k]
 
@@ -90,7 +91,7 @@ def factor(band, lower, upper, pivots):
     `lower` and `upper` are the half-widths below and above the diagonal. The pivots are kept as their inverses;
     `pivots` (size,) is filled with the row exchanged with each row.
     """
-    flat = band.reshape(band.size)
+    flat = as_vector(band)
     size, one, below, above = np.uint64(band.shape[0]), np.uint64(1), np.uint64(lower), np.uint64(upper)
     next_row = np.uint64(band.shape[1]) - one
     first, last = np.uint64(0), np.uint64(0)
@@ -170,7 +171,7 @@ def substitute(flat, pivots, below, reach, x):
 @kernel(types.void(MATRIX, COUNT, COUNT, PLACES, MATRIX), **OPTIONS)
 def solve(band, lower, upper, pivots, right):
     """Solve A·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
-    flat = band.reshape(band.size)
+    flat = as_vector(band)
     for c in range(right.shape[0]):
         if LOWER > 0 and lower == LOWER and upper == LOWER:
             substitute(flat, pivots, np.uint64(LOWER), np.uint64(2 * LOWER), right[c])
@@ -185,7 +186,7 @@ def assemble(columns, grid, states, frequency, band):
     points, count = columns.shape[0], STATES if STATES > 0 else states
     lower, width = grid.half_width * count + count - 1, WIDTH if WIDTH > 0 else first.size
     one, two = first * frequency, second * frequency**2
-    flat, source = band.reshape(band.size), columns.reshape(columns.size)
+    flat, source = as_vector(band), as_vector(columns)
     for k in range(flat.size):
         flat[k] = 0.0
     for i in range(points):
@@ -352,7 +353,7 @@ def back_substitute(grid, factors, right):
             for s in range(count):
                 value += inverses[j, e, s] * right[k, s]
             forced[j, e] = value
-    flat, gain, start = forced.reshape(points * count), gains.reshape(gains.size), 0
+    flat, gain, start = as_vector(forced), as_vector(gains), 0
     for q in range(segments):
         stop = ends[q + 1] + 1
         for j in range(start, start + reach):
@@ -381,7 +382,7 @@ def back_substitute(grid, factors, right):
                 x[0, (q + 1) % segments * block + d * count + e] = forced[ends[q + 1] - d, e]
     matrix = factors.interface[: size * (3 * size - 2)].reshape((size, 3 * size - 2))
     solve(matrix, size - 1, size - 1, factors.interface_pivots, x)
-    start, moved, out = 0, transfer.reshape(transfer.size), right.reshape(points * count)
+    start, moved, out = 0, as_vector(transfer), as_vector(right)
     for q in range(segments):
         for e in range(count):
             for k in range(ends[q + 1] + 1 - start):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit, types
 
-from bayesperiodic.models.code_generation import grid_function_at
+from bayesperiodic.models.code_generation import as_vector, grid_function_at
 
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
     from bayesperiodic.periodic._kernels.border import *
@@ -36,8 +36,8 @@ def differentiate(z, drift, grid, frequency, states):
     # Offsets are consecutive where their number is known, the lowest first; in the middle no neighbour is cyclic.
     start, inside = ((points - neighbours[0, 0]) % points, points - WIDTH + 1) if WIDTH > 0 else (0, 0)
     squared, all_states = frequency**2, np.uint64(count)
-    flat, rest = z.reshape(z.size), tau[start:]
-    here, out = flat[start * count :], states.reshape(states.size)[3 * start * count :]
+    flat, rest = as_vector(z), tau[start:]
+    here, out = flat[start * count :], as_vector(states)[3 * start * count :]
     for k in range(np.uint64(inside)):
         for j in range(count):
             s, rate, acceleration = np.uint64(j), 0.0, 0.0
@@ -302,9 +302,9 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
 def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fraction, z):
     """Fill z with the anchor's linear prediction, at a fraction of the way from the anchor's parameters."""
     copy(anchor_z, z)
-    flat = z.reshape(z.size)
+    flat = as_vector(z)
     for p in range(parameters.size):
-        change, slope = fraction * (parameters[p] - anchor_parameters[p]), anchor_sensitivities[p].reshape(z.size)
+        change, slope = fraction * (parameters[p] - anchor_parameters[p]), as_vector(anchor_sensitivities[p])
         if change != 0.0:
             for k in range(flat.size):
                 flat[k] += slope[k] * change
