@@ -15,7 +15,6 @@ SCHEMES = ["backward2", "central2", "central4", "fourier"]
 # Schemes with gaps between the offsets and without offsets before the point.
 GAPS = bp.Scheme("gaps", 2, first={-3: -1 / 6, 3: 1 / 6}, second={-3: 1 / 9, 0: -2 / 9, 3: 1 / 9})
 FORWARD = bp.Scheme("forward", 1, first={0: -1.0, 1: 1.0}, second={0: 1.0, 1: -2.0, 2: 1.0})
-LINEAR = compiled.kernels("linear", 1, (2, 3, 2))
 ORIGINAL = compiled._kernels
 CALLED = """from numba import njit
 
@@ -31,6 +30,11 @@ CALLING = """from numba import njit
 def twice(x):
     return 2.0 * shifted(x)
 """
+
+
+def linear():
+    """Return the compiled linear algebra of one state."""
+    return compiled.kernels("linear", 1, (2, 3, 2))
 
 
 def growing(states: int) -> bp.Model:
@@ -227,8 +231,8 @@ def test_factors_solve_random_systems_that_need_pivoting(half):
     right = generator.standard_normal((3, size))
     expected = np.linalg.solve(matrix, right.T).T
     band, pivots = rows_of_band(matrix, half), np.empty(size, dtype=np.int64)
-    assert LINEAR.factor(band, half, half, pivots)
-    LINEAR.solve(band, half, half, pivots, right)
+    assert linear().factor(band, half, half, pivots)
+    linear().solve(band, half, half, pivots, right)
     assert right == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
 
 
@@ -236,7 +240,7 @@ def test_singular_and_not_finite_matrices_are_detected():
     for bad in (0.0, np.nan):
         band = rows_of_band(np.eye(5), 1)
         band[2, 1] = bad
-        assert not LINEAR.factor(band, 1, 1, np.empty(5, dtype=np.int64))
+        assert not linear().factor(band, 1, 1, np.empty(5, dtype=np.int64))
 
 
 @pytest.mark.parametrize("exponent", [-40.0, -20.0, 20.0, 40.0])
@@ -255,8 +259,8 @@ def test_folded_band_is_accurate_for_stable_and_unstable_orbits(exponent):
     right = np.empty((1, size))
     right[0, shape.place] = forcing
     pivots = np.empty(size, dtype=np.int64)
-    assert LINEAR.factor(matrix, half, half, pivots)
-    LINEAR.solve(matrix, half, half, pivots, right)
+    assert linear().factor(matrix, half, half, pivots)
+    linear().solve(matrix, half, half, pivots, right)
     assert right[0, shape.place] == pytest.approx(expected, abs=1e-12)
 
 
