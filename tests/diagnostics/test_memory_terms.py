@@ -51,6 +51,7 @@ def found(relaxing):
     return bp.missing_terms(*relaxing)
 
 
+@pytest.mark.slow
 def test_a_relaxing_spring_is_found_with_stiffness_and_lag(relaxing, found):
     """The state z lags x by 1.5 s: spring·(x − z) is −spring·(lag(x) − x); with c and k free, lag(dx) is the same."""
     (step,) = found.steps
@@ -71,6 +72,7 @@ def test_a_relaxing_spring_is_found_with_stiffness_and_lag(relaxing, found):
     assert "The data determine the product of coefficient and lag, but not both." in vague
 
 
+@pytest.mark.slow
 def test_the_model_with_memory_has_the_lag_as_a_state_and_can_be_fitted(relaxing, found):
     (step,) = found.steps
     model, better = found.model(), found.problem()
@@ -165,6 +167,7 @@ def test_a_term_for_the_error_of_the_grid_is_refused():
     assert bp.missing_terms(finer, bp.map_estimate(finer, progress=False)).before.verdict == "adequate"
 
 
+@pytest.mark.slow
 def test_results_are_saved_and_read_without_their_models(relaxing, found, tmp_path):
     problem, fit = relaxing
     found.save(tmp_path / "found.h5")

@@ -147,6 +147,7 @@ def test_unconverged_anchor_near_the_orbit_gives_the_exact_solution():
     assert found.frequency[0, 0] == pytest.approx(solved(1.05).frequency, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1.0, 1e-3, 1e-8])
 def test_shrunk_and_repeated_orbits_are_detected(size):
     tau = grid(60)

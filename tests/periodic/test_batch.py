@@ -220,7 +220,7 @@ def rig(drive: str, scheme: str) -> list[PeriodicEquations]:
     ids=["posterior", "5 %", "theta16 twice its value", "theta16 five times its value"],
 )
 @pytest.mark.parametrize("scheme", ["backward2", "central2"])
-@pytest.mark.parametrize("drive", ["force", "displacement"])
+@pytest.mark.parametrize("drive", [pytest.param("force", marks=pytest.mark.slow), "displacement"])
 def test_solves_with_reused_factors_equal_solves_from_scratch(drive, scheme, spread):
     """Spreads are standard deviations relative to theta4, theta6 and theta16; many theta16 are negative.
 

@@ -242,6 +242,7 @@ def test_continuation_of_a_limit_cycle_in_its_parameter_agrees_with_shooting():
     assert middle.period == pytest.approx(period, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_period_doubling_of_a_limit_cycle_agrees_with_shooting():
     """Rössler's equations, a = b = 0.2, against shooting with the period as a further state."""
     start = bp.solve_periodic(ROESSLER, {"a": 0.2, "b": 0.2, "c": 2.6}, frequency=0.17, samples=200, scheme="central4")

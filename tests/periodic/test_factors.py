@@ -12,6 +12,9 @@ from bayesperiodic.periodic.schemes import CyclicGrid, find_scheme
 from tests.known import grid
 
 SCHEMES = ["backward2", "central2", "central4", "fourier"]
+# Kernels of two states and these schemes take half a minute to compile, for few tests.
+SLOW_TWO = pytest.param(2, marks=pytest.mark.slow)
+SLOW_SCHEMES = [pytest.param(scheme, marks=pytest.mark.slow) for scheme in ("backward2", "central2")]
 # Schemes with gaps between the offsets and without offsets before the point.
 GAPS = bp.Scheme("gaps", 2, first={-3: -1 / 6, 3: 1 / 6}, second={-3: 1 / 9, 0: -2 / 9, 3: 1 / 9})
 FORWARD = bp.Scheme("forward", 1, first={0: -1.0, 1: 1.0}, second={0: 1.0, 1: -2.0, 2: 1.0})
@@ -91,7 +94,7 @@ def test_linear_solves_are_accurate_for_stable_and_unstable_orbits(scheme, expon
 
 
 @pytest.mark.parametrize("exponent", [-40.0, 40.0])
-@pytest.mark.parametrize("states", [1, 2, 4])
+@pytest.mark.parametrize("states", [1, SLOW_TWO, 4])
 @pytest.mark.parametrize("scheme", ["backward2", "central2"])
 def test_segments_agree_with_the_folded_band_and_are_used(scheme, states, exponent):
     equations = equations_of(growing(states), scheme, 800)
@@ -124,7 +127,7 @@ def test_derivatives_are_weighted_sums_of_neighbours(scheme, states):
 
 
 @pytest.mark.parametrize("exponent", [-40.0, 1.0, 40.0])
-@pytest.mark.parametrize("scheme", ["backward2", "central2", "central4"])
+@pytest.mark.parametrize("scheme", [*SLOW_SCHEMES, "central4"])
 def test_transposed_solves_by_segments_and_by_the_band_match_dense_algebra(scheme, exponent):
     states = 2
     equations = equations_of(growing(states), scheme, 120)
@@ -141,7 +144,7 @@ def test_transposed_solves_by_segments_and_by_the_band_match_dense_algebra(schem
     assert solved.ravel() == pytest.approx(expected, rel=1e-8, abs=1e-8 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("states", [1, 2])
+@pytest.mark.parametrize("states", [1, SLOW_TWO])
 @pytest.mark.parametrize("scheme", ["backward2", "central2", "central4"])
 def test_bands_of_any_length_are_factored_with_row_exchanges(scheme, states):
     """Random bands without dominance, one with a column of zeros, against dense algebra."""
@@ -183,7 +186,7 @@ def test_a_march_that_grows_too_fast_is_left_for_the_folded_band():
     assert solved.ravel() == pytest.approx(np.linalg.solve(dense(equations, columns), right.ravel()), rel=1e-9)
 
 
-@pytest.mark.parametrize("states", [1, 2, 4])
+@pytest.mark.parametrize("states", [1, SLOW_TWO, 4])
 @pytest.mark.parametrize("scheme", [*SCHEMES, GAPS], ids=lambda s: getattr(s, "name", s))
 def test_many_sides_and_the_transpose_match_dense_algebra(scheme, states):
     equations = equations_of(growing(states), scheme, 30)
@@ -198,7 +201,7 @@ def test_many_sides_and_the_transpose_match_dense_algebra(scheme, states):
     assert factors.solve_transposed(right).reshape(5, -1) == pytest.approx(transposed, rel=1e-8, abs=1e-8)
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("scheme", [*SLOW_SCHEMES, "central4", "fourier"])
 @pytest.mark.parametrize("rate", [0.0, 1e-13, 1.5])
 def test_bordered_systems_are_solved_where_the_block_is_singular(scheme, rate):
     """ẇ = u has a constant as null vector; a border fixes the mean and frees a constant force."""

@@ -10,6 +10,7 @@ from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations
 from tests.known import CYCLE, SADDLE_NODE, grid
+from tests.periodic.test_factors import SLOW_SCHEMES
 
 
 def fitzhugh_nagumo(inputs=()):
@@ -104,7 +105,7 @@ def test_driven_first_order_model_agrees_with_the_integration_by_default(samples
     assert solution.states["v"] == pytest.approx(v, abs={100: 4e-2, 200: 2e-3, 400: 2e-4}[samples])
 
 
-@pytest.mark.parametrize("scheme", ["central2", "central4", "backward2", "fourier"])
+@pytest.mark.parametrize("scheme", [*SLOW_SCHEMES, "central4", "fourier"])
 @pytest.mark.parametrize("samples", [32, 50, 60, 100, 101, 120, 150, 200, 300])
 @pytest.mark.filterwarnings("ignore:The solution of:UserWarning")
 def test_whatever_converges_has_the_integrated_period(reference, scheme, samples):
@@ -117,6 +118,7 @@ def test_whatever_converges_has_the_integrated_period(reference, scheme, samples
         assert solution.period == pytest.approx(reference[0], rel=tolerance)
 
 
+@pytest.mark.slow
 def test_status_and_warning_of_an_unresolved_solution_name_the_cure(reference):
     with pytest.warns(UserWarning, match="is not resolved.*Take more samples than 200.*central4"):
         solution = from_reference(reference, 200, "central2")
@@ -148,6 +150,7 @@ def test_only_alternation_above_one_per_cent_is_unresolved(values, jagged):
     assert equations.kernels.is_jagged(z, equations.inputs) == jagged
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The solution of:UserWarning")
 def test_batches_have_the_status_of_single_solves(reference):
     for model, scheme in ((FREE, "central2"), (FREE, "central4")):
@@ -268,6 +271,7 @@ def test_mass_that_symmetry_keeps_at_rest_does_not_prevent_convergence(stiffness
     assert np.abs(whole.states["b"]).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_density_of_a_chain_with_a_mass_at_rest_is_that_of_half_the_chain():
     drive = np.cos(2 * np.pi * grid(100))
     y = 0.4 * np.cos(2 * np.pi * grid(100) - 0.3) + 0.01 * np.random.default_rng(3).standard_normal(100)

@@ -199,6 +199,7 @@ def test_sensitivity_of_a_limit_cycles_multiplier_to_its_parameter_agrees_with_s
     assert -solution.frequency_sensitivities["mu"] / solution.frequency**2 == pytest.approx(expected[0], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_multiplier_sensitivities_of_an_unstable_cycle_of_three_states_equal_differences():
     """The solution is the guess of its neighbours, so that their phases are fixed as the sensitivities assume."""
     period, start = 1.5586522107162, np.array([-13.763610682134, -19.578751942452, 27.0])

@@ -161,7 +161,7 @@ def sensitivities(name, model, outputs):
     return columns[:, size > 0.0] / size[size > 0.0]
 
 
-@pytest.mark.parametrize("name", LIBRARY)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "chain")) for n in LIBRARY])
 def test_sensitivities_of_periodic_solutions_have_the_same_rank(name, found):
     model, outputs, structure = found(name)
     size = np.linalg.svd(sensitivities(name, model, outputs))[1]
