@@ -29,6 +29,7 @@ import llvmlite.binding
 import numba
 import platformdirs
 from numba.core import sigutils, typing
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.extending import _Intrinsic
 from numba.core.registry import cpu_target
 
@@ -93,11 +94,8 @@ def _stored(source: str, names: Mapping[str, Any], entry: Path) -> types.ModuleT
 
 def _remove(entry: Path) -> None:
     """Remove an entry at once, also while another process reads it."""
-    aside = Path(tempfile.mkdtemp(prefix=BUILDING, dir=entry.parent))
-    try:
-        entry.rename(aside / entry.name)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=BUILDING, dir=entry.parent, ignore_cleanup_errors=True) as aside:
+        entry.rename(Path(aside) / entry.name)
 
 
 def _header() -> str:
@@ -164,14 +162,15 @@ def _execute(source: str, names: Mapping[str, Any], path: Path, cache: bool) -> 
     module.__dict__.update(own, __file__=str(path), CACHE=cache)
     sys.modules[module.__name__] = module
     settings: Any = numba.config
-    elsewhere, thresholds = settings.CACHE_DIR, gc.get_threshold()
-    settings.CACHE_DIR = ""  # beside the source, where its digests are kept
-    gc.set_threshold(0)  # looking for garbage takes a fifth of the compiler's time
-    try:
-        exec(compile(source, str(path), "exec"), module.__dict__)
-    finally:
-        settings.CACHE_DIR = elsewhere
-        gc.set_threshold(*thresholds)
+    with global_compiler_lock:
+        elsewhere, thresholds = settings.CACHE_DIR, gc.get_threshold()
+        settings.CACHE_DIR = ""  # beside the source, where its digests are kept
+        gc.set_threshold(0)  # looking for garbage takes a fifth of the compiler's time
+        try:
+            exec(compile(source, str(path), "exec"), module.__dict__)
+        finally:
+            settings.CACHE_DIR = elsewhere
+            gc.set_threshold(*thresholds)
     return module
 
 

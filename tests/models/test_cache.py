@@ -1,9 +1,11 @@
+import gc
 import os
 import shutil
 import subprocess
 import sys
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -101,6 +103,17 @@ def test_two_processes_may_fill_the_cache_at_once(folder):
         assert process.returncode == 0
     assert entry(folder).is_dir()
     assert start().communicate()[0] == f"{len(FUNCTIONS)}\n"
+
+
+def test_the_garbage_collector_is_as_before_after_loading_in_threads_and_after_an_error(folder):
+    thresholds = gc.get_threshold()
+    with ThreadPoolExecutor(4) as pool:
+        modules = pool.map(cache.load, [SMALL.replace("2.0", f"{number}.0") for number in range(1, 5)])
+        assert [module.twice(3.0) for module in modules] == [3.0, 6.0, 9.0, 12.0]
+    assert gc.get_threshold() == thresholds
+    with pytest.raises(ZeroDivisionError):
+        cache.load("1 / 0")
+    assert gc.get_threshold() == thresholds and gc.isenabled()
 
 
 def test_folder_is_private_to_the_user(folder):
