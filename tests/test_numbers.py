@@ -9,9 +9,11 @@ import json
 import re
 from functools import cache
 from pathlib import Path
+from statistics import median
 
 import pytest
 
+from studies.benchmark import large
 from tests.numbers_without_results import WITHOUT_RESULTS
 
 ROOT = Path(__file__).parents[1]
@@ -374,6 +376,44 @@ def cell(value):
     if value >= 1000.0:
         return f"{round(value, -1):,.0f}"
     return f"{value:.0f}" if value >= 9.95 else f"{value:.1f}" if value >= 0.995 else f"{value:.2f}"
+
+
+@on("docs/benchmarks.md")
+def cold_start():
+    d = json.loads((ROOT / "figures" / "benchmark" / "cold_start.json").read_text("utf-8"))
+    ways, installed = d["first_results"].values(), d["installation"]
+    targets = {row["what"]: row for row in d["targets"]}
+
+    def seconds(stage):
+        return " | ".join(f"{way[stage]:.2g}" for way in ways)
+
+    def target(*names):
+        return " and ".join(f"{targets[f'{name} [s]']['high']:g}" for name in names)
+
+    yield f"installation takes {installed['s']:.0f} s: {installed['packages']} packages, {installed['MB']:.0f} MB"
+    yield f"| import | {seconds('import')} | - |"
+    first = target("first solve, empty cache"), target("new model's first solve")
+    yield f"a Duffing oscillator | {seconds('first solve')} | {first[0]} with the import, {first[1]} for a new model |"
+    estimate = target("new model's first MAP")
+    yield f"| first MAP estimate | {seconds('first MAP')} | {estimate} for a new model |"
+    yield f"| first draws | {seconds('first draws')} | - |"
+    for name, key in (("first command", "first_command"), ("tests", "tests")):
+        both = " | ".join(f"{median(d[key][way]):.0f}" for way in ("empty", "full"))
+        yield f"{name} | {both} | - | {target(*(f'{name}, {way} cache' for way in ('empty', 'full')))} |"
+    for name, peer in d["peers"].items():
+        size = f"{peer['installation s']:.0f} | {peer['installation MB']:.0f}"
+        yield f"| {name} | {size} | {peer['import']:.2g} | {peer['first posterior evaluation']:.2g} |"
+    for what, size, joined in (("fold", 5_000_000, "with"), ("orbits", 500_000, "and")):
+        own = d["large"][what]
+        at = own["sizes"].index(size)
+        yield f"{own['s'][at]:.2g} s {joined} {own['GB'][at]:.2g} GB (target"
+        yield f"{target(f'{what}, {size:,}')} s"
+    yield f"in a section of {size:,} points"
+    yield f"and {large.ORBIT_TARGET[2]:g} GB)"
+    yield " and ".join(f"{d['large'][what]['exponent']:.2f}" for what in ("fold", "orbits"))
+    missed = [row["what"] for row in d["targets"] if not row["met"]]
+    named = ("first command, empty cache", "first command, full cache", "tests, empty cache", "tests, full cache")
+    assert set(missed) == {f"{name} [s]" for name in (*named, "first solve, empty cache")}, "change the missed targets"
 
 
 @on("docs/benchmarks.md")

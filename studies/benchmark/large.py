@@ -79,7 +79,7 @@ def _sizes(python: Path | str, what: str, sizes: Sequence[int]) -> dict[str, Any
 
 def draw(found: dict[str, Any]) -> Figure:
     """Return time and memory over size, with what is linear, and the targets."""
-    figure, axes = plt.subplots(1, 2, figsize=(8.0, 3.4), layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(8.0, 4.0), layout="constrained")
     names = {"fold": ("samples", FOLD_TARGET, "o", "#0072B2"), "orbits": ("points", ORBIT_TARGET, "s", "#D55E00")}
     for what, (unit, (size, seconds, gigabytes), marker, colour) in names.items():
         own = found[what]
@@ -91,5 +91,8 @@ def draw(found: dict[str, Any]) -> Figure:
         axes[0].loglog(own["sizes"], [start * n for n in own["sizes"]], ":", lw=0.8, color=colour)
     axes[0].set(xlabel="size", ylabel="time [s]", title="Time (dotted: proportional to size)")
     axes[1].set(xlabel="size", ylabel="peak memory [GB]", title="Memory of the process")
-    axes[0].legend(frameon=False, fontsize="x-small")
+    axes[1].set_yticks(ticks := [0.3, 0.5, 1.0, 2.0, 4.0], [f"{tick:g}" for tick in ticks])
+    axes[1].minorticks_off()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    figure.suptitle("Folding a recording, and finding orbits in a section (synthetic data)", fontsize="medium")
     return figure
