@@ -63,6 +63,11 @@ def test_a_vector_has_the_entries_of_its_array_and_keeps_their_memory():
     assert total(rows, np.zeros(1000)) == pytest.approx(expected, rel=1e-12)
 
 
+def test_a_strided_array_is_no_vector():
+    with pytest.raises(AssertionError, match="as_vector: must be C-contiguous, got layout 'A'"):
+        njit("float64(float64[:,:])")(lambda rows: as_vector(rows)[0])
+
+
 def test_a_model_without_smooth_signs_compiles_no_function_for_them():
     assert "def transitions(" not in duffing.symbolic.kernel_source()
     assert "def transitions(" in pendulum.symbolic.kernel_source()
