@@ -18,7 +18,7 @@ WITHOUT_RESULTS = {
             "A value above 1 means",
         ),
         UNSTORED: (
-            "49 functions of Numba",
+            "48 functions of Numba",
             "97 s of processor time on two cores: 44 s for the orbits at three noise", "28 s for the posterior of five",
             "15 s for the shooting reference, 10 s for the recording", "some 190 models", "spread over 3,700 tests",
             "takes 15 s of one core once per machine", "64 walkers at once |",

@@ -406,8 +406,8 @@ def cold_start():
     for what, size, joined in (("fold", 5_000_000, "with"), ("orbits", 500_000, "and")):
         own = d["large"][what]
         at = own["sizes"].index(size)
-        yield f"{own['s'][at]:.2g} s {joined} {own['GB'][at]:.2g} GB (target"
-        yield f"{target(f'{what}, {size:,}')} s"
+        limit = target(f"{what}, {size:,}")
+        yield f"{own['s'][at]:.2g} s {joined} {own['GB'][at]:.2g} GB (target {limit} s"
     yield f"in a section of {size:,} points"
     yield f"and {large.ORBIT_TARGET[2]:g} GB)"
     yield " and ".join(f"{d['large'][what]['exponent']:.2f}" for what in ("fold", "orbits"))

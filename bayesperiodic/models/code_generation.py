@@ -93,7 +93,7 @@ def without_gathers(typing_context: Any) -> Any:
 
 @intrinsic
 def as_vector(typing_context: Any, array: Any) -> Any:
-    """Return a C-contiguous array as a vector, for use in compiled code; `reshape` compiles for three times as long."""
+    """Return a C-contiguous array as a vector, for use in compiled code; `reshape` takes longer to compile."""
     assert array.layout == "C", f"as_vector: must be C-contiguous, got layout {array.layout!r}"
     vector = types.Array(array.dtype, 1, "C")
 
