@@ -113,36 +113,36 @@ def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) 
     """Return the cycles of a prime period to which close returns in the section (n, 2) lead."""
     starts, members = _close_returns(maps, section, period)
     chains = section[starts[:, None] + np.arange(period)]
-    step, heir = _converge(maps, atlas, chains)
-    kept = np.array([k for k in np.unique(heir) if step[k] < NEARLY], dtype=int)
-    members = [np.concatenate([members[i] for i in np.flatnonzero(heir == k)]) for k in kept]
-    chains, step = chains[kept], step[kept]
+    step = np.empty(0)
     # The maps of the atlas are discontinuous between centres, so the last steps fit about the points themselves.
-    for _ in range(EXACT_STEPS):
-        step = _newton(maps, chains, atlas.exactly)[0]
-        near = np.flatnonzero(step < NEARLY)
-        chains, step, members = chains[near], step[near], [members[k] for k in near]
+    for images, steps, longest in ((atlas.at, STEPS, np.inf), (atlas.exactly, EXACT_STEPS, NEARLY)):
+        step, heir = _converge(maps, images, chains, steps, longest)
+        kept = np.array([k for k in np.unique(heir) if step[k] < NEARLY], dtype=int)
+        members = [np.concatenate([members[i] for i in np.flatnonzero(heir == k)]) for k in kept]
+        chains, step = chains[kept], step[kept]
     return _distinct(maps, section, chains, step, members)
 
 
-def _converge(maps: ReturnMap, atlas: Atlas, chains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Move chains (m, period, 2) on the atlas; return their last steps and the chains into which they were merged."""
+def _converge(
+    maps: ReturnMap, images: Images, chains: np.ndarray, steps: int, longest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Move chains (m, period, 2); return their last steps and the chains into which they were merged."""
     noise, heir = float(maps.noise.max()), np.arange(len(chains))
     step, active = np.full(len(chains), np.inf), heir
-    for _ in range(STEPS):
+    for _ in range(steps):
         if active.size == 0:
             break
         moved = chains[active]
-        size, bandwidth = _newton(maps, moved, atlas.at)
+        size, bandwidth = _newton(maps, moved, images)
         chains[active] = moved
-        lost = (bandwidth > max(WIDEST, 2.0 * noise)) | ~np.isfinite(size)
+        lost = (bandwidth > max(WIDEST, 2.0 * noise)) | ~(size < longest)
         step[active] = np.where(lost, np.inf, size)
         active = active[(size > max(0.01 * CONVERGED, 0.05 * noise)) & ~lost]
         cells = _cells(maps, chains[active], max(MERGED, noise))
         _, first, owner = np.unique(cells, axis=0, return_index=True, return_inverse=True)
         heir[active] = active[first][owner.ravel()]
         active = active[first]
-    for _ in range(STEPS):
+    for _ in range(steps):
         heir = heir[heir]
     return step, heir
 
@@ -214,37 +214,37 @@ def refine(maps: ReturnMap, points: np.ndarray, neighbours: int) -> Estimate | N
     the difference to the wider neighbourhood.
     """
     bandwidths = _bandwidths(maps, points, neighbours)
-    narrow = _close(maps, points, maps.count_within(points, bandwidths))
-    wide = _close(maps, points, maps.count_within(points, WIDENED * bandwidths))
+    narrow = _close(maps, points, bandwidths)
+    wide = _close(maps, points, WIDENED * bandwidths) if narrow is not None else None
     if narrow is None or wide is None:
         return None
-    cycle, fits = narrow
-    values, wide_values = (eigenvalues(np.concatenate([fit.jacobian for fit in each])) for each in (fits, wide[1]))
+    cycle, fit = narrow
+    values, wide_values = eigenvalues(fit.jacobian), eigenvalues(wide[1].jacobian)
     slope_bias = (np.log(np.abs(wide_values)) - np.log(np.abs(values))) / SLOPE_GROWTH
     point_bias = maps.wrap(wide[0] - cycle).ravel() / VALUE_GROWTH
-    run = np.sum([fit.value[0] - point for fit, point in zip(fits, cycle, strict=True)], axis=0)
     bias = np.concatenate([point_bias, slope_bias])
-    return Estimate(maps.wrap(cycle), values, _joint_covariance(fits, cycle), bias, _turns(maps, run))
+    run = np.sum(fit.value - cycle, axis=0)
+    return Estimate(maps.wrap(cycle), values, _joint_covariance(fit), bias, _turns(maps, run))
 
 
 def _turns(maps: ReturnMap, run: np.ndarray) -> float:
     return float(np.sum(run[maps.angle] / maps.turn[maps.angle]))
 
 
-def _close(maps: ReturnMap, points: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, list[LocalFit]] | None:
+def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple[np.ndarray, LocalFit] | None:
     """Return the points at which the chained fits close, and the fits; None without convergence."""
     cycle, last, refined = points.copy(), np.inf, max(REFINED, REFINED_NOISE * float(maps.noise.max()))
     for step in range(REFINING_STEPS):
         final = last < refined or step == REFINING_STEPS - 1
-        fits = [maps.fit(point[None], int(n), DEGREE, influence=final) for point, n in zip(cycle, counts, strict=True)]
-        defect = maps.wrap(np.concatenate([fit.value for fit in fits]) - np.roll(cycle, -1, axis=0))
-        correction = newton_step(defect[None], np.concatenate([fit.jacobian for fit in fits])[None])[0]
+        fit = maps.fit_within(cycle, bandwidths, DEGREE, influence=final)
+        defect = maps.wrap(fit.value - np.roll(cycle, -1, axis=0))
+        correction = newton_step(defect[None], fit.jacobian[None])[0]
         size = float(np.abs(correction).max())
         if not np.isfinite(size) or np.abs(maps.wrap(cycle - points)).max() > 0.1:
             return None
         if final:
             # Neighbours change as the centre moves, which leaves steps far below the errors.
-            return (cycle, fits) if size < 1e-3 else None
+            return (cycle, fit) if size < 1e-3 else None
         cycle, last = cycle + correction * min(1.0, LONGEST_STEP / max(size, 1e-300)), size
     return None
 
@@ -252,23 +252,22 @@ def _close(maps: ReturnMap, points: np.ndarray, counts: np.ndarray) -> tuple[np.
 def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndarray:
     """Return the bandwidth of each point's neighbourhood, (period,)."""
     nearest = maps.nearest(points, int(2.25 * neighbours))[0][:, -1] / REACH
-    smallest = np.maximum(nearest, ROOM * maps.noise.max())
-    ladder = smallest[:, None] * WIDENED ** np.arange(SIZES)
-    counts = [maps.count_within(points, bandwidths) for bandwidths in ladder.T]
-    most = len(maps.arguments) // 8
-    narrowest = [maps.fit(point[None], int(n), DEGREE) for point, n in zip(points, counts[0], strict=True)]
-    right, left = _eigenvectors(np.concatenate([fit.jacobian for fit in narrowest]), 0)
-    chosen = []
-    for j, point in enumerate(points):
-        accepted: list[tuple[np.ndarray, np.ndarray]] = []
-        for count in (int(n[j]) for n in counts if n[j] <= most):
-            fit = maps.fit(point[None], count, DEGREE) if accepted else narrowest[j]
-            target, sd = _along(fit, left[j : j + 1], right[j : j + 1])
-            if any(np.any(np.abs(target - other) > AGREEMENT * other_sd) for other, other_sd in accepted):
+    ladder = np.maximum(nearest, ROOM * maps.noise.max()) * WIDENED ** np.arange(SIZES)[:, None]
+    fit = maps.fit_within(points, ladder[0], DEGREE)
+    right, left = _eigenvectors(fit.jacobian, 0)
+    targets, sds = np.empty((2, SIZES, len(points), 3))
+    active, accepted = np.arange(len(points)), np.zeros(len(points), dtype=int)
+    for size, bandwidths in enumerate(ladder):
+        if size > 0:
+            active = active[maps.count_within(points[active], bandwidths[active]) <= len(maps.arguments) // 8]
+            if not active.size:
                 break
-            accepted.append((target, sd))
-        chosen.append(ladder[j, max(len(accepted) - 2, 0)])
-    return np.array(chosen)
+            fit = maps.fit_within(points[active], bandwidths[active], DEGREE)
+        targets[size, active], sds[size, active] = _along(fit, left[active], right[active])
+        away = np.abs(targets[size, active] - targets[:size, active])
+        active = active[~np.any(away > AGREEMENT * sds[:size, active], axis=(0, 2))]
+        accepted[active] += 1
+    return ladder[np.maximum(accepted - 2, 0), np.arange(len(points))]
 
 
 def _along(fit: LocalFit, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -293,13 +292,12 @@ def _eigenvectors(jacobian: np.ndarray, which: int) -> tuple[np.ndarray, np.ndar
     return vectors[0], np.roll(vectors[1], -1, axis=0)
 
 
-def _joint_covariance(fits: list[LocalFit], cycle: np.ndarray) -> np.ndarray:
-    """Return the joint covariance of the points and of log|eigenvalue|, by the delta method.
+def _joint_covariance(fit: LocalFit) -> np.ndarray:
+    """Return the joint covariance of the points of a cycle and of log|eigenvalue|, by the delta method.
 
     Consecutive pairs of points share the noise of a point, so errors are summed over runs of consecutive pairs.
     """
-    p = len(cycle)
-    jacobian, hessian = (np.concatenate([getattr(fit, name) for fit in fits]) for name in ("jacobian", "hessian"))
+    jacobian, hessian, p = fit.jacobian, fit.hessian, len(fit.value)
     by_value = -np.linalg.inv(_closing_matrix(jacobian[None])[0])
     by_slope, by_point = np.zeros((2, p, 2, 2)), np.zeros((2, p, 2))
     for k in range(2):
@@ -308,11 +306,11 @@ def _joint_covariance(fits: list[LocalFit], cycle: np.ndarray) -> np.ndarray:
         by_slope[k] = (np.einsum("pi,pj->pij", left, right) / slope[:, None, None]).real
         by_point[k] = (np.einsum("pi,pijl,pj->pl", left, hessian, right) / slope[:, None]).real
     rows = []
-    for j, fit in enumerate(fits):
-        points = fit.influence[0, :, 0] @ by_value[:, 2 * j : 2 * j + 2].T
-        slopes = np.einsum("kil,nli->nk", by_slope[:, j], fit.influence[0, :, 1:3])
+    for j, influence in enumerate(fit.influence):
+        points = influence[:, 0] @ by_value[:, 2 * j : 2 * j + 2].T
+        slopes = np.einsum("kil,nli->nk", by_slope[:, j], influence[:, 1:3])
         rows.append(np.concatenate([points, slopes + points @ by_point.reshape(2, -1).T], axis=1))
-    pairs, owner = np.unique(np.concatenate([fit.neighbours[0] for fit in fits]), return_inverse=True)
+    pairs, owner = np.unique(fit.neighbours.ravel(), return_inverse=True)
     runs = np.concatenate([[0], np.cumsum(np.diff(pairs) > 1)])
     errors = np.zeros((runs[-1] + 1, 2 * p + 2))
     np.add.at(errors, runs[owner], np.concatenate(rows))
@@ -347,7 +345,7 @@ def box_orbits(
         estimate = Estimate(
             points,
             eigenvalues(fits[-1].jacobian),
-            transfer @ _joint_covariance(fits[-1:], points[:1]) @ transfer.T,
+            transfer @ _joint_covariance(fits[-1]) @ transfer.T,
             np.zeros(2 * period + 2),
             _turns(maps, fits[-1].value[0] - points[0]),
         )

@@ -10,9 +10,11 @@ from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 # Powers of the two coordinates, degree by degree, and the factorials that make the coefficients derivatives.
-POWERS = np.array([(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)])
+POWERS = np.array([(degree - k, k) for degree in range(7) for k in range(degree + 1)])
 FACTORIALS = np.array([1.0, 1.0, 1.0, 2.0, 1.0, 2.0, 6.0, 2.0, 2.0, 6.0])
-TERMS = {1: 3, 2: 6, 3: 10}
+TERMS = {1: 3, 2: 6, 3: 10, 4: 15, 6: 28}
+# Fewest neighbours of a fit of given bandwidth.
+FEWEST = 30
 # Neighbours are used up to this many bandwidths, where the kernel is 1.1 % of its maximum.
 REACH = 3.0
 # Largest noise as a fraction of the bandwidth; deconvolution needs less than one.
@@ -100,9 +102,29 @@ class ReturnMap:
 
     def fit(self, centres: np.ndarray, count: int, degree: int, *, influence: bool = True) -> LocalFit:
         """Fit polynomials about the centres (m, 2) to their `count` nearest neighbours; faster without `influence`."""
-        rows = max(1, BLOCK // (count * TERMS[degree] ** 2))
-        parts = [self._fit(centres[k : k + rows], count, degree, influence) for k in range(0, len(centres), rows)]
+        parts, size = [], max(1, BLOCK // (count * TERMS[2 * degree]))
+        for block in (centres[k : k + size] for k in range(0, len(centres), size)):
+            distance, index = self.nearest(block, count)
+            parts.append(self._fit(block, distance[:, -1] / REACH, index, np.array([True]), degree, influence))
         return LocalFit(*map(np.concatenate, zip(*parts, strict=True)))
+
+    def fit_within(
+        self, centres: np.ndarray, bandwidths: np.ndarray, degree: int, *, influence: bool = True
+    ) -> LocalFit:
+        """Fit polynomials about the centres (m, 2) with the bandwidths (m,), or larger ones where points are few.
+
+        The neighbours are repeated to equal numbers, without influence.
+        """
+        distance, nearest = self.nearest(centres, FEWEST)
+        bandwidths = np.maximum(bandwidths, distance[:, -1] / REACH)
+        near = self._tree.query_ball_point(self.wrap_points(centres), REACH * bandwidths)
+        counts = np.array([len(members) for members in near])[:, None]
+        position = np.arange(counts.max() + 1)
+        # The nearest comes first, and again in its place.
+        inside = (position > 0) & (position <= counts)
+        index = np.repeat(nearest[:, :1], len(position), axis=1)
+        index[inside] = np.concatenate(near)
+        return self._fit(centres, bandwidths, index, inside, degree, influence)
 
     @staticmethod
     def predict(fit: LocalFit, away: np.ndarray) -> np.ndarray:
@@ -122,55 +144,58 @@ class ReturnMap:
         free = np.maximum(fit.effective - fit.derivatives.shape[1], 1.0) / fit.effective
         return np.einsum("mn,mnc->mc", weight, residual**2) / weight.sum(1)[:, None] / free[:, None]
 
-    def _fit(self, centres: np.ndarray, count: int, degree: int, wants_influence: bool) -> LocalFit:
-        distance, index = self.nearest(centres, count)
-        bandwidth = np.maximum(distance[:, -1] / REACH, np.max(self.noise) / MOST_NOISE)
+    def _fit(
+        self, centres: np.ndarray, bandwidth: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int,
+        wants_influence: bool,
+    ) -> LocalFit:  # fmt: skip
+        bandwidth = np.maximum(bandwidth, np.max(self.noise) / MOST_NOISE)
         away = self.wrap(self.arguments[index] - centres[:, None])
         image = away + self.increments[index]
         reference = image[:, :1]
         image = image - reference
         if not self.winds:
             image = self.wrap(image)
-        moments, weight = _deconvoluted(away / bandwidth[:, None, None], self.noise / bandwidth[:, None], 2 * degree)
-        powers = POWERS[: TERMS[degree]]
-        sums = powers[:, None] + powers[None]
-        weighted = weight[..., None] * moments[0]
-        normal = (weighted.transpose(0, 2, 1) @ moments[1])[:, sums[..., 0], sums[..., 1]]
-        regressors = weighted[..., powers[:, 0]] * moments[1][..., powers[:, 1]]
-        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
-        solution = inverse @ (regressors.transpose(0, 2, 1) @ image)
+        one, other = _deconvoluted(away / bandwidth[:, None, None], self.noise / bandwidth[:, None], 2 * degree)
+        one *= inside[:, None]
+        powers, weight = POWERS[: TERMS[degree]], one[:, 0]
+        regressors = one[:, powers[:, 0]] * other[:, powers[:, 1]]
+        sums = powers[:, None] + powers
+        inverse = np.linalg.pinv((one @ other.mT)[:, sums[..., 0], sums[..., 1]], rcond=1e-10, hermitian=True)
+        solution = inverse @ (regressors @ image)
         effective = weight.sum(1) ** 2 / (weight**2).sum(1)
         scale = (FACTORIALS[: len(powers)] / bandwidth[:, None] ** powers.sum(1))[..., None]
         influence = np.empty((len(centres), 0, len(powers), 2))
         if wants_influence:
             # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
-            product = weighted[..., sums[..., 0]] * moments[1][..., sums[..., 1]]
-            residual = regressors[..., None] * image[:, :, None] - product @ solution[:, None]
-            leverage = np.clip(np.einsum("mab,mnab->mn", inverse, product), 0.0, MOST_LEVERAGE)
-            influence = (inverse[:, None] @ residual) * scale[:, None] / (1.0 - leverage)[..., None, None]
+            products = POWERS[: TERMS[2 * degree]]
+            functions = one[:, products[:, 0]] * other[:, products[:, 1]]
+            belongs = np.all(sums[..., None, :] == products, axis=-1).astype(float)
+            fitted = np.einsum("abf,mbc,mka->mkcf", belongs, solution, inverse, optimize=True)
+            residual = (inverse @ regressors)[:, :, None] * image.mT[:, None]
+            residual -= (fitted.reshape(len(centres), -1, len(products)) @ functions).reshape(residual.shape)
+            leverage = np.clip(np.einsum("mab,abf->mf", inverse, belongs)[:, None] @ functions, 0.0, MOST_LEVERAGE)
+            influence = (residual * scale[..., None] / (1.0 - leverage)[:, None]).transpose(0, 3, 1, 2)
         derivatives = solution * scale
         value = centres + reference[:, 0] + derivatives[:, 0]
         return LocalFit(value, derivatives, bandwidth, index, influence, effective)
 
 
-def _deconvoluted(
-    away: np.ndarray, noise: np.ndarray, highest: int
-) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Return, by coordinate, functions whose expectation is (kernel ×) power, and the kernel, for unit bandwidth.
+def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.ndarray]:
+    """Return, by coordinate, functions (m, power, n) whose expectations are the powers, the first times the kernel.
 
     x^a exp(−x²/2) is the expectation, over noise of variance s², of the Gaussian of variance 1 − s² times the a-th
     moment of a normal distribution with mean x/(1 − s²) and the negative variance −s²/(1 − s²).
     """
     left = 1.0 - noise[:, None] ** 2
-    weight = np.exp(-0.5 * np.sum(away**2 / left, axis=-1)) / np.sqrt(left.prod(-1))
+    kernel = np.exp(-0.5 * np.sum(away**2 / left, axis=-1)) / np.sqrt(left.prod(-1))
     moments = []
-    for k in range(2):
+    for k, factor in enumerate((kernel, np.ones_like(kernel))):
         mean, variance = away[..., k] / left[..., k], -(1.0 - left[..., k]) / left[..., k]
-        rows = [np.ones_like(mean), mean]
+        rows = [factor, mean * factor]
         for order in range(2, highest + 1):
             rows.append(mean * rows[-1] + (order - 1) * variance * rows[-2])
-        moments.append(np.stack(rows[: highest + 1], axis=-1))
-    return (moments[0], moments[1]), weight
+        moments.append(np.stack(rows, axis=1))
+    return moments
 
 
 class Atlas:

@@ -120,7 +120,7 @@ DETERMINED = ("l", *COMBINATIONS)
 DETERMINED_UNITS = {"l": "m", "c1": "1/s^2", "c2": "1/s", "c3": "1"}
 QUICK_STEPS = 250
 # The stop rule is met with some 3500 effective draws: Monte Carlo errors of means are 2 % of the standard deviations.
-SAMPLING: dict[str, Any] = {"ensembles": 2, "walkers": 16, "variances": "collapsed"}
+SAMPLING: dict[str, Any] = {"walkers": 12, "variances": "collapsed"}
 
 
 @dataclass(frozen=True)

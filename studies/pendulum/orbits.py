@@ -19,7 +19,7 @@ from studies.pendulum.recording import COORDINATES, OMEGA, TRUTH
 from studies.shooting import TURN
 
 # Tolerances of the integration, and of that which counts the turns; accuracy of the orbit.
-TOLERANCE, ROUGH, ACCURACY = 1e-12, 1e-6, 1e-9
+TOLERANCE, ROUGH, ACCURACY = 1e-10, 1e-6, 1e-9
 
 
 class Shot(NamedTuple):

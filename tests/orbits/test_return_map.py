@@ -54,6 +54,25 @@ def test_influences_give_the_variance_of_replicates():
     np.testing.assert_allclose(stated, actual, rtol=0.25)
 
 
+def test_fits_of_given_bandwidths_are_those_of_as_many_neighbours():
+    noisy, centres = maps(1500, 0.02, 1), np.array([[0.1, 0.2], [-0.6, 0.5], [0.9, -0.9]])
+    alone = [noisy.fit(centre[None], count, 3) for centre, count in zip(centres, (80, 250, 120), strict=True)]
+    together = noisy.fit_within(centres, np.array([fit.bandwidth[0] for fit in alone]) * (1.0 + 1e-12), 3)
+    for k, fit in enumerate(alone):
+        np.testing.assert_allclose(together.value[k], fit.value[0], rtol=1e-9)
+        np.testing.assert_allclose(together.derivatives[k], fit.derivatives[0], rtol=1e-6, atol=1e-9)
+        for neighbour, influence in zip(fit.neighbours[0], fit.influence[0], strict=True):
+            same = together.influence[k][together.neighbours[k] == neighbour].sum(axis=0)
+            np.testing.assert_allclose(same, influence, rtol=1e-6, atol=1e-6)
+        assert np.count_nonzero(np.any(together.influence[k], axis=(1, 2))) == fit.neighbours.size
+
+
+def test_where_points_are_few_the_bandwidth_is_larger():
+    fit = maps(1500, 0.0, 1).fit_within(np.array([[0.1, 0.2], [3.0, 3.0]]), np.array([0.1, 0.1]), 2)
+    assert fit.bandwidth[0] == 0.1 and fit.bandwidth[1] > 0.5
+    np.testing.assert_allclose(fit.value, quadratic(np.array([[0.1, 0.2], [3.0, 3.0]])), atol=1e-6)
+
+
 def test_increments_modulo_a_turn_give_the_same_map():
     generator = np.random.default_rng(3)
     angle = generator.uniform(0.0, 1.0, 800)
