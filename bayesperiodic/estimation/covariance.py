@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import lu_factor, lu_solve
 
 from bayesperiodic import _fourier
 from bayesperiodic._linalg import TINY, covariance_eigh, hessian_scale, scaled
@@ -332,16 +333,17 @@ def _mixture(
     log_posterior, found = np.empty(len(points)), np.empty((len(points), names, names))
     for i, shape in enumerate(_spectra(problem, blocks, np.column_stack([np.ones(len(points)), points]))):
         own = weight / shape
-        left, variance = r, float(np.sum(own * r**2)) / freedom
+        gram, along = (s * own) @ s.T, s @ (own * r)
+        variance = float(np.sum(own * r**2)) / freedom
         for _ in range(UPDATES):
-            total = (s * own) @ s.T / variance + others
-            step = np.linalg.solve(total, s @ (own * r) / variance + pull)
+            factors = lu_factor(gram / variance + others)
+            step = lu_solve(factors, along / variance + pull)
             left = r - step @ s
             variance = max(float(np.sum(own * left**2)) / freedom, TINY)
         misfit = np.sum(own * left**2) / variance + step @ others @ step - 2.0 * step @ pull
-        logarithms = float(np.sum(weight * np.log(variance * shape))) + np.linalg.slogdet(total)[1]
+        logarithms = float(np.sum(weight * np.log(variance * shape)) + np.sum(np.log(np.abs(np.diag(factors[0])))))
         log_posterior[i] = log_prior[i] - 0.5 * (misfit + logarithms)
-        found[i] = np.linalg.inv(total)[:names, :names] + np.outer(step[:names], step[:names])
+        found[i] = lu_solve(factors, np.eye(len(s), names))[:names] + np.outer(step[:names], step[:names])
     return np.tensordot(_probabilities(log_posterior), found, 1)
 
 

@@ -295,10 +295,13 @@ class Shared:
             vector = vector + (part.T @ (precision * own)[..., None])[..., 0]
         return matrix, vector
 
+    def _diagonal(self, p: Sequence[np.ndarray]) -> np.ndarray | None:
+        """Return the diagonal of S (…, errors) if S is diagonal: one block, the same precision of all components."""
+        return 1.0 + p[0] * self._squares if len(p) == 1 and p[0].shape[-1] == 1 else None
+
     def log_likelihood(self, r: Sequence[np.ndarray], p: Sequence[np.ndarray], factor: float) -> np.ndarray:
         """Return −½ (sum of squares + ln|S|) (…,), the logarithm multiplied by a factor; NaN if not finite."""
-        if len(r) == 1 and p[0].shape[-1] == 1:  # S is diagonal
-            diagonal = 1.0 + p[0] * self._squares
+        if (diagonal := self._diagonal(p)) is not None:
             along = (self._axes.T @ r[0][..., None])[..., 0]
             total = np.add.reduce(factor * np.log(diagonal) + along * along * (p[0] / diagonal), axis=-1)
             if not self._complete:
@@ -320,13 +323,12 @@ class Shared:
         self, r: Sequence[np.ndarray], p: Sequence[np.ndarray], factor: float
     ) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Return the derivatives of what is added by r and by the logarithms of p, (size,) a block."""
-        matrix, vector = self._system(r, p)
-        inverse = np.linalg.inv(matrix)
-        errors = inverse @ vector
+        diagonal, (matrix, vector) = self._diagonal(p), self._system(r, p)
+        inverse = np.linalg.inv(matrix) if diagonal is None else matrix
         by_residual, by_logarithm = [], []
         for part, own, precision in zip(self.parts, r, p, strict=True):
-            explained = part @ errors
-            taken = np.sum((part @ inverse) * part, axis=1)
+            weighted = part @ inverse if diagonal is None else part / diagonal
+            explained, taken = weighted @ vector, np.sum(weighted * part, axis=1)
             by_residual.append(precision * explained)
             by_logarithm.append(precision * (explained * own - 0.5 * explained**2 - 0.5 * factor * taken))
         return by_residual, by_logarithm
@@ -336,6 +338,8 @@ class Shared:
 
         The columns of U are orthonormal.
         """
+        if self._diagonal(p) is not None:
+            return self._axes, p[0] * self._squares
         scaled = [np.sqrt(precision)[..., None] * part for precision, part in zip(p, self.parts, strict=True)]
         vectors, values, _ = np.linalg.svd(np.concatenate(scaled, axis=-2), full_matrices=False)
         return vectors, values**2

@@ -283,7 +283,7 @@ def of_known_origin(cubic, seed):
     return bp.compare_models(pairs, held_out=False)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_probabilities_of_a_cubic_and_a_linear_spring_are_calibrated_over_50_data_sets():
     """Origin by coin, parameters from the priors: the number of cubic springs has mean Σp and variance Σp(1 − p).
 

@@ -184,7 +184,7 @@ CALIBRATED = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("case", CALIBRATED)
 def test_false_alarms_under_the_prior(case):
     """400 data sets with parameters from the prior: at most 1 % alarms, and p uniform (normal priors) or larger.

@@ -204,7 +204,7 @@ def test_drift_of_all_walkers_together_shows_in_rhat():
     assert convergence.rhat(values.swapaxes(1, 2).reshape(4, -1)) < 1.01
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("dimension", [2, 6])
 def test_means_of_repeated_runs_scatter_by_the_printed_error(dimension):
     """60 runs of two ensembles on a standard normal: Σ(mean/mcse)² is χ² with 60 to 360 degrees of freedom.

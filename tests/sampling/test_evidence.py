@@ -337,7 +337,7 @@ def test_draws_that_have_not_converged_bring_a_warning():
         bp.evidence(problem, short)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.filterwarnings(OPTIMA, "ignore:The estimate of 'a'.*lies at", "ignore:The evidence is unreliable. the two")
 @pytest.mark.parametrize(("case", "count"), [("two modes", 400), ("edge of a prior", 60)])
 def test_errors_of_the_evidence_cover(case, count):
@@ -439,7 +439,7 @@ def damper() -> bp.Problem:
     return bp.Problem(bp.models.dahl, [given], priors=priors, noise=noise)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.filterwarnings(OPTIMA, "ignore:.*:DeprecationWarning")
 @pytest.mark.parametrize("make", [lambda: wells()[0], oscillator, damper], ids=["two modes", "duffing", "damper"])
 def test_evidence_agrees_with_nested_sampling(make):

@@ -85,7 +85,7 @@ import bayesperiodic as bp
 from tests.sampling.test_faults import posed
 
 def run(executor):
-    settings = {"seed": 1, "ensembles": 2, "walkers": 8, "max_steps": 1000, "progress": False}
+    settings = {"seed": 1, "ensembles": 2, "walkers": 8, "max_steps": 400, "progress": False}
     posterior = bp.sample(*posed(), checkpoint="run.h5", executor=executor, **settings)
     np.save(os.environ["DRAWS"], [posterior.draws(name) for name in posterior.names])
 

@@ -88,7 +88,7 @@ def test_errors_are_one_line_with_an_exit_status(tmp_path, capsys):
     assert capsys.readouterr().err.count("\n") == 2
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @real_data
 def test_the_measured_damper(tmp_path, capsys):
     results = run(tmp_path)

@@ -97,7 +97,7 @@ def test_an_orbit_of_period_one_doubles_where_its_multiplier_passes_minus_one(re
     assert least[0] > -1.0 > least[1]
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.skipif(REAL is None, reason="the measured file is missing, see studies/diode/rig.py")
 def test_measured_records_are_fitted_to_their_noise_and_most_are_predicted(tmp_path, capsys):
     assert main(["diode", "--quick", "--out", str(tmp_path)]) == 0

@@ -196,7 +196,7 @@ def test_the_force_given_its_noise_leaves_the_sign_open(quick):
     assert exact["laplace_sd"]["theta16"] < 0.4 * sd
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_with_the_force_given_standard_deviations_are_those_of_the_errors():
     """Errors of 20 campaigns in units of their standard deviations, at a false-alarm rate of 1 % for three parameters.
 

@@ -97,7 +97,7 @@ def test_error_found_by_doubling_is_that_against_time_integration(steady_period)
     assert grid.difference.size == 4096
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @real_data
 def test_the_measured_silverbox(tmp_path, capsys):
     results = run(tmp_path)
