@@ -1,5 +1,7 @@
 """Limits of the sizes that ``python -m tests.layout`` prints."""
 
+import re
+from pathlib import Path
 from statistics import median
 
 from tests import layout
@@ -44,3 +46,11 @@ def test_functions_fit_on_a_screen():
 def test_public_functions_have_few_parameters_or_a_reason():
     many = {name for name, count in layout.public_parameters().items() if count > MOST_PARAMETERS}
     assert many == REASONS.keys()
+
+
+def test_every_campaign_has_passed_and_its_result_is_kept():
+    kept = Path("figures/campaigns.txt").read_text(encoding="utf-8")
+    marked = r"@pytest\.mark\.campaign\n(?:@.*\n)*def (\w+)"
+    names = [f"{p}::{name}" for p in Path("tests").rglob("*.py") for name in re.findall(marked, p.read_text("utf-8"))]
+    assert names and all(name in kept for name in names)
+    assert re.search(r"^\d+ passed in ", kept, re.MULTILINE)

@@ -254,9 +254,7 @@ class Recording(Result):
         >>> run.name, round(float(run.outputs["x"].max()), 3)
         ('run', 0.025)
         """
-        layout = Layout(
-            Path(path).name, outputs, {} if inputs is None else inputs, time, sampling_rate, units or {}, missing
-        )
+        layout = Layout(Path(path).name, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
         name = name or Path(path).stem
         if split is None:
             return layout.recording(read_csv(path, layout.columns), name)
@@ -275,17 +273,10 @@ class Recording(Result):
 
     @classmethod
     def from_npz(
-        cls,
-        path: str | Path,
-        *,
-        outputs: Mapping[str, str],
-        inputs: Mapping[str, str] | None = None,
-        time: str | None = None,
-        sampling_rate: float | None = None,
-        units: Units | None = None,
-        missing: str | None = None,
-        name: str | None = None,
-    ) -> "Recording":
+        cls, path: str | Path, *, outputs: Mapping[str, str], inputs: Mapping[str, str] | None = None,
+        time: str | None = None, sampling_rate: float | None = None, units: Units | None = None,
+        missing: str | None = None, name: str | None = None,
+    ) -> "Recording":  # fmt: skip
         """Read a recording from the named arrays of an NPZ file.
 
         Parameters
@@ -302,24 +293,15 @@ class Recording(Result):
         FileNotFoundError, ValueError
             As for `from_csv`, and for a damaged file or an array of objects, which would have to be unpickled.
         """
-        layout = Layout(
-            Path(path).name, outputs, {} if inputs is None else inputs, time, sampling_rate, units or {}, missing
-        )
+        layout = Layout(Path(path).name, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
         return layout.recording(read_npz(path, layout.columns), name or Path(path).stem)
 
     @classmethod
     def from_mat(
-        cls,
-        path: str | Path,
-        *,
-        outputs: Mapping[str, str],
-        inputs: Mapping[str, str] | None = None,
-        time: str | None = None,
-        sampling_rate: float | None = None,
-        units: Units | None = None,
-        missing: str | None = None,
-        name: str | None = None,
-    ) -> "Recording":
+        cls, path: str | Path, *, outputs: Mapping[str, str], inputs: Mapping[str, str] | None = None,
+        time: str | None = None, sampling_rate: float | None = None, units: Units | None = None,
+        missing: str | None = None, name: str | None = None,
+    ) -> "Recording":  # fmt: skip
         """Read a recording from the variables of a MAT file, version 5 or 7.3.
 
         Parameters
@@ -337,9 +319,7 @@ class Recording(Result):
             As for `from_csv`, and for a damaged file, one of version 4, or a variable that is not a vector of real
             numbers.
         """
-        layout = Layout(
-            Path(path).name, outputs, {} if inputs is None else inputs, time, sampling_rate, units or {}, missing
-        )
+        layout = Layout(Path(path).name, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
         return layout.recording(read_mat(path, layout.columns), name or Path(path).stem)
 
     def between(self, start: float, stop: float) -> "Recording":

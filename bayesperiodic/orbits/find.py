@@ -192,22 +192,11 @@ def _orbit(
             values = cycle[section.coordinates[column]]
             values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
     return Orbit(
-        name="",
-        coordinates=section.coordinates,
-        angles=section.angles,
-        frequency=section.frequency,
-        period=period,
-        winding=round(estimate.turns) if section.winds else None,
-        points=points,
-        joint_covariance=covariance,
-        eigenvalues=estimate.eigenvalues,
-        eigenvalue_bias=bias[size:],
-        returns=candidate.returns,
-        quality=quality,
-        cycle=cycle,
-        equilibrium=cycle is not None and _at_rest(section, scaled, cycle),
-        synthetic=section.synthetic,
-    )
+        name="", coordinates=section.coordinates, angles=section.angles, frequency=section.frequency, period=period,
+        winding=round(estimate.turns) if section.winds else None, points=points, joint_covariance=covariance,
+        eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[size:], returns=candidate.returns, quality=quality,
+        cycle=cycle, equilibrium=cycle is not None and _at_rest(section, scaled, cycle), synthetic=section.synthetic,
+    )  # fmt: skip
 
 
 def _at_rest(section: PoincareSection, scaled: _ScaledSection, cycle: dict[str, np.ndarray]) -> bool:
