@@ -112,6 +112,36 @@ def test_shape_parameters_are_spread_over_99_percent_of_their_priors():
     assert np.ptp(log_prior - expected) < 1e-9
 
 
+def test_covariance_under_an_uncertain_spectrum_is_that_of_a_mixture_with_the_coefficient_integrated_out():
+    """One coefficient a of components with variances v·(1 + shape·k), by quadrature over a for every shape."""
+    k, generator, prior = np.arange(24.0), np.random.default_rng(2), bp.LogNormal(0.5, 1.0)
+    regressor, y = np.cos(k), np.cos(k) + 0.3 * np.sqrt(1.0 + 0.4 * k) * generator.standard_normal(24)
+    noise = SimpleNamespace(
+        shape_priors={"shape": prior}, spectrum=lambda _, values: (values[..., :1] * (1.0 + values[..., 1:] * k), None)
+    )
+    block = SimpleNamespace(size=24, weight=1.0)
+    problem = SimpleNamespace(noise=noise, likelihood=SimpleNamespace(blocks=[block], names=("v", "shape")))
+    now = 0.09 * (1.0 + 0.4 * k)
+    here = np.sum(regressor * y / now) / np.sum(regressor**2 / now)
+    fit = covariance._Linear(
+        np.ones(1), np.array([[np.sum(regressor**2 / now)]]), [regressor[None]], [y - here * regressor]
+    )
+    estimate = SimpleNamespace(noise=np.array([0.09, 0.4]))
+    found = covariance._mixture(problem, estimate, fit, (("v", "shape"), [0], 23.0))
+    points, log_prior = covariance._points(problem)
+    a, log_weights, squares = np.linspace(-4.0, 6.0, 20_001), [], []
+    for shape, log_weight in zip(points[:, 0], log_prior, strict=True):
+        own = 1.0 + shape * k
+        best = np.sum(regressor * y / own) / np.sum(regressor**2 / own)
+        v = np.sum((y - best * regressor) ** 2 / own) / 23.0
+        log_density = stats.norm.logpdf(y[:, None], regressor[:, None] * a, np.sqrt(v * own)[:, None]).sum(axis=0)
+        density = np.exp(log_density - log_density.max())
+        log_weights.append(log_weight + log_density.max() + np.log(density.sum()))
+        squares.append(np.sum(density * (a - here) ** 2) / density.sum())
+    weights = np.exp(log_weights - np.max(log_weights))
+    assert found[0, 0] == pytest.approx(np.sum(weights * squares) / weights.sum(), rel=1e-6)
+
+
 @pytest.mark.parametrize("value", [-0.7, 0.0, 0.4, 2.5])
 def test_score_of_an_estimate_under_a_normal_prior_is_that_of_the_sum_of_variances(value):
     prior = 2.0 * conflict.SCORES
