@@ -20,8 +20,8 @@ WITHOUT_RESULTS = {
         UNSTORED: (
             "48 functions of Numba",
             "takes some 85 s of processor time on two cores: 28 s", "32 s for the posterior of five parameters",
-            "8 s for the shooting", "18 s for the recording, the estimates", "some 190 models", "spread over 3,700 tests",
-            "takes 15 s of one core once per machine", "64 walkers at once |",
+            "8 s for the shooting", "18 s for the recording, the estimates", "some 190 models",
+            "spread over 3,700 tests", "takes 15 s of one core once per machine", "64 walkers at once |",
             "Duffing | 1 | 160 | 0.93 | 1.2", "Duffing, folded | 1 | 800 | 1.1 | 2.0", "damper | 1 | 1600 | 1.2 | 2.3",
             "gear, force | 2 | 800 | 1.8 | 1.8", "gear, force, folded | 2 | 800 | 1.9 | 2.4",
             "van der Pol | 1 | 200 | 1.0 | 1.1", "coupled van der Pol | 2 | 200 | 1.0 | 1.6",
