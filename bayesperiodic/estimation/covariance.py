@@ -336,14 +336,15 @@ def _mixture(
         gram, along = (s * own) @ s.T, s @ (own * r)
         variance = float(np.sum(own * r**2)) / freedom
         for _ in range(UPDATES):
-            factors = lu_factor(gram / variance + others)
-            step = lu_solve(factors, along / variance + pull)
+            factors = lu_factor(gram / variance + others, check_finite=False)
+            step = lu_solve(factors, along / variance + pull, check_finite=False)
             left = r - step @ s
             variance = max(float(np.sum(own * left**2)) / freedom, TINY)
         misfit = np.sum(own * left**2) / variance + step @ others @ step - 2.0 * step @ pull
         logarithms = float(np.sum(weight * np.log(variance * shape)) + np.sum(np.log(np.abs(np.diag(factors[0])))))
         log_posterior[i] = log_prior[i] - 0.5 * (misfit + logarithms)
-        found[i] = lu_solve(factors, np.eye(len(s), names))[:names] + np.outer(step[:names], step[:names])
+        inverse = lu_solve(factors, np.eye(len(s), names), check_finite=False)
+        found[i] = inverse[:names] + np.outer(step[:names], step[:names])
     return np.tensordot(_probabilities(log_posterior), found, 1)
 
 
