@@ -8,10 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 import bayesperiodic as bp
-from studies.pendulum.recording import KNOWN, TRUTH
+from studies.pendulum.recording import COORDINATES, FREQUENCY, KNOWN, TRUTH
 
 # Of the start, in table 1 of the paper.
 START_ERRORS = {"m": 0.51, "l": 0.189, "k3": 1.0}
@@ -58,6 +59,12 @@ def identify(orbits: bp.Orbits, *, which: Sequence[str] = tuple(FREE)) -> Identi
     problems = {name: problem_of([o.experiment(samples=SAMPLES) for o in selected], FREE[name]) for name in which}
     fits = {name: _fit(problem) for name, problem in problems.items()}
     return Identified(polished, selected, problems, fits, tuple(lost))
+
+
+def compile_kernels() -> None:
+    """Compile or load what the estimates need, by one evaluation at a state of rest."""
+    rest = bp.Experiment("rest", FREQUENCY, dict.fromkeys(COORDINATES, np.zeros(SAMPLES)), samples=SAMPLES)
+    problem_of([rest], FREE["k3"]).log_posterior({"k3": TRUTH["k3"]}, dict.fromkeys(COORDINATES, 1.0))
 
 
 def with_eigenvalues(selected: bp.Orbits, free: Sequence[str]) -> bp.MapEstimate:

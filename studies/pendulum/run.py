@@ -58,15 +58,17 @@ def run(options: argparse.Namespace) -> None:
         _replicates(options)
         return
     watch = common.Stopwatch()
-    with watch.part("recording", "the recording"):
-        recording, about = pendulum_recording.get(options.data, options.quick, options.seed)
-    kind = "SYNTHETIC" if about["synthetic"] else "measured"
-    print(f"  {kind} recording: {about['drive_periods']} drive periods, {about['values']} numbers")
-    noise = options.noise if about["synthetic"] else 0.0
     periods = QUICK_PERIODS if options.quick else PERIODS
-    results: dict[str, Any] = {"recording": about, "noise": noise, "seed": options.seed, "quick": options.quick}
     with common.workers(1) as pool:
-        # Meanwhile, in another process: the orbits of the other noise levels, and those without noise by shooting.
+        # Another process compiles the solver while this one simulates; then it finds the orbits of the other noise
+        # levels, and those without noise by shooting.
+        compiled = pool.submit(pendulum_estimates.compile_kernels)
+        with watch.part("recording", "the recording"):
+            recording, about = pendulum_recording.get(options.data, options.quick, options.seed)
+        kind = "SYNTHETIC" if about["synthetic"] else "measured"
+        print(f"  {kind} recording: {about['drive_periods']} drive periods, {about['values']} numbers")
+        noise = options.noise if about["synthetic"] else 0.0
+        results: dict[str, Any] = {"recording": about, "noise": noise, "seed": options.seed, "quick": options.quick}
         clean = pool.submit(_clean, recording, options.seed, periods) if about["synthetic"] else None
         levels = sorted({noise} if options.quick or not clean else {noise, *NOISE_LEVELS})
         others = {level: pool.submit(_found, recording, level, options.seed, periods) for level in levels
@@ -75,6 +77,7 @@ def run(options: argparse.Namespace) -> None:
             found = clean.result()[0] if clean and noise == 0.0 else _found(recording, noise, options.seed, periods)
             print(f"  {len(found.chained)} candidates", flush=True)
         with watch.part("estimates", "m and l, k3, and all five, from the paper's start"):
+            compiled.result()
             identified = pendulum_estimates.identify(found.chained)
             eigenvalue_fits = {
                 which: pendulum_estimates.with_eigenvalues(identified.selected, names) for which, names in FREE.items()
