@@ -32,7 +32,8 @@ FURTHEST = 2.8
 # because priors may vanish at the end, or is the outermost thousandth of the prior if that is closer.
 NEARER, NEAREST, TAIL = 0.1, 1e-6, 1e-3
 MOST_POINTS, MOST_FAILURES, MOST_ROUNDS = 60, 5, 5
-GAIN, CUT = 1e-6, 1e-12
+# Gain of an improved point; curvature that is none; distance from a known iterate within which a climb leads to it.
+GAIN, CUT, MET = 1e-6, 1e-12, 0.1
 
 
 class Point(NamedTuple):
@@ -137,18 +138,28 @@ class Ridge:
         for point in points[1:]:
             inwards = side != 0.0 and side * (point.value - self.at) >= 0.0
             before = next((p.iterate for p in kept[::-1] if p.iterate is not None), None)
-            other = self._climbed(before, point.value) if before is not None and (inwards or improved) else None
+            try_it = before is not None and (inwards or improved)
+            other = self._climbed(before, point.value, point.iterate) if try_it else None
             improved = other is not None and (point.iterate is None or other.objective > point.iterate.objective + GAIN)
             kept.append(Point(point.value, other) if improved else point)
         return kept
 
-    def _climbed(self, start: Iterate, value: float) -> Iterate | None:
-        """Return the best iterate with the parameter at a value, climbed from a neighbour."""
+    def _climbed(self, start: Iterate, value: float, known: Iterate | None = None) -> Iterate | None:
+        """Return the best iterate with the parameter at a value, climbed from a neighbour; a known one if it is met."""
         plain = np.where(self._held, value, start.theta)
         tangent = start.theta + (value - start.theta[self.column]) * self._tangent(start)[0]
         found = [self.objective.at(theta, start.here, start.noise) for theta in (tangent, plain)]
         first = max(filter(None, found), key=lambda iterate: iterate.objective, default=None)
-        return None if first is None else climb(self.objective, self.objective.anchored(first), self._held).iterate
+        if first is None or (known is not None and self._meets(first, known)):
+            return known
+        return climb(self.objective, self.objective.anchored(first), self._held).iterate
+
+    def _meets(self, found: Iterate, known: Iterate) -> bool:
+        """Return whether parameters and residuals are those of a known iterate, which is not worse."""
+        likelihood, prior = self.objective.density.problem.likelihood, self.objective.density.problem.joint_prior
+        one, other = (np.concatenate(likelihood.whitened(i.here.residuals, known.noise)) for i in (found, known))
+        off = np.concatenate([one - other, (found.theta - known.theta) / prior.widths])
+        return bool(found.objective <= known.objective and off @ off < MET**2)
 
     @property
     def _held(self) -> np.ndarray:
