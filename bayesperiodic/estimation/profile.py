@@ -138,8 +138,9 @@ class Ridge:
         for point in points[1:]:
             inwards = side != 0.0 and side * (point.value - self.at) >= 0.0
             before = next((p.iterate for p in kept[::-1] if p.iterate is not None), None)
-            try_it = before is not None and (inwards or improved)
-            other = self._climbed(before, point.value, point.iterate) if try_it else None
+            other = None
+            if before is not None and (inwards or improved):
+                other = self._climbed(before, point.value, point.iterate)
             improved = other is not None and (point.iterate is None or other.objective > point.iterate.objective + GAIN)
             kept.append(Point(point.value, other) if improved else point)
         return kept

@@ -48,13 +48,18 @@ def cache_folder() -> Path:
 
 
 def load(
-    body: str, constants: Mapping[str, Any] | None = None, shared: types.ModuleType | None = None
+    body: str,
+    constants: Mapping[str, Any] | None = None,
+    shared: types.ModuleType | None = None,
+    run: Callable[..., None] | None = None,
 ) -> types.ModuleType:
     """Return a source text as a module of compiled functions, from the cache or freshly compiled (and then cached).
 
     Its functions have Numba signatures and the option ``cache=CACHE``. The constants, values with a unique `repr`, and
     the names of the `shared` module, which this function returned, are defined in the module before its text is
-    executed. An entry is compiled again when the text, the constants or the shared module change.
+    executed. An entry is compiled again when the text, the constants or the shared module change. A function
+    ``run(source, names, path, module, cache=…)`` may define the functions of other texts in the module and keep their
+    machine code beside the path, in files `*.nbc` in `__pycache__`.
     """
     configuration: Any = numba.config
     if configuration.DISABLE_JIT:
@@ -64,7 +69,7 @@ def load(
     names = {**(vars(shared) if shared else {}), **constants}
     try:
         entry = _private_folder() / hashlib.sha256(source.encode()).hexdigest()[:32]
-        return _stored(source, names, entry) or _build(source, names, entry)
+        return _stored(source, names, entry, run or _run) or _build(source, names, entry, run or _run)
     except (CacheProblem, OSError) as problem:
         reason = str(problem)
     warnings.warn(
@@ -73,16 +78,16 @@ def load(
         RuntimeWarning,
         stacklevel=2,
     )
-    return _execute(source, names, Path("<kernels compiled in memory>"), cache=False)
+    return _execute(source, names, Path("<kernels compiled in memory>"), run or _run, cache=False)
 
 
-def _stored(source: str, names: Mapping[str, Any], entry: Path) -> types.ModuleType | None:
+def _stored(source: str, names: Mapping[str, Any], entry: Path, run: Callable[..., None]) -> types.ModuleType | None:
     """Return the module of an entry; None if there is none, or if it was damaged and has been removed."""
     if not os.path.lexists(entry):
         return None
     try:
         _check(entry, source)
-        return _execute(source, names, entry / SOURCE, cache=True)
+        return _execute(source, names, entry / SOURCE, run, cache=True)
     except CacheProblem as problem:
         reason = str(problem)
     except Exception as problem:  # any error that a damaged compiled file causes in the loader
@@ -120,7 +125,7 @@ def _announce() -> None:
     print("compiling kernels (once per machine) …", file=sys.stderr, flush=True)
 
 
-def _build(source: str, names: Mapping[str, Any], entry: Path) -> types.ModuleType:
+def _build(source: str, names: Mapping[str, Any], entry: Path, run: Callable[..., None]) -> types.ModuleType:
     for other in entry.parent.glob(f"{BUILDING}*"):
         with suppress(OSError):
             if other.stat().st_mtime < time.time() - ABANDONED:
@@ -129,7 +134,7 @@ def _build(source: str, names: Mapping[str, Any], entry: Path) -> types.ModuleTy
     workshop = Path(tempfile.mkdtemp(prefix=BUILDING, dir=entry.parent))
     try:
         (workshop / SOURCE).write_text(source, encoding="utf-8")
-        module = _execute(source, names, workshop / SOURCE, cache=True)
+        module = _execute(source, names, workshop / SOURCE, run, cache=True)
         (workshop / MANIFEST).write_text(json.dumps(_digests(workshop)), encoding="utf-8")
         try:
             workshop.rename(entry)
@@ -156,10 +161,17 @@ def _digests(entry: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def _execute(source: str, names: Mapping[str, Any], path: Path, cache: bool) -> types.ModuleType:
+def _run(source: str, names: Mapping[str, Any], path: Path, module: types.ModuleType, *, cache: bool) -> None:
+    module.__dict__.update(names, CACHE=cache)
+    exec(compile(source, str(path), "exec"), module.__dict__)
+
+
+def _execute(
+    source: str, names: Mapping[str, Any], path: Path, run: Callable[..., None], cache: bool
+) -> types.ModuleType:
     module = types.ModuleType(f"bayesperiodic_kernels_{hashlib.sha256(source.encode()).hexdigest()[:32]}")
     own = {name: value for name, value in names.items() if not name.startswith("__")}
-    module.__dict__.update(own, __file__=str(path), CACHE=cache)
+    module.__file__ = str(path)
     sys.modules[module.__name__] = module
     settings: Any = numba.config
     with global_compiler_lock:
@@ -167,7 +179,7 @@ def _execute(source: str, names: Mapping[str, Any], path: Path, cache: bool) -> 
         settings.CACHE_DIR = ""  # beside the source, where its digests are kept
         gc.set_threshold(0)  # looking for garbage takes a fifth of the compiler's time
         try:
-            exec(compile(source, str(path), "exec"), module.__dict__)
+            run(source, own, path, module, cache=cache)
         finally:
             settings.CACHE_DIR = elsewhere
             gc.set_threshold(*thresholds)

@@ -8,12 +8,12 @@ Every generated function has the signature ``(states, inputs, parameters, tau, f
 - out (points, size): the result, one row per grid point.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cache, partial
+from types import ModuleType
 from typing import Any
 
-import llvmlite.binding
 import numpy as np
 import sympy as sp
 from numba import types
@@ -23,30 +23,35 @@ from numba.extending import intrinsic
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympy.printing.pycode import PythonCodePrinter
 
+from bayesperiodic.models import machine_code
 from bayesperiodic.models.cache import load
 
 GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
 FUNCTIONS = ("residual", "residual_jacobian", "outputs", "derivatives", "transitions")
-MANY_ZEROS = 30
-IMPORTS = "from bayesperiodic.models.code_generation import as_vector, without_gathers"
-NO_GATHER, FIRST_LLVM = "+prefer-no-gather", 17  # and the first version of LLVM that has this feature
 _arguments, _result = sigutils.normalize_signature(GRID_SIGNATURE)
-GRID_FUNCTION = types.FunctionType(_result(*_arguments))
+GRID = _result(*_arguments)
+GRID_FUNCTION = types.FunctionType(GRID)
+CALL = f"""
+from numba import njit
+from bayesperiodic.models.code_generation import grid_function_at
+
+@njit("{GRID_SIGNATURE.replace("(", "(int64, ", 1)}", cache=CACHE, nogil=True)
+def call(address, states, inputs, parameters, tau, frequency, out):
+    grid_function_at(address)(states, inputs, parameters, tau, frequency, out)
+"""
 
 
 class GridFunction(types.WrapperAddressProtocol):
-    """A compiled grid function that can be passed to other compiled functions.
+    """The machine code of a grid function, which Python and compiled functions can call.
 
-    Numba looks up the address of a compiled function at every call that takes one as an argument, which takes longer
-    than a periodic solve. Here the address is looked up once, and so is the type (`_numba_type_`). In short calls even
-    the conversion of this argument counts; these take the `address`, see `grid_function_at`.
+    The type and the address are at hand: Numba would look them up at every call that takes a compiled function as an
+    argument, which takes longer than a periodic solve. In short calls even the conversion of this argument counts;
+    these take the `address`, see `grid_function_at`.
     """
 
-    def __init__(self, compiled: Any):
+    def __init__(self, address: int):
         self._numba_type_ = GRID_FUNCTION
-        self._compiled = compiled
-        code = compiled.get_compile_result(GRID_FUNCTION.signature)
-        self.address = code.library.get_pointer_to_function(code.fndesc.llvm_cfunc_wrapper_name)
+        self.address = address
 
     def __wrapper_address__(self) -> int:
         return self.address
@@ -57,7 +62,7 @@ class GridFunction(types.WrapperAddressProtocol):
 
     def __call__(self, *arguments: Any) -> None:
         """Run the compiled function."""
-        self._compiled(*arguments)
+        _call()(self.address, *arguments)
 
 
 @intrinsic
@@ -70,25 +75,6 @@ def grid_function_at(typing_context: Any, address: Any) -> Any:
         return function._getvalue()
 
     return GRID_FUNCTION(types.int64), structure
-
-
-@intrinsic
-def without_gathers(typing_context: Any) -> Any:
-    """Compile the calling function without gather instructions: strided columns are loaded one number at a time.
-
-    Gathers are slow on most Intel processors since the mitigation of gather data sampling (Intel, advisory 00828,
-    2023): without them the sweeps of a landing gear over its grid take a third of the time.
-    """
-
-    def attribute(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        features = context.codegen().magic_tuple()[2]
-        if "+avx2" in features.split(",") and llvmlite.binding.llvm_version_info[0] >= FIRST_LLVM:
-            given = builder.function.attributes
-            set.add(given, f'"target-features"="{features},{NO_GATHER}"')  # `given.add` accepts only a few names.
-            given.add("noinline")  # A caller that inlines the loop has its own attributes.
-        return context.get_dummy_value()
-
-    return types.void(), attribute
 
 
 @intrinsic
@@ -210,7 +196,7 @@ class SymbolicModel:
             "transitions": [*self.transitions],
         }
         arguments = self._arguments(q, u, theta)
-        return _module([_function(name, needed, arguments) for name, needed in expressions.items() if needed])
+        return "\n".join(_function(name, needed, arguments) for name, needed in expressions.items() if needed)
 
     def jacobian_change_source(self) -> str:
         """Return the module of the directional derivative of ∂g/∂(q, q̇, q̈), row by row (states × 3·states), as text.
@@ -226,7 +212,7 @@ class SymbolicModel:
             sum((sp.diff(e, x) * dx for x, dx in change.items() if x in e.free_symbols), sp.S.Zero)
             for e in _jacobian(self.equations, self.states)
         ]
-        return _module([_function("jacobian_change", changes, arguments)])
+        return _function("jacobian_change", changes, arguments)
 
     def vjp_source(self, moving: tuple[int, ...]) -> str:
         """Return the module of `VjpKernels`, with respect to the parameters of these indices, as text."""
@@ -242,24 +228,36 @@ class SymbolicModel:
             return _function(name, products, arguments, len(by))
 
         outputs = function("outputs_vjp", "w", self.outputs, (*self.states, *by))
-        return _module([outputs, function("equations_vjp", "l", tuple(-e for e in self.equations), by)])
+        return outputs + "\n" + function("equations_vjp", "l", tuple(-e for e in self.equations), by)
 
     def _arguments(
         self, states: tuple[sp.Symbol, ...], inputs: tuple[sp.Symbol, ...], parameters: tuple[sp.Symbol, ...]
     ) -> dict[sp.Symbol, str]:
-        """Return the Python expression of every symbol in a grid function."""
+        """Return the Python expression of every symbol at a grid point."""
         return (
-            {symbol: f"flat_states[{len(states)}*i + {column}]" for column, symbol in enumerate(states)}
-            | {symbol: f"flat_inputs[{len(inputs)}*i + {column}]" for column, symbol in enumerate(inputs)}
+            {symbol: f"states[{column}]" for column, symbol in enumerate(states)}
+            | {symbol: f"inputs[{column}]" for column, symbol in enumerate(inputs)}
             | {symbol: f"parameters[{index}]" for index, symbol in enumerate(parameters)}
-            | {self.tau: "tau[i]", self.frequency: "frequency"}
+            | {self.tau: "tau", self.frequency: "frequency"}
         )
 
 
 def grid_functions(source: str, names: Sequence[str]) -> list[GridFunction]:
-    """Return functions of a generated module, compiled or from the cache."""
-    module = load(source)
+    """Return functions of a generated text, compiled or from the cache."""
+    module = compiled(source)
     return [GridFunction(getattr(module, name)) for name in names]
+
+
+def compiled(source: str) -> ModuleType:
+    """Return the addresses of the functions of a generated text, by their names, compiled or from the cache."""
+    run = partial(machine_code.compile_functions, signature=GRID)
+    return load(f"# {machine_code.digest()}\n{source}", run=run)
+
+
+@cache
+def _call() -> Callable[..., None]:
+    """Return the compiled function that calls the grid function at an address."""
+    return load(CALL).call
 
 
 def _jacobian(rows: Sequence[sp.Expr], columns: Sequence[sp.Symbol]) -> list[sp.Expr]:
@@ -267,87 +265,53 @@ def _jacobian(rows: Sequence[sp.Expr], columns: Sequence[sp.Symbol]) -> list[sp.
     return [sp.diff(row, x) if x in row.free_symbols else sp.S.Zero for row in rows for x in columns]
 
 
-def _module(functions: list[str]) -> str:
-    """Return the source of grid functions, preceded by the elementary functions that they call."""
-    body = "\n\n".join(functions)
-    text = Path(__file__).with_name("_kernels").joinpath("elementary.py").read_text(encoding="utf-8")
-    header, *blocks = text.strip().split("\n\n\n")
-    for block in reversed(blocks):
-        name = block.partition("def ")[2].partition("(")[0]
-        if f"{name}(" in body:
-            body = f"{block}\n\n\n{body}"
-    return f"{header}\n{IMPORTS}\n\n\n{body}"
-
-
 def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str], summed: int = 0) -> str:
-    """Return the source of a grid function.
-
-    Strides are literals, so that the loop can be vectorised. The last `summed` expressions are summed over the grid, in
-    any order, and stored after the rows.
-    """
+    """Return the source of a function of one grid point, see `machine_code`; the last expressions are `summed`."""
     common, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("common"), order="canonical")
     used = set().union(*(e.free_symbols for e in reduced), *(e.free_symbols for _, e in common))
-    places = {symbol: place for symbol, place in arguments.items() if symbol in used and symbol.name != place}
-    varying = {symbol: place for symbol, place in places.items() if place.startswith(("flat_", "tau["))}
-    columns = len(reduced) - summed
-    before, own, after = _sums(reduced[columns:], columns)
-    lines = [
-        "    without_gathers()",
-        *(f"    flat_{a} = as_vector({a})" for a in ("states", "inputs", "out")),
-        *(f"    {symbol} = {place}" for symbol, place in places.items() if symbol not in varying),
-        *before,
-        "    for i in range(states.shape[0]):",
-        *(f"        {symbol} = {place}" for symbol, place in varying.items()),
-        *(f"        {symbol} = {_code(expression)}" for symbol, expression in common),
-        *([*_row(reduced[:columns]), *own] or ["        pass"]),
-        *after,
-    ]
-    fast = ', fastmath={"reassoc"}' if summed else ""
-    header = f'@njit("{GRID_SIGNATURE}", cache=CACHE, nogil=True, error_model="numpy"{fast})\n'
-    return header + f"def {name}(states, inputs, parameters, tau, frequency, out):\n" + "\n".join(lines) + "\n"
-
-
-def _row(expressions: list[sp.Expr]) -> list[str]:
-    """Return the lines that fill a row; many zeros are set in a loop."""
-    size, zeros = len(expressions), sum(expression == 0 for expression in expressions)
-    cleared = zeros > MANY_ZEROS
-    clearing = [f"        for column in range({size}):", f"            flat_out[{size}*i + column] = 0.0"]
-    return (clearing if cleared else []) + [
-        f"        flat_out[{size}*i + {column}] = {_code(expression)}"
-        for column, expression in enumerate(expressions)
-        if not cleared or expression != 0
-    ]
-
-
-def _sums(expressions: list[sp.Expr], columns: int) -> tuple[list[str], list[str], list[str]]:
-    """Return the lines before, in and after the loop that sum expressions and store them after rows of `columns`."""
-    start = f"{columns}*states.shape[0]" if columns else "0"
-    there = [column for column, expression in enumerate(expressions) if expression != 0]
-    return (
-        [f"    sum_{column} = 0.0" for column in there],
-        [f"        sum_{column} += {_code(expressions[column])}" for column in there],
-        [f"    flat_out[{start} + {c}] = {f'sum_{c}' if c in there else 0.0}" for c in range(len(expressions))],
+    columns = [sum(a.startswith(f"{kind}[") for a in arguments.values()) for kind in ("states", "inputs")]
+    rows, sums = reduced[: len(reduced) - summed], reduced[len(reduced) - summed :]
+    head = (
+        f"def {name}(states, inputs, parameters, tau, frequency, out, sums, columns={(*columns, len(rows), summed)}):"
     )
+    lines = [
+        *(f"    {symbol} = {place}" for symbol, place in arguments.items() if symbol in used),
+        *(f"    {symbol} = {_code(expression)}" for symbol, expression in common),
+        *(f"    out[{column}] = {_code(expression)}" for column, expression in enumerate(rows)),
+        *(f"    sums[{number}] = {_code(term)}" for number, term in enumerate(sums) if term != 0),
+    ]
+    return "\n".join([head, *(lines or ["    pass"])]) + "\n"
 
 
 class _Printer(PythonCodePrinter):
-    """SymPy's Python printer, with the elementary functions of `_kernels` and generalised functions."""
+    """SymPy's Python printer, with the functions of `machine_code` for conditions and generalised functions."""
 
     def _print_sign(self, expression: sp.Expr) -> str:
-        argument = self._print(expression.args[0])
-        return f"(({argument} > 0.0) - ({argument} < 0.0))"
+        return f"sign({self._print(expression.args[0])})"
 
     def _print_Heaviside(self, expression: sp.Expr) -> str:
-        argument = self._print(expression.args[0])
-        return f"(0.5*(({argument} > 0.0) + ({argument} >= 0.0)))"
-
-    def _print_elementary(self, expression: sp.Expr) -> str:
-        return f"{expression.func.__name__}({self._print(expression.args[0])})"
-
-    _print_exp = _print_tanh = _print_atan = _print_elementary
+        return f"step({self._print(expression.args[0])})"
 
     def _print_DiracDelta(self, expression: sp.Expr) -> str:
         return "0.0"
+
+    def _print_Piecewise(self, expression: sp.Expr) -> str:
+        text = "math.nan"
+        for value, condition in reversed(expression.args):
+            text = f"where({self._print(condition)}, {self._print(value)}, {text})"
+        return text
+
+    def _print_ITE(self, expression: sp.Expr) -> str:
+        return f"where({', '.join(map(self._print, expression.args))})"
+
+    def _print_And(self, expression: sp.Expr) -> str:
+        return "(" + " & ".join(f"({self._print(part)})" for part in expression.args) + ")"
+
+    def _print_Or(self, expression: sp.Expr) -> str:
+        return "(" + " | ".join(f"({self._print(part)})" for part in expression.args) + ")"
+
+    def _print_Not(self, expression: sp.Expr) -> str:
+        return f"(~({self._print(expression.args[0])}))"
 
 
 def _code(expression: sp.Expr) -> str:

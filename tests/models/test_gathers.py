@@ -2,48 +2,29 @@ import numpy as np
 import pytest
 from numba import njit
 
-from bayesperiodic.models.code_generation import as_vector, without_gathers
+from bayesperiodic.models import machine_code
+from bayesperiodic.models.code_generation import as_vector, compiled
 from bayesperiodic.models.library import duffing, pendulum
+from tests.known import formula_model
 
 
-def quotient(rows, out):
-    flat, result = rows.reshape(rows.size), out.reshape(out.size)
-    for i in range(out.shape[0]):
-        result[i] = flat[7 * i] / (1.0 + flat[7 * i + 2])
+def assembly(model, folder, monkeypatch):
+    """Return the machine code of a model's functions as text."""
+    monkeypatch.setenv("BAYESPERIODIC_CACHE", str(folder))
+    return compiled(model.symbolic.kernel_source()).library.get_asm_str()
 
 
-def quotient_without(rows, out):
-    without_gathers()
-    flat, result = rows.reshape(rows.size), out.reshape(out.size)
-    for i in range(out.shape[0]):
-        result[i] = flat[7 * i] / (1.0 + flat[7 * i + 2])
-
-
-def test_strided_columns_are_loaded_without_gathers_by_vectorised_code():
-    rows = np.random.default_rng(1).uniform(size=(101, 7))
-    found = []
-    for function in (quotient, quotient_without):
-        compiled = njit("void(float64[:,::1], float64[:,::1])", error_model="numpy")(function)
-        out = np.empty((101, 1))
-        compiled(rows, out)
-        assert np.array_equal(out[:, 0], rows[:, 0] / (1.0 + rows[:, 2]))
-        (text,) = compiled.inspect_asm().values()
-        found.append((text.count("vgather"), text.count("vdivpd")))
-    if not found[0][0]:
+def test_strided_columns_are_loaded_without_gathers_by_vectorised_code(tmp_path, monkeypatch):
+    model = formula_model("quotient", ["a"], lambda p, u, s: {"y": p.a * u.x / (1.0 + u.dx)})
+    without = assembly(model, tmp_path / "without", monkeypatch)
+    monkeypatch.setattr(machine_code, "NO_GATHER", "-prefer-no-gather")
+    found = assembly(model, tmp_path / "with", monkeypatch)
+    if not found.count("vgather"):
         pytest.skip("this processor has no gathers, or LLVM takes none")
-    assert found[1][0] == 0 and found[1][1] > 0
-
-
-def test_generated_functions_take_no_gathers():
-    sources = [
-        duffing.symbolic.kernel_source(),
-        duffing.symbolic.vjp_source((1,)),
-        duffing.symbolic.jacobian_change_source(),
-    ]
-    for source in sources:
-        assert (
-            source.count("without_gathers()") == source.count("(states, inputs, parameters, tau, frequency, out)") > 0
-        )
+    assert without.count("vgather") == 0 and without.count("vdivpd") > 0
+    kernels, inputs = model.kernels, np.random.default_rng(1).uniform(size=(101, 3))
+    out = kernels.evaluate("outputs", np.zeros((101, 3)), inputs, np.array([2.0]), np.zeros(101), 1.0)
+    assert np.array_equal(out[:, 0], 2.0 * inputs[:, 0] / (1.0 + inputs[:, 1]))
 
 
 def test_a_vector_has_the_entries_of_its_array_and_keeps_their_memory():
