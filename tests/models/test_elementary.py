@@ -95,10 +95,10 @@ EXPRESSIONS = [
 
 
 def test_compiled_expressions_have_the_values_of_exact_arithmetic():
-    states, out = np.random.default_rng(3).uniform(-2.5, 2.5, (40, 2)), np.empty((40, len(EXPRESSIONS)))
+    states, out = np.random.default_rng(3).uniform(-2.5, 2.5, (15, 2)), np.empty((15, len(EXPRESSIONS)))
     source = _function("values", EXPRESSIONS, {X: "states[0]", Y: "states[1]"})
     (values,) = grid_functions(source, ["values"])
-    values(states, np.empty((40, 0)), np.empty(0), np.zeros(40), 1.0, out)
+    values(states, np.empty((15, 0)), np.empty(0), np.zeros(15), 1.0, out)
     for column, expression in zip(out.T, EXPRESSIONS, strict=True):
         exact = [complex(expression.subs({X: x, Y: y}, simultaneous=True).evalf(30)) for x, y in states]
         real = np.array([value.real if value.imag == 0.0 else np.nan for value in exact])

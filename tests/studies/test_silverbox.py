@@ -33,15 +33,17 @@ def quick(steady_period, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
         patch.setattr(common, "find_data", lambda *_: None)
         patch.setattr(silverbox, "steady_period", lambda: steady_period)
+        # The third, "circulant", takes a minute; the campaign on the measured file has it.
+        patch.setattr(silverbox, "NOISES", silverbox.NOISES[:2])
         results = run(folder, "--quick")
     return folder, results, printed.getvalue()
 
 
-def has_the_promised_keys(results):
+def has_the_promised_keys(results, noises=silverbox.NOISES):
     for by_noise in (results["sd"], results["robust_sd"], results["estimates"]):
-        assert set(by_noise) == set(silverbox.NOISES)
+        assert set(by_noise) == set(noises)
         assert all(set(values) == set(NAMES) for values in by_noise.values())
-    assert set(results["map"]) == set(NAMES) and set(results["whiteness"]) == set(silverbox.NOISES)
+    assert set(results["map"]) == set(NAMES) and set(results["whiteness"]) == set(noises)
     assert set(results["noise_split"]) == {"measurement", "model"}
     assert set(results) > {"data", "seed", "frequency", "cycles", "seconds", "versions", "units"}
     return True
@@ -52,8 +54,8 @@ def test_synthetic_data_are_labelled_and_the_truth_is_recovered(quick):
     folder, results, printed = quick
     assert "SYNTHETIC" in printed and silverbox.SHA256 in printed and "nonlinearbenchmark.org" in printed
     assert results["data"] == {"path": "generated", "sha256": None, "synthetic": True}
-    assert has_the_promised_keys(results)
-    for noise in silverbox.NOISES:
+    assert has_the_promised_keys(results, silverbox.NOISES[:2])
+    for noise in silverbox.NOISES[:2]:
         for name, true in silverbox.TRUE.items():
             assert abs(results["estimates"][noise][name] - true) < 5 * results["sd"][noise][name], (noise, name)
     assert sorted(path.name for path in folder.glob("*.png")) == ["estimates.png", "spectrum.png"]
