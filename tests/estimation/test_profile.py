@@ -7,6 +7,7 @@ from scipy.optimize import lsq_linear
 from scipy.special import ndtri
 
 import bayesperiodic as bp
+from bayesperiodic.estimation import profile as profiles
 from bayesperiodic.estimation.profile import Ridge
 from bayesperiodic.posterior.description import fingerprint
 from tests.known import LINEAR, formula_model, grid, linear_experiment, linear_regressors
@@ -175,6 +176,25 @@ def test_profile_is_extended_where_another_branch_raises_its_end():
     every = np.array([problem.log_posterior({"a": a, "b": b}, {}).max() for a in profile.values["a"]])
     assert profile.log_density["a"] == pytest.approx(every - problem.log_posterior(profile.best, {}), abs=1e-5)
     assert profile.shape == {"a": "closed"}
+
+
+def test_the_way_back_climbs_only_where_it_does_not_meet_the_known_point(linear, monkeypatch):
+    problem, fit, found = linear
+    climbs, climb = [], profiles.climb
+    monkeypatch.setattr(profiles, "climb", lambda *arguments: (climbs.append(arguments), climb(*arguments))[1])
+    assert np.array_equal(bp.profile(problem, fit).log_density["k"], found.log_density["k"])
+    assert len(climbs) == sum(values.size - 1 for values in found.values.values())
+
+
+def test_a_known_point_is_met_by_the_same_parameters_and_residuals_that_are_not_better(linear):
+    objective, peak = profiles._at_estimate(*linear[:2])
+    ridge, sd = Ridge(objective, 0, peak), np.array(list(linear[1].sd.values()))
+    near, far = (objective.at(peak.theta + np.array([0, s, 0]) * sd, peak.here, peak.noise) for s in (0.01, 2.0))
+    assert ridge._meets(near, peak) and not ridge._meets(peak, near)
+    assert not ridge._meets(far, peak)
+    assert not ridge._meets(replace(near, here=far.here), peak)
+    prior = objective.density.problem.joint_prior.widths
+    assert not ridge._meets(replace(near, theta=peak.theta + np.array([0, 0.2, 0]) * prior), peak)
 
 
 def test_point_better_than_the_estimate_is_reported_and_can_be_the_start():
