@@ -105,6 +105,14 @@ def test_compiled_expressions_have_the_values_of_exact_arithmetic():
         assert column == pytest.approx(real, rel=1e-13, abs=1e-14, nan_ok=True), expression
 
 
+def test_values_at_jumps_and_of_nan_are_those_of_the_definitions():
+    expressions = [sp.sign(X), sp.Heaviside(X), sp.Mod(X + 1.5, -0.75), sp.Piecewise((1, sp.Ne(X, Y)), (2, True))]
+    out = np.empty((2, 4))
+    (values,) = grid_functions(_function("values", expressions, {X: "states[0]", Y: "states[1]"}), ["values"])
+    values(np.array([[0.0, 0.0], [0.0, math.nan]]), np.empty((2, 0)), np.empty(0), np.zeros(2), 1.0, out)
+    assert out.tolist() == [[0.0, 0.5, 0.0, 2.0], [0.0, 0.5, 0.0, 1.0]]
+
+
 def test_functions_without_a_compiled_counterpart_are_refused():
     source = _function("values", [sp.factorial(X)], {X: "states[0]"})
     with pytest.raises(ValueError, match="must be elementary functions, got factorial, which cannot be compiled"):
