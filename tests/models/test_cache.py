@@ -8,10 +8,13 @@ import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
+import sympy as sp
 
 from bayesperiodic.models import cache
 from bayesperiodic.models.code_generation import FUNCTIONS
+from tests.known import formula_model
 
 PROGRAM = """
 from bayesperiodic.models import machine_code
@@ -147,6 +150,21 @@ def test_damaged_entry_is_never_executed_but_built_again(folder, damage):
         warnings.simplefilter("error")
         assert cache.load(SMALL).four_times(1.5) == 6.0
     assert len(list(folder.iterdir())) == 1
+
+
+def test_machine_code_of_a_model_is_built_again_when_damaged_and_in_memory_without_a_cache(folder, monkeypatch):
+    def values():
+        made = formula_model("any", ["a"], lambda p, u, s: {"y": p.a * sp.exp(u.x)})
+        return made.kernels.evaluate("outputs", *np.ones((2, 5, 3)), np.full(1, 2.0), np.zeros(5), 1.0)[:, 0]
+
+    assert values() == pytest.approx(np.full(5, 2.0 * np.e), rel=1e-15)
+    (stored,) = folder.glob("*/__pycache__/functions.nbc")
+    stored.write_bytes(stored.read_bytes()[:-1])
+    with pytest.warns(RuntimeWarning, match="damaged entry of the kernel cache is built again"):
+        assert values() == pytest.approx(np.full(5, 2.0 * np.e), rel=1e-15)
+    folder.chmod(0o777)
+    with pytest.warns(RuntimeWarning, match="compiling in memory"):
+        assert values() == pytest.approx(np.full(5, 2.0 * np.e), rel=1e-15)
 
 
 def test_file_in_the_place_of_an_entry_is_replaced(folder):
