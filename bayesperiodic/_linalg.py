@@ -5,12 +5,12 @@ different units. All decompositions here are those of the matrix scaled to a uni
 """
 
 from collections.abc import Callable
-from functools import wraps
+from functools import cache, wraps
 from typing import ParamSpec, TypeVar
 
 import numpy as np
 from scipy.linalg import orth
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 Arguments = ParamSpec("Arguments")
 Value = TypeVar("Value")
@@ -69,7 +69,13 @@ def in_one_thread(function: Callable[Arguments, Value]) -> Callable[Arguments, V
 
     @wraps(function)
     def limited(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Value:
-        with threadpool_limits(limits=1, user_api="blas"):
+        with _libraries().limit(limits=1, user_api="blas"):
             return function(*args, **kwargs)
 
     return limited
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    """Return the loaded libraries that have threads; looking for them takes some milliseconds."""
+    return ThreadpoolController()

@@ -5,6 +5,11 @@ offsets of the scheme are unrolled for small models: the sizes are constants of 
 """
 
 import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -13,7 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
-from bayesperiodic.models.cache import load
+from bayesperiodic._parallel import available_cores
+from bayesperiodic.models.cache import declare, is_stored, load
 
 STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit", "not resolved")
 CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT, NOT_RESOLVED = range(len(STATUSES))
@@ -214,8 +220,44 @@ def kernels(name: str, states: int, stencil: tuple[int, int, int]) -> ModuleType
 @cache
 def _kernels(name: str, sizes: tuple[int, ...]) -> ModuleType:
     text, shared = MODULES[name]
-    constants = {"SIZES": sizes, "BORDERED": shared == "border", "DEFINITIONS": _digest()}
-    return load(source(text), constants, _kernels(shared, sizes) if shared else None)
+    if not shared:
+        return load(source(text), _constants(name, sizes))
+    with _other_process(name, sizes):
+        base = _kernels(shared, sizes)
+    return load(source(text), _constants(name, sizes), base)
+
+
+def _constants(name: str, sizes: tuple[int, ...]) -> dict[str, Any]:
+    return {"SIZES": sizes, "BORDERED": MODULES[name][1] == "border", "DEFINITIONS": _digest()}
+
+
+@contextmanager
+def _other_process(name: str, sizes: tuple[int, ...]) -> Iterator[None]:
+    """Compile one of `MODULES` in another process, while this one compiles the one that it is based on.
+
+    Neither process needs the other's results, so each compiles half of the solver.  If the other one fails, this one
+    finds no entry in the cache.
+    """
+    shared = MODULES[name][1] or ""
+    if MODULES[shared][1] or available_cores() < 2 or is_stored(source(MODULES[shared][0]), _constants(shared, sizes)):
+        yield
+        return
+    call = f"from {__name__} import compile_alone; compile_alone({name!r}, {sizes!r})"
+    command = [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}; {call}"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield
+        except BaseException:
+            process.kill()
+            raise
+
+
+def compile_alone(name: str, sizes: tuple[int, ...]) -> None:
+    """Compile one of `MODULES` for the cache without the one that it is based on, and end the process."""
+    text, shared = MODULES[name]
+    base = declare(source(MODULES[shared or ""][0]), _constants(shared or "", sizes))
+    load(source(text), _constants(name, sizes), base)
+    os._exit(0)  # without clearing the memory first, which takes a third of a second
 
 
 def source(name: str) -> str:

@@ -4,12 +4,13 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from functools import cache
 from typing import Any
 
 import emcee
 import numpy as np
 from scipy.special import gammaln, logsumexp
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from bayesperiodic._linalg import covariance_eigh
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
@@ -183,11 +184,17 @@ def _fitted(draws: np.ndarray, count: int, curvature: np.ndarray) -> StudentMixt
     none = np.empty(0)
     draws = StudentMixture(none, none, none, none, curvature).straightened(draws)
     fit = GaussianMixture(count, reg_covar=REGULAR * draws.var(axis=0).min(), random_state=0, tol=1e-2).fit
-    with threadpool_limits(limits=1), warnings.catch_warnings():
+    with _libraries().limit(limits=1), warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # a mixture that is not the best one is a proposal too
         found = fit(draws)
     factors = np.linalg.cholesky(found.covariances_)
     return StudentMixture(found.weights_, found.means_, factors, np.full(count, HEAVY), curvature)
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    """Return the libraries that have threads, those of scikit-learn included, which are loaded by then."""
+    return ThreadpoolController()
 
 
 def _with_wider(mixture: StudentMixture, degrees: float | None = None) -> StudentMixture:

@@ -68,7 +68,7 @@ def back_substitute_transposed(grid, factors, right):
             right[k, s] = value
 
 
-@njit(types.void(MATRIX, MATRIX, MATRIX), **OPTIONS)
+@inlined(types.void(MATRIX, MATRIX, MATRIX), **INNER)
 def concatenate(states, others, both):
     """Fill `both` with the columns of `states` (q, q̇, q̈), then those of `others`."""
     first, second = 3 * STATES if STATES > 0 else states.shape[1], others.shape[1]

@@ -80,7 +80,7 @@ def broyden(functions, grid, setting, band, pivots, border, target, z, states, c
     return False, MAX_SECANTS, frequency
 
 
-@njit(NUMBER(NUMBER, VECTOR, VECTOR, VECTOR, NUMBER), **OPTIONS)
+@inlined(NUMBER(NUMBER, VECTOR, VECTOR, VECTOR, NUMBER), **INNER)
 def predicted_frequency(frequency, sensitivities, anchor_parameters, parameters, fraction):
     """Return the anchor's linear prediction of the frequency, or its own where that is not positive."""
     result = frequency
@@ -89,7 +89,7 @@ def predicted_frequency(frequency, sensitivities, anchor_parameters, parameters,
     return result if result > 0.0 else frequency
 
 
-@njit(FLAG(MATRIX, MATRIX, MATRIX, NUMBER, NUMBER), **OPTIONS)
+@inlined(FLAG(MATRIX, MATRIX, MATRIX, NUMBER, NUMBER), **INNER)
 def has_leapt(z, predicted, start, frequency, expected):
     """Return whether an orbit is not a continuation of `start`: unpredicted, shrunk, or of a shorter period."""
     if is_far(z, predicted, start) or abs(frequency - expected) > FAR * expected:
@@ -99,7 +99,7 @@ def has_leapt(z, predicted, start, frequency, expected):
 
 @kernel(
     types.Tuple([COUNT, COUNT, NUMBER])(FUNCTIONS, GRID, SETTING, ANCHOR, NUMBER, BORDER, MATRIX, MATRIX, WORKSPACE),
-    **OPTIONS,
+    **INNER,
 )
 def continue_from_anchor(functions, grid, setting, anchor, orientation, border, z, history, work):
     """Follow an orbit from the anchor's parameters to those of the setting; return status, iterations and frequency.

@@ -17,7 +17,7 @@ POLISHED = 1e-12
 LARGEST_PART = 1.0 / 16.0
 
 
-@njit(NUMBER(VECTOR, VECTOR), **OPTIONS)
+@inlined(NUMBER(VECTOR, VECTOR), **INNER)
 def in_units(reached, amplitude):
     """Return the largest of the values of each state in units of its amplitude; zeros do not count."""
     result = 0.0
@@ -31,7 +31,7 @@ def in_units(reached, amplitude):
     types.Tuple([FLAG, COUNT, NUMBER])(
         FUNCTIONS, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, FACTORS, MATRIX, MATRIX
     ),
-    **OPTIONS,
+    **INNER,
 )
 def newton_chord(
     functions, grid, setting, amplitude, stiffness, predicted, polish, z, states, change, factors, left, right
@@ -86,7 +86,7 @@ def newton_chord(
     return converged, MAX_CHORDS, moved
 
 
-@njit(FLAG(MATRIX, COUNT), **OPTIONS)
+@inlined(FLAG(MATRIX, COUNT), **INNER)
 def was_damped(history, iterations):
     """Return whether the Newton iteration took a shortened step."""
     for iteration in range(iterations):
@@ -99,7 +99,7 @@ def was_damped(history, iterations):
     types.Tuple([COUNT, COUNT])(
         FUNCTIONS, GRID, COUNT, SETTING, UNKNOWNS, BORDER, VECTOR, MATRIX, CUBE, FLAG, MATRIX, MATRIX, WORKSPACE
     ),
-    **OPTIONS,
+    **INNER,
 )
 def continue_from_anchor(
     functions, grid, periods, setting, unknowns, border, anchor_parameters, anchor_z, sensitivities, leapt, z, history,

@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
     from bayesperiodic.periodic._kernels.linear import *
 
 
-@njit(NUMBER(MATRIX, PLACES), **OPTIONS)
+@inlined(NUMBER(MATRIX, PLACES), **INNER)
 def determinant_sign(band, pivots):
     """Return the sign of the determinant, without the last pivot, of a matrix factored by `factor`."""
     sign, lower = 1.0, (band.shape[1] - 1) // 3
@@ -124,7 +124,7 @@ def phase_row(z, states, grid, row):
     return target
 
 
-@njit(types.void(MATRIX, NUMBER, MATRIX), **OPTIONS)
+@inlined(types.void(MATRIX, NUMBER, MATRIX), **INNER)
 def scale_rates(inputs, ratio, result):
     """Fill u, u̇, ü at another frequency, `ratio` times as high."""
     count = inputs.shape[1] // 3
@@ -184,7 +184,7 @@ def fill_slopes(functions, grid, setting, unknowns, states, columns, table, slop
                 slopes[k, grid.place[i] * count + e] = value
 
 
-@njit(NUMBER(MATRIX, VECTOR, GRID), **OPTIONS)
+@inlined(NUMBER(MATRIX, VECTOR, GRID), **INNER)
 def folded_product(z, row, grid):
     """Return row · z, the row (size,) in the folded order."""
     total, count = 0.0, z.shape[1]
@@ -198,7 +198,7 @@ def folded_product(z, row, grid):
     types.Tuple([NUMBER, NUMBER])(
         FUNCTIONS, GRID, SETTING, UNKNOWNS, BORDER, MATRIX, MATRIX, MATRIX, MATRIX, WORKSPACE, VECTOR
     ),
-    **OPTIONS,
+    **INNER,
 )
 def bordered_step(functions, grid, setting, unknowns, border, states, columns, z, step, work, change):
     """Fill the Newton step of z and of the unknowns' values; return its size and the orientation, 0 if singular."""
@@ -223,7 +223,7 @@ def bordered_step(functions, grid, setting, unknowns, border, states, columns, z
     return size, orientation
 
 
-@njit(FLAG(MATRIX, MATRIX), **OPTIONS)
+@inlined(FLAG(MATRIX, MATRIX), **OPTIONS)
 def has_shrunk(z, start):
     """Return whether an orbit has shrunk to an equilibrium."""
     for s in range(z.shape[1]):
@@ -236,7 +236,7 @@ def has_shrunk(z, start):
     return True
 
 
-@njit(NUMBER(MATRIX, COUNT), **OPTIONS)
+@inlined(NUMBER(MATRIX, COUNT), **INNER)
 def power(z, harmonic):
     """Return the power of a harmonic, summed over the states."""
     points, total = z.shape[0], 0.0

@@ -97,7 +97,7 @@ def scales(columns, states, grid, amplitude, frequency, size, rounding, weight):
         rounding[e] *= ROUNDING
 
 
-@njit(types.void(MATRIX, VECTOR), **OPTIONS)
+@inlined(types.void(MATRIX, VECTOR), **INNER)
 def largest(z, amplitude):
     """Fill the largest absolute value of each state; four independent maxima at a time."""
     points = z.shape[0]
@@ -112,7 +112,7 @@ def largest(z, amplitude):
         amplitude[s] = max(a, b, c, d)
 
 
-@njit(NUMBER(VECTOR, VECTOR), fastmath={"reassoc"}, **OPTIONS)
+@inlined(NUMBER(VECTOR, VECTOR), fastmath={"reassoc"}, **INNER)
 def dot(one, other):
     """Return the sum of products, in any order."""
     total = 0.0
@@ -121,7 +121,7 @@ def dot(one, other):
     return total
 
 
-@njit(NUMBER(MATRIX, VECTOR), **OPTIONS)
+@inlined(NUMBER(MATRIX, VECTOR), **INNER)
 def norm(columns, size):
     """Return the root of the mean square of the residuals, each in units of its equation's size.
 
@@ -137,7 +137,7 @@ def norm(columns, size):
     return np.sqrt(total / (columns.shape[0] * count))
 
 
-@njit(types.void(VECTOR, VECTOR, VECTOR, MATRIX, types.boolean[::1]), **OPTIONS)
+@inlined(types.void(VECTOR, VECTOR, VECTOR, MATRIX, types.boolean[::1]), **INNER)
 def find_resting(amplitude, moved, size, weight, resting):
     """Mark the states that change no equation noticeably, neither by their values nor by their step.
 
@@ -150,7 +150,7 @@ def find_resting(amplitude, moved, size, weight, resting):
                 resting[s] = False
 
 
-@njit(NUMBER(MATRIX, MATRIX, types.boolean[::1]), **OPTIONS)
+@inlined(NUMBER(MATRIX, MATRIX, types.boolean[::1]), **INNER)
 def scaled_step(z, step, resting):
     """Return the largest step of any moving state in units of its largest value; infinite if not finite."""
     result = 0.0
@@ -167,7 +167,7 @@ def scaled_step(z, step, resting):
     return result
 
 
-@kernel(COUNT(GRID, FACTORS, VECTOR, VECTOR, types.boolean[::1], MATRIX, MATRIX), **OPTIONS)
+@kernel(COUNT(GRID, FACTORS, VECTOR, VECTOR, types.boolean[::1], MATRIX, MATRIX), **INNER)
 def ending(grid, factors, rounding, reached, resting, z, change):
     """Set the states at rest to zero, and return the status of a settled iteration: "singular" if undetermined.
 
@@ -223,19 +223,23 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
         frequency = fill_setting(setting, unknowns, unknowns.values, inputs, parameters)
     differentiate(z, drift, grid, frequency, states)
     residual_jacobian(states, inputs, parameters, tau, frequency, columns)
-    previous, rounded, moved, reached = np.inf, 0, np.empty(count), np.zeros(count)
-    unit, resting = np.empty(count), np.zeros(count, dtype=np.bool_)
+    previous, rounded, moved, reached = np.inf, 0, np.empty(count), np.empty(count)
+    unit, resting, settled = np.empty(count), np.empty(count, dtype=np.bool_), not BORDERED
+    for s in range(count):
+        reached[s] = 0.0
     for iteration in range(MAX_ITERATIONS):
         largest(z, amplitude)
         scales(columns, states, grid, amplitude, frequency, size, rounding, weight)
         before = norm(columns, size)
         if not np.isfinite(before):
             return NOT_FINITE, iteration, orientation
-        if iteration == 0 and not BORDERED and norm(columns, rounding) <= 1.0 and np.all(amplitude > 0.0):
-            rounded = 1
+        settled = settled and norm(columns, rounding) <= 1.0
         for s in range(count):
             reached[s] = max(reached[s], amplitude[s])
             unit[s] = amplitude[s] if amplitude[s] > 0.0 else 1.0
+            settled = settled and amplitude[s] > 0.0
+        if settled:
+            rounded, settled = 1, False
         for i in range(points):
             for s in range(count):
                 step[i, s] = -columns[i, s]
@@ -298,7 +302,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     return STALLED, MAX_ITERATIONS, orientation
 
 
-@kernel(types.void(MATRIX, CUBE, VECTOR, VECTOR, NUMBER, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, CUBE, VECTOR, VECTOR, NUMBER, MATRIX), **INNER)
 def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fraction, z):
     """Fill z with the anchor's linear prediction, at a fraction of the way from the anchor's parameters."""
     copy(anchor_z, z)
@@ -310,7 +314,7 @@ def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fract
                 flat[k] += slope[k] * change
 
 
-@kernel(FLAG(MATRIX, MATRIX, MATRIX), **OPTIONS)
+@kernel(FLAG(MATRIX, MATRIX, MATRIX), **INNER)
 def is_far(z, predicted, anchor_z):
     """Return whether z is off the prediction by more than `FAR` of the anchor's range and of the change.
 
@@ -328,7 +332,7 @@ def is_far(z, predicted, anchor_z):
     return False
 
 
-@njit(NUMBER(MATRIX, VECTOR, COUNT), **OPTIONS)
+@inlined(NUMBER(MATRIX, VECTOR, COUNT), **INNER)
 def fourth_differences(z, fourth, s):
     """Fill the cyclic fourth differences of column s of z, over 16; return the sum of their squares."""
     last = z.shape[0] - 1
@@ -341,7 +345,7 @@ def fourth_differences(z, fourth, s):
     return dot(fourth, fourth)
 
 
-@njit(FLAG(MATRIX, COUNT, NUMBER, NUMBER), **OPTIONS)
+@inlined(FLAG(MATRIX, COUNT, NUMBER, NUMBER), **INNER)
 def is_large(z, s, energy, share):
     """Return whether an energy exceeds that of a share of the variation of column s of z, and its accuracy."""
     total, square, reached = 0.0, 0.0, 0.0
