@@ -264,5 +264,5 @@ def kernel(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Ker
 
 
 def inlined(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles a function by ``njit`` into those that call it; a declared one once it is used."""
+    """Return a decorator that compiles a function by ``njit`` into its callers; in a declared module if it has any."""
     return lambda function: numba.njit(*[] if function.__globals__["DECLARED"] else [signature], **options)(function)

@@ -219,12 +219,12 @@ def kernels(name: str, states: int, stencil: tuple[int, int, int]) -> ModuleType
 
 @cache
 def _kernels(name: str, sizes: tuple[int, ...]) -> ModuleType:
-    text, shared = MODULES[name]
-    if not shared:
+    text, base = MODULES[name]
+    if not base:
         return load(source(text), _constants(name, sizes))
     with _other_process(name, sizes):
-        base = _kernels(shared, sizes)
-    return load(source(text), _constants(name, sizes), base)
+        shared = _kernels(base, sizes)
+    return load(source(text), _constants(name, sizes), shared)
 
 
 def _constants(name: str, sizes: tuple[int, ...]) -> dict[str, Any]:
@@ -235,11 +235,12 @@ def _constants(name: str, sizes: tuple[int, ...]) -> dict[str, Any]:
 def _other_process(name: str, sizes: tuple[int, ...]) -> Iterator[None]:
     """Compile one of `MODULES` in another process, while this one compiles the one that it is based on.
 
-    Neither process needs the other's results, so each compiles half of the solver.  If the other one fails, this one
-    finds no entry in the cache.
+    Neither needs what the other compiles before it runs. If the other process fails, its entry is missing in the cache,
+    and is compiled here.
     """
-    shared = MODULES[name][1] or ""
-    if MODULES[shared][1] or available_cores() < 2 or is_stored(source(MODULES[shared][0]), _constants(shared, sizes)):
+    base = MODULES[name][1] or ""
+    alone = MODULES[base][1] or not Path(sys.executable or "").stem.startswith("python") or available_cores() < 2
+    if alone or is_stored(source(MODULES[base][0]), _constants(base, sizes)):
         yield
         return
     call = f"from {__name__} import compile_alone; compile_alone({name!r}, {sizes!r})"
@@ -254,10 +255,10 @@ def _other_process(name: str, sizes: tuple[int, ...]) -> Iterator[None]:
 
 def compile_alone(name: str, sizes: tuple[int, ...]) -> None:
     """Compile one of `MODULES` for the cache without the one that it is based on, and end the process."""
-    text, shared = MODULES[name]
-    base = declare(source(MODULES[shared or ""][0]), _constants(shared or "", sizes))
-    load(source(text), _constants(name, sizes), base)
-    os._exit(0)  # without clearing the memory first, which takes a third of a second
+    text, base = MODULES[name]
+    declared = declare(source(MODULES[base or ""][0]), _constants(base or "", sizes))
+    load(source(text), _constants(name, sizes), declared)
+    os._exit(0)  # without clearing the memory, which takes a third of a second
 
 
 def source(name: str) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
+from bayesperiodic._parallel import available_cores
 from bayesperiodic.models import cache
 from bayesperiodic.models.code_generation import FUNCTIONS
 from tests.known import formula_model
@@ -46,6 +47,28 @@ def four_times(x):
     ("twice", "four_times"),
 )
 
+# Kernels, and a module of functions that call them.
+KERNELS = """
+from bayesperiodic.models.cache import inlined, kernel
+
+@inlined("float64(float64)", cache=CACHE)
+def next(x):
+    return x + 1.0
+
+@kernel("float64(float64)", cache=CACHE)
+def twice(x):
+    return 2.0 * next(x)
+
+@kernel("float64(float64)", cache=CACHE, no_cpython_wrapper=True)
+def thrice(x):
+    return 3.0 * x
+"""
+CALLERS = """
+@kernel("float64(float64)", cache=CACHE)
+def combined(x):
+    return twice(thrice(x)) + next(x)
+"""
+
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
@@ -78,6 +101,41 @@ def test_second_start_loads_all_functions_from_the_cache(folder):
     assert first.communicate()[0] == FIRST
     second = start()
     assert second.communicate()[0] == SECOND
+
+
+def test_callers_of_declared_kernels_are_compiled_for_processes_that_have_the_kernels(folder):
+    cache.load(KERNELS)
+    cache.load(CALLERS, shared=cache.declare(KERNELS))
+    program = f"""
+from bayesperiodic.models import cache
+cache._build = None
+print(cache.load({CALLERS!r}, shared=cache.load({KERNELS!r})).combined(2.0))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT)
+    assert (done.stdout, done.stderr) == (f"{2.0 * (3.0 * 2.0 + 1.0) + 2.0 + 1.0}\n", "")
+
+
+def test_a_kernel_for_compiled_code_only_cannot_be_called_by_python(folder):
+    kernels = cache.load(KERNELS)
+    assert kernels.twice(2.0) == 6.0
+    with pytest.raises(TypeError, match="thrice: must be called by compiled code"):
+        kernels.thrice(2.0)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(available_cores() < 2, reason="two cores are needed")
+def test_two_processes_compile_half_of_the_solver_each(folder):
+    program = """
+from bayesperiodic.models import cache
+from bayesperiodic.periodic.compiled import kernels
+built, build = [], cache._build
+cache._build = lambda source, *arguments: (built.append(source), build(source, *arguments))[1]
+kernels("newton", 1, (2, 3, 2))
+print(["Compiled linear algebra" in source for source in built])
+"""
+    for expected in ("[True]\n", "[]\n"):
+        assert subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True).stdout == expected
+    assert len(list(folder.iterdir())) == 2
 
 
 @pytest.mark.slow

@@ -277,9 +277,24 @@ def test_folded_order_has_the_expected_half_width(scheme, half_width, points):
 
 def test_changed_kernels_recompile_their_callers(monkeypatch, tmp_path):
     monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path))
+    monkeypatch.setattr(compiled, "available_cores", lambda: 1)
     for added, states in ((1.0, 0), (3.0, 0), (3.0, 2), (1.0, 0)):
         texts = {"linear": CALLED.format(added=added), "newton": CALLING}
         monkeypatch.setattr(compiled, "source", texts.__getitem__)
         monkeypatch.setattr(compiled, "_kernels", cache(ORIGINAL.__wrapped__))
         caller = compiled.kernels("newton", states, (1, 1, 1))
         assert caller.twice(1.0) == 2.0 * (1.0 + added + states)
+
+
+@pytest.mark.parametrize(("executable", "starts"), [("python3", True), ("application", False)])
+def test_a_failure_of_the_other_process_that_compiles_is_made_up_for(monkeypatch, tmp_path, executable, starts):
+    monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(compiled, "available_cores", lambda: 2)
+    monkeypatch.setattr(compiled, "source", {"linear": CALLED.format(added=1.0), "newton": CALLING}.__getitem__)
+    monkeypatch.setattr(compiled, "_kernels", cache(ORIGINAL.__wrapped__))
+    script = tmp_path / executable
+    script.write_text(f"#!/bin/sh\ntouch {tmp_path}/started\nexit 1\n")
+    script.chmod(0o700)
+    monkeypatch.setattr(compiled.sys, "executable", str(script))
+    assert compiled.kernels("newton", 2, (1, 1, 1)).twice(1.0) == 8.0
+    assert (tmp_path / "started").exists() == starts

@@ -7,7 +7,7 @@ by the implicit function theorem (de Kraker et al. 1997, eq. 4).
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from bayesperiodic.models.code_generation import as_vector, grid_function_at
 

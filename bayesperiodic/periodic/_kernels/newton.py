@@ -10,7 +10,7 @@ The source is compiled with and without further unknowns (`BORDERED`); without, 
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from bayesperiodic.models.code_generation import as_vector, grid_function_at
 
