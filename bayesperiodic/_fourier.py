@@ -22,6 +22,11 @@ def coefficients(values: np.ndarray, harmonics: int | None = None) -> np.ndarray
     return amplitudes
 
 
+def within_half_turn(angles: np.ndarray) -> np.ndarray:
+    """Return angles [rad] within half a turn; unlike the remainder of a division, quickly and exactly for those."""
+    return angles - 2 * np.pi * np.rint(angles / (2 * np.pi))
+
+
 def on_grid(amplitudes: np.ndarray, points: int) -> np.ndarray:
     """Return signals (…, points) from complex amplitudes (…, harmonics + 1)."""
     spectrum = np.zeros((*amplitudes.shape[:-1], points // 2 + 1), dtype=complex)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.signal import medfilt
 from scipy.special import chdtrc, fdtrc, softmax
 
 from bayesperiodic import _checks, _fourier
@@ -580,7 +579,7 @@ def _steps(time: np.ndarray, signal: np.ndarray, rising: np.ndarray) -> list[int
     period = np.log(np.diff(crossing))
     noise = max(float(np.median(np.abs(np.diff(period)))), 1e-4)
     # A single odd period, as at a jump of the phase, is no step.
-    period = medfilt(period, 3)
+    period = np.median([np.append(period[:1], period[:-1]), period, np.append(period[1:], period[-1:])], axis=0)
     found, stack = [], [(0, period.size)]
     while stack:
         first, last = stack.pop()

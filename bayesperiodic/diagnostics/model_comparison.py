@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.optimize import brentq
 from scipy.special import expit, softmax
 
-from bayesperiodic import _checks
+from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics.adequacy import MISSPECIFIED
@@ -475,7 +475,7 @@ def _what_would_tell(models: Models, one: str, other: str) -> str:
             for channel in e.outputs:
                 means, variances, noises = zip(*(predicted[channel] for predicted in found), strict=True)
                 gap = means[0] - means[1]
-                gap = np.mod(gap + np.pi, 2 * np.pi) - np.pi if channel in problem.model.angles else gap
+                gap = _fourier.within_half_turn(gap) if channel in problem.model.angles else gap
                 total += 0.5 * e.independent[channel] * np.mean(gap**2 / (max(noises) + sum(variances)))
             if np.isfinite(total):
                 gains[e.name, scale] = total

@@ -281,7 +281,7 @@ class Observation:
                 else:
                     noise[:, e.mask, c] = components[c]
         values = self._predicted(response) + noise
-        turned = self.data - (np.mod(self.data - values + np.pi, 2 * np.pi) - np.pi)
+        turned = self.data - _fourier.within_half_turn(self.data - values)
         return {n: (turned if self.angles[c] else values)[..., c] for c, n in enumerate(self.channels)}
 
     def compared(self, response: Response, ahead: int = 0) -> dict[str, np.ndarray]:
@@ -302,7 +302,7 @@ class Observation:
             predicted = np.roll(predicted, -ahead * self.experiment.samples, axis=-2)
         difference = self.data - predicted
         for c in np.flatnonzero(self.angles):
-            difference[..., c] = np.mod(difference[..., c] + np.pi, 2 * np.pi) - np.pi
+            difference[..., c] = _fourier.within_half_turn(difference[..., c])
         return difference
 
     def _components(

@@ -34,9 +34,17 @@ class Found(NamedTuple):
     boxes: bp.Orbits  # By the paper's recipe
 
 
+def _section(recording: bp.Recording, noise: float, seed: int) -> bp.PoincareSection:
+    return section_of(with_noise(recording, noise, seed) if noise > 0.0 else recording)
+
+
+def _boxes(section: bp.PoincareSection, periods: Sequence[int]) -> bp.Orbits:
+    return bp.find_orbits(section, periods=periods, method="boxes")
+
+
 def _found(recording: bp.Recording, noise: float, seed: int, periods: Sequence[int]) -> Found:
-    section = section_of(with_noise(recording, noise, seed) if noise > 0.0 else recording)
-    return Found(section, *(bp.find_orbits(section, periods=periods, method=m) for m in orbits.METHODS))
+    section = _section(recording, noise, seed)
+    return Found(section, bp.find_orbits(section, periods=periods), _boxes(section, periods))
 
 
 def _clean(recording: bp.Recording, seed: int, periods: Sequence[int]) -> tuple[Found, orbits.Confirmed]:
@@ -69,24 +77,26 @@ def run(options: argparse.Namespace) -> None:
         print(f"  {kind} recording: {about['drive_periods']} drive periods, {about['values']} numbers")
         noise = options.noise if about["synthetic"] else 0.0
         results: dict[str, Any] = {"recording": about, "noise": noise, "seed": options.seed, "quick": options.quick}
-        clean = pool.submit(_clean, recording, options.seed, periods) if about["synthetic"] else None
-        levels = sorted({noise} if options.quick or not clean else {noise, *NOISE_LEVELS})
-        others = {level: pool.submit(_found, recording, level, options.seed, periods) for level in levels
-                  if level not in (0.0, noise)}  # fmt: skip
+        clean = pool.submit(_clean, recording, options.seed, periods) if about["synthetic"] and noise > 0.0 else None
+        others = {level: pool.submit(_found, recording, level, options.seed, periods) for level in NOISE_LEVELS
+                  if level not in (0.0, noise) and about["synthetic"] and not options.quick}  # fmt: skip
         with watch.part("orbits", f"finding orbits without a model, noise {noise:.2%}"):
-            found = clean.result()[0] if clean and noise == 0.0 else _found(recording, noise, options.seed, periods)
-            print(f"  {len(found.chained)} candidates", flush=True)
+            section = _section(recording, noise, options.seed)
+            boxes = pool.submit(_boxes, section, periods)
+            chained = bp.find_orbits(section, periods=periods)
+            print(f"  {len(chained)} candidates", flush=True)
         with watch.part("estimates", "m and l, k3, and all five, from the paper's start"):
             compiled.result()
-            identified = pendulum_estimates.identify(found.chained)
+            identified = pendulum_estimates.identify(chained)
             eigenvalue_fits = {
                 which: pendulum_estimates.with_eigenvalues(identified.selected, names) for which, names in FREE.items()
             }
         with watch.part("ridge", "sampling the posterior of all five with emcee"):
             ridge = pendulum_estimates.sample(identified, options.seed, options.quick)
-        if clean:
+        found = Found(section, chained, boxes.result())
+        if about["synthetic"]:
             with watch.part("reference", "waiting for the orbits at other noise levels, and by shooting"):
-                without, confirmed = clean.result()
+                without, confirmed = clean.result() if clean else (found, orbits.true_orbits(chained))
                 every = {0.0: without, noise: found} | {level: other.result() for level, other in others.items()}
             results |= _against_shooting(dict(sorted(every.items())), confirmed)
             print(_orbit_account(results))
