@@ -9,6 +9,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
+from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.files import Units, convert, read_csv, read_mat, read_npz
 from bayesperiodic.data.folding import AUTO, Signals, automatic_periods, fold_signals, parts
@@ -382,6 +383,7 @@ class Recording(Result):
         outputs, inputs = ({key: v[samples] for key, v in kind.items()} for kind in (self.outputs, self.inputs))
         return replace(self, time=self.time[samples], outputs=outputs, inputs=inputs, name=name)
 
+    @in_one_thread
     def fold(
         self,
         samples: int = 800,

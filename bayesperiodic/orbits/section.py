@@ -8,6 +8,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
+from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.data.recording import Recording
 
 DEGREES = 180.0 / np.pi
@@ -75,6 +76,7 @@ class PoincareSection(Result):
     synthetic: bool = False
 
     @classmethod
+    @in_one_thread
     def from_recording(
         cls,
         recording: Recording,
