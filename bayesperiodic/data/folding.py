@@ -579,7 +579,8 @@ def _steps(time: np.ndarray, signal: np.ndarray, rising: np.ndarray) -> list[int
     period = np.log(np.diff(crossing))
     noise = max(float(np.median(np.abs(np.diff(period)))), 1e-4)
     # A single odd period, as at a jump of the phase, is no step.
-    period = np.median([np.append(period[:1], period[:-1]), period, np.append(period[1:], period[-1:])], axis=0)
+    mirrored = np.concatenate([period[1:2], period, period[-2:-1]])
+    period = np.median([mirrored[:-2], period, mirrored[2:]], axis=0)
     found, stack = [], [(0, period.size)]
     while stack:
         first, last = stack.pop()
