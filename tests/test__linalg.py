@@ -5,6 +5,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import bayesperiodic as bp
 from bayesperiodic._linalg import covariance_cholesky, covariance_eigh, hessian_eigh, in_one_thread
+from bayesperiodic.data import recording
 from tests.known import LINEAR
 
 UNITS = np.array([1e-9, 1.0, 1e7, 3e-4])
@@ -58,6 +59,14 @@ def test_linear_algebra_has_one_thread_inside_and_as_many_as_before_outside(two_
     assert set(in_one_thread(threads)()) == {1}
     with pytest.raises(ZeroDivisionError):
         in_one_thread(lambda: 1 / 0)()
+
+
+def test_recordings_are_folded_with_one_thread(two_threads, monkeypatch):
+    found, fold_signals = [], recording.fold_signals
+    monkeypatch.setattr(recording, "fold_signals", lambda *given: found.extend(threads()) or fold_signals(*given))
+    time = np.arange(200) / 20.0
+    bp.Recording(time, {"x": np.cos(2 * np.pi * time)}, {}).fold(samples=20)
+    assert set(found) == {1}
 
 
 @pytest.mark.slow

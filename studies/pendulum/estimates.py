@@ -5,6 +5,7 @@ With all five parameters free, the ridge is described by structure, Laplace appr
 
 import re
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -144,19 +145,18 @@ class Ridge:
     combinations: pd.DataFrame  # By Laplace (value, laplace_sd) and MCMC (mean, sd)
 
 
-def sample(identified: Identified, seed: int, quick: bool) -> Ridge:
-    """Sample the posterior of all five parameters, and diagnose it."""
+def sample(identified: Identified, seed: int, quick: bool, pool: Executor) -> Ridge:
+    """Sample the posterior of all five parameters, and diagnose it, by half in a process of the pool."""
     problem, fit = identified.problems[ALL], identified.fits[ALL]
     settings: dict[str, Any] = {"max_steps": QUICK_STEPS} if quick else {}
     posterior = bp.sample(problem, fit, seed=seed, **SAMPLING, **settings)
+    verdicts = pool.submit(bp.identifiability, problem, fit, posterior)
     table = fit.derive(COMBINATIONS).rename(columns={"sd": "laplace_sd"})
     table = table.join(posterior.derive(COMBINATIONS)[["mean", "sd"]])
     table.loc["l"] = [fit.theta["l"], fit.sd["l"], posterior.draws("l").mean(), posterior.draws("l").std()]
-    return Ridge(
-        fit, posterior, bp.structure(bp.models.pendulum, fixed=list(KNOWN)),
-        bp.identifiability(problem, fit, posterior), bp.compare(problem, fit, posterior),
-        bp.compare(problem, fit, posterior, coordinates="sampling"), table.loc[list(DETERMINED)],
-    )  # fmt: skip
+    structure = bp.structure(bp.models.pendulum, fixed=list(KNOWN))
+    natural, sampling = (bp.compare(problem, fit, posterior, coordinates=c) for c in ("natural", "sampling"))
+    return Ridge(fit, posterior, structure, verdicts.result(), natural, sampling, table.loc[list(DETERMINED)])
 
 
 def combinations(values: Mapping[str, Any]) -> dict[str, Any]:

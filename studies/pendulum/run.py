@@ -92,7 +92,7 @@ def run(options: argparse.Namespace) -> None:
                 which: pendulum_estimates.with_eigenvalues(identified.selected, names) for which, names in FREE.items()
             }
         with watch.part("ridge", "sampling the posterior of all five with emcee"):
-            ridge = pendulum_estimates.sample(identified, options.seed, options.quick)
+            ridge = pendulum_estimates.sample(identified, options.seed, options.quick, pool)
         found = Found(section, chained, boxes.result())
         if about["synthetic"]:
             with watch.part("reference", "waiting for the orbits at other noise levels, and by shooting"):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from bayesperiodic import _fourier
 from bayesperiodic.data import harmonics
 from bayesperiodic.data.harmonics import Pace
 
@@ -177,3 +178,10 @@ def test_resolved_harmonics_are_those_of_the_samples_and_of_the_grid():
     assert harmonics.resolved_harmonics(np.arange(8) / 7.0, 0.3, 200) == 3
     with pytest.raises(ValueError, match=r"at least 3 samples per cycle.* got 2\.9; sample faster"):
         harmonics.resolved_harmonics(time, 9.9 / 2.9, 200)
+
+
+@pytest.mark.parametrize("turns", [-7, -1, 0, 1, 1000])
+def test_angles_are_reduced_to_half_a_turn(turns):
+    angles = np.array([-3.141, -0.5, -1e-9, 0.0, 0.25, 3.141])
+    reduced = _fourier.within_half_turn(angles + 2 * np.pi * turns)
+    assert reduced == pytest.approx(angles, rel=0, abs=abs(turns) * 2e-15)
