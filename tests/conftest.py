@@ -8,6 +8,7 @@ import pytest
 from hypothesis import configuration, settings
 
 import bayesperiodic as bp
+from bayesperiodic.periodic import compiled
 from tests.known import LINEAR, linear_experiment
 
 matplotlib.use("Agg")
@@ -23,6 +24,12 @@ settings.load_profile("default")
 def interrupts():
     """Enable SIGINT, which a shell disables for tests that it runs in the background."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compilation_in_one_process():
+    """Compile in this process alone, because pytest occupies all cores."""
+    compiled.available_cores = lambda: 1
 
 
 @pytest.fixture(scope="session")
