@@ -134,6 +134,7 @@ print(json.dumps(seconds))
 
 def run(options: argparse.Namespace) -> None:
     """Measure in new environments and write cold_start.json."""
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # which a newcomer does not have
     watch, repeats = common.Stopwatch(), QUICK_REPEATS if options.quick else REPEATS
     found: dict[str, Any] = {"cores": len(os.sched_getaffinity(0)), "python": platform.python_version()}
     found["load_average_before"] = [*os.getloadavg()]
