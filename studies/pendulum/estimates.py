@@ -62,11 +62,12 @@ def identify(orbits: bp.Orbits, *, which: Sequence[str] = tuple(FREE)) -> Identi
     return Identified(polished, selected, problems, fits, tuple(lost))
 
 
-def compile_kernels() -> None:
-    """Compile or load what the estimates need, by one evaluation at a state of rest."""
+def prepare() -> bp.Structure:
+    """Compile or load what the estimates need, by one evaluation at a state of rest; analyse the model's structure."""
     wave = np.cos(2 * np.pi * np.arange(SAMPLES) / SAMPLES)
     experiment = bp.Experiment("any", FREQUENCY, dict.fromkeys(COORDINATES, wave), samples=SAMPLES)
     problem_of([experiment], FREE["k3"]).log_posterior({"k3": TRUTH["k3"]}, dict.fromkeys(COORDINATES, 1.0))
+    return bp.structure(bp.models.pendulum, fixed=list(KNOWN))
 
 
 def with_eigenvalues(selected: bp.Orbits, free: Sequence[str]) -> bp.MapEstimate:
@@ -145,7 +146,7 @@ class Ridge:
     combinations: pd.DataFrame  # By Laplace (value, laplace_sd) and MCMC (mean, sd)
 
 
-def sample(identified: Identified, seed: int, quick: bool, pool: Executor) -> Ridge:
+def sample(identified: Identified, structure: bp.Structure, seed: int, quick: bool, pool: Executor) -> Ridge:
     """Sample the posterior of all five parameters, and diagnose it, by half in a process of the pool."""
     problem, fit = identified.problems[ALL], identified.fits[ALL]
     settings: dict[str, Any] = {"max_steps": QUICK_STEPS} if quick else {}
@@ -154,7 +155,6 @@ def sample(identified: Identified, seed: int, quick: bool, pool: Executor) -> Ri
     table = fit.derive(COMBINATIONS).rename(columns={"sd": "laplace_sd"})
     table = table.join(posterior.derive(COMBINATIONS)[["mean", "sd"]])
     table.loc["l"] = [fit.theta["l"], fit.sd["l"], posterior.draws("l").mean(), posterior.draws("l").std()]
-    structure = bp.structure(bp.models.pendulum, fixed=list(KNOWN))
     natural, sampling = (bp.compare(problem, fit, posterior, coordinates=c) for c in ("natural", "sampling"))
     return Ridge(fit, posterior, structure, verdicts.result(), natural, sampling, table.loc[list(DETERMINED)])
 

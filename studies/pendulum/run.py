@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> None:
     with common.workers(1) as pool:
         # Another process compiles the solver while this one simulates; then it finds the orbits of the other noise
         # levels, and those without noise by shooting.
-        compiled = pool.submit(pendulum_estimates.compile_kernels)
+        prepared = pool.submit(pendulum_estimates.prepare)
         with watch.part("recording", "the recording"):
             recording, about = pendulum_recording.get(options.data, options.quick, options.seed)
         kind = "SYNTHETIC" if about["synthetic"] else "measured"
@@ -86,13 +86,13 @@ def run(options: argparse.Namespace) -> None:
             chained = bp.find_orbits(section, periods=periods)
             print(f"  {len(chained)} candidates", flush=True)
         with watch.part("estimates", "m and l, k3, and all five, from the paper's start"):
-            compiled.result()
+            structure = prepared.result()
             identified = pendulum_estimates.identify(chained)
             eigenvalue_fits = {
                 which: pendulum_estimates.with_eigenvalues(identified.selected, names) for which, names in FREE.items()
             }
         with watch.part("ridge", "sampling the posterior of all five with emcee"):
-            ridge = pendulum_estimates.sample(identified, options.seed, options.quick, pool)
+            ridge = pendulum_estimates.sample(identified, structure, options.seed, options.quick, pool)
         found = Found(section, chained, boxes.result())
         if about["synthetic"]:
             with watch.part("reference", "waiting for the orbits at other noise levels, and by shooting"):
