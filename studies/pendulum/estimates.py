@@ -146,17 +146,22 @@ class Ridge:
     combinations: pd.DataFrame  # By Laplace (value, laplace_sd) and MCMC (mean, sd)
 
 
-def sample(identified: Identified, structure: bp.Structure, seed: int, quick: bool, pool: Executor) -> Ridge:
-    """Sample the posterior of all five parameters, and diagnose it, by half in a process of the pool."""
-    problem, fit = identified.problems[ALL], identified.fits[ALL]
+def sample(identified: Identified, seed: int, quick: bool) -> bp.Posterior:
+    """Sample the posterior of all five parameters."""
     settings: dict[str, Any] = {"max_steps": QUICK_STEPS} if quick else {}
-    posterior = bp.sample(problem, fit, seed=seed, **SAMPLING, **settings)
-    verdicts = pool.submit(bp.identifiability, problem, fit, posterior)
+    return bp.sample(identified.problems[ALL], identified.fits[ALL], seed=seed, **SAMPLING, **settings)
+
+
+def diagnose(identified: Identified, structure: bp.Structure, posterior: bp.Posterior, idle: Executor | None) -> Ridge:
+    """Return all verdicts on all five parameters; with an idle process, half of them from there."""
+    problem, fit = identified.problems[ALL], identified.fits[ALL]
+    elsewhere = idle.submit(bp.identifiability, problem, fit, posterior) if idle else None
     table = fit.derive(COMBINATIONS).rename(columns={"sd": "laplace_sd"})
     table = table.join(posterior.derive(COMBINATIONS)[["mean", "sd"]])
     table.loc["l"] = [fit.theta["l"], fit.sd["l"], posterior.draws("l").mean(), posterior.draws("l").std()]
     natural, sampling = (bp.compare(problem, fit, posterior, coordinates=c) for c in ("natural", "sampling"))
-    return Ridge(fit, posterior, structure, verdicts.result(), natural, sampling, table.loc[list(DETERMINED)])
+    verdicts = elsewhere.result() if elsewhere else bp.identifiability(problem, fit, posterior)
+    return Ridge(fit, posterior, structure, verdicts, natural, sampling, table.loc[list(DETERMINED)])
 
 
 def combinations(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -92,7 +92,9 @@ def run(options: argparse.Namespace) -> None:
                 which: pendulum_estimates.with_eigenvalues(identified.selected, names) for which, names in FREE.items()
             }
         with watch.part("ridge", "sampling the posterior of all five with emcee"):
-            ridge = pendulum_estimates.sample(identified, structure, options.seed, options.quick, pool)
+            posterior = pendulum_estimates.sample(identified, options.seed, options.quick)
+            idle = pool if boxes.done() else None
+            ridge = pendulum_estimates.diagnose(identified, structure, posterior, idle)
         found = Found(section, chained, boxes.result())
         if about["synthetic"]:
             with watch.part("reference", "waiting for the orbits at other noise levels, and by shooting"):
