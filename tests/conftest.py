@@ -6,6 +6,7 @@ from multiprocessing import get_context
 import matplotlib
 import pytest
 from hypothesis import configuration, settings
+from threadpoolctl import threadpool_limits
 
 import bayesperiodic as bp
 from tests.known import LINEAR, linear_experiment
@@ -23,6 +24,19 @@ settings.load_profile("default")
 def interrupts():
     """Enable SIGINT, which a shell disables for tests that it runs in the background."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_blas_thread():
+    """Limit BLAS to one thread: those that wait for others occupy the cores on which the other tests run.
+
+    What the tests compute with NumPy themselves takes several times the processor time otherwise. Tests of the package's
+    own limit ask for two threads.
+    """
+    import scipy.linalg  # noqa: F401  its library is limited too, once it is loaded
+
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
 
 
 @pytest.fixture(scope="session")
