@@ -30,8 +30,8 @@ def interrupts():
 def one_blas_thread():
     """Limit BLAS to one thread: those that wait for others occupy the cores on which the other tests run.
 
-    What the tests compute with NumPy themselves takes several times the processor time otherwise. Tests of the package's
-    own limit ask for two threads.
+    What the tests compute with NumPy themselves takes several times the processor time otherwise. Tests of the limit
+    that the package sets itself ask for two threads.
     """
     import scipy.linalg  # noqa: F401  its library is limited too, once it is loaded
 
