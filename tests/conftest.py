@@ -6,6 +6,7 @@ from multiprocessing import get_context
 import matplotlib
 import pytest
 from hypothesis import configuration, settings
+from threadpoolctl import threadpool_limits
 
 import bayesperiodic as bp
 from bayesperiodic.periodic import compiled
@@ -30,6 +31,19 @@ def interrupts():
 def compilation_in_one_process():
     """Compile in this process alone, because pytest occupies all cores."""
     compiled.available_cores = lambda: 1
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_blas_thread():
+    """Limit BLAS to one thread: those that wait for others occupy the cores on which the other tests run.
+
+    What the tests compute with NumPy themselves takes several times the processor time otherwise. Tests of the limit
+    that the package sets itself ask for two threads.
+    """
+    import scipy.linalg  # noqa: F401  its library is limited too, once it is loaded
+
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -75,7 +75,10 @@ def faults(figure):
         for text, box in found.items()
         if box.min() < -ROOM or (box.max(axis=0) > np.array([width, height]) + ROOM).any()
     ]
-    for (one, a), (other, b) in combinations(found.items(), 2):
-        if overlap(a, b):
+    for (one, a, low, high), (other, b, lowest, highest) in combinations(
+        [(text, box, box.min(axis=0).tolist(), box.max(axis=0).tolist()) for text, box in found.items()], 2
+    ):
+        apart = low[0] > highest[0] or lowest[0] > high[0] or low[1] > highest[1] or lowest[1] > high[1]
+        if not apart and overlap(a, b):
             wrong.append(f"overlap: {one.get_text()!r} and {other.get_text()!r}")
     return wrong

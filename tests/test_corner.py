@@ -33,7 +33,7 @@ def quadrature_area(density, x, y, probability):
 def product_ridge(generator, spread, width):
     """Return a = exp(s), b = exp(w − s) for normal s and w; dA = exp(w) ds dw."""
     s, w = spread * generator.standard_normal(COUNT), width * generator.standard_normal(COUNT)
-    x, y = np.linspace(-6 * spread, 6 * spread, 1501), np.linspace(-6 * width, 6 * width, 1501)
+    x, y = np.linspace(-6 * spread, 6 * spread, 501), np.linspace(-6 * width, 6 * width, 501)
     across, along = np.meshgrid(x, y, indexing="ij")
     density = norm.pdf(across, scale=spread) * norm.pdf(along, scale=width) * np.exp(-along)
     order, cell = np.argsort(density, axis=None)[::-1], (x[1] - x[0]) * (y[1] - y[0])
@@ -61,7 +61,7 @@ def two_normals(generator, centres, sds):
         at = np.stack([x, y], axis=-1)
         return sum(0.5 * multivariate_normal(c, s**2).pdf(at) for c, s in zip(centres, sds, strict=True))
 
-    reach = [np.linspace(*ends, 1201) for ends in ((-6.0, 11.0), (-6.0, 6.0))]
+    reach = [np.linspace(*ends, 601) for ends in ((-6.0, 11.0), (-6.0, 6.0))]
     return points, lambda p: quadrature_area(density, *reach, p)
 
 

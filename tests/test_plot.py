@@ -362,7 +362,8 @@ def test_comparison_plot_names_the_verdict_and_the_coordinates(solved):
 def lacking():
     """Return a problem without its quadratic damping, the estimate, and what is missing."""
     problem, fit = quadratic_damping()
-    found = bp.missing_terms(problem, fit, equations=False, candidates={"equation of x": ["dx*abs(dx)", "x**5"]})
+    wanted = {"equation of x": ["dx*abs(dx)", "x**5"]}
+    found = bp.missing_terms(problem, fit, wanted, equations=False, outputs=False)
     return problem, fit, found
 
 

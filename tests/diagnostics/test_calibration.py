@@ -85,17 +85,17 @@ def test_ranks_agree_with_the_exact_posterior():
 
 
 def test_the_variance_is_that_of_one_recorded_sample():
-    """Of 200 folds of the cycles recorded, the squared distance from the clean cycle is χ² with 21 degrees each."""
+    """Of 100 folds of the cycles recorded, the squared distance from the clean cycle is χ² with 21 degrees each."""
     problem, generator = linear(), np.random.default_rng(1)
     theta, variances = {"k": 900.0, "c": 40.0, "coulomb": 25.0}, {"variance[force]": KNOWN_VARIANCE}
     e = problem.experiments[0]
     clean = e.project("force", linear_regressors(0.05, 2.0, grid(32)) @ [900.0, 40.0, 25.0])
     squares = []
-    for _ in range(200):
+    for _ in range(100):
         again = calibration._measured(problem, e, theta, variances, generator)
         assert again.independent == {"force": 21} and again.synthetic and again.averaged == 32 * again.cycles
         squares.append(np.mean((again.outputs["force"] - clean) ** 2) * again.averaged / KNOWN_VARIANCE)
-    assert np.mean(squares) / 21 == pytest.approx(1.0, abs=5 * np.sqrt(2 / (200 * 21)))
+    assert np.mean(squares) / 21 == pytest.approx(1.0, abs=5 * np.sqrt(2 / (100 * 21)))
 
 
 def test_a_variance_with_a_proper_prior_is_ranked_too():

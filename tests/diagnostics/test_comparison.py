@@ -17,7 +17,7 @@ from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 from tests.sampling.test_targets import known, model, run
 
 SHAPE = (4, 80, 20)
-SEEDS = range(20)
+SEEDS = range(8)
 QUIET = {"progress": False}
 END = 1.6448536269514722
 
@@ -192,7 +192,7 @@ def test_optimum_without_draws_is_not_called_fine():
     ],
 )
 def test_verdicts_are_right_and_do_not_depend_on_the_draws(name, coordinates, verdict, joint, advice):
-    """On 20 sets of 6400 exact draws each."""
+    """On 8 sets of 6400 exact draws each."""
     problem, fit, posterior, draw = case(name)
     for seed in SEEDS:
         again = redrawn(problem, posterior, draw(np.random.default_rng(seed)))

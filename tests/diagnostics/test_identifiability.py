@@ -12,7 +12,7 @@ from tests.problems import cycle_run, pendulum_run
 from tests.sampling.test_targets import known, model, run
 
 QUIET = {"progress": False}
-SHORT = QUIET | {"seed": 1, "ensembles": 2, "max_steps": 500}
+SHORT = QUIET | {"seed": 1, "ensembles": 2, "max_steps": 250}
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.LogNormal(800.0, 0.2), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
 WIDE = bp.Normal(0.0, 2.0)

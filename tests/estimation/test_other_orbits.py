@@ -137,7 +137,7 @@ def test_an_orbit_that_stays_another_one_is_never_called_adequate():
     assert fit.status == "other orbit" and not fit.converged
     assert SHORTER in fit.other_orbits["run"] and SHORTER in repr(fit)
     assert "of the variance of the recording is unexplained" in fit.other_orbits["run"]
-    posterior = bp.sample(problem, fit, seed=1, max_steps=250, progress=False)
+    posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=50, progress=False)
     found = bp.predict(problem, posterior, draws=20)
     assert found.verdict == "misspecified" and set(found.table["verdict"]) == {"misspecified"}
     assert SHORTER in found.findings["experiment run"] and SHORTER in repr(found)

@@ -17,20 +17,6 @@ from bayesperiodic.models import cache
 from bayesperiodic.models.code_generation import FUNCTIONS
 from tests.known import formula_model
 
-PROGRAM = """
-from bayesperiodic.models import machine_code
-from bayesperiodic.models.cache import load
-from bayesperiodic.models.library import pendulum
-from tests.models.test_cache import NAMES, SMALL
-compiled, append = [], machine_code._append
-machine_code._append = lambda *arguments: (compiled.append(arguments), append(*arguments))
-pendulum.kernels
-small = load(SMALL)
-print(len(compiled), sum(sum(getattr(small, name).stats.cache_hits.values()) for name in NAMES))
-"""
-FIRST, SECOND = f"{len(FUNCTIONS)} 0\n", "0 2\n"
-
-
 # Functions that compile quickly.
 SMALL, NAMES = (
     """
@@ -68,6 +54,18 @@ CALLERS = """
 def combined(x):
     return twice(thrice(x)) + next(x)
 """
+PROGRAM = f"""
+from bayesperiodic.models import machine_code
+from bayesperiodic.models.cache import load
+from bayesperiodic.models.library import pendulum
+SMALL, NAMES = {SMALL!r}, {NAMES!r}
+compiled, append = [], machine_code._append
+machine_code._append = lambda *arguments: (compiled.append(arguments), append(*arguments))
+pendulum.kernels
+small = load(SMALL)
+print(len(compiled), sum(sum(getattr(small, name).stats.cache_hits.values()) for name in NAMES))
+"""
+FIRST, SECOND = f"{len(FUNCTIONS)} 0\n", "0 2\n"
 
 
 @pytest.fixture

@@ -277,7 +277,6 @@ def test_folded_order_has_the_expected_half_width(scheme, half_width, points):
 
 def test_changed_kernels_recompile_their_callers(monkeypatch, tmp_path):
     monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path))
-    monkeypatch.setattr(compiled, "available_cores", lambda: 1)
     for added, states in ((1.0, 0), (3.0, 0), (3.0, 2), (1.0, 0)):
         texts = {"linear": CALLED.format(added=added), "newton": CALLING}
         monkeypatch.setattr(compiled, "source", texts.__getitem__)

@@ -89,7 +89,7 @@ def test_both_intervals_have_nominal_coverage_with_white_errors(name, robust):
 
 
 def test_robust_sd_equals_the_prior_sd_if_the_prior_dominates():
-    experiment = folded(0.0, 6)[0]
+    experiment = folded(0.0, 6, 1)[0]
     priors = {"k": bp.Normal(900.0, 1e-3), "coulomb": bp.Normal(25.0, 1e-5)}
     fit = bp.map_estimate(bp.Problem(LINEAR, [experiment], priors=priors, fixed={"c": DAMPING}), progress=False)
     assert list(fit.robust_sd.values()) == pytest.approx([1e-3, 1e-5], rel=1e-6)

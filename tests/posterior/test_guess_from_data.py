@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -24,9 +25,10 @@ MODELS = {
 }
 
 
-def problem(case, measured):
-    """Return the problem of 36 drive periods with 1 % noise, after 300, with the medians of the priors off by 20 %."""
-    force, omega, c, k, k3, periods = CASES[case]
+@cache
+def motion(case):
+    """Return displacement and velocity over 36 drive periods, after 300."""
+    force, omega, c, k, k3, _ = CASES[case]
     step = 2 * np.pi / omega / SAMPLES
 
     def slope(n, z):
@@ -39,9 +41,15 @@ def problem(case, measured):
         second = slope(n + 0.5, z + 0.5 * step * first)
         third = slope(n + 0.5, z + 0.5 * step * second)
         z = z + step / 6 * (first + 2 * second + 2 * third + slope(n + 1, z + step * third))
-    y = np.array(found[300 * SAMPLES :])[:, ["displacement", "velocity"].index(measured)]
+    return dict(zip(MODELS, np.array(found[300 * SAMPLES :]).T, strict=True))
+
+
+def problem(case, measured):
+    """Return the problem of the motion with 1 % noise, with the medians of the priors off by 20 %."""
+    force, omega, c, k, k3, periods = CASES[case]
+    y = motion(case)[measured]
     y = y + 0.01 * y.std() * np.random.default_rng(0).standard_normal(y.size)
-    time = np.arange(y.size) * step
+    time = np.arange(y.size) * (2 * np.pi / omega / SAMPLES)
     run = bp.Recording.from_arrays(time, {"y": y}, {"force": force * np.cos(omega * time)}, name="run")
     run = run.fold(SAMPLES, frequency=omega / 2 / np.pi, periods="auto", guess="data")
     assert run.periods == periods

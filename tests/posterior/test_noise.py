@@ -264,7 +264,7 @@ def test_priors_of_the_shape_are_normalised_over_the_logarithm():
         return np.exp(likelihood.log_prior(np.exp([0.0, log_lengthscale, log_floor])))
 
     low, high = np.log([0.03, 0.01]) - 8.0 * np.array([1.5, 2.0]), np.log([0.03, 0.01]) + 8.0 * np.array([1.5, 2.0])
-    x, y = (np.linspace(a, b, 201) for a, b in zip(low, high, strict=True))
+    x, y = (np.linspace(a, b, 61) for a, b in zip(low, high, strict=True))
     values = np.array([[density(b, a) for b in y] for a in x])
     assert integrate.simpson(integrate.simpson(values, x=y), x=x) == pytest.approx(1.0, rel=1e-6)
     assert likelihood.log_prior(np.array([3.0, 0.03, 0.01])) == pytest.approx(-np.log(2 * np.pi * 1.5 * 2.0), rel=1e-12)

@@ -61,5 +61,5 @@ def hostile(tmp_path_factory):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         fit = bp.map_estimate(problem, progress=False)
-        posterior = bp.sample(problem, fit, seed=1, max_steps=250, progress=False)
+        posterior = bp.sample(problem, fit, seed=1, ensembles=2, max_steps=100, progress=False)
         return bp.report(problem, fit, posterior, tmp_path_factory.mktemp("hostile") / "it's <b>.html", title=ATTACK)

@@ -13,6 +13,12 @@ from tests.reporting.conftest import ATTACK, NAME
 from tests.reporting.reading import Page, value
 
 
+@pytest.fixture
+def pictures_left_out(monkeypatch):
+    """Make the figures without writing them as images, which takes most of the time of a report."""
+    monkeypatch.setattr("bayesperiodic.reporting.contents.embedded", lambda drawing, name: "data:,")
+
+
 def test_estimates_are_those_of_fit_and_posterior(solved, page):
     """All that is shown is rounded to a hundredth of a standard deviation, at least."""
     _, fit, posterior = solved
@@ -69,6 +75,7 @@ def test_settings_seed_and_versions_are_shown(solved, page):
     assert versions["numpy"] == [np.__version__]
 
 
+@pytest.mark.usefixtures("pictures_left_out")
 def test_given_verdicts_are_not_recomputed(solved, scored, tmp_path, monkeypatch):
     problem, fit, posterior = solved
     found, predicted = bp.identifiability(problem, fit, profile=False), bp.predict(problem, posterior, draws=20)
@@ -87,6 +94,7 @@ def test_report_of_a_fit_alone_states_that_there_are_no_draws(solved, tmp_path):
     assert {e.attributes["id"] for e in written.all("figure")} == {"figure-fit-1", "figure-loops"}
 
 
+@pytest.mark.usefixtures("pictures_left_out")
 def test_failed_prediction_is_reported(solved, scored, tmp_path, monkeypatch):
     def fail(*_):
         raise RuntimeError("posterior: none of its draws has a periodic solution.")
@@ -96,6 +104,7 @@ def test_failed_prediction_is_reported(solved, scored, tmp_path, monkeypatch):
     assert written.text.count("none of its draws has a periodic solution") == 2
 
 
+@pytest.mark.usefixtures("pictures_left_out")
 def test_fit_with_warnings_is_marked(solved, tmp_path):
     """Synthetic data, a search that stalled, an estimate at its end, a residual that is not white."""
     problem, fit, _ = solved
@@ -109,6 +118,7 @@ def test_fit_with_warnings_is_marked(solved, tmp_path):
     assert "Robust 90 % interval" in text
 
 
+@pytest.mark.usefixtures("pictures_left_out")
 def test_single_points_are_labelled(solved, tmp_path):
     problem, _, _ = solved
     run = problem.experiments[0]
@@ -230,6 +240,7 @@ TREATED = {
 }
 
 
+@pytest.mark.usefixtures("pictures_left_out")
 @pytest.mark.parametrize("noise", TREATED)
 def test_treatment_of_the_inputs_noise_its_size_and_its_linearisation_are_stated(noise, tmp_path):
     fit, page = gain_page(tmp_path, [gain_run()], {"x": 0.05} if noise == "given" else noise)
@@ -245,6 +256,7 @@ def test_treatment_of_the_inputs_noise_its_size_and_its_linearisation_are_stated
     assert ("estimated error of x, measured minus estimated input, with its 90 % band" in alt) is integrated
 
 
+@pytest.mark.usefixtures("pictures_left_out")
 def test_experiments_with_too_few_cycles_are_named_as_exact(tmp_path):
     _, page = gain_page(tmp_path, [gain_run("long"), gain_run("short", cycles=4)], "measured")
     assert "The inputs of short are taken as exact." in page.text
@@ -252,6 +264,7 @@ def test_experiments_with_too_few_cycles_are_named_as_exact(tmp_path):
     assert "the estimated error of x" in shown[0] and "the estimated error" not in shown[1]
 
 
+@pytest.mark.usefixtures("pictures_left_out")
 def test_errors_that_are_not_linear_are_stated_by_the_largest_or_a_failed_solve(tmp_path):
     fit, _ = gain_page(tmp_path, [gain_run()], "measured")
     problem = bp.Problem(GAIN, [gain_run()], priors={"a": bp.Normal(0.0, 10.0)})
@@ -261,6 +274,7 @@ def test_errors_that_are_not_linear_are_stated_by_the_largest_or_a_failed_solve(
         assert f"What is not linear in it changes estimates {stated}" in page.text
 
 
+@pytest.mark.usefixtures("pictures_left_out")
 def test_noise_of_inputs_that_is_negligible_is_said_to_be(tmp_path):
     fit, page = gain_page(tmp_path, [gain_run()], {"x": 1e-6})
     assert not fit.input_errors
@@ -271,9 +285,11 @@ def test_noise_of_inputs_that_is_negligible_is_said_to_be(tmp_path):
     assert "What is not linear" not in page.text and not any("error of x" in e.text for e in page.all("figcaption"))
 
 
+@pytest.mark.usefixtures("pictures_left_out")
 def test_missing_terms_have_a_section_where_they_are_given(solved, page, tmp_path):
     problem, fit = quadratic_damping()
-    found = bp.missing_terms(problem, fit, {"equation of x": ["x**5"]}, outputs=False)
+    wanted = {"equation of x": ["dx*abs(dx)", "x**5"]}
+    found = bp.missing_terms(problem, fit, wanted, equations=False, outputs=False)
     read = Page(bp.report(problem, fit, None, tmp_path / "report.html", missing=found).read_text("utf-8"))
     rows = read.rows("table-missing")
     assert list(rows) == ["given model", "dx*abs(dx)"] and len(rows["given model"]) == len(rows["dx*abs(dx)"]) == 8
@@ -288,7 +304,7 @@ def test_missing_terms_have_a_section_where_they_are_given(solved, page, tmp_pat
     ids = {e.attributes.get("id") for e in read.elements}
     assert {"missing", "figure-missing"} <= ids
     assert "Missing terms" not in page.text
-    none = bp.missing_terms(problem, fit, max_terms=0)
+    none = bp.missing_terms(problem, fit, wanted, equations=False, outputs=False, max_terms=0)
     plain = Page(bp.report(problem, fit, None, tmp_path / "report.html", missing=none).read_text("utf-8"))
     assert "None was added. The search ended after 0 terms" in plain.text
     assert "figure-missing" not in {e.attributes.get("id") for e in plain.elements}
@@ -296,6 +312,7 @@ def test_missing_terms_have_a_section_where_they_are_given(solved, page, tmp_pat
         bp.report(*solved, tmp_path / "report.html", missing=found)
 
 
+@pytest.mark.usefixtures("pictures_left_out")
 def test_a_misspecified_model_is_pointed_to_the_search(solved, scored, tmp_path):
     problem, fit, posterior = solved
     table = bp.predict(problem, posterior, draws=20).table.copy()

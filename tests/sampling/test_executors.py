@@ -9,7 +9,7 @@ import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import cache
 from importlib.util import find_spec
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 
 import numpy as np
@@ -91,12 +91,9 @@ def test_chains_are_identical_for_any_executor(posed, serial, which, request, tm
     assert same(content(path), content(serial[1]))
 
 
-def test_chains_are_identical_for_any_number_of_processes(posed, serial):
-    assert alike(sampled(posed, executor=2), serial[0])
-
-
-def test_chains_with_integrated_variances_are_identical_for_any_executor(posed, processes):
-    assert alike(*(sampled(posed, executor=e, variances="collapsed", max_steps=50) for e in (None, processes)))
+def test_chains_with_integrated_variances_are_identical_for_a_number_of_processes(posed):
+    """Those with sampled variances come from the pool `processes` below, after an interrupt."""
+    assert alike(*(sampled(posed, executor=e, variances="collapsed", max_steps=50) for e in (None, 2)))
 
 
 @pytest.mark.slow
@@ -164,6 +161,39 @@ def test_draws_before_an_interrupt_are_kept(posed, serial, processes, tmp_path, 
         partial = sampled(posed, executor=processes, checkpoint=path, progress=True)
     assert not partial.converged and partial.reason.startswith("interrupted after ")
     assert alike(sampled(posed, executor=processes, checkpoint=path), serial[0])
+
+
+class Failing(stats.rv_continuous):
+    """A standard normal distribution whose density raises in the processes of an executor."""
+
+    def _logpdf(self, x):
+        if parent_process() is not None:
+            raise ZeroDivisionError("in the prior")
+        return -0.5 * x**2 - 0.5 * np.log(2 * np.pi)
+
+    def _pdf(self, x):
+        return np.exp(self._logpdf(x))
+
+    def _cdf(self, x):
+        return stats.norm.cdf(x)
+
+    def _ppf(self, q):
+        return stats.norm.ppf(q)
+
+
+# That the exception of a task reaches the caller from Dask too is a test of test__parallel.py.
+@pytest.mark.parametrize("which", ["processes", pytest.param("dask", marks=pytest.mark.slow)])
+def test_exception_in_a_prior_of_the_user_reaches_the_caller(which, posed, request, tmp_path):
+    """The checkpoint of the steps before it is intact, and the executor can be used again."""
+    priors = DUFFING_PRIORS | {"k3": Failing(name="failing")(0.5, 0.3)}
+    problem = bp.Problem(bp.models.duffing, [duffing_run()], priors=priors, fixed={"m": 1.0})
+    failing, path = (problem, bp.map_estimate(problem, progress=False)), tmp_path / "run.h5"
+    sampled(failing, checkpoint=path, max_steps=50)
+    before, executor = path.read_bytes(), request.getfixturevalue(which)
+    with pytest.raises(ZeroDivisionError, match="in the prior"):
+        sampled(failing, checkpoint=path, executor=executor)
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["run.h5"]
+    assert sampled(posed, executor=executor, max_steps=50).draws("k").size
 
 
 @pytest.mark.slow

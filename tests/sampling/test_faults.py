@@ -1,16 +1,14 @@
-"""Full disks, exceptions, and killed processes under every executor: one error, no process left, the same chain."""
+"""Full disks and killed processes under every executor: one error, no process left, the same chain."""
 
 import os
 import signal
 import subprocess
 import sys
 import time
-from multiprocessing import parent_process
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
 
 import bayesperiodic as bp
 from tests.known import LINEAR, linear_experiment
@@ -21,8 +19,8 @@ PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": 
 RUN = {"seed": 5, "ensembles": 2, "walkers": 8, "max_steps": 150, "progress": False}
 
 
-def posed(**priors):
-    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS | priors)
+def posed():
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS)
     return problem, bp.map_estimate(problem, progress=False)
 
 
@@ -45,37 +43,6 @@ def test_full_disk_is_an_error_after_which_the_run_goes_on(which, request, tmp_p
     assert path.read_bytes() == before and os.listdir(tmp_path) == ["run.h5"]
     resumed = bp.sample(*problem, checkpoint=path, executor=executor, **RUN)
     assert all(np.array_equal(resumed.draws(name), expected.draws(name)) for name in expected.names)
-
-
-class Failing(stats.rv_continuous):
-    """A standard normal distribution whose density raises in the processes of an executor."""
-
-    def _logpdf(self, x):
-        if parent_process() is not None:
-            raise ZeroDivisionError("in the prior")
-        return -0.5 * x**2 - 0.5 * np.log(2 * np.pi)
-
-    def _pdf(self, x):
-        return np.exp(self._logpdf(x))
-
-    def _cdf(self, x):
-        return stats.norm.cdf(x)
-
-    def _ppf(self, q):
-        return stats.norm.ppf(q)
-
-
-@pytest.mark.parametrize("which", ["processes", "dask"])
-def test_exception_in_a_prior_of_the_user_reaches_the_caller(which, request, tmp_path):
-    """The checkpoint of the steps before it is intact, and the executor can be used again."""
-    problem, path, executor = posed(coulomb=Failing(name="failing")(20.0, 10.0)), tmp_path / "run.h5", None
-    bp.sample(*problem, checkpoint=path, **(RUN | {"max_steps": 50}))
-    before, executor = path.read_bytes(), request.getfixturevalue(which)
-    with pytest.raises(ZeroDivisionError, match="in the prior"):
-        bp.sample(*problem, checkpoint=path, executor=executor, **RUN)
-    assert path.read_bytes() == before and os.listdir(tmp_path) == ["run.h5"]
-    sound = posed()
-    assert bp.sample(*sound, executor=executor, **(RUN | {"max_steps": 50})).draws("k").size
 
 
 JOB = """

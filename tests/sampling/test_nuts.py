@@ -103,12 +103,12 @@ def test_nuts_matches_the_closed_form_within_monte_carlo_error(monkeypatch):
     priors = PRIORS | {"c": bp.Normal(30.0, 20.0)}
     experiment = linear_experiment(TRUTH, 3.0, seed=1)
     problem = bp.Problem(LINEAR, [experiment], priors=priors, fixed={"variance[force]": 9.0})
-    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, **NUTS)
+    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, ensembles=2, **NUTS)
     design = linear_regressors(0.05, 2.0, grid(40))
     precision = np.diag([60.0**-2, 20.0**-2, 10.0**-2])
     covariance = np.linalg.inv(design.T @ design / 9.0 + precision)
     means = covariance @ (design.T @ experiment.outputs["force"] / 9.0 + precision @ [800.0, 30.0, 20.0])
-    assert posterior.converged and posterior.reason.endswith("draws of 4 chains")
+    assert posterior.converged and posterior.reason.endswith("draws of 2 chains")
     assert min(posterior.ess.values()) > 4 * convergence.LENGTHS_ALONE
     assert posterior.failures == {}
     for name, mean, sd in zip(problem.names, means, np.sqrt(np.diag(covariance)), strict=True):
@@ -194,11 +194,12 @@ def test_failed_solves_and_trajectories_that_end_in_them_are_counted(edge, brief
 
 @needs_nutpie
 def test_interrupted_run_returns_its_draws(linear, briefly, monkeypatch):
-    monkeypatch.setattr(nuts, "stop_rule", interrupting_at(250))
+    monkeypatch.setattr(nuts, "BLOCK", 50)
+    monkeypatch.setattr(nuts, "stop_rule", interrupting_at(50))
     posterior = bp.sample(*linear, seed=1, **(briefly | {"max_steps": 5000}))
     assert not posterior.converged
     assert posterior.reason == f"interrupted after {posterior.data['posterior'].sizes['draw']} draws"
-    assert posterior.data["posterior"].sizes["draw"] >= 250
+    assert posterior.data["posterior"].sizes["draw"] >= 50
 
 
 def interrupting_at(draws: int) -> Callable[..., tuple]:
@@ -216,6 +217,7 @@ def test_terminated_run_returns_its_draws(linear, briefly, monkeypatch):
         signal.raise_signal(signal.SIGTERM)
         return np.empty(0), ["nothing"]
 
+    monkeypatch.setattr(nuts, "BLOCK", 50)
     monkeypatch.setattr(nuts, "stop_rule", terminate)
     posterior = bp.sample(*linear, seed=1, **(briefly | {"max_steps": 5000}))
     assert posterior.reason.startswith("interrupted after ") and not posterior.converged

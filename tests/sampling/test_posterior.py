@@ -103,7 +103,7 @@ def test_variances_of_each_experiment_follow_their_closed_form(prior, spent):
         noise=bp.noise.Independent(per="experiment", prior=prior),
     )
     assert problem.free_noise == (f"variance[force, {FIRST}]", f"variance[force, {SECOND}]")
-    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), seed=2, max_steps=750, **PAIR)
+    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), seed=2, max_steps=250, **PAIR)
     degrees, error = 40 - spent, 4 / np.sqrt(min(posterior.ess.values()))
     scores = []
     for e, name in zip(problem.experiments, problem.free_noise, strict=True):
@@ -157,7 +157,7 @@ def test_correlated_errors_have_the_posterior_of_a_quadrature_over_the_correlati
         noise=bp.noise.Circulant(kernel="exponential"),
     )
     fit = bp.map_estimate(problem, **QUIET)
-    posterior = bp.sample(problem, fit, seed=3, max_steps=1500, **PAIR)
+    posterior = bp.sample(problem, fit, seed=3, max_steps=250, **PAIR)
     assert posterior.names == ("k", "variance[force]", "lengthscale[force]")
 
     data = experiment.outputs["force"] - REGRESSORS[:, 1:] @ TRUTH[1:]
@@ -190,7 +190,7 @@ def test_model_error_above_measured_noise_follows_its_closed_form():
         fixed={"k": 900.0, "c": 40.0},
         noise="measured",
     )
-    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), seed=4, max_steps=1500, **PAIR)
+    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), seed=4, max_steps=250, **PAIR)
     moment = profiled(first.outputs["force"] - REGRESSORS[:, :2] @ TRUTH[:2], REGRESSORS[:, 2:], np.eye(40))[1]
     chi = stats.chi2(39)
     mass = chi.cdf(moment / 4.0)
@@ -407,7 +407,7 @@ def test_failed_solves_are_counted_by_cause():
         "run", 1.0, {"x": 0.3 + 0.2 * np.random.default_rng(1).standard_normal(12)}, {"u": np.zeros(12)}, samples=12
     )
     problem = bp.Problem(SADDLE_NODE, [run], priors={"a": bp.Normal(0.1, 0.3)}, fixed={"variance[x]": 0.2})
-    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=250, **PAIR)
+    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=100, **PAIR)
     assert posterior.draws("a").min() > 0.0
     assert sum(posterior.failures.values()) > 0.05
     assert posterior.summary().attrs["failures"] == posterior.failures

@@ -14,6 +14,16 @@ TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(900.0, 60.0), "c": bp.Normal(40.0, 20.0), "coulomb": bp.Normal(25.0, 10.0)}
 
 
+SHORT = {"seed": 1, "walkers": 8, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def rotating():
+    """Return the problem of an unstable rotation of the pendulum, and draws."""
+    problem = pendulum_problem([pendulum_run()])
+    return problem, bp.sample(problem, bp.map_estimate(problem, progress=False), max_steps=100, **SHORT)
+
+
 @pytest.mark.parametrize("case", [name for name in CASES if name != "autonomous"])
 def test_residual_of_a_replicate_equals_its_simulated_noise(case):
     """The residual components of a simulated experiment equal those of its noise, within the kept harmonics."""
@@ -52,7 +62,7 @@ def test_simulated_noise_has_the_covariance_of_the_likelihood(case):
 def test_replicates_scatter_about_the_draws_own_curves_by_their_own_variances():
     """100 draws of a linear model: the squared distance is χ² per sample, its mean within 4 standard errors."""
     problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS)
-    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=500, progress=False)
+    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), max_steps=250, **SHORT)
     replicates = posterior.tree["posterior_predictive"].to_dataset()
     draws = posterior.tree["posterior"].to_dataset().sel(chain=replicates["chain"], draw=replicates["draw"])
     theta = np.stack([draws[name].to_numpy() for name in problem.names], axis=-1)
@@ -66,10 +76,9 @@ def test_replicates_scatter_about_the_draws_own_curves_by_their_own_variances():
     assert np.all(posterior.data["sample_stats"]["status"] == 0)
 
 
-def test_predictive_multipliers_are_reported_without_rejecting_draws():
+def test_predictive_multipliers_are_reported_without_rejecting_draws(rotating):
     """The pendulum's rotation is unstable at every draw, and its multiplier is the solver's."""
-    problem = pendulum_problem([pendulum_run()])
-    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=250, progress=False)
+    problem, posterior = rotating
     group = posterior.tree["posterior_predictive"].to_dataset()
     largest = group["largest_multiplier"].sel(experiment="rotation")
     assert largest.shape == (4, 25) and np.all(largest > 1.0) and not posterior.failures
@@ -81,10 +90,9 @@ def test_predictive_multipliers_are_reported_without_rejecting_draws():
     assert np.all(np.abs(group["rotation angle"] - data) <= np.pi)
 
 
-def test_predictions_start_from_the_orbits_of_the_draws():
+def test_predictions_start_from_the_orbits_of_the_draws(rotating):
     """With the problem anchored elsewhere the prediction stays on the rotation that was sampled."""
-    problem = pendulum_problem([pendulum_run()])
-    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=250, progress=False)
+    problem, posterior = rotating
     states = posterior.guesses(["rotation"], ["phi"])["rotation"]
     assert states["phi"][-1] - states["phi"][0] == pytest.approx(2 * np.pi, abs=0.2)
     middle = {name: float(np.median(posterior.draws(name))) for name in problem.names}

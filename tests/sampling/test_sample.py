@@ -14,6 +14,8 @@ TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
 QUIET = {"progress": False}
 PAIR = QUIET | {"ensembles": 2}
+# Tuned proposals from step 100 on.
+SHORT = PAIR | {"walkers": 8, "max_steps": 150}
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +96,7 @@ def test_variances_of_a_spectrum_of_unknown_shape_cannot_be_collapsed():
     noise = bp.noise.Circulant()
     problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=2)], priors=PRIORS, noise=noise)
     with pytest.raises(ValueError, match="or of circulant ones with a fixed shape"):
-        bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, variances="collapsed", **PAIR)
+        bp.sample(problem, bp.map_estimate(problem, starts=1, **QUIET), seed=1, variances="collapsed", **PAIR)
 
 
 def regressors() -> np.ndarray:
@@ -128,29 +130,29 @@ def test_positive_parameter_sampled_in_its_logarithm_keeps_its_natural_density()
 
 
 def test_same_seed_gives_identical_draws_and_another_seed_others(known_variance):
-    first, again, other = (bp.sample(*known_variance, seed=s, max_steps=250, **PAIR) for s in (5, 5, 6))
+    first, again, other = (bp.sample(*known_variance, seed=s, **SHORT) for s in (5, 5, 6))
     assert np.array_equal(first.draws("k"), again.draws("k"))
     assert not np.array_equal(first.draws("k"), other.draws("k"))
 
 
 def test_draws_do_not_depend_on_the_number_of_cores(known_variance, monkeypatch):
-    two = bp.sample(*known_variance, seed=5, max_steps=250, **PAIR)
+    two = bp.sample(*known_variance, seed=5, **SHORT)
     for module in (observation, batch):
         monkeypatch.setattr(module, "available_cores", lambda: 1)
-    assert np.array_equal(two.draws("k"), bp.sample(*known_variance, seed=5, max_steps=250, **PAIR).draws("k"))
+    assert np.array_equal(two.draws("k"), bp.sample(*known_variance, seed=5, **SHORT).draws("k"))
 
 
 def test_reaching_max_steps_is_reported(known_variance):
-    posterior = bp.sample(*known_variance, seed=1, max_steps=250, **PAIR)
+    posterior = bp.sample(*known_variance, seed=1, **SHORT)
     assert not posterior.converged
-    assert posterior.reason.startswith("max_steps = 250 reached with ")
+    assert posterior.reason.startswith("max_steps = 150 reached with ")
     assert "NOT CONVERGED" in repr(posterior)
 
 
 def test_resumed_run_gives_the_same_chain(known_variance, tmp_path):
-    whole = bp.sample(*known_variance, seed=5, max_steps=500, **PAIR)
-    bp.sample(*known_variance, seed=5, max_steps=250, checkpoint=tmp_path / "run.h5", **PAIR)
-    resumed = bp.sample(*known_variance, seed=5, max_steps=500, checkpoint=tmp_path / "run.h5", **PAIR)
+    whole = bp.sample(*known_variance, seed=5, **(SHORT | {"max_steps": 250}))
+    bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **SHORT)
+    resumed = bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **(SHORT | {"max_steps": 250}))
     assert np.array_equal(whole.draws("k"), resumed.draws("k"))
 
 
@@ -165,12 +167,12 @@ def test_finished_run_comes_back_from_its_checkpoint(known_variance, tmp_path, m
 
 
 def test_checkpoint_of_another_run_is_refused(known_variance, tmp_path):
-    bp.sample(*known_variance, seed=5, max_steps=250, checkpoint=tmp_path / "run.h5", **PAIR)
+    bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **SHORT)
     with pytest.raises(ValueError, match="must be a file of this run"):
-        bp.sample(*known_variance, seed=6, max_steps=250, checkpoint=tmp_path / "run.h5", **PAIR)
+        bp.sample(*known_variance, seed=6, checkpoint=tmp_path / "run.h5", **SHORT)
     (tmp_path / "text.h5").write_text("no HDF5")
     with pytest.raises(ValueError, match="checkpoint: must be an intact file, got"):
-        bp.sample(*known_variance, seed=6, max_steps=250, checkpoint=tmp_path / "text.h5", **PAIR)
+        bp.sample(*known_variance, seed=6, checkpoint=tmp_path / "text.h5", **SHORT)
 
 
 def test_draws_pass_into_arviz_and_carry_units(posterior):
@@ -259,6 +261,6 @@ def test_burn_in_starts_again_if_slow_moves_are_expected_at_the_draws_kept(known
         return 10.0 if len(asked) == slow else 2.0
 
     monkeypatch.setattr(sample_module, "expected_time", stated)
-    posterior = bp.sample(*known_variance, seed=1, max_steps=350, **PAIR)
+    posterior = bp.sample(*known_variance, seed=1, **(SHORT | {"max_steps": 350}))
     assert posterior.tree["proposal"].attrs["burn_in"] == burn_in
     assert posterior.by_step(posterior.draws("k")).shape[1] == 350 - burn_in

@@ -82,7 +82,13 @@ def change_of(model, outputs, symmetry):
 
 
 def unchanged(model, outputs, symmetry):
-    return all(sp.simplify(sp.cancel(sp.together(e))) == 0 for e in change_of(model, outputs, symmetry))
+    return all(map(vanishes, change_of(model, outputs, symmetry)))
+
+
+def vanishes(expression):
+    """Return whether an expression is zero: a rational one is, if its numerator is."""
+    numerator = sp.expand(sp.numer(sp.together(expression)))
+    return numerator == 0 or (not numerator.is_polynomial() and sp.simplify(numerator) == 0)
 
 
 LIBRARY = {
