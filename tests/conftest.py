@@ -21,16 +21,25 @@ settings.register_profile("thorough", settings.get_profile("default"), max_examp
 settings.load_profile("default")
 
 
+# pytest occupies all cores: the process that needs kernels compiles them alone.
+compiled.available_cores = lambda: 1
+# Number of states and stencil of the kernels that nearly all tests use.
+COMMON = ((1, (2, 3, 2)), (1, (3, 4, 6)))
+
+
+def pytest_collection_finish(session):
+    """Compile for one of `COMMON` in each process, before all tests; each would compile for all at the same time."""
+    worker = getattr(session.config, "workerinput", {"workerid": "gw0", "workercount": 1})
+    if worker["workercount"] > 1 and len(session.items) > 1000:
+        for states, stencil in COMMON[int(worker["workerid"][2:]) :: worker["workercount"]]:
+            for name in ("adjoint", "autonomous"):
+                compiled.kernels(name, states, stencil)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def interrupts():
     """Enable SIGINT, which a shell disables for tests that it runs in the background."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def compilation_in_one_process():
-    """Compile in this process alone, because pytest occupies all cores."""
-    compiled.available_cores = lambda: 1
 
 
 @pytest.fixture(scope="session", autouse=True)
