@@ -10,7 +10,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -236,8 +236,8 @@ def _constants(name: str, sizes: tuple[int, ...]) -> dict[str, Any]:
 def _other_process(name: str, sizes: tuple[int, ...]) -> Iterator[None]:
     """Compile one of `MODULES` in another process, while this one compiles the one that it is based on.
 
-    Neither needs what the other compiles before it runs. If the other process fails, its entry is missing in the cache,
-    and is compiled here.
+    Neither needs what the other compiles before it runs. If the other process cannot be started or fails, its entry is
+    missing in the cache, and is compiled here.
     """
     base = MODULES[name][1] or ""
     alone = MODULES[base][1] or not Path(sys.executable or "").stem.startswith("python") or available_cores() < 2
@@ -246,12 +246,12 @@ def _other_process(name: str, sizes: tuple[int, ...]) -> Iterator[None]:
         return
     call = f"from {__name__} import compile_alone; compile_alone({name!r}, {sizes!r})"
     command = [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}; {call}"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        try:
-            yield
-        except BaseException:
-            process.kill()
-            raise
+    with ExitStack() as stack:
+        with suppress(OSError):
+            silent = subprocess.DEVNULL
+            process = stack.enter_context(subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent))
+            stack.push(lambda error, *_: process.kill() if error else None)
+        yield
 
 
 def compile_alone(name: str, sizes: tuple[int, ...]) -> None:

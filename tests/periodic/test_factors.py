@@ -285,15 +285,31 @@ def test_changed_kernels_recompile_their_callers(monkeypatch, tmp_path):
         assert caller.twice(1.0) == 2.0 * (1.0 + added + states)
 
 
-@pytest.mark.parametrize(("executable", "starts"), [("python3", True), ("application", False)])
+def test_an_interrupted_compilation_ends_the_other_process(monkeypatch, tmp_path):
+    monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path))
+    monkeypatch.setattr(compiled, "available_cores", lambda: 2)
+    started = []
+    real = compiled.subprocess.Popen
+    monkeypatch.setattr(
+        compiled.subprocess, "Popen", lambda command, **o: started.append(real(["sleep", "600"], **o)) or started[0]
+    )
+    with pytest.raises(KeyboardInterrupt), compiled._other_process("newton", (1, 2, 3, 2)):
+        raise KeyboardInterrupt
+    assert started[0].returncode not in (None, 0)
+
+
+@pytest.mark.parametrize(
+    ("executable", "starts"), [("python3", True), ("python missing", False), ("application", False)]
+)
 def test_a_failure_of_the_other_process_that_compiles_is_made_up_for(monkeypatch, tmp_path, executable, starts):
     monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(compiled, "available_cores", lambda: 2)
     monkeypatch.setattr(compiled, "source", {"linear": CALLED.format(added=1.0), "newton": CALLING}.__getitem__)
     monkeypatch.setattr(compiled, "_kernels", cache(ORIGINAL.__wrapped__))
     script = tmp_path / executable
-    script.write_text(f"#!/bin/sh\ntouch {tmp_path}/started\nexit 1\n")
-    script.chmod(0o700)
+    if "missing" not in executable:
+        script.write_text(f"#!/bin/sh\ntouch {tmp_path}/started\nexit 1\n")
+        script.chmod(0o700)
     monkeypatch.setattr(compiled.sys, "executable", str(script))
     assert compiled.kernels("newton", 2, (1, 1, 1)).twice(1.0) == 8.0
     assert (tmp_path / "started").exists() == starts
