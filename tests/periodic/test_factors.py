@@ -291,7 +291,7 @@ def test_an_interrupted_compilation_ends_the_other_process(monkeypatch, tmp_path
     started = []
     real = compiled.subprocess.Popen
     monkeypatch.setattr(
-        compiled.subprocess, "Popen", lambda command, **o: started.append(real(["sleep", "600"], **o)) or started[0]
+        compiled.subprocess, "Popen", lambda command, **o: started.append(real(["sleep", "60"], **o)) or started[0]
     )
     with pytest.raises(KeyboardInterrupt), compiled._other_process("newton", (1, 2, 3, 2)):
         raise KeyboardInterrupt
