@@ -264,5 +264,8 @@ def kernel(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Ker
 
 
 def inlined(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles a function by ``njit`` into its callers; in a declared module if it has any."""
+    """Return a decorator that compiles a function by ``njit`` into its callers; in a declared module if it has any.
+
+    Python must not call it, if it has the option `no_cpython_wrapper`.
+    """
     return lambda function: numba.njit(*[] if function.__globals__["DECLARED"] else [signature], **options)(function)
