@@ -5,8 +5,9 @@ different units. All decompositions here are those of the matrix scaled to a uni
 """
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import cache, wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from scipy.linalg import orth
@@ -69,10 +70,15 @@ def in_one_thread(function: Callable[Arguments, Value]) -> Callable[Arguments, V
 
     @wraps(function)
     def limited(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Value:
-        with _libraries().limit(limits=1, user_api="blas"):
+        with one_thread():
             return function(*args, **kwargs)
 
     return limited
+
+
+def one_thread() -> AbstractContextManager[Any]:
+    """Limit BLAS to one thread, see `in_one_thread`, without a frame of its own where warnings name the caller's."""
+    return _libraries().limit(limits=1, user_api="blas")
 
 
 @cache

@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
-from bayesperiodic._linalg import in_one_thread
+from bayesperiodic._linalg import one_thread
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.files import Units, convert, read_csv, read_mat, read_npz
 from bayesperiodic.data.folding import AUTO, Signals, automatic_periods, fold_signals, parts
@@ -383,7 +383,6 @@ class Recording(Result):
         outputs, inputs = ({key: v[samples] for key, v in kind.items()} for kind in (self.outputs, self.inputs))
         return replace(self, time=self.time[samples], outputs=outputs, inputs=inputs, name=name)
 
-    @in_one_thread
     def fold(
         self,
         samples: int = 800,
@@ -483,7 +482,8 @@ class Recording(Result):
             if periods == AUTO:
                 periods, evidence = automatic_periods(signals, frequency)
             periods = _checks.integer("periods", periods, 1)
-            folded = fold_signals(signals, samples, periods, frequency, harmonics, origin, largest_drift)
+            with one_thread():
+                folded = fold_signals(signals, samples, periods, frequency, harmonics, origin, largest_drift)
         except np.linalg.LinAlgError:
             raise ValueError(
                 f"recording: must have samples in all parts of its periods, got {self.name!r}, which has too few; "

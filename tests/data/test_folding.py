@@ -373,8 +373,9 @@ def test_drift_of_the_period_is_reported_with_a_warning(change):
     """The drift over the K cycles used is K/40 of that over the recording."""
     with pytest.warns(
         UserWarning, match=r"free: the period changes by [+-]0\.\d+% over the \d+ cycles used \(of \d+\)"
-    ):
+    ) as caught:
         e = drifting(change).fold(64)
+    assert caught[0].filename == __file__
     assert e.period_drift == pytest.approx(change * e.cycles / 40, rel=0.1)
 
 
