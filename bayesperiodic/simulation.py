@@ -7,8 +7,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from bayesperiodic import _checks, _fourier
+from bayesperiodic._compile.code_generation import as_columns
 from bayesperiodic.data.recording import Recording
-from bayesperiodic.models.code_generation import as_columns
 from bayesperiodic.models.model import Model, integration_kernels
 
 RELATIVE_TOLERANCE = 1e-10

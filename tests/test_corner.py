@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal, norm
 import bayesperiodic as bp
 from bayesperiodic.plot import pairs, regions
 from bayesperiodic.plot.style import ENSEMBLES
-from bayesperiodic.posterior.parameters import support
+from bayesperiodic.problem.parameters import support
 from bayesperiodic.sampling.convergence import arviz
 from tests.drawn import posterior_of
 

@@ -12,10 +12,10 @@ from scipy.fft import dct
 
 from bayesperiodic._linalg import column_space
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.log_posterior import Linearisation
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.result import MapEstimate, of_periodogram
-from bayesperiodic.posterior.density import Linearisation
-from bayesperiodic.posterior.noise import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
-from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.likelihood.noise import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
 
 ABSORBED = 1e-3
 NOT_TESTED = float("nan")

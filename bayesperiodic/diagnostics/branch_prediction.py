@@ -10,12 +10,12 @@ from tqdm import tqdm
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.predictive import QUANTILES, draws_of
 from bayesperiodic.periodic.continuation import FOLD, Branch, continue_periodic
 from bayesperiodic.periodic.equations import FREQUENCY
-from bayesperiodic.posterior.description import check_results
-from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.problem.description import check_results
+from bayesperiodic.sampling.draws import Posterior
 
 MEASURES = AMPLITUDE, MAXIMUM = "amplitude", "maximum"
 # Values of the varied quantity in a band, and the fraction of the draws that must have an orbit at them.

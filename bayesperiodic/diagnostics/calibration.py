@@ -22,15 +22,15 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic._parallel import checkpointed_tasks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import holm
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.posterior.description import fingerprint
-from bayesperiodic.posterior.input_noise import JOINT, MEASURED, error_waves, noisy_inputs
-from bayesperiodic.posterior.joint_priors import as_prior
-from bayesperiodic.posterior.noise import EXPERIMENT, VARIANCE, Independent
-from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.likelihood.input_noise import JOINT, MEASURED, error_waves, noisy_inputs
+from bayesperiodic.likelihood.noise import EXPERIMENT, VARIANCE, Independent
+from bayesperiodic.priors.joint import as_prior
+from bayesperiodic.problem.description import fingerprint
+from bayesperiodic.sampling.draws import Posterior
 from bayesperiodic.sampling.sample import sample
 from bayesperiodic.simulation import NotSettled, steady_cycle
 

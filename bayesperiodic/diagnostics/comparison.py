@@ -13,17 +13,17 @@ from scipy.stats import skew
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.density.log_posterior import COLLAPSED, NATURAL, LogPosterior, SamplingCoordinates
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics import verdicts
 from bayesperiodic.diagnostics.adequacy import misfit
 from bayesperiodic.diagnostics.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, USABLE_K, WIDE, Sample
 from bayesperiodic.estimation.modes import notable
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
-from bayesperiodic.posterior.density import COLLAPSED, NATURAL, LogPosterior, SamplingCoordinates
-from bayesperiodic.posterior.description import check_results
-from bayesperiodic.posterior.parameters import unit
-from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.parameters import unit
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.sampling.draws import Posterior
 from bayesperiodic.sampling.starts import laplace_approximation
 
 SAMPLING = "sampling"

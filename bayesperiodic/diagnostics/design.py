@@ -13,8 +13,8 @@ from scipy.special import ndtr
 from bayesperiodic import _checks
 from bayesperiodic._linalg import hessian_eigh
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.posterior.problem import Problem
 
 ONE_SD = float(ndtr(1.0))
 SMALLEST, NEGLIGIBLE = 1e-12, 1e-3

@@ -12,6 +12,7 @@ from scipy.special import ndtr, softmax, stdtr
 
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import misfit
 from bayesperiodic.diagnostics.design import Candidate, Information, default_candidates, rank_candidates
 from bayesperiodic.diagnostics.predictive import draws_of
@@ -21,10 +22,9 @@ from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
-from bayesperiodic.posterior.description import check_results
-from bayesperiodic.posterior.parameters import SHIFT, local_names
-from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.parameters import SHIFT, local_names
+from bayesperiodic.sampling.draws import Posterior
 from bayesperiodic.symmetry.determining import system_of, with_signs
 from bayesperiodic.symmetry.structure import Structure, analyse_structure
 

@@ -13,6 +13,7 @@ from scipy import stats
 from bayesperiodic import _checks
 from bayesperiodic._io import NOT_STORED, Result
 from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import ALL, adequacy
 from bayesperiodic.diagnostics.candidates import (
     Candidate,
@@ -37,8 +38,7 @@ from bayesperiodic.diagnostics.score_tests import ScoreTests, lags_to_try, varia
 from bayesperiodic.estimation.map_estimate import map_estimate, nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
-from bayesperiodic.posterior.description import check_results
-from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.problem.description import check_results
 
 # Ratio of the errors in experiments that are left out from which on these tell two terms apart.
 WORSE = 2.0

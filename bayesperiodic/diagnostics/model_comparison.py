@@ -14,17 +14,17 @@ from scipy.special import expit, softmax
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import MISSPECIFIED
 from bayesperiodic.diagnostics.predictive import draws_of, predict
 from bayesperiodic.diagnostics.verdicts import UNCONVERGED, USABLE_K
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.modes import default_starts
-from bayesperiodic.posterior.description import check_results, digest
-from bayesperiodic.posterior.parameters import CHAIN, DRAW, EXPERIMENT
-from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.problem.description import check_results, digest
+from bayesperiodic.problem.parameters import CHAIN, DRAW, EXPERIMENT
 from bayesperiodic.sampling import convergence
+from bayesperiodic.sampling.draws import OBSERVATION, Posterior, log_likelihood_terms
 from bayesperiodic.sampling.evidence import evidence
-from bayesperiodic.sampling.posterior import OBSERVATION, Posterior, log_likelihood_terms
 from bayesperiodic.sampling.sample import sample
 
 # Log evidence ratio of a probability of 95 %. A difference of ELPD below 4 is too small for its standard error to be

@@ -7,15 +7,15 @@ from functools import cached_property
 import numpy as np
 
 from bayesperiodic._linalg import TINY, hessian_scale, scaled
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.candidates import Candidate, lag_names
 from bayesperiodic.estimation.gauss_newton import SINGULAR, Iterate, Objective
 from bayesperiodic.estimation.map_estimate import nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.solution import PeriodicSolution
-from bayesperiodic.posterior.parameters import local_names
-from bayesperiodic.posterior.priors import LogNormal, Normal
-from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.priors.single import LogNormal, Normal
+from bayesperiodic.problem.parameters import local_names
 
 # Standard deviations of the difference of two log-likelihoods from which on the data tell two terms apart.
 DISTINCT = 2.0

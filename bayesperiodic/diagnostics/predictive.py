@@ -15,6 +15,8 @@ from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
+from bayesperiodic.density.log_posterior import NATURAL
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import (
     ALL,
     LEVEL,
@@ -29,11 +31,9 @@ from bayesperiodic.estimation.conflict import prior_conflict
 from bayesperiodic.estimation.gauss_newton import Objective, bias_correction
 from bayesperiodic.periodic import arclength
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
-from bayesperiodic.posterior.density import NATURAL
-from bayesperiodic.posterior.description import check_results
-from bayesperiodic.posterior.parameters import CHAIN, DRAW
-from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.parameters import CHAIN, DRAW
+from bayesperiodic.sampling.draws import Posterior
 
 PROBABILITY = 0.9
 # Of the median and of the ends of the central band.

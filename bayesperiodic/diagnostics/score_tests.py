@@ -10,15 +10,15 @@ from scipy import stats
 from bayesperiodic import _fourier
 from bayesperiodic._linalg import column_space
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import Whitened, used
 from bayesperiodic.diagnostics.candidates import MEMORY, Candidate, factors, places, values
 from bayesperiodic.estimation.covariance import predicted_changes, residual_variances
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.likelihood.noise import KNOWN
 from bayesperiodic.periodic.equations import PeriodicEquations, respond
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
-from bayesperiodic.posterior.noise import KNOWN
-from bayesperiodic.posterior.problem import Problem
 
 # Part of the square of an effect that the parameters cannot have instead, below which the two cannot be told apart.
 UNIDENTIFIABLE = 1e-6

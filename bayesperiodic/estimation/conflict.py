@@ -10,11 +10,11 @@ import pandas as pd
 from scipy.special import chdtrc, chdtri, ndtr, ndtri, stdtrit
 
 from bayesperiodic._linalg import column_space
+from bayesperiodic.density.log_posterior import RIDGE, LogPosterior
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, bias_correction, climb
-from bayesperiodic.posterior.density import RIDGE, LogPosterior
-from bayesperiodic.posterior.joint_priors import JointPrior, MultivariateNormal
-from bayesperiodic.posterior.priors import LogNormal, TruncatedNormal
-from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.priors.joint import JointPrior, MultivariateNormal
+from bayesperiodic.priors.single import LogNormal, TruncatedNormal
 
 LEVEL = 0.01
 # Largest error, in widths of the prior, of a direction that is tested: the data have 1 % of the prior's information.

@@ -10,12 +10,10 @@ from scipy.linalg import lu_factor, lu_solve
 from bayesperiodic import _fourier
 from bayesperiodic._linalg import TINY, covariance_eigh, hessian_scale, scaled
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.problem import Problem
+from bayesperiodic.density.responses import orbit_multipliers
 from bayesperiodic.estimation.gauss_newton import Iterate, changes_by_variance, information
-from bayesperiodic.periodic.compiled import CONVERGED
-from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, input_sensitivities
-from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
-from bayesperiodic.periodic.solve import solve_driven, solve_free
-from bayesperiodic.posterior.input_noise import (
+from bayesperiodic.likelihood.input_noise import (
     InputErrors,
     InputNoise,
     directions,
@@ -24,11 +22,13 @@ from bayesperiodic.posterior.input_noise import (
     expected_errors,
     true_inputs,
 )
-from bayesperiodic.posterior.likelihood import Likelihood
-from bayesperiodic.posterior.noise import LENGTHSCALE, SPECTRAL, VARIANCE, Block
-from bayesperiodic.posterior.observation import Response
-from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.posterior.simulator import orbit_multipliers
+from bayesperiodic.likelihood.likelihood import Likelihood
+from bayesperiodic.likelihood.noise import LENGTHSCALE, SPECTRAL, VARIANCE, Block
+from bayesperiodic.likelihood.observation import Response
+from bayesperiodic.periodic.compiled import CONVERGED
+from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, input_sensitivities
+from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
+from bayesperiodic.periodic.solve import solve_driven, solve_free
 
 # Correlation lengths tried, in response periods, and the prior probability of white noise, the alternative to them.
 LENGTHSCALES = np.geomspace(1e-3, 3.0, 40)

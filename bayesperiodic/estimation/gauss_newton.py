@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesperiodic._linalg import hessian_eigh, hessian_scale, scaled
-from bayesperiodic.posterior.density import Linearisation, LogPosterior
-from bayesperiodic.posterior.description import Description
-from bayesperiodic.posterior.noise_estimate import estimate_noise
+from bayesperiodic.density.log_posterior import Linearisation, LogPosterior
+from bayesperiodic.likelihood.noise_estimate import estimate_noise
+from bayesperiodic.problem.description import Description
 
 MAX_ITERATIONS = 100
 MAX_HALVINGS = 30

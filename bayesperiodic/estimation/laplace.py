@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from bayesperiodic._linalg import covariance_eigh, hessian_eigh, hessian_scale, scaled
+from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.estimation.gauss_newton import SINGULAR, Iterate, Objective, climb
-from bayesperiodic.posterior.density import LogPosterior
-from bayesperiodic.posterior.description import Description
+from bayesperiodic.problem.description import Description
 
 STEP = 1e-3
 NOISE_STEP = 1e-4

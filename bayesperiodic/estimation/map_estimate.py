@@ -11,6 +11,10 @@ from tqdm import tqdm
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.density.initial_orbits import InitialEstimate, measured_orbits, simultaneous_fit
+from bayesperiodic.density.log_posterior import NATURAL, RIDGE, Linearisation, LogPosterior
+from bayesperiodic.density.problem import Problem
+from bayesperiodic.density.responses import Simulator
 from bayesperiodic.estimation.conflict import prior_conflict
 from bayesperiodic.estimation.covariance import (
     caused_by_inputs,
@@ -40,13 +44,9 @@ from bayesperiodic.estimation.laplace import COMBINED, SILENT, joint_laplace, un
 from bayesperiodic.estimation.modes import default_starts, notable, weighed, with_images
 from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, noise_split
 from bayesperiodic.estimation.units import compared_with_data, unit_error
+from bayesperiodic.likelihood.input_noise import EXACT, FEWEST_CYCLES, ROUGH
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
-from bayesperiodic.posterior.density import NATURAL, RIDGE, Linearisation, LogPosterior
-from bayesperiodic.posterior.description import fingerprint
-from bayesperiodic.posterior.initial import InitialEstimate, measured_orbits, simultaneous_fit
-from bayesperiodic.posterior.input_noise import EXACT, FEWEST_CYCLES, ROUGH
-from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.posterior.simulator import Simulator
+from bayesperiodic.problem.description import fingerprint
 
 NOISE_SHARE = 0.1
 LARGEST_SHIFT, LARGEST_NONLINEARITY = 0.1, 0.3

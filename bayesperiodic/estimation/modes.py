@@ -12,7 +12,7 @@ from bayesperiodic._linalg import covariance_eigh, hessian_eigh
 from bayesperiodic.estimation.gauss_newton import SINGULAR, End, Iterate, Objective, preference
 from bayesperiodic.estimation.laplace import JointLaplace
 from bayesperiodic.periodic.schemes import FourierScheme, find_scheme
-from bayesperiodic.posterior.description import Description
+from bayesperiodic.problem.description import Description
 
 # Default number of starts: at most 8, and at most this number of unknowns of all starts and experiments. A dense
 # scheme counts as many times more as its grid is longer than 50 points.

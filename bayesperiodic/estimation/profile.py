@@ -15,14 +15,14 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import hessian_scale, in_one_thread, scaled
 from bayesperiodic._parallel import TaskPool, checked_executor
+from bayesperiodic.density.log_posterior import NATURAL, Linearisation, LogPosterior
+from bayesperiodic.density.problem import Problem
+from bayesperiodic.density.responses import Simulator
 from bayesperiodic.estimation.gauss_newton import PRESSED, Iterate, Objective, bias_correction, climb
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.posterior.density import NATURAL, Linearisation, LogPosterior
-from bayesperiodic.posterior.description import check_results
-from bayesperiodic.posterior.parameters import SHIFT
-from bayesperiodic.posterior.priors import Prior
-from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.posterior.simulator import Simulator
+from bayesperiodic.priors.single import Prior
+from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.parameters import SHIFT
 
 # Distance of points, as the change of the root of the drop; growth, shortening and smallest size of steps.
 SPACING, GROWTH, SHORTENED, SMALLEST = 0.5, 3.0, 0.25, 0.01

@@ -14,15 +14,15 @@ from scipy.special import stdtrit
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse_all
 from bayesperiodic._io import Result
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.conflict import PriorConflict
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.modes import Mode, notable
+from bayesperiodic.likelihood.input_noise import InputErrors
+from bayesperiodic.likelihood.noise import POINTS, SPECTRAL
 from bayesperiodic.periodic.solution import PeriodicSolution
-from bayesperiodic.posterior.input_noise import InputErrors
-from bayesperiodic.posterior.joint_priors import MultivariateNormal
-from bayesperiodic.posterior.noise import POINTS, SPECTRAL
-from bayesperiodic.posterior.parameters import checked_key, in_experiment, local_hint, local_names
-from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.priors.joint import MultivariateNormal
+from bayesperiodic.problem.parameters import checked_key, in_experiment, local_hint, local_names
 
 # Fraction of a channel's variance below which its residual consists of rounding errors of the periodic solves.
 ROUNDING = 1e-16

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.periodic.equations import FREQUENCY
 from bayesperiodic.periodic.floquet import first_order_matrix
-from bayesperiodic.posterior.problem import Problem
 
 # Experiments named in a message, and the powers of ten that point to a unit.
 SHOWN, UNIT_DECADES = 3, 2.0

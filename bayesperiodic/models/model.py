@@ -13,9 +13,9 @@ import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
+from bayesperiodic._compile.cache import load
+from bayesperiodic._compile.code_generation import GridFunction, Kernels, SymbolicModel, VjpKernels, grid_functions
 from bayesperiodic._expressions import parse
-from bayesperiodic.models.cache import load
-from bayesperiodic.models.code_generation import GridFunction, Kernels, SymbolicModel, VjpKernels, grid_functions
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
 DERIVATIVES = ("", "d", "dd")

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
+from bayesperiodic._compile.cache import declare, is_stored, load
 from bayesperiodic._parallel import available_cores
-from bayesperiodic.models.cache import declare, is_stored, load
 
 STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit", "not resolved")
 CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT, NOT_RESOLVED = range(len(STATUSES))

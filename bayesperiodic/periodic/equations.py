@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic.models.code_generation import as_columns
+from bayesperiodic._compile.code_generation import as_columns
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.compiled import (
     CONVERGED,

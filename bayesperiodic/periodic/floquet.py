@@ -18,7 +18,7 @@ from types import ModuleType
 
 import numpy as np
 
-from bayesperiodic.models.cache import load
+from bayesperiodic._compile.cache import load
 from bayesperiodic.periodic.compiled import source
 
 STENCIL = 8

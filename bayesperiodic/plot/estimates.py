@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.predictive import Prediction
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, caveats_of, chosen, draws_label, styled
-from bayesperiodic.posterior.description import check_results
-from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.problem.description import check_results
+from bayesperiodic.sampling.draws import Posterior
 
 MEASURED: dict[str, Any] = {"color": COLOURS["measured"], "marker": "o"}
 FITTED: dict[str, Any] = {"color": COLOURS["map"], "ls": "--", "marker": "x"}

@@ -7,6 +7,7 @@ from typing import Any, cast
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure, SubFigure
 
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.comparison import Comparison, compare
 from bayesperiodic.diagnostics.identifiability import DETERMINED, Identifiability, identifiability
 from bayesperiodic.diagnostics.verdicts import FINE
@@ -14,9 +15,8 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot.estimates import draw_period
 from bayesperiodic.plot.pairs import corner
 from bayesperiodic.plot.style import axis_label, styled
-from bayesperiodic.posterior.description import check_results
-from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.problem.description import check_results
+from bayesperiodic.sampling.draws import Posterior
 
 COLUMNS, MOST_NAMES = 58, 6
 WHITE = 0.01

@@ -15,6 +15,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from scipy.stats import norm
 
 from bayesperiodic import _checks
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot import regions, style
 from bayesperiodic.plot.style import (
@@ -28,10 +29,9 @@ from bayesperiodic.plot.style import (
     draws_label,
     styled,
 )
-from bayesperiodic.posterior.description import check_fingerprint, check_results
-from bayesperiodic.posterior.parameters import support
-from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.sampling.posterior import MODE, Posterior
+from bayesperiodic.problem.description import check_fingerprint, check_results
+from bayesperiodic.problem.parameters import support
+from bayesperiodic.sampling.draws import MODE, Posterior
 
 LEVELS = (0.5, 0.9)
 LEVELS_TEXT = "50 and 90 %"

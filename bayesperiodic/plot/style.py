@@ -13,8 +13,8 @@ from matplotlib.figure import Figure, FigureBase
 from scipy.stats import norm
 
 from bayesperiodic import _checks
-from bayesperiodic.posterior.parameters import unit
-from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.problem.parameters import unit
+from bayesperiodic.sampling.draws import Posterior
 
 #: Colours of measurements, of the MAP estimate, of the Laplace approximation and of MCMC, in all figures.
 COLOURS = {"measured": "#000000", "map": "#0072B2", "laplace": "#D55E00", "mcmc": "#56B4E9"}

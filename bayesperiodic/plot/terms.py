@@ -11,13 +11,13 @@ from matplotlib.ticker import NullFormatter
 
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.score_tests import along_orbit
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot import style
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, styled
-from bayesperiodic.posterior.description import check_results, fingerprint
-from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.problem.description import check_results, fingerprint
 
 # Colours without another meaning, one for each channel; and that of the residual with the terms.
 CHANNELS, AFTER = ENSEMBLES[1:4], ENSEMBLES[2]

@@ -5,15 +5,15 @@ from pathlib import Path
 
 from bayesperiodic import plot
 from bayesperiodic._io import in_folder, written_whole
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import LEVEL
 from bayesperiodic.diagnostics.comparison import Comparison
 from bayesperiodic.diagnostics.identifiability import Identifiability
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.predictive import Prediction
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.reporting import contents, html
-from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.sampling.draws import Posterior
 
 
 def report(

@@ -15,6 +15,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bayesperiodic import _checks
+from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import ADEQUATE, MISSPECIFIED, TESTS, UNTESTED
 from bayesperiodic.diagnostics.comparison import Comparison, compare
 from bayesperiodic.diagnostics.identifiability import CONFLICT, DETERMINED, NOTHING, Identifiability, identifiability
@@ -23,14 +24,13 @@ from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction, predic
 from bayesperiodic.diagnostics.verdicts import FINE, MODE, UNCONVERGED
 from bayesperiodic.estimation.map_estimate import estimation_warnings
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.likelihood.input_noise import JOINT, MEASURED
 from bayesperiodic.periodic.schemes import find_scheme
-from bayesperiodic.posterior.description import check_results, fingerprint
-from bayesperiodic.posterior.input_noise import JOINT, MEASURED
-from bayesperiodic.posterior.parameters import SHIFT, squared
-from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.problem.description import check_results, fingerprint
+from bayesperiodic.problem.parameters import SHIFT, squared
 from bayesperiodic.reporting import html
 from bayesperiodic.reporting.html import Rows, code, number
-from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.sampling.draws import Posterior
 
 # Level of the whiteness test, and the ratio of robust to Laplace sd above which the report warns.
 NOT_WHITE, LARGE_RATIO = 0.01, 1.5

@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 from scipy.stats import norm
 
-from bayesperiodic.posterior.parameters import CHAIN, DRAW
+from bayesperiodic.problem.parameters import CHAIN, DRAW
 
 FEWEST_WEIGHTS, EQUAL, SMALLEST = 0.25, 1e-6, 700.0
 LEVELS = np.array([0.05, 0.5, 0.95])

@@ -12,16 +12,16 @@ from scipy.integrate import IntegrationWarning, quad
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import covariance_cholesky, in_one_thread
+from bayesperiodic.density.log_posterior import LogPosterior
+from bayesperiodic.density.problem import Problem
+from bayesperiodic.likelihood.noise import SCALE, VARIANCE
 from bayesperiodic.periodic.compiled import CONVERGED
-from bayesperiodic.posterior.density import LogPosterior
-from bayesperiodic.posterior.description import check_results
-from bayesperiodic.posterior.joint_priors import FromScipy, as_prior, as_written
-from bayesperiodic.posterior.noise import SCALE, VARIANCE
-from bayesperiodic.posterior.parameters import CHAIN, DRAW, SHIFT, local_name
-from bayesperiodic.posterior.priors import LOG_ROOT_TWO_PI, Uniform
-from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.priors.joint import FromScipy, as_prior, as_written
+from bayesperiodic.priors.single import LOG_ROOT_TWO_PI, Uniform
+from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.parameters import CHAIN, DRAW, SHIFT, local_name
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.sampling.draws import Posterior
 from bayesperiodic.sampling.proposals import AffineTransform, fit_mixture
 
 # Draws of the posterior and of the mixture for each of the two estimates.

@@ -11,12 +11,12 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
+from bayesperiodic.density.log_posterior import SAMPLED, LogPosterior
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.posterior.density import SAMPLED, LogPosterior
-from bayesperiodic.posterior.parameters import CHAIN, DRAW
+from bayesperiodic.problem.parameters import CHAIN, DRAW
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.convergence import PASSES, stop_rule
-from bayesperiodic.sampling.posterior import Posterior, gather
+from bayesperiodic.sampling.draws import Posterior, gather
 from bayesperiodic.sampling.proposals import AffineTransform, CallCount
 from bayesperiodic.sampling.starts import mode_of, sampling_axes, start_points
 

@@ -23,8 +23,7 @@ from bayesperiodic._parallel import (
     interrupted_by_termination,
     interrupts_deferred,
 )
-from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.posterior.density import (
+from bayesperiodic.density.log_posterior import (
     COLLAPSED,
     NATURAL,
     RIDGE,
@@ -34,13 +33,14 @@ from bayesperiodic.posterior.density import (
     SamplingCoordinates,
     collapsible,
 )
-from bayesperiodic.posterior.description import digest
-from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.posterior.simulator import Simulator
+from bayesperiodic.density.problem import Problem
+from bayesperiodic.density.responses import Simulator
+from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.problem.description import digest
 from bayesperiodic.sampling.checkpoint import Checkpoint
 from bayesperiodic.sampling.convergence import PASSES, stop_rule
+from bayesperiodic.sampling.draws import Posterior, gather
 from bayesperiodic.sampling.nuts import refuse_for_nuts, sample_nuts
-from bayesperiodic.sampling.posterior import Posterior, gather
 from bayesperiodic.sampling.proposals import (
     MIXTURE_STEPS,
     AffineTransform,

@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 
 from bayesperiodic._linalg import covariance_cholesky
+from bayesperiodic.density.log_posterior import LogPosterior, SamplingCoordinates
 from bayesperiodic.estimation.modes import Mode
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.likelihood.noise_estimate import estimate_noise
 from bayesperiodic.periodic.compiled import CONVERGED
-from bayesperiodic.posterior.density import LogPosterior, SamplingCoordinates
-from bayesperiodic.posterior.noise_estimate import estimate_noise
 from bayesperiodic.sampling.proposals import HEAVY, AffineTransform, CallCount, StudentMixture
 
 LAPLACE, PRIOR, OVERDISPERSED = "laplace", "prior", "overdispersed"

@@ -7,7 +7,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic import _fourier
 from bayesperiodic.diagnostics.adequacy import TESTS, adequacy
-from bayesperiodic.sampling.posterior import tree
+from bayesperiodic.sampling.draws import tree
 from tests.known import LINEAR, NOISES, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors
 from tests.problems import CASES, DUFFING, DUFFING_PRIORS, SAMPLES
 

@@ -65,7 +65,7 @@ def test_fraction_of_prior_draws_without_a_cycle_is_reported():
 
 def test_solver_failures_are_distinguished_from_missing_orbits(monkeypatch):
     problem = saddle_node(bp.Normal(1.0, 1.0))
-    monkeypatch.setattr("bayesperiodic.posterior.simulator.path_outcome", lambda *_: arclength.ARRIVED)
+    monkeypatch.setattr("bayesperiodic.density.responses.path_outcome", lambda *_: arclength.ARRIVED)
     found = bp.prior_predictive(problem, draws=40, progress=False)
     assert found.table["no orbit"].max() == 0.0 < found.table.loc["all", "solver failed"]
 

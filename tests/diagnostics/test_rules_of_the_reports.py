@@ -11,7 +11,7 @@ from scipy.fft import dct
 import bayesperiodic as bp
 from bayesperiodic.diagnostics import adequacy, identifiability
 from bayesperiodic.diagnostics.adequacy import Unexplained
-from bayesperiodic.posterior.noise import CORRELATED, POINTS, SPECTRAL, Block
+from bayesperiodic.likelihood.noise import CORRELATED, POINTS, SPECTRAL, Block
 
 ROW = {
     "p_negative": np.nan, "p_negative_mcse": np.nan, "other_values": "", "profile": "", "collinearity": 1.0,

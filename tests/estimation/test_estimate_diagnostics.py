@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.estimation import map_estimate
 from bayesperiodic.estimation.laplace import undetermined
-from bayesperiodic.posterior.density import LogPosterior
 from bayesperiodic.sampling.starts import laplace_approximation
 from tests.known import LINEAR, formula_model, grid, linear_experiment, linear_regressors
 from tests.problems import DUFFING, DUFFING_PRIORS, duffing_run

@@ -13,8 +13,8 @@ from bayesperiodic.estimation import conflict, covariance, modes, units
 from bayesperiodic.estimation.gauss_newton import End, _step, inverse_hessian
 from bayesperiodic.estimation.laplace import JointLaplace, joint_laplace
 from bayesperiodic.estimation.modes import Mode, images, notable
-from bayesperiodic.posterior.input_noise import MEASURED, directions
-from bayesperiodic.posterior.noise import SPECTRAL, Block
+from bayesperiodic.likelihood.input_noise import MEASURED, directions
+from bayesperiodic.likelihood.noise import SPECTRAL, Block
 from tests.known import LINEAR, formula_model, linear_experiment
 
 HIGHEST = 9

@@ -10,7 +10,7 @@ from scipy import stats
 from bayesperiodic.estimation import map_estimate, profile, result
 from bayesperiodic.estimation.modes import Mode
 from bayesperiodic.estimation.result import MapEstimate, NoiseSplit, of_periodogram
-from bayesperiodic.posterior.noise import KNOWN, SPECTRAL
+from bayesperiodic.likelihood.noise import KNOWN, SPECTRAL
 
 
 def fitted(**changes):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, climb
-from bayesperiodic.posterior.density import LogPosterior
 from tests.known import LINEAR, linear_experiment
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.posterior.initial import simultaneous_fit
+from bayesperiodic.density.initial_orbits import simultaneous_fit
 from tests.known import LINEAR, linear_experiment
 from tests.pendulum import FREQUENCY, GENTLE, PENDULUM, measured, section_problem
 from tests.problems import cycle_run

@@ -15,7 +15,7 @@ import sympy as sp
 from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
-from bayesperiodic.posterior.orbit_check import other_orbit
+from bayesperiodic.density.orbit_check import other_orbit
 from tests.pendulum import PENDULUM
 from tests.problems import pendulum_run, rotation
 

@@ -14,7 +14,7 @@ from filelock import FileLock
 from tqdm import tqdm
 
 import bayesperiodic as bp
-from bayesperiodic.posterior.density import LogPosterior
+from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.sampling import checkpoint
 from tests.known import LINEAR, linear_experiment
 

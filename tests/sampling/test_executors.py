@@ -18,8 +18,8 @@ from scipy import stats
 from tqdm import tqdm
 
 import bayesperiodic as bp
+from bayesperiodic.likelihood import observation
 from bayesperiodic.periodic import batch
-from bayesperiodic.posterior import observation
 from bayesperiodic.sampling import sample
 from tests.problems import (
     DUFFING,

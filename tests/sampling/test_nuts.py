@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
+from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.periodic.compiled import CONVERGED
-from bayesperiodic.posterior.density import LogPosterior
 from bayesperiodic.sampling import convergence, nuts
 from studies.damper import run as damper
 from tests.known import EIGHTH_ORDER, LINEAR, RUNAWAY, grid, linear_experiment, linear_regressors

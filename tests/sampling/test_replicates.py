@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.posterior.observation import Response
+from bayesperiodic.likelihood.observation import Response
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 from tests.problems import CASES, pendulum_problem, pendulum_run, rotation
 

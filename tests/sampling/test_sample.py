@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.likelihood import observation
 from bayesperiodic.periodic import batch
-from bayesperiodic.posterior import observation
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling import sample as sample_module
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors, normal_posterior

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from bayesperiodic.models.code_generation import GRID_SIGNATURE
+from bayesperiodic._compile.code_generation import GRID_SIGNATURE
 
 MATRIX, VECTOR = "float64[:,::1]", "float64[::1]"
 FUNCTION = f"FunctionType({GRID_SIGNATURE})"

@@ -1,0 +1,1 @@
+"""Compilation of models and solver kernels."""

@@ -1,0 +1,1 @@
+"""The posterior density and its periodic responses."""

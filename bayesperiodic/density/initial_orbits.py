@@ -1,0 +1,359 @@
+"""Simultaneous fit of orbits and parameters, an initial estimate where the orbits at the first guess of θ do not serve.
+
+Measured orbits need not satisfy the equations of motion until the end. First θ is moved to where the equations hold
+best along the measured orbits. Then each iteration linearises g(z, θ) = 0 at the present orbit z of every experiment
+and at θ, which do not solve it yet, and takes the Gauss-Newton step of all unknowns; the orbits are eliminated, as
+dz = −g_z⁻¹ (g + g_θ dθ) ([1]_). The steps are so short that the equations are nearly linear along them, which keeps
+each orbit on its own branch.
+
+References
+----------
+.. [1] H. G. Bock, Recent advances in parameter identification techniques for ordinary differential equations, in:
+   Numerical Treatment of Inverse Problems in Differential and Integral Equations, Birkhäuser, 1983, 95-121.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from bayesperiodic._linalg import hessian_eigh, in_one_thread, scaled
+from bayesperiodic.data.experiment import DATA, Experiment
+from bayesperiodic.likelihood.likelihood import Likelihood
+from bayesperiodic.likelihood.noise_estimate import estimate_noise
+from bayesperiodic.likelihood.observation import Observation, Response
+from bayesperiodic.periodic.equations import CyclicFactors, PeriodicEquations, along
+from bayesperiodic.problem.description import Description
+
+MAX_ITERATIONS = 60
+LARGEST_STEP = 0.7
+NONLINEAR, SMALLEST_SHARE = 0.5, 1e-3
+ON_ORBIT, SMALL_STEP = 1e-6, 1e-2
+# Of the orbits that outputs show: harmonics of the forcing, weight of the equations, iterations; turns with θ.
+SEEN, EQUATIONS, ROUNDS, TURNS, FEW_TURNS = 8, 0.03, 5, 100, 5
+# Means of a state that are tried, in standard deviations from the one found.
+MEANS = (1.0, -1.0, 2.0, -2.0)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """One experiment's equations and outputs linearised where neither orbit nor parameters solve them."""
+
+    factors: CyclicFactors  # of ∂g/∂z
+    correction: np.ndarray  # −g_z⁻¹ g (points, states), Newton's step at fixed parameters
+    response: np.ndarray  # −g_z⁻¹ g_θ (names, points, states)
+    residuals: list[np.ndarray]  # of the corrected orbit, (size,) a block
+    changes: list[np.ndarray]  # derivatives of the predicted components by θ, (names, size) a block
+
+
+class InitialEstimate(NamedTuple):
+    """Result of a simultaneous fit."""
+
+    theta: np.ndarray  # (names,), the estimate, or the last θ that was reached
+    states: dict[str, dict[str, np.ndarray]]  # of every experiment, turns included; empty if the fit failed
+    blocked: str  # the experiment whose orbit could not be followed; empty otherwise
+
+
+def simultaneous_fit(problem: Description, theta: np.ndarray) -> InitialEstimate | None:
+    """Return θ and orbits near the MAP point; None if the model is autonomous or an experiment has no guess.
+
+    The fit starts at θ (names,) and at the experiments' guesses, ignores multipliers, and moves positive parameters in
+    their logarithms.
+    """
+    if problem.model.autonomous or not all(e.guess for e in problem.experiments):
+        return None
+    fit = _SimultaneousFit(with_guesses(problem, theta))
+    return fit.iterate(fit.parameters_along_guesses(theta))
+
+
+@in_one_thread
+def with_guesses(problem: Description, theta: np.ndarray) -> Description:
+    """Return the problem with states in place of ``guess="data"``, found from a θ (names,); see `measured_orbits`."""
+    if all(e.guess != DATA for e in problem.experiments):
+        return problem
+    near: dict[str, dict[str, np.ndarray]] = {}
+    for e in problem.experiments:
+        equations = problem.equations[e.name]
+        z = equations.static_guess(problem.parameters(theta[None], e.name)[0])
+        states = z + equations.drift * equations.grid.tau[:, None]
+        near[e.name] = dict(zip(problem.model.states, states.T.copy(), strict=True))
+    fit = _SimultaneousFit(problem.with_experiments(replace(e, guess=near[e.name]) for e in problem.experiments))
+    for e in problem.experiments:
+        if e.guess == DATA:
+            near[e.name] = fit._states(e.name, fit.orbit_of_any_mean(e.name, theta))
+    _, found = measured_orbits(problem, theta, near, FEW_TURNS)
+    for name, states in found.states.items():
+        if lost := [state for state, values in states.items() if not np.isfinite(values).all()]:
+            raise ValueError(
+                f"guess of experiment {name!r}: must be finite, got nan for {lost[0]!r} from the data; give the states "
+                "as a mapping, or start nearer to the truth."
+            )
+    return problem.with_experiments(
+        replace(e, guess=found.states[e.name]) if e.guess == DATA else e for e in problem.experiments
+    )
+
+
+def measured_orbits(
+    problem: Description, theta: np.ndarray, near: dict[str, dict[str, np.ndarray]], most: int = TURNS
+) -> tuple[Description, InitialEstimate]:
+    """Return orbits of a driven model that give the measured outputs, and the θ that fits them, in turns from a θ.
+
+    The orbits solve the equations only as far as the outputs leave them free; `near` are the states of other orbits
+    from which they start. Returned with them is the problem whose experiments have these orbits as their guesses.
+    """
+    fit = _SimultaneousFit(problem.with_experiments(replace(e, guess=near[e.name]) for e in problem.experiments))
+    misfit, before, turns = np.inf, np.inf, 0
+    while turns < most and not before - misfit < SMALL_STEP:
+        fit.guess = {name: fit.measured_orbit(name, theta) for name in fit.guess}
+        theta = fit.parameters_along_guesses(theta)
+        misfit, before, turns = fit._misfit(theta), misfit, turns + 1
+    states = {name: fit._states(name, z) for name, z in fit.guess.items()}
+    guessed = problem.with_experiments(replace(e, guess=states[e.name]) for e in problem.experiments)
+    return guessed, InitialEstimate(theta, states, "")
+
+
+class _SimultaneousFit:
+    def __init__(self, problem: Description):
+        self.problem, self.maps = problem, problem.parameter_maps
+        experiments = [_without_multipliers(e) for e in problem.experiments]
+        self.observations = {e.name: Observation(e, problem.model, self.maps[e.name].delayed) for e in experiments}
+        blocks = [block for observation in self.observations.values() for block in observation.blocks]
+        self.likelihood = Likelihood(problem.noise, blocks, problem.likelihood.fixed)
+        self.equations: dict[str, PeriodicEquations] = problem.equations
+        self.guess = {e.name: self._periodic_part(e) for e in experiments}
+
+    def _periodic_part(self, e: Experiment) -> np.ndarray:
+        equations, guess = self.equations[e.name], {} if isinstance(e.guess, str) else e.guess
+        states = np.stack([guess[name] for name in self.problem.model.states], axis=-1)
+        return states - equations.drift * equations.grid.tau[:, None]
+
+    def parameters_along_guesses(self, theta: np.ndarray) -> np.ndarray:
+        """Return the θ near which the equations hold best along the experiments' guesses, by damped Gauss-Newton."""
+        now = self._misfit(theta)
+        for _ in range(MAX_ITERATIONS):
+            total, count = 0.0, 0
+            hessian, gradient = np.zeros((theta.size, theta.size)), np.zeros(theta.size)
+            for name, z in self.guess.items():
+                own, equations = self.maps[name], self.equations[name]
+                at = np.ascontiguousarray(own.values(theta[None])[0, :-1])
+                g = _weighed(equations, equations.residual_jacobian(z, at)[:, : equations.count, None]).ravel()
+                by = _weighed(equations, equations.derivatives(z, at).g_theta @ own.slopes(theta)[:-1])
+                by = by.reshape(g.size, theta.size)
+                hessian, gradient = hessian + by.T @ by, gradient - by.T @ g
+                total, count = total + g @ g, count + g.size
+            if total == 0.0:
+                break
+            weight = self.problem.counted / total
+            step, size = self._step(weight * hessian, weight * gradient, theta)
+            if size < SMALL_STEP:
+                break
+            share = 1.0
+            while share > SMALLEST_SHARE:
+                there = self._there(theta, share * step)
+                trial = self._misfit(there)
+                if trial < now:
+                    break
+                share *= 0.5
+            else:
+                break
+            theta, now = there, trial
+        return theta
+
+    def measured_orbit(self, name: str, theta: np.ndarray) -> np.ndarray:
+        """Return the orbit (points, states) near the guess that fits the outputs and, as far as it can, the equations.
+
+        Least squares over the low harmonics, in which each block of outputs and each equation is divided by the size
+        of its derivatives.
+        """
+        equations, observation, z = self.equations[name], self.observations[name], self.guess[name]
+        parameters = np.ascontiguousarray(self.maps[name].values(theta[None])[0])
+        at, (points, count) = parameters[:-1], z.shape
+        phase = 2 * np.pi * np.outer(np.arange(SEEN * equations.grid.periods + 1), np.arange(points) / points)
+        waves = np.concatenate([np.cos(phase), np.sin(phase[1:])])[: points - 1]
+        sizes = np.ptp(z, axis=0) + SMALL_STEP * np.abs(z).max()
+        basis = np.einsum("hn,st->hsnt", waves, np.diag(np.where(sizes > 0.0, sizes, 1.0)))
+        basis = basis.reshape(-1, points, count)
+        changes, none = equations.changes(basis), np.zeros(len(basis))
+        for _ in range(ROUNDS):
+            d, columns = equations.derivatives(z, at), equations.residual_jacobian(z, at)
+            by_q = columns[:, count:].reshape(points, count, -1)
+            here = Response(equations.outputs(z, at), np.array(equations.frequency), none[:0], parameters[-1])
+            moved = Response(along(d.f_q, changes), none, none[:, None][:, :0], none)
+            g = _weighed(equations, columns[:, :count, None])[..., 0]
+            dg = _weighed(equations, np.einsum("neq,dnq->ned", by_q, changes))
+            parts = [
+                (1.0, *pair) for pair in zip(observation.changes(here, moved), observation.residuals(here), strict=True)
+            ]
+            parts += [(EQUATIONS, dg[:, e].T, -g[:, e]) for e in range(count)]
+            scales = [weight / (float(np.linalg.norm(j)) or np.inf) for weight, j, _ in parts]
+            rows = np.concatenate([scale * j.T for scale, (_, j, _) in zip(scales, parts, strict=True)])
+            right = np.concatenate([scale * r for scale, (_, _, r) in zip(scales, parts, strict=True)])
+            if not (np.isfinite(rows).all() and np.isfinite(right).all()):
+                break
+            z = z + np.tensordot(np.linalg.lstsq(rows, right, rcond=1e-9)[0], basis, 1)
+        return z
+
+    def orbit_of_any_mean(self, name: str, theta: np.ndarray) -> np.ndarray:
+        """Return the measured orbit that solves the equations best, from means of each state on both sides.
+
+        Outputs such as a velocity leave the mean of a state to the equations, which may have several solutions.
+        """
+        best = self.measured_orbit(name, theta)
+        error = self._equation_error(name, best, theta)
+        for shift in np.kron(np.eye(best.shape[1]), np.array(MEANS)[:, None]):
+            self.guess[name] = best + shift * np.std(best, axis=0)
+            z = self.measured_orbit(name, theta)
+            if (other := self._equation_error(name, z, theta)) < error:
+                best, error = z, other
+        return best
+
+    def _equation_error(self, name: str, z: np.ndarray, theta: np.ndarray) -> float:
+        at, equations = np.ascontiguousarray(self.maps[name].values(theta[None])[0, :-1]), self.equations[name]
+        return float(np.sum(_weighed(equations, equations.residual_jacobian(z, at)[:, : equations.count, None]) ** 2))
+
+    def _misfit(self, theta: np.ndarray) -> float:
+        """Return −log of the prior's density and of that of the equations' errors along the guesses."""
+        prior = float(self.problem.joint_prior.log_prob(theta))
+        if not np.isfinite(prior):
+            return np.inf
+        total = sum(self._equation_error(name, z, theta) for name, z in self.guess.items())
+        return 0.5 * self.problem.counted * np.log(max(total, np.finfo(float).tiny)) - prior
+
+    def _there(self, theta: np.ndarray, step: np.ndarray) -> np.ndarray:
+        return np.where(self.problem.logarithmic, theta * np.exp(step * self.problem.logarithmic), theta + step)
+
+    def iterate(self, theta: np.ndarray) -> InitialEstimate:
+        """Return where the Gauss-Newton iteration in orbits and θ leads to from the guesses and a θ."""
+        orbits, noise = self.guess, self.likelihood.guess()
+        for _ in range(MAX_ITERATIONS):
+            linear = {}
+            for name, z in orbits.items():
+                one = self._linearise(name, z, theta)
+                if one is None:
+                    return InitialEstimate(theta, {}, name)
+                linear[name] = one
+            noise = estimate_noise(self.likelihood, [r for one in linear.values() for r in one.residuals], noise, 1.0)
+            step, size = self._step(*self._information(linear, noise), theta)
+            off = {name: _size(one.correction, orbits[name]) for name, one in linear.items()}
+            worst = max(off, key=lambda name: off[name])
+            if off[worst] < ON_ORBIT and size < SMALL_STEP:
+                return InitialEstimate(theta, {name: self._states(name, z) for name, z in orbits.items()}, "")
+            theta, orbits, blocked = self._moved(linear, orbits, theta, step)
+            if blocked:
+                return InitialEstimate(theta, {}, blocked)
+        # Where the data leave a direction open, θ moves on along it while the orbits solve the equations.
+        if off[worst] < SMALL_STEP:
+            return InitialEstimate(theta, {name: self._states(name, z) for name, z in orbits.items()}, "")
+        return InitialEstimate(theta, {}, worst)
+
+    def _linearise(self, name: str, z: np.ndarray, theta: np.ndarray) -> Linear | None:
+        """Return one experiment's equations linearised at an orbit and θ; None where ∂g/∂z is singular."""
+        equations, own = self.equations[name], self.maps[name]
+        parameters, slopes = np.ascontiguousarray(own.values(theta[None])[0]), own.slopes(theta)
+        at, by = parameters[:-1], slopes[:-1]
+        d, columns = equations.derivatives(z, at), equations.residual_jacobian(z, at)
+        factors = equations.factors(columns)
+        if not np.isfinite(columns).all() or not factors.regular:
+            return None
+        g = np.concatenate([np.tensordot(by, d.g_theta, (0, 2)), columns[None, :, : equations.count]])
+        dz = factors.solve(-g)
+        outputs = along(d.f_q, equations.changes(dz))
+        outputs[:-1] += np.tensordot(by, d.f_theta, (0, 2))
+        frequency, none = np.array(equations.frequency), np.zeros(0)
+        here = Response(equations.outputs(z, at) + outputs[-1], frequency, none, parameters[-1])
+        directions = Response(outputs[:-1], np.zeros(theta.size), np.zeros((theta.size, 0)), slopes[-1])
+        observation = self.observations[name]
+        return Linear(factors, dz[-1], dz[:-1], observation.residuals(here), observation.changes(here, directions))
+
+    def _information(self, linear: dict[str, Linear], noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the data's part of the Hessian and of the gradient of the log-density by θ."""
+        changes = [c for one in linear.values() for c in one.changes]
+        residuals = [r for one in linear.values() for r in one.residuals]
+        white = np.concatenate(self.likelihood.whitened(changes, noise), axis=1)
+        return white @ white.T, white @ np.concatenate(self.likelihood.whitened(residuals, noise))
+
+    def _step(self, hessian: np.ndarray, gradient: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the step of θ's coordinates, positive parameters in their logarithms, and its length in sds."""
+        prior = self.problem.joint_prior
+        by_prior = prior.gradient(theta)
+        unit = np.where(self.problem.logarithmic, theta, 1.0)
+        hessian = scaled(hessian + prior.curvature(theta), unit)
+        hessian -= np.diag(np.where(self.problem.logarithmic, theta * by_prior, 0.0))
+        gradient = (gradient + by_prior) * unit
+        values, vectors, scale = hessian_eigh(hessian)
+        values = np.maximum(np.abs(values), 1e-13 * np.abs(values).max())
+        along = vectors.T @ (scale * gradient) / values
+        step = scale * (vectors @ along)
+        longest = np.max(np.abs(step), where=self.problem.logarithmic, initial=0.0)
+        return step * min(1.0, LARGEST_STEP / max(longest, LARGEST_STEP)), float(np.sqrt(np.sum(values * along**2)))
+
+    def _moved(
+        self, linear: dict[str, Linear], orbits: dict[str, np.ndarray], theta: np.ndarray, step: np.ndarray
+    ) -> tuple[np.ndarray, dict[str, np.ndarray], str]:
+        """Return θ and the orbits a step further, so short that all equations are nearly linear; or what forbids it."""
+        share, blocked = 1.0, next(iter(orbits))
+        while share > SMALLEST_SHARE:
+            there = self._there(theta, share * step)
+            share *= 0.5
+            if not np.isfinite(self.problem.joint_prior.log_prob(there)):
+                continue
+            moved: dict[str, np.ndarray] = {}
+            for name, one in linear.items():
+                z = self._orbit_moved(name, one, orbits[name], there - theta, there, 2.0 * share)
+                if z is None:
+                    blocked = name
+                    break
+                moved[name] = z
+            else:
+                return there, moved, ""
+        return theta, orbits, blocked
+
+    def _orbit_moved(
+        self, name: str, linear: Linear, z: np.ndarray, change: np.ndarray, there: np.ndarray, share: float
+    ) -> np.ndarray | None:
+        """Return an orbit a step further, with one chord correction; None where the step is not nearly linear."""
+        equations = self.equations[name]
+        step = share * linear.correction + np.tensordot(change, linear.response, (0, 0))
+        at = np.ascontiguousarray(self.maps[name].values(there[None])[0, :-1])
+        columns = equations.residual_jacobian(z + step, at)
+        if not np.isfinite(columns).all():
+            return None
+        again = linear.factors.solve(-columns[None, :, : equations.count])[0]
+        curved = _size(again - (1.0 - share) * linear.correction, z)
+        if curved > NONLINEAR * _size(step, z) and curved > ON_ORBIT:
+            return None
+        return z + step + (again if share == 1.0 else 0.0)
+
+    def _states(self, name: str, z: np.ndarray) -> dict[str, np.ndarray]:
+        equations = self.equations[name]
+        states = z + equations.drift * equations.grid.tau[:, None]
+        return dict(zip(self.problem.model.states, states.T.copy(), strict=True))
+
+
+def _weighed(equations: PeriodicEquations, values: np.ndarray) -> np.ndarray:
+    """Return values (points, equations, columns) as real Fourier amplitudes, harmonics weighed down by their square.
+
+    An orbit's noise is weighed up by as much where it is differentiated twice.
+    """
+    amplitudes = np.fft.rfft(values, axis=0) / len(values)
+    harmonic = np.arange(len(amplitudes)) / equations.grid.periods
+    amplitudes /= (1.0 + harmonic**2)[:, None, None]
+    return np.concatenate([amplitudes.real, amplitudes.imag])
+
+
+def _size(change: np.ndarray, z: np.ndarray) -> float:
+    """Return the largest change (points, states) in units of the range of each state of an orbit."""
+    spread = np.ptp(z, axis=0)
+    return float(np.max(np.abs(change) / np.where(spread > 0.0, spread, 1.0)))
+
+
+def _without_multipliers(experiment: Experiment) -> Experiment:
+    if experiment.multipliers is None:
+        return experiment
+    covariance = experiment.covariance
+    if covariance is not None and experiment.multiplier_sd is None:
+        size = len(covariance) - experiment.multipliers.size
+        covariance = covariance[:size, :size]
+    return replace(experiment, multipliers=None, multiplier_sd=None, covariance=covariance)

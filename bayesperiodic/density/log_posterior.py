@@ -1,0 +1,397 @@
+"""The log-posterior density over sampling coordinates: prior, Jacobian, likelihood, and their derivatives."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import gammaln
+
+from bayesperiodic.density.initial_orbits import simultaneous_fit
+from bayesperiodic.density.orbit_check import other_orbit
+from bayesperiodic.density.responses import Guesses, Simulator
+from bayesperiodic.likelihood.likelihood import Residuals
+from bayesperiodic.likelihood.noise import FLAT, JEFFREYS, KNOWN, SPECTRAL, Circulant, Independent
+from bayesperiodic.likelihood.observation import Comparisons, Response, Simulation
+from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
+from bayesperiodic.periodic.solution import PeriodicSolution
+from bayesperiodic.problem.description import Description
+
+RIDGE, NATURAL = "ridge", "natural"
+SAMPLED, COLLAPSED = "sampled", "collapsed"
+
+
+class Linearisation:
+    """Residuals at one θ (names,) and their Jacobian (de Kraker et al. 1997, eq. 4-5).
+
+    Derivatives by `changes` need a simulator anchored at θ. With `polish` the solves are as accurate as possible;
+    without it the residuals are those of `LogPosterior.evaluate`.
+    """
+
+    def __init__(self, theta: np.ndarray, simulator: Simulator, comparisons: Comparisons, polish: bool = True):
+        self.theta, self.simulator, self._comparisons, self._polish = theta, simulator, comparisons, polish
+        self._observations = simulator.problem.observations
+
+    @cached_property
+    def _simulation(self) -> Simulation:
+        return self.simulator.solve(self.theta[None], keep=True, polish=self._polish)
+
+    def moved(self, theta: np.ndarray) -> "Linearisation":
+        """Return the residuals at another θ (names,), solved from the same anchors."""
+        return Linearisation(theta, self.simulator, self._comparisons)
+
+    def anchored(self) -> "Linearisation":
+        """Return the same with the anchors at its θ."""
+        return Linearisation(self.theta, self.simulator.anchored(self.theta), self._comparisons)
+
+    @property
+    def status(self) -> int:
+        """The worst status code of the solves."""
+        return int(self._simulation.status[0])
+
+    @property
+    def statuses(self) -> dict[str, str]:
+        """Status of the solve of each experiment."""
+        return {name: STATUSES[int(self._simulation.statuses(name)[0])] for name in self._observations}
+
+    @property
+    def converged(self) -> bool:
+        """Whether all solves converged."""
+        return self.status == CONVERGED
+
+    @cached_property
+    def residuals(self) -> Residuals:
+        """Residual components, one array (size,) a block."""
+        return self._comparisons.residuals(self._simulation).at(0)
+
+    @cached_property
+    def _responses(self) -> dict[str, Response]:
+        here = self._simulation.at(0)
+        return {name: here.response(name) for name in self._observations}
+
+    @cached_property
+    def changes(self) -> list[np.ndarray]:
+        """Derivatives of the predicted components by θ, one array (names, size) a block; NaN where singular."""
+        result = []
+        for name, observation in self._observations.items():
+            response = self._responses[name]
+            directions = self.simulator.changes(self.theta, name, response, self._simulation.z(name)[0])
+            if directions is None:
+                result += [np.full((self.theta.size, block.size), np.nan) for block in observation.blocks]
+            else:
+                result += observation.changes(response, directions)
+        return result
+
+    def compared(self) -> dict[str, dict[str, np.ndarray]]:
+        """Return y − ŷ (points,) by experiment and channel, within the harmonics kept."""
+        return {name: o.compared(self._responses[name]) for name, o in self._observations.items()}
+
+    @cached_property
+    def other_orbits(self) -> dict[str, str]:
+        """Why the model's orbit is not the measured one, by experiment, see `other_orbit`; without the others."""
+        reasons = {name: other_orbit(o, self._responses[name]) for name, o in self._observations.items()}
+        return {name: reason for name, reason in reasons.items() if reason}
+
+    def vjp(self, by_residual: Sequence[np.ndarray], *, adjoint: bool) -> dict[str, np.ndarray]:
+        """Return Σ by_residual · ∂residual/∂θ, (names,) by experiment; NaN where the derivatives do not exist.
+
+        `by_residual` has one array (size,) a block. `adjoint` takes one transposed solve an experiment (driven models)
+        instead of `changes`.
+        """
+        if adjoint:
+            by_response = self._comparisons.vjp(self._simulation, self.residuals.like(by_residual))
+            return {name: -own for name, own in self.simulator.vjp(self.theta, self._simulation, *by_response).items()}
+        result, start, blocks = {}, 0, list(by_residual)
+        for name, observation in self._observations.items():
+            stop = start + len(observation.blocks)
+            pairs = zip(self.changes[start:stop], blocks[start:stop], strict=True)
+            result[name] = -np.sum([s @ w for s, w in pairs], axis=0)
+            start = stop
+        return result
+
+
+class Evaluation(NamedTuple):
+    """Log-densities at several points."""
+
+    log_prob: np.ndarray  # (points,), −inf where a periodic solve fails or the prior is zero
+    moments: np.ndarray  # (points, collapsed), M of eq. (6) of each collapsed variance; NaN where a solve fails
+    status: np.ndarray  # int (points,), worst status code of the periodic solves; "converged" where nothing was solved
+
+
+class SamplingCoordinates:
+    """Coordinates of a problem's posterior density.
+
+    A parameter whose prior's support is (0, ∞) is replaced by its logarithm, any other is its own coordinate; the
+    logarithms of the free noise parameters follow. `coordinates` "natural" takes no logarithms of parameters,
+    `variances` "collapsed" leaves out the variances that can be integrated out in closed form.
+
+    Attributes
+    ----------
+    labels : tuple of str
+        Parameters and noise parameters, in the order of the coordinates.
+    collapsed : tuple of str
+        Variances that are integrated out.
+    free : tuple of str
+        Noise parameters that have a coordinate.
+    """
+
+    def __init__(self, problem: Description, *, coordinates: str = RIDGE, variances: str = SAMPLED):
+        self.problem, self.coordinates = problem, coordinates
+        self.logarithmic = problem.logarithmic & (coordinates == RIDGE)
+        self._logarithms = np.flatnonzero(self.logarithmic)
+        self.collapsed = collapsible(problem) if variances == COLLAPSED else ()
+        self.free = tuple(name for name in problem.free_noise if name not in self.collapsed)
+        self.labels = (*problem.names, *self.free)
+        self.noise_columns = [problem.noise_names.index(name) for name in self.free]
+        fixed = problem.likelihood.fixed
+        self._noise = np.array([fixed.get(name, 1.0) for name in problem.noise_names])
+
+    @property
+    def dimension(self) -> int:
+        """Number of sampling coordinates."""
+        return len(self.labels)
+
+    def to_natural(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return θ (…, names) and all noise parameters (…, noise_names) of points; integrated variances are 1."""
+        count = len(self.problem.names)
+        theta, noise = np.array(points[..., :count]), np.empty((*points.shape[:-1], self._noise.size))
+        with np.errstate(over="ignore"):
+            np.exp(theta, out=theta, where=self.logarithmic)
+            noise[...] = self._noise
+            noise[..., self.noise_columns] = np.exp(points[..., count:])
+        return theta, noise
+
+    def from_natural(self, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return coordinates (…, dimension) from θ (…, names) and all noise parameters (…, noise_names)."""
+        points = np.log(theta, out=np.array(theta), where=self.logarithmic)
+        return np.concatenate([points, np.log(noise[..., self.noise_columns])], axis=-1)
+
+
+class LogPosterior(SamplingCoordinates):
+    """Log-posterior density over the sampling coordinates of a problem, the Jacobian determinant included.
+
+    Its value depends on the point alone: periodic solves start from the fixed anchors of the simulator.
+    """
+
+    def __init__(
+        self,
+        problem: Description,
+        simulator: Simulator,
+        *,
+        coordinates: str = RIDGE,
+        variances: str = SAMPLED,
+        comparisons: Comparisons | None = None,
+    ):
+        super().__init__(problem, coordinates=coordinates, variances=variances)
+        self.simulator = simulator
+        self.comparisons = comparisons or Comparisons(
+            [[problem.observations[e.name] for e in group] for group in simulator.groups], problem.observations
+        )
+
+    @classmethod
+    def start(cls, problem: Description, theta: np.ndarray | None = None) -> "LogPosterior":
+        """Return the density anchored near θ, by default the medians of the priors.
+
+        Where every experiment of a forced model has a guess of its orbit, the anchors are where orbits and parameters
+        fit together, see `simultaneous_fit`: at the medians other orbits may be nearer, or none may exist.
+        """
+        theta = problem.median() if theta is None else theta
+        found = simultaneous_fit(problem, theta)
+        if found is not None and found.states:
+            return cls(problem, Simulator.start(problem, found.theta, found.states))
+        return cls(problem, Simulator.start(problem, theta))
+
+    def anchored(self, theta: np.ndarray, guesses: Guesses | None = None) -> "LogPosterior":
+        """Return the density anchored at another θ (names,), solved from guesses or the present anchors."""
+        moved = self.simulator.anchored(theta) if guesses is None else Simulator.start(self.problem, theta, guesses)
+        return self.with_settings(simulator=moved)
+
+    def with_settings(
+        self, *, simulator: Simulator | None = None, coordinates: str | None = None, variances: str | None = None
+    ) -> "LogPosterior":
+        """Return the density with other anchors, coordinates or treatment of the variances."""
+        return LogPosterior(
+            self.problem,
+            simulator or self.simulator,
+            coordinates=coordinates or self.coordinates,
+            variances=variances or (COLLAPSED if self.collapsed else SAMPLED),
+            comparisons=self.comparisons,
+        )
+
+    def log_prior(self, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the log-prior density over the coordinates (…,) at θ (…, names) and noise parameters."""
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            prior = self.problem.joint_prior.log_prob(theta) + self.problem.likelihood.log_prior(noise)
+            if self._logarithms.size:
+                prior = prior + np.log(theta[..., self._logarithms]).sum(axis=-1)
+        return np.asarray(prior)
+
+    def add_prior(
+        self, theta: np.ndarray, gradient: np.ndarray, curvature: np.ndarray | None = None
+    ) -> tuple[np.ndarray, Any]:
+        """Add the derivatives of the log-prior over the coordinates to those of the log-likelihood at θ (names,).
+
+        They are the gradient (names,) and, if it is given, minus the Hessian (names, names).
+        """
+        logs, prior = self._logarithms, self.problem.joint_prior
+        gradient = gradient + prior.gradient(theta)
+        if logs.size:
+            gradient[logs] += 1.0 / theta[logs]
+        if curvature is not None:
+            curvature = curvature + prior.curvature(theta)
+            curvature[logs, logs] += theta[logs] ** -2
+        return gradient, curvature
+
+    def log_likelihood(self, theta: np.ndarray, noise: np.ndarray, threads: int | None = None) -> Evaluation:
+        """Return log-likelihoods at θ (points, names) and noise (points, noise_names), see `collapsed`.
+
+        The values do not depend on the number of threads, by default one per core.
+        """
+        simulation = self.simulator.solve(theta, threads, whole=True)
+        good = simulation.status == CONVERGED
+        count = np.count_nonzero(good)
+        if count == good.size:
+            return Evaluation(*self._log_likelihood(simulation, noise, threads), simulation.status)
+        log_prob, moments = self._nothing(len(theta))
+        if count:
+            log_prob[good], moments[good] = self._log_likelihood(simulation.at(good), noise[good], threads)
+        return Evaluation(log_prob, moments, simulation.status)
+
+    def _log_likelihood(
+        self, simulation: Simulation, noise: np.ndarray, threads: int | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return log-likelihoods and moments of converged solutions."""
+        residuals = self.comparisons.residuals(simulation, threads)
+        values = self.problem.likelihood(residuals, noise)
+        if not self.collapsed:
+            return values, np.empty((len(values), 0))
+        by_name = self.problem.likelihood.moments(residuals)
+        moments = np.stack([by_name[name] for name in self.collapsed], axis=-1)
+        values = values + np.sum(0.5 * moments + self._integrals(moments), axis=-1)
+        return np.where(np.isfinite(values), values, -np.inf), moments
+
+    def _nothing(self, points: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return log-densities and moments of points without a solution."""
+        return np.full(points, -np.inf), np.full((points, len(self.collapsed)), np.nan)
+
+    def at(self, theta: np.ndarray, noise: np.ndarray, threads: int | None = None) -> Evaluation:
+        """Return the log-density over the coordinates at natural values; arguments as in `log_likelihood`."""
+        prior = self.log_prior(theta, noise)
+        inside = np.isfinite(prior)
+        count = np.count_nonzero(inside)
+        if count == inside.size:
+            likelihood, moments, status = self.log_likelihood(theta, noise, threads)
+            return Evaluation(prior + likelihood, moments, status)
+        (log_prob, moments), status = self._nothing(len(theta)), np.full(len(theta), CONVERGED)
+        if count:
+            likelihood, moments[inside], status[inside] = self.log_likelihood(theta[inside], noise[inside], threads)
+            log_prob[inside] = prior[inside] + likelihood
+        return Evaluation(log_prob, moments, status)
+
+    def evaluate(self, points: np.ndarray, threads: int | None = 1) -> Evaluation:
+        """Return the log-density at points (points, dimension), by default in one thread."""
+        return self.at(*self.to_natural(points), threads)
+
+    def value_and_gradient(self, point: np.ndarray) -> tuple[float, np.ndarray, int]:
+        """Return the log-density at one point (dimension,), its gradient, and the status code.
+
+        Variances are not integrated out. The value is −inf and the gradient zero where a solve fails or a derivative
+        does not exist (status "singular").
+        """
+        theta, noise = self.to_natural(point)
+        value, by_theta, by_noise, status = self.value_and_gradient_at(theta, noise)
+        by_theta[self.logarithmic] *= theta[self.logarithmic]
+        return value, np.concatenate([by_theta, by_noise[self.noise_columns]]), status
+
+    def value_and_gradient_at(
+        self, theta: np.ndarray, noise: np.ndarray, *, forward: bool = False
+    ) -> tuple[float, np.ndarray, np.ndarray, int]:
+        """Return the log-density at θ (names,) and noise, its gradients by θ and ln φ, and the status code.
+
+        A driven model takes one periodic solve and one transposed solve an experiment; with `forward`, or if the model
+        is autonomous, one solve a parameter.
+        """
+        zeros = np.zeros(theta.size), np.zeros(noise.size)
+        prior = float(self.log_prior(theta, noise))
+        if not np.isfinite(prior):
+            return -np.inf, *zeros, CONVERGED
+        forward = forward or self.problem.model.autonomous
+        here = Linearisation(theta, self.simulator, self.comparisons, polish=forward)
+        if not here.converged:
+            return -np.inf, *zeros, here.status
+        value = prior + float(self.problem.likelihood(here.residuals, noise))
+        if not np.isfinite(value):
+            return -np.inf, *zeros, CONVERGED
+        by_residual, by_noise = self.problem.likelihood.gradients(here.residuals, noise)
+        if forward or any(e.multipliers is not None for e in self.problem.experiments):
+            here = here.anchored()
+        by_theta = np.add.reduce(list(here.vjp(by_residual, adjoint=not forward).values()))
+        by_theta, _ = self.add_prior(theta, by_theta)
+        if not (np.isfinite(by_theta).all() and np.isfinite(by_noise).all()):
+            return -np.inf, *zeros, SINGULAR
+        return value, by_theta, by_noise, CONVERGED
+
+    def linearise(self, theta: np.ndarray) -> Linearisation:
+        """Solve at one θ (names,) from the present anchors, and return residuals and Jacobian there."""
+        return Linearisation(theta, self.simulator.anchored(theta), self.comparisons)
+
+    def objective(self, here: Linearisation, noise: np.ndarray, log_variance_factor: float | np.ndarray) -> float:
+        """Return the log-density over the coordinates where all solves have converged.
+
+        For `log_variance_factor` see `Likelihood.__call__`.
+        """
+        prior = self.problem.joint_prior.log_prob(here.theta) + np.sum(np.log(here.theta[self.logarithmic]))
+        likelihood = self.problem.likelihood
+        return float((likelihood(here.residuals, noise, log_variance_factor) + likelihood.log_prior(noise)) + prior)
+
+    def solve(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
+        """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""
+        return self.simulator.solutions(theta)
+
+    def outputs(self, theta: np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
+        """Return the predicted outputs at θ (draws, names) and whether the solves converged, see `Problem.outputs`."""
+        found = self.simulator.solve(theta)
+        predicted = {name: o.predicted(found.response(name)) for name, o in self.problem.observations.items()}
+        return predicted, found.status == CONVERGED
+
+    def _integrals(self, moments: np.ndarray) -> np.ndarray:
+        """Return ln ∫ exp(−½ [n ln v + M/v]) p(v) dv of each collapsed variance."""
+        with np.errstate(divide="ignore"):
+            return gammaln(self._shapes) - self._shapes * np.log(0.5 * moments)
+
+    @cached_property
+    def _shapes(self) -> np.ndarray:
+        """Shape parameters of the inverse-gamma distributions of the collapsed variances."""
+        counts = np.array([self.problem.likelihood.counts[name] for name in self.collapsed])
+        return 0.5 * counts - (1.0 if self.problem.noise.prior == FLAT else 0.0)
+
+    def with_variances(
+        self, points: np.ndarray, log_prob: np.ndarray, moments: np.ndarray, generator: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the collapsed variances of points (…, dimension) from their conditional distribution.
+
+        It is InvGamma(n/2, M/2), with the flat prior InvGamma(n/2 − 1, M/2). The points returned are coordinates of the
+        density with all variances, (…, dimension + collapsed).
+        """
+        variances = 0.5 * moments / generator.gamma(self._shapes, size=moments.shape)
+        joint = -self._shapes * np.log(variances) - 0.5 * moments / variances
+        log_prob = log_prob + np.sum(joint - self._integrals(moments), axis=-1)
+        count = len(self.problem.names)
+        columns = {name: points[..., count + i] for i, name in enumerate(self.free)}
+        columns |= {name: np.log(variances[..., i]) for i, name in enumerate(self.collapsed)}
+        noise = np.stack([columns[name] for name in self.problem.free_noise], axis=-1)
+        return np.concatenate([points[..., :count], noise], axis=-1), log_prob
+
+
+def collapsible(problem: Description) -> tuple[str, ...]:
+    """Return the free variances that can be integrated out in closed form, those with the prior 1/v or a flat one.
+
+    The errors must be independent, or of whole periods with a spectrum of known shape, and the inputs exact.
+    """
+    if problem.likelihood.shared:
+        return ()
+    noise, counts = problem.noise, problem.likelihood.counts
+    shaped = isinstance(noise, Circulant) and all(b.kind in (SPECTRAL, KNOWN) for b in problem.likelihood.blocks)
+    closed = (isinstance(noise, Independent) or shaped) and noise.prior in (JEFFREYS, FLAT)
+    known = all(name in counts for name in problem.free_noise)
+    return tuple(name for name in problem.free_noise if closed and name in counts and (known or not shaped))

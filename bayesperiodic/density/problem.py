@@ -1,0 +1,330 @@
+"""Problem: a model, experiments and priors, and the posterior density they define."""
+
+from collections.abc import Mapping
+from copy import copy
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bayesperiodic import _checks
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.log_posterior import NATURAL, RIDGE, SAMPLED, Evaluation, LogPosterior
+from bayesperiodic.density.responses import Guesses, Simulator
+from bayesperiodic.likelihood.input_noise import InputErrors, same
+from bayesperiodic.likelihood.likelihood import Likelihood
+from bayesperiodic.likelihood.observation import Observation
+from bayesperiodic.periodic.solution import PeriodicSolution
+from bayesperiodic.problem.description import Description
+
+METHODS = ("adjoint", "forward")
+
+
+class Problem(Description):
+    r"""A model, experiments and priors, and the posterior density that they define.
+
+    The density ([1]_, eq. 5-6) is over (θ, log φ), φ the noise parameters. With independent errors, the paper's model,
+    φ is the variance of each channel with Jeffreys' prior 1/v, and the density is
+
+    .. math::
+
+        -\frac{1}{2} \sum_\beta \left[ n_\beta \ln v_\beta + \frac{M_\beta}{v_\beta} \right]
+        + \sum_\alpha \ln p(\theta_\alpha),
+
+    where n_β is the number of independent values of channel β, and M_β weighs each squared residual by
+    independent values per sample. It is eq. (6) where every sample is independent. Outputs are projected onto the
+    harmonics that the experiment keeps before they are compared, angles are compared modulo 2π.
+
+    Parameters
+    ----------
+    model : Model
+        For an autonomous model the measured frequency, with its standard error, is data too.
+    experiments : sequence of Experiment
+    priors : mapping of str or tuple of str to prior
+        Makes a parameter free; a tuple of names takes a `MultivariateNormal`. A frozen continuous distribution of
+        scipy.stats is a prior too. The name "shift" makes the delay [s] of the measured outputs a parameter of each
+        experiment; an autonomous model, whose phase is free, always has it.
+    fixed : mapping of str to float or to mapping of str to float, optional
+        Values of other parameters, for all experiments or by experiment; a name such as ``"variance[force]"`` fixes a
+        noise parameter.
+    tied : mapping of str to str, optional
+        The remaining parameters as expressions of others, such as ``{"theta11": "-1e5*theta4"}``: numbers, names, pi,
+        + - * / ** and sqrt, exp, log, sin, cos, tan, atan, sinh, cosh, tanh, abs.
+    local : sequence of str
+        Free parameters that each experiment has its own of, called ``theta16[run 7]``. Their prior goes by the plain
+        name, or by that of one experiment; an experiment may have a fixed value instead.
+    noise : str or noise model
+        "independent", "measured" or "circulant", or a model of `bayesperiodic.noise`.
+    scheme : str or Scheme, optional
+        See `solve_periodic`.
+    input_noise : "measured", "exact", "joint" or mapping of str to float or array (amplitudes, amplitudes)
+        Errors of the measured inputs. "measured": with the variances that `fold` found, averaged over neighbouring
+        harmonics, in experiments of at least five cycles; the inputs of others are exact. A mapping gives the standard
+        deviation of one value of the mean period, white noise, or the covariance of mean, cosines and sines of the
+        harmonics kept, as many amplitudes as these. The true inputs, with a flat prior, are integrated out, linearised
+        about the estimate; see `MapEstimate.input_errors`. "joint": as "measured", but the amplitudes of the errors are
+        parameters of each experiment, ``force_mean``, ``force_cos1``, ``force_sin1``, …, in the unit of the input.
+
+    Raises
+    ------
+    ValueError
+        For a parameter that is not just one of free, fixed and tied, or is in two priors, an expression that is not
+        allowed or circular, a value that is no prior or does not fit its tuple of names, an unknown name, an experiment
+        without the model's inputs or with outputs that the model lacks or that are constant, no more independent values
+        than free parameters behind a variance whose prior is improper, an autonomous model whose measured frequency has
+        no standard error.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
+
+    Examples
+    --------
+    >>> problem  # doctest: +NORMALIZE_WHITESPACE
+    Problem('duffing', 1 experiments, free: c, k, channels: displacement with 11 independent values, independent noise,
+    noise of force integrated out)
+    >>> at = {"c": 0.2, "k": 1.0}, {"displacement": 1e-6}
+    >>> bool(problem.log_posterior(*at) > problem.log_posterior({"c": 0.2, "k": 1.1}, at[1]))
+    True
+    >>> problem.gradient(*at).shape, problem.solve(at[0])["synthetic duffing"].status
+    ((3,), 'converged')
+    """
+
+    @cached_property
+    def _densities(self) -> dict[tuple[str, str], LogPosterior]:
+        return {}
+
+    def density(self, *, coordinates: str = RIDGE, variances: str = SAMPLED) -> LogPosterior:
+        """Return the log-posterior over the sampling coordinates.
+
+        Its periodic solves are anchored at the medians of the priors, see `LogPosterior.start`, or where `anchored`
+        has put them. The first call computes the anchors.
+
+        Parameters
+        ----------
+        coordinates : "ridge" or "natural"
+        variances : "sampled" or "collapsed"
+            See `LogPosterior`.
+
+        Returns
+        -------
+        LogPosterior
+        """
+        settings = coordinates, variances
+        if settings not in self._densities:
+            first = next(iter(self._densities.values()), None) or LogPosterior.start(self)
+            self._densities[settings] = first.with_settings(coordinates=coordinates, variances=variances)
+        return self._densities[settings]
+
+    def anchored(self, theta: Mapping[str, float] | np.ndarray, guesses: Guesses | None = None) -> "Problem":
+        """Return the same problem with its periodic solves anchored at another θ.
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (names,)
+        guesses : mapping of str to mapping of str to array (points,), optional
+            States of every experiment, turns included, from which to solve; by default the present anchors.
+
+        Returns
+        -------
+        Problem
+
+        Raises
+        ------
+        ValueError
+            For unknown or missing names, or arrays of another length.
+        """
+        values, other = self.vector(theta), copy(self)
+        if guesses is None:
+            density = self.density().anchored(values)
+        else:
+            density = LogPosterior(self, Simulator.start(self, values, guesses))
+        other._densities = {(density.coordinates, SAMPLED): density}
+        return other
+
+    def with_input_errors(self, errors: Mapping[str, InputErrors]) -> "Problem":
+        """Return the same problem with the errors of its inputs, linearised about an estimate.
+
+        `map_estimate`, `sample` and whatever takes their results do this themselves.
+
+        Parameters
+        ----------
+        errors : mapping of str to InputErrors
+            By experiment, as `MapEstimate.input_errors`; none for exact inputs.
+
+        Returns
+        -------
+        Problem
+        """
+        if same(self.input_errors, errors):
+            return self
+        if self._last and same(self._last[0].input_errors, errors):
+            return self._last[0]
+        other, own = copy(self), self.likelihood
+        other.__dict__.pop("_densities", None)
+        other.input_errors = dict(errors)
+        other.observations = {}
+        for name, seen in self.observations.items():
+            caused = errors[name].parts([block.size for block in seen.blocks]) if name in errors else None
+            delayed = self.parameter_maps[name].delayed
+            other.observations[name] = Observation(seen.experiment, self.model, delayed, caused)
+        loadings = {name: one.loadings for name, one in errors.items()}
+        other.likelihood = Likelihood(own.model, own.blocks, own.fixed, loadings)
+        self._last[:] = [other]
+        return other
+
+    @cached_property
+    def _last(self) -> list["Problem"]:
+        """The last problem of `with_input_errors`, whose anchors are kept."""
+        return []
+
+    def planned(self, experiment: Experiment, noise: Mapping[str, float]) -> "Problem":
+        """Return the problem of an experiment that may be made, alone, with exact inputs and this one's parameters.
+
+        Parameters
+        ----------
+        experiment : Experiment
+            With the name of one of this problem's experiments, whose parameters are its own.
+        noise : mapping of str to float
+            The noise parameters by their full names, known.
+
+        Returns
+        -------
+        Problem
+        """
+        other, seen = copy(self), Observation(experiment, self.model, self.parameter_maps[experiment.name].delayed)
+        names = {name for block in seen.blocks for name in self.noise.parameter_names(block)}
+        other.experiments, other.observations, other.input_errors = (experiment,), {experiment.name: seen}, {}
+        other.likelihood = Likelihood(self.noise, seen.blocks, {name: noise[name] for name in names})
+        other._densities = {}
+        return other
+
+    def _evaluated(self, evaluate: str, theta: Any, variances: Any, threads: int | None = None) -> np.ndarray:
+        values, noise = self.vector(theta), self.noise_values(variances)
+        if noise.shape[:-1] != values.shape[:-1]:
+            noise = np.broadcast_to(noise, (*values.shape[:-1], noise.shape[-1]))
+        flat = values.reshape(-1, values.shape[-1]), noise.reshape(-1, noise.shape[-1])
+        found: Evaluation = getattr(self.density(coordinates=NATURAL), evaluate)(*flat, threads)
+        return found.log_prob.reshape(values.shape[:-1])
+
+    def log_likelihood(
+        self, theta: Mapping[str, float] | np.ndarray, variances: Any, threads: int | None = None
+    ) -> np.ndarray:
+        """Return the log-likelihood.
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (…, names)
+            See `vector`, which raises for unknown or missing names.
+        variances : mapping of str to float, or array (…, noise_names)
+            See `noise_values`, which does likewise.
+        threads : int, optional
+            By default one per core. The value does not depend on it.
+
+        Returns
+        -------
+        array (…)
+            −inf where a periodic solve fails.
+        """
+        return self._evaluated("log_likelihood", theta, variances, threads)
+
+    def log_posterior(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> np.ndarray:
+        """Return log-prior plus log-likelihood, a density over (θ, log φ) (de Kraker et al. 1997, eq. 6).
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (…, names)
+        variances : mapping of str to float, or array (…, noise_names)
+            See `log_likelihood`.
+
+        Returns
+        -------
+        array (…)
+            −inf outside the priors' support and where a periodic solve fails.
+        """
+        return self._evaluated("at", theta, variances)
+
+    def gradient(
+        self, theta: Mapping[str, float] | np.ndarray, variances: Any, *, method: str = "adjoint"
+    ) -> np.ndarray:
+        """Return the gradient of `log_posterior` by θ and by the logarithms of the free noise parameters.
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (names,)
+        variances : mapping of str to float, or array (noise_names,)
+        method : "adjoint" or "forward"
+            One transposed solve an experiment, whatever the number of parameters, or one solve a parameter (eq. 4 of
+            the paper). An autonomous model always takes the second.
+
+        Returns
+        -------
+        array (names + free_noise,)
+
+        Raises
+        ------
+        ValueError
+            Where the log-posterior is not finite.
+        """
+        _checks.one_of("method", method, METHODS)
+        value, gradient = self._value_and_gradient(theta, variances, forward=method == "forward")
+        if not np.isfinite(value):
+            given = dict(zip(self.names, self.vector(theta).tolist(), strict=True))
+            raise ValueError(
+                f"theta: the log-posterior must be finite, got {value} at {given}. A prior excludes this point, or a "
+                "solve fails: see log_prior(theta) and solve(theta)."
+            )
+        return gradient
+
+    def value_and_gradient(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> tuple[float, np.ndarray]:
+        """Return `log_posterior` at one θ and its `gradient`; −inf and zeros where one of them is not finite.
+
+        One periodic solve and one transposed solve an experiment, shared among the cores.
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (names,)
+        variances : mapping of str to float, or array (noise_names,)
+
+        Returns
+        -------
+        value : float
+        gradient : array (names + free_noise,)
+        """
+        return self._value_and_gradient(theta, variances, forward=False)
+
+    def _value_and_gradient(self, theta: Any, variances: Any, *, forward: bool) -> tuple[float, np.ndarray]:
+        density = self.density(coordinates=NATURAL)
+        natural = self.vector(theta), self.noise_values(variances)
+        value, by_theta, by_noise, _ = density.value_and_gradient_at(*natural, forward=forward)
+        return value, np.concatenate([by_theta, by_noise[density.noise_columns]])
+
+    def outputs(self, theta: Mapping[str, float] | np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
+        """Return the predicted outputs at many θ, and whether the solves converged.
+
+        Parameters
+        ----------
+        theta : mapping of str to array (draws,), or array (draws, names)
+
+        Returns
+        -------
+        outputs : dict of str to dict of str to array (draws, points)
+            By experiment and channel, in the channel's unit.
+        converged : bool array (draws,)
+        """
+        return self.density().outputs(self.vector(theta))
+
+    def solve(self, theta: Mapping[str, float] | np.ndarray) -> dict[str, PeriodicSolution]:
+        """Return the periodic solution of every experiment at one θ.
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (names,)
+
+        Returns
+        -------
+        dict of str to PeriodicSolution
+            By experiment; a solve that fails has another status than "converged".
+        """
+        return self.density().solve(self.vector(theta))

@@ -1,0 +1,291 @@
+"""Periodic responses of all experiments of a problem at any θ, solved from anchors."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bayesperiodic import _checks
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.initial_orbits import with_guesses
+from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
+from bayesperiodic.periodic.arclength import LOST, path_outcome
+from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
+from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
+from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved, directional_sensitivities
+from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
+from bayesperiodic.periodic.solution import PeriodicSolution, describe, logarithmic_changes
+from bayesperiodic.periodic.solve import solve_driven, solve_free
+from bayesperiodic.problem.description import Description
+from bayesperiodic.problem.parameters import ParameterMaps
+
+Guesses = Mapping[str, Mapping[str, np.ndarray]]
+
+
+class Simulator:
+    """Periodic solutions of a problem's experiments at any θ, solved from anchors, and their derivatives at one θ.
+
+    By experiment: the guesses are states (points,), or "static", to solve from where the anchors fail; the derivatives
+    are those of outputs and frequency at the anchors by all parameters, None where they do not exist.
+    """
+
+    def __init__(
+        self,
+        problem: Description,
+        guesses: Mapping[str, Any],
+        anchors: Mapping[str, Anchor],
+        derivatives: Mapping[str, Sensitivities | None],
+    ):
+        self.problem, self._guesses, self._anchors, self._derivatives = problem, guesses, anchors, derivatives
+
+    @classmethod
+    def start(cls, problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> "Simulator":
+        """Return the simulator anchored at θ (names,), solved from guesses, the experiments' own or the equilibrium."""
+        if guesses is not None:
+            _checks.same_names("guesses", guesses, [e.name for e in problem.experiments])
+        experiments = with_guesses(problem, theta).experiments if guesses is None else problem.experiments
+        own = {
+            e.name: (e if guesses is None else replace(e, guess=guesses[e.name])).guess or "static" for e in experiments
+        }
+        return cls(problem, own, {}, {}).anchored(theta)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The factors at the anchors are computed again; the anchors are kept to the last bit.
+        return {key: value for key, value in self.__dict__.items() if key != "_batches"}
+
+    def anchored(self, theta: np.ndarray) -> "Simulator":
+        """Return the simulator anchored at θ (names,), solved from the present anchors, else from the guesses."""
+        found = self.solve(theta[None], keep=True, polish=True) if self._anchors else None
+        anchors: dict[str, Anchor] = {}
+        derivatives: dict[str, Sensitivities | None] = {}
+        for name, equations in self.problem.equations.items():
+            parameters = self.problem.parameters(theta[None], name)[0]
+            if found is not None and found.statuses(name)[0] == CONVERGED:
+                here, z = equations.at_frequency(float(found.response(name).frequency[0])), found.z(name)[0]
+            else:
+                here, (z, code, *_) = self._from_guess(name, parameters)
+                if code != CONVERGED:
+                    anchors[name], derivatives[name] = Anchor(parameters, z, equations.frequency), None
+                    continue
+            moving = np.flatnonzero(self.problem.parameter_maps[name].slopes(theta)[:-1].any(axis=1))
+            directions = np.eye(parameters.size)[moving]
+            derivative = directional_sensitivities(here, z, parameters, directions)
+            anchors[name] = Anchor.of(here, parameters, z, derivative, moving)
+            derivatives[name] = derivative and derivative._replace(
+                outputs=np.tensordot(directions, derivative.outputs, (0, 0)),
+                frequency=directions.T @ derivative.frequency,
+            )
+        return Simulator(self.problem, self._guesses, anchors, derivatives)
+
+    def _from_guess(self, experiment: str, parameters: np.ndarray) -> tuple[PeriodicEquations, Solved]:
+        """Solve from the experiment's guess, with all fallbacks."""
+        equations, guess = self.problem.equations[experiment], self._guesses[experiment]
+        if self.problem.model.autonomous:
+            return solve_free(equations, parameters, guess)[:2]
+        return equations, solve_driven(equations, parameters, guess)[0]
+
+    @cached_property
+    def groups(self) -> list[tuple[Experiment, ...]]:
+        """Experiments on the same grid and with the same parameters free, which are solved together."""
+        groups: dict[tuple[Any, ...], list[Experiment]] = {}
+        for e in self.problem.experiments:
+            groups.setdefault((e.samples, e.periods, *self.problem.parameter_maps[e.name].columns), []).append(e)
+        return [tuple(group) for group in groups.values()]
+
+    @cached_property
+    def _places(self) -> dict[str, tuple[int, int]]:
+        """Group and member of every experiment."""
+        return {e.name: (g, m) for g, group in enumerate(self.groups) for m, e in enumerate(group)}
+
+    @cached_property
+    def _batches(self) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch, bool]]:
+        """The groups, their parameters, their solver, and whether multipliers were measured."""
+        kind = AutonomousBatch if self.problem.model.autonomous else Batch
+        return [
+            (
+                group,
+                ParameterMaps([self.problem.parameter_maps[e.name] for e in group]),
+                kind([self.problem.equations[e.name] for e in group], [self._anchors[e.name] for e in group]),
+                any(e.multipliers is not None for e in group),
+            )
+            for group in self.groups
+        ]
+
+    def solve(
+        self,
+        theta: np.ndarray,
+        threads: int | None = None,
+        *,
+        keep: bool = False,
+        polish: bool = False,
+        whole: bool = False,
+    ) -> Simulation:
+        """Solve every experiment for θ (solves, names); the result does not depend on the number of threads.
+
+        With `keep` the periodic parts z are returned too; with `polish` the solves are as accurate as possible, as
+        wherever multipliers are measured. With `whole` a θ counts only if every solve converges; where one has failed,
+        other experiments may be skipped.
+        """
+        found = []
+        for experiments, maps, batch, multipliers in self._batches:
+            values = maps.values(theta)
+            parameters = values[..., :-1]
+            if isinstance(batch, AutonomousBatch):
+                solved = batch.solve(parameters, threads, keep=keep or multipliers, whole=whole)
+            else:
+                solved = batch.solve(parameters, threads, keep=keep or multipliers, polish=polish or multipliers)
+            status, logarithms = solved.status, [np.empty((len(theta), 0))] * len(experiments)
+            if multipliers:
+                status = status.copy()
+                logarithms = [
+                    self._log_multipliers(e, solved.z[i], solved.frequency[i], parameters[i], status[i])
+                    for i, e in enumerate(experiments)
+                ]
+            found.append(GroupSolution(solved.outputs, solved.frequency, values, logarithms, solved.z, status))
+        return Simulation(found, self._places)
+
+    def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
+        """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""
+        anchor, parameters = self._anchors[experiment], self.problem.parameters(theta[None], experiment)[0]
+        return (
+            LOST
+            if anchor.sensitivities is None
+            else path_outcome(self.problem.equations[experiment], anchor, parameters)
+        )
+
+    def _log_multipliers(
+        self, experiment: Experiment, z: np.ndarray, frequency: np.ndarray, parameters: np.ndarray, status: np.ndarray
+    ) -> np.ndarray:
+        """Return log|μ| (solves, multipliers) of those that were measured; "other orbit" where a sign differs."""
+        measured = experiment.multipliers
+        if measured is None:
+            return np.empty((len(z), 0))
+        result = np.full((len(z), measured.size), np.nan)
+        for i in np.flatnonzero(status == CONVERGED):
+            equations = self.problem.equations[experiment.name].at_frequency(float(frequency[i]))
+            found = orbit_multipliers(equations, parameters[i], z[i], measured.size)
+            if found.size < measured.size:
+                status[i] = SINGULAR
+            elif np.any(np.sign(found.real) != np.sign(measured)):
+                status[i] = OTHER_ORBIT
+            else:
+                result[i] = np.log(np.abs(found))
+        return result
+
+    def largest_multipliers(self, theta: np.ndarray, experiment: str, simulation: Simulation) -> np.ndarray:
+        """Return the modulus (solves,) of the largest multiplier at θ (solves, names); NaN where the solve failed."""
+        parameters, result = self.problem.parameters(theta, experiment), np.full(len(theta), np.nan)
+        frequency, z = simulation.response(experiment).frequency, simulation.z(experiment)
+        for i in np.flatnonzero(simulation.statuses(experiment) == CONVERGED):
+            equations = self.problem.equations[experiment].at_frequency(float(frequency[i]))
+            result[i] = np.abs(orbit_multipliers(equations, parameters[i], z[i], 1)).max(initial=0.0)
+        return result
+
+    def solutions(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
+        """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""
+        found, solutions = self.solve(theta[None], keep=True, polish=True), {}
+        for name, equations in self.problem.equations.items():
+            here = equations.at_frequency(float(found.response(name).frequency[0]))
+            parameters, code = self.problem.parameters(theta[None], name)[0], int(found.statuses(name)[0])
+            solutions[name] = describe(here, parameters, Solved(found.z(name)[0], code, np.empty((0, 3))))
+        return solutions
+
+    def changes(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:
+        """Return the derivatives of a response at the anchor by θ, (names, …); None where they do not exist."""
+        slopes, derivative = self.problem.parameter_maps[experiment].slopes(theta), self._derivatives[experiment]
+        if derivative is None:
+            return None
+        outputs = np.tensordot(slopes[:-1], derivative.outputs, (0, 0))
+        multipliers = np.zeros((theta.size, 0))
+        if response.log_multipliers.size:
+            multipliers = self._multiplier_changes(theta, experiment, z, response)
+        return Response(outputs, slopes[:-1].T @ derivative.frequency, multipliers, slopes[-1])
+
+    def _multiplier_changes(self, theta: np.ndarray, experiment: str, z: np.ndarray, response: Response) -> np.ndarray:
+        """Return ∂ log|μ|/∂θ at the anchor, (names, multipliers)."""
+        anchor, directions = self._anchors[experiment], self.problem.parameter_maps[experiment].slopes(theta)[:-1].T
+        assert anchor.sensitivities is not None and anchor.frequency_sensitivities is not None
+        equations = self.problem.equations[experiment].at_frequency(float(response.frequency))
+        parameters, count = self.problem.parameters(theta[None], experiment)[0], response.log_multipliers.size
+        solution = _described(equations, parameters, z)
+        every = logarithmic_changes(
+            equations,
+            parameters,
+            z,
+            solution,
+            np.tensordot(directions, anchor.sensitivities, (1, 0)),
+            directions,
+            directions @ anchor.frequency_sensitivities,
+            None if solution.autonomous else count,
+        ).real
+        return np.array([_without_trivial(solution, row)[:count] for row in every])
+
+    def vjp(
+        self,
+        theta: np.ndarray,
+        simulation: Simulation,
+        by_outputs: Sequence[np.ndarray],
+        by_delay: Sequence[np.ndarray],
+        by_multipliers: Mapping[str, np.ndarray],
+    ) -> dict[str, np.ndarray]:
+        """Return the derivatives of a scalar by θ, (names,) by experiment, from those that `Comparisons.vjp` returns.
+
+        The simulation is of a driven model, at this θ alone, with z. Each experiment takes one transposed solve; NaN
+        where the derivatives do not exist.
+        """
+        result: dict[str, np.ndarray] = {}
+        for g, (experiments, maps, batch, _) in enumerate(self._batches):
+            assert isinstance(batch, Batch)
+            solved = simulation.groups[g]
+            values = solved.values[:, 0]
+            by_parameter = np.zeros(values.shape)
+            by_parameter[:, maps.moving] = batch.vjp(values[:, :-1], solved.z[:, 0], by_outputs[g], maps.moving)
+            by_parameter[:, -1] = by_delay[g]
+            result |= zip((e.name for e in experiments), maps.vjp(values, by_parameter), strict=True)
+        for e in self.problem.experiments:
+            if e.multipliers is not None:
+                response = simulation.at(0).response(e.name)
+                changes = self._multiplier_changes(theta, e.name, simulation.z(e.name)[0], response)
+                result[e.name] = result[e.name] + changes @ by_multipliers[e.name]
+        return result
+
+
+def orbit_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int) -> np.ndarray:
+    """Return the `count` largest multipliers of a solution z, or fewer, without an autonomous orbit's trivial 1."""
+    if not count:
+        return np.empty(0)
+    easy = None if equations.model.autonomous else _leading_multipliers_directly(equations, parameters, z, count)
+    if easy is not None:
+        return easy
+    solution = _described(equations, parameters, z)
+    return _without_trivial(solution, solution.multipliers)[:count]
+
+
+def _leading_multipliers_directly(
+    equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int
+) -> np.ndarray | None:
+    """Return the largest multipliers of a driven model where `floquet.leading_multipliers` finds them."""
+    orders = tuple(equations.model.orders.values())
+    columns = equations.residual_jacobian(z, parameters)[:, equations.count :]
+    try:
+        matrix = first_order_matrix(columns.reshape(len(z), equations.count, -1), orders)
+    except np.linalg.LinAlgError:
+        return None
+    period = equations.grid.periods / equations.frequency
+    spread = np.ptp(z, axis=0)
+    sizes = np.where(spread > 0.0, spread, 1.0)
+    sizes = np.concatenate([sizes, 2 * np.pi / period * sizes[[order == 2 for order in orders]]])
+    return leading_multipliers(matrix * (sizes / sizes[:, None]), period, count)
+
+
+def _described(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> PeriodicSolution:
+    return describe(equations, parameters, Solved(z, CONVERGED, np.empty((0, 3))), sensitivities=False)
+
+
+def _without_trivial(solution: PeriodicSolution, values: np.ndarray) -> np.ndarray:
+    """Return values, one a multiplier, without that of an autonomous orbit's trivial multiplier 1."""
+    if not solution.autonomous or not values.size:
+        return values
+    return np.delete(values, np.argmin(np.abs(solution.exponents)))

@@ -1,0 +1,89 @@
+"""The noise parameters that fit given residuals best."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import minimize
+
+from bayesperiodic.likelihood.likelihood import Likelihood
+from bayesperiodic.likelihood.noise import CORRELATED, FLAT, JEFFREYS, SCALE, VARIANCE, Independent
+
+LOWEST, HIGHEST = 25.0, 8.0
+TINY = np.finfo(float).tiny
+
+
+def estimate_noise(
+    likelihood: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, log_variance_factor: float | np.ndarray
+) -> np.ndarray:
+    """Return the noise parameters (names,) that fit residuals best, one array (size,) a block, from a start.
+
+    For independent errors with the prior 1/v this is eq. (7) of [1]_, v = Σe²/(n·f) with the factor f; otherwise it
+    maximises the log-likelihood, its logarithms multiplied by f as in `Likelihood.__call__`, plus the log-prior.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
+    """
+    if likelihood.shared and likelihood.free:
+        without = Likelihood(likelihood.model, likelihood.blocks, likelihood.fixed)
+        centre = estimate_noise(without, residuals, start, log_variance_factor)
+        return _maximise(likelihood, residuals, start, centre, log_variance_factor)
+    values = start.copy()
+    for group, members in likelihood.groups():
+        if not set(group) & set(likelihood.free):
+            continue
+        blocks = [likelihood.blocks[b] for b in members]
+        factor = float(np.broadcast_to(log_variance_factor, len(residuals))[members[0]])
+        chosen = [residuals[b] for b in members]
+        total = sum(
+            block.weight / likelihood.model.gain(block) * float(r @ r) for block, r in zip(blocks, chosen, strict=True)
+        )
+        count = sum(block.count for block in blocks)
+        plain = isinstance(likelihood.model, Independent) or all(block.kind == CORRELATED for block in blocks)
+        corrected = count * factor - {JEFFREYS: 0.0, FLAT: 2.0}.get(str(likelihood.model.prior), np.inf)
+        columns = [likelihood.names.index(name) for name in group]
+        if plain and corrected > 0.0:
+            values[columns[0]] = max(total / corrected, TINY)
+            continue
+        held = {name: values[i] for name, i in zip(group, columns, strict=True) if name in likelihood.fixed}
+        part = Likelihood(likelihood.model, blocks, held)
+        size = np.where([name.startswith((VARIANCE, SCALE)) for name in group], max(total / count, TINY), part.guess())
+        values[columns] = _maximise(part, chosen, values[columns], size, factor)
+    return values
+
+
+def _maximise(
+    part: Likelihood,
+    residuals: Sequence[np.ndarray],
+    start: np.ndarray,
+    centre: np.ndarray,
+    log_variance_factor: float | np.ndarray,
+) -> np.ndarray:
+    """Return the best noise parameters (names,) from a start and from a centre, within bounds about the centre."""
+    free = [part.names.index(name) for name in part.free]
+
+    def complete(logarithms: np.ndarray) -> np.ndarray:
+        values = start.copy()
+        values[free] = np.exp(logarithms)
+        return values
+
+    def negative(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
+        values = complete(logarithms)
+        value = float(part(residuals, values, log_variance_factor) + part.log_prior(values))
+        if not np.isfinite(value):
+            return 1e300, np.zeros(len(free))
+        return -value, -part.gradients(residuals, values, log_variance_factor)[1][free]
+
+    middle = np.log(centre[free])
+    bounds = [(c - LOWEST, c + HIGHEST) for c in middle]
+    here = np.clip(np.log(start[free]), *np.transpose(bounds))
+    found = minimize(
+        negative,
+        min((here, middle), key=lambda x: negative(x)[0]),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"gtol": 1e-9, "ftol": 1e-15, "maxiter": 500},
+    )
+    return complete(found.x)

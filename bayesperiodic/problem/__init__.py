@@ -1,0 +1,1 @@
+"""What a posterior density is defined by."""

@@ -1,0 +1,543 @@
+"""A model, experiments, priors and a noise model, validated: what a posterior density is defined by."""
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import sympy as sp
+
+from bayesperiodic import _checks
+from bayesperiodic.data.experiment import DATA, Experiment
+from bayesperiodic.data.recording import Recording
+from bayesperiodic.likelihood.input_noise import (
+    EXACT,
+    JOINT,
+    MEASURED,
+    InputErrors,
+    InputNoise,
+    checked,
+    noisy_inputs,
+    same,
+    true_inputs,
+    with_errors_as_parameters,
+)
+from bayesperiodic.likelihood.likelihood import Likelihood
+from bayesperiodic.likelihood.noise import EXPERIMENT, Noise, as_noise
+from bayesperiodic.likelihood.observation import Observation
+from bayesperiodic.models.model import Model
+from bayesperiodic.periodic.equations import PeriodicEquations
+from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
+from bayesperiodic.priors.joint import JointPrior
+from bayesperiodic.priors.single import Uniform
+from bayesperiodic.problem.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
+
+# Least width of a prior relative to its median; below it the log-posterior is not smooth in double precision.
+NARROWEST = 1e-12
+
+
+class Description:
+    """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction."""
+
+    def __init__(
+        self,
+        model: Model,
+        experiments: Iterable[Experiment],
+        *,
+        priors: Mapping[Any, Any],
+        fixed: Mapping[str, float | Mapping[str, float]] | None = None,
+        tied: Mapping[str, str] | None = None,
+        local: Iterable[str] = (),
+        noise: str | Noise = "independent",
+        scheme: str | Scheme | None = None,
+        input_noise: InputNoise = MEASURED,
+    ):
+        if not isinstance(model, Model):
+            raise ValueError(f"model: must be a Model, got {_checks.shortened(model)}.")
+        if not isinstance(priors, Mapping):
+            raise ValueError(f"priors: must be a mapping of names to priors, got {priors!r}.")
+        self.noise, self.experiments = as_noise(noise), _checked_experiments(model, experiments)
+        local = local if isinstance(local, str) else tuple(local)
+        self._given: dict[str, Any] = {
+            "model": model, "priors": dict(priors), "fixed": dict(fixed or {}), "tied": tied, "local": local,
+            "noise": noise, "scheme": scheme, "input_noise": input_noise,
+        }  # fmt: skip
+        self.input_noise = checked(input_noise, model.inputs, self.experiments)
+        if self.input_noise == JOINT:
+            model, errors, none = with_errors_as_parameters(model, self.experiments)
+            priors, fixed = {**priors, **errors}, {**(fixed or {}), **none}
+            local = (*local,) + tuple(name for name in model.parameters if name not in self._given["model"].parameters)
+        self.model, self.scheme = model, scheme or default_scheme(model)
+        find_scheme(self.scheme)
+        if not self.noise.flat and any(e.mask is not None for e in self.experiments):
+            if isinstance(self.input_noise, Mapping):
+                raise ValueError(
+                    f"input_noise: must be 'joint' or 'exact' for points of a mask with {self.noise.name!r} noise, got "
+                    f"{_checks.shortened(input_noise)}; take noise='independent' or 'measured', or whole periods."
+                )
+            self.input_noise = EXACT if self.input_noise == MEASURED else self.input_noise
+        self.input_errors: dict[str, InputErrors] = {}
+        measured = {channel for experiment in self.experiments for channel in experiment.outputs}
+        self.channels = tuple(channel for channel in model.outputs if channel in measured)
+        runs = [e.name for e in self.experiments]
+        fixed, tied, every = dict(fixed or {}), dict(tied or {}), (*model.parameters, SHIFT)
+        self.local = _checked_local(local, every, priors, tied)
+        self.fixed = {n: _constant(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
+        given = expand_priors(priors, self.local, runs, self.fixed) | self._free_phases(priors, fixed, tied)
+        self.joint_prior = JointPrior.of(given, free_names(model.parameters, self.local, runs))
+        self.names = self.joint_prior.names
+        self._check_widths()
+        self._check_free(fixed)
+        self.parameter_maps = {
+            run: ParameterMap.of(
+                model.parameters, self.names, run, {n: v[run] for n, v in self.fixed.items() if run in v}, tied
+            )
+            for run in runs
+        }
+        self.ties = self._ties()
+        self.observations = {
+            e.name: Observation(e, model, self.parameter_maps[e.name].delayed) for e in self.experiments
+        }
+        self.likelihood = self._likelihood(fixed)
+        self._check_counts()
+
+    def _free_phases(self, priors: Any, fixed: Mapping[str, Any], tied: Mapping[str, Any]) -> dict[str, Uniform]:
+        """Return the priors of the delays that an autonomous model needs and that were not given."""
+        if not self.model.autonomous or SHIFT in fixed or SHIFT in tied or SHIFT in priors:
+            return {}
+        return {
+            f"{SHIFT}[{e.name}]": Uniform(-0.5 / e.frequency, 0.5 / e.frequency)
+            for e in self.experiments
+            if f"{SHIFT}[{e.name}]" not in priors
+        }
+
+    def _likelihood(self, fixed: Mapping[str, Any]) -> Likelihood:
+        blocks = [block for observation in self.observations.values() for block in observation.blocks]
+        known = {name: value for name, value in fixed.items() if name not in self.fixed}
+        names = tuple(dict.fromkeys(n for block in blocks for n in self.noise.parameter_names(block)))
+        for plain in (name.partition("[")[0] for name in names):
+            if plain in self.model.parameters:
+                raise ValueError(
+                    f"model: parameters must have other names than those of the noise model {self.noise.name!r}, got "
+                    f"{plain!r}. Rename the model's parameter."
+                )
+        for name, value in known.items():
+            _checks.one_of("fixed", name, (*self.model.parameters, SHIFT, *names))
+            _checks.positive(f"fixed[{name!r}]", value)
+        return Likelihood(self.noise, blocks, known)
+
+    def _check_free(self, fixed: Mapping[str, Any]) -> None:
+        known = {*fixed, *(local_name(name, run) for name, by_run in self.fixed.items() for run in by_run)}
+        for name in self.names:
+            if name in known:
+                raise ValueError(f"fixed: {name!r} has a prior too; give a prior or a value.")
+        if not self.names:
+            raise ValueError("priors: must have at least one free parameter, got {}.")
+
+    def _check_widths(self) -> None:
+        """Refuse priors that are narrower than the rounding of their parameter."""
+        sizes = np.spacing(np.abs(self.median())) / np.finfo(float).eps
+        for name, width, size in zip(self.names, self.joint_prior.widths, sizes, strict=True):
+            if not width > NARROWEST * size:
+                raise ValueError(
+                    f"priors[{name!r}]: must be wider than {NARROWEST:g} of the median, got a width of {width:.3g}; a "
+                    f"known value is given by fixed={{{name!r}: …}}."
+                )
+
+    def _check_counts(self) -> None:
+        """Refuse an improper prior of a variance where as many parameters can fit the data exactly."""
+        if self.noise.proper:
+            return
+        for group, members in self.likelihood.groups():
+            count = self.likelihood.counts[group[0]]
+            runs = {self.likelihood.blocks[b].experiment for b in members}
+            acting = sorted({i for run in runs for i in self.parameter_maps[run].columns.values()})
+            needed = len(acting) + self.noise.spare
+            if group[0] in self.likelihood.free and count <= needed:
+                names = ", ".join(self.names[i] for i in acting)
+                shared = "Share it among experiments (per='channel'), fix" if self.noise.per == EXPERIMENT else "Fix"
+                raise ValueError(
+                    f"priors: an unknown {group[0]!r} with the {self.noise.prior_text} must have more than {needed} "
+                    f"independent values for {len(acting)} free parameters ({names}), got only {count:.0f}. {shared} "
+                    f"parameters or {group[0]!r}, give it a proper prior (noise.Independent(prior=…)), keep more "
+                    "harmonics, or add experiments."
+                )
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """All noise parameters, the last axis of `variances` in what follows."""
+        return self.likelihood.names
+
+    @property
+    def free_noise(self) -> tuple[str, ...]:
+        """Noise parameters without a known value."""
+        return self.likelihood.free
+
+    @property
+    def counted(self) -> float:
+        """Σn, the independent values behind all unknown and known variances."""
+        return sum(self.likelihood.counts.values())
+
+    def with_experiments(self, experiments: Iterable[Experiment]) -> Self:
+        """Return the same problem with other data, or with some of its experiments.
+
+        Parameters
+        ----------
+        experiments : iterable of Experiment
+            Priors and fixed values of single experiments go by the experiments' names; those of experiments left out
+            are dropped.
+
+        Returns
+        -------
+        Problem
+
+        Raises
+        ------
+        ValueError
+            As the constructor does.
+        """
+        chosen = tuple(experiments)
+        gone = {e.name for e in self.experiments} - {getattr(e, "name", None) for e in chosen}
+        ends = tuple(local_name("", name) for name in gone)
+        priors, fixed = (
+            {key: value for key, value in given.items() if not (isinstance(key, str) and key.endswith(ends))}
+            for given in (self._given["priors"], self._given["fixed"])
+        )
+        for name, value in fixed.items():
+            if isinstance(value, Mapping):
+                fixed[name] = {run: number for run, number in value.items() if run not in gone}
+        return type(self)(experiments=chosen, **self._given | {"priors": priors, "fixed": fixed})
+
+    @property
+    def tied(self) -> dict[str, str]:
+        """The expressions of the tied parameters."""
+        any_map = next(iter(self.parameter_maps.values()))
+        return {name: expression.text for name, expression in any_map.tied.items()}
+
+    def _ties(self) -> dict[str, sp.Expr]:
+        """Return the expressions of the model's tied parameters by its symbols, those of others inserted."""
+        symbols: dict[str, sp.Expr] = self.model.parameter_symbols | {SHIFT: sp.Symbol(SHIFT, real=True)}
+        degrees: dict[str, float] = {}
+        tied = next(iter(self.parameter_maps.values())).tied  # each only of those before it
+        for name, tie in tied.items():
+            symbols[name], degrees[name] = tie.symbolic(f"tied[{name!r}]", symbols, degrees)
+        return {name: symbols[name] for name in tied if name != SHIFT}
+
+    @property
+    def priors(self) -> dict[str | tuple[str, ...], Any]:
+        """The priors by name, in the order of the model's parameters."""
+        return self.joint_prior.blocks
+
+    def median(self) -> np.ndarray:
+        """Return the medians of the priors, (names,)."""
+        return self.joint_prior.median()
+
+    def vector(self, theta: Mapping[str, float] | np.ndarray | Sequence[float]) -> np.ndarray:
+        """Return θ as an array from a mapping or an array.
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (…, names)
+            Natural values, in the parameters' units.
+
+        Returns
+        -------
+        array (…, names)
+
+        Raises
+        ------
+        ValueError
+            For unknown or missing names, or another last axis.
+        """
+        return _values("theta", theta, self.names)
+
+    def noise_values(self, variances: Mapping[str, Any] | np.ndarray) -> np.ndarray:
+        """Return the noise parameters as an array from a mapping or an array.
+
+        Parameters
+        ----------
+        variances : mapping of str to float, or array (…, noise_names)
+            In a mapping a channel's name stands for its variance [channel's unit squared], and those with a known value
+            may be left out.
+
+        Returns
+        -------
+        array (…, noise_names)
+
+        Raises
+        ------
+        ValueError
+            For unknown or missing names, or another last axis.
+        """
+        names = self.noise_names
+        if isinstance(variances, Mapping):
+            longer = {f"variance[{name}]": name for name in variances}
+            renamed = {long if long in names else short: variances[short] for long, short in longer.items()}
+            variances = {**self.likelihood.fixed, **renamed}
+        return _values("variances", variances, names)
+
+    def log_prior(self, theta: Mapping[str, float] | np.ndarray) -> np.ndarray:
+        """Return Σ ln p(θ_α).
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (…, names)
+            See `vector`.
+
+        Returns
+        -------
+        array (…)
+            −inf outside the support.
+        """
+        return self.joint_prior.log_prob(self.vector(theta))
+
+    @cached_property
+    def logarithmic(self) -> np.ndarray:
+        """Parameters sampled in their logarithm, those whose prior's support is (0, ∞): bool array (names,)."""
+        return np.array([support == (0.0, np.inf) for support in self.joint_prior.supports.values()])
+
+    @property
+    def noisy_inputs(self) -> dict[str, list[str]]:
+        """Inputs whose errors are integrated out, by experiment; without experiments that have none."""
+        found = {e.name: noisy_inputs(e, self.input_noise) for e in self.experiments}
+        return {name: inputs for name, inputs in found.items() if inputs}
+
+    def true_inputs(self, experiment: Experiment) -> dict[str, np.ndarray]:
+        """Return the inputs of the model in an experiment: the measured ones less their expected errors.
+
+        Parameters
+        ----------
+        experiment : Experiment
+
+        Returns
+        -------
+        dict of str to array (points,)
+            In the inputs' units.
+        """
+        return true_inputs(experiment, self.input_noise, self.input_errors.get(experiment.name))
+
+    @cached_property
+    def equations(self) -> dict[str, PeriodicEquations]:
+        """The discretised equations of every experiment."""
+        return {
+            e.name: PeriodicEquations.build(
+                self.model,
+                self.true_inputs(e),
+                frequency=e.frequency,
+                samples=e.samples,
+                scheme=self.scheme,
+                periods=e.periods,
+                winding=e.winding,
+            )
+            for e in self.experiments
+        }
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled functions cannot be pickled; they are loaded again where they are needed. Copies have other anchors.
+        return {key: value for key, value in self.__dict__.items() if key not in ("equations", "_last")}
+
+    def parameters(self, theta: np.ndarray, experiment: str) -> np.ndarray:
+        """Return every parameter of the model in an experiment, free, fixed and tied.
+
+        Parameters
+        ----------
+        theta : array (draws, names)
+        experiment : str
+
+        Returns
+        -------
+        array (draws, parameters)
+            In the order of the model.
+        """
+        return np.ascontiguousarray(self.parameter_maps[experiment].values(theta)[:, :-1])
+
+    def sample_prior(self, size: int, seed: int) -> dict[str, np.ndarray]:
+        """Return independent draws of every free parameter from its prior.
+
+        Parameters
+        ----------
+        size : int
+        seed : int
+
+        Returns
+        -------
+        dict of str to array (size,)
+            By name.
+        """
+        draws = self.joint_prior.sample(size, np.random.default_rng(seed))
+        return dict(zip(self.names, draws.T.copy(), strict=True))
+
+    def __repr__(self) -> str:
+        noisy = ", ".join(dict.fromkeys(name for own in self.noisy_inputs.values() for name in own))
+        return (
+            f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
+            f"channels: {', '.join(self.channels)} with {self.counted:.0f} independent values, {self.noise.name} noise"
+            f"{f', noise of {noisy} integrated out' if noisy else ''})"
+        )
+
+
+# What makes or computes each kind of result again.
+RESULTS = {"MapEstimate": "map_estimate(problem)", "Posterior": "sample(problem, fit)"}
+
+
+# Fields of experiments that no density depends on.
+LABELS = ("synthetic",)
+
+
+def fingerprint(problem: Description) -> str:
+    """Return digests of all that the density depends on, part by part: "model:… experiments:… priors:… …"."""
+    parts = {
+        "model": problem.model.definition,
+        "experiments": [[getattr(e, f.name) for f in fields(e) if f.name not in LABELS] for e in problem.experiments],
+        "priors": repr(problem.priors),
+        "constants": [problem.fixed, problem.tied, problem.likelihood.fixed],
+        "noise": repr(problem.noise),
+        "scheme": repr(find_scheme(problem.scheme)),
+    }
+    if problem.input_noise != EXACT:
+        parts["input_noise"] = [problem.input_noise]
+    return " ".join(f"{part}:{digest(value)}" for part, value in parts.items())
+
+
+def digest(value: Any) -> str:
+    """Return a digest of nested mappings, sequences, arrays and single values."""
+    return hashlib.sha256(b"".join(_bytes(value))).hexdigest()[:12]
+
+
+def _bytes(value: Any) -> Iterator[bytes]:
+    """Yield the content of nested mappings, sequences, arrays and single values."""
+    if isinstance(value, np.ndarray):
+        yield f"array {value.dtype} {value.shape} ".encode() + np.ascontiguousarray(value).tobytes()
+    elif isinstance(value, Mapping | list | tuple):
+        yield f"{len(value)} items ".encode()
+        for item in value.items() if isinstance(value, Mapping) else value:
+            yield from _bytes(item)
+    else:
+        number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        yield repr(float(value) if number else value).encode("utf-8", "backslashreplace") + b";"
+
+
+def changed_parts(made_for: str, here: str) -> list[str]:
+    """Return the parts in which two fingerprints differ."""
+    there = dict(part.partition(":")[::2] for part in made_for.split())
+    return [name for name, _, digest in (part.partition(":") for part in here.split()) if there.get(name) != digest]
+
+
+def check_results(problem: Any, **results: Any) -> Any:
+    """Return the problem as an estimate `fit` and draws `posterior` have it, with the errors of its inputs.
+
+    A ValueError is raised unless they were computed from the problem: model's equations, experiments with their data,
+    priors, constants, noise model and scheme must be the same.
+    """
+    if not isinstance(problem, Description):
+        raise ValueError(f"problem: must be a Problem, got {type(problem).__name__}.")
+    here = ""
+    for argument, result in results.items():
+        here = here or fingerprint(problem)
+        check_fingerprint(argument, result, here)
+    first, *others = [result.input_errors for result in results.values()]
+    if any(not same(first, other) for other in others):
+        raise ValueError(
+            "posterior: must be draws from the density of `fit`, got draws with other errors of the inputs, which "
+            f"another estimate determined; give {RESULTS['Posterior']}."
+        )
+    given: Any = problem
+    return given.with_input_errors(first)
+
+
+def check_fingerprint(argument: str, result: Any, here: str) -> None:
+    """Raise a ValueError unless an estimate, or draws if the argument is `posterior`, are of the problem `here`."""
+    kind = "Posterior" if argument == "posterior" else "MapEstimate"
+    if type(result).__name__ != kind:
+        raise ValueError(f"{argument}: must be a {kind}, got {type(result).__name__}; give {RESULTS[kind]}.")
+    if changed := changed_parts(result.fingerprint, here):
+        raise ValueError(
+            f"{argument}: must be a result of this problem, got one of a problem with other {', '.join(changed)}; give "
+            f"{RESULTS[kind]}."
+        )
+
+
+def _values(argument: str, given: Any, names: tuple[str, ...]) -> np.ndarray:
+    if isinstance(given, Mapping):
+        _checks.same_names(argument, given, names)
+        given = np.stack(np.broadcast_arrays(*(_checks.real_array(argument, given[name]) for name in names)), -1)
+    values = _checks.real_array(argument, given)
+    if values.shape[-1:] != (len(names),):
+        raise ValueError(f"{argument}: last axis must be {list(names)}, got shape {values.shape}.")
+    return values
+
+
+def _checked_local(
+    local: Iterable[str], every: tuple[str, ...], priors: Any, tied: Mapping[str, str]
+) -> tuple[str, ...]:
+    if isinstance(local, str):
+        raise ValueError(f"local: must be a sequence of names, got {local!r}. Give [{local!r}].")
+    names = tuple(local)
+    for name in names:
+        _checks.one_of("local", name, every)
+        if name in tied:
+            raise ValueError(f"local: {name!r} is tied; it follows what it is tied to, so leave it out.")
+    if isinstance(priors, Mapping):
+        for key in priors:
+            for name in key if isinstance(key, tuple) else ():
+                if name in names:
+                    raise ValueError(
+                        f"priors[{key!r}]: {name!r} is local; a joint prior needs the names of single experiments, "
+                        f"such as '{name}[run]'."
+                    )
+    return names if SHIFT in names else (*names, SHIFT)
+
+
+def _constant(name: str, given: Any, runs: list[str], local: bool) -> dict[str, float]:
+    """Return the value of a fixed parameter in each experiment; a local one may be fixed in some of them."""
+    if not isinstance(given, Mapping):
+        return dict.fromkeys(runs, _checks.finite_number(f"fixed[{name!r}]", given))
+    for run in given:
+        _checks.one_of(f"fixed[{name!r}]", run, runs)
+    if not local:
+        _checks.same_names(f"fixed[{name!r}]", given, runs)
+    return {run: _checks.finite_number(f"fixed[{name!r}][{run!r}]", given[run]) for run in runs if run in given}
+
+
+def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tuple[Experiment, ...]:
+    if isinstance(experiments, Experiment):
+        raise ValueError(
+            f"experiments: must be a sequence, got {experiments.name!r}. Give a list of one, [experiment]."
+        )
+    result = tuple(experiments)
+    for e in result:
+        if isinstance(e, Recording):
+            raise ValueError(f"experiments: must be experiments, got the recording {e.name!r}. Fold it, see fold().")
+        if not isinstance(e, Experiment):
+            raise ValueError(f"experiments: must each be an Experiment, got {e!r}.")
+    if not result:
+        raise ValueError("experiments: must have at least one experiment, got ().")
+    names = [experiment.name for experiment in result]
+    if len(set(names)) < len(names):
+        raise ValueError(f"experiments: names must differ, got {names}. Name them with fold(name=…).")
+    for e in result:
+        _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
+        if not e.outputs:
+            raise ValueError(f"outputs of experiment {e.name!r}: must have at least one channel, got {{}}.")
+        for channel, values in e.outputs.items():
+            _checks.one_of(f"outputs of experiment {e.name!r}", channel, model.outputs)
+            if e.mask is None and e.covariance is None and np.ptp(values) == 0.0:
+                raise ValueError(
+                    f"outputs of experiment {e.name!r}: {channel!r} is constant ({values[0]:g}); a channel must vary "
+                    "over the period, or tells nothing about its variance."
+                )
+        if e.guess == DATA and model.autonomous:
+            raise ValueError(
+                f"guess of experiment {e.name!r}: must be states for {model.name!r}, which is autonomous, got {DATA!r}."
+            )
+        if e.guess and not isinstance(e.guess, str):
+            _checks.same_names(f"guess of experiment {e.name!r}", e.guess, model.states)
+        if model.autonomous and not e.frequency_se > 0.0:
+            raise ValueError(
+                f"experiment {e.name!r}: frequency_se must be > 0, got {e.frequency_se:g}; {model.name!r} is "
+                "autonomous, so that its measured frequency is data. Fold without `frequency`, which is then "
+                "estimated with its error, or set Experiment(…, frequency_se=…)."
+            )
+    return result

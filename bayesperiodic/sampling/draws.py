@@ -1,0 +1,578 @@
+"""Posterior: draws with their convergence diagnostics."""
+
+import importlib.metadata
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import emcee
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from bayesperiodic import _checks
+from bayesperiodic._expressions import parse_all
+from bayesperiodic._io import Result
+from bayesperiodic.density.log_posterior import LogPosterior
+from bayesperiodic.likelihood.input_noise import InputErrors
+from bayesperiodic.likelihood.noise import SCALE
+from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
+from bayesperiodic.priors.joint import MultivariateNormal
+from bayesperiodic.problem.description import Description, fingerprint
+from bayesperiodic.problem.parameters import (
+    CHAIN,
+    CHANNEL,
+    DRAW,
+    EXPERIMENT,
+    NOISE,
+    SHIFT,
+    checked_key,
+    column,
+    full_name,
+    in_experiment,
+    is_noise,
+    local_hint,
+    local_names,
+    pack,
+    places,
+    squared,
+)
+from bayesperiodic.sampling import convergence
+from bayesperiodic.sampling.proposals import CallCount
+
+SAMPLED_ONLY = "Only sampled parameters are part of the draws; write the value of a fixed one as a number."
+
+
+@dataclass(frozen=True)
+class Posterior(Result):
+    """Draws from the posterior of θ and the noise parameters.
+
+    Every quantity has a full name, as in the problem: ``k``, ``theta16[run 7]``, ``variance[force]``, or
+    ``variance[force, run 7]`` where the noise model has its own parameters for each experiment.
+
+    Attributes
+    ----------
+    tree : DataTree
+        In the schema of ArviZ. Group ``posterior``: variables with dims (chain, draw) first. A chain is an independent
+        ensemble; its draws are those of the first half of the steps, walker by walker, then those of the second half,
+        with the coordinates ``walker`` and ``step``. A local parameter is one variable with the dim ``experiment``,
+        with its fixed value where it is not free. ``variance``, ``lengthscale`` and ``floor`` have the dim ``channel``,
+        then ``experiment`` if each has its own; ``scale`` has at most the latter. Known noise parameters are included
+        with their values; NaN marks missing ones, such as the variance of a channel in an experiment without it.
+        Attributes: ``units``, or ``units of <channel>`` of ``variance``; ``support of <full name>``, that of the prior;
+        ``noise``, the name of the noise model, on its parameters. Group ``sample_stats``: lp, the log-density in
+        sampling coordinates; the status of the draw's solves; acceptance_rate, with emcee 1 where the proposal of the
+        step was accepted, else 0; mode, the row of `MapEstimate.modes` whose Laplace approximation is the densest
+        there, if there are several. Group ``proposal``: the mixture from which emcee proposed, in sampling coordinates:
+        weight, degrees of freedom, mean and scale matrix of its Student t components; attributes acceptance and burn_in
+        [steps]. Group ``log_likelihood``, for ``arviz.loo``: at some draws, the terms of independent observations,
+        which sum to the log-likelihood without the factor (2π)^(−n/2) and other constants of the data: values of the
+        mean period at equally spaced instants, or its harmonics if the noise is coloured; with the coordinates
+        experiment, channel, harmonic (NaN at an instant) and weight, the independent values per value. Group
+        ``posterior_predictive``: for some draws, replicates of the measured outputs, noise included, and
+        largest_multiplier, the modulus of each orbit's largest Floquet multiplier. Group ``orbits``: states of every
+        experiment, turns included, at the draw with the highest density. Groups ``observed_data`` and
+        ``constant_data``: outputs and inputs.
+    converged : bool
+        True if the stop rule was met.
+    reason : str
+        Why sampling stopped.
+    tau, ess, rhat : dict of str to float
+        By full name: the integrated autocorrelation time of the stop rule [steps], in sampling coordinates; ArviZ's
+        effective sample size (ess_bulk) and R-hat (r_hat) between the halves of all ensembles.
+    acceptance : float
+        Mean fraction of accepted proposals.
+    failures : dict of str to float
+        Fraction of proposals whose periodic solve failed, by status.
+    log_posterior_calls : int
+        Proposals, each with one solve of every experiment.
+    seed : int
+
+    Examples
+    --------
+    >>> posterior.converged, posterior.names
+    (True, ('c', 'k', 'variance[displacement]'))
+    >>> summary = posterior.summary()
+    >>> bool(summary.loc["k", "q05"] < 1.0 < summary.loc["k", "q95"])
+    True
+    >>> posterior.data["posterior"]["k"].dims, posterior.draws("k").size == posterior.data["posterior"]["k"].size
+    (('chain', 'draw'), True)
+    >>> import arviz as az
+    >>> float(az.rhat(posterior.data)["k"]) == posterior.rhat["k"]
+    True
+    >>> list(posterior.derive({"damping_ratio": "c/(2*sqrt(k))"}).index)
+    ['damping_ratio']
+    """
+
+    tree: xr.DataTree
+    converged: bool
+    reason: str
+    tau: dict[str, float]
+    ess: dict[str, float]
+    rhat: dict[str, float]
+    acceptance: float
+    failures: dict[str, float]
+    log_posterior_calls: int
+    seed: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Full names of the sampled quantities, parameters first, in the order of the summary."""
+        return tuple(self.tau)
+
+    @property
+    def fingerprint(self) -> str:
+        """Digests of the parts of the problem (model, experiments, priors, constants, noise, scheme)."""
+        return str(self.tree.attrs.get("fingerprint", ""))
+
+    @property
+    def input_errors(self) -> dict[str, InputErrors]:
+        """Errors of the inputs by experiment, as `MapEstimate.input_errors`; empty for exact inputs."""
+        if INPUT_NOISE not in self.tree.children:
+            return {}
+        group = self.tree[INPUT_NOISE].to_dataset()
+        names = [str(name).removesuffix(f" {EXPECTED}") for name in group if str(name).endswith(f" {EXPECTED}")]
+        return {
+            n: InputErrors(*(group[f"{n} {kind}"].to_numpy() for kind in (EXPECTED, LOADINGS, CAUSED))) for n in names
+        }
+
+    @property
+    def modes(self) -> pd.DataFrame:
+        """Optima that draws belong to, by the rows of `MapEstimate.modes`; empty if the estimate has one optimum.
+
+        Columns: mass, the fraction of the draws, its Monte Carlo error mcse_mass, and the mean of every quantity there.
+        """
+        stats = self.tree["sample_stats"].to_dataset()
+        if MODE not in stats:
+            return pd.DataFrame()
+        mode, rows = stats[MODE].to_numpy(), {}
+        for row in np.unique(mode):
+            inside = (mode == row).astype(float)
+            error = 0.0 if inside.all() else convergence.mean_error(inside)
+            means = {name: float(self.draws(name)[mode.ravel() == row].mean()) for name in self.names}
+            rows[int(row)] = {"mass": float(inside.mean()), "mcse_mass": error} | means
+        return pd.DataFrame.from_dict(rows, orient="index").rename_axis(MODE)
+
+    @property
+    def data(self) -> Any:
+        """`tree` as the functions of the installed ArviZ take it: itself, or with ArviZ 0.23 as InferenceData."""
+        return convergence.for_arviz(self.tree)
+
+    def draws(self, name: str) -> np.ndarray:
+        """Return all draws of a quantity, chain by chain; `by_step` arranges them by steps and walkers.
+
+        Parameters
+        ----------
+        name : str
+            Full name, such as "k", "theta16[run 7]" or "variance[force]"; see `names`.
+
+        Returns
+        -------
+        array (chains·draws,)
+            In its unit.
+
+        Raises
+        ------
+        ValueError
+            For an unknown name.
+        """
+        return column(self._group, name).ravel()
+
+    def by_step(self, values: np.ndarray) -> np.ndarray:
+        """Return values at all draws by the steps and walkers of the ensembles.
+
+        Parameters
+        ----------
+        values : array (draws,)
+            In the order of `draws`.
+
+        Returns
+        -------
+        array (ensembles, steps, walkers)
+        """
+        step, walker = (self._group[name].to_numpy() for name in (STEP, WALKER))
+        shape = self._group.sizes[CHAIN], int(step.max()) + 1, int(walker.max()) + 1
+        return values.reshape(shape[0], -1)[:, np.lexsort((walker, step))].reshape(shape)
+
+    def guesses(self, experiments: Iterable[str], states: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
+        """Return the states at the draw with the highest density, as guesses for further solves.
+
+        Parameters
+        ----------
+        experiments : iterable of str
+        states : iterable of str
+
+        Returns
+        -------
+        dict of str to dict of str to array (samples·periods,)
+            By experiment and state, turns of angles included.
+        """
+        group, states = self.tree["orbits"].to_dataset(), tuple(states)
+        return {run: {state: group[f"{run} {state}"].to_numpy() for state in states} for run in experiments}
+
+    @property
+    def _group(self) -> xr.Dataset:
+        return self.tree["posterior"].to_dataset()
+
+    @property
+    def _noise(self) -> list[str]:
+        """Full names of the noise parameters."""
+        return [n for n, (variable, _) in places(self._group).items() if is_noise(self._group, variable)]
+
+    def summary(self, *, mode: int | None = None) -> pd.DataFrame:
+        """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, one row per parameter.
+
+        mcse_mean, ess and rhat are mcse_mean, ess_bulk and r_hat of ``arviz.summary``. Its ``attrs`` contain interval,
+        converged, reason and failures.
+
+        Parameters
+        ----------
+        mode : int, optional
+            Row of `modes`: only mean, sd and interval of the draws that belong to this optimum.
+
+        Returns
+        -------
+        DataFrame
+
+        Raises
+        ------
+        ValueError
+            For a mode without draws.
+        """
+        if mode is not None:
+            _checks.one_of("mode", mode, self.modes.index.tolist())
+            inside = self.tree["sample_stats"][MODE].to_numpy().ravel() == mode
+            return _table({name: _moments(self.draws(name)[inside]) for name in self.names})
+        table = _table(
+            {
+                name: _described(column(self._group, name), self.ess[name])
+                | {"tau": self.tau[name], "rhat": self.rhat[name]}
+                for name in self.names
+            }
+        )
+        table.attrs |= {"converged": self.converged, "reason": self.reason, "failures": dict(self.failures)}
+        return table
+
+    def derive(self, expressions: Mapping[str, str], *, experiment: str | None = None) -> pd.DataFrame:
+        """Return quantities derived from the sampled parameters, evaluated at every draw.
+
+        Parameters
+        ----------
+        expressions : mapping of str to str
+            By new name, such as ``{"damping_ratio": "c/(2*sqrt(k*1.5))"}``, as in `MapEstimate.derive`. Values of fixed
+            parameters, which the draws do not contain, are written as numbers.
+        experiment : str, optional
+            Its local parameters are named without brackets: with "run 7" ``theta16`` is ``theta16[run 7]``. Without it,
+            expressions contain shared parameters only.
+
+        Returns
+        -------
+        DataFrame
+            Mean, sd, 90 % equal-tailed interval, Monte Carlo error and ESS, one row per quantity, as in `summary`; the
+            ESS is that of the quantity, NaN if it does not vary.
+
+        Raises
+        ------
+        ValueError
+            For an invalid expression or one that is not finite at some draw, a new name that is no identifier or the
+            name of a parameter, an unknown experiment.
+        """
+        group, noise = self._group, self._noise
+        if experiment is not None:
+            _checks.one_of("experiment", experiment, group[EXPERIMENT].values.tolist())
+        kept = [name for name in places(group) if name not in noise]
+        named = in_experiment(kept, experiment)
+        note = f"{SAMPLED_ONLY} {local_hint(kept, experiment)}".strip()
+        quantities = parse_all("expressions", expressions, named, ["variance", *map(str, group.data_vars)], note)
+        values = {plain: column(group, name) for plain, name in named.items()}
+        rows = {}
+        for name, quantity in quantities.items():
+            draws = np.broadcast_to(quantity.value(values), (group.sizes["chain"], group.sizes["draw"]))
+            if bad := int(np.sum(~np.isfinite(draws))):
+                raise ValueError(
+                    f"expressions[{name!r}]: must be finite at all draws, got NaN or infinity at {bad} of {draws.size} "
+                    f"for {quantity.text!r}."
+                )
+            rows[name] = _described(draws, convergence.effective_size(draws))
+        return _table(rows)
+
+    def as_prior(self, names: tuple[str, ...]) -> MultivariateNormal:
+        """Return the normal distribution with the mean and covariance of the draws, as the prior of another problem.
+
+        Use it as ``priors={names: posterior.as_prior(names)}``. It is a distribution of natural values, so that
+        positive parameters are no longer restricted to positive values; it contains no noise parameters, and no tails
+        or further modes of the draws, see `compare`.
+
+        Parameters
+        ----------
+        names : tuple of str
+            Free parameters, local ones as ``theta16[run 7]``, in the order of the prior's.
+
+        Returns
+        -------
+        MultivariateNormal
+
+        Raises
+        ------
+        ValueError
+            For anything else than a tuple of different free parameters.
+
+        Warns
+        -----
+        UserWarning
+            If the draws have not converged.
+        """
+        noise = self._noise
+        key = checked_key(names, [name for name in self.names if name not in noise], noise)
+        if not self.converged:
+            warnings.warn(
+                f"The draws have not converged ({self.reason}), and the prior is unreliable. Sample longer, see "
+                "max_steps.",
+                stacklevel=2,
+            )
+        draws = np.stack([self.draws(name) for name in key])
+        return MultivariateNormal(draws.mean(axis=1), np.cov(draws).reshape(len(key), len(key)))
+
+    def __repr__(self) -> str:
+        failed = ", ".join(f"{share:.2%} {status}" for status, share in self.failures.items())
+        tables = [self.summary(), self.modes]
+        return "\n".join(
+            [
+                f"Posterior ({'converged' if self.converged else 'NOT CONVERGED'})",
+                *(t.to_string(float_format="{:.5g}".format) for t in tables if not t.empty),
+                f"Sampling ended: {self.reason}.",
+                f"Failed solves of {self.log_posterior_calls} proposals: {failed or 'none'}.",
+            ]
+        )
+
+
+def _described(draws: np.ndarray, ess: float) -> dict[str, float]:
+    return _moments(draws) | {"mcse_mean": convergence.mean_error(draws), "ess": ess}
+
+
+def _moments(draws: np.ndarray) -> dict[str, float]:
+    low, median, high = np.quantile(draws, [0.05, 0.5, 0.95])
+    return {"mean": draws.mean(), "sd": draws.std(ddof=1), "q05": low, "q50": median, "q95": high}
+
+
+def _table(rows: dict[str, dict[str, float]]) -> pd.DataFrame:
+    table = pd.DataFrame.from_dict(rows, orient="index")
+    table.attrs["interval"] = "90 % equal-tailed: q05 to q95"
+    return table
+
+
+REPLICATES = 100
+# Draws at which the terms of the log-likelihood are stored, and the most numbers that these may take.
+TERM_DRAWS, MOST_TERMS = (500, 2000), 10_000_000
+
+
+def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, time: dict[str, str], seed: int) -> xr.Dataset:
+    """Return replicates of the measured mean periods, noise included, for some draws.
+
+    Variables are ``<experiment> <channel>`` with dims (chain, draw, time axis), and ``largest_multiplier``, the modulus
+    of the largest Floquet multiplier, with dims (chain, draw, experiment); NaN where a solve fails.
+    """
+    problem = density.problem
+    chosen, theta, noise = _some(problem, posterior, REPLICATES)
+    shape = chosen.sizes[CHAIN], chosen.sizes[DRAW]
+    components = problem.likelihood.simulate(noise, np.random.default_rng(seed))
+    simulation, variables, largest = density.simulator.solve(theta, keep=True, polish=True), {}, []
+    for e in problem.experiments:
+        observation, failed = problem.observations[e.name], simulation.statuses(e.name) != CONVERGED
+        own, components = components[: len(observation.blocks)], components[len(observation.blocks) :]
+        for channel, values in observation.replicates(simulation.response(e.name), own).items():
+            values[failed] = np.nan
+            variables[f"{e.name} {channel}"] = ((CHAIN, DRAW, time[e.name]), values.reshape(*shape, -1))
+        largest.append(density.simulator.largest_multipliers(theta, e.name, simulation).reshape(shape))
+    variables["largest_multiplier"] = ((CHAIN, DRAW, EXPERIMENT), np.stack(largest, axis=-1))
+    return xr.Dataset(variables, coords=chosen.coords)
+
+
+def orbits(density: LogPosterior, theta: np.ndarray, time: dict[str, str]) -> xr.Dataset:
+    """Return the states, turns included, of every experiment at one θ (names,): ``<experiment> <state>`` over time."""
+    states = {
+        f"{name} {state}": ((time[name],), values)
+        for name, solution in density.solve(theta).items()
+        for state, values in solution.states.items()
+    }
+    return xr.Dataset(states, coords={time[e.name]: e.time for e in density.problem.experiments})
+
+
+def _some(problem: Description, posterior: xr.Dataset, most: int) -> tuple[xr.Dataset, np.ndarray, np.ndarray]:
+    """Return equally spaced draws of every chain, their θ (draws, names) and noise parameters (draws, noise_names)."""
+    each = max(1, most // posterior.sizes[CHAIN])
+    draws = posterior.sizes[DRAW]
+    chosen = posterior.isel({DRAW: np.linspace(0, draws - 1, min(each, draws)).astype(int)})
+    size = chosen.sizes[CHAIN] * chosen.sizes[DRAW]
+    theta, noise = (
+        np.array([column(chosen, name).ravel() for name in names]).reshape(len(names), size).T
+        for names in (problem.names, problem.noise_names)
+    )
+    return chosen, theta, noise
+
+
+STEP, WALKER, OBSERVATION, MODE = "step", "walker", "observation", "mode"
+INPUT_NOISE, EXPECTED, LOADINGS, CAUSED = "input_noise", "expected errors", "loadings", "caused"
+
+
+def gather(
+    density: LogPosterior,
+    kept: np.ndarray,
+    log_density: np.ndarray,
+    calls: CallCount,
+    *,
+    converged: bool,
+    reason: str,
+    acceptance: float,
+    seed: int,
+    modes: np.ndarray | None = None,
+) -> Posterior:
+    """Return the posterior of chains (ensembles, steps, walkers, coordinates) in sampling coordinates.
+
+    `log_density` and `modes`, the optimum to which each draw belongs, are (ensembles, steps, walkers).
+    """
+    names = density.labels
+    data = tree(density, kept, log_density, seed, modes)
+    data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason}
+    tau, group = convergence.autocorrelation_time(kept), data["posterior"].to_dataset()
+    return Posterior(
+        tree=data,
+        converged=converged,
+        reason=reason,
+        tau=dict(zip(names, tau.tolist(), strict=True)),
+        ess={name: convergence.effective_size(column(group, name)) for name in names},
+        rhat={name: convergence.rhat(column(group, name)) for name in names},
+        acceptance=acceptance,
+        failures={status: count / calls.points for status, count in calls.failures.items()},
+        log_posterior_calls=calls.points,
+        seed=seed,
+    )
+
+
+def tree(
+    density: LogPosterior, kept: np.ndarray, log_density: np.ndarray, seed: int, modes: np.ndarray | None = None
+) -> xr.DataTree:
+    """Return draws (ensembles, steps, walkers, coordinates) as the groups of `Posterior.tree`."""
+    problem, lp = density.problem, convergence.as_chains(log_density)
+    steps, walkers = log_density.shape[1:]
+    moved = np.full(log_density.shape, np.nan)
+    moved[:, 1:] = np.any(np.diff(kept[..., : len(problem.names)], axis=1) != 0.0, axis=-1)
+    theta, noise = density.to_natural(convergence.as_chains(kept))
+    best = theta.reshape(-1, theta.shape[-1])[np.argmax(lp)]
+    step, walker = (convergence.as_chains(index[None])[0] for index in np.indices((steps, walkers)))
+    coords = {
+        CHAIN: np.arange(len(lp)), DRAW: np.arange(lp.shape[1]), STEP: (DRAW, step), WALKER: (DRAW, walker)
+    }  # fmt: skip
+    posterior, time = _variables(problem, theta, noise).assign_coords(coords), _time_axes(problem)
+    status = np.where(np.isfinite(lp), CONVERGED, NOT_FINITE).astype(np.int8)
+    meanings = {
+        "flag_values": list(range(len(STATUSES))),
+        "flag_meanings": " ".join(s.replace(" ", "_") for s in STATUSES),
+    }
+    stats = {"lp": ((CHAIN, DRAW), lp), "status": ((CHAIN, DRAW), status, meanings)}
+    stats |= {"acceptance_rate": ((CHAIN, DRAW), convergence.as_chains(moved))}
+    if modes is not None:
+        stats |= {MODE: ((CHAIN, DRAW), convergence.as_chains(modes.astype(np.int8)))}
+    groups = {
+        "posterior": posterior,
+        "sample_stats": xr.Dataset(stats, coords=coords),
+        "log_likelihood": log_likelihood_terms(density, posterior),
+        "posterior_predictive": posterior_predictive(density, posterior, time, seed),
+        "orbits": orbits(density, best, time),
+        "observed_data": _signals(problem, "outputs", time),
+        "constant_data": _signals(problem, "inputs", time),
+    }
+    if problem.input_errors:
+        variables: dict[str, Any] = {}
+        for name, own in problem.input_errors.items():
+            variables[f"{name} {EXPECTED}"] = ((f"{name} error",), own.expected)
+            variables[f"{name} {LOADINGS}"] = ((f"{name} component", f"{name} error"), own.loadings)
+            variables[f"{name} {CAUSED}"] = ((f"{name} component",), own.caused)
+        groups[INPUT_NOISE] = xr.Dataset(variables)
+    result = xr.DataTree.from_dict(groups)
+    result.attrs = {
+        "fingerprint": fingerprint(problem),
+        "synthetic": int(any(e.synthetic for e in problem.experiments)),
+        "bayesperiodic": importlib.metadata.version("bayesperiodic"),
+        "emcee": emcee.__version__,
+    }
+    return result
+
+
+def log_likelihood_terms(density: LogPosterior, posterior: xr.Dataset) -> xr.Dataset:
+    """Return the terms of the log-likelihood at some draws of the group ``posterior`` as the only variable of a group.
+
+    The observations have the coordinates experiment, channel, harmonic and weight, see `Likelihood.labels`.
+    """
+    likelihood = density.problem.likelihood
+    most = min(max(MOST_TERMS // len(likelihood.observations), TERM_DRAWS[0]), TERM_DRAWS[1])
+    chosen, theta, noise = _some(density.problem, posterior, most)
+    simulation = density.simulator.solve(theta, whole=True)
+    terms = likelihood.terms(density.comparisons.residuals(simulation, None), noise)
+    terms[simulation.status != CONVERGED] = np.nan
+    shaped = terms.reshape(chosen.sizes[CHAIN], chosen.sizes[DRAW], -1)
+    coords = {name: chosen.coords[name] for name in (CHAIN, DRAW, STEP, WALKER)}
+    group = xr.Dataset({"data": ((CHAIN, DRAW, OBSERVATION), shaped)}, coords=coords)
+    labels = {name: (OBSERVATION, values) for name, values in likelihood.labels.items()}
+    return group.assign_coords({OBSERVATION: [*likelihood.observations], **labels})
+
+
+def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr.Dataset:
+    """Return θ (chains, draws, names) and noise parameters (chains, draws, noise_names) as labelled variables."""
+    columns = {name: theta[..., i] for i, name in enumerate(problem.names)}
+    columns |= _fixed_locals(problem, theta.shape[:-1])
+    columns |= {name: noise[..., i] for i, name in enumerate(problem.noise_names)}
+    dims = {name.partition("[")[0]: _dims(problem, name) for name in (*problem.names, *problem.noise_names)}
+    coords = {CHANNEL: list(problem.channels), EXPERIMENT: [e.name for e in problem.experiments]}
+    noises = {name.partition("[")[0] for name in problem.noise_names}
+    attributes = {v: _noise_attributes(problem, v) if v in noises else _attributes(problem, v) for v in dims}
+    packed = pack(columns, dims, coords)
+    return xr.Dataset({v: (*values, attributes[v]) for v, values in packed.items()}, coords=coords)
+
+
+def _fixed_locals(problem: Description, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """Return the values of local parameters in the experiments where they are fixed."""
+    return {
+        full_name(plain, (run,)): np.full(shape, parameter_map.fixed[plain])
+        for plain in local_names(problem.names)
+        for run, parameter_map in problem.parameter_maps.items()
+        if plain in parameter_map.fixed
+    }
+
+
+def _dims(problem: Description, name: str) -> tuple[str, ...]:
+    """Return the dims, after chain and draw, of the variable of a full name."""
+    if "[" not in name:
+        return ()
+    if name in problem.names or name.startswith(f"{SCALE}["):
+        return (EXPERIMENT,)
+    return (CHANNEL,) if problem.noise.per == CHANNEL else (CHANNEL, EXPERIMENT)
+
+
+def _attributes(problem: Description, parameter: str) -> dict[str, Any]:
+    """Return the unit of a parameter, and the support of its prior, one for each experiment that has its own."""
+    supports = problem.joint_prior.supports.items()
+    each = {f"support of {name}": list(ends) for name, ends in supports if name.partition("[")[0] == parameter}
+    return {"units": "s" if parameter == SHIFT else problem.model.units.get(parameter, "")} | each
+
+
+def _noise_attributes(problem: Description, variable: str) -> dict[str, str]:
+    """Return the noise model's name, and the unit of each channel's variance."""
+    units = problem.model.units if variable == "variance" else {}
+    each = {f"units of {channel}": squared(units[channel]) for channel in problem.channels if channel in units}
+    return {NOISE: problem.noise.name} | each
+
+
+def _signals(problem: Description, kind: str, time: dict[str, str]) -> xr.Dataset:
+    signals = {
+        f"{e.name} {channel}": ((time[e.name],), values)
+        for e in problem.experiments
+        for channel, values in getattr(e, kind).items()
+    }
+    return xr.Dataset(signals, coords={time[e.name]: e.time for e in problem.experiments})
+
+
+def _time_axes(problem: Description) -> dict[str, str]:
+    """Return the name of each experiment's time axis, which no channel can have."""
+    return {e.name: f"{e.name} time [s]" for e in problem.experiments}

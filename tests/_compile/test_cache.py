@@ -1,0 +1,305 @@
+import gc
+import os
+import shutil
+import subprocess
+import sys
+import time
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from bayesperiodic._compile import cache
+from bayesperiodic._compile.code_generation import FUNCTIONS
+from bayesperiodic._parallel import available_cores
+from tests.known import formula_model
+
+# Functions that compile quickly.
+SMALL, NAMES = (
+    """
+from numba import njit
+
+@njit("float64(float64)", cache=CACHE)
+def twice(x):
+    return 2.0 * x
+
+@njit("float64(float64)", cache=CACHE)
+def four_times(x):
+    return twice(twice(x))
+""",
+    ("twice", "four_times"),
+)
+
+# Kernels, and a module of functions that call them.
+KERNELS = """
+from bayesperiodic._compile.cache import inlined, kernel
+
+@inlined("float64(float64)", cache=CACHE)
+def next(x):
+    return x + 1.0
+
+@kernel("float64(float64)", cache=CACHE)
+def twice(x):
+    return 2.0 * next(x)
+
+@kernel("float64(float64)", cache=CACHE, no_cpython_wrapper=True)
+def thrice(x):
+    return 3.0 * x
+"""
+CALLERS = """
+@kernel("float64(float64)", cache=CACHE)
+def combined(x):
+    return twice(thrice(x)) + next(x)
+"""
+PROGRAM = f"""
+from bayesperiodic._compile import machine_code
+from bayesperiodic._compile.cache import load
+from bayesperiodic.models.library import pendulum
+SMALL, NAMES = {SMALL!r}, {NAMES!r}
+compiled, append = [], machine_code._append
+machine_code._append = lambda *arguments: (compiled.append(arguments), append(*arguments))
+pendulum.kernels
+small = load(SMALL)
+print(len(compiled), sum(sum(getattr(small, name).stats.cache_hits.values()) for name in NAMES))
+"""
+FIRST, SECOND = f"{len(FUNCTIONS)} 0\n", "0 2\n"
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path))
+    return tmp_path / "kernels"
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def start(root: Path = ROOT) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-W", "error::RuntimeWarning", "-c", PROGRAM], stdout=subprocess.PIPE, text=True, cwd=root
+    )
+
+
+def load_with_warning(match: str) -> None:
+    with pytest.warns(RuntimeWarning, match=match):
+        kernels = cache.load(SMALL)
+    assert kernels.four_times(1.5) == 6.0
+
+
+def entry(folder: Path) -> Path:
+    (found,) = folder.iterdir()
+    return found
+
+
+def test_second_start_loads_all_functions_from_the_cache(folder):
+    first = start()
+    assert first.communicate()[0] == FIRST
+    second = start()
+    assert second.communicate()[0] == SECOND
+
+
+def test_callers_of_declared_kernels_are_compiled_for_processes_that_have_the_kernels(folder):
+    cache.load(KERNELS)
+    cache.load(CALLERS, shared=cache.declare(KERNELS))
+    program = f"""
+from bayesperiodic._compile import cache
+cache._build = None
+print(cache.load({CALLERS!r}, shared=cache.load({KERNELS!r})).combined(2.0))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT)
+    assert (done.stdout, done.stderr) == (f"{2.0 * (3.0 * 2.0 + 1.0) + 2.0 + 1.0}\n", "")
+
+
+def test_a_kernel_for_compiled_code_only_cannot_be_called_by_python(folder):
+    kernels = cache.load(KERNELS)
+    assert kernels.twice(2.0) == 6.0
+    with pytest.raises(TypeError, match="thrice: must be called by compiled code"):
+        kernels.thrice(2.0)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(available_cores() < 2, reason="two cores are needed")
+def test_two_processes_compile_half_of_the_solver_each(folder):
+    program = """
+from bayesperiodic._compile import cache
+from bayesperiodic.periodic.compiled import kernels
+built, build = [], cache._build
+cache._build = lambda source, *arguments: (built.append(source), build(source, *arguments))[1]
+kernels("newton", 1, (2, 3, 2))
+print(["Compiled linear algebra" in source for source in built])
+"""
+    for expected in ("[True]\n", "[]\n"):
+        assert subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True).stdout == expected
+    assert len(list(folder.iterdir())) == 2
+
+
+@pytest.mark.slow
+def test_an_upgrade_that_keeps_the_sources_loads_the_entries_of_the_version_before(folder, tmp_path):
+    first = start()
+    assert first.communicate()[0] == FIRST
+    for part in ("bayesperiodic", "tests"):
+        shutil.copytree(ROOT / part, tmp_path / "upgraded" / part, ignore=shutil.ignore_patterns("__pycache__"))
+    package = tmp_path / "upgraded" / "bayesperiodic"
+    for path in ("__init__.py", "_compile/cache.py", "models/model.py", "_compile/code_generation.py"):
+        with (package / path).open("a", encoding="utf-8") as file:
+            file.write("\n# changed\n")
+    second = start(package.parent)
+    assert second.communicate()[0] == SECOND
+
+
+def test_numba_settings_of_the_user_do_not_move_the_files(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(cache.numba.config, "CACHE_DIR", str(tmp_path / "elsewhere"))
+    cache.load(SMALL)
+    names = {path.name.split("-")[0].split(".")[1] for path in (entry(folder) / "__pycache__").glob("*.nbi")}
+    assert names >= set(NAMES)
+    assert cache.numba.config.CACHE_DIR == str(tmp_path / "elsewhere")
+
+
+@pytest.mark.slow
+def test_two_processes_may_fill_the_cache_at_once(folder):
+    both = [start(), start()]
+    for process in both:
+        process.communicate()
+        assert process.returncode == 0
+    assert len(list(folder.iterdir())) == 2
+    assert start().communicate()[0] == SECOND
+
+
+def test_the_garbage_collector_is_as_before_after_loading_in_threads_and_after_an_error(folder):
+    thresholds = gc.get_threshold()
+    with ThreadPoolExecutor(4) as pool:
+        modules = pool.map(cache.load, [SMALL.replace("2.0", f"{number}.0") for number in range(1, 5)])
+        assert [module.twice(3.0) for module in modules] == [3.0, 6.0, 9.0, 12.0]
+    assert gc.get_threshold() == thresholds
+    with pytest.raises(ZeroDivisionError):
+        cache.load("1 / 0")
+    assert gc.get_threshold() == thresholds and gc.isenabled()
+
+
+def test_folder_is_private_to_the_user(folder):
+    cache.load(SMALL)
+    assert folder.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize("damage", ["truncate", "alter", "remove", "source", "manifest"])
+def test_damaged_entry_is_never_executed_but_built_again(folder, damage):
+    cache.load(SMALL)
+    compiled = sorted((entry(folder) / "__pycache__").glob("*.nbc"))[0]
+    if damage == "truncate":
+        compiled.write_bytes(compiled.read_bytes()[:100])
+    elif damage == "alter":
+        content = bytearray(compiled.read_bytes())
+        content[len(content) // 2] ^= 1
+        compiled.write_bytes(content)
+    elif damage == "remove":
+        compiled.unlink()
+    elif damage == "source":
+        source = entry(folder) / cache.SOURCE
+        source.write_text(source.read_text() + "\nraise SystemExit('executed')\n")
+    else:
+        (entry(folder) / cache.MANIFEST).write_text("{")
+    load_with_warning("damaged entry of the kernel cache is built again")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert cache.load(SMALL).four_times(1.5) == 6.0
+    assert len(list(folder.iterdir())) == 1
+
+
+def test_machine_code_of_a_model_is_built_again_when_damaged_and_in_memory_without_a_cache(folder, monkeypatch):
+    def values():
+        made = formula_model("any", ["a"], lambda p, u, s: {"y": p.a * sp.exp(u.x)})
+        return made.kernels.evaluate("outputs", *np.ones((2, 5, 3)), np.full(1, 2.0), np.zeros(5), 1.0)[:, 0]
+
+    assert values() == pytest.approx(np.full(5, 2.0 * np.e), rel=1e-15)
+    (stored,) = folder.glob("*/__pycache__/functions.nbc")
+    stored.write_bytes(stored.read_bytes()[:-1])
+    with pytest.warns(RuntimeWarning, match="damaged entry of the kernel cache is built again"):
+        assert values() == pytest.approx(np.full(5, 2.0 * np.e), rel=1e-15)
+    folder.chmod(0o777)
+    with pytest.warns(RuntimeWarning, match="compiling in memory"):
+        assert values() == pytest.approx(np.full(5, 2.0 * np.e), rel=1e-15)
+
+
+def test_file_in_the_place_of_an_entry_is_replaced(folder):
+    cache.load(SMALL)
+    place = entry(folder)
+    shutil.rmtree(place)
+    place.write_text("not a folder")
+    load_with_warning("built again")
+    assert entry(folder).is_dir()
+
+
+def test_folders_of_killed_builds_are_removed_after_an_hour(folder):
+    for name, age in (("building-killed", 3700.0), ("building-running", 60.0)):
+        other = folder / name
+        other.mkdir(parents=True)
+        other.parent.chmod(0o700)
+        os.utime(other, (time.time() - age,) * 2)
+    cache.load(SMALL)
+    assert sorted(path.name for path in folder.glob("building-*")) == ["building-running"]
+
+
+def test_disabled_compilation_is_refused_with_the_setting(folder, monkeypatch):
+    monkeypatch.setattr(cache.numba.config, "DISABLE_JIT", 1)
+    with pytest.raises(RuntimeError, match="NUMBA_DISABLE_JIT: must not be set"):
+        cache.load(SMALL)
+
+
+def test_folder_open_to_others_is_not_used(folder):
+    folder.mkdir(parents=True)
+    folder.chmod(0o777)
+    load_with_warning("not private")
+    assert not list(folder.iterdir())
+
+
+def test_unwritable_cache_falls_back_to_memory(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path / "file"))
+    load_with_warning("compiling in memory")
+
+
+HOMELESS = """
+from bayesperiodic._compile import cache
+from bayesperiodic.sampling import convergence
+from tests._compile.test_cache import SMALL
+print(cache.load(SMALL).four_times(1.5), convergence.arviz().rhat)
+"""
+
+
+@pytest.mark.slow
+def test_unwritable_home_is_a_warning(tmp_path):
+    """A file in the place of the home folder, which no user can write below, not even root; ArviZ 0.23 would fail."""
+    (tmp_path / "home").write_text("")
+    dropped = ("BAYESPERIODIC_CACHE", "XDG_CACHE_HOME")
+    environment = {key: value for key, value in os.environ.items() if key not in dropped}
+    done = subprocess.run(
+        [sys.executable, "-c", HOMELESS],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[2],
+        env=environment | {"HOME": str(tmp_path / "home")},
+    )
+    assert done.stdout.startswith("6.0 <function rhat"), done.stderr
+    assert "cannot be used" in done.stderr and "compiling in memory" in done.stderr
+
+
+def test_failed_build_leaves_nothing_behind(folder, monkeypatch):
+    def full(*_):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(cache, "_digests", full)
+    load_with_warning("no space left")
+    assert not list(folder.iterdir())
+
+
+def test_other_versions_get_an_entry_of_their_own(folder, monkeypatch):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cache.load(SMALL)
+        monkeypatch.setattr(cache.numba, "__version__", "0.0")
+        cache.load(SMALL)
+    assert len(list(folder.iterdir())) == 2
+    assert os.environ["BAYESPERIODIC_CACHE"]

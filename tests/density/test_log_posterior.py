@@ -1,0 +1,150 @@
+"""Densities over sampling coordinates: which variances are integrated out, and the integral by quadrature."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.integrate import quad
+
+import bayesperiodic as bp
+from bayesperiodic import noise
+from bayesperiodic.density.log_posterior import SamplingCoordinates, collapsible
+from bayesperiodic.likelihood.noise import KNOWN, POINTS, SPECTRAL
+from tests.known import LINEAR, SADDLE_NODE, linear_experiment
+
+PRIORS = {"k": bp.LogNormal(800.0, 0.1), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
+
+
+def description(model, free=("variance[y]",), counts=("variance[y]",), kinds=(SPECTRAL,)):
+    likelihood = SimpleNamespace(
+        counts=dict.fromkeys(counts, 9.0), blocks=[SimpleNamespace(kind=k) for k in kinds], shared=[]
+    )
+    return SimpleNamespace(noise=model, likelihood=likelihood, free_noise=free)
+
+
+BOTH = ("variance[y]", "lengthscale[y]")
+
+
+@pytest.mark.parametrize(
+    ("problem", "expected"),
+    [
+        (description(noise.Independent()), ("variance[y]",)),
+        (description(noise.Independent(prior="flat"), kinds=(POINTS,)), ("variance[y]",)),
+        (description(noise.Independent(prior=bp.InverseGamma(2.0, 1.0))), ()),
+        (description(noise.Independent(), free=("variance[y]", "other")), ("variance[y]",)),
+        (description(noise.Independent(), free=()), ()),
+        (description(noise.Measured()), ()),
+        (description(noise.Circulant()), ("variance[y]",)),
+        (description(noise.Circulant(), kinds=(SPECTRAL, KNOWN)), ("variance[y]",)),
+        (description(noise.Circulant(), kinds=(SPECTRAL, POINTS)), ()),
+        (description(noise.Circulant(), free=BOTH), ()),
+        (description(noise.Circulant(prior="flat")), ("variance[y]",)),
+        (description(noise.Circulant(prior=bp.InverseGamma(2.0, 1.0))), ()),
+    ],
+)
+def test_variances_are_integrated_out_where_the_integral_has_a_closed_form(problem, expected):
+    assert collapsible(problem) == expected
+
+
+@pytest.mark.parametrize("prior", ["jeffreys", "flat"])
+def test_a_collapsed_density_is_the_integral_over_the_variance(prior):
+    data = linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)
+    problem = bp.Problem(LINEAR, [data], priors=PRIORS, noise=noise.Independent(prior=prior))
+    sampled = problem.density()
+    collapsed = sampled.with_settings(variances="collapsed")
+    assert (collapsed.collapsed, collapsed.free, collapsed.dimension) == (("variance[force]",), (), 3)
+    assert collapsed.with_settings(simulator=collapsed.simulator).collapsed == collapsed.collapsed
+    assert sampled.with_settings(coordinates="natural").collapsed == ()
+    for k in (880.0, 905.0):
+        theta = np.array([np.log(k), 41.0, 24.0])
+        density = lambda log_v, t=theta: float(sampled.evaluate(np.array([[*t, log_v]])).log_prob[0])  # noqa: E731
+        peak = max(density(x) for x in np.linspace(0.0, 6.0, 61))
+        integral = quad(lambda x, peak=peak, f=density: np.exp(f(x) - peak), -4.0, 12.0, limit=200)[0]
+        found = collapsed.evaluate(theta[None])
+        assert found.log_prob[0] == pytest.approx(peak + np.log(integral), abs=1e-6)
+    # Drawn variances have the conditional distribution, and complete the density.
+    points, log_prob = collapsed.with_variances(
+        np.tile(theta, (4000, 1)),
+        np.full(4000, found.log_prob[0]),
+        np.tile(found.moments, (4000, 1)),
+        np.random.default_rng(0),
+    )
+    assert log_prob[:5] == pytest.approx(sampled.evaluate(points[:5]).log_prob, abs=1e-9)
+    shape = 0.5 * problem.likelihood.counts["variance[force]"] - (prior == "flat")
+    gamma = 0.5 * found.moments[0, 0] / np.exp(points[:, 3])
+    assert stats.kstest(gamma, stats.gamma(shape).cdf).pvalue > 1e-3
+
+
+def test_coordinates_are_logarithms_of_positive_parameters_and_free_noise():
+    data = linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)
+    free = SamplingCoordinates(bp.Problem(LINEAR, [data], priors=PRIORS))
+    assert free.labels == ("k", "c", "coulomb", "variance[force]")
+    theta, values = free.to_natural(np.array([[np.log(7.0), -3.0, 2.0, np.log(5.0)]]))
+    assert theta == pytest.approx(np.array([[7.0, -3.0, 2.0]])) and values == pytest.approx(np.array([[5.0]]))
+    assert free.from_natural(theta, values) == pytest.approx(np.array([[np.log(7.0), -3.0, 2.0, np.log(5.0)]]))
+    known = bp.Problem(LINEAR, [data], priors=PRIORS, fixed={"variance[force]": 9.0})
+    natural = SamplingCoordinates(known, coordinates="natural")
+    theta, values = natural.to_natural(np.array([7.0, -3.0, 2.0]))
+    assert (theta.tolist(), values.tolist(), natural.dimension) == ([7.0, -3.0, 2.0], [9.0], 3)
+    assert natural.from_natural(theta, values).tolist() == [7.0, -3.0, 2.0]
+
+
+def test_log_prior_and_its_derivatives_are_those_over_the_coordinates():
+    data = linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)
+    density = bp.Problem(LINEAR, [data], priors=PRIORS).density()
+    theta, noise_values = np.array([850.0, 33.0, 18.0]), np.array([[7.0]])
+
+    def log_prior(at):
+        logs = stats.norm.logpdf(np.log(at[0]), np.log(800.0), 0.1)
+        return logs + stats.norm.logpdf(at[1], 30.0, 20.0) + stats.norm.logpdf(at[2], 20.0, 10.0)
+
+    assert density.log_prior(theta[None], noise_values)[0] == pytest.approx(log_prior(theta))
+    steps = np.diag([1e-2, 1e-3, 1e-3])
+    slopes = [(log_prior(theta + e) - log_prior(theta - e)) / (2 * e.sum()) for e in steps]
+    bends = [(log_prior(theta + e) - 2 * log_prior(theta) + log_prior(theta - e)) / e.sum() ** 2 for e in steps * 100]
+    gradient, curvature = density.add_prior(theta, np.array([1.0, 2.0, 3.0]), np.eye(3))
+    assert gradient == pytest.approx(np.array([1.0, 2.0, 3.0]) + slopes, rel=1e-6)
+    assert np.diag(curvature) == pytest.approx(1.0 - np.array(bends), rel=1e-5)
+    assert density.add_prior(theta, np.zeros(3))[1] is None
+
+
+def test_a_point_outside_the_support_has_no_density_and_is_not_solved():
+    data = linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)
+    bounded = PRIORS | {"c": bp.Uniform(0.0, 100.0)}
+    density = bp.Problem(LINEAR, [data], priors=bounded).density()
+    points = np.array([[np.log(900.0), 40.0, 25.0, 2.0], [np.log(900.0), -1.0, 25.0, 2.0]])
+    both, one = density.evaluate(points), density.evaluate(points[:1])
+    assert both.log_prob.tolist() == [one.log_prob[0], -np.inf]
+    assert density.evaluate(points[1:]).log_prob.tolist() == [-np.inf]
+    value, gradient, status = density.value_and_gradient(points[1])
+    assert (value, gradient.tolist(), status) == (-np.inf, [0.0] * 4, both.status[1])
+    value, gradient, _ = density.value_and_gradient(points[0])
+    assert value == pytest.approx(one.log_prob[0], rel=1e-9)
+    steps = 1e-5 * np.eye(4)
+    slopes = [
+        (density.evaluate((points[0] + e)[None]).log_prob[0] - density.evaluate((points[0] - e)[None]).log_prob[0])
+        / 2e-5
+        for e in steps
+    ]
+    assert gradient == pytest.approx(np.array(slopes), rel=1e-4, abs=1e-4)
+
+
+def test_points_beside_failed_solves_have_their_own_values():
+    """ẋ = a − x² + u has no periodic solution for a < 0; variances differ, and (2π)^(−n/2) is left out."""
+    tau = np.arange(64) / 64
+    data = bp.Experiment(
+        "synthetic", 0.1, {"x": 1.0 + 0.3 * np.cos(2 * np.pi * tau)}, {"u": 0.1 * np.cos(2 * np.pi * tau)}, samples=64
+    )
+    problem = bp.Problem(SADDLE_NODE, [data], priors={"a": bp.Normal(0.5, 1.0)}, scheme="central4")
+    theta, variance = np.array([[1.0], [-0.5], [0.8], [1.2]]), np.array([[0.01], [0.02], [0.03], [0.04]])
+    found = problem.log_likelihood(theta, variance)
+    assert np.isneginf(found).tolist() == [False, True, False, False]
+    for i in (0, 2, 3):
+        x = bp.solve_periodic(
+            SADDLE_NODE, {"a": theta[i, 0]}, dict(data.inputs), frequency=0.1, samples=64, scheme="central4"
+        ).states["x"]
+        expected = stats.norm.logpdf(data.outputs["x"] - x, scale=np.sqrt(variance[i, 0])).sum() + 32 * np.log(
+            2 * np.pi
+        )
+        assert found[i] == pytest.approx(expected, rel=1e-8)
