@@ -28,6 +28,7 @@ from .estimation.profile import Profile as Profile
 from .estimation.profile import profile as profile
 from .estimation.result import MapEstimate as MapEstimate
 from .likelihood import noise as noise
+from .models import elements as elements
 from .models.model import Model as Model
 from .models.model import smooth_abs as smooth_abs
 from .models.model import smooth_sign as smooth_sign

@@ -13,6 +13,11 @@ def test_every_public_name_is_there_and_documented(name):
     assert inspect.getdoc(value)
 
 
+@pytest.mark.parametrize("name", [name for name in bp.__all__ if inspect.ismodule(getattr(bp, name))])
+def test_every_public_module_is_there_at_its_first_use(name):
+    subprocess.run([sys.executable, "-c", f"import bayesperiodic as bp; bp.{name}"], check=True)
+
+
 def test_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="bayesperiodic attribute nothing"):
         bp.nothing  # noqa: B018

@@ -11,6 +11,7 @@ from scipy import stats
 from scipy.fft import dct
 
 from bayesperiodic._linalg import column_space
+from bayesperiodic._verdicts import BAD, GOOD, NEUTRAL, with_tone
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.log_posterior import Linearisation
 from bayesperiodic.density.problem import Problem
@@ -142,7 +143,8 @@ SHAPE_KNOWN = 4.0
 LEVEL = 0.01
 SHAPES = 20
 TESTS = ("whiteness", "harmonics", "size", "amplitude", "consistency")
-ADEQUATE, MISSPECIFIED, UNTESTED = "adequate", "misspecified", "not tested"
+ADEQUATE, MISSPECIFIED = with_tone("adequate", GOOD), with_tone("misspecified", BAD)
+UNTESTED = with_tone("not tested", NEUTRAL)
 MEASURED, ASSUMED = "measured", "assumed"
 ALL = "all"
 SEARCH = "bp.missing_terms(problem, fit) looks for the term that is missing"

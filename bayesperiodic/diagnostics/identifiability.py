@@ -12,6 +12,7 @@ from scipy.special import ndtr, softmax, stdtr
 
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
+from bayesperiodic._verdicts import BAD, GOOD, with_tone
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import misfit
 from bayesperiodic.diagnostics.design import Candidate, Information, default_candidates, rank_candidates
@@ -116,9 +117,9 @@ def _one_sided(x: np.ndarray, weighted: np.ndarray) -> float:
     return float(np.sqrt(max(against(p, q) + against(q, p), 0.0) / total))
 
 
-DETERMINED, PRIOR_ONLY = "determined", "only with the prior"
-COMBINATION, SIGN, NOTHING = "only in combination", "sign undetermined", "not determined"
-CONFLICT, SEVERAL = "prior conflict", "several values"
+DETERMINED, NOTHING = with_tone("determined", GOOD), with_tone("not determined", BAD)
+PRIOR_ONLY, COMBINATION, SIGN = "only with the prior", "only in combination", "sign undetermined"
+CONFLICT, SEVERAL = with_tone("prior conflict", BAD), "several values"
 # Standard deviations left by the data alone, in prior sds: the largest one of determined parameters (a contraction of
 # 0.9), and the smallest one of undetermined parameters (1 % of the information of the prior).
 DETERMINED_SD, UNINFORMED_SD = 1.0 / 3.0, 10.0

@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.special import chdtri, ndtr, ndtri
 
 from bayesperiodic._linalg import covariance_eigh
+from bayesperiodic._verdicts import BAD, GOOD, with_tone
 
 BATCHES = 8
 # Expected Wasserstein distance of n independent standard normal draws from their own distribution, times √n.
@@ -140,8 +141,9 @@ def _beyond_errors(values: np.ndarray) -> bool:
     return bool(values.mean() > ERRORS * values.std(ddof=1) / np.sqrt(len(values)))
 
 
-FINE, NARROW, WIDE, SHAPE, MODE = "fine", "too narrow", "too wide", "wrong shape", "wrong mode"
-UNCONVERGED = "not converged"
+FINE, MODE = with_tone("fine", GOOD), with_tone("wrong mode", BAD)
+NARROW, WIDE, SHAPE = "too narrow", "too wide", "wrong shape"
+UNCONVERGED = with_tone("not converged", BAD)
 ERRORS = 3.0
 TAIL, END_SHIFT = 0.05, 0.25
 END = float(ndtri(1.0 - TAIL))

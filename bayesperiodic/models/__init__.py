@@ -1,5 +1,6 @@
 """Models: equations, compiled functions, and a library of models (the attributes of this package)."""
 
+from bayesperiodic.models import elements as elements
 from bayesperiodic.models.library import (
     chain,
     dahl,

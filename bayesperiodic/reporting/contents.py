@@ -15,13 +15,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bayesperiodic import _checks
+from bayesperiodic._verdicts import CAUTION, TONES
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.adequacy import ADEQUATE, MISSPECIFIED, TESTS, UNTESTED
+from bayesperiodic.diagnostics.adequacy import TESTS
 from bayesperiodic.diagnostics.comparison import Comparison, compare
-from bayesperiodic.diagnostics.identifiability import CONFLICT, DETERMINED, NOTHING, Identifiability, identifiability
+from bayesperiodic.diagnostics.identifiability import Identifiability, identifiability
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction, predict
-from bayesperiodic.diagnostics.verdicts import FINE, MODE, UNCONVERGED
 from bayesperiodic.estimation.map_estimate import estimation_warnings
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import JOINT, MEASURED
@@ -36,8 +36,6 @@ from bayesperiodic.sampling.draws import Posterior
 NOT_WHITE, LARGE_RATIO = 0.01, 1.5
 LONGEST, MOST_PANELS = 120, 7
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "xarray", "matplotlib")
-TONES = dict.fromkeys((FINE, DETERMINED, ADEQUATE), html.GOOD) | {UNTESTED: html.NEUTRAL}
-TONES |= dict.fromkeys((MISSPECIFIED, MODE, UNCONVERGED, NOTHING, CONFLICT), html.BAD)
 
 
 @dataclass(frozen=True)
@@ -135,7 +133,7 @@ class ReportInputs:
 
 def badge(verdict: str) -> html.Badge:
     """Return the badge of a verdict; verdicts without a tone of their own get "caution"."""
-    return html.Badge(TONES.get(verdict, html.CAUTION), verdict)
+    return html.Badge(TONES.get(verdict, CAUTION), verdict)
 
 
 def other_than(good: str, verdicts: Mapping[Any, str]) -> list[str]:

@@ -14,9 +14,9 @@ from markupsafe import Markup
 from sympy.printing.mathml import MathMLPresentationPrinter
 from sympy.printing.pretty.pretty_symbology import greek_unicode
 
+from bayesperiodic._verdicts import BAD, CAUTION, GOOD, NEUTRAL
 from bayesperiodic.models.model import Model
 
-GOOD, CAUTION, BAD, NEUTRAL = "good", "caution", "bad", "neutral"
 # A badge shows its tone by a sign as well as by a colour.
 SIGNS = {GOOD: "✓", CAUTION: "!", BAD: "✕", NEUTRAL: "•"}
 

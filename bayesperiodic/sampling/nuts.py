@@ -162,7 +162,7 @@ class _Run:
     def _judge(self, max_steps: int, progress: bool) -> None:
         passes, tau = 0, np.empty(0)
         with tqdm(total=max_steps, unit="draw", desc="sampling", disable=not progress) as bar:
-            for steps in range(BLOCK, max_steps + 1, BLOCK):
+            for steps in (*range(BLOCK, max_steps, BLOCK), max_steps):
                 self._wait(steps, bar)
                 self.steps, kept = steps, self.kept(steps)
                 tau, missing = stop_rule(kept, mode_of(self.density, self.fit, kept), tau, self.density.labels)

@@ -150,6 +150,13 @@ def test_same_seed_gives_identical_draws_and_another_seed_others(linear, briefly
 
 
 @needs_nutpie
+def test_fewer_draws_than_a_block_are_kept_and_not_converged(linear, briefly):
+    posterior = bp.sample(*linear, seed=1, **(briefly | {"max_steps": 60}))
+    assert not posterior.converged and posterior.draws("k").size == 2 * 60
+    assert "max_steps = 60 reached with" in posterior.reason
+
+
+@needs_nutpie
 def test_too_few_draws_are_not_converged_and_nuts_statistics_are_kept(linear, briefly, tmp_path):
     problem, fit = linear
     posterior = bp.sample(problem, fit, seed=1, start="overdispersed", **briefly)
