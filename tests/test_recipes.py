@@ -1,7 +1,7 @@
 """The recipes of CONTRIBUTING.md, carried out in a copy of the repository.
 
-The first line of each block of a recipe names a file: "new" makes it, "at the end" appends to it. The block "use" is run
-then, in one process for all recipes, so that they do not disturb each other either.
+The first line of each block of a recipe names a file: "new" makes it, "at the end" appends to it. The block "use" is
+run then, in one process for all recipes, so that they do not disturb each other either.
 """
 
 import json
@@ -32,6 +32,8 @@ MOST_FILES = {"A kind of data": 2}
 
 
 class Recipe(NamedTuple):
+    """What a recipe adds, and the code that uses it."""
+
     files: dict[str, tuple[str, str]]  # by path: "new" or "at the end", and the text
     use: str
 

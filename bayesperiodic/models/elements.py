@@ -66,7 +66,7 @@ def gap(x: sp.Expr, k: sp.Expr | float, clearance: sp.Expr | float, width: float
     A stop of 20 N/m at 0.5 m:
 
     >>> model = bp.Model("stop", states=["x"], inputs=["force"], parameters=["c", "k", "kg"],
-    ...     equations=lambda s, p, u: [s.ddx + p.c * s.dx + p.k * s.x + bp.elements.gap(s.x, p.kg, 0.5, 0.01) - u.force],
+    ...     equations=lambda s, p, u: [s.ddx + p.c*s.dx + p.k*s.x + bp.elements.gap(s.x, p.kg, 0.5, 0.01) - u.force],
     ...     outputs=lambda s, p, u: {"x": s.x})
     >>> import sympy as sp
     >>> x = sp.Symbol("x", real=True)

@@ -426,8 +426,8 @@ def smooth_abs(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
     Parameters
     ----------
     x, width : sympy expression, and number > 0 or sympy expression in the same unit
-        The value tends to ``|x|`` − width for large ``|x|``; the curvature at zero is 1 / width. So (x + smooth_abs)/2 is
-        no ramp: it tends to −width/2 for large negative x; see `elements.ramp`.
+        The value tends to ``|x|`` − width for large ``|x|``; the curvature at zero is 1 / width. So
+        (x + smooth_abs)/2 is no ramp: it tends to −width/2 for large negative x; see `elements.ramp`.
 
     Returns
     -------
