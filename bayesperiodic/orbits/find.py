@@ -13,10 +13,10 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
 from bayesperiodic.orbits.cycles import Candidate, Estimate
 from bayesperiodic.orbits.orbit import Orbit, Orbits
-from bayesperiodic.orbits.return_map import REACH, Atlas, ReturnMap, check_chaos, estimate_noise
+from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, ReturnMap, check_chaos, estimate_noise
 from bayesperiodic.orbits.section import PoincareSection, wrapped
 
-METHODS = ("chained", "boxes")
+SEARCHES = ("chained", "boxes")
 QUALITY_DEGREE, FEWEST_NEIGHBOURS = 3, 32
 # Bandwidth of the local fits of the search, in standard deviations of the noise.
 SEARCH_WIDTH = 4.0
@@ -25,7 +25,7 @@ LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
-STILL, SPREAD = 0.02, 20.0
+STILL_RANGE, STILL_NOISE = 0.02, 20.0
 
 
 class _ScaledSection(NamedTuple):
@@ -92,7 +92,7 @@ def find_orbits(
     """
     _checks.instance("section", section, PoincareSection)
     wanted = _periods(periods, len(section))
-    _checks.one_of("method", method, METHODS)
+    _checks.one_of("method", method, SEARCHES)
     neighbours, box = _checks.integer("neighbours", neighbours, 16), _checks.positive("box", box)
     scaled = _scaled(section, neighbours)
     if method == "boxes":
@@ -140,7 +140,7 @@ def _search_count(maps: ReturnMap, neighbours: int) -> int:
     centres = maps.arguments[:: max(1, len(maps.arguments) // 500)]
     count = int(2.25 * neighbours)
     while count < len(maps.arguments) // 100:
-        if np.median(maps.nearest(centres, count)[0][:, -1]) / REACH > SEARCH_WIDTH * maps.noise.max():
+        if np.median(maps.nearest(centres, count)[0][:, -1]) / KERNEL_REACH > SEARCH_WIDTH * maps.noise.max():
             break
         count = int(1.5 * count)
     return count
@@ -201,7 +201,7 @@ def _orbit(
 
 def _at_rest(section: PoincareSection, scaled: _ScaledSection, cycle: dict[str, np.ndarray]) -> bool:
     """Return whether a measured cycle moves no more than by noise and its distance to the orbit."""
-    limit = (STILL + SPREAD * scaled.maps.noise) * scaled.extent
+    limit = (STILL_RANGE + STILL_NOISE * scaled.maps.noise) * scaled.extent
     return all(np.ptp(cycle[name]) < limit[k] for k, name in enumerate(section.coordinates))
 
 

@@ -15,7 +15,7 @@ from sympy.polys.matrices import DomainMatrix
 from bayesperiodic.models.model import Model
 
 PRIME = 2_147_483_629
-HEAVY = 100
+PARAMETER_WEIGHT = 100
 
 
 @dataclass(frozen=True)
@@ -369,7 +369,7 @@ class Determining:
     @property
     def weights(self) -> np.ndarray:
         """Weights of the terms, by which transformations of few parameters are preferred, (terms,)."""
-        return np.array([HEAVY if term.is_parameter else 1 for term in self.terms])
+        return np.array([PARAMETER_WEIGHT if term.is_parameter else 1 for term in self.terms])
 
     @property
     def unknowns(self) -> list[sp.Symbol]:
