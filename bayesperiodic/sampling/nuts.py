@@ -22,7 +22,7 @@ from bayesperiodic.sampling.starts import mode_of, sampling_axes, start_points
 
 TUNE = 300
 # Draws between checks of the stop rule.
-BLOCK = 250
+DRAWS_BETWEEN_CHECKS = 250
 PAUSE = 0.01
 POSITION = "u"
 # Statistics of nutpie by their names in ArviZ's schema.
@@ -155,14 +155,14 @@ class _Run:
             self._judge(max_steps, progress)
         except KeyboardInterrupt:
             self.steps = min(chain.done for chain in self.chains)
-            if self.steps < BLOCK:
+            if self.steps < DRAWS_BETWEEN_CHECKS:
                 raise
             self.reason = f"interrupted after {self.steps} draws"
 
     def _judge(self, max_steps: int, progress: bool) -> None:
         passes, tau = 0, np.empty(0)
         with tqdm(total=max_steps, unit="draw", desc="sampling", disable=not progress) as bar:
-            for steps in range(BLOCK, max_steps + 1, BLOCK):
+            for steps in range(DRAWS_BETWEEN_CHECKS, max_steps + 1, DRAWS_BETWEEN_CHECKS):
                 self._wait(steps, bar)
                 self.steps, kept = steps, self.kept(steps)
                 tau, missing = stop_rule(kept, mode_of(self.density, self.fit, kept), tau, self.density.labels)
