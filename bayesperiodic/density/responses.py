@@ -11,7 +11,7 @@ from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.initial_orbits import with_guesses
 from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
-from bayesperiodic.periodic.arclength import LOST, path_outcome
+from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved, directional_sensitivities
@@ -150,7 +150,7 @@ class Simulator:
         """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""
         anchor, parameters = self._anchors[experiment], self.problem.parameters(theta[None], experiment)[0]
         return (
-            LOST
+            PATH_LOST
             if anchor.sensitivities is None
             else path_outcome(self.problem.equations[experiment], anchor, parameters)
         )

@@ -99,7 +99,7 @@ MAX_POINTS = 2000
 SMALLEST_STEP = 1e-6
 LARGEST_TURN = 0.8
 FEW_ITERATIONS, MANY_ITERATIONS = 3, 6
-GROWTH = 1.5
+STEP_GROWTH = 1.5
 
 
 Change = tuple[np.ndarray, np.ndarray]  # of z (points, states) and of the unknowns' values (unknowns,)
@@ -260,7 +260,7 @@ def trace(
             return
         here = after
         if iterations <= FEW_ITERATIONS:
-            length = min(length * GROWTH, tracer.longest(here, largest))
+            length = min(length * STEP_GROWTH, tracer.longest(here, largest))
         elif iterations > MANY_ITERATIONS:
             length /= 2
 
@@ -274,8 +274,8 @@ def _passed(value: float, origin: float, until: float) -> float | None:
 
 
 ARRIVED, ROUND_FOLDS, FOLD = "arrived", "round folds", "fold"
-EQUILIBRIUM, SHORTER, LOST = "equilibrium", "shorter period", "lost"
-STEP, MOST_POINTS = 0.1, 300
+EQUILIBRIUM, SHORTER, PATH_LOST = "equilibrium", "shorter period", "lost"
+PATH_STEP, MOST_PATH_POINTS = 0.1, 300
 
 
 def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.ndarray) -> str:
@@ -295,7 +295,7 @@ def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.nd
     once, folded = equations.kernels.repetitions(anchor.z, equations.grid.periods), False
     before = anchor.z
     with np.errstate(all="ignore"):
-        for point in islice(trace(parametrised, anchor.z, values, until=1.0, step=STEP), MOST_POINTS):
+        for point in islice(trace(parametrised, anchor.z, values, until=1.0, step=PATH_STEP), MOST_PATH_POINTS):
             if autonomous and _is_reversed(point.z, before):
                 return EQUILIBRIUM
             if equations.kernels.repetitions(point.z, equations.grid.periods) > once:
@@ -304,7 +304,7 @@ def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.nd
                 return ROUND_FOLDS if folded else ARRIVED
             folded |= bool(point.tangent[1][0] < 0.0)
             before = point.z
-    return FOLD if folded else LOST
+    return FOLD if folded else PATH_LOST
 
 
 def _is_reversed(z: np.ndarray, before: np.ndarray) -> bool:

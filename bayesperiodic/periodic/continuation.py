@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 FOLD, PERIOD_DOUBLING = "fold", "period doubling"
-STEPS = 50
+BRANCH_STEPS = 50
 LOCATED = 1e-9
 FOUND_BY = "continuation"
 DOUBLED = 0.005
@@ -236,7 +236,7 @@ def iterate_periodic(
         _checks.positive("until", until)
     if until == values[0]:
         raise ValueError(f"until: must differ from the start value of {vary}, got {until!r}.")
-    step = abs(until - values[0]) / STEPS if step is None else _checks.positive("step", step)
+    step = abs(until - values[0]) / BRANCH_STEPS if step is None else _checks.positive("step", step)
     solved = _remembered(parametrised)
     for point in trace(parametrised, z, values, until=until, step=step, refine=partial(_special_points, solved)):
         yield float(point.values[0]), solved(point), point.kind

@@ -13,9 +13,9 @@ from bayesperiodic._compile.code_generation import as_columns
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.compiled import (
     CONVERGED,
-    MAX_HALVINGS,
-    MAX_ITERATIONS,
+    HALVINGS,
     MAX_SEGMENTS,
+    MOST_NEWTON_STEPS,
     NO_BORDER,
     NO_UNKNOWNS,
     NOT_RESOLVED,
@@ -235,7 +235,7 @@ class PeriodicEquations:
         inputs[0, len(self.model.inputs) :] = 0.0
         states, best = np.zeros((1, 3 * count)), np.inf
         solution = states[0, :count].copy()
-        for _ in range(MAX_ITERATIONS):
+        for _ in range(MOST_NEWTON_STEPS):
             row = kernels.evaluate("residual_jacobian", states, inputs, parameters, tau, self.frequency)[0]
             residual, stiffness = row[:count], row[count:].reshape(count, 3, count)[:, 0]
             size = float(np.linalg.norm(residual))
@@ -250,10 +250,10 @@ class PeriodicEquations:
     ) -> Solved:
         """Run the Newton iteration for z and further unknowns from a guess (points, states) for the periodic part."""
         z, bordered = np.array(guess, dtype=float, order="C"), unknowns.values.size > 0
-        history, work = np.zeros((MAX_ITERATIONS, 3)), workspace(self, bordered=bordered)
+        history, work = np.zeros((MOST_NEWTON_STEPS, 3)), workspace(self, bordered=bordered)
         compiled = kernels("bordered newton" if bordered else "newton", self.count, self.grid.stencil)
         code, iterations, _ = compiled.newton(
-            self.functions, self.grid.packed, self.setting(parameters), unknowns, border, MAX_HALVINGS, z, history, work
+            self.functions, self.grid.packed, self.setting(parameters), unknowns, border, HALVINGS, z, history, work
         )
         return Solved(z, code, history[:iterations], unknowns.values)
 
