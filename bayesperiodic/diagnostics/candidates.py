@@ -14,7 +14,7 @@ from bayesperiodic import _checks
 from bayesperiodic.models.model import DERIVATIVES, Model, Names, smooth_abs, smooth_sign, with_derivatives
 from bayesperiodic.models.units import Unit, parsed, product, unit_of, written
 
-DEGREE, HIGHEST_POWER = 3, 5
+HIGHEST_DEGREE, HIGHEST_POWER = 3, 5
 # Widths of smooth absolute values and signs, relative to the standard deviation of their arguments.
 ABS_WIDTH, SIGN_WIDTH = 0.02, 0.2
 # Characters of a term in the name of its coefficient.
@@ -51,11 +51,11 @@ def generated(model: Model, where: Iterable[str], deviations: Mapping[str, float
     smooth, steepest = factors(model)
     moving = {name: e for name, e in smooth.items() if deviations.get(name, 1.0) > 0.0}
     found: dict[str, sp.Expr] = {"1": sp.Integer(1)}
-    for degree in range(1, DEGREE + 1):
+    for degree in range(1, HIGHEST_DEGREE + 1):
         for chosen in combinations_with_replacement(moving, degree):
             found[_product(chosen)] = sp.Mul(*(moving[name] for name in chosen))
     for name, e in moving.items():
-        found |= {f"{name}**{power}": e**power for power in range(DEGREE + 1, HIGHEST_POWER + 1)}
+        found |= {f"{name}**{power}": e**power for power in range(HIGHEST_DEGREE + 1, HIGHEST_POWER + 1)}
     widths = {name: deviations.get(name, 1.0) for name in moving}
     for name, e in moving.items():
         size = smooth_abs(e, ABS_WIDTH * widths[name])

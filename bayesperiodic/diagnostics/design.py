@@ -17,7 +17,7 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.result import MapEstimate
 
 ONE_SD = float(ndtr(1.0))
-SMALLEST, NEGLIGIBLE = 1e-12, 1e-3
+SMALLEST_EIGENVALUE, NEGLIGIBLE_COMPONENT = 1e-12, 1e-3
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Information:
     def spectrum(self) -> np.ndarray:
         """Eigenvalues of the information, descending, in units of the logarithm or of the prior sd if signed."""
         values = hessian_eigh(self.matrix, np.where(self.logarithmic, 1.0, self.prior_sd))[0][::-1]
-        return np.where(values > SMALLEST * values[0], values, 0.0)
+        return np.where(values > SMALLEST_EIGENVALUE * values[0], values, 0.0)
 
     @property
     def condition(self) -> float:
@@ -90,9 +90,9 @@ class Information:
         A change below 0.1 % of the prior sd along a unit direction does not count.
         """
         values, vectors = self._relative
-        informed = values > SMALLEST * max(values[-1], np.finfo(float).tiny)
+        informed = values > SMALLEST_EIGENVALUE * max(values[-1], np.finfo(float).tiny)
         variance = np.sum(vectors[:, informed] ** 2 / values[informed], axis=1)
-        unseen = np.any(np.abs(vectors[:, ~informed]) > NEGLIGIBLE, axis=1)
+        unseen = np.any(np.abs(vectors[:, ~informed]) > NEGLIGIBLE_COMPONENT, axis=1)
         return np.where(unseen, np.inf, np.sqrt(variance))
 
     @property
@@ -106,7 +106,7 @@ class Information:
         return np.where(self.logarithmic, np.log(np.where(self.logarithmic, values, 1.0)), values)
 
 
-FACTORS = (0.5, 1.0, 2.0)
+FREQUENCY_FACTORS = (0.5, 1.0, 2.0)
 MOST_RUNS = 5
 
 
@@ -128,8 +128,8 @@ def default_candidates(problem: Problem) -> list[Candidate]:
     runs = sorted(problem.experiments, key=lambda e: e.frequency)
     most = len(runs) if any("[" in name for name in problem.names) else MOST_RUNS
     chosen = [runs[i] for i in sorted({round(k) for k in np.linspace(0, len(runs) - 1, most)})]
-    scales = FACTORS if problem.model.inputs else (1.0,)
-    return [Candidate(e.name, f * e.frequency, s) for e in chosen for f in FACTORS for s in scales]
+    scales = FREQUENCY_FACTORS if problem.model.inputs else (1.0,)
+    return [Candidate(e.name, f * e.frequency, s) for e in chosen for f in FREQUENCY_FACTORS for s in scales]
 
 
 def rank_candidates(

@@ -26,7 +26,7 @@ from bayesperiodic.diagnostics.candidates import (
     places,
 )
 from bayesperiodic.diagnostics.optima import (
-    SIGNIFICANT,
+    SIGNIFICANT_COEFFICIENT,
     Optimum,
     distinct,
     doubt,
@@ -41,7 +41,7 @@ from bayesperiodic.models.model import Model
 from bayesperiodic.problem.description import check_results
 
 # Ratio of the errors in experiments that are left out from which on these tell two terms apart.
-WORSE = 2.0
+WORSE_RATIO = 2.0
 
 
 @dataclass(frozen=True)
@@ -249,7 +249,7 @@ def _sentence(k: int, step: Step) -> str:
     text += f" in {step.place}, {size} (p = {step.p:.2g}){others}."
     if np.isfinite(step.lag):
         text += f" Its lag is {step.lag:.3g} ± {step.lag_sd:.2g} s."
-        if abs(step.coefficient) < SIGNIFICANT * step.robust_sd:
+        if abs(step.coefficient) < SIGNIFICANT_COEFFICIENT * step.robust_sd:
             text += " The data determine the product of coefficient and lag, but not both."
     if step.worse:
         text += f" As good a fit, but worse in experiments left out: {', '.join(step.worse)}."
@@ -497,7 +497,7 @@ class _Search:
         alike = [key for key in fitted if key == best or not distinct(fitted[best], fitted[key])]
         errors = {key: held_out_error(fitted[key]) for key in alike} if len(alike) > 1 else {best: np.nan}
         # Errors that are nearly equal are in an order by chance: of these, the evidence tells which is best.
-        well = [key for key in alike if not errors[key] > WORSE * min(errors.values())]
+        well = [key for key in alike if not errors[key] > WORSE_RATIO * min(errors.values())]
         # Of a term with memory, short and long lags have the effect of one without.
         first = max(well, key=lambda key: (self.terms[key].force is None, fitted[key].evidence))
         # Each of the candidates is as likely to be the missing one.

@@ -24,7 +24,7 @@ FEWEST_EXPERIMENTS = 3
 # Where the search for an optimum ends by itself; "stalled" steps are limited by the accuracy of the periodic solutions.
 ENDED = ("converged", "stalled")
 # Robust standard deviations from zero of a coefficient.
-SIGNIFICANT = 2.0
+SIGNIFICANT_COEFFICIENT = 2.0
 # Fraction by which a coefficient may change on twice as many points.
 COARSE = 0.5
 # Standard deviation of the logarithm of a lag about where its estimation starts.
@@ -153,8 +153,8 @@ def doubt(fit: MapEstimate, name: str, term: Candidate) -> str:
         # Of a short or a long lag, the data determine only its product with the coefficient, or the quotient.
         joint = fit.covariance.loc[[name, lag_names(name)[0]], [name, lag_names(name)[0]]].to_numpy()
         robust *= np.sqrt(max(1.0 - joint[0, 1] ** 2 / (joint[0, 0] * joint[1, 1]), 0.0))
-    if size < SIGNIFICANT * robust:
-        return f"its coefficient is less than {SIGNIFICANT:g} robust sds from zero"
+    if size < SIGNIFICANT_COEFFICIENT * robust:
+        return f"its coefficient is less than {SIGNIFICANT_COEFFICIENT:g} robust sds from zero"
     if (change := abs(fit.doubling_shift[name]) * sd / size) > COARSE:
         return (
             f"on twice as many points its coefficient changes by {change:.0%}: the error of the grid looks like this "

@@ -23,9 +23,9 @@ from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 # Part of the square of an effect that the parameters cannot have instead, below which the two cannot be told apart.
 UNIDENTIFIABLE = 1e-6
 # 1 − cos² of the angle between two effects that are the same on the measured orbits.
-COLLINEAR = 1e-8
+SAME_EFFECT = 1e-8
 # Lags that are tried: in radians of the fastest and of the slowest experiment, with this factor or less between them.
-SHORTEST, LONGEST, FACTOR = 0.3, 3.0, 3.5
+SHORTEST_LAG, LONGEST_LAG, LARGEST_LAG_FACTOR = 0.3, 3.0, 3.5
 
 
 class Compared(NamedTuple):
@@ -97,7 +97,7 @@ class ScoreTests:
         left = [i for i in np.argsort(-self.explained, kind="stable") if self.identifiable[i] and i in among]
         while left:
             cosine = self._effects[left] @ self._effects[left[0]] / (size[left] * size[left[0]])
-            same = 1.0 - cosine**2 < COLLINEAR
+            same = 1.0 - cosine**2 < SAME_EFFECT
             yield sorted(int(i) for i, own in zip(left, same, strict=True) if own)
             left = [i for i, own in zip(left, same, strict=True) if not own]
 
@@ -151,8 +151,8 @@ def variable_deviations(problem: Problem, fit: MapEstimate) -> dict[str, float]:
 def lags_to_try(fit: MapEstimate) -> list[float]:
     """Return lags [s] of terms with memory, which cover all experiments."""
     rates = [2.0 * np.pi * own.frequency / own.periods for own in fit.solutions.values()]
-    ends = SHORTEST / max(rates), LONGEST / min(rates)
-    return np.geomspace(*ends, 1 + int(np.ceil(np.log(ends[1] / ends[0]) / np.log(FACTOR)))).tolist()
+    ends = SHORTEST_LAG / max(rates), LONGEST_LAG / min(rates)
+    return np.geomspace(*ends, 1 + int(np.ceil(np.log(ends[1] / ends[0]) / np.log(LARGEST_LAG_FACTOR)))).tolist()
 
 
 def _at(

@@ -16,12 +16,18 @@ from matplotlib.figure import Figure
 
 from bayesperiodic import _checks
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.adequacy import ADEQUATE, MISSPECIFIED, TESTS, UNTESTED
+from bayesperiodic.diagnostics.adequacy import ADEQUACY_TESTS, ADEQUATE, MISSPECIFIED, UNTESTED
 from bayesperiodic.diagnostics.comparison import Comparison, compare
-from bayesperiodic.diagnostics.identifiability import CONFLICT, DETERMINED, NOTHING, Identifiability, identifiability
+from bayesperiodic.diagnostics.identifiability import (
+    CONFLICT,
+    DETERMINED,
+    NOT_DETERMINED,
+    Identifiability,
+    identifiability,
+)
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction, predict
-from bayesperiodic.diagnostics.verdicts import FINE, MODE, UNCONVERGED
+from bayesperiodic.diagnostics.verdicts import FINE, UNCONVERGED, WRONG_MODE
 from bayesperiodic.estimation.map_estimate import estimation_warnings
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import JOINT, MEASURED
@@ -37,7 +43,7 @@ NOT_WHITE, LARGE_RATIO = 0.01, 1.5
 LONGEST, MOST_PANELS = 120, 7
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "xarray", "matplotlib")
 TONES = dict.fromkeys((FINE, DETERMINED, ADEQUATE), html.GOOD) | {UNTESTED: html.NEUTRAL}
-TONES |= dict.fromkeys((MISSPECIFIED, MODE, UNCONVERGED, NOTHING, CONFLICT), html.BAD)
+TONES |= dict.fromkeys((MISSPECIFIED, WRONG_MODE, UNCONVERGED, NOT_DETERMINED, CONFLICT), html.BAD)
 
 
 @dataclass(frozen=True)
@@ -403,7 +409,7 @@ def laplace(found: Comparison) -> Rows:
 def adequacy(found: Prediction) -> Rows:
     """Return the table of the tests of the model."""
     columns: dict[str, Any] = {"label": ("Experiment and channel", str), "verdict": ("Verdict", badge)}
-    columns |= {test: (f"p-values: {test}", html.p_value) for test in TESTS}
+    columns |= {test: (f"p-values: {test}", html.p_value) for test in ADEQUACY_TESTS}
     return _formatted(found.table, **columns, model_error_share=("Fraction of model error", html.percent))
 
 
