@@ -110,7 +110,7 @@ FREQUENCY_FACTORS = (0.5, 1.0, 2.0)
 MOST_RUNS = 5
 
 
-class Candidate(NamedTuple):
+class FurtherExperiment(NamedTuple):
     """A possible experiment: the inputs of a run with scaled variation at another frequency [Hz]."""
 
     run: str
@@ -118,7 +118,7 @@ class Candidate(NamedTuple):
     scale: float
 
 
-def default_candidates(problem: Problem) -> list[Candidate]:
+def default_candidates(problem: Problem) -> list[FurtherExperiment]:
     """Return half, once and twice the frequency and the amplitude of runs spread over the frequencies.
 
     These are all runs if some parameters are local; none for a free-running model, which has no drive to change.
@@ -129,11 +129,11 @@ def default_candidates(problem: Problem) -> list[Candidate]:
     most = len(runs) if any("[" in name for name in problem.names) else MOST_RUNS
     chosen = [runs[i] for i in sorted({round(k) for k in np.linspace(0, len(runs) - 1, most)})]
     scales = FREQUENCY_FACTORS if problem.model.inputs else (1.0,)
-    return [Candidate(e.name, f * e.frequency, s) for e in chosen for f in FREQUENCY_FACTORS for s in scales]
+    return [FurtherExperiment(e.name, f * e.frequency, s) for e in chosen for f in FREQUENCY_FACTORS for s in scales]
 
 
 def rank_candidates(
-    problem: Problem, fit: MapEstimate, information: Information, candidates: Iterable[Candidate]
+    problem: Problem, fit: MapEstimate, information: Information, candidates: Iterable[FurtherExperiment]
 ) -> pd.DataFrame:
     """Return the expected gain [nats] of each candidate and the ratio of each sd after it to the present one.
 
@@ -153,11 +153,11 @@ def rank_candidates(
             row["gain"] = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1])
             row |= zip(problem.names, np.sqrt(np.diag(np.linalg.inv(after))) / now, strict=True)
         rows.append(row)
-    table = pd.DataFrame(rows, columns=[*Candidate._fields, "gain", *problem.names])
+    table = pd.DataFrame(rows, columns=[*FurtherExperiment._fields, "gain", *problem.names])
     return table.sort_values("gain", ascending=False, na_position="last", ignore_index=True)
 
 
-def _added(problem: Problem, fit: MapEstimate, run: Experiment, candidate: Candidate) -> np.ndarray:
+def _added(problem: Problem, fit: MapEstimate, run: Experiment, candidate: FurtherExperiment) -> np.ndarray:
     """Return the information of a candidate in the coordinates of `Information`; NaN without an orbit."""
     inputs = {name: u.mean() + candidate.scale * (u - u.mean()) for name, u in problem.true_inputs(run).items()}
     planned = problem.planned(replace(run, frequency=candidate.frequency, inputs=inputs), fit.noise)

@@ -14,7 +14,7 @@ from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import misfit
-from bayesperiodic.diagnostics.design import Candidate, Information, default_candidates, rank_candidates
+from bayesperiodic.diagnostics.design import FurtherExperiment, Information, default_candidates, rank_candidates
 from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
 from bayesperiodic.estimation.modes import NOTABLE, Mode, notable
@@ -272,7 +272,7 @@ def identifiability(
     problem = check_results(problem, fit=fit, **({} if posterior is None else {"posterior": posterior}))
     information, structure = Information.of(problem, fit), structure_of(problem)
     shapes = profile_of(problem, fit).shape if profile is True else profile.shape if profile else {}
-    options = default_candidates(problem) if candidates is None else [Candidate(*c) for c in candidates]
+    options = default_candidates(problem) if candidates is None else [FurtherExperiment(*c) for c in candidates]
     experiments, directions = rank_candidates(problem, fit, information, options), _directions(information)
     widths, errors = _widths(problem, fit, posterior, information)
     left = information.together if posterior is None else np.sqrt(1.0 / np.maximum(1.0 / widths**2 - 1.0, 1e-12))

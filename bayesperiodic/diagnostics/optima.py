@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesperiodic._linalg import TINY, hessian_scale, scaled
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.candidates import Candidate, lag_names
+from bayesperiodic.diagnostics.candidates import Term, lag_names
 from bayesperiodic.estimation.gauss_newton import SINGULAR, Iterate, Objective
 from bayesperiodic.estimation.map_estimate import nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate
@@ -32,7 +32,7 @@ LAG_SPREAD = 1.5
 
 
 def problem_of(
-    problem: Problem, model: Model, terms: Mapping[str, tuple[Candidate, float]], zero: Mapping[str, Candidate]
+    problem: Problem, model: Model, terms: Mapping[str, tuple[Term, float]], zero: Mapping[str, Term]
 ) -> Problem:
     """Return the problem with another model, whose coefficients have normal priors of given widths or are zero."""
     settings = dict(problem._given)
@@ -146,7 +146,7 @@ def held_out_error(state: Optimum) -> float:
     return float(np.mean(fractions))
 
 
-def doubt(fit: MapEstimate, name: str, term: Candidate) -> str:
+def doubt(fit: MapEstimate, name: str, term: Term) -> str:
     """Return why the coefficient of a term is not believed, in words; "" if it is."""
     size, sd, robust = abs(fit.theta[name]), fit.sd[name], fit.robust_sd[name]
     if term.force is not None:

@@ -12,7 +12,7 @@ from bayesperiodic._linalg import column_space
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import Whitened, used
-from bayesperiodic.diagnostics.candidates import MEMORY, Candidate, factors, places, values
+from bayesperiodic.diagnostics.candidates import MEMORY, Term, factors, places, values
 from bayesperiodic.estimation.covariance import predicted_changes, residual_variances
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.result import MapEstimate
@@ -51,7 +51,7 @@ class ScoreTests:
         Coefficients whose effect is as large as the measured output, in the channel where it is largest.
     """
 
-    def __init__(self, problem: Problem, optimum: Iterate, terms: Sequence[Candidate]):
+    def __init__(self, problem: Problem, optimum: Iterate, terms: Sequence[Term]):
         likelihood, noise, here = problem.likelihood, optimum.noise, optimum.here
         solutions = here.simulator.solutions(optimum.theta)
         effects = _effects(problem, optimum.theta, solutions, terms)
@@ -165,7 +165,7 @@ def _at(
 
 
 def _effects(
-    problem: Problem, theta: np.ndarray, solutions: Mapping[str, PeriodicSolution], terms: Sequence[Candidate]
+    problem: Problem, theta: np.ndarray, solutions: Mapping[str, PeriodicSolution], terms: Sequence[Term]
 ) -> list[np.ndarray]:
     """Return the changes of the predicted components by each coefficient, one array (terms, size) a block.
 

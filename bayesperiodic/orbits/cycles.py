@@ -40,7 +40,7 @@ Wrap = Callable[[np.ndarray], np.ndarray]
 Images = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
-class Candidate(NamedTuple):
+class MapCycle(NamedTuple):
     """A cycle of the local maps, not yet refined."""
 
     points: np.ndarray  # (period, 2)
@@ -109,7 +109,7 @@ def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool
     return any(np.abs(wrap(np.concatenate([points[d:], points[:d]]) - points)).max() < tolerance for d in divisors)
 
 
-def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) -> list[Candidate]:
+def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) -> list[MapCycle]:
     """Return the cycles of a prime period to which close returns in the section (n, 2) lead."""
     starts, members = _close_returns(maps, section, period)
     chains = section[starts[:, None] + np.arange(period)]
@@ -179,7 +179,7 @@ def _close_returns(maps: ReturnMap, section: np.ndarray, period: int) -> tuple[n
 
 def _distinct(
     maps: ReturnMap, section: np.ndarray, chains: np.ndarray, step: np.ndarray, members: list[np.ndarray]
-) -> list[Candidate]:
+) -> list[MapCycle]:
     noise = float(maps.noise.max())
     tolerance = max(SAME_CYCLE, 3.0 * noise)
     # Each cycle with the first points and the shift of each of its close returns, (returns, 2).
@@ -202,7 +202,7 @@ def _distinct(
         starts, shifts = np.concatenate(group, axis=1)
         expected = cycle[(steps + shifts[:, None]) % len(cycle)]
         closest = int(np.argmin(np.abs(maps.wrap(section[starts[:, None] + steps] - expected)).max((1, 2))))
-        result.append(Candidate(cycle, len(starts), int(starts[closest]), int(shifts[closest])))
+        result.append(MapCycle(cycle, len(starts), int(starts[closest]), int(shifts[closest])))
     return result
 
 
@@ -319,7 +319,7 @@ def _joint_covariance(fit: LocalFit) -> np.ndarray:
 
 def box_orbits(
     maps: ReturnMap, section: np.ndarray, period: int, neighbours: int, box: float
-) -> list[tuple[Candidate, Estimate]]:
+) -> list[tuple[MapCycle, Estimate]]:
     """Return the orbits of one period by the method "boxes" of `find_orbits`.
 
     A point that is in its own or an adjacent box again after `period` steps is recurrent; adjacent boxes with several
@@ -328,7 +328,7 @@ def box_orbits(
     """
     count = int(2.25 * neighbours)
     iterates = [_iterated(maps, section, k) for k in range(1, period + 1)]
-    found: list[tuple[Candidate, Estimate]] = []
+    found: list[tuple[MapCycle, Estimate]] = []
     for centre, members in _recurrent_boxes(maps, section, period, box):
         fit = iterates[-1].fit(centre[None], count, 1)
         step = newton_step(maps.wrap(fit.value - centre)[None], fit.jacobian[None])[0, 0]
@@ -352,7 +352,7 @@ def box_orbits(
         if any(shift_between(points, other.points, maps.wrap)[0] < 2.0 * box for _, other in found):
             continue
         away = maps.distance(section[members], points[0])
-        found.append((Candidate(points, len(members), int(members[np.argmin(away)]), 0), estimate))
+        found.append((MapCycle(points, len(members), int(members[np.argmin(away)]), 0), estimate))
     return found
 
 

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
-from bayesperiodic.orbits.cycles import Candidate, Estimate
+from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, ReturnMap, check_chaos, estimate_noise
 from bayesperiodic.orbits.section import PoincareSection, wrapped
@@ -146,9 +146,9 @@ def _search_count(maps: ReturnMap, neighbours: int) -> int:
     return count
 
 
-def _chained(scaled: _ScaledSection, atlas: Atlas, period: int, neighbours: int) -> list[tuple[Candidate, Estimate]]:
+def _chained(scaled: _ScaledSection, atlas: Atlas, period: int, neighbours: int) -> list[tuple[MapCycle, Estimate]]:
     maps = scaled.maps
-    found: list[tuple[Candidate, Estimate]] = []
+    found: list[tuple[MapCycle, Estimate]] = []
 
     def same(one: Estimate, other: Estimate) -> bool:
         distance, _ = cycles.shift_between(one.points, other.points, maps.wrap)
@@ -169,7 +169,7 @@ def _largest_sd(estimate: Estimate) -> float:
 
 
 def _orbit(
-    section: PoincareSection, scaled: _ScaledSection, candidate: Candidate, estimate: Estimate, quality: float
+    section: PoincareSection, scaled: _ScaledSection, candidate: MapCycle, estimate: Estimate, quality: float
 ) -> Orbit:
     period = len(estimate.points)
     size = 2 * period
@@ -205,7 +205,7 @@ def _at_rest(section: PoincareSection, scaled: _ScaledSection, cycle: dict[str, 
     return all(np.ptp(cycle[name]) < limit[k] for k, name in enumerate(section.coordinates))
 
 
-def _quality(scaled: _ScaledSection, candidate: Candidate, estimate: Estimate, neighbours: int) -> float:
+def _quality(scaled: _ScaledSection, candidate: MapCycle, estimate: Estimate, neighbours: int) -> float:
     """Return the p-value of the closest return under the maps along the orbit."""
     maps, period = scaled.maps, len(estimate.points)
     steps = np.arange(period + 1)

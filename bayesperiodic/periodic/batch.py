@@ -15,9 +15,9 @@ from bayesperiodic.periodic.compiled import (
     Anchors,
     BatchSolution,
     Border,
+    CycleAnchors,
     Factors,
     Functions,
-    Orbits,
     Sets,
     kernels,
 )
@@ -196,7 +196,7 @@ class AutonomousBatch:
         for e, anchor in enumerate(anchors):
             if anchor.sensitivities is not None and anchor.frequency_sensitivities is not None:
                 sensitivities[e], slopes[e] = anchor.sensitivities, anchor.frequency_sensitivities
-        self._orbits = Orbits(
+        self._orbits = CycleAnchors(
             parameters,
             z,
             frequency,

@@ -155,7 +155,7 @@ class Anchors(NamedTuple):
     right: np.ndarray
 
 
-class Orbits(NamedTuple):
+class CycleAnchors(NamedTuple):
     """Anchors of an autonomous batch, arrays (sets, …); see `batch.Anchor`."""
 
     parameters: np.ndarray
@@ -196,7 +196,7 @@ SETS = named(Sets, CUBE, VECTOR, MATRIX)
 ALL_FACTORS = named(Factors, CUBE, INDICES, GAINS, types.Array(NUMBER, 5, "C"), GAINS, INDICES, MATRIX, INDICES)
 ANCHORS = named(Anchors, MATRIX, CUBE, GAINS, MATRIX, MATRIX, VECTOR, ALL_FACTORS, CUBE, CUBE)
 ALL_BORDERS = named(Border, CUBE, CUBE, CUBE, CUBE, INDICES)
-ORBITS = named(Orbits, MATRIX, CUBE, VECTOR, GAINS, MATRIX, CUBE, INDICES, ALL_BORDERS, VECTOR, VECTOR)
+CYCLE_ANCHORS = named(CycleAnchors, MATRIX, CUBE, VECTOR, GAINS, MATRIX, CUBE, INDICES, ALL_BORDERS, VECTOR, VECTOR)
 SOLUTION = named(BatchSolution, GAINS, GAINS, MATRIX, INDICES, INDICES)
 
 

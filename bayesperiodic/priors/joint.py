@@ -13,11 +13,11 @@ from scipy.stats.distributions import rv_frozen
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import covariance_cholesky
-from bayesperiodic.priors.single import LOG_ROOT_TWO_PI, Density, Normal, Prior, Univariate
+from bayesperiodic.priors.single import LOG_ROOT_TWO_PI, LogDensity, Normal, Prior, Univariate
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class MultivariateNormal(Density):
+class MultivariateNormal(LogDensity):
     """The joint normal distribution of several parameters: one posterior becomes the next prior.
 
     Parameters

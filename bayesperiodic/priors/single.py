@@ -18,7 +18,7 @@ ROOT_TWO = math.sqrt(2.0)
 LEGENDRE_NODES, LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
-class Density(Protocol):
+class LogDensity(Protocol):
     """Probability density of one parameter, or of n parameters jointly."""
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
@@ -45,7 +45,7 @@ class Density(Protocol):
 
 
 @runtime_checkable
-class Prior(Density, Protocol):
+class Prior(LogDensity, Protocol):
     """Interface of the priors of one parameter."""
 
     @property

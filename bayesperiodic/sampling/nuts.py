@@ -61,7 +61,7 @@ def sample_nuts(
     sequences = np.random.SeedSequence(seed).spawn(ensembles + 2)
     axes = sampling_axes(density, fit, start, np.random.default_rng(sequences[ensembles]))
     starts = start_points(density, fit, start, ensembles, np.random.default_rng(sequences[ensembles + 1]))
-    run = _Run(density, fit, axes)
+    run = _Chains(density, fit, axes)
     try:
         for u, sequence in zip(axes.whiten(starts), sequences, strict=False):
             chain_seed = int(sequence.generate_state(1, np.uint64)[0])
@@ -141,7 +141,7 @@ class _Chain:
             _ = self.sampler.is_finished
 
 
-class _Run:
+class _Chains:
     """The chains, their number of draws, and the result of the stop rule."""
 
     def __init__(self, density: LogPosterior, fit: MapEstimate, axes: AffineTransform):

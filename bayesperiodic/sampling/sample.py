@@ -223,7 +223,7 @@ def sample(
             return sample_nuts(density, fit, seed, ensembles, max_steps, start, progress)
         lists = {run: {state: [*map(float, x)] for state, x in states.items()} for run, states in guesses.items()}
         state = {"anchor": anchor.tolist(), "guesses": lists} | saved
-        run = _Run(density, fit, seed, start, (ensembles, size), backend, state)
+        run = _EnsembleRun(density, fit, seed, start, (ensembles, size), backend, state)
         run.go(max_steps, store, executor, progress)
         found = run.posterior()
     if found.converged and coordinates == NATURAL and problem.logarithmic.any():
@@ -248,7 +248,7 @@ def _checked_walkers(walkers: int | None, problem: Problem, variances: str) -> i
     return walkers
 
 
-class _Run:
+class _EnsembleRun:
     """A sampling run: one emcee sampler for all ensembles, the fit of its mixture, and the state of the stop rule."""
 
     def __init__(

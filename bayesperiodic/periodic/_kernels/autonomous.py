@@ -154,7 +154,7 @@ def continue_from_anchor(functions, grid, setting, anchor, orientation, border, 
     return CONVERGED, used, now
 
 
-@kernel(types.void(ADDRESSES, GRID, SETS, ORBITS, CUBE, COUNT, COUNT, FLAG, WORKSPACE, SOLUTION), **OPTIONS)
+@kernel(types.void(ADDRESSES, GRID, SETS, CYCLE_ANCHORS, CUBE, COUNT, COUNT, FLAG, WORKSPACE, SOLUTION), **OPTIONS)
 def follow_many(functions, grid, sets, orbits, parameters, start, stop, whole, work, solution):
     """Follow every orbit to its parameter vectors start … stop: by `broyden`, or else by `continue_from_anchor`.
 
