@@ -28,8 +28,8 @@ class Unexplained:
     is the sum of squares, `freedom` the number of its degrees of freedom.
     """
 
-    def __init__(self, components: np.ndarray, changes: np.ndarray, harmonic: np.ndarray):
-        self._basis = column_space(changes)
+    def __init__(self, components: np.ndarray, jacobian: np.ndarray, harmonic: np.ndarray):
+        self._basis = column_space(jacobian)
         self._rest = components - self._basis @ (self._basis.T @ components)
         self.square = float(self._rest @ self._rest)
         self.freedom = components.size - self._basis.shape[1]
@@ -37,19 +37,19 @@ class Unexplained:
 
     @classmethod
     def of_measured_noise(
-        cls, components: np.ndarray, changes: np.ndarray, harmonic: np.ndarray, behind: np.ndarray
+        cls, components: np.ndarray, jacobian: np.ndarray, harmonic: np.ndarray, behind: np.ndarray
     ) -> "Unexplained":
         """Return what is unexplained in units of measured standard deviations with degrees of freedom (harmonics,).
 
         The square of each harmonic is F distributed. It is weighted so that it is the χ² quantile of its probability.
         """
-        first = cls(components, changes, harmonic)
+        first = cls(components, jacobian, harmonic)
         square, freedom = first.explained(np.eye(first.harmonics.size, dtype=bool))
         free = np.maximum(freedom, 1)
         p = np.maximum(stats.f.sf(square / free, free, behind), np.finfo(float).tiny)
         known = np.where((freedom > 0) & (square > 0.0), stats.chi2.isf(p, free), square)
         factor = np.sqrt(np.divide(known, square, out=np.ones_like(square), where=known > 0.0))[first._group]
-        return cls(components * factor, changes * factor, harmonic)
+        return cls(components * factor, jacobian * factor, harmonic)
 
     @cached_property
     def _sums(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -41,9 +41,9 @@ class Information:
         guesses = {e.name: fit.solutions[e.name].states for e in problem.experiments}
         here = problem.anchored(theta, guesses).density().linearise(theta)
         noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
-        changes = problem.likelihood.whitened(here.changes, noise)
+        jacobian = problem.likelihood.whitened(here.changes, noise)
         slopes = np.where(logs, theta, 1.0)
-        design = np.concatenate(changes, axis=1) * slopes[:, None]
+        design = np.concatenate(jacobian, axis=1) * slopes[:, None]
         ends = [
             marginal.quantile(np.array([1.0 - ONE_SD, ONE_SD])) for marginal in problem.joint_prior.marginals.values()
         ]

@@ -80,9 +80,9 @@ class ScoreTests:
             statistic = tests.gains()
         else:
             likelihood, noise, here = problem.likelihood, optimum.noise, optimum.here
-            changes, residuals = (likelihood.whitened(part, noise) for part in (here.changes, here.residuals))
-            information = problem.joint_prior.curvature(optimum.theta) + sum(s @ s.T for s in changes)
-            variances = residual_variances(likelihood, changes, residuals, noise, information)
+            jacobian, residuals = (likelihood.whitened(part, noise) for part in (here.changes, here.residuals))
+            information = problem.joint_prior.curvature(optimum.theta) + sum(s @ s.T for s in jacobian)
+            variances = residual_variances(likelihood, jacobian, residuals, noise, information)
             sds = [np.sqrt(np.maximum(used(b, v)[0], 1e-12)) for b, v in zip(blocks, variances, strict=True)]
             parts = [[r / sd, j / sd] for (r, j, _), sd in zip(white.parts, sds, strict=True)]
             tests = _projected(parts, parameters)
@@ -167,7 +167,7 @@ def _at(
 def _effects(
     problem: Problem, theta: np.ndarray, solutions: Mapping[str, PeriodicSolution], terms: Sequence[Term]
 ) -> list[np.ndarray]:
-    """Return the changes of the predicted components by each coefficient, one array (terms, size) a block.
+    """Return the derivatives of the predicted components by each coefficient, one array (terms, size) a block.
 
     NaN for terms that are not finite along an orbit.
     """

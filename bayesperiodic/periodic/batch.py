@@ -108,7 +108,7 @@ class Batch:
             sensitivities,
             amplitude,
             gradient,
-            first.kernels.FAR * ratios.min(axis=1),
+            first.kernels.OFF_ANCHOR * ratios.min(axis=1),
             factors,
             left,
             right,

@@ -331,7 +331,7 @@ class PeriodicEquations:
         """Return the partial derivatives of g and f."""
         return Derivatives(*self.model.kernels.split_derivatives(self.evaluate("derivatives", z, parameters)))
 
-    def frequency_changes(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def frequency_jacobian(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return ∂(q, q̇, q̈)/∂frequency and ∂(u, u̇, ü)/∂frequency, z and the inputs held as functions of tau."""
         order = np.repeat([0.0, 1.0, 2.0], self.count) / self.frequency
         input_order = np.repeat([0.0, 1.0, 2.0], len(self.model.inputs)) / self.frequency
@@ -442,17 +442,17 @@ def input_sensitivities(
     return respond(equations, z, columns, d, along(d.g_u, directions), along(d.f_u, directions))
 
 
-def along(derivatives: np.ndarray, changes: np.ndarray) -> np.ndarray:
-    """Return the derivatives (points, values, variables) times changes (directions, points, variables)."""
+def along(derivatives: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return the derivatives (points, values, variables) times directions (directions, points, variables)."""
     with np.errstate(over="ignore", invalid="ignore"):  # Where outputs overflow the result is not finite.
-        return np.ascontiguousarray(np.moveaxis(derivatives @ np.moveaxis(changes, 0, 2), 2, 0))
+        return np.ascontiguousarray(np.moveaxis(derivatives @ np.moveaxis(directions, 0, 2), 2, 0))
 
 
 def frequency_derivatives(
     equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray, d: Derivatives
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return dg/dfrequency (points, states) and df/dfrequency (points, channels), z and inputs held in tau."""
-    states, inputs = equations.frequency_changes(z)
+    states, inputs = equations.frequency_jacobian(z)
     _, g_u, g_frequency, f_q, _, f_u, f_frequency = d
     g_q = columns[:, equations.count :].reshape(len(z), equations.count, -1)
     g = g_frequency[:, :, 0] + np.einsum("neq,nq->ne", g_q, states) + np.einsum("neu,nu->ne", g_u, inputs)

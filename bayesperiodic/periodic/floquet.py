@@ -75,7 +75,7 @@ def first_order_matrix(linearisation: np.ndarray, orders: tuple[int, ...]) -> np
     return _companion(-np.linalg.solve(highest, lower), orders)
 
 
-def change_factors(
+def derivative_factors(
     linearisation: np.ndarray, orders: tuple[int, ...], matrix: np.ndarray, v: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a (multipliers, points, states) and b (…, 3·states) for which wᵀ dA v = aᵀ d∂g/∂(q, q̇, q̈) b.
