@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-MOST_LETTERS, SHOWN = 200, 12
+MOST_LETTERS, MOST_LISTED = 200, 12
 # Sizes of measured values, whose squares and their ratios must be numbers.
-SMALLEST, LARGEST = 1e-100, 1e100
+SMALLEST_VALUE, LARGEST_VALUE = 1e-100, 1e100
 
 
 def one_of(argument: str, value: Any, allowed: Iterable[str]) -> None:
@@ -83,7 +83,7 @@ def identifiers(argument: str, names: Iterable[str], reserved: Iterable[str] = (
         if name in result[:place]:
             raise ValueError(f"{argument}: must differ, got {name!r} twice.")
         if name in taken:
-            others = f"{_listed(taken[:SHOWN])}{', …' * (len(taken) > SHOWN)}"
+            others = f"{_listed(taken[:MOST_LISTED])}{', …' * (len(taken) > MOST_LISTED)}"
             raise ValueError(
                 f"{argument}: must be neither reserved nor used elsewhere ({others}), got {name!r}; choose another "
                 "name."
@@ -168,16 +168,16 @@ def measured_vector(argument: str, values: Any, length: int | None = None, meani
     """Return `values` as by `finite_vector`; raise a ValueError if its values are too small or too large."""
     array = finite_vector(argument, values, length, meaning)
     size = float(np.max(np.abs(array), initial=0.0))
-    if size and not SMALLEST < size < LARGEST:
+    if size and not SMALLEST_VALUE < size < LARGEST_VALUE:
         raise ValueError(
-            f"{argument}: must be between {SMALLEST:g} and {LARGEST:g} in size, got up to {size:g}; choose another "
-            "unit."
+            f"{argument}: must be between {SMALLEST_VALUE:g} and {LARGEST_VALUE:g} in size, got up to {size:g}; choose "
+            "another unit."
         )
     return array
 
 
 def _code_points(name: str) -> str:
-    return " ".join(f"U+{ord(letter):04X}" for letter in name[:SHOWN])
+    return " ".join(f"U+{ord(letter):04X}" for letter in name[:MOST_LISTED])
 
 
 def _listed(names: Iterable[str]) -> str:

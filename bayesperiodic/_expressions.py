@@ -21,7 +21,7 @@ MAX_EXPONENT = 1000.0
 # Of the polynomials in an expression that is analysed symbolically; the work grows with the square of the degree.
 MAX_DEGREE = 20.0
 MAX_DENOMINATOR = 1000
-SHOWN = 80
+SHOWN_LETTERS = 80
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ OPERATORS = {
     ast.USub: Operation(np.negative, (lambda a: -1.0,)),
     ast.UAdd: Operation(np.positive, (lambda a: 1.0,)),
 }
-FUNCTIONS = {
+OPERATIONS = {
     "sqrt": Operation(np.sqrt, (lambda a: 0.5 / np.sqrt(a),), "sqrt"),
     "exp": Operation(np.exp, (np.exp,), "exp"),
     "log": Operation(np.log, (lambda a: 1.0 / a,), "log"),
@@ -71,7 +71,7 @@ DESCRIBED = {
     "Compare": "a comparison",
     "Subscript": "a subscript",
 }
-ALLOWED = f"numbers, names, pi, + - * / **, parentheses and {', '.join(FUNCTIONS)} of one argument"
+ALLOWED_EXPRESSION = f"numbers, names, pi, + - * / **, parentheses and {', '.join(OPERATIONS)} of one argument"
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Expression:
                 if degree > MAX_DEGREE:
                     raise ValueError(
                         f"{argument}: must have powers and products of a degree up to {MAX_DEGREE:g}, got "
-                        f"{self.text[:SHOWN]!r} of degree {degree:g}."
+                        f"{self.text[:SHOWN_LETTERS]!r} of degree {degree:g}."
                     )
                 stack.append((step.value(*operands), degree))
             elif isinstance(step, str):
@@ -173,7 +173,7 @@ def _popped(stack: list[Any], count: int) -> list[Any]:
 def parse(argument: str, text: Any, names: Iterable[str], note: str = "") -> Expression:
     """Parse a text such as ``"k1/(m*l**2)"``.
 
-    Only numbers, `names`, pi, + - * / **, parentheses and `FUNCTIONS` are accepted; a name pi replaces the constant.
+    Only numbers, `names`, pi, + - * / **, parentheses and `OPERATIONS` are accepted; a name pi replaces the constant.
     Numbers are floats, and parts without names are evaluated when the text is parsed. A ValueError, which names the
     `argument` and for an unknown name ends with the `note`, is raised for anything else, more than 1000 characters, a
     number or a part without names that is not finite, and a constant exponent beyond ±1000.
@@ -222,9 +222,9 @@ class _Parser:
 
     def __init__(self, argument: str, text: Any, names: Iterable[str], note: str):
         if not isinstance(text, str):
-            raise ValueError(f"{argument}: must be a text of {ALLOWED}, got {text!r}.")
+            raise ValueError(f"{argument}: must be a text of {ALLOWED_EXPRESSION}, got {text!r}.")
         self.text = text.strip()
-        self.argument, self.shown = argument, repr(text if len(text) <= SHOWN else f"{text[:SHOWN]}…")
+        self.argument, self.shown = argument, repr(text if len(text) <= SHOWN_LETTERS else f"{text[:SHOWN_LETTERS]}…")
         # Python's parser normalises names, for example µ (micro) to μ (mu).
         known = tuple(dict.fromkeys(names))
         self.names = {unicodedata.normalize("NFKC", name): name for name in known}
@@ -237,7 +237,9 @@ class _Parser:
 
     def refuse(self, reason: str) -> NoReturn:
         """Raise the ValueError."""
-        raise ValueError(f"{self.argument}: must consist of {ALLOWED}, got {self.shown}, {reason}.") from None
+        raise ValueError(
+            f"{self.argument}: must consist of {ALLOWED_EXPRESSION}, got {self.shown}, {reason}."
+        ) from None
 
     def tree(self) -> ast.expr:
         """Return the root of Python's syntax tree."""
@@ -259,7 +261,7 @@ class _Parser:
         if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
             return [node.left, node.right]
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-            self._check_name(node.func.id, FUNCTIONS, "functions")
+            self._check_name(node.func.id, OPERATIONS, "functions")
             if node.keywords or len(node.args) != 1:
                 self.refuse(f"in which {node.func.id} has not exactly one argument")
             return node.args
@@ -277,7 +279,7 @@ class _Parser:
             return [CONSTANTS[node.id]]
         numbers = [part[0] for part in operands if len(part) == 1 and isinstance(part[0], float)]
         called = isinstance(node, ast.Call)
-        operation = FUNCTIONS[node.func.id] if called else OPERATORS[type(node.op)]
+        operation = OPERATIONS[node.func.id] if called else OPERATORS[type(node.op)]
         if operation is OPERATORS[ast.Pow] and isinstance(exponent := operands[1][-1], float):
             if abs(exponent) > MAX_EXPONENT:
                 self.refuse(f"whose exponent {exponent:g} is beyond ±{MAX_EXPONENT:g}")

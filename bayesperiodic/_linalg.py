@@ -48,12 +48,12 @@ def covariance_cholesky(covariance: np.ndarray) -> np.ndarray:
     return sd[:, None] * np.linalg.cholesky(covariance / np.outer(sd, sd))
 
 
-def column_space(changes: np.ndarray) -> np.ndarray:
+def column_space(jacobian: np.ndarray) -> np.ndarray:
     """Return an orthonormal basis (size, rank) of the span of rows (parameters, size), normalised to unit length."""
-    length = np.linalg.norm(changes, axis=1)
-    rows = changes[length > 0.0] / length[length > 0.0, None]
+    length = np.linalg.norm(jacobian, axis=1)
+    rows = jacobian[length > 0.0] / length[length > 0.0, None]
     if not rows.size:
-        return np.empty((changes.shape[1], 0))
+        return np.empty((jacobian.shape[1], 0))
     return orth(rows.T, rcond=RANK)
 
 

@@ -4,7 +4,7 @@ import importlib.metadata
 import platform
 import sys
 
-PACKAGES = (
+RECORDED_PACKAGES = (
     "bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "xarray", "pandas", "matplotlib", "h5py",
     "h5netcdf", "corner", "scikit-learn", "nutpie", "dask", "mpi4py",
 )  # fmt: skip
@@ -27,7 +27,7 @@ def show_versions() -> None:
     bayesperiodic  ...
     """
     versions = {"python": sys.version.split()[0], "platform": platform.platform()}
-    for name in PACKAGES:
+    for name in RECORDED_PACKAGES:
         try:
             versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:

@@ -20,12 +20,12 @@ DIFFERENCE_STEP = 2e-3
 # In forcing periods.
 LONGEST_STEP, TRIAL = 0.05, 3.0
 # Largest number of steps between two output times.
-STEPS = 100_000
+STEPS_EACH = 100_000
 # Steady cycles: periods of a transient, number of transients, Newton iterations; tolerance and difference step.
-TRANSIENT, ROUNDS, NEWTON = 5, 12, 12
-TOLERANCE, STEP = 1e-9, 1e-5
+TRANSIENT_PERIODS, TRANSIENTS, CYCLE_ITERATIONS = 5, 12, 12
+CYCLE_TOLERANCE, STATE_STEP = 1e-9, 1e-5
 
-REMEDY = "The motion may be unbounded; check the signs and units of the parameters, and the start."
+UNBOUNDED = "The motion may be unbounded; check the signs and units of the parameters, and the start."
 
 Signal = np.ndarray | Callable[[np.ndarray], np.ndarray]
 
@@ -167,7 +167,7 @@ def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.n
         max_step=step,
     )
     if not result.success or not np.isfinite(result.y).all():
-        raise RuntimeError(f"The time integration of {system.model.name!r} failed: {result.message} {REMEDY}")
+        raise RuntimeError(f"The time integration of {system.model.name!r} failed: {result.message} {UNBOUNDED}")
     return result.y.T
 
 
@@ -189,7 +189,7 @@ def _integrate_periodic(system: _FirstOrder, start: np.ndarray, time: np.ndarray
         found = np.empty((tau.size, start.size))
         found[0] = start
         settings = (amplitudes, system.theta, system.frequency, system.orders, tau)
-        return found[: dormand_prince(function, *settings, found, *_tableau(), absolute, relative, STEPS)]
+        return found[: dormand_prince(function, *settings, found, *_tableau(), absolute, relative, STEPS_EACH)]
 
     trial = path(np.linspace(0.0, min(tau[-1], TRIAL), 61), 1e-12 * ones, 1e-3 * ones)
     size, relative = np.abs(trial).max(axis=0) + np.finfo(float).tiny, RELATIVE_TOLERANCE * ones
@@ -200,7 +200,7 @@ def _integrate_periodic(system: _FirstOrder, start: np.ndarray, time: np.ndarray
     if len(found) < time.size or not np.isfinite(found).all():
         raise RuntimeError(
             f"The time integration of {system.model.name!r} failed at {time[len(found) - 1]:.6g} s, because the step "
-            f"became too small. {REMEDY}"
+            f"became too small. {UNBOUNDED}"
         )
     return found
 
@@ -257,15 +257,15 @@ def steady_cycle(
     system = _FirstOrder(model, parameters, inputs, frequency)
     try:
         y = system.start(start or {})
-        for _ in range(ROUNDS):
-            y = _advanced(system, y, TRANSIENT)
+        for _ in range(TRANSIENTS):
+            y = _advanced(system, y, TRANSIENT_PERIODS)
             found = _fixed_point(system, y)
             if found is not None:
                 time = np.arange(samples) / (samples * frequency)
                 return system.outputs(time, _integrate_periodic(system, found, time))
     except (RuntimeError, np.linalg.LinAlgError) as error:
         raise NotSettled(f"{model.name!r}: {error}") from error
-    raise NotSettled(f"{model.name!r} does not converge to a stable cycle in {ROUNDS * TRANSIENT} periods.")
+    raise NotSettled(f"{model.name!r} does not converge to a stable cycle in {TRANSIENTS * TRANSIENT_PERIODS} periods.")
 
 
 def _advanced(system: _FirstOrder, y: np.ndarray, periods: int) -> np.ndarray:
@@ -275,15 +275,15 @@ def _advanced(system: _FirstOrder, y: np.ndarray, periods: int) -> np.ndarray:
 def _fixed_point(system: _FirstOrder, y: np.ndarray) -> np.ndarray | None:
     """Return the state near y that is repeated after one cycle; None if there is none or it is unstable."""
     identity = np.eye(y.size)
-    for _ in range(NEWTON):
-        scale = np.maximum(np.abs(y), np.abs(y).max() * STEP) + np.finfo(float).tiny
+    for _ in range(CYCLE_ITERATIONS):
+        scale = np.maximum(np.abs(y), np.abs(y).max() * STATE_STEP) + np.finfo(float).tiny
         end = _advanced(system, y, 1)
-        moved = [_advanced(system, y + STEP * scale[i] * identity[i], 1) for i in range(y.size)]
-        monodromy = np.stack([(m - end) / (STEP * s) for m, s in zip(moved, scale, strict=True)], axis=1)
+        moved = [_advanced(system, y + STATE_STEP * scale[i] * identity[i], 1) for i in range(y.size)]
+        monodromy = np.stack([(m - end) / (STATE_STEP * s) for m, s in zip(moved, scale, strict=True)], axis=1)
         step = np.linalg.solve(identity - monodromy, end - y)
         if not np.isfinite(step).all():
             return None
         y = y + step
-        if np.all(np.abs(step) <= TOLERANCE * scale):
+        if np.all(np.abs(step) <= CYCLE_TOLERANCE * scale):
             return y if np.abs(np.linalg.eigvals(monodromy)).max() < 1.0 else None
     return None

@@ -1,4 +1,4 @@
-"""Size of the package: files, lines, functions and public signatures, printed by ``python -m tests.layout``."""
+"""Size of the package: files, lines, functions and public signatures, printed by ``python -m tests.layout``; names."""
 
 import ast
 import inspect
@@ -64,6 +64,31 @@ def _callables(name: str, value: Any) -> Iterator[tuple[str, Any]]:
                 yield f"{name}.{member}", function
     elif inspect.isfunction(value):
         yield name, value
+
+
+def constants(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield the name and the expression of each constant that a file defines at its top level."""
+    for node in ast.parse(path.read_text("utf-8")).body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                for name, value in _assigned(target, node.value):
+                    if name.strip("_").isupper():
+                        yield name, value
+
+
+def _assigned(target: ast.expr, value: ast.expr) -> Iterator[tuple[str, str]]:
+    if isinstance(target, ast.Name):
+        yield target.id, ast.unparse(value)
+    elif isinstance(target, ast.Tuple):
+        each = value.elts if isinstance(value, ast.Tuple) else [value] * len(target.elts)
+        for k, (part, of) in enumerate(zip(target.elts, each, strict=True)):
+            for name, text in _assigned(part, of):
+                yield name, text if of is not value else f"{text}[{k}]"
+
+
+def classes(path: Path) -> Iterator[str]:
+    """Yield the names of the classes that a file defines."""
+    return (node.name for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.ClassDef))
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ import pytest
 import sympy as sp
 
 from bayesperiodic import _expressions
-from bayesperiodic._expressions import FUNCTIONS, MAX_LENGTH, parse, parse_all
+from bayesperiodic._expressions import MAX_LENGTH, OPERATIONS, parse, parse_all
 
 VALUES = {"k": 0.7, "m": 1.3, "b": 0.4}
 # Each text with the same in Python, which also takes complex numbers.
@@ -106,7 +106,7 @@ def test_value_and_derivatives_against_complex_steps(text):
         assert float(gradient[name]) == pytest.approx(stepped, rel=1e-13, abs=1e-16)
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", OPERATIONS)
 def test_every_function_has_its_derivative(name):
     expression = parse("e", f"{name}(k)", ["k"])
     k, step = np.array([0.3, 1.1, 2.5]), 1e-6
@@ -171,7 +171,7 @@ def counted_operations(patch):
 
         return evaluate
 
-    for table in (_expressions.OPERATORS, _expressions.FUNCTIONS):
+    for table in (_expressions.OPERATORS, _expressions.OPERATIONS):
         for key, operation in list(table.items()):
             patch.setitem(table, key, replace(operation, value=counted(operation.value)))
     return done

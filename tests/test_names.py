@@ -1,10 +1,42 @@
 import inspect
 import subprocess
 import sys
+from collections import defaultdict
+from pathlib import Path
 
 import pytest
 
 import bayesperiodic as bp
+from tests import layout
+
+# Folders and files of the package whose names are not yet unique.
+NOT_YET = (
+    "_compile/", "_io.py", "data/experiment.py", "data/files.py", "data/recording.py", "density/", "estimation/",
+    "likelihood/", "plot/", "problem/", "reporting/",
+)  # fmt: skip
+
+
+def modules() -> dict[str, Path]:
+    root = layout.ROOT / "bayesperiodic"
+    names = {path.relative_to(root).as_posix(): path for path in sorted(root.rglob("*.py"))}
+    return {name: path for name, path in names.items() if not name.startswith(NOT_YET)}
+
+
+def test_a_constant_has_one_value():
+    values = defaultdict(lambda: defaultdict(list))
+    for module, path in modules().items():
+        for name, value in layout.constants(path):
+            values[name][value].append(module)
+    several = {name: dict(places) for name, places in values.items() if len(places) > 1}
+    assert not several, "say in the name what the constant limits, or import the one that is meant"
+
+
+def test_a_class_name_stands_for_one_class():
+    places = defaultdict(list)
+    for module, path in modules().items():
+        for name in layout.classes(path):
+            places[name].append(module)
+    assert not {name: where for name, where in places.items() if len(where) > 1}
 
 
 @pytest.mark.parametrize("name", bp.__all__)

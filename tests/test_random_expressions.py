@@ -12,12 +12,12 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from bayesperiodic import _expressions
-from bayesperiodic._expressions import FUNCTIONS, parse
+from bayesperiodic._expressions import OPERATIONS, parse
 from tests.test__expressions import counted_operations
 
 NAMES = ("k", "m", "l_2", "μ", "exp_")
-PYTHON = {name: getattr(math, name) for name in FUNCTIONS if name != "abs"} | {"abs": abs, "pi": math.pi}
-COMPLEX = {name: getattr(cmath, name) for name in FUNCTIONS if name != "abs"} | {"pi": math.pi}
+PYTHON = {name: getattr(math, name) for name in OPERATIONS if name != "abs"} | {"abs": abs, "pi": math.pi}
+COMPLEX = {name: getattr(cmath, name) for name in OPERATIONS if name != "abs"} | {"pi": math.pi}
 
 numbers = st.one_of(
     st.integers(0, 12).map(str),
@@ -33,7 +33,7 @@ def larger(parts):
         st.tuples(parts, parts).map(lambda pair: f"({pair[0]})*({pair[1]})"),
         st.tuples(parts, st.sampled_from(["2", "3", "-1", "0.5", "-2", "k", "0"])).map(lambda p: f"({p[0]})**{p[1]}"),
         st.tuples(st.sampled_from(["-", "+", "--"]), parts).map("".join),
-        st.tuples(st.sampled_from([*FUNCTIONS]), parts).map(lambda pair: f"{pair[0]}({pair[1]})"),
+        st.tuples(st.sampled_from([*OPERATIONS]), parts).map(lambda pair: f"{pair[0]}({pair[1]})"),
     )
 
 

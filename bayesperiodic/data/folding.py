@@ -20,8 +20,8 @@ from bayesperiodic.data.harmonics import (
     resolved_harmonics,
     track_frequency,
 )
-from bayesperiodic.data.quantisation import repeated_variance
-from bayesperiodic.data.response_period import aperiodic, response_period
+from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
+from bayesperiodic.data.response_period import FALSE_ALARM_RATE, FINENESS, aperiodic, response_period
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,7 +34,7 @@ MAXIMUM_POINTS = 1_000_000
 # A crossing counts after the signal was below minus this fraction of its standard deviation.
 HYSTERESIS = 0.25
 # Smallest relative step of the period, in itself and in standard errors.
-SMALLEST_STEP, SIGNIFICANT = 1e-3, 8.0
+SMALLEST_PERIOD_STEP, SIGNIFICANT_PERIOD_STEP = 1e-3, 8.0
 MINIMUM_PERIODICITY = 0.5
 # Ratio of residual variances from which the estimated frequency is right, and the given one wrong.
 CLEARLY = 4.0
@@ -43,21 +43,18 @@ OTHER_CYCLES = 0.05
 # Largest distance of a cycle from the steady ones, relative to their own, in harmonics and in the mean value.
 STEADY, STEADY_MEAN = 3.0, 12.0
 # Cycles from which the median of their distances is taken, the largest one of fewer.
-FEW = 9
+FEWEST_FOR_MEDIAN = 9
 # Response cycles of the later half of a recording that show a period which the whole has not.
 LATER_CYCLES = 6
-FALSE_ALARM_RATE = 0.01
 CROSSING, AUTO = "crossing", "auto"
 
-# The spectrum of the noise: grid points a sample, and a cycle if there are not many harmonics; neighbouring lines on
-# each side of a harmonic.
-FINENESS, FINEST, NEIGHBOURS = 4, 1 << 14, 16
+# The spectrum of the noise: grid points a cycle if there are not many harmonics; neighbouring lines on each side of a
+# harmonic.
+FINEST, NEIGHBOURING_LINES = 1 << 14, 16
 # Neighbouring harmonics on each side with which variances and slopes of one are averaged.
 POOLED = 2
-# Degrees of freedom of the variance of repeated errors, less than of any measured one.
-REPEATED_FREEDOM = 3.0
 # Lines from which frequency zero is extrapolated: for the kind of noise, and for the level of white and slow noise.
-LINES, WHITE_LINES, SLOW_LINES = 40, 8, 2
+LINES_NEAR_ZERO, WHITE_LINES, SLOW_LINES = 40, 8, 2
 # Correlation times in recording lengths, white floors relative to line 1, and line 0 of 1/f noise relative to line 1
 # if its spectrum is flat below a quarter of a line.
 CORRELATION_TIMES, FLOORS, ZERO_OF_PINK = (0.45, 0.1, 0.05, 0.025), (0.0, 0.01, 0.1), 2.75
@@ -356,7 +353,7 @@ def _steady_part(cycle: np.ndarray, shape: np.ndarray) -> np.ndarray:
     middle = np.median(shape[:half].real, axis=0) + 1j * np.median(shape[:half].imag, axis=0)
     away, settled = np.abs(shape - middle) ** 2, np.ones(total, dtype=bool)
     # The median of few cycles is one of them in every component, and the median distance from it is no scale.
-    usual = np.median if half >= FEW else np.max
+    usual = np.median if half >= FEWEST_FOR_MEDIAN else np.max
     for squares, factor in ((away[:, :, 1:].sum(axis=2), STEADY), (away[:, :, 0], STEADY_MEAN)):
         distance = np.sqrt(squares.max(axis=1))
         settled &= distance <= factor * usual(distance[:half]) + 1e-9
@@ -411,12 +408,12 @@ def _noise(signals: Signals, fit: HarmonicFit, row: int, cycles: int) -> tuple[n
     signal = np.bincount(place, residuals, points * cycles)
     size = np.bincount(place // points, minlength=cycles)[:, None]
     deviation = np.fft.rfft(signal.reshape(cycles, points), axis=1)[:, harmonic] / size
-    sides = np.clip(cycles // 4, min(4, cycles // 2), NEIGHBOURS)
+    sides = np.clip(cycles // 4, min(4, cycles // 2), NEIGHBOURING_LINES)
     amplitude = _between(signal.reshape(cycles, points)) / time.size
     beside = np.concatenate([amplitude[:sides, harmonic], np.conj(amplitude[:sides, -harmonic])])
     near = np.mean(np.abs(beside) ** 2, axis=0)
     freedom = np.full(harmonic.size, 4.0 * sides)
-    near[0], freedom[0] = _at_zero(np.abs(amplitude[:, : points // 2].T.ravel()[:LINES]) ** 2)
+    near[0], freedom[0] = _at_zero(np.abs(amplitude[:, : points // 2].T.ravel()[:LINES_NEAR_ZERO]) ** 2)
     repeated = _repeated_error(signals.values[row], residuals, fit.amplitudes[row], phase, grid)
     # Satterthwaite; how the repeated error is distributed over the harmonics is hardly known.
     uncertain = near**2 / freedom + repeated**2 / REPEATED_FREEDOM
@@ -466,7 +463,7 @@ def _between(signal: np.ndarray) -> np.ndarray:
     By sums over the cycles first, so that the time does not depend on the prime factors of their number.
     """
     cycles, points = signal.shape
-    side = np.arange(1, min(cycles, LINES + 1))[:, None]
+    side = np.arange(1, min(cycles, LINES_NEAR_ZERO + 1))[:, None]
     turn = 2.0 * np.pi / cycles * side * np.arange(cycles)
     total = np.cos(turn) @ signal - 1j * (np.sin(turn) @ signal)
     total *= np.exp(-2j * np.pi / (cycles * points) * side * np.arange(points))
@@ -593,7 +590,7 @@ def _steps(time: np.ndarray, signal: np.ndarray, rising: np.ndarray) -> list[int
         difference = before / number - (own.sum() - before) / (size - number)
         score = np.abs(difference) * np.sqrt(number * (size - number) / size)
         best = int(np.argmax(score))
-        if score[best] > SIGNIFICANT * noise and abs(difference[best]) > SMALLEST_STEP:
+        if score[best] > SIGNIFICANT_PERIOD_STEP * noise and abs(difference[best]) > SMALLEST_PERIOD_STEP:
             middle = first + int(number[best])
             found.append(middle)
             stack += [(first, middle), (middle, last)]

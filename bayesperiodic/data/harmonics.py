@@ -17,7 +17,7 @@ MINIMUM_CYCLES = 3
 # Cycles of a stretch from which its frequency is tracked.
 TRACKED = 48
 # Deviations of the phase [cycles] below this are of no consequence; others count if they are not explained by noise.
-NEGLIGIBLE_PHASE, FALSE_ALARM_RATE = 1.0 / 360.0, 1e-4
+NEGLIGIBLE_PHASE, PHASE_FALSE_ALARM_RATE = 1.0 / 360.0, 1e-4
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Pace:
 
     def differs(self, difference: float, duration: float) -> bool:
         """Return whether a frequency differs from the estimated one significantly, and by a phase that matters."""
-        significant = abs(difference) > self.se * student.isf(0.5 * FALSE_ALARM_RATE, self.freedom)
+        significant = abs(difference) > self.se * student.isf(0.5 * PHASE_FALSE_ALARM_RATE, self.freedom)
         return bool(significant and abs(difference) * duration > NEGLIGIBLE_PHASE)
 
 
@@ -141,11 +141,11 @@ def _pace(time: np.ndarray, fit: HarmonicFit, clear: np.ndarray, weights: np.nda
     others = np.concatenate([phase[3:], amplitude[1:] if orders < 4 else []])
     noise = max(float(np.sum(others**2)) / max(others.size, 1), 1.0 / own)
     irregular = float(np.ptp(phase[3:] @ basis[3:]))
-    allowed = fdtri(orders, orders, 1.0 - FALSE_ALARM_RATE) * max(float(np.sum(amplitude[3:] ** 2)), orders / own)
+    allowed = fdtri(orders, orders, 1.0 - PHASE_FALSE_ALARM_RATE) * max(float(np.sum(amplitude[3:] ** 2)), orders / own)
     wanders = orders >= 4 and irregular > NEGLIGIBLE_PHASE and float(np.sum(phase[3:] ** 2)) > allowed
     curvature = phase[2] * basis[2]
     bend = float(np.ptp(curvature))
-    limit = student.isf(0.5 * FALSE_ALARM_RATE, others.size)
+    limit = student.isf(0.5 * PHASE_FALSE_ALARM_RATE, others.size)
     sign = float(np.sign(curvature[0] - curvature[score.size // 2]))
     return Pace(
         float(np.sqrt(noise * own / information)),

@@ -3,7 +3,9 @@
 import numpy as np
 
 # Samples from which the step is taken; with fewer levels the values may be exact, as those of a relay.
-SAMPLES, FEWEST_LEVELS, TOLERANCE = 100_000, 8, 0.01
+SAMPLES, FEWEST_LEVELS, LEVEL_TOLERANCE = 100_000, 8, 0.01
+# Degrees of freedom of the variance of errors that repeat, fewer than those of any measured one.
+REPEATED_FREEDOM = 3.0
 
 # In steps: standard deviation of the noise before quantisation, variance of the mean error at one place, and variance
 # of the error about it (the Fourier series of the sawtooth, with normal noise).
@@ -19,7 +21,7 @@ def step_of(values: np.ndarray) -> float:
         return 0.0
     step = float(np.diff(levels).min())
     multiples = (levels - levels[0]) / step
-    return step if np.all(np.abs(multiples - np.round(multiples)) < TOLERANCE) else 0.0
+    return step if np.all(np.abs(multiples - np.round(multiples)) < LEVEL_TOLERANCE) else 0.0
 
 
 def repeated_variance(values: np.ndarray, fitted: np.ndarray, phases: int, scatter: float) -> float:

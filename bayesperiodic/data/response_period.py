@@ -6,23 +6,22 @@ import numpy as np
 from scipy.special import fdtrc
 
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES, fit_harmonics, resolved_harmonics
-from bayesperiodic.data.quantisation import repeated_variance
+from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
 
 if TYPE_CHECKING:
     import pandas as pd
 
 # Longest response period, and most drive periods that are used.
-LONGEST, MOST_PERIODS = 8, 256
+LONGEST_RESPONSE, MOST_PERIODS = 8, 256
 # Harmonics of the drive whose lines are tested, and that the noise between the lines is compared with.
-TESTED, SLOW, FAST = 8, 2, 4
+TESTED_HARMONICS, SLOW_HARMONICS, FAST_HARMONICS = 8, 2, 4
 # Largest share of the variance between the lines, and largest ratio of slow to fast noise, of a periodic signal.
-BETWEEN, WHITE = 5e-3, 3.0
+LARGEST_BETWEEN, WHITE_RATIO = 5e-3, 3.0
 # Lines on each side of a harmonic that drifts may reach, one of so many; lines whose mean whitens the others.
 SKIRT, SMOOTH = 6, 8
 # Lines on each side of an added one with which it is compared; amplitude that does not count, relative to the largest.
-NEIGHBOURS, NEGLIGIBLE = 4, 1e-6
-# Degrees of freedom of quantisation errors that repeat.
-REPEATED_FREEDOM = 3.0
+COMPARED_LINES, NEGLIGIBLE_AMPLITUDE = 4, 1e-6
+# Grid points of a spectrum for each sample.
 FINENESS = 4
 FALSE_ALARM_RATE = 0.01
 CHOSEN, REST, NOTHING_ADDED, MORE_LINES = "chosen", "not periodic", "adds no lines", "lacks lines"
@@ -51,11 +50,11 @@ class Lines(NamedTuple):
         line = 1 + np.arange(self.rest.size)
         apart = np.abs((line + self.cycles // 2) % self.cycles - self.cycles // 2) > self.cycles // SKIRT
         place = line / (self.cycles * periods)
-        slow, fast = apart & (place <= SLOW), apart & (place > max(0.5 * place[-1], FAST))
-        if fast.any() and self.rest[slow].mean() <= WHITE * self.rest[fast].mean():
+        slow, fast = apart & (place <= SLOW_HARMONICS), apart & (place > max(0.5 * place[-1], FAST_HARMONICS))
+        if fast.any() and self.rest[slow].mean() <= WHITE_RATIO * self.rest[fast].mean():
             return 0.0
-        inside = apart & (place <= TESTED)
-        return float(self.rest[inside].mean() * np.count_nonzero(place <= TESTED) / variance)
+        inside = apart & (place <= TESTED_HARMONICS)
+        return float(self.rest[inside].mean() * np.count_nonzero(place <= TESTED_HARMONICS) / variance)
 
     def p_value(self, divisor: int) -> float:
         """Return the p-value of the lines that a shorter response period lacks, by `divisor`: there are none.
@@ -66,9 +65,9 @@ class Lines(NamedTuple):
         total, count = np.convolve(self.rest, window, "same"), np.convolve(between, window, "same")
         number = 1 + np.arange(self.harmonics.size)
         number = number[(number % divisor != 0) & (number * self.cycles < self.rest.size - self.cycles)]
-        place, sides = number * self.cycles - 1, min((self.cycles - 1) // 2, NEIGHBOURS)
+        place, sides = number * self.cycles - 1, min((self.cycles - 1) // 2, COMPARED_LINES)
         beside = place[:, None] + np.r_[-sides:0, 1 : sides + 1]
-        floor = max(self.error, NEGLIGIBLE**2 * self.harmonics.max())
+        floor = max(self.error, NEGLIGIBLE_AMPLITUDE**2 * self.harmonics.max())
         # Without the line itself, as those of the added lines are.
         smooth = (total - self.rest)[beside] / (count - 1)[beside]
         level = np.divide(self.rest[beside], smooth, out=np.ones(smooth.shape), where=smooth > 0.0).mean()
@@ -103,7 +102,7 @@ def _lines(time: np.ndarray, values: np.ndarray, frequency: float, periods: int,
 
 def _highest(time: np.ndarray, frequency: float, periods: int) -> int:
     limit = resolved_harmonics(time, frequency / periods, time.size)
-    return min(limit, max(TESTED * periods, 1))
+    return min(limit, max(TESTED_HARMONICS * periods, 1))
 
 
 def response_period(
@@ -116,17 +115,17 @@ def response_period(
     import pandas as pd
 
     total = np.ptp(time) * time.size / (time.size - 1) * frequency * (1 + 1e-9)
-    longest = min(int(total) // cycles, LONGEST)
+    longest = min(int(total) // cycles, LONGEST_RESPONSE)
     rows, level = [], FALSE_ALARM_RATE / max(longest - 1, 1)
     for periods in range(1, longest + 1):
         cycles = int(min(total, MOST_PERIODS)) // periods
         lines = _lines(time, values, frequency, periods, cycles)
-        share = [own.unexplained(periods, float(v.var())) for own, v in zip(lines, values, strict=True)]
+        share = [line.unexplained(periods, float(v.var())) for line, v in zip(lines, values, strict=True)]
         worst = int(np.argmax(share))
         divisors = [prime for prime in PRIMES if periods % prime == 0]
-        p = max((min(own.p_value(d) for own in lines) * len(lines) for d in divisors), default=np.nan)
-        verdict = REST if share[worst] > BETWEEN else NOTHING_ADDED if p >= level else CHOSEN
-        explained = min(own.explained for own in lines)
+        p = max((min(line.p_value(d) for line in lines) * len(lines) for d in divisors), default=np.nan)
+        verdict = REST if share[worst] > LARGEST_BETWEEN else NOTHING_ADDED if p >= level else CHOSEN
+        explained = min(line.explained for line in lines)
         rows.append((periods, cycles, explained, share[worst], channels[worst], np.minimum(p, 1.0), verdict))
     names = ["periods", "cycles", "explained", "between", "channel", "p", "verdict"]
     table = pd.DataFrame(rows, columns=names)

@@ -11,12 +11,12 @@ from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.initial_orbits import with_guesses
 from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
-from bayesperiodic.periodic.arclength import LOST, path_outcome
+from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved, directional_sensitivities
 from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
-from bayesperiodic.periodic.solution import PeriodicSolution, describe, logarithmic_changes
+from bayesperiodic.periodic.solution import PeriodicSolution, describe, logarithmic_jacobian
 from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.parameters import ParameterMaps
@@ -150,7 +150,7 @@ class Simulator:
         """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""
         anchor, parameters = self._anchors[experiment], self.problem.parameters(theta[None], experiment)[0]
         return (
-            LOST
+            PATH_LOST
             if anchor.sensitivities is None
             else path_outcome(self.problem.equations[experiment], anchor, parameters)
         )
@@ -210,7 +210,7 @@ class Simulator:
         equations = self.problem.equations[experiment].at_frequency(float(response.frequency))
         parameters, count = self.problem.parameters(theta[None], experiment)[0], response.log_multipliers.size
         solution = _described(equations, parameters, z)
-        every = logarithmic_changes(
+        every = logarithmic_jacobian(
             equations,
             parameters,
             z,

@@ -29,8 +29,8 @@ class Unexplained:
     is the sum of squares, `freedom` the number of its degrees of freedom.
     """
 
-    def __init__(self, components: np.ndarray, changes: np.ndarray, harmonic: np.ndarray):
-        self._basis = column_space(changes)
+    def __init__(self, components: np.ndarray, jacobian: np.ndarray, harmonic: np.ndarray):
+        self._basis = column_space(jacobian)
         self._rest = components - self._basis @ (self._basis.T @ components)
         self.square = float(self._rest @ self._rest)
         self.freedom = components.size - self._basis.shape[1]
@@ -38,19 +38,19 @@ class Unexplained:
 
     @classmethod
     def of_measured_noise(
-        cls, components: np.ndarray, changes: np.ndarray, harmonic: np.ndarray, behind: np.ndarray
+        cls, components: np.ndarray, jacobian: np.ndarray, harmonic: np.ndarray, behind: np.ndarray
     ) -> "Unexplained":
         """Return what is unexplained in units of measured standard deviations with degrees of freedom (harmonics,).
 
         The square of each harmonic is F distributed. It is weighted so that it is the χ² quantile of its probability.
         """
-        first = cls(components, changes, harmonic)
+        first = cls(components, jacobian, harmonic)
         square, freedom = first.explained(np.eye(first.harmonics.size, dtype=bool))
         free = np.maximum(freedom, 1)
         p = np.maximum(stats.f.sf(square / free, free, behind), np.finfo(float).tiny)
         known = np.where((freedom > 0) & (square > 0.0), stats.chi2.isf(p, free), square)
         factor = np.sqrt(np.divide(known, square, out=np.ones_like(square), where=known > 0.0))[first._group]
-        return cls(components * factor, changes * factor, harmonic)
+        return cls(components * factor, jacobian * factor, harmonic)
 
     @cached_property
     def _sums(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -140,12 +140,12 @@ def holm(p: np.ndarray) -> np.ndarray:
 
 # Degrees of freedom of a spectrum, below which it is mostly assumed.
 SHAPE_KNOWN = 4.0
-LEVEL = 0.01
+ADEQUACY_LEVEL = 0.01
 SHAPES = 20
-TESTS = ("whiteness", "harmonics", "size", "amplitude", "consistency")
+ADEQUACY_TESTS = ("whiteness", "harmonics", "size", "amplitude", "consistency")
 ADEQUATE, MISSPECIFIED = with_tone("adequate", GOOD), with_tone("misspecified", BAD)
 UNTESTED = with_tone("not tested", NEUTRAL)
-MEASURED, ASSUMED = "measured", "assumed"
+MEASURED_SPECTRUM, ASSUMED_SPECTRUM = "measured", "assumed"
 ALL = "all"
 SEARCH = "bp.missing_terms(problem, fit) looks for the term that is missing"
 
@@ -175,7 +175,7 @@ def adequacy(
             "harmonic": harmonic[0],
             "size": size,
             "model_error_share": share,
-            "spectrum": ASSUMED if white[0].spectrum(i) is None else MEASURED,
+            "spectrum": ASSUMED_SPECTRUM if white[0].spectrum(i) is None else MEASURED_SPECTRUM,
             "amplitude": _amplitude(problem, block, replicates),
         }
     rows[ALL] = {
@@ -184,13 +184,13 @@ def adequacy(
         "spectrum": "",
         "consistency": np.mean([w.consistency() for w in white]),
     }
-    columns = ["experiment", "channel", *TESTS, "harmonic", "model_error_share", "spectrum"]
+    columns = ["experiment", "channel", *ADEQUACY_TESTS, "harmonic", "model_error_share", "spectrum"]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
     adjusted = adjusted_p(table)
     smallest = np.min(np.where(np.isnan(adjusted), np.inf, adjusted), axis=1)
     smallest[-1] = min(smallest)
     table["p"] = np.where(np.isinf(smallest), np.nan, smallest)
-    table["verdict"] = np.select([np.isinf(smallest), smallest < LEVEL], [UNTESTED, MISSPECIFIED], ADEQUATE)
+    table["verdict"] = np.select([np.isinf(smallest), smallest < ADEQUACY_LEVEL], [UNTESTED, MISSPECIFIED], ADEQUATE)
     return table
 
 
@@ -206,8 +206,8 @@ REJECTIONS = {
 def rejections(table: pd.DataFrame) -> dict[str, str]:
     """Return the rejections of a table in words, by row."""
     found = {}
-    for (label, row), small in zip(table.iterrows(), adjusted_p(table) < LEVEL, strict=True):
-        if reasons := [f"{REJECTIONS[test]} (p = {row[test]:.2g})" for test in compress(TESTS, small)]:
+    for (label, row), small in zip(table.iterrows(), adjusted_p(table) < ADEQUACY_LEVEL, strict=True):
+        if reasons := [f"{REJECTIONS[test]} (p = {row[test]:.2g})" for test in compress(ADEQUACY_TESTS, small)]:
             error, harmonic = row["model_error_share"], row["harmonic"]
             text = "" if np.isnan(harmonic) else f"; its strongest harmonic is {harmonic:.0f}"
             if harmonic > 1:
@@ -238,14 +238,14 @@ def concerns_noise(table: pd.DataFrame) -> bool:
 
     A measured spectrum of the noise, or a residual larger than the measured noise, tells the two apart.
     """
-    rejected = pd.DataFrame(adjusted_p(table) < LEVEL, table.index, TESTS)
-    measured = rejected[["whiteness", "harmonics"]][table["spectrum"] == MEASURED]
+    rejected = pd.DataFrame(adjusted_p(table) < ADEQUACY_LEVEL, table.index, ADEQUACY_TESTS)
+    measured = rejected[["whiteness", "harmonics"]][table["spectrum"] == MEASURED_SPECTRUM]
     return table.loc[ALL, "verdict"] == MISSPECIFIED and not (rejected["size"].any() or measured.any(axis=None))
 
 
 def adjusted_p(table: pd.DataFrame) -> np.ndarray:
     """Return the p-values (rows, tests) of a table, adjusted for their total number."""
-    return holm(table[[*TESTS]].to_numpy(dtype=float).ravel()).reshape(len(table), -1)
+    return holm(table[[*ADEQUACY_TESTS]].to_numpy(dtype=float).ravel()).reshape(len(table), -1)
 
 
 class Whitened:

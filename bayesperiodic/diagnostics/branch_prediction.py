@@ -11,15 +11,15 @@ from tqdm import tqdm
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.predictive import QUANTILES, draws_of
+from bayesperiodic.diagnostics.predictive import BAND_QUANTILES, draws_of
 from bayesperiodic.periodic.continuation import FOLD, Branch, continue_periodic
 from bayesperiodic.periodic.equations import FREQUENCY
 from bayesperiodic.problem.description import check_results
 from bayesperiodic.sampling.draws import Posterior
 
-MEASURES = AMPLITUDE, MAXIMUM = "amplitude", "maximum"
+BAND_MEASURES = AMPLITUDE, MAXIMUM = "amplitude", "maximum"
 # Values of the varied quantity in a band, and the fraction of the draws that must have an orbit at them.
-POINTS, FEWEST = 200, 0.5
+BAND_POINTS, LEAST_FRACTION = 200, 0.5
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class BranchPrediction(Result):
     def folds(self) -> pd.DataFrame:
         """Median and central 90 % of the varied quantity at each fold, and the number of draws that have it."""
         at = self.curves[self.curves["kind"] == FOLD].groupby("part")["value"]
-        levels = {name: at.quantile(q) for name, q in zip(("median", "low", "high"), QUANTILES, strict=True)}
+        levels = {name: at.quantile(q) for name, q in zip(("median", "low", "high"), BAND_QUANTILES, strict=True)}
         return pd.DataFrame(levels | {"draws": at.count()}).reset_index(drop=True)
 
     def band(self, output: str | None = None, measure: str = AMPLITUDE) -> pd.DataFrame:
@@ -100,19 +100,19 @@ class BranchPrediction(Result):
         """
         output = self.outputs[0] if output is None else output
         _checks.one_of("output", output, self.outputs)
-        _checks.one_of("measure", measure, MEASURES)
+        _checks.one_of("measure", measure, BAND_MEASURES)
         column, rows = f"{measure}[{output}]", []
         for part, curves in self.curves.groupby("part"):
-            grid = np.linspace(curves["value"].min(), curves["value"].max(), POINTS)
-            every, stable = np.full((2, self.draws, POINTS), np.nan)
+            grid = np.linspace(curves["value"].min(), curves["value"].max(), BAND_POINTS)
+            every, stable = np.full((2, self.draws, BAND_POINTS), np.nan)
             for i, (_, one) in enumerate(curves.groupby("draw")):
                 ordered = one.sort_values("value")
                 value = ordered["value"].to_numpy()
                 every[i] = np.interp(grid, value, ordered[column], left=np.nan, right=np.nan)
                 stable[i] = np.where(np.isnan(every[i]), np.nan, np.interp(grid, value, 1.0 * ordered["stable"]))
             fraction = np.mean(~np.isnan(every), axis=0)
-            kept = fraction >= FEWEST
-            median, low, high = np.nanquantile(every[:, kept], QUANTILES, axis=0)
+            kept = fraction >= LEAST_FRACTION
+            median, low, high = np.nanquantile(every[:, kept], BAND_QUANTILES, axis=0)
             rows.append(
                 pd.DataFrame(
                     {
@@ -121,7 +121,7 @@ class BranchPrediction(Result):
                         "median": median,
                         "low": low,
                         "high": high,
-                        "stable": np.nanmean(stable[:, kept], axis=0) > FEWEST,
+                        "stable": np.nanmean(stable[:, kept], axis=0) > LEAST_FRACTION,
                         "fraction": fraction[kept],
                     }
                 )

@@ -24,6 +24,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import holm
+from bayesperiodic.diagnostics.verdicts import NARROW, WIDE
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import JOINT, MEASURED, error_waves, noisy_inputs
@@ -34,14 +35,14 @@ from bayesperiodic.sampling.draws import Posterior
 from bayesperiodic.sampling.sample import sample
 from bayesperiodic.simulation import NotSettled, steady_cycle
 
-POINTS, SIMULATED, SIMULATION_SEED = 100, 20_000, 0
+ECDF_POINTS, SIMULATED, SIMULATION_SEED = 100, 20_000, 0
 FEWEST_IN_BIN, MOST_BINS = 20, 20
-EDGE = 1e-12
+SMALLEST_RANK = 1e-12
 
 
 def normal_scores(values: np.ndarray) -> np.ndarray:
     """Return the standard normal quantiles of values in [0, 1], clipped to 1e-12 from the ends."""
-    return ndtri(np.clip(values, EDGE, 1.0 - EDGE))
+    return ndtri(np.clip(values, SMALLEST_RANK, 1.0 - SMALLEST_RANK))
 
 
 def dispersion_test(values: np.ndarray) -> tuple[float, float]:
@@ -92,7 +93,7 @@ def binomial_band(size: int, probabilities: np.ndarray, tail: float) -> tuple[np
 
 def evaluation_points() -> np.ndarray:
     """Return the points (points,) at which empirical distribution functions are evaluated."""
-    return np.arange(1, POINTS) / POINTS
+    return np.arange(1, ECDF_POINTS) / ECDF_POINTS
 
 
 @cache
@@ -101,23 +102,23 @@ def _null(size: int) -> tuple[np.ndarray, np.ndarray]:
     counts, points = np.arange(size + 1)[:, None], evaluation_points()
     table = 2.0 * np.minimum(stats.binom.cdf(counts, size, points), stats.binom.sf(counts - 1, size, points))
     generator = np.random.default_rng(SIMULATION_SEED)
-    drawn = generator.multinomial(size, np.full(POINTS, 1.0 / POINTS), SIMULATED).cumsum(axis=1)[:, :-1]
-    return table, table[drawn, np.arange(POINTS - 1)].min(axis=1)
+    drawn = generator.multinomial(size, np.full(ECDF_POINTS, 1.0 / ECDF_POINTS), SIMULATED).cumsum(axis=1)[:, :-1]
+    return table, table[drawn, np.arange(ECDF_POINTS - 1)].min(axis=1)
 
 
 MCMC, LAPLACE = "mcmc", "laplace"
-METHODS = (MCMC, LAPLACE)
+CALIBRATED_METHODS = (MCMC, LAPLACE)
 DONE, NO_STEADY_STATE = "done", "no steady state"
-FEWEST_CYCLES = 3
+SIMULATED_CYCLES = 3
 # Steps between draws taken as independent, in autocorrelation times (which short chains underestimate), the least
 # number of these draws, and the largest R-hat.
-SPACING, FEWEST_DRAWS, LARGEST_RHAT = 5.0, 20, 1.1
+DRAW_SPACING, FEWEST_DRAWS, LARGEST_RHAT = 5.0, 20, 1.1
 FILE = "replicates.jsonl"
-LEVELS = (0.5, 0.8, 0.9, 0.95)
+COVERAGE_LEVELS = (0.5, 0.8, 0.9, 0.95)
 FALSE_ALARMS = 0.01
-CALIBRATED, NARROW, WIDE, SHAPE, FEW = "calibrated", "too narrow", "too wide", "not uniform", "too few replicates"
-FEWEST = 20
-TESTS = ("p_dispersion", "p_ecdf", "p_chi_square")
+CALIBRATED, NOT_UNIFORM, TOO_FEW = "calibrated", "not uniform", "too few replicates"
+FEWEST_REPLICATES = 20
+P_VALUES = ("p_dispersion", "p_ecdf", "p_chi_square")
 
 
 @dataclass(frozen=True)
@@ -248,7 +249,7 @@ def calibrate(
     check_supported(problem)
     settings = (
         f"{importlib.metadata.version('bayesperiodic')}, {fingerprint(problem)}, seed {seed}, {ensembles} x {walkers} "
-        f"walkers, {max_steps} steps, {SPACING} apart"
+        f"walkers, {max_steps} steps, {DRAW_SPACING} apart"
     )
     source = hashlib.sha256(settings.encode()).hexdigest()[:16]
     lines = checkpointed_tasks(
@@ -266,7 +267,7 @@ def calibrate(
 
 def summary(lines: Sequence[dict[str, Any]], names: Sequence[str]) -> Calibration:
     """Summarise the results of all replicates for these quantities."""
-    found = {method: [line[method] for line in lines if method in line] for method in METHODS}
+    found = {method: [line[method] for line in lines if method in line] for method in CALIBRATED_METHODS}
     positions = {m: {name: np.array([line[name] for line in own]) for name in names} for m, own in found.items()}
     failures = Counter(line["status"] for line in lines if line["status"] != DONE)
     if unconverged := sum("map" in line and LAPLACE not in line for line in lines):
@@ -288,19 +289,19 @@ def _table(method: str, positions: dict[str, np.ndarray]) -> pd.DataFrame:
     for name, values in positions.items():
         finite = values[np.isfinite(values)]
         row: dict[str, Any] = {"quantity": name, "method": method, "replicates": finite.size}
-        row |= dict.fromkeys(("dispersion", "shift", *TESTS), np.nan)
-        if finite.size >= FEWEST:
+        row |= dict.fromkeys(("dispersion", "shift", *P_VALUES), np.nan)
+        if finite.size >= FEWEST_REPLICATES:
             row["dispersion"], row["p_dispersion"] = dispersion_test(finite)
             row["shift"] = float(normal_scores(finite).mean())
             row["p_ecdf"], row["p_chi_square"] = ecdf_test(finite), chi_square_test(finite)
-        rows.append(row | {f"coverage_{100 * level:.0f}": coverage(finite, level) for level in LEVELS})
+        rows.append(row | {f"coverage_{100 * level:.0f}": coverage(finite, level) for level in COVERAGE_LEVELS})
     table = pd.DataFrame(rows)
-    for test in TESTS:
+    for test in P_VALUES:
         table[test] = holm(table[test].to_numpy(dtype=float))
-    rejected = table[[*TESTS]] < FALSE_ALARMS
+    rejected = table[[*P_VALUES]] < FALSE_ALARMS
     off = np.where(table["dispersion"] > 1.0, NARROW, WIDE)
-    cases = [table["replicates"] < FEWEST, rejected["p_dispersion"], rejected.any(axis=1)]
-    table["verdict"] = np.select(cases, [FEW, off, SHAPE], CALIBRATED)
+    cases = [table["replicates"] < FEWEST_REPLICATES, rejected["p_dispersion"], rejected.any(axis=1)]
+    table["verdict"] = np.select(cases, [TOO_FEW, off, NOT_UNIFORM], CALIBRATED)
     return table
 
 
@@ -383,7 +384,7 @@ def _measured(
     model, (row,) = problem.model, problem.parameters(problem.vector(theta)[None], e.name).tolist()
     values, start = dict(zip(model.parameters, row, strict=True)), _first_state(problem, e, theta)
     cycle = steady_cycle(model, values, e.inputs, frequency=e.frequency, samples=e.samples, start=start)
-    limit, cycles = _fourier.highest_harmonic(e.samples), max(e.cycles, FEWEST_CYCLES)
+    limit, cycles = _fourier.highest_harmonic(e.samples), max(e.cycles, SIMULATED_CYCLES)
     size = cycles * e.samples
     kept = {channel: e.harmonics.get(channel, limit) for channel in (*e.inputs, *e.outputs)}
     outputs = {}
@@ -453,7 +454,7 @@ def independent_draws(posterior: Posterior) -> dict[str, np.ndarray] | None:
     tau = max(posterior.tau.values())
     if not np.isfinite(tau):
         return None
-    apart = int(np.ceil(SPACING * tau))
+    apart = int(np.ceil(DRAW_SPACING * tau))
     draws = {name: posterior.by_step(posterior.draws(name))[:, ::-1][:, ::apart].ravel() for name in posterior.names}
     return draws if min(map(len, draws.values())) >= FEWEST_DRAWS else None
 

@@ -14,7 +14,7 @@ from bayesperiodic import _checks
 from bayesperiodic.models.model import DERIVATIVES, Model, Names, smooth_abs, smooth_sign, with_derivatives
 from bayesperiodic.models.units import Unit, parsed, product, unit_of, written
 
-DEGREE, HIGHEST_POWER = 3, 5
+HIGHEST_DEGREE, HIGHEST_POWER = 3, 5
 # Widths of smooth absolute values and signs, relative to the standard deviation of their arguments.
 ABS_WIDTH, SIGN_WIDTH = 0.02, 0.2
 # Characters of a term in the name of its coefficient.
@@ -25,7 +25,7 @@ Factors = Mapping[str, sp.Expr]
 
 
 @dataclass(frozen=True)
-class Candidate:
+class Term:
     """A term that is added to an equation g or an output f with an unknown coefficient.
 
     The place is the name of the output, or "equation of x" with the name of the state. A term with memory contains
@@ -42,7 +42,7 @@ class Candidate:
         return f"{self.text} in {self.place}"
 
 
-def generated(model: Model, where: Iterable[str], deviations: Mapping[str, float]) -> list[Candidate]:
+def generated(model: Model, where: Iterable[str], deviations: Mapping[str, float]) -> list[Term]:
     """Return the terms from the model's own variables, for every place.
 
     `deviations` are the standard deviations of the variables along the measured orbits, by name; variables that are
@@ -51,11 +51,11 @@ def generated(model: Model, where: Iterable[str], deviations: Mapping[str, float
     smooth, steepest = factors(model)
     moving = {name: e for name, e in smooth.items() if deviations.get(name, 1.0) > 0.0}
     found: dict[str, sp.Expr] = {"1": sp.Integer(1)}
-    for degree in range(1, DEGREE + 1):
+    for degree in range(1, HIGHEST_DEGREE + 1):
         for chosen in combinations_with_replacement(moving, degree):
             found[_product(chosen)] = sp.Mul(*(moving[name] for name in chosen))
     for name, e in moving.items():
-        found |= {f"{name}**{power}": e**power for power in range(DEGREE + 1, HIGHEST_POWER + 1)}
+        found |= {f"{name}**{power}": e**power for power in range(HIGHEST_DEGREE + 1, HIGHEST_POWER + 1)}
     widths = {name: deviations.get(name, 1.0) for name in moving}
     for name, e in moving.items():
         size = smooth_abs(e, ABS_WIDTH * widths[name])
@@ -63,9 +63,9 @@ def generated(model: Model, where: Iterable[str], deviations: Mapping[str, float
         found |= {f"{other}*abs({name})": factor * size for other, factor in moving.items()}
         found[f"sign({name})"] = smooth_sign(e, SIGN_WIDTH * widths[name])
     found |= {name: e for name, e in steepest.items() if deviations.get(name, 1.0) > 0.0}
-    plain = [Candidate(place, text, e) for place in where for text, e in found.items()]
+    plain = [Term(place, text, e) for place in where for text, e in found.items()]
     return plain + [
-        Candidate(place, f"lag({name}) - {f'({name})' if ' ' in name else name}", MEMORY - e, e)
+        Term(place, f"lag({name}) - {f'({name})' if ' ' in name else name}", MEMORY - e, e)
         for place in where
         for name, e in (moving | _forces(model, place)).items()
     ]
@@ -90,7 +90,7 @@ def _forces(model: Model, place: str) -> dict[str, sp.Expr]:
 
 
 def places(model: Model) -> tuple[str, ...]:
-    """Return the names of outputs and equations, as `Candidate` has them."""
+    """Return the names of outputs and equations, as `Term` has them."""
     return *model.outputs, *(f"equation of {state}" for state in model.states)
 
 
@@ -118,7 +118,7 @@ def factors(model: Model) -> tuple[dict[str, sp.Expr], dict[str, sp.Expr]]:
     return known, steepest
 
 
-def given(model: Model, candidates: Mapping[str, Iterable[Any]]) -> list[Candidate]:
+def given(model: Model, candidates: Mapping[str, Iterable[Any]]) -> list[Term]:
     """Return candidates that were given by place, as texts or functions of (s, p, u)."""
     _checks.mapping("candidates", candidates, "{'force': ['x**2']}")
     spaces = (
@@ -140,7 +140,7 @@ def given(model: Model, candidates: Mapping[str, Iterable[Any]]) -> list[Candida
             for own in (expression, memory):
                 if own is not None:
                     _check_order(model, argument, text, own, place)
-            found.append(Candidate(place, text, expression if memory is None else MEMORY + expression, memory))
+            found.append(Term(place, text, expression if memory is None else MEMORY + expression, memory))
             try:
                 coefficient_unit(model, found[-1])
             except ValueError as error:
@@ -216,7 +216,7 @@ def symbol_units(model: Model) -> dict[sp.Symbol, Unit]:
     return found
 
 
-def coefficient_unit(model: Model, term: Candidate) -> str:
+def coefficient_unit(model: Model, term: Term) -> str:
     """Return the unit of the coefficient of a term as text; "" where units are missing.
 
     A ValueError is raised for a term that adds quantities of different dimensions.
@@ -240,7 +240,7 @@ def _unit_or_none(expression: sp.Expr, units: Mapping[sp.Symbol, Unit]) -> Unit 
         return None
 
 
-def coefficient_names(model: Model, terms: Iterable[Candidate]) -> list[str]:
+def coefficient_names(model: Model, terms: Iterable[Term]) -> list[str]:
     """Return a new parameter for the coefficient of each term, such as ``c_w_x_2`` for ``w*x**2``.
 
     Those of terms with memory are ``c_lag_x`` for ``lag(x) - x``, with lag and state as `lag_names` has them.
@@ -262,7 +262,7 @@ def lag_names(name: str) -> tuple[str, str]:
     return "tau" + name[1:], "m" + name[1:]
 
 
-def extended(model: Model, terms: Mapping[str, Candidate]) -> Model:
+def extended(model: Model, terms: Mapping[str, Term]) -> Model:
     """Return the model with the terms, by the names of their coefficients."""
     other = copy(model)
     lags = {name: lag_names(name) for name, term in terms.items() if term.force is not None}

@@ -17,7 +17,17 @@ from bayesperiodic.density.log_posterior import COLLAPSED, NATURAL, LogPosterior
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics import verdicts
 from bayesperiodic.diagnostics.adequacy import misfit
-from bayesperiodic.diagnostics.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, USABLE_K, WIDE, Sample
+from bayesperiodic.diagnostics.verdicts import (
+    ELLIPSOID_LEVELS,
+    FINE,
+    NARROW,
+    UNCONVERGED,
+    USABLE_K,
+    WIDE,
+    WRONG_MODE,
+    WRONG_SHAPE,
+    Sample,
+)
 from bayesperiodic.estimation.modes import notable
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.problem.description import check_results
@@ -31,11 +41,11 @@ COORDINATES = (NATURAL, SAMPLING)
 PROPOSALS, SEED = 8000, 1
 # Efficiency of the importance weights above which their tail is irrelevant: a probability of 5 % under Laplace is then
 # off by at most √((1/0.98 − 1)·0.05·0.95) = 3 % (Cauchy-Schwarz), as far as a quarter of a sd moves it.
-EVEN, NO_TAIL = 0.98, (0.0, 0.0)
-QUANTILES = {"q05": (0.05, -1.6448536269514722), "q50": (0.5, 0.0), "q95": (0.95, 1.6448536269514722)}
+EVEN_WEIGHTS, NO_TAIL = 0.98, (0.0, 0.0)
+COMPARED_QUANTILES = {"q05": (0.05, -1.6448536269514722), "q50": (0.5, 0.0), "q95": (0.95, 1.6448536269514722)}
 PROBABILITIES = np.concatenate([[0.002, 0.005], np.arange(1, 100) / 100, [0.995, 0.998]])
-BINS, SHOWN = 40, (0.0005, 0.9995)
-BACKGROUND = {FINE: "#d9f0d3", NARROW: "#fdd0a2", WIDE: "#c6dbef", SHAPE: "#fee391", MODE: "#fcbba1"}
+BINS, HISTOGRAM_RANGE = 40, (0.0005, 0.9995)
+BACKGROUND = {FINE: "#d9f0d3", NARROW: "#fdd0a2", WIDE: "#c6dbef", WRONG_SHAPE: "#fee391", WRONG_MODE: "#fcbba1"}
 
 
 @dataclass(frozen=True)
@@ -114,7 +124,7 @@ class Comparison(Result):
             columns[c] = table[c].map("{:.2f}".format) + table[f"{c}_mcse"].map(" ± {:.2f}".format)
         columns |= {"verdict": table["verdict"].map(mark), "recommendation": table["recommendation"].map(text)}
         data = ", synthetic data" if self.synthetic else ""
-        keys = [f"share_{100 * level:.0f}" for level in LEVELS]
+        keys = [f"share_{100 * level:.0f}" for level in ELLIPSOID_LEVELS]
         inside = ", ".join(f"{joint[key]:.1%} ± {joint[f'{key}_mcse']:.1%}" for key in keys)
         return (
             f"Laplace against MCMC in {self.coordinates} coordinates{data} (± Monte Carlo error)",
@@ -190,9 +200,9 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     shares, errors = scored.inside(PROBABILITIES)
     table, joint = _table(scored, cured), _joint(scored, cured)
     if advice := orbit_advice(fit):
-        table[["verdict", "recommendation"]] = MODE, advice
-        joint |= {"verdict": MODE, "recommendation": advice}
-    histograms = {name: np.histogram(x, BINS, tuple(np.quantile(x, SHOWN))) for name, x in draws.items()}
+        table[["verdict", "recommendation"]] = WRONG_MODE, advice
+        joint |= {"verdict": WRONG_MODE, "recommendation": advice}
+    histograms = {name: np.histogram(x, BINS, tuple(np.quantile(x, HISTOGRAM_RANGE))) for name, x in draws.items()}
     return Comparison(
         table=table,
         joint=joint,
@@ -342,23 +352,23 @@ def _scores(problem: Problem, fit: MapEstimate, posterior: Posterior, coordinate
     unknown = np.full(len(points), np.nan)
     distances = verdicts.radii(points, laplace.mean, laplace.covariance) if laplace.determined else unknown
     *k, efficiency = importance_k(problem, fit, coordinates)
-    tail = NO_TAIL if efficiency > EVEN else (k[0], k[1])
+    tail = NO_TAIL if efficiency > EVEN_WEIGHTS else (k[0], k[1])
     joint = verdicts.joint_verdict(points, laplace.mean, laplace.covariance, sampled, tail, posterior.converged)
     if posterior.converged and notable(fit.other_modes):
-        marginal |= {name: MODE for name in problem.names if fit.other_values(name)}
-        joint = MODE
+        marginal |= {name: WRONG_MODE for name in problem.names if fit.other_values(name)}
+        joint = WRONG_MODE
     joint = _consistent(joint, set(marginal.values()))
     return Scores(laplace, samples, sampled(distances), marginal, (k[0], k[1]), efficiency, joint)
 
 
 def _consistent(joint: str, rows: set[str]) -> str:
     """Return the joint verdict made consistent with the marginal ones."""
-    if MODE in rows:
-        return MODE
-    if joint in (NARROW, WIDE) and SHAPE in rows:
-        return SHAPE
+    if WRONG_MODE in rows:
+        return WRONG_MODE
+    if joint in (NARROW, WIDE) and WRONG_SHAPE in rows:
+        return WRONG_SHAPE
     if joint == FINE and FINE not in rows:
-        return rows.pop() if len(rows) == 1 else SHAPE
+        return rows.pop() if len(rows) == 1 else WRONG_SHAPE
     return joint
 
 
@@ -370,7 +380,7 @@ def _row(sample: Sample, mean: float, sd: float) -> dict[str, float]:
     found |= {"shift": (own_mean - mean) / own, "shift_mcse": mean_error / own}
     found |= {"sd_ratio": sd / own, "sd_ratio_mcse": sd / own * spread / own}
     found["skewness"], found["skewness_mcse"] = sample.estimate(lambda x: skew(x, axis=-1))
-    for label, (probability, z) in QUANTILES.items():
+    for label, (probability, z) in COMPARED_QUANTILES.items():
         value, error = sample.estimate(lambda x, p=probability: np.quantile(x, p, axis=-1))  # type: ignore[misc]
         end = mean + z * sd if z else mean
         found |= {f"laplace_{label}": end, label: value}
@@ -396,7 +406,7 @@ def _table(scored: Scores, cured: Scores | None) -> pd.DataFrame:
 
 def _joint(scored: Scores, cured: Scores | None) -> dict[str, float | str]:
     found: dict[str, float | str] = {"dimension": scored.laplace.mean.size}
-    for level, inside, error in zip(LEVELS, *scored.inside(np.array(LEVELS)), strict=True):
+    for level, inside, error in zip(ELLIPSOID_LEVELS, *scored.inside(np.array(ELLIPSOID_LEVELS)), strict=True):
         key = f"share_{100 * level:.0f}"
         found |= {key: float(inside), f"{key}_mcse": float(error)}
     found |= zip(("pareto_k", "pareto_k_mcse", "efficiency"), (*scored.pareto_k, scored.efficiency), strict=True)
@@ -405,7 +415,7 @@ def _joint(scored: Scores, cured: Scores | None) -> dict[str, float | str]:
     if scored.joint == FINE:
         others = [name for name, verdict in scored.verdicts.items() if verdict != FINE]
         advice += f", except for {', '.join(others)}" if others else ""
-        heavy_tail = not scored.efficiency > EVEN and scored.pareto_k[0] > USABLE_K
+        heavy_tail = not scored.efficiency > EVEN_WEIGHTS and scored.pareto_k[0] > USABLE_K
         advice += ", not as an importance proposal" if heavy_tail else ""
     return found | {"verdict": scored.joint, "recommendation": advice}
 
@@ -416,7 +426,7 @@ def _recommendation(verdict: str, cure: bool, logarithm: bool, determined: bool)
         return "use Laplace"
     if verdict == UNCONVERGED:
         return "sample longer"
-    if verdict == MODE:
+    if verdict == WRONG_MODE:
         return "report each mode by itself; see fit.modes, map_estimate(starts=…)"
     if cure:
         return ("logarithms cure it: " if logarithm else "") + "use Laplace in sampling coordinates"

@@ -17,7 +17,7 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.result import MapEstimate
 
 ONE_SD = float(ndtr(1.0))
-SMALLEST, NEGLIGIBLE = 1e-12, 1e-3
+SMALLEST_EIGENVALUE, NEGLIGIBLE_COMPONENT = 1e-12, 1e-3
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class Information:
         guesses = {e.name: fit.solutions[e.name].states for e in problem.experiments}
         here = problem.anchored(theta, guesses).density().linearise(theta)
         noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
-        changes = problem.likelihood.whitened(here.changes, noise)
+        jacobian = problem.likelihood.whitened(here.changes, noise)
         slopes = np.where(logs, theta, 1.0)
-        design = np.concatenate(changes, axis=1) * slopes[:, None]
+        design = np.concatenate(jacobian, axis=1) * slopes[:, None]
         ends = [
             marginal.quantile(np.array([1.0 - ONE_SD, ONE_SD])) for marginal in problem.joint_prior.marginals.values()
         ]
@@ -70,7 +70,7 @@ class Information:
     def spectrum(self) -> np.ndarray:
         """Eigenvalues of the information, descending, in units of the logarithm or of the prior sd if signed."""
         values = hessian_eigh(self.matrix, np.where(self.logarithmic, 1.0, self.prior_sd))[0][::-1]
-        return np.where(values > SMALLEST * values[0], values, 0.0)
+        return np.where(values > SMALLEST_EIGENVALUE * values[0], values, 0.0)
 
     @property
     def condition(self) -> float:
@@ -90,9 +90,9 @@ class Information:
         A change below 0.1 % of the prior sd along a unit direction does not count.
         """
         values, vectors = self._relative
-        informed = values > SMALLEST * max(values[-1], np.finfo(float).tiny)
+        informed = values > SMALLEST_EIGENVALUE * max(values[-1], np.finfo(float).tiny)
         variance = np.sum(vectors[:, informed] ** 2 / values[informed], axis=1)
-        unseen = np.any(np.abs(vectors[:, ~informed]) > NEGLIGIBLE, axis=1)
+        unseen = np.any(np.abs(vectors[:, ~informed]) > NEGLIGIBLE_COMPONENT, axis=1)
         return np.where(unseen, np.inf, np.sqrt(variance))
 
     @property
@@ -106,11 +106,11 @@ class Information:
         return np.where(self.logarithmic, np.log(np.where(self.logarithmic, values, 1.0)), values)
 
 
-FACTORS = (0.5, 1.0, 2.0)
+FREQUENCY_FACTORS = (0.5, 1.0, 2.0)
 MOST_RUNS = 5
 
 
-class Candidate(NamedTuple):
+class FurtherExperiment(NamedTuple):
     """A possible experiment: the inputs of a run with scaled variation at another frequency [Hz]."""
 
     run: str
@@ -118,7 +118,7 @@ class Candidate(NamedTuple):
     scale: float
 
 
-def default_candidates(problem: Problem) -> list[Candidate]:
+def default_candidates(problem: Problem) -> list[FurtherExperiment]:
     """Return half, once and twice the frequency and the amplitude of runs spread over the frequencies.
 
     These are all runs if some parameters are local; none for a free-running model, which has no drive to change.
@@ -128,12 +128,12 @@ def default_candidates(problem: Problem) -> list[Candidate]:
     runs = sorted(problem.experiments, key=lambda e: e.frequency)
     most = len(runs) if any("[" in name for name in problem.names) else MOST_RUNS
     chosen = [runs[i] for i in sorted({round(k) for k in np.linspace(0, len(runs) - 1, most)})]
-    scales = FACTORS if problem.model.inputs else (1.0,)
-    return [Candidate(e.name, f * e.frequency, s) for e in chosen for f in FACTORS for s in scales]
+    scales = FREQUENCY_FACTORS if problem.model.inputs else (1.0,)
+    return [FurtherExperiment(e.name, f * e.frequency, s) for e in chosen for f in FREQUENCY_FACTORS for s in scales]
 
 
 def rank_candidates(
-    problem: Problem, fit: MapEstimate, information: Information, candidates: Iterable[Candidate]
+    problem: Problem, fit: MapEstimate, information: Information, candidates: Iterable[FurtherExperiment]
 ) -> pd.DataFrame:
     """Return the expected gain [nats] of each candidate and the ratio of each sd after it to the present one.
 
@@ -153,11 +153,11 @@ def rank_candidates(
             row["gain"] = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1])
             row |= zip(problem.names, np.sqrt(np.diag(np.linalg.inv(after))) / now, strict=True)
         rows.append(row)
-    table = pd.DataFrame(rows, columns=[*Candidate._fields, "gain", *problem.names])
+    table = pd.DataFrame(rows, columns=[*FurtherExperiment._fields, "gain", *problem.names])
     return table.sort_values("gain", ascending=False, na_position="last", ignore_index=True)
 
 
-def _added(problem: Problem, fit: MapEstimate, run: Experiment, candidate: Candidate) -> np.ndarray:
+def _added(problem: Problem, fit: MapEstimate, run: Experiment, candidate: FurtherExperiment) -> np.ndarray:
     """Return the information of a candidate in the coordinates of `Information`; NaN without an orbit."""
     inputs = {name: u.mean() + candidate.scale * (u - u.mean()) for name, u in problem.true_inputs(run).items()}
     planned = problem.planned(replace(run, frequency=candidate.frequency, inputs=inputs), fit.noise)

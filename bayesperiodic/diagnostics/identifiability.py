@@ -15,7 +15,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic._verdicts import BAD, GOOD, with_tone
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import misfit
-from bayesperiodic.diagnostics.design import Candidate, Information, default_candidates, rank_candidates
+from bayesperiodic.diagnostics.design import FurtherExperiment, Information, default_candidates, rank_candidates
 from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
 from bayesperiodic.estimation.modes import NOTABLE, Mode, notable
@@ -58,7 +58,7 @@ def _structure(
 
 
 POWER, NOTICEABLE = 1.25, 0.05
-MOST_DRAWS = 20_000
+MOST_THINNED_DRAWS = 20_000
 
 
 def power_scaling(problem: Problem, posterior: Posterior) -> dict[str, tuple[float, float]]:
@@ -72,7 +72,7 @@ def power_scaling(problem: Problem, posterior: Posterior) -> dict[str, tuple[flo
     ArviZ that the package supports scale this diagnostic differently.
     """
     lp = posterior.tree["sample_stats"]["lp"].transpose("chain", "draw").to_numpy().ravel()
-    thinned = slice(None, None, max(1, lp.size // MOST_DRAWS))
+    thinned = slice(None, None, max(1, lp.size // MOST_THINNED_DRAWS))
     theta, noise = draws_of(problem, posterior, thinned)
     prior = np.asarray(problem.log_prior(theta))
     jacobian = np.log(theta[:, problem.logarithmic]).sum(axis=1)
@@ -117,7 +117,7 @@ def _one_sided(x: np.ndarray, weighted: np.ndarray) -> float:
     return float(np.sqrt(max(against(p, q) + against(q, p), 0.0) / total))
 
 
-DETERMINED, NOTHING = with_tone("determined", GOOD), with_tone("not determined", BAD)
+DETERMINED, NOT_DETERMINED = with_tone("determined", GOOD), with_tone("not determined", BAD)
 PRIOR_ONLY, COMBINATION, SIGN = "only with the prior", "only in combination", "sign undetermined"
 CONFLICT, SEVERAL = with_tone("prior conflict", BAD), "several values"
 # Standard deviations left by the data alone, in prior sds: the largest one of determined parameters (a contraction of
@@ -131,7 +131,7 @@ UNINFORMED_GAIN = 1e-13
 PRIOR_DRAWS = 20_000
 BOTH_SIGNS = "both signs fit the data: use a prior of one sign, or measure an output that is odd in it"
 # Columns of the printed table, by their titles.
-PRINTED = {"data sd": "together", "others known": "alone", "prior sensitivity": "prior_sensitivity"}
+COLUMN_TITLES = {"data sd": "together", "others known": "alone", "prior sensitivity": "prior_sensitivity"}
 OTHER_VALUES = "give a prior that excludes the other value, or measure an output that differs between them"
 
 
@@ -197,7 +197,7 @@ class Identifiability(Result):
         for name, column in {"contraction": "contraction", "P(negative)": "p_negative"}.items():
             values = zip(table[column], table[f"{column}_mcse"], strict=True)
             columns[name] = [f"{v:.3f}" + (f" ± {error:.3f}" if error else "") for v, error in values]
-        columns |= {title: table[column].map("{:.2g}".format) for title, column in PRINTED.items()}
+        columns |= {title: table[column].map("{:.2g}".format) for title, column in COLUMN_TITLES.items()}
         columns["profile"] = table["profile"]
         shown = pd.DataFrame(columns, index=table.index).replace({"nan": "", "nan ± nan": ""})
         shown = shown.loc[:, (shown != "").any()].replace("", "-")
@@ -273,7 +273,7 @@ def identifiability(
     problem = check_results(problem, fit=fit, **({} if posterior is None else {"posterior": posterior}))
     information, structure = Information.of(problem, fit), structure_of(problem)
     shapes = profile_of(problem, fit).shape if profile is True else profile.shape if profile else {}
-    options = default_candidates(problem) if candidates is None else [Candidate(*c) for c in candidates]
+    options = default_candidates(problem) if candidates is None else [FurtherExperiment(*c) for c in candidates]
     experiments, directions = rank_candidates(problem, fit, information, options), _directions(information)
     widths, errors = _widths(problem, fit, posterior, information)
     left = information.together if posterior is None else np.sqrt(1.0 / np.maximum(1.0 / widths**2 - 1.0, 1e-12))
@@ -307,7 +307,7 @@ def identifiability(
         remarks = ([_against_the_prior(fit, row)] if conflict else []) + _remarks(row)
         row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments, structure)
         if advice := orbit_advice(fit):
-            row["verdict"] = NOTHING if row["verdict"] == DETERMINED else row["verdict"]
+            row["verdict"] = NOT_DETERMINED if row["verdict"] == DETERMINED else row["verdict"]
             remarks.append(f"at another orbit than the measured one in {', '.join(map(repr, fit.other_orbits))}")
             row["remedy"] = advice
         row["remarks"] = ", ".join(remarks)
@@ -433,7 +433,7 @@ def _verdict(row: dict, size_known: bool, within: float) -> str:
     if row["profile"] == ONE_SIDED and row["collinearity"] < COLLINEAR:
         return PRIOR_ONLY
     if row["alone"] > UNINFORMED_SD:
-        return NOTHING
+        return NOT_DETERMINED
     if row["structural"]:
         return COMBINATION
     if row["together"] <= DETERMINED_SD:

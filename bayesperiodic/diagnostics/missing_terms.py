@@ -16,7 +16,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import ALL, adequacy
 from bayesperiodic.diagnostics.candidates import (
-    Candidate,
+    Term,
     coefficient_names,
     coefficient_unit,
     extended,
@@ -26,7 +26,7 @@ from bayesperiodic.diagnostics.candidates import (
     places,
 )
 from bayesperiodic.diagnostics.optima import (
-    SIGNIFICANT,
+    SIGNIFICANT_COEFFICIENT,
     Optimum,
     distinct,
     doubt,
@@ -41,7 +41,7 @@ from bayesperiodic.models.model import Model
 from bayesperiodic.problem.description import check_results
 
 # Ratio of the errors in experiments that are left out from which on these tell two terms apart.
-WORSE = 2.0
+WORSE_RATIO = 2.0
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class MissingTerms(Result):
     stopped: str
     _fits: tuple[MapEstimate, ...]
     _problem: Problem | None = field(default=None, metadata=NOT_STORED)
-    _terms: dict[str, tuple[Candidate, float]] = field(default_factory=dict, metadata=NOT_STORED)
+    _terms: dict[str, tuple[Term, float]] = field(default_factory=dict, metadata=NOT_STORED)
 
     def model(self, k: int | None = None) -> Model:
         """Return the model with the terms of the first k steps, by default of all.
@@ -210,7 +210,7 @@ class MissingTerms(Result):
             raise ValueError(f"k: must be at most {len(self.steps)}, the number of steps, got {count}.")
         return count
 
-    def _first(self, k: int | None) -> tuple[Problem, dict[str, tuple[Candidate, float]]]:
+    def _first(self, k: int | None) -> tuple[Problem, dict[str, tuple[Term, float]]]:
         if self._problem is None:
             raise ValueError("found: must be what missing_terms has returned, got one of a file, which has no models.")
         return self._problem, {step.name: self._terms[step.name] for step in self.steps[: self._count(k)]}
@@ -249,7 +249,7 @@ def _sentence(k: int, step: Step) -> str:
     text += f" in {step.place}, {size} (p = {step.p:.2g}){others}."
     if np.isfinite(step.lag):
         text += f" Its lag is {step.lag:.3g} ± {step.lag_sd:.2g} s."
-        if abs(step.coefficient) < SIGNIFICANT * step.robust_sd:
+        if abs(step.coefficient) < SIGNIFICANT_COEFFICIENT * step.robust_sd:
             text += " The data determine the product of coefficient and lag, but not both."
     if step.worse:
         text += f" As good a fit, but worse in experiments left out: {', '.join(step.worse)}."
@@ -354,14 +354,14 @@ def missing_terms(
 class _Search:
     """Candidates of one problem, and the steps."""
 
-    def __init__(self, problem: Problem, terms: list[Candidate], rate: float, keep: int, lags: list[float]):
+    def __init__(self, problem: Problem, terms: list[Term], rate: float, keep: int, lags: list[float]):
         self.problem, self.model, self.rate, self.keep = problem, problem._given["model"], rate, keep
         self.lags, self.terms = lags, {str(term): term for term in terms}
         self.names = dict(zip(self.terms, coefficient_names(self.model, terms), strict=True))
         self.keys = {name: key for key, name in self.names.items()}
         self.refused: dict[str, str] = {}
         self.widths: dict[str, float] = {}
-        self.compiled: tuple[Model, dict[str, Candidate]] = self.model, {}
+        self.compiled: tuple[Model, dict[str, Term]] = self.model, {}
         self.fitted: dict[tuple[str, ...], Optimum] = {}
 
     def run(self, fit: MapEstimate, max_terms: int) -> MissingTerms:
@@ -371,7 +371,7 @@ class _Search:
         steps: list[Step] = []
         table, before = ranking, _step(state, fit, fit, None, held_out_error(state))
         stopped = f"The search ended after {max_terms} terms, as asked for by max_terms."
-        chosen: dict[str, Candidate] = {}
+        chosen: dict[str, Term] = {}
         fits = [fit]
         while len(steps) < max_terms:
             found = self.best(state, table, chosen)
@@ -422,11 +422,11 @@ class _Search:
         terms = self.priors(names)
         return problem_of(self.problem, model, terms, {n: self.terms[self.keys[n]] for n in known if n not in terms})
 
-    def priors(self, names: Iterable[str]) -> dict[str, tuple[Candidate, float]]:
+    def priors(self, names: Iterable[str]) -> dict[str, tuple[Term, float]]:
         """Return terms and widths of the priors of their coefficients, by these."""
         return {name: (self.terms[self.keys[name]], self.widths[name]) for name in names}
 
-    def estimate(self, terms: Mapping[str, Candidate], near: Optimum) -> MapEstimate | None:
+    def estimate(self, terms: Mapping[str, Term], near: Optimum) -> MapEstimate | None:
         """Return the estimate of the model with terms, by name, from a near optimum; None if it cannot start there."""
         model = extended(self.model, terms)
         problem = problem_of(self.problem, model, self.priors(terms), {})
@@ -464,7 +464,7 @@ class _Search:
         return table
 
     def best(
-        self, state: Optimum, table: pd.DataFrame, chosen: Mapping[str, Candidate]
+        self, state: Optimum, table: pd.DataFrame, chosen: Mapping[str, Term]
     ) -> tuple[str, tuple[str, ...], tuple[str, ...], float, Optimum] | str:
         """Return the term to be added, alternatives, worse ones, p, and the optimum with it; or why there is none."""
         if not len(table):
@@ -497,7 +497,7 @@ class _Search:
         alike = [key for key in fitted if key == best or not distinct(fitted[best], fitted[key])]
         errors = {key: held_out_error(fitted[key]) for key in alike} if len(alike) > 1 else {best: np.nan}
         # Errors that are nearly equal are in an order by chance: of these, the evidence tells which is best.
-        well = [key for key in alike if not errors[key] > WORSE * min(errors.values())]
+        well = [key for key in alike if not errors[key] > WORSE_RATIO * min(errors.values())]
         # Of a term with memory, short and long lags have the effect of one without.
         first = max(well, key=lambda key: (self.terms[key].force is None, fitted[key].evidence))
         # Each of the candidates is as likely to be the missing one.
@@ -513,7 +513,7 @@ class _Search:
         worse = tuple(other for own in others if own[0] not in well for other in own)
         return first, tuple(alternatives), worse, float(p[first]), fitted[first]
 
-    def compile(self, wanted: Sequence[str], more: Sequence[str], chosen: Mapping[str, Candidate]) -> None:
+    def compile(self, wanted: Sequence[str], more: Sequence[str], chosen: Mapping[str, Term]) -> None:
         """Take a model with all wanted terms; where the present one lacks any, one with more terms."""
         if not {self.names[key] for key in wanted} <= set(self.compiled[1]):
             terms = dict(chosen) | {self.names[key]: self.terms[key] for key in dict.fromkeys([*wanted, *more])}
@@ -558,7 +558,7 @@ def _step(
     state: Optimum,
     fit: MapEstimate,
     before: MapEstimate,
-    added: tuple[Candidate, str, tuple[str, ...], tuple[str, ...], float, float] | None,
+    added: tuple[Term, str, tuple[str, ...], tuple[str, ...], float, float] | None,
     held_out: float,
 ) -> Step:
     table = adequacy(state.problem, state.iterate.here, state.iterate.noise[None], {})

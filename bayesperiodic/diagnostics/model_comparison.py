@@ -29,13 +29,13 @@ from bayesperiodic.sampling.sample import sample
 
 # Log evidence ratio of a probability of 95 %. A difference of ELPD below 4 is too small for its standard error to be
 # reliable, and so is a standard error from fewer than 5 experiments.
-DECISIVE, SMALLEST_GAIN, FEWEST_EXPERIMENTS = float(np.log(19.0)), 4.0, 5
+DECISIVE, SMALLEST_GAIN, FEWEST_SCORED = float(np.log(19.0)), 4.0, 5
 PREFERRED, WORSE, OPEN, SPLIT = "preferred", "worse", "not distinguished", "contradictory"
 EVIDENCE, ELPD, HELD_OUT = "log_evidence", "elpd", "held_out"
 CRITERIA = {EVIDENCE: "evidence", ELPD: "leave-one-out prediction", HELD_OUT: "held-out experiments"}
-IMPORTANCE, REFIT, MISSING = "importance", "refit", "not available"
-DRAWS, SCALES, NOTHING = 50, (1.0, 0.5, 2.0), 0.01
-PRINTED = [
+IMPORTANCE, REFIT, NOT_AVAILABLE = "importance", "refit", "not available"
+PREDICTION_DRAWS, INPUT_SCALES, NEGLIGIBLE_GAIN = 50, (1.0, 0.5, 2.0), 0.01
+PRINTED_COLUMNS = [
     EVIDENCE, "probability", ELPD, "elpd_difference", "elpd_difference_se", "pareto_k", "held_out_difference",
     "held_out_difference_se", "adequacy", "verdict",
 ]  # fmt: skip
@@ -83,7 +83,7 @@ class ModelComparison(Result):
 
     def __repr__(self) -> str:
         data = ", synthetic data" if self.synthetic else ""
-        table = self.table[PRINTED].to_string(float_format="{:.4g}".format, na_rep="-")
+        table = self.table[PRINTED_COLUMNS].to_string(float_format="{:.4g}".format, na_rep="-")
         return "\n".join([f"Comparison of models{data}", table, self.conclusion, *self.notes])
 
 
@@ -137,7 +137,8 @@ def compare_models(models: Mapping[str, tuple[Problem, Posterior]], *, held_out:
     experiments = _experiments(models, held_out, notes)
     scores = _Scores([*models], provisional, _evidences(models, notes), *_left_out(models, notes), experiments)
     first, verdicts = scores.verdicts()
-    table, predictions = scores.table(first), {name: predict(*pair, draws=DRAWS) for name, pair in models.items()}
+    table = scores.table(first)
+    predictions = {name: predict(*pair, draws=PREDICTION_DRAWS) for name, pair in models.items()}
     table["adequacy"] = [predictions[str(name)].verdict for name in table.index]
     table["verdict"] = [verdicts[str(name)] for name in table.index]
     if predictions[first].verdict == MISSPECIFIED:
@@ -295,7 +296,7 @@ def _experiments(models: Models, held_out: bool, notes: list[str]) -> pd.DataFra
             row = {"model": name, "experiment": run, "elpd": elpd[i], "pareto_k": pareto_k[i]}
             if isinstance(rest, str):
                 notes.append(f"{name!r} cannot predict experiment {run!r} from the others: {rest}")
-                row |= {"elpd": np.nan, "pareto_k": np.nan, "error": np.nan, "method": MISSING}
+                row |= {"elpd": np.nan, "pareto_k": np.nan, "error": np.nan, "method": NOT_AVAILABLE}
             elif pareto_k[i] > USABLE_K:
                 value, error, reason = _refitted(problem, rest, posterior, i, own, efficiency)
                 row |= {"elpd": value, "error": error, "method": REFIT}
@@ -400,7 +401,7 @@ class _Scores:
         usable = {
             EVIDENCE: self._evidence[one][3] and self._evidence[other][3],
             ELPD: max(self._loo[one][2], self._loo[other][2]) <= USABLE_K,
-            HELD_OUT: len(self._held_out[one]) >= FEWEST_EXPERIMENTS,
+            HELD_OUT: len(self._held_out[one]) >= FEWEST_SCORED,
         }
         found = {}
         for name, (change, error) in self.differences(one, other).items():
@@ -470,7 +471,7 @@ def _what_would_tell(models: Models, one: str, other: str) -> str:
     """
     gains, problem = {}, models[one][0]
     for e in problem.experiments:
-        for scale in SCALES if problem.model.inputs else SCALES[:1]:
+        for scale in INPUT_SCALES if problem.model.inputs else INPUT_SCALES[:1]:
             found, total = [_predicted(*models[name], e.name, scale) for name in (one, other)], 0.0
             for channel in e.outputs:
                 means, variances, noises = zip(*(predicted[channel] for predicted in found), strict=True)
@@ -482,7 +483,7 @@ def _what_would_tell(models: Models, one: str, other: str) -> str:
     if not gains:
         return ""
     (run, scale), gain = max(gains.items(), key=lambda item: item[1])
-    if gain < NOTHING:
+    if gain < NEGLIGIBLE_GAIN:
         return "Neither repetitions of the experiments nor half or twice their drive would distinguish them."
     kind = "a repetition of" if scale == 1.0 else f"{scale:g} times the drive of"
     present = sum(value for (_, s), value in gains.items() if s == 1.0)
@@ -505,7 +506,7 @@ def _predicted(
     """
     e = next(e for e in problem.experiments if e.name == run)
     inputs = {name: u.mean() + scale * (u - u.mean()) for name, u in problem.true_inputs(e).items()}
-    places = np.linspace(0, posterior.draws(problem.names[0]).size - 1, DRAWS).astype(int)
+    places = np.linspace(0, posterior.draws(problem.names[0]).size - 1, PREDICTION_DRAWS).astype(int)
     theta, noise = draws_of(problem, posterior, places)
     level, guesses = np.median(noise, axis=0), posterior.guesses([run], problem.model.states)
     variances = problem.likelihood.value_variances(level)

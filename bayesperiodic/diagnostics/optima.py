@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesperiodic._linalg import TINY, hessian_scale, scaled
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.candidates import Candidate, lag_names
+from bayesperiodic.diagnostics.candidates import Term, lag_names
 from bayesperiodic.estimation.gauss_newton import SINGULAR, Iterate, Objective
 from bayesperiodic.estimation.map_estimate import nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate
@@ -24,7 +24,7 @@ FEWEST_EXPERIMENTS = 3
 # Where the search for an optimum ends by itself; "stalled" steps are limited by the accuracy of the periodic solutions.
 ENDED = ("converged", "stalled")
 # Robust standard deviations from zero of a coefficient.
-SIGNIFICANT = 2.0
+SIGNIFICANT_COEFFICIENT = 2.0
 # Fraction by which a coefficient may change on twice as many points.
 COARSE = 0.5
 # Standard deviation of the logarithm of a lag about where its estimation starts.
@@ -32,7 +32,7 @@ LAG_SPREAD = 1.5
 
 
 def problem_of(
-    problem: Problem, model: Model, terms: Mapping[str, tuple[Candidate, float]], zero: Mapping[str, Candidate]
+    problem: Problem, model: Model, terms: Mapping[str, tuple[Term, float]], zero: Mapping[str, Term]
 ) -> Problem:
     """Return the problem with another model, whose coefficients have normal priors of given widths or are zero."""
     settings = dict(problem._given)
@@ -146,15 +146,15 @@ def held_out_error(state: Optimum) -> float:
     return float(np.mean(fractions))
 
 
-def doubt(fit: MapEstimate, name: str, term: Candidate) -> str:
+def doubt(fit: MapEstimate, name: str, term: Term) -> str:
     """Return why the coefficient of a term is not believed, in words; "" if it is."""
     size, sd, robust = abs(fit.theta[name]), fit.sd[name], fit.robust_sd[name]
     if term.force is not None:
         # Of a short or a long lag, the data determine only its product with the coefficient, or the quotient.
         joint = fit.covariance.loc[[name, lag_names(name)[0]], [name, lag_names(name)[0]]].to_numpy()
         robust *= np.sqrt(max(1.0 - joint[0, 1] ** 2 / (joint[0, 0] * joint[1, 1]), 0.0))
-    if size < SIGNIFICANT * robust:
-        return f"its coefficient is less than {SIGNIFICANT:g} robust sds from zero"
+    if size < SIGNIFICANT_COEFFICIENT * robust:
+        return f"its coefficient is less than {SIGNIFICANT_COEFFICIENT:g} robust sds from zero"
     if (change := abs(fit.doubling_shift[name]) * sd / size) > COARSE:
         return (
             f"on twice as many points its coefficient changes by {change:.0%}: the error of the grid looks like this "

@@ -18,8 +18,8 @@ from bayesperiodic.data.recording import Recording
 from bayesperiodic.density.log_posterior import NATURAL
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import (
+    ADEQUACY_LEVEL,
     ALL,
-    LEVEL,
     MISSPECIFIED,
     SEARCH,
     UNTESTED,
@@ -37,7 +37,7 @@ from bayesperiodic.sampling.draws import Posterior
 
 PROBABILITY = 0.9
 # Of the median and of the ends of the central band.
-QUANTILES = (0.5, 0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY)
+BAND_QUANTILES = (0.5, 0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY)
 NOISE_LEVELS = 21
 
 
@@ -62,14 +62,14 @@ def bands(
     """Return the bands of outputs (draws, points) and residual variances (draws,) at the draws that converged."""
     count = converged.size
     scores = ndtri((np.arange(NOISE_LEVELS) + 0.5) / NOISE_LEVELS)
-    found: list[dict[str, dict[str, np.ndarray]]] = [{e.name: {} for e in problem.experiments} for _ in QUANTILES]
+    found: list[dict[str, dict[str, np.ndarray]]] = [{e.name: {} for e in problem.experiments} for _ in BAND_QUANTILES]
     for e in problem.experiments:
         for channel in e.outputs:
             variance = variances.get((e.name, channel), np.zeros(count))
             expected = e.project(channel, outputs[e.name][channel])
             noise = np.sqrt(variance)[:, None, None] * scores[:, None]
             values = (expected[:, None] + noise)[converged].reshape(-1, expected.shape[1])
-            levels = np.median(expected[converged], axis=0), *np.quantile(values, QUANTILES[1:], axis=0)
+            levels = np.median(expected[converged], axis=0), *np.quantile(values, BAND_QUANTILES[1:], axis=0)
             for band, level in zip(found, levels, strict=True):
                 band[e.name][channel] = level
     median, low, high = found
@@ -146,7 +146,7 @@ def _transient(problem: Problem, theta: np.ndarray, run: Run, experiment: str | 
             signals[output].append(values)
     if not signals:
         raise RuntimeError(f"run: failed at all {len(theta)} draws, last with: {last}") from last
-    levels = {output: np.quantile(values, QUANTILES, axis=0) for output, values in signals.items()}
+    levels = {output: np.quantile(values, BAND_QUANTILES, axis=0) for output, values in signals.items()}
     median, low, high = ({output: found[i] for output, found in levels.items()} for i in range(3))
     return Transient(time, median, low, high, PROBABILITY, len(theta), dict(failures))
 
@@ -245,7 +245,7 @@ class Prediction(Bands):
 
     def __repr__(self) -> str:
         subject = "model or the noise model" if self.concerns_noise else "model"
-        verdict = f"The {subject} is {self.verdict} (overall false alarm rate {LEVEL:.0%})."
+        verdict = f"The {subject} is {self.verdict} (overall false alarm rate {ADEQUACY_LEVEL:.0%})."
         lines = [
             f"Tests of the model from {self.draws} draws, {self.failed} without a periodic solution",
             self.table.to_string(float_format="{:.2g}".format, na_rep="-"),
@@ -378,14 +378,14 @@ def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:
     return " ".join(notes)
 
 
-NO_ORBIT, OTHER, FAILED = "no orbit", "other orbit", "solver failed"
-ENDS = {
+NO_ORBIT, ANOTHER_ORBIT, FAILED = "no orbit", "other orbit", "solver failed"
+PATH_VERDICTS = {
     arclength.FOLD: (NO_ORBIT, "the branch ends in a fold"),
     arclength.EQUILIBRIUM: (NO_ORBIT, "the cycle shrinks to an equilibrium"),
     arclength.SHORTER: (NO_ORBIT, "the orbit merges with one of a shorter period"),
-    arclength.ROUND_FOLDS: (OTHER, "the branch folds back to another orbit at the same parameters"),
+    arclength.ROUND_FOLDS: (ANOTHER_ORBIT, "the branch folds back to another orbit at the same parameters"),
     arclength.ARRIVED: (FAILED, "the orbit exists"),
-    arclength.LOST: (FAILED, "the branch cannot be followed"),
+    arclength.PATH_LOST: (FAILED, "the branch cannot be followed"),
 }
 
 
@@ -468,7 +468,7 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     verdicts = {name: np.full(count, STATUSES[CONVERGED], dtype=object) for name in runs}
     failed = [(name, i) for name in runs for i in np.flatnonzero(solved.statuses(name) != CONVERGED)]
     for name, i in tqdm(failed, desc="failed solves", disable=not (progress and failed)):
-        verdicts[name][i], why = ENDS[density.simulator.path_outcome(theta[i], name)]
+        verdicts[name][i], why = PATH_VERDICTS[density.simulator.path_outcome(theta[i], name)]
         causes[f"{verdicts[name][i]} ({STATUSES[solved.statuses(name)[i]]}): {why}"] += 1
     outputs, converged = density.outputs(theta)
     if not converged.any():
@@ -477,7 +477,7 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
             "priors around values at which problem.solve(theta) converges."
         )
     prediction = bands(problem, outputs, converged, {})
-    order = [STATUSES[CONVERGED], OTHER, NO_ORBIT, FAILED]
+    order = [STATUSES[CONVERGED], ANOTHER_ORBIT, NO_ORBIT, FAILED]
     worst = np.max([[order.index(v) for v in row] for row in verdicts.values()], axis=0)
     verdicts["all"] = np.array(order, dtype=object)[worst]
     shares = {what: [np.mean(row == what) for row in verdicts.values()] for what in order}

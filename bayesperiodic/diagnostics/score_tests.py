@@ -12,7 +12,7 @@ from bayesperiodic._linalg import column_space
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import Whitened, used
-from bayesperiodic.diagnostics.candidates import MEMORY, Candidate, factors, places, values
+from bayesperiodic.diagnostics.candidates import MEMORY, Term, factors, places, values
 from bayesperiodic.estimation.covariance import predicted_changes, residual_variances
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.result import MapEstimate
@@ -23,9 +23,9 @@ from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 # Part of the square of an effect that the parameters cannot have instead, below which the two cannot be told apart.
 UNIDENTIFIABLE = 1e-6
 # 1 − cos² of the angle between two effects that are the same on the measured orbits.
-COLLINEAR = 1e-8
+SAME_EFFECT = 1e-8
 # Lags that are tried: in radians of the fastest and of the slowest experiment, with this factor or less between them.
-SHORTEST, LONGEST, FACTOR = 0.3, 3.0, 3.5
+SHORTEST_LAG, LONGEST_LAG, LARGEST_LAG_FACTOR = 0.3, 3.0, 3.5
 
 
 class Compared(NamedTuple):
@@ -51,7 +51,7 @@ class ScoreTests:
         Coefficients whose effect is as large as the measured output, in the channel where it is largest.
     """
 
-    def __init__(self, problem: Problem, optimum: Iterate, terms: Sequence[Candidate]):
+    def __init__(self, problem: Problem, optimum: Iterate, terms: Sequence[Term]):
         likelihood, noise, here = problem.likelihood, optimum.noise, optimum.here
         solutions = here.simulator.solutions(optimum.theta)
         effects = _effects(problem, optimum.theta, solutions, terms)
@@ -80,9 +80,9 @@ class ScoreTests:
             statistic = tests.gains()
         else:
             likelihood, noise, here = problem.likelihood, optimum.noise, optimum.here
-            changes, residuals = (likelihood.whitened(part, noise) for part in (here.changes, here.residuals))
-            information = problem.joint_prior.curvature(optimum.theta) + sum(s @ s.T for s in changes)
-            variances = residual_variances(likelihood, changes, residuals, noise, information)
+            jacobian, residuals = (likelihood.whitened(part, noise) for part in (here.changes, here.residuals))
+            information = problem.joint_prior.curvature(optimum.theta) + sum(s @ s.T for s in jacobian)
+            variances = residual_variances(likelihood, jacobian, residuals, noise, information)
             sds = [np.sqrt(np.maximum(used(b, v)[0], 1e-12)) for b, v in zip(blocks, variances, strict=True)]
             parts = [[r / sd, j / sd] for (r, j, _), sd in zip(white.parts, sds, strict=True)]
             tests = _projected(parts, parameters)
@@ -97,7 +97,7 @@ class ScoreTests:
         left = [i for i in np.argsort(-self.explained, kind="stable") if self.identifiable[i] and i in among]
         while left:
             cosine = self._effects[left] @ self._effects[left[0]] / (size[left] * size[left[0]])
-            same = 1.0 - cosine**2 < COLLINEAR
+            same = 1.0 - cosine**2 < SAME_EFFECT
             yield sorted(int(i) for i, own in zip(left, same, strict=True) if own)
             left = [i for i, own in zip(left, same, strict=True) if not own]
 
@@ -151,8 +151,8 @@ def variable_deviations(problem: Problem, fit: MapEstimate) -> dict[str, float]:
 def lags_to_try(fit: MapEstimate) -> list[float]:
     """Return lags [s] of terms with memory, which cover all experiments."""
     rates = [2.0 * np.pi * own.frequency / own.periods for own in fit.solutions.values()]
-    ends = SHORTEST / max(rates), LONGEST / min(rates)
-    return np.geomspace(*ends, 1 + int(np.ceil(np.log(ends[1] / ends[0]) / np.log(FACTOR)))).tolist()
+    ends = SHORTEST_LAG / max(rates), LONGEST_LAG / min(rates)
+    return np.geomspace(*ends, 1 + int(np.ceil(np.log(ends[1] / ends[0]) / np.log(LARGEST_LAG_FACTOR)))).tolist()
 
 
 def _at(
@@ -165,9 +165,9 @@ def _at(
 
 
 def _effects(
-    problem: Problem, theta: np.ndarray, solutions: Mapping[str, PeriodicSolution], terms: Sequence[Candidate]
+    problem: Problem, theta: np.ndarray, solutions: Mapping[str, PeriodicSolution], terms: Sequence[Term]
 ) -> list[np.ndarray]:
-    """Return the changes of the predicted components by each coefficient, one array (terms, size) a block.
+    """Return the derivatives of the predicted components by each coefficient, one array (terms, size) a block.
 
     NaN for terms that are not finite along an orbit.
     """

@@ -99,7 +99,7 @@ def normal_draws(
 
 # A second mode: least probability beyond the valley, and depth of the valley relative to the lower peak.
 MASS, DEPTH = 0.05, 0.7
-GRID, GRID_RANGE = 256, (0.001, 0.999)
+MODE_GRID, MODE_GRID_RANGE = 256, (0.001, 0.999)
 
 
 def has_other_mode(sample: Sample, point: float) -> bool:
@@ -114,13 +114,13 @@ def has_other_mode(sample: Sample, point: float) -> bool:
     if not spread > 0.0:
         return False
     bandwidth = 0.9 * spread * sample.size**-0.2
-    low, high = np.quantile(x, GRID_RANGE)
-    edges = np.linspace(low - 3 * bandwidth, high + 3 * bandwidth, GRID + 1)
+    low, high = np.quantile(x, MODE_GRID_RANGE)
+    edges = np.linspace(low - 3 * bandwidth, high + 3 * bandwidth, MODE_GRID + 1)
     width = edges[1] - edges[0]
-    inside = np.clip(((sample.batches - edges[0]) / width).astype(int), 0, GRID - 1)
+    inside = np.clip(((sample.batches - edges[0]) / width).astype(int), 0, MODE_GRID - 1)
     batches = len(inside)
-    counts = np.bincount((inside + GRID * np.arange(batches)[:, None]).ravel(), minlength=batches * GRID)
-    mass = counts.reshape(batches, GRID) / inside.shape[1]
+    counts = np.bincount((inside + MODE_GRID * np.arange(batches)[:, None]).ravel(), minlength=batches * MODE_GRID)
+    mass = counts.reshape(batches, MODE_GRID) / inside.shape[1]
     density = gaussian_filter1d(mass, bandwidth / width, mode="constant")
     slope = np.diff(density.mean(axis=0))
     valleys = np.flatnonzero((slope[:-1] < 0.0) & (slope[1:] >= 0.0)) + 1
@@ -141,18 +141,18 @@ def _beyond_errors(values: np.ndarray) -> bool:
     return bool(values.mean() > ERRORS * values.std(ddof=1) / np.sqrt(len(values)))
 
 
-FINE, MODE = with_tone("fine", GOOD), with_tone("wrong mode", BAD)
-NARROW, WIDE, SHAPE = "too narrow", "too wide", "wrong shape"
+FINE, WRONG_MODE = with_tone("fine", GOOD), with_tone("wrong mode", BAD)
+NARROW, WIDE, WRONG_SHAPE = "too narrow", "too wide", "wrong shape"
 UNCONVERGED = with_tone("not converged", BAD)
 ERRORS = 3.0
-TAIL, END_SHIFT = 0.05, 0.25
-END = float(ndtri(1.0 - TAIL))
-LEVELS = (0.5, 0.9, 0.95)
-SCALE = 1.0 + END_SHIFT / END
+END_PROBABILITY, END_SHIFT = 0.05, 0.25
+END = float(ndtri(1.0 - END_PROBABILITY))
+ELLIPSOID_LEVELS = (0.5, 0.9, 0.95)
+RADIUS_FACTOR = 1.0 + END_SHIFT / END
 # Accumulation at an end of the support: probability within a distance in sds of the draws.
-PILED, EDGE = 0.05, 0.25
+PILED, AT_END = 0.05, 0.25
 # Another mode: probability on one side of the mean ± 3 sd of the approximation.
-REACH, FEW = 3.0, 0.05
+OTHER_MODE_DISTANCE, OTHER_MODE_PROBABILITY = 3.0, 0.05
 USABLE_K = 0.7
 
 
@@ -168,41 +168,41 @@ def marginal_verdict(sample: Sample, mean: float, sd: float, support: tuple[floa
     if not np.isfinite(sd):
         return WIDE
     if _elsewhere(sample, mean, sd) or has_other_mode(sample, mean):
-        return MODE
+        return WRONG_MODE
     own = float(sample.whole.std())
     low = _end(sample, mean, sd, own)
     high = _end(Sample(-sample.whole, -sample.batches, sample.size, sample.ensembles), -mean, sd, own)
     if low == high == FINE:
         distance, error = wasserstein_distance(sample, mean, sd)
-        return SHAPE if distance - ERRORS * error > END_SHIFT else FINE
+        return WRONG_SHAPE if distance - ERRORS * error > END_SHIFT else FINE
     if _piled(sample, support, own):
-        return SHAPE
-    quantiles = np.quantile(sample.whole, [TAIL, 1.0 - TAIL])
+        return WRONG_SHAPE
+    quantiles = np.quantile(sample.whole, [END_PROBABILITY, 1.0 - END_PROBABILITY])
     outwards = np.array([mean - END * sd - quantiles[0], quantiles[1] - mean - END * sd]) / own
     if np.all(outwards > 0.5 * END_SHIFT):
         return NARROW
-    return WIDE if np.all(outwards < -0.5 * END_SHIFT) else SHAPE
+    return WIDE if np.all(outwards < -0.5 * END_SHIFT) else WRONG_SHAPE
 
 
 def _unconverged(sample: Sample, mean: float) -> str:
-    return MODE if all(has_other_mode(ensemble, mean) for ensemble in sample.by_ensemble()) else UNCONVERGED
+    return WRONG_MODE if all(has_other_mode(ensemble, mean) for ensemble in sample.by_ensemble()) else UNCONVERGED
 
 
 def _end(sample: Sample, mean: float, sd: float, own: float) -> str:
     """Return the verdict on the lower end of the 90 % interval; `own` is the sd of the draws."""
     end = mean - END * sd
-    beyond, error = sample.below(end - END_SHIFT * own, TAIL)
-    if beyond > TAIL + ERRORS * error:
+    beyond, error = sample.below(end - END_SHIFT * own, END_PROBABILITY)
+    if beyond > END_PROBABILITY + ERRORS * error:
         return NARROW
-    beyond, error = sample.below(end + END_SHIFT * own, TAIL)
-    return WIDE if beyond < TAIL - ERRORS * error else FINE
+    beyond, error = sample.below(end + END_SHIFT * own, END_PROBABILITY)
+    return WIDE if beyond < END_PROBABILITY - ERRORS * error else FINE
 
 
 def _elsewhere(sample: Sample, mean: float, sd: float) -> bool:
     """Return whether fewer than 5 % of the draws lie below mean + 3 sd, or above mean − 3 sd."""
-    low = sample.below(mean + REACH * sd, FEW)
-    high = sample.fraction(lambda x: x > mean - REACH * sd, FEW)
-    return any(within < FEW - ERRORS * error for within, error in (low, high))
+    low = sample.below(mean + OTHER_MODE_DISTANCE * sd, OTHER_MODE_PROBABILITY)
+    high = sample.fraction(lambda x: x > mean - OTHER_MODE_DISTANCE * sd, OTHER_MODE_PROBABILITY)
+    return any(within < OTHER_MODE_PROBABILITY - ERRORS * error for within, error in (low, high))
 
 
 def _piled(sample: Sample, support: tuple[float, float], own: float) -> bool:
@@ -211,7 +211,7 @@ def _piled(sample: Sample, support: tuple[float, float], own: float) -> bool:
     A normal posterior truncated two sds from its centre has 1.8 % there, one truncated at its centre 12 %.
     """
     bounds = [end for end in support if np.isfinite(end)]
-    near = [sample.fraction(lambda x, e=end: np.abs(x - e) < EDGE * own, PILED) for end in bounds]  # type: ignore[misc]
+    near = [sample.fraction(lambda x, e=end: np.abs(x - e) < AT_END * own, PILED) for end in bounds]  # type: ignore[misc]
     return any(fraction > PILED + ERRORS * error for fraction, error in near)
 
 
@@ -242,13 +242,13 @@ def joint_verdict(
     if not np.isfinite(covariance).all():
         return WIDE
     if has_other_mode(along, float(mean @ direction)):
-        return MODE
+        return WRONG_MODE
     found = _ellipsoids(sampled(radii(points, mean, covariance)), mean.size)
     if found == FINE:
-        return SHAPE if pareto_k[0] - pareto_k[1] > USABLE_K else FINE
+        return WRONG_SHAPE if pareto_k[0] - pareto_k[1] > USABLE_K else FINE
     if _ellipsoids(sampled(radii(points, own_mean, own_covariance)), mean.size) != FINE:
-        return SHAPE
-    return SHAPE if _ellipsoids(sampled(radii(points, own_mean, covariance)), mean.size) == FINE else found
+        return WRONG_SHAPE
+    return WRONG_SHAPE if _ellipsoids(sampled(radii(points, own_mean, covariance)), mean.size) == FINE else found
 
 
 def ellipsoid_radii(levels: np.ndarray, dimension: int) -> np.ndarray:
@@ -259,9 +259,9 @@ def ellipsoid_radii(levels: np.ndarray, dimension: int) -> np.ndarray:
 def _ellipsoids(distances: Sample, dimension: int) -> str:
     """Return whether the ellipsoids contain as many draws as expected."""
     found = set()
-    for level, radius in zip(LEVELS, ellipsoid_radii(np.array(LEVELS), dimension), strict=True):
-        larger, error = distances.below(SCALE * radius, level)
+    for level, radius in zip(ELLIPSOID_LEVELS, ellipsoid_radii(np.array(ELLIPSOID_LEVELS), dimension), strict=True):
+        larger, error = distances.below(RADIUS_FACTOR * radius, level)
         found |= {NARROW} if larger < level - ERRORS * error else set()
-        smaller, error = distances.below(radius / SCALE, level)
+        smaller, error = distances.below(radius / RADIUS_FACTOR, level)
         found |= {WIDE} if smaller > level + ERRORS * error else set()
-    return found.pop() if len(found) == 1 else SHAPE if found else FINE
+    return found.pop() if len(found) == 1 else WRONG_SHAPE if found else FINE

@@ -19,7 +19,7 @@ from bayesperiodic._expressions import parse
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
 DERIVATIVES = ("", "d", "dd")
-LARGEST = np.finfo(float).max
+LARGEST_FLOAT = np.finfo(float).max
 VJP_FUNCTIONS = ("outputs_vjp", "equations_vjp")
 # Texts of the TypeErrors of NumPy, math and `if` when they are given symbols.
 NUMERIC_ONLY = ("ufunc", "truth value", "expression to float", "to integer", "'Symbol'")
@@ -180,7 +180,9 @@ class Model:
                 "as left - right."
             )
         numbers = given.atoms(sp.Number)
-        if given.has(sp.I, sp.zoo, sp.nan, sp.oo, -sp.oo) or any(abs(number) > sp.Float(LARGEST) for number in numbers):
+        if given.has(sp.I, sp.zoo, sp.nan, sp.oo, -sp.oo) or any(
+            abs(number) > sp.Float(LARGEST_FLOAT) for number in numbers
+        ):
             raise ValueError(f"{argument}: must be real and finite, got {_checks.shortened(given)}.")
         known = {*self.state_symbols.values(), *self.input_symbols.values()}
         known |= {*self.parameter_symbols.values(), *self.time_symbols.values()}

@@ -13,13 +13,13 @@ BASE: dict[str, Unit] = {
     "Ohm": {"kg": 1, "m": 2, "s": -3, "A": -2}, "Ω": {"kg": 1, "m": 2, "s": -3, "A": -2}, "rad": {},
     "F": {"kg": -1, "m": -2, "s": 4, "A": 2}, "H": {"kg": 1, "m": 2, "s": -2, "A": -2},
 }  # fmt: skip
-SUPERSCRIPTS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
-FACTOR = re.compile(r"([^\W\d_]+)\^?(-?\d+)?")
+FROM_SUPERSCRIPTS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+UNIT_POWER = re.compile(r"([^\W\d_]+)\^?(-?\d+)?")
 
 
 def parsed(text: str) -> Unit | None:
     """Return a unit from a text such as ``"N s/m^2"`` or ``"J/(kg K)"``; None if it is empty or not understood."""
-    plain = text.translate(SUPERSCRIPTS).replace("·", " ").replace("*", " ").replace("(", " ").replace(")", " ")
+    plain = text.translate(FROM_SUPERSCRIPTS).replace("·", " ").replace("*", " ").replace("(", " ").replace(")", " ")
     over, *under = plain.split("/")
     if not over.strip() or len(under) > 1:
         return None
@@ -28,7 +28,7 @@ def parsed(text: str) -> Unit | None:
         for word in part.split():
             if word == "1":
                 continue
-            if not (factor := FACTOR.fullmatch(word)):
+            if not (factor := UNIT_POWER.fullmatch(word)):
                 return None
             found = product(found, {factor[1]: sign * float(factor[2] or 1)})
     return found

@@ -11,22 +11,22 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import label
 
-from bayesperiodic.orbits.return_map import REACH, Atlas, LocalFit, ReturnMap
+from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, LocalFit, ReturnMap
 
 # Search: a return this close starts a chain; chains in one cell are searched once.
 CLOSE, CELL = 0.08, 0.01
-LONGEST_STEP, STEPS, CONVERGED = 0.03, 14, 2e-4
+LONGEST_CORRECTION, CORRECTIONS, CONVERGED_CORRECTION = 0.03, 14, 2e-4
 # Largest bandwidth of a map; chains closer than this are merged.
-WIDEST, MERGED = 0.06, 2e-3
+WIDEST_BANDWIDTH, MERGED = 0.06, 2e-3
 NEARLY, EXACT_STEPS = 0.02, 4
-SAME = 3e-3
+SAME_CYCLE = 3e-3
 
 # Refinement: a wider neighbourhood is used while its fit agrees with all narrower ones within this many of their
 # standard deviations; the number of widths tried and their ratio.
-AGREEMENT, SIZES, WIDENED = 2.5, 6, 2.0**0.5
-DEGREE = 3
+AGREEMENT, WIDTHS_TRIED, WIDENED = 2.5, 6, 2.0**0.5
+REFINING_DEGREE = 3
 # Smallest bandwidth in standard deviations of the noise.
-ROOM = 2.5
+SMALLEST_REFINING = 2.5
 # Refinement ends below this step, or this fraction of the noise.
 REFINING_STEPS, REFINED, REFINED_NOISE = 12, 1e-6, 1e-3
 # The bias of slopes is proportional to the third power of the bandwidth. That of values is in theory to the fourth;
@@ -40,7 +40,7 @@ Wrap = Callable[[np.ndarray], np.ndarray]
 Images = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
-class Candidate(NamedTuple):
+class MapCycle(NamedTuple):
     """A cycle of the local maps, not yet refined."""
 
     points: np.ndarray  # (period, 2)
@@ -109,13 +109,13 @@ def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool
     return any(np.abs(wrap(np.concatenate([points[d:], points[:d]]) - points)).max() < tolerance for d in divisors)
 
 
-def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) -> list[Candidate]:
+def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) -> list[MapCycle]:
     """Return the cycles of a prime period to which close returns in the section (n, 2) lead."""
     starts, members = _close_returns(maps, section, period)
     chains = section[starts[:, None] + np.arange(period)]
     step = np.empty(0)
     # The maps of the atlas are discontinuous between centres, so the last steps fit about the points themselves.
-    for images, steps, longest in ((atlas.at, STEPS, np.inf), (atlas.exactly, EXACT_STEPS, NEARLY)):
+    for images, steps, longest in ((atlas.at, CORRECTIONS, np.inf), (atlas.exactly, EXACT_STEPS, NEARLY)):
         step, heir = _converge(maps, images, chains, steps, longest)
         kept = np.array([k for k in np.unique(heir) if step[k] < NEARLY], dtype=int)
         members = [np.concatenate([members[i] for i in np.flatnonzero(heir == k)]) for k in kept]
@@ -135,9 +135,9 @@ def _converge(
         moved = chains[active]
         size, bandwidth = _newton(maps, moved, images)
         chains[active] = moved
-        lost = (bandwidth > max(WIDEST, 2.0 * noise)) | ~(size < longest)
+        lost = (bandwidth > max(WIDEST_BANDWIDTH, 2.0 * noise)) | ~(size < longest)
         step[active] = np.where(lost, np.inf, size)
-        active = active[(size > max(0.01 * CONVERGED, 0.05 * noise)) & ~lost]
+        active = active[(size > max(0.01 * CONVERGED_CORRECTION, 0.05 * noise)) & ~lost]
         cells = _cells(maps, chains[active], max(MERGED, noise))
         _, first, owner = np.unique(cells, axis=0, return_index=True, return_inverse=True)
         heir[active] = active[first][owner.ravel()]
@@ -156,7 +156,7 @@ def _newton(maps: ReturnMap, chains: np.ndarray, images: Images) -> tuple[np.nda
     defect = maps.wrap(image.reshape(*shape, 2) - np.roll(chains, -1, axis=1))
     correction = newton_step(defect, jacobian.reshape(*shape, 2, 2))
     size = np.abs(correction).max((1, 2))
-    chains += correction * np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))[:, None, None]
+    chains += correction * np.minimum(1.0, LONGEST_CORRECTION / np.maximum(size, 1e-300))[:, None, None]
     return size, bandwidth.reshape(shape).max(1)
 
 
@@ -179,13 +179,13 @@ def _close_returns(maps: ReturnMap, section: np.ndarray, period: int) -> tuple[n
 
 def _distinct(
     maps: ReturnMap, section: np.ndarray, chains: np.ndarray, step: np.ndarray, members: list[np.ndarray]
-) -> list[Candidate]:
+) -> list[MapCycle]:
     noise = float(maps.noise.max())
-    tolerance = max(SAME, 3.0 * noise)
+    tolerance = max(SAME_CYCLE, 3.0 * noise)
     # Each cycle with the first points and the shift of each of its close returns, (returns, 2).
     found: list[tuple[np.ndarray, list[np.ndarray]]] = []
     for k in np.argsort(step, kind="stable"):
-        if step[k] > max(CONVERGED, 0.1 * noise):
+        if step[k] > max(CONVERGED_CORRECTION, 0.1 * noise):
             break
         if has_shorter_period(chains[k], maps.wrap, tolerance):
             continue
@@ -202,7 +202,7 @@ def _distinct(
         starts, shifts = np.concatenate(group, axis=1)
         expected = cycle[(steps + shifts[:, None]) % len(cycle)]
         closest = int(np.argmin(np.abs(maps.wrap(section[starts[:, None] + steps] - expected)).max((1, 2))))
-        result.append(Candidate(cycle, len(starts), int(starts[closest]), int(shifts[closest])))
+        result.append(MapCycle(cycle, len(starts), int(starts[closest]), int(shifts[closest])))
     return result
 
 
@@ -236,7 +236,7 @@ def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple
     cycle, last, refined = points.copy(), np.inf, max(REFINED, REFINED_NOISE * float(maps.noise.max()))
     for step in range(REFINING_STEPS):
         final = last < refined or step == REFINING_STEPS - 1
-        fit = maps.fit_within(cycle, bandwidths, DEGREE, influence=final)
+        fit = maps.fit_within(cycle, bandwidths, REFINING_DEGREE, influence=final)
         defect = maps.wrap(fit.value - np.roll(cycle, -1, axis=0))
         correction = newton_step(defect[None], fit.jacobian[None])[0]
         size = float(np.abs(correction).max())
@@ -245,24 +245,24 @@ def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple
         if final:
             # Neighbours change as the centre moves, which leaves steps far below the errors.
             return (cycle, fit) if size < 1e-3 else None
-        cycle, last = cycle + correction * min(1.0, LONGEST_STEP / max(size, 1e-300)), size
+        cycle, last = cycle + correction * min(1.0, LONGEST_CORRECTION / max(size, 1e-300)), size
     return None
 
 
 def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndarray:
     """Return the bandwidth of each point's neighbourhood, (period,)."""
-    nearest = maps.nearest(points, int(2.25 * neighbours))[0][:, -1] / REACH
-    ladder = np.maximum(nearest, ROOM * maps.noise.max()) * WIDENED ** np.arange(SIZES)[:, None]
-    fit = maps.fit_within(points, ladder[0], DEGREE)
+    nearest = maps.nearest(points, int(2.25 * neighbours))[0][:, -1] / KERNEL_REACH
+    ladder = np.maximum(nearest, SMALLEST_REFINING * maps.noise.max()) * WIDENED ** np.arange(WIDTHS_TRIED)[:, None]
+    fit = maps.fit_within(points, ladder[0], REFINING_DEGREE)
     right, left = _eigenvectors(fit.jacobian, 0)
-    targets, sds = np.empty((2, SIZES, len(points), 3))
+    targets, sds = np.empty((2, WIDTHS_TRIED, len(points), 3))
     active, accepted = np.arange(len(points)), np.zeros(len(points), dtype=int)
     for size, bandwidths in enumerate(ladder):
         if size > 0:
             active = active[maps.count_within(points[active], bandwidths[active]) <= len(maps.arguments) // 8]
             if not active.size:
                 break
-            fit = maps.fit_within(points[active], bandwidths[active], DEGREE)
+            fit = maps.fit_within(points[active], bandwidths[active], REFINING_DEGREE)
         targets[size, active], sds[size, active] = _along(fit, left[active], right[active])
         away = np.abs(targets[size, active] - targets[:size, active])
         active = active[~np.any(away > AGREEMENT * sds[:size, active], axis=(0, 2))]
@@ -319,7 +319,7 @@ def _joint_covariance(fit: LocalFit) -> np.ndarray:
 
 def box_orbits(
     maps: ReturnMap, section: np.ndarray, period: int, neighbours: int, box: float
-) -> list[tuple[Candidate, Estimate]]:
+) -> list[tuple[MapCycle, Estimate]]:
     """Return the orbits of one period by the method "boxes" of `find_orbits`.
 
     A point that is in its own or an adjacent box again after `period` steps is recurrent; adjacent boxes with several
@@ -328,7 +328,7 @@ def box_orbits(
     """
     count = int(2.25 * neighbours)
     iterates = [_iterated(maps, section, k) for k in range(1, period + 1)]
-    found: list[tuple[Candidate, Estimate]] = []
+    found: list[tuple[MapCycle, Estimate]] = []
     for centre, members in _recurrent_boxes(maps, section, period, box):
         fit = iterates[-1].fit(centre[None], count, 1)
         step = newton_step(maps.wrap(fit.value - centre)[None], fit.jacobian[None])[0, 0]
@@ -352,7 +352,7 @@ def box_orbits(
         if any(shift_between(points, other.points, maps.wrap)[0] < 2.0 * box for _, other in found):
             continue
         away = maps.distance(section[members], points[0])
-        found.append((Candidate(points, len(members), int(members[np.argmin(away)]), 0), estimate))
+        found.append((MapCycle(points, len(members), int(members[np.argmin(away)]), 0), estimate))
     return found
 
 

@@ -11,12 +11,12 @@ from scipy.stats import chi2
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
-from bayesperiodic.orbits.cycles import Candidate, Estimate
+from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
-from bayesperiodic.orbits.return_map import REACH, Atlas, ReturnMap, check_chaos, estimate_noise
+from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, ReturnMap, check_chaos, estimate_noise
 from bayesperiodic.orbits.section import PoincareSection, wrapped
 
-METHODS = ("chained", "boxes")
+SEARCHES = ("chained", "boxes")
 QUALITY_DEGREE, FEWEST_NEIGHBOURS = 3, 32
 # Bandwidth of the local fits of the search, in standard deviations of the noise.
 SEARCH_WIDTH = 4.0
@@ -25,7 +25,7 @@ LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
-STILL, SPREAD = 0.02, 20.0
+STILL_RANGE, STILL_NOISE = 0.02, 20.0
 
 
 class _ScaledSection(NamedTuple):
@@ -92,7 +92,7 @@ def find_orbits(
     """
     _checks.instance("section", section, PoincareSection)
     wanted = _periods(periods, len(section))
-    _checks.one_of("method", method, METHODS)
+    _checks.one_of("method", method, SEARCHES)
     neighbours, box = _checks.integer("neighbours", neighbours, 16), _checks.positive("box", box)
     scaled = _scaled(section, neighbours)
     if method == "boxes":
@@ -140,15 +140,15 @@ def _search_count(maps: ReturnMap, neighbours: int) -> int:
     centres = maps.arguments[:: max(1, len(maps.arguments) // 500)]
     count = int(2.25 * neighbours)
     while count < len(maps.arguments) // 100:
-        if np.median(maps.nearest(centres, count)[0][:, -1]) / REACH > SEARCH_WIDTH * maps.noise.max():
+        if np.median(maps.nearest(centres, count)[0][:, -1]) / KERNEL_REACH > SEARCH_WIDTH * maps.noise.max():
             break
         count = int(1.5 * count)
     return count
 
 
-def _chained(scaled: _ScaledSection, atlas: Atlas, period: int, neighbours: int) -> list[tuple[Candidate, Estimate]]:
+def _chained(scaled: _ScaledSection, atlas: Atlas, period: int, neighbours: int) -> list[tuple[MapCycle, Estimate]]:
     maps = scaled.maps
-    found: list[tuple[Candidate, Estimate]] = []
+    found: list[tuple[MapCycle, Estimate]] = []
 
     def same(one: Estimate, other: Estimate) -> bool:
         distance, _ = cycles.shift_between(one.points, other.points, maps.wrap)
@@ -169,7 +169,7 @@ def _largest_sd(estimate: Estimate) -> float:
 
 
 def _orbit(
-    section: PoincareSection, scaled: _ScaledSection, candidate: Candidate, estimate: Estimate, quality: float
+    section: PoincareSection, scaled: _ScaledSection, candidate: MapCycle, estimate: Estimate, quality: float
 ) -> Orbit:
     period = len(estimate.points)
     size = 2 * period
@@ -201,11 +201,11 @@ def _orbit(
 
 def _at_rest(section: PoincareSection, scaled: _ScaledSection, cycle: dict[str, np.ndarray]) -> bool:
     """Return whether a measured cycle moves no more than by noise and its distance to the orbit."""
-    limit = (STILL + SPREAD * scaled.maps.noise) * scaled.extent
+    limit = (STILL_RANGE + STILL_NOISE * scaled.maps.noise) * scaled.extent
     return all(np.ptp(cycle[name]) < limit[k] for k, name in enumerate(section.coordinates))
 
 
-def _quality(scaled: _ScaledSection, candidate: Candidate, estimate: Estimate, neighbours: int) -> float:
+def _quality(scaled: _ScaledSection, candidate: MapCycle, estimate: Estimate, neighbours: int) -> float:
     """Return the p-value of the closest return under the maps along the orbit."""
     maps, period = scaled.maps, len(estimate.points)
     steps = np.arange(period + 1)

@@ -19,7 +19,7 @@ from bayesperiodic.periodic.solution import PeriodicSolution, describe, multipli
 from bayesperiodic.periodic.solve import solve_driven
 
 # In units of the attractor's size: solutions that coincide, the largest range of a state of rest.
-SAME, STILL = 1e-5, 1e-6
+SAME_SOLUTION, SMALLEST_MOTION = 1e-5, 1e-6
 # Largest distance of a solution from the measured orbit, in standard errors.
 MOST_ERRORS = 5.0
 # Signs of multipliers are compared up to this standard deviation of log|μ| and this phase.
@@ -178,7 +178,7 @@ class _Polisher:
             return None
         points, others = sign * self._section_points(one), self._section_points(other)
         distance, shift = shift_between(points, others, lambda away: self._wrap(away) / self.scales)
-        return shift if distance <= SAME else None
+        return shift if distance <= SAME_SOLUTION else None
 
     def _wrap(self, points: np.ndarray) -> np.ndarray:
         """Return points or differences (…, coordinates) with angles in (−π, π]."""
@@ -209,7 +209,7 @@ class _Polisher:
             return orbit, f"the periodic solve ended with {STATUSES[solved.code]!r}"
         columns = [self.model.outputs.index(name) for name in orbit.coordinates]
         outputs = equations.outputs(solved.z, self.theta)[:, columns]
-        still = not equations.drift.any() and bool(np.all(np.ptp(outputs, axis=0) <= STILL * self.scales))
+        still = not equations.drift.any() and bool(np.all(np.ptp(outputs, axis=0) <= SMALLEST_MOTION * self.scales))
         repetitions = int(equations.kernels.repetitions(solved.z, equations.grid.periods))
         times = orbit.period if still else repetitions
         winding = sum(equations.winding.values()) // times

@@ -10,18 +10,18 @@ from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 # Powers of the two coordinates, degree by degree, and the factorials that make the coefficients derivatives.
-POWERS = np.array([(degree - k, k) for degree in range(7) for k in range(degree + 1)])
+MONOMIAL_POWERS = np.array([(degree - k, k) for degree in range(7) for k in range(degree + 1)])
 FACTORIALS = np.array([1.0, 1.0, 1.0, 2.0, 1.0, 2.0, 6.0, 2.0, 2.0, 6.0])
 TERMS = {1: 3, 2: 6, 3: 10, 4: 15, 6: 28}
 # Fewest neighbours of a fit of given bandwidth.
-FEWEST = 30
+FEWEST_FITTED = 30
 # Neighbours are used up to this many bandwidths, where the kernel is 1.1 % of its maximum.
-REACH = 3.0
+KERNEL_REACH = 3.0
 # Largest noise as a fraction of the bandwidth; deconvolution needs less than one.
 MOST_NOISE = 0.75
 MOST_LEVERAGE = 0.9
 # Limits of memory: products of regressors in one call, neighbours of all fits of an atlas.
-BLOCK, MOST_NEIGHBOURS = 4_000_000, 6_000_000
+MOST_PRODUCTS, MOST_NEIGHBOURS = 4_000_000, 6_000_000
 
 
 class LocalFit(NamedTuple):
@@ -97,15 +97,15 @@ class ReturnMap:
 
     def count_within(self, centres: np.ndarray, bandwidths: np.ndarray) -> np.ndarray:
         """Return the number of neighbours (m,) of fits about the centres (m, 2) with the bandwidths (m,)."""
-        radii = REACH * bandwidths
+        radii = KERNEL_REACH * bandwidths
         return np.asarray(self._tree.query_ball_point(self.wrap_points(centres), radii, return_length=True))
 
     def fit(self, centres: np.ndarray, count: int, degree: int, *, influence: bool = True) -> LocalFit:
         """Fit polynomials about the centres (m, 2) to their `count` nearest neighbours; faster without `influence`."""
-        parts, size = [], max(1, BLOCK // (count * TERMS[2 * degree]))
+        parts, size = [], max(1, MOST_PRODUCTS // (count * TERMS[2 * degree]))
         for block in (centres[k : k + size] for k in range(0, len(centres), size)):
             distance, index = self.nearest(block, count)
-            parts.append(self._fit(block, distance[:, -1] / REACH, index, np.array([True]), degree, influence))
+            parts.append(self._fit(block, distance[:, -1] / KERNEL_REACH, index, np.array([True]), degree, influence))
         return LocalFit(*map(np.concatenate, zip(*parts, strict=True)))
 
     def fit_within(
@@ -115,9 +115,9 @@ class ReturnMap:
 
         The neighbours are repeated to equal numbers, without influence.
         """
-        distance, nearest = self.nearest(centres, FEWEST)
-        bandwidths = np.maximum(bandwidths, distance[:, -1] / REACH)
-        near = self._tree.query_ball_point(self.wrap_points(centres), REACH * bandwidths)
+        distance, nearest = self.nearest(centres, FEWEST_FITTED)
+        bandwidths = np.maximum(bandwidths, distance[:, -1] / KERNEL_REACH)
+        near = self._tree.query_ball_point(self.wrap_points(centres), KERNEL_REACH * bandwidths)
         counts = np.array([len(members) for members in near])[:, None]
         position = np.arange(counts.max() + 1)
         # The nearest comes first, and again in its place.
@@ -130,7 +130,7 @@ class ReturnMap:
     def predict(fit: LocalFit, away: np.ndarray) -> np.ndarray:
         """Return images (m, …, 2) at displacements (m, …, 2) from the centres."""
         terms = fit.derivatives.shape[1]
-        monomials = np.stack([away[..., 0] ** a * away[..., 1] ** b for a, b in POWERS[1:terms]], axis=-1)
+        monomials = np.stack([away[..., 0] ** a * away[..., 1] ** b for a, b in MONOMIAL_POWERS[1:terms]], axis=-1)
         slopes = fit.derivatives[:, 1:] / FACTORIALS[1:terms, None]
         shape = (len(away), *(1,) * (away.ndim - 2), 2)
         return fit.value.reshape(shape) + np.einsum("m...t,mtc->m...c", monomials, slopes)
@@ -157,7 +157,7 @@ class ReturnMap:
             image = self.wrap(image)
         one, other = _deconvoluted(away / bandwidth[:, None, None], self.noise / bandwidth[:, None], 2 * degree)
         one *= inside[:, None]
-        powers, weight = POWERS[: TERMS[degree]], one[:, 0]
+        powers, weight = MONOMIAL_POWERS[: TERMS[degree]], one[:, 0]
         regressors = one[:, powers[:, 0]] * other[:, powers[:, 1]]
         sums = powers[:, None] + powers
         inverse = np.linalg.pinv((one @ other.mT)[:, sums[..., 0], sums[..., 1]], rcond=1e-10, hermitian=True)
@@ -167,7 +167,7 @@ class ReturnMap:
         influence = np.empty((len(centres), 0, len(powers), 2))
         if wants_influence:
             # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
-            products = POWERS[: TERMS[2 * degree]]
+            products = MONOMIAL_POWERS[: TERMS[2 * degree]]
             functions = one[:, products[:, 0]] * other[:, products[:, 1]]
             belongs = np.all(sums[..., None, :] == products, axis=-1).astype(float)
             fitted = np.einsum("abf,mbc,mka->mkcf", belongs, solution, inverse, optimize=True)
@@ -228,9 +228,9 @@ class Atlas:
         return fit.value, fit.jacobian, fit.bandwidth
 
 
-NOISE_CENTRES, ROUNDS = 600, 8
+NOISE_CENTRES, NOISE_ROUNDS = 600, 8
 # Smallest bandwidth of a quadratic return map, in standard deviations of the noise.
-ROOM = 4.0
+SMALLEST_BANDWIDTH = 4.0
 
 
 def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
@@ -245,7 +245,7 @@ def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
     for _ in range(3):
         width = maps.nearest(centres, count)[0][:, -1]
         noise = _noise_at(maps, centres[width <= np.median(width)], count)
-        if np.median(width) / REACH > ROOM * noise.max() or count * 2 > len(maps.arguments) // 8:
+        if np.median(width) / KERNEL_REACH > SMALLEST_BANDWIDTH * noise.max() or count * 2 > len(maps.arguments) // 8:
             break
         count *= 2
     return noise
@@ -257,7 +257,7 @@ def _noise_at(maps: ReturnMap, centres: np.ndarray, count: int) -> np.ndarray:
     target = maps.residual_variance(centres, fit).reshape(-1)
     weight = 1.0 / np.maximum(target, 1e-30)
     solution = np.zeros(2)
-    for _ in range(ROUNDS):
+    for _ in range(NOISE_ROUNDS):
         solution, _ = nnls(rows * weight[:, None], target * weight)
         predicted = rows @ solution
         # Residuals far above the prediction are curvature, not noise.
@@ -270,14 +270,14 @@ LONGEST_PERIOD = 32
 SAME_POINT, UNPREDICTED = 0.05, 0.2
 # Neighbours that diverge by less than this factor in this many steps show no chaos.
 DIVERGED, DIVERGING_STEPS = 2.5, 6
-PROBES = 400
+DIVERGING_PROBES = 400
 NEIGHBOUR = 8
 
 
 def check_chaos(maps: ReturnMap, section: np.ndarray) -> None:
     """Raise a ValueError, which names the kind of motion, unless the section (n, 2) shows a chaotic return map."""
     generator = np.random.default_rng(0)
-    one, other = generator.integers(len(section), size=(2, 4 * PROBES))
+    one, other = generator.integers(len(section), size=(2, 4 * DIVERGING_PROBES))
     random = np.median(maps.distance(section[one], section[other]))
     for period in range(1, min(LONGEST_PERIOD, len(section) // 10) + 1):
         if np.median(maps.distance(section[period:], section[:-period])) < SAME_POINT * random:
@@ -285,7 +285,9 @@ def check_chaos(maps: ReturnMap, section: np.ndarray) -> None:
                 f"section: must be of a chaotic motion, got one of period {period}. Use recording.fold with "
                 f"periods={period} instead."
             )
-    centre = generator.choice(len(maps.arguments) - DIVERGING_STEPS, min(PROBES, len(section) // 4), replace=False)
+    centre = generator.choice(
+        len(maps.arguments) - DIVERGING_STEPS, min(DIVERGING_PROBES, len(section) // 4), replace=False
+    )
     neighbour = _neighbours(maps, centre)
     now = np.median(maps.distance(section[centre], section[neighbour]))
     images = np.median(maps.distance(section[centre + 1], section[neighbour + 1]))

@@ -14,12 +14,12 @@ from bayesperiodic.data.recording import Recording
 DEGREES = 180.0 / np.pi
 FEWEST_SAMPLES, FEWEST_POINTS, CYCLE_SAMPLES = 8, 200, 64
 # Local polynomials: degree for the values; degree and number of samples for the variance of the noise.
-DEGREE, NOISE_DEGREE, NOISE_SAMPLES = 7, 11, 14
+VALUE_DEGREE, NOISE_DEGREE, NOISE_SAMPLES = 7, 11, 14
 # Half the number of samples in the smallest window.
-SMALLEST = (DEGREE + 1) // 2
+SMALLEST_WINDOW = (VALUE_DEGREE + 1) // 2
 # The window is narrower by this factor than the first window with a significant bias.
-MARGIN = 1.6
-BLOCK = 20_000
+WINDOW_MARGIN = 1.6
+CROSSINGS_EACH = 20_000
 
 
 @dataclass(frozen=True)
@@ -381,8 +381,8 @@ def _estimate(time: np.ndarray, signals: np.ndarray, at: np.ndarray) -> tuple[np
     # A higher degree on few samples: noise dominates the residual.
     variance = _fit(time, signals, at, NOISE_SAMPLES // 2, NOISE_DEGREE)[2].mean(0)
     count = signals.shape[1]
-    halves, unbiased = [SMALLEST], np.ones(count, dtype=bool)
-    widest = max(SMALLEST, int(0.5 * (time.size - 1) / (time[-1] - time[0]) * np.median(np.diff(at))))
+    halves, unbiased = [SMALLEST_WINDOW], np.ones(count, dtype=bool)
+    widest = max(SMALLEST_WINDOW, int(0.5 * (time.size - 1) / (time[-1] - time[0]) * np.median(np.diff(at))))
     first_biased = np.full(count, widest)
     while (half := halves[-1] + max(1, halves[-1] // 5)) <= widest and unbiased.any():
         wide, gain, _ = _fit(time, signals, at, half)
@@ -393,15 +393,15 @@ def _estimate(time: np.ndarray, signals: np.ndarray, at: np.ndarray) -> tuple[np
         halves.append(half)
     values, sd = narrow.copy(), np.sqrt(variance * narrow_gain.mean())
     for channel in range(count):
-        half = max(h for h in halves if h == SMALLEST or h * MARGIN <= first_biased[channel])
-        if half > SMALLEST:
+        half = max(h for h in halves if h == SMALLEST_WINDOW or h * WINDOW_MARGIN <= first_biased[channel])
+        if half > SMALLEST_WINDOW:
             fitted, gain, _ = _fit(time, signals[:, [channel]], at, half)
             values[:, channel], sd[channel] = fitted[:, 0], np.sqrt(variance[channel] * gain.mean())
     return values, sd
 
 
 def _fit(
-    time: np.ndarray, signals: np.ndarray, at: np.ndarray, half: int = SMALLEST, degree: int = DEGREE
+    time: np.ndarray, signals: np.ndarray, at: np.ndarray, half: int = SMALLEST_WINDOW, degree: int = VALUE_DEGREE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return values, their variance for unit noise, and the residual variance of polynomials on 2·half samples each."""
     count = 2 * half
@@ -409,10 +409,12 @@ def _fit(
     centre = np.polynomial.legendre.legvander(np.zeros(1), degree)[0]
     free = max(count - degree - 1, 1)
     values, gains, residuals = [], [], []
-    for k in range(0, len(at), BLOCK):
-        index = first[k : k + BLOCK, None] + np.arange(count)
+    for k in range(0, len(at), CROSSINGS_EACH):
+        index = first[k : k + CROSSINGS_EACH, None] + np.arange(count)
         width = 0.5 * (time[index[:, -1]] - time[index[:, 0]])
-        basis = np.polynomial.legendre.legvander((time[index] - at[k : k + BLOCK, None]) / width[:, None], degree)
+        basis = np.polynomial.legendre.legvander(
+            (time[index] - at[k : k + CROSSINGS_EACH, None]) / width[:, None], degree
+        )
         normal = basis.transpose(0, 2, 1) @ basis
         local = signals[index]
         reference = local[:, half]

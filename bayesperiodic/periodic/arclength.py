@@ -99,13 +99,13 @@ MAX_POINTS = 2000
 SMALLEST_STEP = 1e-6
 LARGEST_TURN = 0.8
 FEW_ITERATIONS, MANY_ITERATIONS = 3, 6
-GROWTH = 1.5
+STEP_GROWTH = 1.5
 
 
 Change = tuple[np.ndarray, np.ndarray]  # of z (points, states) and of the unknowns' values (unknowns,)
 
 
-class Point(NamedTuple):
+class BranchPoint(NamedTuple):
     """A point of a branch: z, the unknowns' values, the unit tangent, the arclength, the kind."""
 
     z: np.ndarray
@@ -148,13 +148,13 @@ class Tracer:
             return None
         return self.unit((solved[0][0], solved[1][0]))
 
-    def correct(self, start: Point, step: float) -> tuple[Point, int] | None:
+    def correct(self, start: BranchPoint, step: float) -> tuple[BranchPoint, int] | None:
         """Return the point of the branch a step along the tangent from another, and the iterations it took."""
         z, values = start.z + step * start.tangent[0], start.values + step * start.tangent[1]
         rows, corner = self._conditions(z, start.tangent)
         return self._solve(start, z, values, rows, corner, step)
 
-    def stop_at(self, start: Point, end: Point, value: float) -> Point | None:
+    def stop_at(self, start: BranchPoint, end: BranchPoint, value: float) -> BranchPoint | None:
         """Return the point between two others where the first unknown has a value."""
         share = (value - start.values[0]) / (end.values[0] - start.values[0])
         z, values = start.z + share * (end.z - start.z), start.values + share * (end.values - start.values)
@@ -172,15 +172,15 @@ class Tracer:
         """Return the length of a change of z and the values."""
         return float(np.sqrt(self._product(change, change)))
 
-    def longest(self, point: Point, largest: float) -> float:
+    def longest(self, point: BranchPoint, largest: float) -> float:
         """Return the largest step: longer for a larger orbit, but never above the largest in the first unknown."""
         grown = max(1.0, float((np.ptp(point.z, axis=0) / self._size).max()))
         share = abs(point.tangent[1][0]) / self._value_scales[0]
         return largest * min(grown, 1.0 / max(share, 1e-12))
 
     def _solve(
-        self, start: Point, z: np.ndarray, values: np.ndarray, rows: np.ndarray, corner: np.ndarray, step: float
-    ) -> tuple[Point, int] | None:
+        self, start: BranchPoint, z: np.ndarray, values: np.ndarray, rows: np.ndarray, corner: np.ndarray, step: float
+    ) -> tuple[BranchPoint, int] | None:
         targets = np.einsum("rps,ps->r", rows, z) + corner @ values
         found = self.parametrised.solve(z, values, rows, corner, targets, self._value_scales)
         if found.code != CONVERGED:
@@ -188,7 +188,7 @@ class Tracer:
         tangent = self.tangent(found.z, found.values, start.tangent)
         if tangent is None:
             return None
-        return Point(found.z, found.values, tangent, start.distance + step), len(found.history)
+        return BranchPoint(found.z, found.values, tangent, start.distance + step), len(found.history)
 
     def _conditions(self, z: np.ndarray, tangent: Change) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and corner of: distance along a tangent; for an autonomous model, the phase against z."""
@@ -207,7 +207,7 @@ class Tracer:
         length = self.length(change)
         return change[0] / length, change[1] / length
 
-    def follows(self, before: Point, after: Point, step: float) -> bool:
+    def follows(self, before: BranchPoint, after: BranchPoint, step: float) -> bool:
         """Return whether a corrected point continues the branch, and did not jump to another."""
         moved = self.length((after.z - before.z, after.values - before.values))
         return moved < 2.0 * step and self._product(before.tangent, after.tangent) > LARGEST_TURN
@@ -221,8 +221,8 @@ def trace(
     until: float,
     step: float,
     size: np.ndarray | None = None,
-    refine: Callable[["Tracer", Point, Point], list[Point]] | None = None,
-) -> Iterator[Point]:
+    refine: Callable[["Tracer", BranchPoint, BranchPoint], list[BranchPoint]] | None = None,
+) -> Iterator[BranchPoint]:
     """Yield the points of a branch from a solution until the first unknown reaches a value or passes its start.
 
     Only the solution is yielded if the branch has no unique tangent there or turns back (at a fold). `step` is the
@@ -233,7 +233,7 @@ def trace(
     origin = float(values[0])
     direction = 1.0 if until > origin else -1.0
     tangent = tracer.first_tangent(z, values, direction)
-    here = Point(z, values, tangent or (np.zeros_like(z), np.zeros_like(values)), 0.0)
+    here = BranchPoint(z, values, tangent or (np.zeros_like(z), np.zeros_like(values)), 0.0)
     yield here
     if tangent is None:
         return
@@ -260,7 +260,7 @@ def trace(
             return
         here = after
         if iterations <= FEW_ITERATIONS:
-            length = min(length * GROWTH, tracer.longest(here, largest))
+            length = min(length * STEP_GROWTH, tracer.longest(here, largest))
         elif iterations > MANY_ITERATIONS:
             length /= 2
 
@@ -274,8 +274,8 @@ def _passed(value: float, origin: float, until: float) -> float | None:
 
 
 ARRIVED, ROUND_FOLDS, FOLD = "arrived", "round folds", "fold"
-EQUILIBRIUM, SHORTER, LOST = "equilibrium", "shorter period", "lost"
-STEP, MOST_POINTS = 0.1, 300
+EQUILIBRIUM, SHORTER, PATH_LOST = "equilibrium", "shorter period", "lost"
+PATH_STEP, MOST_PATH_POINTS = 0.1, 300
 
 
 def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.ndarray) -> str:
@@ -295,7 +295,7 @@ def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.nd
     once, folded = equations.kernels.repetitions(anchor.z, equations.grid.periods), False
     before = anchor.z
     with np.errstate(all="ignore"):
-        for point in islice(trace(parametrised, anchor.z, values, until=1.0, step=STEP), MOST_POINTS):
+        for point in islice(trace(parametrised, anchor.z, values, until=1.0, step=PATH_STEP), MOST_PATH_POINTS):
             if autonomous and _is_reversed(point.z, before):
                 return EQUILIBRIUM
             if equations.kernels.repetitions(point.z, equations.grid.periods) > once:
@@ -304,7 +304,7 @@ def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.nd
                 return ROUND_FOLDS if folded else ARRIVED
             folded |= bool(point.tangent[1][0] < 0.0)
             before = point.z
-    return FOLD if folded else LOST
+    return FOLD if folded else PATH_LOST
 
 
 def _is_reversed(z: np.ndarray, before: np.ndarray) -> bool:

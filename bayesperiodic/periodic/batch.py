@@ -15,9 +15,9 @@ from bayesperiodic.periodic.compiled import (
     Anchors,
     BatchSolution,
     Border,
+    CycleAnchors,
     Factors,
     Functions,
-    Orbits,
     Sets,
     kernels,
 )
@@ -31,9 +31,9 @@ from bayesperiodic.periodic.equations import (
     workspace,
 )
 
-SMALLEST_PART, PARTS_EACH = 4, 4
-SWEEPS = 3
-SMALL = 1e-4
+SMALLEST_BLOCK, PARTS_EACH = 4, 4
+INVERSE_ITERATIONS = 3
+SMALL_DISTANCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Batch:
             sensitivities,
             amplitude,
             gradient,
-            first.kernels.FAR * ratios.min(axis=1),
+            first.kernels.OFF_ANCHOR * ratios.min(axis=1),
             factors,
             left,
             right,
@@ -139,7 +139,7 @@ class Batch:
         solve_many, functions = self._compiled
         before = functions, grid.packed, grid.periods, self._sets, self._anchors, every
         after = polish, first.model.kernels.output_rates, solution
-        _in_blocks(lambda block: solve_many(*before, *block, *after), solution.status.size, SMALLEST_PART, threads)
+        _in_blocks(lambda block: solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads)
         return solution
 
     def vjp(
@@ -165,7 +165,7 @@ class Batch:
             factors = empty_factors(grid, self._first.count)
             compiled.vjp_many(addresses, grid.packed, self._sets, *points, factors, *block, gradients)
 
-        _in_blocks(part, self._size, SMALLEST_PART, threads, each=1)
+        _in_blocks(part, self._size, SMALLEST_BLOCK, threads, each=1)
         return gradients
 
 
@@ -196,7 +196,7 @@ class AutonomousBatch:
         for e, anchor in enumerate(anchors):
             if anchor.sensitivities is not None and anchor.frequency_sensitivities is not None:
                 sensitivities[e], slopes[e] = anchor.sensitivities, anchor.frequency_sensitivities
-        self._orbits = Orbits(
+        self._orbits = CycleAnchors(
             parameters,
             z,
             frequency,
@@ -263,7 +263,7 @@ def smallest_singular_vectors(
     size = equations.sizes(z, columns)
     units, terms = np.where(amplitude > 0, amplitude, 1.0), np.where(size > 0, size, 1.0)
     right = np.broadcast_to(units, z.shape)
-    for _ in range(SWEEPS):
+    for _ in range(INVERSE_ITERATIONS):
         left = factors.solve_transposed(right / units**2) * terms**2
         left /= np.linalg.norm(left / terms)
         right = factors.solve(left)
@@ -290,8 +290,8 @@ def stiffness_gradient(
     units = np.where(amplitude > 0.0, amplitude, 1.0)
     weights = np.einsum("ne,nq->neq", left, right).ravel()
     for p in np.flatnonzero(sensitivities.any(axis=(1, 2))):
-        small = SMALL / np.max(np.abs(sensitivities[p]) / units)
-        small = min(small, SMALL * abs(parameters[p])) if parameters[p] != 0.0 else small
+        small = SMALL_DISTANCE / np.max(np.abs(sensitivities[p]) / units)
+        small = min(small, SMALL_DISTANCE * abs(parameters[p])) if parameters[p] != 0.0 else small
         ends = []
         for step in (small, -small):
             moved = parameters + step * (np.arange(parameters.size) == p)

@@ -26,11 +26,11 @@ STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit", "no
 CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT, NOT_RESOLVED = range(len(STATUSES))
 MAX_SEGMENTS = 12
 NO_FACTORS = -1
-MAX_ITERATIONS = 50
-MAX_HALVINGS = 20
+MOST_NEWTON_STEPS = 50
+HALVINGS = 20
 STEP_TOLERANCE = 1e-9
 UNROLLED_STATES = 3
-SAME = 1e-6  # largest difference of repetitions, in units of the range
+SAME_REPETITIONS = 1e-6  # largest difference of repetitions, in units of the range
 SHRUNK = 1e-6  # largest range of an equilibrium, in units of the guess's
 ABSENT = 1e-6  # largest relative amplitude of an absent harmonic
 
@@ -155,7 +155,7 @@ class Anchors(NamedTuple):
     right: np.ndarray
 
 
-class Orbits(NamedTuple):
+class CycleAnchors(NamedTuple):
     """Anchors of an autonomous batch, arrays (sets, …); see `batch.Anchor`."""
 
     parameters: np.ndarray
@@ -185,7 +185,7 @@ def named(kind: type, *fields: types.Type) -> types.NamedTuple:
     return types.NamedTuple(fields, kind)
 
 
-FUNCTIONS = types.NamedUniTuple(COUNT, len(Functions._fields), Functions)
+ADDRESSES = types.NamedUniTuple(COUNT, len(Functions._fields), Functions)
 GRID = named(Grid, VECTOR, VECTOR, INDICES, INDICES, PLACES, VECTOR, COUNT, COUNT)
 SETTING = named(Setting, MATRIX, VECTOR, NUMBER, VECTOR)
 FACTORS = named(Factors, MATRIX, PLACES, CUBE, GAINS, CUBE, PLACES, VECTOR, PLACES)
@@ -196,12 +196,12 @@ SETS = named(Sets, CUBE, VECTOR, MATRIX)
 ALL_FACTORS = named(Factors, CUBE, INDICES, GAINS, types.Array(NUMBER, 5, "C"), GAINS, INDICES, MATRIX, INDICES)
 ANCHORS = named(Anchors, MATRIX, CUBE, GAINS, MATRIX, MATRIX, VECTOR, ALL_FACTORS, CUBE, CUBE)
 ALL_BORDERS = named(Border, CUBE, CUBE, CUBE, CUBE, INDICES)
-ORBITS = named(Orbits, MATRIX, CUBE, VECTOR, GAINS, MATRIX, CUBE, INDICES, ALL_BORDERS, VECTOR, VECTOR)
+CYCLE_ANCHORS = named(CycleAnchors, MATRIX, CUBE, VECTOR, GAINS, MATRIX, CUBE, INDICES, ALL_BORDERS, VECTOR, VECTOR)
 SOLUTION = named(BatchSolution, GAINS, GAINS, MATRIX, INDICES, INDICES)
 
 
 # What each module of compiled functions is compiled from: the source, and the module whose names are defined in it.
-MODULES = {
+SOURCES = {
     "linear": ("linear", None),
     "border": ("border", "linear"),
     "newton": ("newton", "linear"),
@@ -213,14 +213,14 @@ MODULES = {
 
 
 def kernels(name: str, states: int, stencil: tuple[int, int, int]) -> ModuleType:
-    """Return one of `MODULES` for a number of states and a `schemes.CyclicGrid.stencil`."""
+    """Return one of `SOURCES` for a number of states and a `schemes.CyclicGrid.stencil`."""
     sizes = (states, *stencil) if states <= UNROLLED_STATES and any(stencil) else (0, 0, 0, 0)
     return _kernels(name, sizes)
 
 
 @cache
 def _kernels(name: str, sizes: tuple[int, ...]) -> ModuleType:
-    text, base = MODULES[name]
+    text, base = SOURCES[name]
     if not base:
         return load(source(text), _constants(name, sizes))
     with _other_process(name, sizes):
@@ -229,19 +229,19 @@ def _kernels(name: str, sizes: tuple[int, ...]) -> ModuleType:
 
 
 def _constants(name: str, sizes: tuple[int, ...]) -> dict[str, Any]:
-    return {"SIZES": sizes, "BORDERED": MODULES[name][1] == "border", "DEFINITIONS": _digest()}
+    return {"SIZES": sizes, "BORDERED": SOURCES[name][1] == "border", "DEFINITIONS": _digest()}
 
 
 @contextmanager
 def _other_process(name: str, sizes: tuple[int, ...]) -> Iterator[None]:
-    """Compile one of `MODULES` in another process, while this one compiles the one that it is based on.
+    """Compile one of `SOURCES` in another process, while this one compiles the one that it is based on.
 
     Neither needs what the other compiles before it runs. If the other process cannot be started or fails, its entry is
     missing in the cache, and is compiled here.
     """
-    base = MODULES[name][1] or ""
-    alone = MODULES[base][1] or not Path(sys.executable or "").stem.startswith("python") or available_cores() < 2
-    if alone or is_stored(source(MODULES[base][0]), _constants(base, sizes)):
+    base = SOURCES[name][1] or ""
+    alone = SOURCES[base][1] or not Path(sys.executable or "").stem.startswith("python") or available_cores() < 2
+    if alone or is_stored(source(SOURCES[base][0]), _constants(base, sizes)):
         yield
         return
     call = f"from {__name__} import compile_alone; compile_alone({name!r}, {sizes!r})"
@@ -255,10 +255,10 @@ def _other_process(name: str, sizes: tuple[int, ...]) -> Iterator[None]:
 
 
 def compile_alone(name: str, sizes: tuple[int, ...]) -> None:
-    """Compile one of `MODULES` for the cache without the one that it is based on, and end the process."""
-    text, base = MODULES[name]
+    """Compile one of `SOURCES` for the cache without the one that it is based on, and end the process."""
+    text, base = SOURCES[name]
     gc.disable()
-    declared = declare(source(MODULES[base or ""][0]), _constants(base or "", sizes))
+    declared = declare(source(SOURCES[base or ""][0]), _constants(base or "", sizes))
     load(source(text), _constants(name, sizes), declared)
     os._exit(0)  # without clearing the memory, which takes half a second
 

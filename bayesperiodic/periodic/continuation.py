@@ -16,7 +16,7 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, Point, Tracer, trace
+from bayesperiodic.periodic.arclength import INPUTS, BranchPoint, ParametrisedEquations, Tracer, trace
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved, null_vector
 from bayesperiodic.periodic.solution import PeriodicSolution, describe, equations_of
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 FOLD, PERIOD_DOUBLING = "fold", "period doubling"
-STEPS = 50
+BRANCH_STEPS = 50
 LOCATED = 1e-9
 FOUND_BY = "continuation"
 DOUBLED = 0.005
@@ -236,7 +236,7 @@ def iterate_periodic(
         _checks.positive("until", until)
     if until == values[0]:
         raise ValueError(f"until: must differ from the start value of {vary}, got {until!r}.")
-    step = abs(until - values[0]) / STEPS if step is None else _checks.positive("step", step)
+    step = abs(until - values[0]) / BRANCH_STEPS if step is None else _checks.positive("step", step)
     solved = _remembered(parametrised)
     for point in trace(parametrised, z, values, until=until, step=step, refine=partial(_special_points, solved)):
         yield float(point.values[0]), solved(point), point.kind
@@ -296,7 +296,7 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
     doubling = null_vector(twice.grid, columns, twice.count, twice.frequency)
     doubling = 0.5 * (doubling - np.roll(doubling, len(z), axis=0))
     tracer = Tracer(parametrised, np.ptp(start, axis=0), values, 2.0 * values[0] + 1.0)
-    point = Point(start, values, tracer.unit((doubling, np.zeros_like(values))), 0.0)
+    point = BranchPoint(start, values, tracer.unit((doubling, np.zeros_like(values))), 0.0)
     corrected = tracer.correct(point, DOUBLED)
     if corrected is None:
         return describe(twice, parameters, Solved(start, SINGULAR, np.empty((0, 3))), FOUND_BY)
@@ -321,17 +321,17 @@ def _parametrised(
     return ParametrisedEquations(equations, parameters, (vary, *own)), np.array([value, *own_values])
 
 
-def _solution(parametrised: ParametrisedEquations, point: Point, sensitivities: bool = False) -> PeriodicSolution:
+def _solution(parametrised: ParametrisedEquations, point: BranchPoint, sensitivities: bool = False) -> PeriodicSolution:
     equations, parameters = parametrised.at(point.values)
     solved = Solved(point.z, CONVERGED, np.empty((0, 3)))
     return describe(equations, parameters, solved, FOUND_BY, sensitivities)
 
 
-def _remembered(parametrised: ParametrisedEquations) -> Callable[[Point], PeriodicSolution]:
+def _remembered(parametrised: ParametrisedEquations) -> Callable[[BranchPoint], PeriodicSolution]:
     """Return a function that returns the solution at a point; those of the last points are kept."""
-    recent: dict[int, tuple[Point, PeriodicSolution]] = {}
+    recent: dict[int, tuple[BranchPoint, PeriodicSolution]] = {}
 
-    def solution(point: Point) -> PeriodicSolution:
+    def solution(point: BranchPoint) -> PeriodicSolution:
         key = id(point.z)
         if key not in recent:
             if len(recent) == REMEMBERED:
@@ -343,20 +343,22 @@ def _remembered(parametrised: ParametrisedEquations) -> Callable[[Point], Period
 
 
 def _special_points(
-    solved: Callable[[Point], PeriodicSolution], tracer: Tracer, before: Point, after: Point
-) -> list[Point]:
+    solved: Callable[[BranchPoint], PeriodicSolution], tracer: Tracer, before: BranchPoint, after: BranchPoint
+) -> list[BranchPoint]:
     """Return the folds and period doublings between two neighbouring points, in order."""
-    found: list[Point] = []
+    found: list[BranchPoint] = []
     for kind, test in ((FOLD, _fold_test), (PERIOD_DOUBLING, lambda point: _doubling_test(solved(point)))):
         if test(before) * test(after) < 0.0:
             found += _locate(tracer, before, after, kind, test)
     return sorted(found, key=lambda point: point.distance)
 
 
-def _locate(tracer: Tracer, before: Point, after: Point, kind: str, test: Callable[[Point], float]) -> list[Point]:
+def _locate(
+    tracer: Tracer, before: BranchPoint, after: BranchPoint, kind: str, test: Callable[[BranchPoint], float]
+) -> list[BranchPoint]:
     """Return the point where a test function is zero, in a list that is empty if a correction fails."""
     span = after.distance - before.distance
-    known: dict[float, Point] = {0.0: before, span: after}
+    known: dict[float, BranchPoint] = {0.0: before, span: after}
 
     def at(distance: float) -> float:
         if distance not in known:
@@ -378,7 +380,7 @@ class _Lost(Exception):
     """A correction failed."""
 
 
-def _fold_test(point: Point) -> float:
+def _fold_test(point: BranchPoint) -> float:
     """Return the slope of the varied quantity along the branch."""
     return float(point.tangent[1][0])
 

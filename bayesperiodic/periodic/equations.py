@@ -13,9 +13,9 @@ from bayesperiodic._compile.code_generation import as_columns
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.compiled import (
     CONVERGED,
-    MAX_HALVINGS,
-    MAX_ITERATIONS,
+    HALVINGS,
     MAX_SEGMENTS,
+    MOST_NEWTON_STEPS,
     NO_BORDER,
     NO_UNKNOWNS,
     NOT_RESOLVED,
@@ -235,7 +235,7 @@ class PeriodicEquations:
         inputs[0, len(self.model.inputs) :] = 0.0
         states, best = np.zeros((1, 3 * count)), np.inf
         solution = states[0, :count].copy()
-        for _ in range(MAX_ITERATIONS):
+        for _ in range(MOST_NEWTON_STEPS):
             row = kernels.evaluate("residual_jacobian", states, inputs, parameters, tau, self.frequency)[0]
             residual, stiffness = row[:count], row[count:].reshape(count, 3, count)[:, 0]
             size = float(np.linalg.norm(residual))
@@ -250,10 +250,10 @@ class PeriodicEquations:
     ) -> Solved:
         """Run the Newton iteration for z and further unknowns from a guess (points, states) for the periodic part."""
         z, bordered = np.array(guess, dtype=float, order="C"), unknowns.values.size > 0
-        history, work = np.zeros((MAX_ITERATIONS, 3)), workspace(self, bordered=bordered)
+        history, work = np.zeros((MOST_NEWTON_STEPS, 3)), workspace(self, bordered=bordered)
         compiled = kernels("bordered newton" if bordered else "newton", self.count, self.grid.stencil)
         code, iterations, _ = compiled.newton(
-            self.functions, self.grid.packed, self.setting(parameters), unknowns, border, MAX_HALVINGS, z, history, work
+            self.functions, self.grid.packed, self.setting(parameters), unknowns, border, HALVINGS, z, history, work
         )
         return Solved(z, code, history[:iterations], unknowns.values)
 
@@ -331,7 +331,7 @@ class PeriodicEquations:
         """Return the partial derivatives of g and f."""
         return Derivatives(*self.model.kernels.split_derivatives(self.evaluate("derivatives", z, parameters)))
 
-    def frequency_changes(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def frequency_jacobian(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return ∂(q, q̇, q̈)/∂frequency and ∂(u, u̇, ü)/∂frequency, z and the inputs held as functions of tau."""
         order = np.repeat([0.0, 1.0, 2.0], self.count) / self.frequency
         input_order = np.repeat([0.0, 1.0, 2.0], len(self.model.inputs)) / self.frequency
@@ -442,17 +442,17 @@ def input_sensitivities(
     return respond(equations, z, columns, d, along(d.g_u, directions), along(d.f_u, directions))
 
 
-def along(derivatives: np.ndarray, changes: np.ndarray) -> np.ndarray:
-    """Return the derivatives (points, values, variables) times changes (directions, points, variables)."""
+def along(derivatives: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return the derivatives (points, values, variables) times directions (directions, points, variables)."""
     with np.errstate(over="ignore", invalid="ignore"):  # Where outputs overflow the result is not finite.
-        return np.ascontiguousarray(np.moveaxis(derivatives @ np.moveaxis(changes, 0, 2), 2, 0))
+        return np.ascontiguousarray(np.moveaxis(derivatives @ np.moveaxis(directions, 0, 2), 2, 0))
 
 
 def frequency_derivatives(
     equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray, d: Derivatives
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return dg/dfrequency (points, states) and df/dfrequency (points, channels), z and inputs held in tau."""
-    states, inputs = equations.frequency_changes(z)
+    states, inputs = equations.frequency_jacobian(z)
     _, g_u, g_frequency, f_q, _, f_u, f_frequency = d
     g_q = columns[:, equations.count :].reshape(len(z), equations.count, -1)
     g = g_frequency[:, :, 0] + np.einsum("neq,nq->ne", g_q, states) + np.einsum("neu,nu->ne", g_u, inputs)

@@ -32,7 +32,7 @@ GAUSS_MATRIX = np.array(
     ]
 )
 HARMLESS, IN_RANGE = 1e3, 1e60
-SWEEPS, ROUNDS = 8, 60
+BASIS_SWEEPS, POWER_ROUNDS = 8, 60
 DECOUPLED = 1e-11
 STIFF, MOST_PARTS = 3.0, 32
 
@@ -75,7 +75,7 @@ def first_order_matrix(linearisation: np.ndarray, orders: tuple[int, ...]) -> np
     return _companion(-np.linalg.solve(highest, lower), orders)
 
 
-def change_factors(
+def derivative_factors(
     linearisation: np.ndarray, orders: tuple[int, ...], matrix: np.ndarray, v: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a (multipliers, points, states) and b (…, 3·states) for which wᵀ dA v = aᵀ d∂g/∂(q, q̇, q̈) b.
@@ -144,7 +144,7 @@ def leading_multipliers(matrix: np.ndarray, period: float, count: int) -> np.nda
     steps = _transfer_matrices(matrix, period / points)
     if count == 1:
         found, logarithm, sign = _kernels().dominant_multiplier(
-            steps, np.full(size, 1.0 / np.sqrt(size)), ROUNDS, DECOUPLED
+            steps, np.full(size, 1.0 / np.sqrt(size)), POWER_ROUNDS, DECOUPLED
         )
         if found:
             with np.errstate(over="ignore"):
@@ -213,7 +213,7 @@ def _invariant_bases(groups: np.ndarray, splits: list[int] | None = None) -> tup
     size = groups.shape[1]
     basis = np.ascontiguousarray(np.linalg.qr(np.random.default_rng(0).standard_normal((size, size)))[0])
     before = np.empty(groups.shape)
-    for _ in range(SWEEPS if len(groups) > 1 else 0):
+    for _ in range(BASIS_SWEEPS if len(groups) > 1 else 0):
         start = basis.copy()
         _kernels().sweep(np.ascontiguousarray(groups), basis, before)
         turned = start.T @ basis

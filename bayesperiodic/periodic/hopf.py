@@ -18,7 +18,7 @@ from bayesperiodic.periodic.floquet import first_order_matrix
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import PeriodicSolution, describe
 
-INTERVALS, FEWEST = 64, 4
+INTERVALS, EQUILIBRIUM_SAMPLES = 64, 4
 OSCILLATING = 1e-9
 
 
@@ -101,7 +101,7 @@ def hopf_points(
     given = dict(parameters) | {vary: low}
     _checks.same_names("parameters", given, model.parameters)
     theta = np.array([_checks.finite_number(f"parameters[{n!r}]", given[n]) for n in model.parameters])
-    equations = PeriodicEquations.build(model, None, frequency=1.0, samples=FEWEST, scheme="fourier")
+    equations = PeriodicEquations.build(model, None, frequency=1.0, samples=EQUILIBRIUM_SAMPLES, scheme="fourier")
 
     def at(value: float) -> np.ndarray:
         return np.where(np.array(model.parameters) == vary, value, theta)

@@ -22,7 +22,7 @@ from bayesperiodic.periodic.equations import (
     parameter_sensitivities,
     phase_row,
 )
-from bayesperiodic.periodic.floquet import Floquet, change_factors, first_order_matrix, floquet
+from bayesperiodic.periodic.floquet import Floquet, derivative_factors, first_order_matrix, floquet
 from bayesperiodic.periodic.schemes import CyclicGrid, Scheme
 
 
@@ -440,11 +440,11 @@ def multiplier_sensitivities(model: Model, solution: PeriodicSolution) -> dict[s
     names = [*model.parameters, FREQUENCY][: len(derivative.frequency)]
     directions = np.eye(len(names), theta.size)
     frequency = derivative.frequency if model.autonomous else np.eye(len(names))[-1]
-    logarithmic = logarithmic_changes(equations, theta, z, solution, derivative.states, directions, frequency)
-    return {name: solution.multipliers * change for name, change in zip(names, logarithmic, strict=True)}
+    logarithmic = logarithmic_jacobian(equations, theta, z, solution, derivative.states, directions, frequency)
+    return {name: solution.multipliers * row for name, row in zip(names, logarithmic, strict=True)}
 
 
-def logarithmic_changes(
+def logarithmic_jacobian(
     equations: PeriodicEquations,
     theta: np.ndarray,
     z: np.ndarray,
@@ -454,7 +454,7 @@ def logarithmic_changes(
     frequency: np.ndarray,
     count: int | None = None,
 ) -> np.ndarray:
-    """Return the changes of log μ along directions, complex (directions, multipliers).
+    """Return the derivatives of log μ along directions, complex (directions, multipliers).
 
     A direction is a change of z (`states`, (directions, points, states)), of the parameters (`directions`, (directions,
     parameters)) and of the frequency (directions,) [Hz]. Only the `count` largest multipliers are considered, or all.
@@ -464,10 +464,10 @@ def logarithmic_changes(
     v, w = solution.floquet.leading(len(solution.multipliers) if count is None else count)
     v, w = v * sizes, w / sizes
     matrix, jacobian = first_order_matrix(solution.linearisation, orders), solution.linearisation
-    left, right = change_factors(jacobian, orders, matrix, v, w)
+    left, right = derivative_factors(jacobian, orders, matrix, v, w)
     overlap = np.einsum("mnp,mnp->mn", w, v)
     stretching = np.einsum("mnp,npq,mnq->mn", w, matrix, v)
-    state_rates, input_rates = equations.frequency_changes(z)
+    state_rates, input_rates = equations.frequency_jacobian(z)
     moved = equations.changes(states)
     here, change = equations.states(z), np.empty((len(z), jacobian[0].size))
     result = np.empty((len(directions), len(v)), dtype=complex)

@@ -65,7 +65,7 @@ def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndar
 
 
 PERIODS = 40
-CYCLES = 120
+SETTLING_CYCLES = 120
 NUDGE = 0.1
 
 
@@ -120,8 +120,8 @@ def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tupl
         parameters,
         frequency=equations.frequency,
         samples=grid.samples,
-        steps=CYCLES * grid.samples,
-        kept=CYCLES * grid.samples // 4,
+        steps=SETTLING_CYCLES * grid.samples,
+        kept=SETTLING_CYCLES * grid.samples // 4,
     )
     if path is None:
         return None

@@ -12,10 +12,10 @@ from scipy.special import ndtri
 
 from bayesperiodic import _checks
 from bayesperiodic.diagnostics import calibration as uniformity
-from bayesperiodic.diagnostics.calibration import METHODS, Calibration
+from bayesperiodic.diagnostics.calibration import CALIBRATED_METHODS, Calibration
 from bayesperiodic.diagnostics.comparison import Comparison
 from bayesperiodic.diagnostics.model_comparison import DECISIVE, SMALLEST_GAIN, ModelComparison
-from bayesperiodic.diagnostics.verdicts import END_SHIFT, ERRORS, FINE, LEVELS
+from bayesperiodic.diagnostics.verdicts import ELLIPSOID_LEVELS, END_SHIFT, ERRORS, FINE
 from bayesperiodic.estimation.profile import CLOSED, Profile
 from bayesperiodic.plot import style
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, LAPLACE, axis_label, chosen, styled, wrapped_label
@@ -68,11 +68,12 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
     grid = figure.subplots(len(names), 3, squeeze=False)
     verdicts = calibration.table.set_index(["method", "quantity"])["verdict"]
     for row, name in zip(grid, names, strict=True):
-        for method in METHODS:
+        for method in CALIBRATED_METHODS:
             values = calibration.positions[method][name]
             values = np.sort(values[np.isfinite(values)])
             _histogram(row[0], values, method, f"{LABELS[method]}: {verdicts[method, name]}")
-            points, size, banded = uniformity.evaluation_points(), values.size, method == METHODS[0] and values.size
+            points, size = uniformity.evaluation_points(), values.size
+            banded = method == CALIBRATED_METHODS[0] and size
             steps = np.searchsorted(values, points, side="right") / max(size, 1)
             _deviation(row[1], steps, uniformity.ecdf_band(size, LEVEL) if banded else None, method)
             covered = np.array([uniformity.coverage(values, level) for level in points])
@@ -90,7 +91,7 @@ def _histogram(axes: Axes, values: np.ndarray, method: str, label: str) -> None:
     bins = uniformity.bin_count(values.size)
     counts, edges = np.histogram(values, bins, (0.0, 1.0))
     expected = max(values.size, 1) / bins
-    if method == METHODS[0] and values.size:
+    if method == CALIBRATED_METHODS[0] and values.size:
         low, high = uniformity.binomial_band(values.size, np.array(1.0 / bins), 1.0 - LEVEL)
         axes.axhspan(float(low) * bins, float(high) * bins, **BAND)
     axes.stairs(counts / expected, edges, color=COLOURS[method], ls=LINES[method], lw=1.6, label=label)
@@ -197,7 +198,7 @@ def _interval_coverage(axes: Axes, comparison: Comparison) -> None:
     axes.plot([0.0, 1.0], [0.0, 1.0], color=COLOURS["laplace"], lw=1.4, ls="--", label="Laplace")
     axes.fill_between(across, shares - errors, shares + errors, color=COLOURS["mcmc"], alpha=0.45, lw=0)
     axes.plot(across, shares, color=COLOURS["mcmc"], lw=1.8, label="MCMC")
-    axes.plot(LEVELS, np.interp(LEVELS, across, shares), "o", color=COLOURS["mcmc"], ms=6)
+    axes.plot(ELLIPSOID_LEVELS, np.interp(ELLIPSOID_LEVELS, across, shares), "o", color=COLOURS["mcmc"], ms=6)
     labels = {"xlabel": "probability of the Laplace ellipsoid", "ylabel": "fraction of the draws inside"}
     axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0), aspect="equal", **labels)
     verdict, k = comparison.joint["verdict"], comparison.joint["pareto_k"]

@@ -13,11 +13,11 @@ from scipy.stats.distributions import rv_frozen
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import covariance_cholesky
-from bayesperiodic.priors.single import LOG_ROOT_TWO_PI, Density, Normal, Prior, Univariate
+from bayesperiodic.priors.single import LOG_ROOT_TWO_PI, LogDensity, Normal, Prior, Univariate
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class MultivariateNormal(Density):
+class MultivariateNormal(LogDensity):
     """The joint normal distribution of several parameters: one posterior becomes the next prior.
 
     Parameters
@@ -245,7 +245,7 @@ def _extrapolate(differences: np.ndarray) -> np.ndarray:
     return best
 
 
-ALLOWED = "a prior such as Normal(mean, sd), or a frozen continuous distribution of scipy.stats"
+ALLOWED_PRIOR = "a prior such as Normal(mean, sd), or a frozen continuous distribution of scipy.stats"
 
 
 @dataclass(frozen=True)
@@ -419,7 +419,7 @@ def as_prior(argument: str, value: Any) -> Prior:
     if isinstance(value, stats.rv_continuous):
         raise ValueError(f"{argument}: must be frozen, got scipy.stats.{value.name}. Give scipy.stats.{value.name}(…).")
     if isinstance(value, type) or not isinstance(value, Prior):
-        raise ValueError(f"{argument}: must be {ALLOWED}, got {value!r}.")
+        raise ValueError(f"{argument}: must be {ALLOWED_PRIOR}, got {value!r}.")
     return value
 
 

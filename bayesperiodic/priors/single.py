@@ -15,10 +15,10 @@ from bayesperiodic import _checks
 LOG_ROOT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
 ROOT_TWO = math.sqrt(2.0)
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
+LEGENDRE_NODES, LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
-class Density(Protocol):
+class LogDensity(Protocol):
     """Probability density of one parameter, or of n parameters jointly."""
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
@@ -45,7 +45,7 @@ class Density(Protocol):
 
 
 @runtime_checkable
-class Prior(Density, Protocol):
+class Prior(LogDensity, Protocol):
     """Interface of the priors of one parameter."""
 
     @property
@@ -553,8 +553,8 @@ def _tail_mass(distance: float, t: np.ndarray) -> np.ndarray:
     t = np.asarray(t, dtype=float)
     exponent = t * (distance + 0.5 * t)
     short = np.where(exponent < 1.0, t, 0.0)[..., None]
-    s = 0.5 * short * (1.0 + NODES)
-    integral = 0.5 * short[..., 0] * (np.exp(-s * (distance + 0.5 * s)) @ WEIGHTS)
+    s = 0.5 * short * (1.0 + LEGENDRE_NODES)
+    integral = 0.5 * short[..., 0] * (np.exp(-s * (distance + 0.5 * s)) @ LEGENDRE_WEIGHTS)
     end = special.erfcx((distance + t) / ROOT_TWO)
     long = ROOT_HALF_PI * (special.erfcx(distance / ROOT_TWO) - np.exp(-exponent) * end)
     return np.where(exponent < 1.0, integral, long)

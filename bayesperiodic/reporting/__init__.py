@@ -6,7 +6,7 @@ from pathlib import Path
 from bayesperiodic import plot
 from bayesperiodic._io import in_folder, written_whole
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.adequacy import LEVEL
+from bayesperiodic.diagnostics.adequacy import ADEQUACY_LEVEL
 from bayesperiodic.diagnostics.comparison import Comparison
 from bayesperiodic.diagnostics.identifiability import Identifiability
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
@@ -81,7 +81,7 @@ def report(
         given=contents.ReportInputs.of(problem, fit, posterior, identifiability, comparison, prediction, missing),
         content=contents,
         plot=plot,
-        level=LEVEL,
+        level=ADEQUACY_LEVEL,
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     )
     with written_whole(target) as draft:

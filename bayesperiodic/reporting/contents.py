@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from bayesperiodic import _checks
 from bayesperiodic._verdicts import CAUTION, TONES
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.adequacy import TESTS
+from bayesperiodic.diagnostics.adequacy import ADEQUACY_TESTS
 from bayesperiodic.diagnostics.comparison import Comparison, compare
 from bayesperiodic.diagnostics.identifiability import Identifiability, identifiability
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
@@ -401,7 +401,7 @@ def laplace(found: Comparison) -> Rows:
 def adequacy(found: Prediction) -> Rows:
     """Return the table of the tests of the model."""
     columns: dict[str, Any] = {"label": ("Experiment and channel", str), "verdict": ("Verdict", badge)}
-    columns |= {test: (f"p-values: {test}", html.p_value) for test in TESTS}
+    columns |= {test: (f"p-values: {test}", html.p_value) for test in ADEQUACY_TESTS}
     return _formatted(found.table, **columns, model_error_share=("Fraction of model error", html.percent))
 
 

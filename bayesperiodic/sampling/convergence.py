@@ -21,8 +21,8 @@ from scipy.stats import norm
 
 from bayesperiodic.problem.parameters import CHAIN, DRAW
 
-FEWEST_WEIGHTS, EQUAL, SMALLEST = 0.25, 1e-6, 700.0
-LEVELS = np.array([0.05, 0.5, 0.95])
+FEWEST_WEIGHTS, EQUAL_WEIGHTS, LARGEST_LOG_RATIO = 0.25, 1e-6, 700.0
+QUANTILE_LEVELS = np.array([0.05, 0.5, 0.95])
 
 
 def arviz() -> ModuleType:
@@ -87,9 +87,9 @@ def quantile_spread(chains: np.ndarray) -> np.ndarray:
     It is that of the fractions of draws up to the pooled quantiles, over the normal density there: between two modes a
     quantile is nowhere certain, but the fraction is.
     """
-    pooled = np.quantile(chains.reshape(-1, chains.shape[-1]), LEVELS, axis=0)
+    pooled = np.quantile(chains.reshape(-1, chains.shape[-1]), QUANTILE_LEVELS, axis=0)
     below = np.stack([np.mean(chains <= quantile, axis=(1, 2)) for quantile in pooled])
-    return np.max(np.ptp(below, axis=1) / norm.pdf(norm.ppf(LEVELS))[:, None], axis=0)
+    return np.max(np.ptp(below, axis=1) / norm.pdf(norm.ppf(QUANTILE_LEVELS))[:, None], axis=0)
 
 
 def pareto_k(log_weights: np.ndarray) -> float:
@@ -101,10 +101,10 @@ def pareto_k(log_weights: np.ndarray) -> float:
     positive = np.isfinite(log_weights)
     if positive.mean() < FEWEST_WEIGHTS:
         return np.inf
-    if np.ptp(log_weights[positive]) < EQUAL:
+    if np.ptp(log_weights[positive]) < EQUAL_WEIGHTS:
         return 0.0
     top = log_weights[positive].max()
-    weights = np.maximum(log_weights, top - SMALLEST)
+    weights = np.maximum(log_weights, top - LARGEST_LOG_RATIO)
     module = arviz()
     if hasattr(module, "psislw"):
         return float(module.psislw(weights)[1])
@@ -119,7 +119,7 @@ LENGTHS_ALONE = 500.0
 TAU_CHANGE = 0.05
 RHAT = 1.005
 QUANTILE_SPREAD = 0.25
-APART = 8.0
+STUCK_DISTANCE = 8.0
 
 
 def stop_rule(
@@ -164,7 +164,7 @@ def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: 
         found.append(f"tau changed by {change:.0%}" if np.isfinite(change) else "tau known from one check alone")
     if (spread := quantile_spread(kept).max()) > QUANTILE_SPREAD:
         found.append(f"quantiles of the ensembles {spread:.2f} sd apart")
-    if not found and (alone := _furthest(kept, tau)) > APART:
+    if not found and (alone := _furthest(kept, tau)) > STUCK_DISTANCE:
         found.append(f"walkers that stay apart, by {alone:.0f} standard errors")
     if not found and (worst := max(map(rhat, np.moveaxis(as_chains(kept), -1, 0)))) > RHAT:
         found.append(f"R-hat {worst:.3f}")

@@ -25,12 +25,12 @@ from bayesperiodic.sampling.draws import Posterior
 from bayesperiodic.sampling.proposals import AffineTransform, fit_mixture
 
 # Draws of the posterior and of the mixture for each of the two estimates.
-DRAWS = 4000
-TOLERANCE, MOST_ITERATIONS = 1e-10, 1000
+DRAWS_EACH = 4000
+EVIDENCE_TOLERANCE, MOST_ITERATIONS = 1e-10, 1000
 # Warnings: fewer than 200 of the draws of the mixture where the posterior is; a posterior RARE times as dense as the
 # mixture, or failed solves, at a fraction of the draws; difference of the two estimates in standard errors, which a
 # normal one exceeds once in 370 times.
-OVERLAP, RARE, FRACTION, APART = 0.05, 100.0, 0.01, 3.0
+OVERLAP, RARE, FRACTION, DIFFERENT_ESTIMATES = 0.05, 100.0, 0.01, 3.0
 # Deviation from one of the integral of a prior that is not of this package or SciPy.
 INTEGRAL = 1e-3
 
@@ -214,7 +214,7 @@ def _bridge(
     groups = [half.reshape(len(fitted), -1, dimension) for half in np.array_split(transform.whiten(fitted), 2, axis=1)]
     fewest = min(group.shape[1] for group in groups)
     mixture = fit_mixture(np.concatenate([group[:, :fewest] for group in groups]))
-    thin = max(1, min(used.shape[1] // 4, -(-used[..., 0].size // DRAWS)))
+    thin = max(1, min(used.shape[1] // 4, -(-used[..., 0].size // DRAWS_EACH)))
     kept = transform.whiten(used[:, ::thin])
     constant = constant + float(np.linalg.slogdet(transform.axes)[1])
 
@@ -223,7 +223,7 @@ def _bridge(
         return found.log_prob + constant - mixture.log_density(u), found.status
 
     at_draws = log_ratios(kept.reshape(-1, dimension))[0].reshape(kept.shape[:-1])
-    at_mixture, status = log_ratios(mixture.draw(DRAWS, generator))
+    at_mixture, status = log_ratios(mixture.draw(DRAWS_EACH, generator))
     return _estimate(at_draws, at_mixture, float(np.mean(status != CONVERGED)))
 
 
@@ -248,7 +248,7 @@ def _estimate(at_draws: np.ndarray, at_mixture: np.ndarray, failed: float) -> _B
         above, below = terms(log)
         change = float(np.log(above.mean() / below.mean()))
         log += change
-        if abs(change) < TOLERANCE:
+        if abs(change) < EVIDENCE_TOLERANCE:
             break
     above, below = terms(log)
     by_draws = np.nan_to_num(convergence.mean_error(below)) / below.mean()
@@ -336,7 +336,7 @@ def _alarms(posterior: Posterior, first: _Bridge, second: _Bridge) -> list[str]:
         found.append(f"posterior and mixture overlap by {overlap:.2g} alone (should be at least {OVERLAP}).")
     if missed > FRACTION:
         found.append(f"the mixture fitted to one half of the draws misses {missed:.1%} of the other half.")
-    if abs(first.log - second.log) > APART * np.hypot(first.error, second.error):
+    if abs(first.log - second.log) > DIFFERENT_ESTIMATES * np.hypot(first.error, second.error):
         found.append(
             f"the two halves of the ensembles give {first.log:.2f} ± {first.error:.2g} and {second.log:.2f} ± "
             f"{second.error:.2g}. Sample longer, see max_steps."

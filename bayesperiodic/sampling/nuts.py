@@ -22,7 +22,7 @@ from bayesperiodic.sampling.starts import mode_of, sampling_axes, start_points
 
 TUNE = 300
 # Draws between checks of the stop rule.
-BLOCK = 250
+DRAWS_BETWEEN_CHECKS = 250
 PAUSE = 0.01
 POSITION = "u"
 # Statistics of nutpie by their names in ArviZ's schema.
@@ -61,7 +61,7 @@ def sample_nuts(
     sequences = np.random.SeedSequence(seed).spawn(ensembles + 2)
     axes = sampling_axes(density, fit, start, np.random.default_rng(sequences[ensembles]))
     starts = start_points(density, fit, start, ensembles, np.random.default_rng(sequences[ensembles + 1]))
-    run = _Run(density, fit, axes)
+    run = _Chains(density, fit, axes)
     try:
         for u, sequence in zip(axes.whiten(starts), sequences, strict=False):
             chain_seed = int(sequence.generate_state(1, np.uint64)[0])
@@ -141,7 +141,7 @@ class _Chain:
             _ = self.sampler.is_finished
 
 
-class _Run:
+class _Chains:
     """The chains, their number of draws, and the result of the stop rule."""
 
     def __init__(self, density: LogPosterior, fit: MapEstimate, axes: AffineTransform):
@@ -155,14 +155,14 @@ class _Run:
             self._judge(max_steps, progress)
         except KeyboardInterrupt:
             self.steps = min(chain.done for chain in self.chains)
-            if self.steps < BLOCK:
+            if self.steps < DRAWS_BETWEEN_CHECKS:
                 raise
             self.reason = f"interrupted after {self.steps} draws"
 
     def _judge(self, max_steps: int, progress: bool) -> None:
         passes, tau = 0, np.empty(0)
         with tqdm(total=max_steps, unit="draw", desc="sampling", disable=not progress) as bar:
-            for steps in (*range(BLOCK, max_steps, BLOCK), max_steps):
+            for steps in (*range(DRAWS_BETWEEN_CHECKS, max_steps, DRAWS_BETWEEN_CHECKS), max_steps):
                 self._wait(steps, bar)
                 self.steps, kept = steps, self.kept(steps)
                 tau, missing = stop_rule(kept, mode_of(self.density, self.fit, kept), tau, self.density.labels)

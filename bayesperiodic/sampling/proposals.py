@@ -16,14 +16,14 @@ from bayesperiodic._linalg import covariance_eigh
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 
 # Numbers of components and degrees of freedom that are tried; a larger mixture must raise the mean log-density of the
-# draws left out by more than GAIN.
-SIZES, HEAVY, LIGHT, GAIN = (1, 2, 3, 4, 6, 8), 5.0, 30.0, 0.01
-WIDE, WIDER = 0.1, 2.0
+# draws left out by more than LEAST_GAIN.
+COMPONENT_NUMBERS, HEAVY_TAILS, LIGHT_TAILS, LEAST_GAIN = (1, 2, 3, 4, 6, 8), 5.0, 30.0, 0.01
+WIDER_WEIGHT, WIDER_FACTOR = 0.1, 2.0
 # Most draws used in a fit, and draws needed per coordinate and component.
-MOST_DRAWS, PER_COMPONENT = 6000, 20
+MOST_FITTED_DRAWS, PER_COMPONENT = 6000, 20
 REGULAR = 1e-6
 # Most coordinates whose products describe curvature, and ridge of that regression, relative to the mean square.
-MOST_CURVED, RIDGE = 20, 1e-6
+MOST_CURVED, CURVATURE_RIDGE = 20, 1e-6
 
 
 @dataclass(frozen=True)
@@ -114,24 +114,24 @@ def fit_mixture(draws: np.ndarray, candidates: Sequence[StudentMixture] = ()) ->
 
     Curvature, numbers of components and of degrees of freedom are those with the largest mean log-density at the last
     ensemble, if the others are fitted; the mixture is then fitted to all. `candidates` are other mixtures to compare
-    with. Coordinates should be ordered by their widths, the narrowest first. A part of the weight, WIDE, is moved to
-    components of WIDER times the width with heavy tails, for what the draws lack.
+    with. Coordinates should be ordered by their widths, the narrowest first. WIDER_WEIGHT of the weight is moved to
+    components of WIDER_FACTOR times the width with heavy tails, for what the draws lack.
     """
-    each = max(1, draws.shape[0] * draws.shape[1] // MOST_DRAWS)
+    each = max(1, draws.shape[0] * draws.shape[1] // MOST_FITTED_DRAWS)
     draws = draws[:, ::each]
     points, train, test = draws.reshape(-1, draws.shape[2]), draws[:-1].reshape(-1, draws.shape[2]), draws[-1]
-    best, size, degrees, chosen = -np.inf, 0, HEAVY, None
+    best, size, degrees, chosen = -np.inf, 0, HEAVY_TAILS, None
     for candidate in candidates:
         if (score := float(_with_wider(candidate).log_density(test).mean())) > best:
             best, chosen = score, candidate
     bent = _bent(train, test)
     worse, curvature = 0, _curvature(train, bent)
-    for count in SIZES:
+    for count in COMPONENT_NUMBERS:
         if count > 1 and len(train) < PER_COMPONENT * count * draws.shape[2]:
             break
         fitted = _fitted(train, count, curvature)
-        found = {nu: float(_with_wider(fitted, nu).log_density(test).mean()) for nu in (HEAVY, LIGHT)}
-        if (score := max(found.values())) > best + (GAIN if size else 0.0):
+        found = {nu: float(_with_wider(fitted, nu).log_density(test).mean()) for nu in (HEAVY_TAILS, LIGHT_TAILS)}
+        if (score := max(found.values())) > best + (LEAST_GAIN if size else 0.0):
             best, size, degrees, chosen, worse = score, count, max(found, key=found.__getitem__), None, 0
         elif (worse := worse + 1) == 2:
             break
@@ -151,12 +151,12 @@ def _terms(points: np.ndarray, bent: int) -> np.ndarray:
 
 def _coefficients(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
     square = terms.T @ terms
-    return np.linalg.solve(square + RIDGE * np.diag(np.diag(square)), terms.T @ values)
+    return np.linalg.solve(square + CURVATURE_RIDGE * np.diag(np.diag(square)), terms.T @ values)
 
 
 def _bent(train: np.ndarray, test: np.ndarray) -> int:
     """Return how many of the first coordinates are curved: where products reduce the variance at the test points."""
-    dimension, gains = train.shape[1], {0: GAIN}
+    dimension, gains = train.shape[1], {0: LEAST_GAIN}
     for bent in sorted({1, 2, 3, dimension // 4, dimension // 2} & set(range(1, dimension))):
         known, new = _terms(train, bent), _terms(test, bent)
         straight, curved = (
@@ -188,7 +188,7 @@ def _fitted(draws: np.ndarray, count: int, curvature: np.ndarray) -> StudentMixt
         warnings.simplefilter("ignore", ConvergenceWarning)  # a mixture that is not the best one is a proposal too
         found = fit(draws)
     factors = np.linalg.cholesky(found.covariances_)
-    return StudentMixture(found.weights_, found.means_, factors, np.full(count, HEAVY), curvature)
+    return StudentMixture(found.weights_, found.means_, factors, np.full(count, HEAVY_TAILS), curvature)
 
 
 @cache
@@ -200,10 +200,10 @@ def _libraries() -> ThreadpoolController:
 def _with_wider(mixture: StudentMixture, degrees: float | None = None) -> StudentMixture:
     """Return a mixture, with `degrees` if given, and wider components."""
     count = len(mixture.weights)
-    weights = np.concatenate([(1.0 - WIDE) * mixture.weights, WIDE * mixture.weights])
-    factors, means = np.concatenate([mixture.factors, WIDER * mixture.factors]), np.tile(mixture.means, (2, 1))
+    weights = np.concatenate([(1.0 - WIDER_WEIGHT) * mixture.weights, WIDER_WEIGHT * mixture.weights])
+    factors, means = np.concatenate([mixture.factors, WIDER_FACTOR * mixture.factors]), np.tile(mixture.means, (2, 1))
     own = mixture.degrees if degrees is None else np.full(count, degrees)
-    return StudentMixture(weights, means, factors, np.append(own, np.full(count, HEAVY)), mixture.curvature)
+    return StudentMixture(weights, means, factors, np.append(own, np.full(count, HEAVY_TAILS)), mixture.curvature)
 
 
 # Fraction of the steps that propose from the mixture, if there is one; the other steps move within the ensembles.

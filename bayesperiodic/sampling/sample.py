@@ -51,16 +51,18 @@ from bayesperiodic.sampling.proposals import (
     fit_mixture,
     moves,
 )
-from bayesperiodic.sampling.starts import LAPLACE, STARTS, laplace_mixture, mode_of, sampling_axes, start_points
+from bayesperiodic.sampling.starts import FROM_LAPLACE, STARTS, laplace_mixture, mode_of, sampling_axes, start_points
 
 EMCEE, NUTS = "emcee", "nuts"
 FEWEST_STEPS, FEWEST_KEPT = 50, 10
 # Steps between fits of the mixture, and at least between checks of the stop rule.
 ROUND = 50
-# Burn-in ends when the autocorrelation time [steps] expected of the mixture is FAST, or after MOST_ROUNDS.
-FAST, MOST_ROUNDS = 3.0, 20
-# It starts again, before MOST_ROUNDS, if SLOW is expected at the draws that are kept: their tails were not known yet.
-SLOW = 6.0
+# Burn-in ends when the autocorrelation time [steps] expected of the mixture is FAST_MIXTURE, or after
+# MOST_BURN_IN_ROUNDS.
+FAST_MIXTURE, MOST_BURN_IN_ROUNDS = 3.0, 20
+# It starts again, before MOST_BURN_IN_ROUNDS, if SLOW_MIXTURE is expected at the draws that are kept: their tails were
+# not known yet.
+SLOW_MIXTURE = 6.0
 ADAPTED = "proposals that are still adapted"
 # Points of a task for an executor.
 PIECE = 16
@@ -76,7 +78,7 @@ def sample(
     ensembles: int = 4,
     walkers: int | None = None,
     max_steps: int = 20_000,
-    start: str = LAPLACE,
+    start: str = FROM_LAPLACE,
     coordinates: str = RIDGE,
     variances: str = SAMPLED,
     sampler: str = EMCEE,
@@ -221,7 +223,7 @@ def sample(
             return sample_nuts(density, fit, seed, ensembles, max_steps, start, progress)
         lists = {run: {state: [*map(float, x)] for state, x in states.items()} for run, states in guesses.items()}
         state = {"anchor": anchor.tolist(), "guesses": lists} | saved
-        run = _Run(density, fit, seed, start, (ensembles, size), backend, state)
+        run = _EnsembleRun(density, fit, seed, start, (ensembles, size), backend, state)
         run.go(max_steps, store, executor, progress)
         found = run.posterior()
     if found.converged and coordinates == NATURAL and problem.logarithmic.any():
@@ -246,7 +248,7 @@ def _checked_walkers(walkers: int | None, problem: Problem, variances: str) -> i
     return walkers
 
 
-class _Run:
+class _EnsembleRun:
     """A sampling run: one emcee sampler for all ensembles, the fit of its mixture, and the state of the stop rule."""
 
     def __init__(
@@ -392,18 +394,18 @@ class _Run:
             if not present or self._expected_time(fitted, half) < self._expected_time(present, half):
                 state["mixture"] = fitted.as_lists()
         rounds, fast = state["steps"] // ROUND, False
-        if present and rounds > 1 and new <= FAST:
-            fast = self._expected_time(StudentMixture.from_lists(state["mixture"]), half) <= FAST
+        if present and rounds > 1 and new <= FAST_MIXTURE:
+            fast = self._expected_time(StudentMixture.from_lists(state["mixture"]), half) <= FAST_MIXTURE
         state |= {"tries": [0, 0], "next": state["steps"] + ROUND}
-        done = fast or rounds >= MOST_ROUNDS
+        done = fast or rounds >= MOST_BURN_IN_ROUNDS
         state |= {"burnt": state["steps"] if done else 0, "missing": [] if done else [ADAPTED], "tau": [], "passes": 0}
 
     def _outdated(self) -> bool:
         """Return whether the burn-in ended too early: the draws since then have tails that the mixture lacks."""
-        if self.state["burnt"] >= MOST_ROUNDS * ROUND:
+        if self.state["burnt"] >= MOST_BURN_IN_ROUNDS * ROUND:
             return False
         mixture = StudentMixture.from_lists(self.state["mixture"])
-        return self._expected_time(mixture, self._first_kept) > SLOW
+        return self._expected_time(mixture, self._first_kept) > SLOW_MIXTURE
 
     def _expected_time(self, mixture: StudentMixture, first: int) -> float:
         """Return the autocorrelation time expected of a mixture, from the draws since a step."""

@@ -10,15 +10,15 @@ from bayesperiodic.estimation.modes import Mode
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.noise_estimate import estimate_noise
 from bayesperiodic.periodic.compiled import CONVERGED
-from bayesperiodic.sampling.proposals import HEAVY, AffineTransform, CallCount, StudentMixture
+from bayesperiodic.sampling.proposals import HEAVY_TAILS, AffineTransform, CallCount, StudentMixture
 
-LAPLACE, PRIOR, OVERDISPERSED = "laplace", "prior", "overdispersed"
-STARTS = (LAPLACE, PRIOR, OVERDISPERSED)
-SPREAD = {LAPLACE: 2.0, OVERDISPERSED: 5.0}
+FROM_LAPLACE, FROM_PRIOR, OVERDISPERSED = "laplace", "prior", "overdispersed"
+STARTS = (FROM_LAPLACE, FROM_PRIOR, OVERDISPERSED)
+SPREAD = {FROM_LAPLACE: 2.0, OVERDISPERSED: 5.0}
 REDRAWS = 100
 NOISE_SPREAD = 0.3
 # Walkers of each ensemble that start at an optimum other than the estimate, at least; optima of less mass have none.
-FEWEST, LEAST_MASS = 2, 1e-3
+FEWEST_WALKERS, LEAST_MASS = 2, 1e-3
 
 
 def laplace_approximation(density: SamplingCoordinates, fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
@@ -71,7 +71,7 @@ def start_points(
     least two at each, and at least two at the estimate.
     """
     calls = CallCount() if calls is None else calls
-    if start == PRIOR:
+    if start == FROM_PRIOR:
         return _finite(density, calls, lambda count: _from_prior(density, count, generator), walkers, start)
 
     def drawn(mean: np.ndarray, covariance: np.ndarray) -> Callable[[int], np.ndarray]:
@@ -82,7 +82,7 @@ def start_points(
     points = _finite(density, calls, drawn(*own), walkers, start)
     left = walkers
     for _, mass, laplace in others:
-        count = min(max(FEWEST, round(mass * walkers)), left - FEWEST)
+        count = min(max(FEWEST_WALKERS, round(mass * walkers)), left - FEWEST_WALKERS)
         if count > 0:
             there = _finite(density, calls, drawn(*laplace), count, start, needed=0)
             points[left - len(there) : left] = there
@@ -115,7 +115,7 @@ def laplace_mixture(density: SamplingCoordinates, fit: MapEstimate) -> tuple[Stu
     known = np.isfinite(masses).all()
     factors = np.stack([covariance_cholesky(covariance) for covariance in covariances])
     weights = np.array(masses) / np.sum(masses) if known else np.full(len(rows), 1.0 / len(rows))
-    return StudentMixture(weights, means, factors, np.full(len(rows), HEAVY)), np.array(rows)
+    return StudentMixture(weights, means, factors, np.full(len(rows), HEAVY_TAILS)), np.array(rows)
 
 
 def mode_of(density: SamplingCoordinates, fit: MapEstimate, points: np.ndarray) -> np.ndarray | None:
@@ -155,7 +155,7 @@ def _finite(
             points = np.concatenate([points, candidates[np.isfinite(found.log_prob)]])
     if len(points) < (wanted if needed is None else needed):
         other = "give a converged fit of this problem, or start='prior'"
-        remedy = "narrow the priors, see prior_predictive(problem)" if start == PRIOR else other
+        remedy = "narrow the priors, see prior_predictive(problem)" if start == FROM_PRIOR else other
         raise ValueError(
             f"start: must give points with a finite log-posterior, got {start!r}, where {1 - len(points) / tried:.1%} "
             f"of {tried} start points have none; {remedy}."
@@ -186,7 +186,7 @@ def sampling_axes(
     try:
         return AffineTransform.of(*laplace_approximation(density, fit))
     except ValueError:
-        if start != PRIOR:
+        if start != FROM_PRIOR:
             raise
     points = start_points(density, fit, start, 10 * density.dimension, generator)
     return AffineTransform(points.mean(axis=0), np.diag(points.std(axis=0)))

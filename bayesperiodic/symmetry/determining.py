@@ -15,7 +15,7 @@ from sympy.polys.matrices import DomainMatrix
 from bayesperiodic.models.model import Model
 
 PRIME = 2_147_483_629
-HEAVY = 100
+PARAMETER_WEIGHT = 100
 
 
 @dataclass(frozen=True)
@@ -314,7 +314,7 @@ class Algebra:
 
 
 @dataclass(frozen=True)
-class Term:
+class BasisField:
     """Basis element of the infinitesimal transformations of one parameter or state."""
 
     name: str
@@ -323,7 +323,7 @@ class Term:
     is_parameter: bool
 
     @property
-    def own(self) -> sp.Symbol:
+    def symbol(self) -> sp.Symbol:
         """The symbol of the parameter or state."""
         return next(iter(self.field))
 
@@ -334,9 +334,9 @@ def lie_derivative(field: Mapping[sp.Symbol, sp.Expr], expression: sp.Expr) -> s
     return sp.Add(*(move * slopes[symbol] for symbol, move in field.items()))
 
 
-def _terms(system: System) -> list[Term]:
+def _terms(system: System) -> list[BasisField]:
     """Return the basis: every parameter, and every state with terms affine in the states and inputs."""
-    found = [Term(n, sp.S.One, {s: sp.S.One}, True) for n, s in system.parameters.items()]
+    found = [BasisField(n, sp.S.One, {s: sp.S.One}, True) for n, s in system.parameters.items()]
     signals = [(n, order) for n, order in system.orders.items()] + [(n, 2) for n in system.inputs]
     for state, order in system.orders.items():
         targets = [system.symbols["d" * k + state] for k in range(order + 1)]
@@ -344,7 +344,7 @@ def _terms(system: System) -> list[Term]:
         for name, highest in signals:
             jets = [system.symbols["d" * k + name] for k in range(highest + 1)]
             chains += [jets[k : k + order + 1] for k in range(highest - order + 1)]
-        found += [Term(state, c[0], dict(zip(targets, c, strict=True)), False) for c in chains]
+        found += [BasisField(state, c[0], dict(zip(targets, c, strict=True)), False) for c in chains]
     return found
 
 
@@ -356,7 +356,7 @@ class Determining:
     powers of the varying symbols must vanish separately.
     """
 
-    terms: tuple[Term, ...]  # the first columns
+    terms: tuple[BasisField, ...]  # the first columns
     algebra: Algebra
     rows: tuple[dict[int, Polynomial], ...]  # by column
     multipliers: tuple[bool, ...]  # the other columns: whether the element of Λ is on its diagonal
@@ -369,7 +369,7 @@ class Determining:
     @property
     def weights(self) -> np.ndarray:
         """Weights of the terms, by which transformations of few parameters are preferred, (terms,)."""
-        return np.array([HEAVY if term.is_parameter else 1 for term in self.terms])
+        return np.array([PARAMETER_WEIGHT if term.is_parameter else 1 for term in self.terms])
 
     @property
     def unknowns(self) -> list[sp.Symbol]:
@@ -486,11 +486,11 @@ def generators_of(equations: Determining) -> list[Generator]:
     """Return a maximal set of symmetries of the parameters that are independent at generic values."""
     terms, parameters, scalings = equations.terms, equations.parameters, _scalings(equations)
     values = dict(zip(equations.unknowns, equations.point, strict=True))
-    rows = [[scaling.get(k, 0) * values[terms[k].own] % PRIME for k in parameters] for scaling in scalings]
+    rows = [[scaling.get(k, 0) * values[terms[k].symbol] % PRIME for k in parameters] for scaling in scalings]
     moves = np.array(rows, dtype=np.int64).reshape(len(scalings), len(parameters))
     vectors = nullspace(equations.matrix)[:, : len(terms)]
     wanted = _rank(vectors[:, parameters])
-    chosen = [_generator(equations, {k: terms[k].own * w for k, w in s.items()}, s) for s in scalings]
+    chosen = [_generator(equations, {k: terms[k].symbol * w for k, w in s.items()}, s) for s in scalings]
     for support in _circuits(vectors, equations.weights) if len(chosen) < wanted else []:
         rest = [k for k in range(len(terms)) if k not in support]
         (move,) = nullspace(vectors[:, rest].T) if rest else np.ones((1, len(vectors)), dtype=np.int64)
@@ -506,9 +506,9 @@ def generators_of(equations: Determining) -> list[Generator]:
 def _scalings(equations: Determining) -> list[dict[int, int]]:
     """Return {term: weight} of independent scalings of parameters and states."""
     terms = equations.terms
-    columns = [k for k, t in enumerate(terms) if t.is_parameter or t.moves == t.own]
+    columns = [k for k, t in enumerate(terms) if t.is_parameter or t.moves == t.symbol]
     diagonal = [len(terms) + j for j, on in enumerate(equations.multipliers) if on]
-    index = {k: equations.unknowns.index(terms[k].own) for k in equations.parameters}
+    index = {k: equations.unknowns.index(terms[k].symbol) for k in equations.parameters}
     table: list[dict[int, sp.Rational]] = []
     for row in equations.rows:
         parts: dict[tuple[int, ...], dict[int, sp.Rational]] = {}

@@ -11,11 +11,11 @@ from bayesperiodic.symmetry.determining import Generator, System
 from bayesperiodic.symmetry.invariants import Flow, verified
 
 ODD = (sp.sin, sp.tan, sp.asin, sp.atan, sp.sinh, sp.tanh, sp.asinh, sp.atanh, sp.sign)
-EVEN = (sp.cos, sp.cosh, sp.Abs)
+EVEN_FUNCTIONS = (sp.cos, sp.cosh, sp.Abs)
 # Largest number of independent sign changes of which all combinations are compared, to find those of few parameters.
-COMBINED = 10
+MOST_COMBINED = 10
 # Random points at which exchanges are tried before the substitution, and the relative error there.
-POINTS, ERROR = 2, 1e-9
+TRIAL_POINTS, ERROR = 2, 1e-9
 IDENTITY = sp.Symbol("none")
 
 
@@ -46,7 +46,7 @@ def _sign_changes(system: System, generators: Sequence[Generator]) -> list[dict[
         for g in generators
         if g.scaling
     ]
-    every = range(1, 1 << len(basis)) if len(basis) <= COMBINED else (1 << i for i in range(len(basis)))
+    every = range(1, 1 << len(basis)) if len(basis) <= MOST_COMBINED else (1 << i for i in range(len(basis)))
     found = [reduce(int.__xor__, (b for i, b in enumerate(basis) if chosen >> i & 1), 0) for chosen in every]
     result = []
     for change in sorted(found, key=lambda f: ((f & own).bit_count(), f.bit_count(), f)):
@@ -73,7 +73,7 @@ def _parity(e: sp.Expr, bits: Mapping[sp.Symbol, int], constraints: list[int]) -
         return own[0] if e.exp % 2 else 0
     if isinstance(e, ODD):
         return own[0]
-    if not isinstance(e, EVEN):
+    if not isinstance(e, EVEN_FUNCTIONS):
         constraints += own
     return 0
 
@@ -133,7 +133,7 @@ def _holds(
 ) -> bool:
     """Return whether equations and outputs do not change at random points, up to a factor of the equations."""
     random = np.random.default_rng(11)
-    for _ in range(POINTS):
+    for _ in range(TRIAL_POINTS):
         values = dict(zip(symbols, random.uniform(0.5, 1.5, len(symbols)), strict=True))
         before = evaluated(*values.values())
         after = evaluated(*(values.get(image.get(s, s), 1.0) for s in symbols))

@@ -14,10 +14,10 @@ from bayesperiodic.symmetry import determining
 from bayesperiodic.symmetry.determining import Algebra, Generator, System, lie_derivative
 
 # Sensitivities: complex step, number of random parameter values, Newton steps, relative size of zero singular values.
-STEP, VALUES, NEWTON_STEPS, ZERO = 1e-30, 4, 30, 1e-9
-SMALL = 1e-7
+COMPLEX_STEP, VALUES, NEWTON_STEPS, ZERO_SINGULAR_VALUE = 1e-30, 4, 30, 1e-9
+SMALL_SLOPE = 1e-7
 # Flows: longest Lie series, and powers of a symbol whose series is tried.
-LONGEST, POWERS = 5, (1, -1, 2)
+LONGEST_SERIES, SYMBOL_POWERS = 5, (1, -1, 2)
 # Operations that a sum in a denominator counts for.
 AWKWARD = 5
 
@@ -120,7 +120,7 @@ def null_directions(system: System) -> list[tuple[dict[sp.Symbol, float], np.nda
         # Each parameter in the unit of its own effect, so that a large one does not hide the others.
         unit = np.where(size > 0.0, size, 1.0)
         _, singular, directions = np.linalg.svd(sensitivities / unit)
-        without = directions[np.count_nonzero(singular > ZERO * singular[0]) :] / unit
+        without = directions[np.count_nonzero(singular > ZERO_SINGULAR_VALUE * singular[0]) :] / unit
         values = dict(zip((*system.parameters.values(), *system.known.values()), [*theta, *known], strict=True))
         found.append((values, np.linalg.qr(without.T)[0].T))
     return found
@@ -139,12 +139,12 @@ def _sensitivities(
     for values in taylor.transpose(1, 0, 3, 2).reshape(points, -1, taylor.shape[2]):
         if not np.all(np.isfinite(values)) or np.any(np.abs(values.imag) > 1e-12 * (1.0 + np.abs(values.real))):
             continue
-        slopes = values.imag / STEP
+        slopes = values.imag / COMPLEX_STEP
         slopes[:, : len(theta)] *= theta
         size = np.abs(slopes).max(axis=1)
         slopes = slopes[size > 0.0] / size[size > 0.0, None]
         basis, singular, _ = np.linalg.svd(slopes[:, len(theta) :])
-        rank = np.count_nonzero(singular > ZERO * max(singular, default=1.0))
+        rank = np.count_nonzero(singular > ZERO_SINGULAR_VALUE * max(singular, default=1.0))
         rows.append(basis[:, rank:].T @ slopes[:, : len(theta)])
         largest = np.maximum(largest, np.abs(slopes[:, : len(theta)]).max(axis=0, initial=0.0))
     return (np.concatenate(rows) if rows else np.empty((0, len(theta)))), largest
@@ -166,7 +166,7 @@ def _motions(
     values = {s: fixed(v) for s, v in zip(system.known.values(), known, strict=True)}
     for i, (symbol, value) in enumerate(zip(system.parameters.values(), theta, strict=True)):
         values[symbol] = fixed(value)
-        values[symbol][0, :, i] += STEP * 1j
+        values[symbol][0, :, i] += COMPLEX_STEP * 1j
     frequency = random.uniform(0.3, 1.0, (points, 1))
     values[system.symbols["frequency"]] = fixed(frequency)
     values[system.symbols["tau"]] = fixed(random.uniform(0.0, 1.0, (points, 1)))
@@ -178,7 +178,7 @@ def _motions(
             signal = differentiated(signal)
     for i, symbol in enumerate(starts):
         values[symbol] = fixed(random.uniform(-1.5, 1.5, (points, 1)))
-        values[symbol][0, :, len(theta) + i] += STEP * 1j
+        values[symbol][0, :, len(theta) + i] += COMPLEX_STEP * 1j
     with np.errstate(all="ignore"):
         _follow(system, values, order)
         shortened = {symbol: v[: order + 1] for symbol, v in values.items()}
@@ -224,7 +224,7 @@ class Directions:
     @property
     def moved(self) -> list[str]:
         """The parameters that are not determined."""
-        return [n for n, column in zip(self.names, self.rows.T, strict=True) if np.any(np.abs(column) > SMALL)]
+        return [n for n, column in zip(self.names, self.rows.T, strict=True) if np.any(np.abs(column) > SMALL_SLOPE)]
 
     def alone(self, name: str) -> bool:
         """Return whether a parameter can change without any other."""
@@ -251,7 +251,7 @@ class Directions:
 
     def preserve(self, expression: sp.Expr, symbols: Sequence[sp.Symbol]) -> bool:
         """Return whether an expression is constant along all directions."""
-        return bool(np.all(np.abs(self.rows @ self.slope(expression, symbols)) < SMALL))
+        return bool(np.all(np.abs(self.rows @ self.slope(expression, symbols)) < SMALL_SLOPE))
 
 
 def directions_of(system: System, generators: Sequence[Generator]) -> Directions:
@@ -265,7 +265,9 @@ def directions_of(system: System, generators: Sequence[Generator]) -> Directions
     values, rows = min(found, key=lambda pair: len(pair[1]))
     explained = _explained(system, generators, values)
     rest = rows - rows @ explained.T @ explained
-    unexplained = tuple(n for n, size in zip(names, np.abs(rest).max(axis=0, initial=0.0), strict=True) if size > SMALL)
+    unexplained = tuple(
+        n for n, size in zip(names, np.abs(rest).max(axis=0, initial=0.0), strict=True) if size > SMALL_SLOPE
+    )
     # Sensitivities do not detect the effect of a parameter on the location of a discontinuity.
     located = {symbol for switch in system.signs for symbol in switch.free_symbols}
     if unexplained and located & set(system.parameters.values()):
@@ -280,7 +282,7 @@ def _explained(system: System, generators: Sequence[Generator], values: dict[sp.
 
 
 def _rank(matrix: np.ndarray) -> int:
-    return int(np.linalg.matrix_rank(matrix, tol=SMALL)) if matrix.size else 0
+    return int(np.linalg.matrix_rank(matrix, tol=SMALL_SLOPE)) if matrix.size else 0
 
 
 @dataclass(frozen=True)
@@ -357,7 +359,7 @@ def verified(system: System, flow: Flow) -> Flow | None:
 
 
 def _image(generator: Generator, symbol: sp.Symbol, amount: sp.Symbol) -> sp.Expr | None:
-    for power in POWERS:
+    for power in SYMBOL_POWERS:
         image = _series(generator, symbol**power, amount)
         if image is not None and power == 2:
             return sp.sqrt(_shortest(image))
@@ -376,7 +378,7 @@ def _shortest(expression: sp.Expr) -> sp.Expr:
 def _series(generator: Generator, start: sp.Expr, amount: sp.Symbol) -> sp.Expr | None:
     """Return exp(δ X) f if X^(n+1) f = c X^n f for a small n and an invariant c of X, which may be 0."""
     total, term = sp.S.Zero, start
-    for order in range(LONGEST):
+    for order in range(LONGEST_SERIES):
         following = sp.cancel(lie_derivative(generator.field, term))
         rate = sp.cancel(following / term)
         if following == 0:

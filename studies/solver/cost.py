@@ -13,7 +13,7 @@ from scipy.linalg import lapack
 
 import bayesperiodic as bp
 from bayesperiodic.periodic.batch import Anchor, Batch
-from bayesperiodic.periodic.compiled import MAX_HALVINGS, MAX_ITERATIONS, NO_BORDER, NO_UNKNOWNS
+from bayesperiodic.periodic.compiled import HALVINGS, MOST_NEWTON_STEPS, NO_BORDER, NO_UNKNOWNS
 from bayesperiodic.periodic.equations import PeriodicEquations, workspace
 from studies.common import available_cores
 from studies.gear import GEAR, RIG, gear_problem, gear_runs
@@ -122,8 +122,8 @@ def _prepared(equations: PeriodicEquations, theta: np.ndarray) -> tuple[Callable
     """Return a solve from a guess 0.1 % off with preallocated work arrays, its Newton iterations, and the solution."""
     solution = equations.solve(theta, equations.static_guess(theta)).z
     guess = solution * (1.0 + OFF)
-    z, history = guess.copy(), np.empty((MAX_ITERATIONS, 3))
-    before = equations.functions, equations.grid.packed, equations.setting(theta), NO_UNKNOWNS, NO_BORDER, MAX_HALVINGS
+    z, history = guess.copy(), np.empty((MOST_NEWTON_STEPS, 3))
+    before = equations.functions, equations.grid.packed, equations.setting(theta), NO_UNKNOWNS, NO_BORDER, HALVINGS
     work = workspace(equations, bordered=False)
 
     def solve() -> tuple[int, int, float]:

@@ -4,7 +4,7 @@ import sympy as sp
 from scipy import integrate, stats
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics.design import Candidate, Information, _added, rank_candidates
+from bayesperiodic.diagnostics.design import FurtherExperiment, Information, _added, rank_candidates
 from bayesperiodic.diagnostics.identifiability import cumulative_jensen_shannon, structure_of
 from tests.known import GEAR, LINEAR, grid, linear_experiment, linear_regressors
 from tests.pendulum import PENDULUM
@@ -202,7 +202,9 @@ def test_candidate_experiment_adds_the_information_of_a_real_one(linear):
     """A repeated run doubles the information; with twice the amplitude each linear regressor counts four times."""
     problem, fit = linear
     information = Information.of(problem, fit)
-    found = rank_candidates(problem, fit, information, [Candidate("run", 2.0, 1.0), Candidate("run", 2.0, 2.0)])
+    found = rank_candidates(
+        problem, fit, information, [FurtherExperiment("run", 2.0, 1.0), FurtherExperiment("run", 2.0, 2.0)]
+    )
     scale = information.prior_sd
     now = information.matrix * np.outer(scale, scale) + np.eye(3)
     again = found[found["scale"] == 1.0].iloc[0]
@@ -233,7 +235,7 @@ def test_repeated_runs_add_exactly_their_present_information(harmonics, noise):
     problem = bp.Problem(bp.models.duffing, runs, priors=priors, fixed={"m": 1.0}, scheme="fourier", noise=noise)
     fit = bp.map_estimate(problem, start={"c": 0.2, "k": 1.0, "k3": 1.0}, **QUIET)
     information = Information.of(problem, fit)
-    added = sum(_added(problem, fit, run, Candidate(run.name, run.frequency, 1.0)) for run in runs)
+    added = sum(_added(problem, fit, run, FurtherExperiment(run.name, run.frequency, 1.0)) for run in runs)
     assert added == pytest.approx(information.matrix, rel=1e-6)
 
 

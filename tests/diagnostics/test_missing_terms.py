@@ -9,7 +9,7 @@ import sympy as sp
 import bayesperiodic as bp
 from bayesperiodic.diagnostics import missing_terms
 from bayesperiodic.diagnostics.candidates import (
-    Candidate,
+    Term,
     coefficient_names,
     coefficient_unit,
     extended,
@@ -92,8 +92,8 @@ def test_what_a_term_explains_is_what_is_left_without_it(damped):
     theta = problem.vector(fit.theta)
     optimum = nearest_optimum(problem, theta, guesses)[1].iterate
     terms = [
-        Candidate("displacement", "force**2", problem.model.input_symbols["force"] ** 2),
-        Candidate("equation of x", "x", problem.model.state_symbols["x"]),
+        Term("displacement", "force**2", problem.model.input_symbols["force"] ** 2),
+        Term("equation of x", "x", problem.model.state_symbols["x"]),
     ]
     tests = ScoreTests(problem, optimum, terms)
     assert tests.identifiable.tolist() == [True, False] and tests.p[1] == 1.0
@@ -242,7 +242,7 @@ def test_effects_of_the_parameters_are_refused(found):
 
 def test_a_coefficient_of_zero_does_not_change_the_model(damped):
     problem, fit = damped
-    term = Candidate("displacement", "force", problem.model.input_symbols["force"])
+    term = Term("displacement", "force", problem.model.input_symbols["force"])
     other = problem_of(problem, extended(problem.model, {"c9": term}), {}, zero={"c9": term})
     assert other.names == problem.names
     theta = problem.vector(fit.theta)

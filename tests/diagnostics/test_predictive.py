@@ -6,7 +6,7 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic import _fourier
-from bayesperiodic.diagnostics.adequacy import TESTS, adequacy
+from bayesperiodic.diagnostics.adequacy import ADEQUACY_TESTS, adequacy
 from bayesperiodic.sampling.draws import tree
 from tests.known import LINEAR, NOISES, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors
 from tests.problems import CASES, DUFFING, DUFFING_PRIORS, SAMPLES
@@ -362,7 +362,7 @@ def test_every_kind_of_observation_with_residual_degrees_of_freedom_is_tested(ca
     posterior = draw(problem, bp.map_estimate(problem, progress=False), 1, draws=40)
     found = bp.predict(problem, posterior, draws=20)
     assert found.verdict == ("adequate" if tests else "not tested")
-    assert found.table[[*TESTS]].notna().sum(axis=None) == tests
+    assert found.table[[*ADEQUACY_TESTS]].notna().sum(axis=None) == tests
     assert ("too few values" in repr(found)) is (tests == 0)
 
 

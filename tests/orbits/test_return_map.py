@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from bayesperiodic.orbits.cycles import _bandwidths
-from bayesperiodic.orbits.return_map import REACH, Atlas, ReturnMap
+from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, ReturnMap
 
 OPEN = np.array([np.inf, np.inf])
 
@@ -84,7 +84,7 @@ def test_a_neighbourhood_is_one_step_narrower_than_the_widest_that_agrees(bend, 
     for seed in range(20):
         noisy = maps(6000, 1e-3, seed)
         noisy.increments[:, 0] += bend * noisy.arguments[:, 0] ** 5
-        narrowest = noisy.nearest(point, 72)[0][0, -1] / REACH
+        narrowest = noisy.nearest(point, 72)[0][0, -1] / KERNEL_REACH
         found.append(_bandwidths(noisy, point, 32)[0] / narrowest)
     assert np.median(found) == pytest.approx(2.0 ** (0.5 * steps), rel=1e-9)
 

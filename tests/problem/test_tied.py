@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic._expressions import FUNCTIONS
+from bayesperiodic._expressions import OPERATIONS
 from bayesperiodic.diagnostics.identifiability import structure_of
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors, normal_posterior
 
@@ -55,7 +55,7 @@ def test_ties_are_part_of_the_fingerprint():
     assert fingerprint(problem({"c": "0.05*k"})) != fingerprint(problem({"c": "0.06*k"}))
 
 
-@pytest.mark.parametrize("function", [*FUNCTIONS])
+@pytest.mark.parametrize("function", [*OPERATIONS])
 def test_every_function_of_a_tie_is_analysed_structurally(function):
     """The force depends on k and on a function of it, so that k is determined."""
     found = structure_of(problem({"c": f"30*{function}(k/800)"}))

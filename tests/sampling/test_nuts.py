@@ -201,7 +201,7 @@ def test_failed_solves_and_trajectories_that_end_in_them_are_counted(edge, brief
 
 @needs_nutpie
 def test_interrupted_run_returns_its_draws(linear, briefly, monkeypatch):
-    monkeypatch.setattr(nuts, "BLOCK", 50)
+    monkeypatch.setattr(nuts, "DRAWS_BETWEEN_CHECKS", 50)
     monkeypatch.setattr(nuts, "stop_rule", interrupting_at(50))
     posterior = bp.sample(*linear, seed=1, **(briefly | {"max_steps": 5000}))
     assert not posterior.converged
@@ -224,7 +224,7 @@ def test_terminated_run_returns_its_draws(linear, briefly, monkeypatch):
         signal.raise_signal(signal.SIGTERM)
         return np.empty(0), ["nothing"]
 
-    monkeypatch.setattr(nuts, "BLOCK", 50)
+    monkeypatch.setattr(nuts, "DRAWS_BETWEEN_CHECKS", 50)
     monkeypatch.setattr(nuts, "stop_rule", terminate)
     posterior = bp.sample(*linear, seed=1, **(briefly | {"max_steps": 5000}))
     assert posterior.reason.startswith("interrupted after ") and not posterior.converged

@@ -5,14 +5,14 @@ from numba import njit
 
 from bayesperiodic._compile.code_generation import GRID_SIGNATURE
 
-MATRIX, VECTOR = "float64[:,::1]", "float64[::1]"
+ARRAY_2D, ARRAY_1D = "float64[:,::1]", "float64[::1]"
 FUNCTION = f"FunctionType({GRID_SIGNATURE})"
 OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
 @njit(
-    f"boolean({FUNCTION}, {VECTOR}, float64, {VECTOR}, float64, int64[::1], {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, "
-    f"{MATRIX}, {VECTOR})",
+    f"boolean({FUNCTION}, {ARRAY_1D}, float64, {ARRAY_1D}, float64, int64[::1], {ARRAY_2D}, {ARRAY_2D}, "
+    f"{ARRAY_2D}, {ARRAY_2D}, {ARRAY_2D}, {ARRAY_1D})",
     **OPTIONS,
 )
 def slope(residual_jacobian, y, time, parameters, frequency, orders, states, row, columns, tau, system, rate):
@@ -60,7 +60,9 @@ def slope(residual_jacobian, y, time, parameters, frequency, orders, states, row
     return True
 
 
-@njit(f"boolean({FUNCTION}, {VECTOR}, {MATRIX}, int64, {VECTOR}, float64, int64[::1], int64, {MATRIX})", **OPTIONS)
+@njit(
+    f"boolean({FUNCTION}, {ARRAY_1D}, {ARRAY_2D}, int64, {ARRAY_1D}, float64, int64[::1], int64, {ARRAY_2D})", **OPTIONS
+)
 def runge_kutta(residual_jacobian, start, inputs, samples, parameters, frequency, orders, steps, path):
     """Fill `path` (kept, size) with the states before the last of the steps; see `models.model.integrate`.
 
@@ -98,7 +100,7 @@ def runge_kutta(residual_jacobian, start, inputs, samples, parameters, frequency
     return True
 
 
-@njit(f"void(complex128[:,::1], float64, {MATRIX})", **OPTIONS)
+@njit(f"void(complex128[:,::1], float64, {ARRAY_2D})", **OPTIONS)
 def fill_inputs(amplitudes, time, row):
     """Fill u, u̇, ü (1, 3·inputs) at a time in forcing periods, from amplitudes (harmonics, 3·inputs)."""
     if row.size == 0:
@@ -113,8 +115,8 @@ def fill_inputs(amplitudes, time, row):
 
 
 @njit(
-    f"int64({FUNCTION}, complex128[:,::1], {VECTOR}, float64, int64[::1], {VECTOR}, {MATRIX}, {MATRIX}, {VECTOR}, "
-    f"{MATRIX}, {VECTOR}, {VECTOR}, int64)",
+    f"int64({FUNCTION}, complex128[:,::1], {ARRAY_1D}, float64, int64[::1], {ARRAY_1D}, {ARRAY_2D}, {ARRAY_2D}, "
+    f"{ARRAY_1D}, {ARRAY_2D}, {ARRAY_1D}, {ARRAY_1D}, int64)",
     **OPTIONS,
 )
 def dormand_prince(

@@ -16,7 +16,7 @@ ANCHOR = types.Tuple([VECTOR, MATRIX, NUMBER, CUBE, VECTOR])
 
 @kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
-        FUNCTIONS, GRID, SETTING, MATRIX, PLACES, BORDER, NUMBER, MATRIX, MATRIX, MATRIX
+        ADDRESSES, GRID, SETTING, MATRIX, PLACES, BORDER, NUMBER, MATRIX, MATRIX, MATRIX
     ),
     **OPTIONS,
 )
@@ -68,7 +68,7 @@ def broyden(functions, grid, setting, band, pivots, border, target, z, states, c
         full = 0.0
         for i in range(own.size):
             full = max(full, abs(own[i]))
-        if not (full < FAR and squares[iteration] > 0.0) or not frequency + own[points * count] * first > 0.0:
+        if not (full < OFF_ANCHOR and squares[iteration] > 0.0) or not frequency + own[points * count] * first > 0.0:
             return full == 0.0, iteration + 1, frequency
         for i in range(points):
             for s in range(count):
@@ -92,13 +92,13 @@ def predicted_frequency(frequency, sensitivities, anchor_parameters, parameters,
 @inlined(FLAG(MATRIX, MATRIX, MATRIX, NUMBER, NUMBER), **INNER)
 def has_leapt(z, predicted, start, frequency, expected):
     """Return whether an orbit is not a continuation of `start`: unpredicted, shrunk, or of a shorter period."""
-    if is_far(z, predicted, start) or abs(frequency - expected) > FAR * expected:
+    if is_far(z, predicted, start) or abs(frequency - expected) > OFF_ANCHOR * expected:
         return True
     return has_shrunk(z, start) or has_shorter_period(z)
 
 
 @kernel(
-    types.Tuple([COUNT, COUNT, NUMBER])(FUNCTIONS, GRID, SETTING, ANCHOR, NUMBER, BORDER, MATRIX, MATRIX, WORKSPACE),
+    types.Tuple([COUNT, COUNT, NUMBER])(ADDRESSES, GRID, SETTING, ANCHOR, NUMBER, BORDER, MATRIX, MATRIX, WORKSPACE),
     **INNER,
 )
 def continue_from_anchor(functions, grid, setting, anchor, orientation, border, z, history, work):
@@ -154,7 +154,7 @@ def continue_from_anchor(functions, grid, setting, anchor, orientation, border, 
     return CONVERGED, used, now
 
 
-@kernel(types.void(FUNCTIONS, GRID, SETS, ORBITS, CUBE, COUNT, COUNT, FLAG, WORKSPACE, SOLUTION), **OPTIONS)
+@kernel(types.void(ADDRESSES, GRID, SETS, CYCLE_ANCHORS, CUBE, COUNT, COUNT, FLAG, WORKSPACE, SOLUTION), **OPTIONS)
 def follow_many(functions, grid, sets, orbits, parameters, start, stop, whole, work, solution):
     """Follow every orbit to its parameter vectors start … stop: by `broyden`, or else by `continue_from_anchor`.
 
@@ -168,7 +168,7 @@ def follow_many(functions, grid, sets, orbits, parameters, start, stop, whole, w
     own = Border(
         np.empty((2, size)), np.empty((1, size)), np.zeros((1, 1)), np.empty((2, 4)), np.empty(2, dtype=np.int64)
     )
-    history, change, inputs = np.empty((MAX_ITERATIONS, 3)), np.empty((points, count)), np.empty_like(sets.inputs[0])
+    history, change, inputs = np.empty((MOST_NEWTON_STEPS, 3)), np.empty((points, count)), np.empty_like(sets.inputs[0])
     predicted, z = np.empty((points, count)), np.empty((points, count))
     for b in range(start, stop):
         lost = CONVERGED

@@ -29,7 +29,7 @@ def in_units(reached, amplitude):
 
 @kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
-        FUNCTIONS, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, FACTORS, MATRIX, MATRIX
+        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, FACTORS, MATRIX, MATRIX
     ),
     **INNER,
 )
@@ -77,7 +77,7 @@ def newton_chord(
         moved += full
         if converged and (full <= POLISHED or not full < CHORD_RATE * previous):
             return True, iteration + 1, moved
-        if not full < FAR or (iteration > 0 and not full < CHORD_RATE * previous):
+        if not full < OFF_ANCHOR or (iteration > 0 and not full < CHORD_RATE * previous):
             return False, iteration + 1, moved
         converged = converged or full <= tolerance or rate * full**2 <= tolerance * previous
         if converged and (full <= POLISHED or not polish):
@@ -97,7 +97,7 @@ def was_damped(history, iterations):
 
 @kernel(
     types.Tuple([COUNT, COUNT])(
-        FUNCTIONS, GRID, COUNT, SETTING, UNKNOWNS, BORDER, VECTOR, MATRIX, CUBE, FLAG, MATRIX, MATRIX, WORKSPACE
+        ADDRESSES, GRID, COUNT, SETTING, UNKNOWNS, BORDER, VECTOR, MATRIX, CUBE, FLAG, MATRIX, MATRIX, WORKSPACE
     ),
     **INNER,
 )
@@ -121,7 +121,7 @@ def continue_from_anchor(
         copy(predicted, z)
         between = anchor_parameters + (setting.parameters - anchor_parameters) * (done + step)
         there = Setting(setting.inputs, between, setting.frequency, setting.drift)
-        code, more, _ = newton(functions, grid, there, unknowns, border, MAX_HALVINGS, z, history, work)
+        code, more, _ = newton(functions, grid, there, unknowns, border, HALVINGS, z, history, work)
         used += more
         if code == CONVERGED and repetitions(z, periods) > once:
             return OTHER_ORBIT, used
@@ -137,7 +137,7 @@ def continue_from_anchor(
     return CONVERGED, used
 
 
-@kernel(types.void(FUNCTIONS, GRID, COUNT, SETS, ANCHORS, CUBE, COUNT, COUNT, FLAG, FLAG, SOLUTION), **OPTIONS)
+@kernel(types.void(ADDRESSES, GRID, COUNT, SETS, ANCHORS, CUBE, COUNT, COUNT, FLAG, FLAG, SOLUTION), **OPTIONS)
 def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop, polish, rates, solution):
     """Solve for input sets times parameter vectors, those of the flat indices start … stop (vectors run fastest).
 
@@ -155,7 +155,7 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
     solves, kept, y, all_factors = parameters.shape[1], solution.z, solution.outputs, anchors.factors
     states, z = np.empty((points, 3 * count)), np.empty((points, count))
     predicted, change, reached = np.empty((points, count)), np.empty((points, count)), np.empty(count)
-    columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MAX_ITERATIONS, 3))
+    columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MOST_NEWTON_STEPS, 3))
     bands, pivots, inverses, gains, transfers, ends, interfaces, interface_pivots = all_factors
     own = Factors(
         np.empty_like(bands[0]), np.empty_like(pivots[0]), np.empty_like(inverses[0]), np.empty_like(gains[0]),
@@ -193,12 +193,12 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
         if not close:
             moved = np.inf
             copy(predicted, z)
-            code, more, _ = newton(functions, grid, setting, unknowns, border, MAX_HALVINGS, z, history, work)
+            code, more, _ = newton(functions, grid, setting, unknowns, border, HALVINGS, z, history, work)
             used += more
             doubtful = was_damped(history, more)
             if code != CONVERGED:
                 copy(at, z)
-                code, more, _ = newton(functions, grid, setting, unknowns, border, MAX_HALVINGS, z, history, work)
+                code, more, _ = newton(functions, grid, setting, unknowns, border, HALVINGS, z, history, work)
                 used += more
                 doubtful = True
         once = repetitions(at, periods)

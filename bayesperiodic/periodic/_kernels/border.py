@@ -155,7 +155,7 @@ def fill_setting(setting, unknowns, values, inputs, parameters):
     return frequency
 
 
-@kernel(types.void(FUNCTIONS, GRID, SETTING, UNKNOWNS, MATRIX, MATRIX, MATRIX, MATRIX), **OPTIONS)
+@kernel(types.void(ADDRESSES, GRID, SETTING, UNKNOWNS, MATRIX, MATRIX, MATRIX, MATRIX), **OPTIONS)
 def fill_slopes(functions, grid, setting, unknowns, states, columns, table, slopes):
     """Fill the first rows of `slopes` with ∂g/∂(unknowns), z held as a function of tau, folded.
 
@@ -196,7 +196,7 @@ def folded_product(z, row, grid):
 
 @kernel(
     types.Tuple([NUMBER, NUMBER])(
-        FUNCTIONS, GRID, SETTING, UNKNOWNS, BORDER, MATRIX, MATRIX, MATRIX, MATRIX, WORKSPACE, VECTOR
+        ADDRESSES, GRID, SETTING, UNKNOWNS, BORDER, MATRIX, MATRIX, MATRIX, MATRIX, WORKSPACE, VECTOR
     ),
     **INNER,
 )

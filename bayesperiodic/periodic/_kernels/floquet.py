@@ -4,11 +4,11 @@ import numpy as np
 from numba import njit
 
 STAGES = 3
-MATRIX, CUBE = "float64[:,::1]", "float64[:,:,::1]"
-OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
+ARRAY_2D, ARRAY_3D = "float64[:,::1]", "float64[:,:,::1]"
+FLOQUET_OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
 
 
-@njit(f"boolean({MATRIX}, {MATRIX})", **OPTIONS)
+@njit(f"boolean({ARRAY_2D}, {ARRAY_2D})", **FLOQUET_OPTIONS)
 def solve(matrix, right):
     """Solve in place for the columns of `right`, with pivoting; return False if the matrix is singular."""
     size, columns = matrix.shape[0], right.shape[1]
@@ -41,7 +41,7 @@ def solve(matrix, right):
     return True
 
 
-@njit(f"void({CUBE}, {CUBE}, int64, float64, {MATRIX}, float64[::1], {CUBE})", **OPTIONS)
+@njit(f"void({ARRAY_3D}, {ARRAY_3D}, int64, float64, {ARRAY_2D}, float64[::1], {ARRAY_3D})", **FLOQUET_OPTIONS)
 def transfer_matrices(matrix, weights, first, step, gauss, sums, result):
     """Fill the transfer matrices (points, size, size) from each grid point to the next; NaN where singular.
 
@@ -92,7 +92,7 @@ def transfer_matrices(matrix, weights, first, step, gauss, sums, result):
                     result[point, p, q] = product[p, q]
 
 
-@njit(f"void({MATRIX}, {MATRIX})", **OPTIONS)
+@njit(f"void({ARRAY_2D}, {ARRAY_2D})", **FLOQUET_OPTIONS)
 def orthogonalise(matrix, basis):
     """Fill the orthogonal factor of QR by Householder's reflections; the matrix is overwritten."""
     size = matrix.shape[0]
@@ -124,7 +124,7 @@ def orthogonalise(matrix, basis):
                 basis[q, p] -= factor * along * mirror[p]
 
 
-@njit(f"void({CUBE}, {MATRIX}, {CUBE})", **OPTIONS)
+@njit(f"void({ARRAY_3D}, {ARRAY_2D}, {ARRAY_3D})", **FLOQUET_OPTIONS)
 def sweep(factors, basis, before):
     """Carry an orthogonal basis (size, size) through the factors, in place; fill the basis before each factor."""
     count, size, _ = factors.shape
@@ -147,7 +147,7 @@ def sweep(factors, basis, before):
         orthogonalise(product, basis)
 
 
-@njit(f"void({CUBE}, complex128[:,::1], int64, boolean, complex128[:,::1])", **OPTIONS)
+@njit(f"void({ARRAY_3D}, complex128[:,::1], int64, boolean, complex128[:,::1])", **FLOQUET_OPTIONS)
 def eigenfunction(steps, at, length, adjoint, result):
     """Fill an eigenfunction (points, size) of unit length from its values `at` every `length`-th point.
 
@@ -170,7 +170,7 @@ def eigenfunction(steps, at, length, adjoint, result):
             result[k, p] /= norm
 
 
-@njit(f"Tuple((boolean, float64, float64))({CUBE}, float64[::1], int64, float64)", **OPTIONS)
+@njit(f"Tuple((boolean, float64, float64))({ARRAY_3D}, float64[::1], int64, float64)", **FLOQUET_OPTIONS)
 def dominant_multiplier(steps, vector, sweeps, tolerance):
     """Iterate a vector over the period until its direction is constant; return whether it is, log|μ|, the sign of μ."""
     points, size, _ = steps.shape

@@ -4,8 +4,8 @@ The band is factored in one of two ways. Both are stable for any Floquet multipl
 period:
 
 - Segments: where the scheme allows it, the equations are solved for the newest point and marched from `reach` unknown
-  start points, until their coefficients have grown by `GROWTH`; there the next segment starts. The start points of all
-  segments are coupled by a small dense system, solved with pivoting.
+  start points, until their coefficients have grown by `SEGMENT_GROWTH`; there the next segment starts. The start
+  points of all segments are coupled by a small dense system, solved with pivoting.
 - Folded band: in the folded order of `schemes.CyclicGrid` a cyclic band is an ordinary one, factored with pivoting.
   Rows of the band are stored side by side: entry (i, j) of the matrix is ``band[i, j - i + lower]``, the width is
   2·lower + upper + 1 and leaves room for the fill-in of row exchanges. It is read through flat, unsigned indices,
@@ -21,8 +21,8 @@ from bayesperiodic.periodic.compiled import *
 
 STATES, REACH, WIDTH, HALF = globals().get("SIZES", (0, 0, 0, 0))  # 0: any number, taken from the arrays
 LOWER = HALF * STATES + STATES - 1 if HALF > 0 else 0  # half-width of the folded band
-NARROW = 5
-GROWTH, TOO_MUCH_GROWTH = 1e4, 1e8
+NARROW_BAND = 5
+SEGMENT_GROWTH, TOO_MUCH_GROWTH = 1e4, 1e8
 CHECK_EVERY = 8
 OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 INNER = OPTIONS | {"no_cpython_wrapper": True}  # for functions that Python never calls: an eighth less to compile
@@ -96,7 +96,7 @@ def factor(band, lower, upper, pivots):
     size, one, below, above = np.uint64(band.shape[0]), np.uint64(1), np.uint64(lower), np.uint64(upper)
     next_row = np.uint64(band.shape[1]) - one
     first, last = np.uint64(0), np.uint64(0)
-    if 0 < LOWER <= NARROW and lower == LOWER and upper == LOWER and size > 3 * LOWER:
+    if 0 < LOWER <= NARROW_BAND and lower == LOWER and upper == LOWER and size > 3 * LOWER:
         # The last rows are shorter.
         first = size - np.uint64(3 * LOWER)
         last = first + np.uint64(2 * LOWER - 1)
@@ -291,7 +291,7 @@ def condense_segments(columns, grid, frequency, amplitude, factors):
                         growth = max(growth, abs(transfer[e, d * count + s, j]) * amplitude[s] / amplitude[e])
             if not growth < TOO_MUCH_GROWTH:
                 return False
-            if (growth > GROWTH or j == points - 1) and j - start >= reach - 1:
+            if (growth > SEGMENT_GROWTH or j == points - 1) and j - start >= reach - 1:
                 if segments == MAX_SEGMENTS:
                     return False
                 segments, start = segments + 1, j + 1

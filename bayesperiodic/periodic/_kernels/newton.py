@@ -19,12 +19,12 @@ if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
 
 BORDERED = globals().get("BORDERED", True)
 CHORD_RATE = 0.2
-ROUNDING = 4.0 * np.finfo(float).eps
+ROUNDING_LEVEL = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
-DETERMINED, MAX_ROUNDED = 1e-6, 3  # largest step that ends the iteration at a residual at rounding level; trials of it
+LAST_STEP, MAX_ROUNDED = 1e-6, 3  # largest step that ends the iteration at a residual at rounding level; trials of it
 UNDETERMINED, RESTING = 0.1, 1e-8  # see `ending` and `find_resting`
-JAGGED, ALTERNATING, ROUGH = 0.01, 0.9, 0.01  # see `is_jagged`
-FAR = 0.3
+JAGGED, ALTERNATING, ROUGHNESS = 0.01, 0.9, 0.01  # see `is_jagged`
+OFF_ANCHOR = 0.3
 SMALLEST_PART = 1.0 / 256.0  # smallest step of a continuation from an anchor
 
 
@@ -94,7 +94,7 @@ def scales(columns, states, grid, amplitude, frequency, size, rounding, weight):
                 size[e] = max(size[e], terms, abs(columns[i, e]))
                 rounding[e] = max(rounding[e], error)
             stride = 1 if stride > 1 and size[e] == 0.0 else 0
-        rounding[e] *= ROUNDING
+        rounding[e] *= ROUNDING_LEVEL
 
 
 @inlined(types.void(MATRIX, VECTOR), **INNER)
@@ -192,14 +192,14 @@ def ending(grid, factors, rounding, reached, resting, z, change):
 
 
 @kernel(
-    types.Tuple([COUNT, COUNT, NUMBER])(FUNCTIONS, GRID, SETTING, UNKNOWNS, BORDER, COUNT, MATRIX, MATRIX, WORKSPACE),
+    types.Tuple([COUNT, COUNT, NUMBER])(ADDRESSES, GRID, SETTING, UNKNOWNS, BORDER, COUNT, MATRIX, MATRIX, WORKSPACE),
     **OPTIONS,
 )
 def newton(functions, grid, setting, unknowns, border, halvings, z, history, work):
     """Solve g(z, values) = 0 and the conditions of the unknowns in place; return status, iterations and orientation.
 
     An iteration ends the search when its step, or the next step expected from the observed rate, is below
-    `STEP_TOLERANCE`, or when the residual is at rounding level and the next step would be below `DETERMINED` of the
+    `STEP_TOLERANCE`, or when the residual is at rounding level and the next step would be below `LAST_STEP` of the
     largest values so far, which for a state of rest is the guess. If it is not at `MAX_ROUNDED` iterates in a row,
     rounding hides whether there is a solution, and the status is "singular", as for a solution that is undetermined.
     The orientation is the sign of the determinant of the bordered matrix at the last but one iterate, 0 without a
@@ -227,7 +227,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     unit, resting, settled = np.empty(count), np.empty(count, dtype=np.bool_), not BORDERED
     for s in range(count):
         reached[s] = 0.0
-    for iteration in range(MAX_ITERATIONS):
+    for iteration in range(MOST_NEWTON_STEPS):
         largest(z, amplitude)
         scales(columns, states, grid, amplitude, frequency, size, rounding, weight)
         before = norm(columns, size)
@@ -265,7 +265,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
             for s in range(count):
                 if moved[s] > 0.0 and not resting[s]:
                     settling = max(settling, moved[s] / reached[s])
-            if settling <= DETERMINED:
+            if settling <= LAST_STEP:
                 return ending(grid, factors, rounding, reached, resting, z, step), iteration, orientation
         if rounded == MAX_ROUNDED:
             return SINGULAR, iteration, orientation
@@ -299,7 +299,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
             return ending(grid, factors, rounding, reached, resting, z, step), iteration + 1, orientation
         previous = full if damping == 1.0 else np.inf
         rounded = rounded + 1 if damping == 1.0 and norm(columns, rounding) <= 1.0 else 0
-    return STALLED, MAX_ITERATIONS, orientation
+    return STALLED, MOST_NEWTON_STEPS, orientation
 
 
 @kernel(types.void(MATRIX, CUBE, VECTOR, VECTOR, NUMBER, MATRIX), **INNER)
@@ -316,7 +316,7 @@ def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fract
 
 @kernel(FLAG(MATRIX, MATRIX, MATRIX), **INNER)
 def is_far(z, predicted, anchor_z):
-    """Return whether z is off the prediction by more than `FAR` of the anchor's range and of the change.
+    """Return whether z is off the prediction by more than `OFF_ANCHOR` of the anchor's range and of the change.
 
     States that remain exactly at rest do not count.
     """
@@ -327,7 +327,7 @@ def is_far(z, predicted, anchor_z):
             off = max(off, abs(z[i, s] - predicted[i, s]))
             change = max(change, abs(predicted[i, s] - anchor_z[i, s]))
             low, high = min(low, anchor_z[i, s]), max(high, anchor_z[i, s])
-        if not rest and off > FAR * (high - low) and off > FAR * change:
+        if not rest and off > OFF_ANCHOR * (high - low) and off > OFF_ANCHOR * change:
             return True
     return False
 
@@ -365,7 +365,7 @@ def is_jagged(z, inputs):
     k of n points with a factor sin⁴(πk/n), 1 at the highest. A state is jagged if its root mean square exceeds `JAGGED`
     of the state's standard deviation, and if most of it is at the highest harmonics: the sixth difference over 64 keeps
     more than `ALTERNATING` of the energy. The spectrum of a resolved state decreases, also at kinks, and its sixth
-    differences keep less than the 0.83 of white noise. Where an input or its derivatives have more than `ROUGH` at
+    differences keep less than the 0.83 of white noise. Where an input or its derivatives have more than `ROUGHNESS` at
     high harmonics, such as noise, so has the response.
     """
     points, last, jagged = z.shape[0], z.shape[0] - 1, False
@@ -380,7 +380,7 @@ def is_jagged(z, inputs):
             jagged = True
     if jagged:
         for k in range(inputs.shape[1]):
-            if is_large(inputs, k, fourth_differences(inputs, fourth, k), ROUGH):
+            if is_large(inputs, k, fourth_differences(inputs, fourth, k), ROUGHNESS):
                 return False
     return jagged
 
@@ -397,7 +397,7 @@ def repetitions(z, periods):
                 for i in range(points):
                     off = max(off, abs(z[i, s] - z[i - shift, s]))
                     low, high = min(low, z[i, s]), max(high, z[i, s])
-                if off > SAME * (high - low):
+                if off > SAME_REPETITIONS * (high - low):
                     same = False
                     break
             if same:
