@@ -139,10 +139,10 @@ def integer(argument: str, value: Any, minimum: int | None = None) -> int:
 def real_array(argument: str, values: Any) -> np.ndarray:
     """Return `values` as an array of floats; raise a ValueError unless they are real numbers."""
     try:
-        found = np.asarray(values)
-        if np.iscomplexobj(found):
+        array = np.asarray(values)
+        if np.iscomplexobj(array):
             raise ValueError
-        return found.astype(float)
+        return array.astype(float)
     except (TypeError, ValueError):
         raise ValueError(f"{argument}: must be an array of real numbers, got {shortened(values)}.") from None
 

@@ -90,8 +90,8 @@ def sums(values: np.ndarray, phase: np.ndarray, harmonics: int) -> np.ndarray:
     for first in range(0, phase.size, length):
         part = slice(first, first + length)
         place, offset = _places(phase[part], points)
-        for channel, own in enumerate(values):
-            weighted = np.array(own[part], dtype=float)
+        for channel, signal in enumerate(values):
+            weighted = np.array(signal[part], dtype=float)
             for table in tables:
                 table[channel] += np.bincount(place, weighted, points)
                 weighted *= offset

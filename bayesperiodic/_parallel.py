@@ -138,15 +138,15 @@ def interrupts_deferred() -> Iterator[Callable[[], None]]:
             raise KeyboardInterrupt
 
     main = threading.current_thread() is threading.main_thread()
-    own = signal.default_int_handler
-    taken = [n for n in (signal.SIGINT, signal.SIGTERM) if main and signal.getsignal(n) is own]
+    default = signal.default_int_handler
+    taken = [n for n in (signal.SIGINT, signal.SIGTERM) if main and signal.getsignal(n) is default]
     for number in taken:
         signal.signal(number, note)
     try:
         yield check
     finally:
         for number in taken:
-            signal.signal(number, own)
+            signal.signal(number, default)
 
 
 class TaskPool:

@@ -186,23 +186,23 @@ def _integrate_periodic(system: _FirstOrder, start: np.ndarray, time: np.ndarray
     function, dormand_prince = system.model.kernels.residual_jacobian, integration_kernels().dormand_prince
 
     def path(tau: np.ndarray, absolute: np.ndarray, relative: np.ndarray) -> np.ndarray:
-        found = np.empty((tau.size, start.size))
-        found[0] = start
+        states = np.empty((tau.size, start.size))
+        states[0] = start
         settings = (amplitudes, system.theta, system.frequency, system.orders, tau)
-        return found[: dormand_prince(function, *settings, found, *_tableau(), absolute, relative, STEPS_EACH)]
+        return states[: dormand_prince(function, *settings, states, *_tableau(), absolute, relative, STEPS_EACH)]
 
     trial = path(np.linspace(0.0, min(tau[-1], TRIAL), 61), 1e-12 * ones, 1e-3 * ones)
     size, relative = np.abs(trial).max(axis=0) + np.finfo(float).tiny, RELATIVE_TOLERANCE * ones
     # The error of an angle is relative to one turn, not to its value.
     angles = [i for i, state in enumerate(system.model.states) if state in system.model.angles]
     size[angles], relative[angles] = np.maximum(size[angles], np.pi), 0.0
-    found = path(tau, RELATIVE_TOLERANCE * size, relative)
-    if len(found) < time.size or not np.isfinite(found).all():
+    states = path(tau, RELATIVE_TOLERANCE * size, relative)
+    if len(states) < time.size or not np.isfinite(states).all():
         raise RuntimeError(
-            f"The time integration of {system.model.name!r} failed at {time[len(found) - 1]:.6g} s, because the step "
+            f"The time integration of {system.model.name!r} failed at {time[len(states) - 1]:.6g} s, because the step "
             f"became too small. {UNBOUNDED}"
         )
-    return found
+    return states
 
 
 class _Periodic:
@@ -259,10 +259,10 @@ def steady_cycle(
         y = system.start(start or {})
         for _ in range(TRANSIENTS):
             y = _advanced(system, y, TRANSIENT_PERIODS)
-            found = _fixed_point(system, y)
-            if found is not None:
+            settled = _fixed_point(system, y)
+            if settled is not None:
                 time = np.arange(samples) / (samples * frequency)
-                return system.outputs(time, _integrate_periodic(system, found, time))
+                return system.outputs(time, _integrate_periodic(system, settled, time))
     except (RuntimeError, np.linalg.LinAlgError) as error:
         raise NotSettled(f"{model.name!r}: {error}") from error
     raise NotSettled(f"{model.name!r} does not converge to a stable cycle in {TRANSIENTS * TRANSIENT_PERIODS} periods.")

@@ -1,3 +1,4 @@
+import ast
 import inspect
 import subprocess
 import sys
@@ -29,6 +30,16 @@ def test_a_constant_has_one_value():
             values[name][value].append(module)
     several = {name: dict(places) for name, places in values.items() if len(places) > 1}
     assert not several, "say in the name what the constant limits, or import the one that is meant"
+
+
+def test_variables_are_called_by_nouns():
+    vague = [
+        f"{module}:{node.lineno} {name}"
+        for module, path in modules().items()
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if (name := getattr(node, "id", getattr(node, "arg", ""))) in ("own", "found")
+    ]
+    assert not vague
 
 
 def test_a_class_name_stands_for_one_class():

@@ -118,7 +118,7 @@ def fold_signals(
     cycles = round(np.ptp(steady.time) * fit.frequency)
     _warn(signals.name, pace, cycles, len(shape))
     one_cycle, noise = zip(*(_noise(steady, fit, row, cycles) for row in range(len(steady.values))), strict=True)
-    significant = [_last_significant(a, own) for a, own in zip(fit.amplitudes, noise, strict=True)]
+    significant = [_last_significant(a, part) for a, part in zip(fit.amplitudes, noise, strict=True)]
     kept = dict(zip(signals.channels, significant, strict=True)) | _chosen(harmonics, signals.channels, limit)
     amplitudes = fit.amplitudes
     if origin == CROSSING:
@@ -131,7 +131,7 @@ def fold_signals(
     def by_channel(values: Iterable[Any]) -> dict[str, Any]:
         return dict(zip(signals.channels, values, strict=True))
 
-    folded = by_channel(_fourier.on_grid(a[own], points) for a, own in zip(amplitudes, used, strict=True))
+    folded = by_channel(_fourier.on_grid(a[part], points) for a, part in zip(amplitudes, used, strict=True))
     inputs, outputs = signals.channels[: signals.inputs], signals.channels[signals.inputs :]
     return {
         "frequency": fit.frequency * periods,
@@ -143,11 +143,11 @@ def fold_signals(
         "periods": periods,
         "cycles": cycles,
         "averaged": steady.time.size,
-        "scatter": by_channel(float(np.sqrt(_power(v[own]))) for v, own in zip(one_cycle, used, strict=True)),
+        "scatter": by_channel(float(np.sqrt(_power(v[part]))) for v, part in zip(one_cycle, used, strict=True)),
         "independent": {channel: min(2 * kept[channel] + 1, steady.time.size) for channel in outputs},
         "harmonics": kept,
-        "amplitude_variance": by_channel(v.variance[own] for v, own in zip(noise, used, strict=True)),
-        "amplitude_freedom": by_channel(v.freedom[own] for v, own in zip(noise, used, strict=True)),
+        "amplitude_variance": by_channel(v.variance[part] for v, part in zip(noise, used, strict=True)),
+        "amplitude_freedom": by_channel(v.freedom[part] for v, part in zip(noise, used, strict=True)),
         "error_slopes": _error_slopes(by_channel(noise), inputs, kept),
         "periodicity": periodicity,
         "drift": drift,
@@ -191,9 +191,9 @@ def _first_guess(signals: Signals, frequency: float | None, periods: int) -> flo
     else:
         fundamental = guess_frequency(time, values)
     if fundamental is None or _cycles(signals.time, fundamental) < MINIMUM_CYCLES:
-        found = "no period" if fundamental is None else f"{_cycles(signals.time, fundamental):.2f} cycles"
+        period = "no period" if fundamental is None else f"{_cycles(signals.time, fundamental):.2f} cycles"
         raise ValueError(
-            f"recording: must have at least {MINIMUM_CYCLES} cycles, got {found} in {signals.name!r} of "
+            f"recording: must have at least {MINIMUM_CYCLES} cycles, got {period} in {signals.name!r} of "
             f"{np.ptp(signals.time):g} s; record longer, or {remedy}."
         )
     return fundamental
@@ -220,8 +220,8 @@ def gaps(time: np.ndarray, period: float) -> np.ndarray:
 
 
 def _refuse_gaps(signals: Signals, fundamental: float) -> None:
-    if (found := gaps(signals.time, 1.0 / fundamental)).size:
-        first, last = signals.time[found[0]], signals.time[found[0] + 1]
+    if (ends := gaps(signals.time, 1.0 / fundamental)).size:
+        first, last = signals.time[ends[0]], signals.time[ends[0] + 1]
         raise ValueError(
             f"recording: must have no gap longer than {GAP:g} periods, got {signals.name!r} without samples from "
             f"{first:g} to {last:g} s (period {1.0 / fundamental:g} s); fold the parts that `split` returns."
@@ -235,7 +235,7 @@ def _tracked(signals: Signals, fundamental: float, given: bool) -> float:
     if given:
         few = min(10, resolved_harmonics(time, max(tracked, fundamental), time.size))
         near = abs(tracked - fundamental) * np.ptp(time) < OTHER_CYCLES
-        if near or not _explains_more(*(fit_harmonics(time, values, own, few) for own in (tracked, fundamental))):
+        if near or not _explains_more(*(fit_harmonics(time, values, rate, few) for rate in (tracked, fundamental))):
             return fundamental
     if (cycles := _cycles(time, tracked)) < MINIMUM_CYCLES:
         raise ValueError(
@@ -310,8 +310,8 @@ def _cycles_apart(signals: Signals, fundamental: float) -> tuple[np.ndarray, np.
     scaled = values[:, used] / values.std(axis=1)[:, None]
     sums = np.empty((order.size, len(values) + 1, total), dtype=complex)
     for h in order:
-        for own, signal in zip(sums[h], [1.0, *(scaled if h < harmonics.size else ())], strict=False):
-            own[:] = np.add.reduceat(signal * power, first - first[0])
+        for row, signal in zip(sums[h], [1.0, *(scaled if h < harmonics.size else ())], strict=False):
+            row[:] = np.add.reduceat(signal * power, first - first[0])
         power *= wave
     # Normal equations of each cycle, as in `fit_harmonics`.
     moments = np.concatenate([np.conj(sums[:0:-1, 0]), sums[:, 0]])
@@ -432,19 +432,19 @@ def _error_slopes(
     That none of the harmonics from the first on does is tested by their coherences γ², of which −2(n − 1)·ln(1 − γ²)
     has the distribution χ² with two degrees of freedom for n lines. Slopes are averaged over neighbouring harmonics.
     """
-    found: dict[str, dict[str, np.ndarray]] = {}
+    slopes: dict[str, dict[str, np.ndarray]] = {}
     for name in inputs:
         for channel in [other for other in noise if other not in inputs]:
             one, two = (noise[c].beside[:, : 1 + min(kept[name], kept[channel])] for c in (name, channel))
-            common, own = np.sum(np.conj(one) * two, axis=0), np.sum(np.abs(one) ** 2, axis=0)
-            every = own * np.sum(np.abs(two) ** 2, axis=0)
-            coherence = np.divide(np.abs(common) ** 2, every, out=np.zeros(own.size), where=every > 0.0)[1:]
+            common, weight = np.sum(np.conj(one) * two, axis=0), np.sum(np.abs(one) ** 2, axis=0)
+            every = weight * np.sum(np.abs(two) ** 2, axis=0)
+            coherence = np.divide(np.abs(common) ** 2, every, out=np.zeros(weight.size), where=every > 0.0)[1:]
             statistic = -2.0 * (len(one) - 1) * np.log1p(-np.minimum(coherence, 1.0 - np.finfo(float).eps)).sum()
             if chdtrc(2 * coherence.size, statistic) < FALSE_ALARM_RATE:
-                slope = neighbours_mean(common, own)
+                slope = neighbours_mean(common, weight)
                 slope[0] = slope[0].real
-                found.setdefault(name, {})[channel] = slope
-    return found
+                slopes.setdefault(name, {})[channel] = slope
+    return slopes
 
 
 def neighbours_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -452,7 +452,7 @@ def neighbours_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     window, result = np.ones(2 * POOLED + 1), np.zeros(values.shape, dtype=values.dtype)
     np.divide(values[:1], weights[:1], out=result[:1], where=weights[:1] > 0.0)
     middle = slice(POOLED, POOLED + values.size - 1)
-    total, weight = (np.convolve(own[1:], window)[middle] for own in (values, weights))
+    total, weight = (np.convolve(terms[1:], window)[middle] for terms in (values, weights))
     np.divide(total, weight, out=result[1:], where=weight > 0.0)
     return result
 
@@ -546,14 +546,14 @@ def parts(time: np.ndarray, signal: np.ndarray) -> list[slice]:
         return [slice(0, time.size)]
     period = float(np.median(np.diff(time[rising])))
     edges = np.concatenate([[0], gaps(time, period) + 1, [time.size]])
-    found = []
+    pieces = []
     for first, last in zip(edges[:-1], edges[1:], strict=True):
         inside = first + _rising(time[first:last], signal[first:last])
         steps = inside[_steps(time, signal, inside)]
         bounds = [first, *steps.tolist(), last]
-        found += [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-    cycles = [np.searchsorted(rising, own.stop) - np.searchsorted(rising, own.start) for own in found]
-    return [own for own, count in zip(found, cycles, strict=True) if count > MINIMUM_CYCLES]
+        pieces += [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    cycles = [np.searchsorted(rising, part.stop) - np.searchsorted(rising, part.start) for part in pieces]
+    return [part for part, count in zip(pieces, cycles, strict=True) if count > MINIMUM_CYCLES]
 
 
 def _rising(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
@@ -578,20 +578,20 @@ def _steps(time: np.ndarray, signal: np.ndarray, rising: np.ndarray) -> list[int
     # A single odd period, as at a jump of the phase, is no step.
     mirrored = np.concatenate([period[1:2], period, period[-2:-1]])
     period = np.median([mirrored[:-2], period, mirrored[2:]], axis=0)
-    found, stack = [], [(0, period.size)]
+    steps, stack = [], [(0, period.size)]
     while stack:
         first, last = stack.pop()
         size = last - first
         number = np.arange(MINIMUM_CYCLES, size - MINIMUM_CYCLES + 1)
         if not number.size:
             continue
-        own = period[first:last]
-        before = np.cumsum(own)[number - 1]
-        difference = before / number - (own.sum() - before) / (size - number)
+        segment = period[first:last]
+        before = np.cumsum(segment)[number - 1]
+        difference = before / number - (segment.sum() - before) / (size - number)
         score = np.abs(difference) * np.sqrt(number * (size - number) / size)
         best = int(np.argmax(score))
         if score[best] > SIGNIFICANT_PERIOD_STEP * noise and abs(difference[best]) > SMALLEST_PERIOD_STEP:
             middle = first + int(number[best])
-            found.append(middle)
+            steps.append(middle)
             stack += [(first, middle), (middle, last)]
-    return sorted(found)
+    return sorted(steps)

@@ -17,7 +17,7 @@ MINIMUM_CYCLES = 3
 # Cycles of a stretch from which its frequency is tracked.
 TRACKED = 48
 # Deviations of the phase [cycles] below this are of no consequence; others count if they are not explained by noise.
-NEGLIGIBLE_PHASE, PHASE_FALSE_ALARM_RATE = 1.0 / 360.0, 1e-4
+NEGLIGIBLE_PHASE, PHASE_FALSE_ALARM = 1.0 / 360.0, 1e-4
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Pace:
 
     def differs(self, difference: float, duration: float) -> bool:
         """Return whether a frequency differs from the estimated one significantly, and by a phase that matters."""
-        significant = abs(difference) > self.se * student.isf(0.5 * PHASE_FALSE_ALARM_RATE, self.freedom)
+        significant = abs(difference) > self.se * student.isf(0.5 * PHASE_FALSE_ALARM, self.freedom)
         return bool(significant and abs(difference) * duration > NEGLIGIBLE_PHASE)
 
 
@@ -130,25 +130,25 @@ def _pace(time: np.ndarray, fit: HarmonicFit, clear: np.ndarray, weights: np.nda
     cycle = np.floor((time - time[0]) * fit.frequency).astype(int)
     rate = _fourier.derivative(clear, 1.0)
     turned = (_fourier.at_times(r, fit.frequency * time) * fit.residuals for r in (rate, 1j * rate))
-    score, quadrature = (np.bincount(cycle, weights @ own) for own in turned)
+    score, quadrature = (np.bincount(cycle, weights @ part) for part in turned)
     if score.size < MINIMUM_CYCLES:
         return Pace(float(np.sqrt(1.0 / information)), 0, 0.0, False)
-    own = time.size * float(weights @ np.sum(np.abs(rate) ** 2, axis=1)) / 2.0 / score.size
+    power = time.size * float(weights @ np.sum(np.abs(rate) ** 2, axis=1)) / 2.0 / score.size
     orders = min(max(score.size // 4, 4), 16, score.size - 3)
     number = np.linspace(-1.0, 1.0, score.size)
     basis = np.linalg.qr(np.polynomial.legendre.legvander(number, orders + 2))[0].T
-    phase, amplitude = basis @ score / own, basis @ quadrature / own
+    phase, amplitude = basis @ score / power, basis @ quadrature / power
     others = np.concatenate([phase[3:], amplitude[1:] if orders < 4 else []])
-    noise = max(float(np.sum(others**2)) / max(others.size, 1), 1.0 / own)
+    noise = max(float(np.sum(others**2)) / max(others.size, 1), 1.0 / power)
     irregular = float(np.ptp(phase[3:] @ basis[3:]))
-    allowed = fdtri(orders, orders, 1.0 - PHASE_FALSE_ALARM_RATE) * max(float(np.sum(amplitude[3:] ** 2)), orders / own)
+    allowed = fdtri(orders, orders, 1.0 - PHASE_FALSE_ALARM) * max(float(np.sum(amplitude[3:] ** 2)), orders / power)
     wanders = orders >= 4 and irregular > NEGLIGIBLE_PHASE and float(np.sum(phase[3:] ** 2)) > allowed
     curvature = phase[2] * basis[2]
     bend = float(np.ptp(curvature))
-    limit = student.isf(0.5 * PHASE_FALSE_ALARM_RATE, others.size)
+    limit = student.isf(0.5 * PHASE_FALSE_ALARM, others.size)
     sign = float(np.sign(curvature[0] - curvature[score.size // 2]))
     return Pace(
-        float(np.sqrt(noise * own / information)),
+        float(np.sqrt(noise * power / information)),
         others.size,
         8.0 * sign * bend * score.size / (score.size - 1) ** 2,
         bool(bend > NEGLIGIBLE_PHASE and abs(phase[2]) > limit * np.sqrt(noise)),

@@ -86,18 +86,18 @@ def _lines(time: np.ndarray, values: np.ndarray, frequency: float, periods: int,
     per_period = (time.size - 1) / (np.ptp(time) * frequency)
     points = FINENESS * int(np.ceil(per_period - 1e-6)) * periods * cycles
     place = np.rint((time - time[0]) * frequency / (periods * cycles) * points).astype(int) % points
-    found = []
-    for own, residuals, amplitudes in zip(values, fit.residuals, fit.amplitudes, strict=True):
+    spectra = []
+    for signal, residuals, amplitudes in zip(values, fit.residuals, fit.amplitudes, strict=True):
         spectrum = np.fft.rfft(np.bincount(place, residuals, points))[1 : int(0.5 * per_period * periods * cycles)]
         # Irregular samples let the harmonics take a part of the noise between them, and have as much less of their own.
         rest = 2.0 * np.abs(spectrum / (time.size - 2 * amplitudes.size)) ** 2
         rest[cycles - 1 :: cycles] = 0.0
         scatter = float(np.mean(residuals**2)) * cycles / (cycles - 1)
-        one_cycle = own - residuals
-        error = 2.0 * repeated_variance(own, one_cycle[: own.size // cycles], own.size // cycles, scatter)
-        explained = 1.0 - float(np.mean(residuals**2)) / float(np.var(own))
-        found.append(Lines(cycles, 0.5 * np.abs(amplitudes[1:]) ** 2, rest, error, explained))
-    return found
+        one_cycle = signal - residuals
+        error = 2.0 * repeated_variance(signal, one_cycle[: signal.size // cycles], signal.size // cycles, scatter)
+        explained = 1.0 - float(np.mean(residuals**2)) / float(np.var(signal))
+        spectra.append(Lines(cycles, 0.5 * np.abs(amplitudes[1:]) ** 2, rest, error, explained))
+    return spectra
 
 
 def _highest(time: np.ndarray, frequency: float, periods: int) -> int:

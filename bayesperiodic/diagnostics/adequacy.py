@@ -111,15 +111,15 @@ def consistency(parts: Sequence[tuple[np.ndarray, np.ndarray, str]], known: froz
     Each block has whitened components (size,), their derivatives (parameters, size), and the group of blocks with which
     it has a common variance; the whitened variance of `known` groups is 1.
     """
-    own = [Unexplained(r, j, np.zeros(r.size, dtype=int)) for r, j, _ in parts]
+    apart = [Unexplained(r, j, np.zeros(r.size, dtype=int)) for r, j, _ in parts]
     scale, freedoms = dict.fromkeys(known, 1.0), [np.inf]
     for group in {g for *_, g in parts} - known:
-        members = [u for u, (*_, g) in zip(own, parts, strict=True) if g == group]
+        members = [u for u, (*_, g) in zip(apart, parts, strict=True) if g == group]
         freedom = sum(u.freedom for u in members)
         if freedom and (square := sum(u.square for u in members)) > 0.0:
             scale[group] = square / freedom
             freedoms.append(freedom)
-    kept = [(u, r, j, g) for u, (r, j, g) in zip(own, parts, strict=True) if g in scale]
+    kept = [(u, r, j, g) for u, (r, j, g) in zip(apart, parts, strict=True) if g in scale]
     if not kept:
         return NOT_TESTED
     r, j = (np.concatenate([part[i] / np.sqrt(scale[part[3]]) for part in kept], axis=-1) for i in (1, 2))
@@ -205,7 +205,7 @@ REJECTIONS = {
 
 def rejections(table: pd.DataFrame) -> dict[str, str]:
     """Return the rejections of a table in words, by row."""
-    found = {}
+    texts = {}
     for (label, row), small in zip(table.iterrows(), adjusted_p(table) < ADEQUACY_LEVEL, strict=True):
         if reasons := [f"{REJECTIONS[test]} (p = {row[test]:.2g})" for test in compress(ADEQUACY_TESTS, small)]:
             error, harmonic = row["model_error_share"], row["harmonic"]
@@ -214,8 +214,8 @@ def rejections(table: pd.DataFrame) -> dict[str, str]:
                 kind = "odd" if harmonic % 2 else "even"
                 text += f", as where a force {kind} in the motion is missing, if the drive is a sine"
             text += "" if np.isnan(error) else f"; {error:.1%} of the residual variance is model error"
-            found[str(label)] = f"{', '.join(reasons)}{text}"
-    return found
+            texts[str(label)] = f"{', '.join(reasons)}{text}"
+    return texts
 
 
 def misfit(problem: Problem, fit: MapEstimate) -> str:
@@ -226,9 +226,9 @@ def misfit(problem: Problem, fit: MapEstimate) -> str:
     guesses = {name: solution.states for name, solution in fit.solutions.items()}
     here = problem.anchored(theta, guesses).density().linearise(theta)
     noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
-    if not here.converged or not (found := rejections(table := adequacy(problem, here, noise[None], {}))):
+    if not here.converged or not (rejected := rejections(table := adequacy(problem, here, noise[None], {}))):
         return ""
-    reasons = "; ".join(f"{label}: {text}" for label, text in found.items())
+    reasons = "; ".join(f"{label}: {text}" for label, text in rejected.items())
     subject, remedy = ("model or the noise model", "") if concerns_noise(table) else ("model", f"; {SEARCH}")
     return f"The {subject} is misspecified, which the verdicts take for right ({reasons}){remedy}"
 
@@ -259,9 +259,9 @@ class Whitened:
         likelihood = problem.likelihood
         self.blocks = likelihood.blocks
         names = [problem.noise.parameter_names(block) for block in self.blocks]
-        self.groups = [own[0] if own else KNOWN for own in names]
+        self.groups = [variances[0] if variances else KNOWN for variances in names]
         each = zip(self.groups, names, strict=True)
-        self.known = frozenset(group for group, own in each if set(own) <= set(likelihood.fixed))
+        self.known = frozenset(group for group, variances in each if set(variances) <= set(likelihood.fixed))
         white = zip(*(likelihood.whitened(part, noise) for part in (here.residuals, here.changes)), strict=True)
         self.parts = [used(block, *both) for block, both in zip(self.blocks, white, strict=True)]
         self._plain, self._likelihood, self._noise = (here.residuals, here.changes), likelihood, noise
@@ -309,11 +309,11 @@ class Whitened:
         """
         shared = next((one for one in self._likelihood.shared if index in one.members), None)
         members = shared.members if shared else (index,)
-        p, found = [precision(b) for b in members], []
+        p, parts = [precision(b) for b in members], []
         for vectors in self._plain:
-            scaled = [vectors[b] * np.sqrt(own) for b, own in zip(members, p, strict=True)]
-            found.append((shared.whitened(scaled, p) if shared else scaled)[members.index(index)])
-        return used(self.blocks[index], *found)
+            scaled = [vectors[b] * np.sqrt(weights) for b, weights in zip(members, p, strict=True)]
+            parts.append((shared.whitened(scaled, p) if shared else scaled)[members.index(index)])
+        return used(self.blocks[index], *parts)
 
     def _by_spectrum(self, index: int) -> np.ndarray:
         """Return the inverse of the measured variances of the components, of one value's where these are not known."""
@@ -413,9 +413,9 @@ def _amplitude(problem: Problem, block: Block, replicates: Mapping[tuple[str, st
     e = next(e for e in problem.experiments if e.name == block.experiment)
     mask = slice(None) if e.mask is None else e.mask
     values = replicates[block.experiment, block.channel][:, mask]
-    found = values[np.isfinite(values).all(axis=1)].std(axis=1)
-    sd = found.std(ddof=1) if found.size > 1 else 0.0
+    rms = values[np.isfinite(values).all(axis=1)].std(axis=1)
+    sd = rms.std(ddof=1) if rms.size > 1 else 0.0
     if not sd > 0.0:
         return NOT_TESTED
-    score = (e.outputs[block.channel][mask].std() - found.mean()) / (sd * np.sqrt(1.0 + 1.0 / found.size))
-    return float(2.0 * stats.t.sf(abs(score), found.size - 1))
+    score = (e.outputs[block.channel][mask].std() - rms.mean()) / (sd * np.sqrt(1.0 + 1.0 / rms.size))
+    return float(2.0 * stats.t.sf(abs(score), rms.size - 1))

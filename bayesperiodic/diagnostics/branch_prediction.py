@@ -204,9 +204,9 @@ def predict_branch(
         if not start.converged:
             failed += 1
             continue
-        found = [continue_periodic(problem.model, start, vary, until=end, progress=False) for end in ends]
-        incomplete += not all(branch.complete for branch in found)
-        curves.append(_curve(draw, found))
+        branches = [continue_periodic(problem.model, start, vary, until=end, progress=False) for end in ends]
+        incomplete += not all(branch.complete for branch in branches)
+        curves.append(_curve(draw, branches))
     if not curves:
         raise RuntimeError("posterior: none of its draws has a periodic solution. Give draws of this problem.")
     units = problem.model.units | ({FREQUENCY: "Hz"} if vary == FREQUENCY else {})

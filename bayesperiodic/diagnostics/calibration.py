@@ -267,8 +267,8 @@ def calibrate(
 
 def summary(lines: Sequence[dict[str, Any]], names: Sequence[str]) -> Calibration:
     """Summarise the results of all replicates for these quantities."""
-    found = {method: [line[method] for line in lines if method in line] for method in CALIBRATED_METHODS}
-    positions = {m: {name: np.array([line[name] for line in own]) for name in names} for m, own in found.items()}
+    finished = {method: [line[method] for line in lines if method in line] for method in CALIBRATED_METHODS}
+    positions = {m: {name: np.array([line[name] for line in each]) for name in names} for m, each in finished.items()}
     failures = Counter(line["status"] for line in lines if line["status"] != DONE)
     if unconverged := sum("map" in line and LAPLACE not in line for line in lines):
         failures["estimate not converged"] = unconverged
@@ -346,7 +346,7 @@ def check_supported(problem: Problem) -> None:
             "a winding number": any(turns),
             "a delay (shift)": problem.parameter_maps[e.name].delayed,
         }
-        if what := next((what for what, found in excluded.items() if found), ""):
+        if what := next((what for what, applies in excluded.items() if applies), ""):
             raise ValueError(
                 f"problem: experiments must have whole histories of one forcing period, got {e.name!r} with {what}."
             )
@@ -414,14 +414,14 @@ def _input_noise(problem: Problem, e: Experiment, name: str, size: int, generato
 
 def _first_state(problem: Problem, e: Experiment, theta: dict[str, float]) -> dict[str, float]:
     """Return the states and rates at τ = 0 of the guess of an experiment; empty without a guess."""
-    found: dict[str, float] = {}
+    state_values: dict[str, float] = {}
     states = problem.solve(theta)[e.name].states if isinstance(e.guess, str) else e.guess
     for state, values in states.items():
-        found[state] = float(values[0])
+        state_values[state] = float(values[0])
         if problem.model.orders[state] == 2:
             rate = _fourier.derivative(_fourier.coefficients(values), e.frequency)
-            found[f"d{state}"] = float(_fourier.on_grid(rate, values.size)[0])
-    return found
+            state_values[f"d{state}"] = float(_fourier.on_grid(rate, values.size)[0])
+    return state_values
 
 
 def _ranks(
@@ -433,20 +433,20 @@ def _ranks(
         fit = map_estimate(problem, progress=False)
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
         return {"status": "no estimate", "error": str(error)}
-    found: dict[str, Any] = {"map": fit.status, "stop_rule": False}
+    result: dict[str, Any] = {"map": fit.status, "stop_rule": False}
     if fit.converged:
-        found[LAPLACE] = _laplace_cdf(fit, truth)
+        result[LAPLACE] = _laplace_cdf(fit, truth)
     try:
         posterior = sample(problem, fit, seed=int(chain.integers(2**32)), progress=False, **campaign.sampler)
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
-        return found | {"status": "no draws", "error": str(error)}
+        return result | {"status": "no draws", "error": str(error)}
     rhat, failed = max(posterior.rhat.values()), sum(posterior.failures.values())
-    found |= {"stop_rule": posterior.converged, "rhat": rhat, "failed": failed}
+    result |= {"stop_rule": posterior.converged, "rhat": rhat, "failed": failed}
     draws = independent_draws(posterior)
     if not rhat <= LARGEST_RHAT or draws is None:
-        return found | {"status": "draws not usable"}
-    found["draws"] = len(next(iter(draws.values())))
-    return found | {"status": DONE, MCMC: {name: position(draws[name], value, ties) for name, value in truth.items()}}
+        return result | {"status": "draws not usable"}
+    result["draws"] = len(next(iter(draws.values())))
+    return result | {"status": DONE, MCMC: {name: position(draws[name], value, ties) for name, value in truth.items()}}
 
 
 def independent_draws(posterior: Posterior) -> dict[str, np.ndarray] | None:
@@ -470,13 +470,13 @@ def _laplace_cdf(fit: MapEstimate, truth: dict[str, float]) -> dict[str, float]:
 
     Student's t of `MapEstimate.interval` for parameters, the joint approximation of the logarithm for variances.
     """
-    found = {}
+    probabilities = {}
     with np.errstate(invalid="ignore", divide="ignore"):
         for name, value in truth.items():
             if name in fit.theta:
                 distance = (value - fit.theta[name]) / fit.sd[name]
-                found[name] = float(stdtr(min(fit.degrees_of_freedom[name], 1e9), distance))
+                probabilities[name] = float(stdtr(min(fit.degrees_of_freedom[name], 1e9), distance))
             else:
                 sd = np.sqrt(fit.joint_covariance[name].to_dict()[name])
-                found[name] = float(ndtr(np.log(value / fit.joint_mode[name]) / sd))
-    return found
+                probabilities[name] = float(ndtr(np.log(value / fit.joint_mode[name]) / sd))
+    return probabilities

@@ -50,20 +50,20 @@ def generated(model: Model, where: Iterable[str], deviations: Mapping[str, float
     """
     smooth, steepest = factors(model)
     moving = {name: e for name, e in smooth.items() if deviations.get(name, 1.0) > 0.0}
-    found: dict[str, sp.Expr] = {"1": sp.Integer(1)}
+    expressions: dict[str, sp.Expr] = {"1": sp.Integer(1)}
     for degree in range(1, HIGHEST_DEGREE + 1):
         for chosen in combinations_with_replacement(moving, degree):
-            found[_product(chosen)] = sp.Mul(*(moving[name] for name in chosen))
+            expressions[_product(chosen)] = sp.Mul(*(moving[name] for name in chosen))
     for name, e in moving.items():
-        found |= {f"{name}**{power}": e**power for power in range(HIGHEST_DEGREE + 1, HIGHEST_POWER + 1)}
+        expressions |= {f"{name}**{power}": e**power for power in range(HIGHEST_DEGREE + 1, HIGHEST_POWER + 1)}
     widths = {name: deviations.get(name, 1.0) for name in moving}
     for name, e in moving.items():
         size = smooth_abs(e, ABS_WIDTH * widths[name])
-        found[f"abs({name})"] = size
-        found |= {f"{other}*abs({name})": factor * size for other, factor in moving.items()}
-        found[f"sign({name})"] = smooth_sign(e, SIGN_WIDTH * widths[name])
-    found |= {name: e for name, e in steepest.items() if deviations.get(name, 1.0) > 0.0}
-    plain = [Term(place, text, e) for place in where for text, e in found.items()]
+        expressions[f"abs({name})"] = size
+        expressions |= {f"{other}*abs({name})": factor * size for other, factor in moving.items()}
+        expressions[f"sign({name})"] = smooth_sign(e, SIGN_WIDTH * widths[name])
+    expressions |= {name: e for name, e in steepest.items() if deviations.get(name, 1.0) > 0.0}
+    plain = [Term(place, text, e) for place in where for text, e in expressions.items()]
     return plain + [
         Term(place, f"lag({name}) - {f'({name})' if ' ' in name else name}", MEMORY - e, e)
         for place in where
@@ -81,12 +81,12 @@ def _forces(model: Model, place: str) -> dict[str, sp.Expr]:
     steepest = {model.state_symbols[DERIVATIVES[order] + state] for state, order in model.orders.items()}
     moving = {*model.state_symbols.values(), *model.input_symbols.values()}
     names = {e: sp.Symbol(name) for e, name in zip(outputs, model.outputs, strict=True) if not e.is_Symbol}
-    found: dict[str, sp.Expr] = {}
+    forces: dict[str, sp.Expr] = {}
     for part in (*sp.Add.make_args(whole), *outputs[index : index + 1]):
         force = part if part in names else part.as_independent(*moving, as_Add=False)[1]
         if force.free_symbols & moving and not force.free_symbols & steepest:
-            found[_written(model, force.xreplace(names))] = force
-    return found
+            forces[_written(model, force.xreplace(names))] = force
+    return forces
 
 
 def places(model: Model) -> tuple[str, ...]:
@@ -126,7 +126,7 @@ def given(model: Model, candidates: Mapping[str, Iterable[Any]]) -> list[Term]:
         Names("parameters", model.parameter_symbols),
         Names("inputs", model.input_symbols),
     )
-    found = []
+    added = []
     for place, terms in candidates.items():
         argument = f"candidates[{place!r}]"
         _checks.one_of("candidates", place, places(model))
@@ -137,15 +137,15 @@ def given(model: Model, candidates: Mapping[str, Iterable[Any]]) -> list[Term]:
             expression = model._expression(argument, rest(*spaces) if callable(rest) else rest)
             text = term.strip() if isinstance(term, str) else _written(model, expression)
             memory = None if force is None else model._expression(argument, force)
-            for own in (expression, memory):
-                if own is not None:
-                    _check_order(model, argument, text, own, place)
-            found.append(Term(place, text, expression if memory is None else MEMORY + expression, memory))
+            for part in (expression, memory):
+                if part is not None:
+                    _check_order(model, argument, text, part, place)
+            added.append(Term(place, text, expression if memory is None else MEMORY + expression, memory))
             try:
-                coefficient_unit(model, found[-1])
+                coefficient_unit(model, added[-1])
             except ValueError as error:
                 raise ValueError(f"{argument}: must add quantities of the same unit, got {text!r}: {error}.") from None
-    return found
+    return added
 
 
 def _lagged(argument: str, text: str) -> tuple[str | None, str]:
@@ -199,21 +199,21 @@ def values(
     listed = list(expressions)
     function: Callable[..., Any] = sp.lambdify(symbols, listed, modules="numpy", cse=True)
     with np.errstate(all="ignore"):
-        found = function(*variables.T, *inputs.T, *parameters, tau, frequency)
-    return np.array([np.broadcast_to(np.asarray(one, dtype=float), tau.shape) for one in found]).reshape(-1, tau.size)
+        results = function(*variables.T, *inputs.T, *parameters, tau, frequency)
+    return np.array([np.broadcast_to(np.asarray(one, dtype=float), tau.shape) for one in results]).reshape(-1, tau.size)
 
 
 def symbol_units(model: Model) -> dict[sp.Symbol, Unit]:
     """Return the units of the model's symbols, where they are known: states, inputs, their rates, and parameters."""
-    found = {model.time_symbols["tau"]: {}, model.time_symbols["frequency"]: {"Hz": 1.0}}
+    units = {model.time_symbols["tau"]: {}, model.time_symbols["frequency"]: {"Hz": 1.0}}
     for space, names in ((model.state_symbols, model.states), (model.input_symbols, model.inputs)):
         for name in names:
             if (unit := parsed(model.units.get(name, ""))) is not None:
-                found |= {space[d + name]: product(unit, {"s": 1.0}, -i) for i, d in enumerate(DERIVATIVES)}
+                units |= {space[d + name]: product(unit, {"s": 1.0}, -i) for i, d in enumerate(DERIVATIVES)}
     for name, symbol in model.parameter_symbols.items():
         if (unit := parsed(model.units.get(name, ""))) is not None:
-            found[symbol] = unit
-    return found
+            units[symbol] = unit
+    return units
 
 
 def coefficient_unit(model: Model, term: Term) -> str:
@@ -224,13 +224,13 @@ def coefficient_unit(model: Model, term: Term) -> str:
     units, index = symbol_units(model), places(model).index(term.place)
     if term.force is not None and (memory := unit_of(term.force, units)) is not None:
         units[MEMORY] = memory
-    own = unit_of(term.expression, units)
+    term_unit = unit_of(term.expression, units)
     if index < len(model.outputs):
         whole = parsed(model.units.get(term.place, ""))
     else:
         parts = sp.Add.make_args(sp.expand(model.equations[index - len(model.outputs)]))
         whole = next((unit for part in parts if (unit := _unit_or_none(part, units)) is not None), None)
-    return "" if own is None or whole is None else written(product(whole, own, -1.0))
+    return "" if term_unit is None or whole is None else written(product(whole, term_unit, -1.0))
 
 
 def _unit_or_none(expression: sp.Expr, units: Mapping[sp.Symbol, Unit]) -> Unit | None:

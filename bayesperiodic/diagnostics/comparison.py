@@ -261,8 +261,8 @@ def _approximation(problem: Problem, fit: MapEstimate, coordinates: str) -> Appr
     logarithmic = np.concatenate([density.logarithmic, np.ones(len(density.free), dtype=bool)])
     # The logarithms of positive parameters and of noise parameters, which come last, are unbounded.
     whole = (-np.inf, np.inf)
-    own = tuple(whole if log else end for end, log in zip_longest(supports, logarithmic))
-    return Approximation(density.labels, logarithmic, mean, covariance, own)
+    ends = tuple(whole if log else end for end, log in zip_longest(supports, logarithmic))
+    return Approximation(density.labels, logarithmic, mean, covariance, ends)
 
 
 def importance_k(problem: Problem, fit: MapEstimate, coordinates: str) -> tuple[float, float, float]:
@@ -298,9 +298,9 @@ def _proposal(density: LogPosterior, fit: MapEstimate, natural: bool) -> tuple[n
         except ValueError:
             return mean, covariance
     if natural:
-        own, noise = slice(len(names)), slice(len(names), None)
-        mean[own], covariance[own, own] = density.problem.vector(fit.theta), fit.covariance.loc[names, names]
-        covariance[own, noise], covariance[noise, own] = 0.0, 0.0
+        free, noise = slice(len(names)), slice(len(names), None)
+        mean[free], covariance[free, free] = density.problem.vector(fit.theta), fit.covariance.loc[names, names]
+        covariance[free, noise], covariance[noise, free] = 0.0, 0.0
     return mean, covariance
 
 
@@ -375,18 +375,18 @@ def _consistent(joint: str, rows: set[str]) -> str:
 def _row(sample: Sample, mean: float, sd: float) -> dict[str, float]:
     """Return the statistics of one quantity and their Monte Carlo errors, see `Comparison.table`."""
     own_mean, mean_error = sample.estimate(lambda x: x.mean(axis=-1))
-    own, spread = sample.estimate(lambda x: np.std(x, axis=-1, ddof=1))
-    found = {"map": mean, "laplace_sd": sd, "mean": own_mean, "sd": own}
-    found |= {"shift": (own_mean - mean) / own, "shift_mcse": mean_error / own}
-    found |= {"sd_ratio": sd / own, "sd_ratio_mcse": sd / own * spread / own}
-    found["skewness"], found["skewness_mcse"] = sample.estimate(lambda x: skew(x, axis=-1))
+    draws_sd, spread = sample.estimate(lambda x: np.std(x, axis=-1, ddof=1))
+    row = {"map": mean, "laplace_sd": sd, "mean": own_mean, "sd": draws_sd}
+    row |= {"shift": (own_mean - mean) / draws_sd, "shift_mcse": mean_error / draws_sd}
+    row |= {"sd_ratio": sd / draws_sd, "sd_ratio_mcse": sd / draws_sd * spread / draws_sd}
+    row["skewness"], row["skewness_mcse"] = sample.estimate(lambda x: skew(x, axis=-1))
     for label, (probability, z) in COMPARED_QUANTILES.items():
         value, error = sample.estimate(lambda x, p=probability: np.quantile(x, p, axis=-1))  # type: ignore[misc]
         end = mean + z * sd if z else mean
-        found |= {f"laplace_{label}": end, label: value}
-        found |= {f"{label}_difference": (value - end) / own, f"{label}_difference_mcse": error / own}
-    found["wasserstein"], found["wasserstein_mcse"] = verdicts.wasserstein_distance(sample, mean, sd)
-    return found
+        row |= {f"laplace_{label}": end, label: value}
+        row |= {f"{label}_difference": (value - end) / draws_sd, f"{label}_difference_mcse": error / draws_sd}
+    row["wasserstein"], row["wasserstein_mcse"] = verdicts.wasserstein_distance(sample, mean, sd)
+    return row
 
 
 def _table(scored: Scores, cured: Scores | None) -> pd.DataFrame:
@@ -405,11 +405,11 @@ def _table(scored: Scores, cured: Scores | None) -> pd.DataFrame:
 
 
 def _joint(scored: Scores, cured: Scores | None) -> dict[str, float | str]:
-    found: dict[str, float | str] = {"dimension": scored.laplace.mean.size}
+    row: dict[str, float | str] = {"dimension": scored.laplace.mean.size}
     for level, inside, error in zip(ELLIPSOID_LEVELS, *scored.inside(np.array(ELLIPSOID_LEVELS)), strict=True):
         key = f"share_{100 * level:.0f}"
-        found |= {key: float(inside), f"{key}_mcse": float(error)}
-    found |= zip(("pareto_k", "pareto_k_mcse", "efficiency"), (*scored.pareto_k, scored.efficiency), strict=True)
+        row |= {key: float(inside), f"{key}_mcse": float(error)}
+    row |= zip(("pareto_k", "pareto_k_mcse", "efficiency"), (*scored.pareto_k, scored.efficiency), strict=True)
     logarithm = cured is not None and bool(cured.laplace.logarithmic[: scored.laplace.mean.size].any())
     advice = _recommendation(scored.joint, cured is not None and cured.fine, logarithm, scored.laplace.determined)
     if scored.joint == FINE:
@@ -417,7 +417,7 @@ def _joint(scored: Scores, cured: Scores | None) -> dict[str, float | str]:
         advice += f", except for {', '.join(others)}" if others else ""
         heavy_tail = not scored.efficiency > EVEN_WEIGHTS and scored.pareto_k[0] > USABLE_K
         advice += ", not as an importance proposal" if heavy_tail else ""
-    return found | {"verdict": scored.joint, "recommendation": advice}
+    return row | {"verdict": scored.joint, "recommendation": advice}
 
 
 def _recommendation(verdict: str, cure: bool, logarithm: bool, determined: bool) -> str:

@@ -109,10 +109,10 @@ def _one_sided(x: np.ndarray, weighted: np.ndarray) -> float:
     middle = 0.5 * (p + q)
 
     # The linear terms of the two parts cancel; with them, rounding errors do not hide small distances.
-    def against(own: np.ndarray, other: np.ndarray) -> float:
+    def against(density: np.ndarray, other: np.ndarray) -> float:
         with np.errstate(divide="ignore", invalid="ignore"):
-            terms = np.where(own > 0.0, own * np.log2(own / middle), 0.0)
-        return float(np.sum(terms * widths) + np.sum((other - own) * widths) / (2.0 * np.log(2.0)))
+            terms = np.where(density > 0.0, density * np.log2(density / middle), 0.0)
+        return float(np.sum(terms * widths) + np.sum((other - density) * widths) / (2.0 * np.log(2.0)))
 
     return float(np.sqrt(max(against(p, q) + against(q, p), 0.0) / total))
 
@@ -205,10 +205,10 @@ class Identifiability(Result):
         known = [name for name, verdict in self.verdicts.items() if verdict == DETERMINED]
         names = " and ".join(filter(None, [", ".join(known[:-1]), *known[-1:]]))
         lines += [f"The data determine {names or 'no parameter'}."]
-        for (verdict, remarks, remedy), own in table.groupby(["verdict", "remarks", "remedy"], sort=False):
+        for (verdict, remarks, remedy), rows in table.groupby(["verdict", "remarks", "remedy"], sort=False):
             if verdict != DETERMINED or remarks or remedy:
                 advice = f" Recommendation: {remedy}." if remedy else ""
-                lines.append(f"{', '.join(own.index)}: {verdict}{remarks and f', {remarks}'}.{advice}")
+                lines.append(f"{', '.join(rows.index)}: {verdict}{remarks and f', {remarks}'}.{advice}")
         lines.append(f"The condition number of the Fisher information is {self.condition:.3g}.")
         lines.append(self.basis)
         lines += [] if self.converged else ["The draws have NOT CONVERGED; these results are provisional."]
@@ -342,7 +342,7 @@ def _structural_images(problem: Problem, fit: MapEstimate, structure: Structure)
 
     There the likelihood is the same; the prior density must be more than 1 % of that at the estimate.
     """
-    found: dict[str, list[float]] = {}
+    images: dict[str, list[float]] = {}
     for change in structure.discrete:
         moves = {name: image for name, image in change.transformation.items() if name in change.parameters}
         if moves.keys() <= fit.theta.keys():
@@ -352,15 +352,15 @@ def _structural_images(problem: Problem, fit: MapEstimate, structure: Structure)
             if problem.log_prior(fit.theta | values) > problem.log_prior(fit.theta) + np.log(NOTABLE):
                 for name, value in values.items():
                     if abs(value - fit.theta[name]) > fit.sd[name]:
-                        found.setdefault(name, []).append(value)
-    return found
+                        images.setdefault(name, []).append(value)
+    return images
 
 
 def _partners(structure: Structure, name: str) -> str:
     """Return the parameters of the structural symmetries that contain one, itself included."""
     plain = name.partition("[")[0]
-    found = [p for symmetry in structure.symmetries if plain in symmetry.parameters for p in symmetry.parameters]
-    return ", ".join(dict.fromkeys(found))
+    names = [p for symmetry in structure.symmetries if plain in symmetry.parameters for p in symmetry.parameters]
+    return ", ".join(dict.fromkeys(names))
 
 
 def _widths(
@@ -401,8 +401,8 @@ def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, n
         return np.nan, np.nan
     if posterior is None:
         freedom = min(fit.degrees_of_freedom[name], 1e9)
-        own = [float(stdtr(freedom, -mode.theta[name] / mode.sd[name])) for mode in _optima(fit)]
-        return float(fit.modes["mass"].to_numpy() @ own), 0.0
+        fractions = [float(stdtr(freedom, -mode.theta[name] / mode.sd[name])) for mode in _optima(fit)]
+        return float(fit.modes["mass"].to_numpy() @ fractions), 0.0
     share = float(np.mean(posterior.draws(name) < 0.0))
     size = posterior.ess[name]
     bounded = np.clip(share, 1.0 / (size + 2.0), 1.0 - 1.0 / (size + 2.0))
@@ -455,27 +455,27 @@ def _against_the_prior(fit: MapEstimate, row: dict) -> str:
 def _numbers(row: dict) -> list[str]:
     """Return the numbers behind a verdict, in words."""
     error = f" ± {row['contraction_mcse']:.2g}" if row["contraction_mcse"] else ""
-    found = [f"contraction {row['contraction']:.3g}{error}"]
+    texts = [f"contraction {row['contraction']:.3g}{error}"]
     if row["collinearity"] >= COLLINEAR:
         factor = "infinitely" if not row["collinearity"] < 1e6 else f"{row['collinearity']:.3g} times"
-        found.append(f"the other parameters widen it {factor}")
+        texts.append(f"the other parameters widen it {factor}")
     if row["alone"] > DETERMINED_SD and row["profile"] != ONE_SIDED:
-        found.append(f"the data alone would leave {row['alone']:.3g} prior sds with all other parameters known")
+        texts.append(f"the data alone would leave {row['alone']:.3g} prior sds with all other parameters known")
     if row["profile"] and row["profile"] != "closed":
-        found.append(f"profile {row['profile']}")
+        texts.append(f"profile {row['profile']}")
     if np.isfinite(row["p_negative"]):
         error = f" ± {row['p_negative_mcse']:.2g}" if row["p_negative_mcse"] else ""
-        found.append(f"P(negative) = {row['p_negative']:.3g}{error}")
+        texts.append(f"P(negative) = {row['p_negative']:.3g}{error}")
     if np.isfinite(row["prior_sensitivity"]) and row["prior_sensitivity"] > NOTICEABLE:
-        found.append(f"sensitive to the prior ({row['prior_sensitivity']:.2g} per doubling)")
-    return found
+        texts.append(f"sensitive to the prior ({row['prior_sensitivity']:.2g} per doubling)")
+    return texts
 
 
 def _remarks(row: dict) -> list[str]:
     """Return the causes of a verdict that are not numbers."""
-    found = ["by a structural symmetry"] if row["structural"] else []
+    causes = ["by a structural symmetry"] if row["structural"] else []
     others = row["other_values"]
-    return found + ([f"{others} at another optimum with more than 1 % of the mass"] if others else [])
+    return causes + ([f"{others} at another optimum with more than 1 % of the mass"] if others else [])
 
 
 def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame, structure: Structure) -> str:
@@ -484,11 +484,11 @@ def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.Data
     if row["verdict"] == CONFLICT:
         return "check units, prior and data, try map_estimate(starts=8), or widen the prior"
     if row["verdict"] == COMBINATION:
-        own = directions[[name in members.split(", ") for members in directions["parameters"]]]
-        own = own[own["gain"] < UNDETERMINED_GAIN]
+        rows = directions[[name in members.split(", ") for members in directions["parameters"]]]
+        rows = rows[rows["gain"] < UNDETERMINED_GAIN]
         members, combos = row["structural"], ", ".join(structure.combinations)
-        if not members and len(own):
-            members, combos = own.iloc[0][["parameters", "combinations"]]
+        if not members and len(rows):
+            members, combos = rows.iloc[0][["parameters", "combinations"]]
         if members:
             return f"fix one of {members}" + (f", or report {combos}" if combos else "")
     ranked = experiments.dropna(subset=[name]).sort_values(name)
@@ -523,7 +523,7 @@ def _directions(information: Information) -> pd.DataFrame:
             "gain": gains,
             "contraction": gains / (1.0 + gains),
             "direction": [in_words(vector, names, logarithmic) for vector in shown],
-            "parameters": [", ".join(np.array(names)[own]) for own in members],
-            "combinations": [", ".join(own) for own in invariant],
+            "parameters": [", ".join(np.array(names)[part]) for part in members],
+            "combinations": [", ".join(part) for part in invariant],
         }
     )

@@ -374,11 +374,11 @@ class _Search:
         chosen: dict[str, Term] = {}
         fits = [fit]
         while len(steps) < max_terms:
-            found = self.best(state, table, chosen)
-            if isinstance(found, str):
-                stopped = found
+            addition = self.best(state, table, chosen)
+            if isinstance(addition, str):
+                stopped = addition
                 break
-            key, others, worse, p, after = found
+            key, others, worse, p, after = addition
             term, name = self.terms[key], self.names[key]
             fit_after = self.estimate({**chosen, name: term}, after)
             why = doubt(fit_after, name, term) if fit_after else VANISHED
@@ -411,10 +411,10 @@ class _Search:
         """Return the optimum at an estimate of the model with terms."""
         problem = self.with_terms(names).with_input_errors(fit.input_errors)
         orbits = {name: solution.states for name, solution in fit.solutions.items()}
-        found = nearest_optimum(problem, problem.vector(fit.theta), guesses_of(self.compiled[0], orbits))
-        if found is None:
+        nearest = nearest_optimum(problem, problem.vector(fit.theta), guesses_of(self.compiled[0], orbits))
+        if nearest is None:
             raise ValueError("fit: must be an estimate with a periodic solution of every experiment, got one without.")
-        return Optimum(problem, found[0], found[1].iterate, names)
+        return Optimum(problem, nearest[0], nearest[1].iterate, names)
 
     def with_terms(self, names: Iterable[str]) -> Problem:
         """Return the problem with coefficients of the compiled model, the others zero."""
@@ -444,14 +444,14 @@ class _Search:
         """Return the table of the score tests of candidates that are not yet chosen, the best first."""
         left = [key for key in self.terms if self.names[key] not in state.names and key not in self.refused]
         lags = [self.lags if self.terms[key].force is not None else [np.nan] for key in left]
-        each = [replace(self.terms[key], lag=lag) for key, own in zip(left, lags, strict=True) for lag in own]
+        each = [replace(self.terms[key], lag=lag) for key, choices in zip(left, lags, strict=True) for lag in choices]
         tests, rows, at = ScoreTests(state.problem, state.iterate, each), [], {}
-        ends = np.cumsum([len(own) for own in lags])
-        for key, own, end in zip(left, lags, ends.tolist(), strict=True):
-            tried = range(end - len(own), end)
+        ends = np.cumsum([len(choices) for choices in lags])
+        for key, choices, end in zip(left, lags, ends.tolist(), strict=True):
+            tried = range(end - len(choices), end)
             i = max(tried, key=lambda i: tests.explained[i] if tests.identifiable[i] else -1.0)
             at[i], self.terms[key], self.widths[self.names[key]] = key, each[i], float(tests.widths[i])
-            tests.p[i] = min(1.0, len(own) * tests.p[i])
+            tests.p[i] = min(1.0, len(choices) * tests.p[i])
             if not tests.identifiable[i]:
                 self.refused[key] = NOT_TOLD
         for group in tests.groups(at):
@@ -509,8 +509,8 @@ class _Search:
             )
         same, p = (dict(zip(table["candidate"], table[column], strict=True)) for column in ("same", "p_adjusted"))
         others = [[key, *same[key]] for key in alike]
-        alternatives = [*same[first], *(o for own in others if own[0] in well and own[0] != first for o in own)]
-        worse = tuple(other for own in others if own[0] not in well for other in own)
+        alternatives = [*same[first], *(o for group in others if group[0] in well and group[0] != first for o in group)]
+        worse = tuple(other for group in others if group[0] not in well for other in group)
         return first, tuple(alternatives), worse, float(p[first]), fitted[first]
 
     def compile(self, wanted: Sequence[str], more: Sequence[str], chosen: Mapping[str, Term]) -> None:
@@ -541,7 +541,7 @@ class _Search:
         self, steps: list[Step], fits: list[MapEstimate], near: Optimum
     ) -> tuple[list[Step], list[MapEstimate]] | None:
         """Return steps with the estimates of their models, the first ones of which are known; None if one is lost."""
-        known, found = len(fits) - 1, list(fits)
+        known, estimates = len(fits) - 1, list(fits)
         for k in range(known, len(steps)):
             names = tuple(step.name for step in steps[: k + 1])
             fit = self.estimate({name: self.terms[self.keys[name]] for name in names}, near)
@@ -549,9 +549,9 @@ class _Search:
                 return None
             state, term, old = self.at(fit, names), self.terms[self.keys[names[-1]]], steps[k]
             added = term, old.name, old.alternatives, old.worse, old.p, old.evidence_gain
-            steps = [*steps[:k], _step(state, fit, found[-1], added, held_out_error(state)), *steps[k + 1 :]]
-            found.append(fit)
-        return steps, found
+            steps = [*steps[:k], _step(state, fit, estimates[-1], added, held_out_error(state)), *steps[k + 1 :]]
+            estimates.append(fit)
+        return steps, estimates
 
 
 def _step(
@@ -565,7 +565,7 @@ def _step(
     term, name, others, worse, p, gain = added or (None, "", (), (), np.nan, np.nan)
     lag = lag_names(name)[0] if term and term.force is not None else ""
     unknown: dict[str, float] = {"": np.nan}
-    theta, sd, robust = (unknown | own for own in (fit.theta, fit.sd, fit.robust_sd))
+    theta, sd, robust = (unknown | estimates for estimates in (fit.theta, fit.sd, fit.robust_sd))
     return Step(
         term.text if term else "", term.place if term else "", others, worse, name,
         coefficient_unit(state.problem.model, term) if term else "",

@@ -192,11 +192,11 @@ FIELDS = ("outputs", "frequency", "frequency_se", "samples", "mask", "covariance
 
 def _data(problem: Problem) -> dict[str, str]:
     """Return digests of what the likelihood is a density of, by name; inputs are not data."""
-    found = {f"{f} of experiment {e.name!r}": digest(getattr(e, f)) for e in problem.experiments for f in FIELDS}
+    digests = {f"{f} of experiment {e.name!r}": digest(getattr(e, f)) for e in problem.experiments for f in FIELDS}
     for block in problem.likelihood.blocks:
         values = block.kind, block.count, block.size, block.channel in problem.model.angles
-        found[f"values of {block.channel!r} of experiment {block.experiment!r}"] = digest(values)
-    return found
+        digests[f"values of {block.channel!r} of experiment {block.experiment!r}"] = digest(values)
+    return digests
 
 
 def _evidences(models: Models, notes: list[str]) -> np.ndarray:
@@ -206,14 +206,14 @@ def _evidences(models: Models, notes: list[str]) -> np.ndarray:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # which the notes repeat
-                found = evidence(problem, posterior)
+                result = evidence(problem, posterior)
         except ValueError as refusal:
             notes.append(f"The evidence of {name!r} is not available: {refusal}")
             rows.append((np.nan, np.nan, np.nan, False))
             continue
-        alarms = [f"Evidence of {name!r}: {note}" for note in found.notes if note.startswith("Unreliable")]
-        rows.append((found.log, found.log_error, np.nan, not alarms))
-        improper[name] = found.improper
+        alarms = [f"Evidence of {name!r}: {note}" for note in result.notes if note.startswith("Unreliable")]
+        rows.append((result.log, result.log_error, np.nan, not alarms))
+        improper[name] = result.improper
         notes += alarms
     values, first = np.array(rows, dtype=float), next(iter(improper.values()), {})
     if any(other != first for other in improper.values()):
@@ -238,9 +238,9 @@ def _leave_one_out(terms: xr.DataArray, efficiency: float) -> tuple[np.ndarray, 
     tree, az = xr.DataTree.from_dict({"log_likelihood": xr.Dataset({"data": terms})}), convergence.arviz()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large k̂, which is part of the result
-        found = az.loo(convergence.for_arviz(tree), pointwise=True, reff=efficiency)
-    elpd = found.loo_i if hasattr(found, "loo_i") else found.elpd_i
-    return np.asarray(elpd).ravel(), np.asarray(found.pareto_k).ravel()
+        loo = az.loo(convergence.for_arviz(tree), pointwise=True, reff=efficiency)
+    elpd = loo.loo_i if hasattr(loo, "loo_i") else loo.elpd_i
+    return np.asarray(elpd).ravel(), np.asarray(loo.pareto_k).ravel()
 
 
 def _terms(posterior: Posterior) -> tuple[xr.DataArray, float]:
@@ -292,18 +292,18 @@ def _experiments(models: Models, held_out: bool, notes: list[str]) -> pd.DataFra
         joint = _joint(problem, terms)
         elpd, pareto_k = _leave_one_out(joint, efficiency)
         for i, run in enumerate(runs):
-            own, rest = joint.to_numpy()[..., i].ravel(), _without(problem, run)
+            left_out, rest = joint.to_numpy()[..., i].ravel(), _without(problem, run)
             row = {"model": name, "experiment": run, "elpd": elpd[i], "pareto_k": pareto_k[i]}
             if isinstance(rest, str):
                 notes.append(f"{name!r} cannot predict experiment {run!r} from the others: {rest}")
                 row |= {"elpd": np.nan, "pareto_k": np.nan, "error": np.nan, "method": NOT_AVAILABLE}
             elif pareto_k[i] > USABLE_K:
-                value, error, reason = _refitted(problem, rest, posterior, i, own, efficiency)
+                value, error, reason = _refitted(problem, rest, posterior, i, left_out, efficiency)
                 row |= {"elpd": value, "error": error, "method": REFIT}
                 if reason:
                     notes.append(f"The draws of {name!r} without experiment {run!r} have not converged ({reason}).")
             else:
-                weights = np.exp(own.min() - own)
+                weights = np.exp(left_out.min() - left_out)
                 error = weights.std() / weights.mean() / np.sqrt(efficiency * weights.size)
                 row |= {"error": float(error), "method": IMPORTANCE}
             rows.append(row)
@@ -313,8 +313,8 @@ def _experiments(models: Models, held_out: bool, notes: list[str]) -> pd.DataFra
 
 def _joint(problem: Problem, terms: xr.DataArray) -> xr.DataArray:
     """Return the log-likelihood (chain, draw, experiment) of each experiment from terms (chain, draw, observation)."""
-    own = [problem.likelihood.labels[EXPERIMENT] == e.name for e in problem.experiments]
-    return xr.DataArray(terms.to_numpy() @ np.array(own, dtype=float).T, dims=(CHAIN, DRAW, EXPERIMENT))
+    members = [problem.likelihood.labels[EXPERIMENT] == e.name for e in problem.experiments]
+    return xr.DataArray(terms.to_numpy() @ np.array(members, dtype=float).T, dims=(CHAIN, DRAW, EXPERIMENT))
 
 
 def _without(problem: Problem, run: str) -> Problem | str:
@@ -324,13 +324,13 @@ def _without(problem: Problem, run: str) -> Problem | str:
     except ValueError as refusal:
         return str(refusal)
     every = (*problem.names, *problem.noise_names)
-    if own := [name for name in every if name not in (*rest.names, *rest.noise_names)]:
-        return f"{', '.join(own)} {'belongs' if len(own) == 1 else 'belong'} to it alone."
+    if alone := [name for name in every if name not in (*rest.names, *rest.noise_names)]:
+        return f"{', '.join(alone)} {'belongs' if len(alone) == 1 else 'belong'} to it alone."
     return rest
 
 
 def _refitted(
-    problem: Problem, rest: Problem, posterior: Posterior, index: int, own: np.ndarray, efficiency: float
+    problem: Problem, rest: Problem, posterior: Posterior, index: int, log_likelihood: np.ndarray, efficiency: float
 ) -> tuple[float, float, str]:
     """Return the ELPD of an experiment from new draws without it, its error, and why these have not converged."""
     lp = posterior.tree["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()
@@ -343,7 +343,7 @@ def _refitted(
         draws = sample(rest, fit, seed=posterior.seed, progress=False)
     terms = log_likelihood_terms(density, draws.tree["posterior"].to_dataset())["data"]
     other = _joint(problem, terms).to_numpy()[..., index].ravel()
-    value, error = bennett(np.nan_to_num(other, nan=-np.inf), own, (_terms(draws)[1], efficiency))
+    value, error = bennett(np.nan_to_num(other, nan=-np.inf), log_likelihood, (_terms(draws)[1], efficiency))
     return value, error, "" if draws.converged else draws.reason
 
 
@@ -364,9 +364,9 @@ def bennett(without: np.ndarray, given: np.ndarray, efficiencies: tuple[float, f
         return float(sizes[0] * first.mean() - sizes[1] * second.mean())
 
     reach = 50.0 + abs(ratio)
-    found = float(brentq(balance, finite.min() - reach, finite.max() + reach))
-    means, spreads = zip(*((max(w.mean(), np.finfo(float).tiny), w.std()) for w in weights(found)), strict=True)
-    return found, float(np.sqrt(np.sum(np.divide(spreads, means) ** 2 / sizes)))
+    solution = float(brentq(balance, finite.min() - reach, finite.max() + reach))
+    means, spreads = zip(*((max(w.mean(), np.finfo(float).tiny), w.std()) for w in weights(solution)), strict=True)
+    return solution, float(np.sqrt(np.sum(np.divide(spreads, means) ** 2 / sizes)))
 
 
 class _Scores:
@@ -388,7 +388,7 @@ class _Scores:
         """Return by how much each criterion is in favour of one of two models, with its standard error."""
         evidence, loo, values = ([rows[one], rows[other]] for rows in (self._evidence, self._loo, self._values))
         runs = self._held_out[one], self._held_out[other]
-        elpd, errors = ([own[column].to_numpy(float) for own in runs] for column in ("elpd", "error"))
+        elpd, errors = ([run[column].to_numpy(float) for run in runs] for column in ("elpd", "error"))
         noise = 0.0 if one == other else np.sqrt(np.square(errors).sum())
         return {
             EVIDENCE: (float(evidence[0][0] - evidence[1][0]), float(np.hypot(evidence[0][1], evidence[1][1]))),
@@ -403,12 +403,12 @@ class _Scores:
             ELPD: max(self._loo[one][2], self._loo[other][2]) <= USABLE_K,
             HELD_OUT: len(self._held_out[one]) >= FEWEST_SCORED,
         }
-        found = {}
+        decisions = {}
         for name, (change, error) in self.differences(one, other).items():
             if usable[name] and np.isfinite(change) and not {one, other} & self.provisional:
                 needed = DECISIVE + 2.0 * error if name == EVIDENCE else max(SMALLEST_GAIN, 2.0 * error)
-                found[name] = int(np.sign(change)) if abs(change) > needed else 0
-        return found
+                decisions[name] = int(np.sign(change)) if abs(change) > needed else 0
+        return decisions
 
     def verdicts(self) -> tuple[str, dict[str, str]]:
         """Return the model that most decisions are in favour of, of equal ones the likeliest, and all verdicts."""
@@ -418,14 +418,14 @@ class _Scores:
             return favour, *np.nan_to_num((self._evidence[name][0], self._loo[name][0]), nan=-np.inf)
 
         self.names = sorted(self.names, key=rank, reverse=True)
-        first, found = self.names[0], {}
+        first, verdicts = self.names[0], {}
         for name in self.names:
             signs = tuple({*self.decisions(first, name).values()} - {0})
             verdict = {(): OPEN, (1,): WORSE}.get(signs, SPLIT)
-            found[name] = UNCONVERGED if {name, first} & self.provisional else verdict
-        others = [found[name] for name in self.names[1:]]
-        found[first] = next((verdict for verdict in (SPLIT, OPEN, UNCONVERGED) if verdict in others), PREFERRED)
-        return first, found
+            verdicts[name] = UNCONVERGED if {name, first} & self.provisional else verdict
+        others = [verdicts[name] for name in self.names[1:]]
+        verdicts[first] = next((verdict for verdict in (SPLIT, OPEN, UNCONVERGED) if verdict in others), PREFERRED)
+        return first, verdicts
 
     def table(self, first: str) -> pd.DataFrame:
         """Return the numbers of `ModelComparison.table`."""
@@ -472,9 +472,9 @@ def _what_would_tell(models: Models, one: str, other: str) -> str:
     gains, problem = {}, models[one][0]
     for e in problem.experiments:
         for scale in INPUT_SCALES if problem.model.inputs else INPUT_SCALES[:1]:
-            found, total = [_predicted(*models[name], e.name, scale) for name in (one, other)], 0.0
+            predictions, total = [_predicted(*models[name], e.name, scale) for name in (one, other)], 0.0
             for channel in e.outputs:
-                means, variances, noises = zip(*(predicted[channel] for predicted in found), strict=True)
+                means, variances, noises = zip(*(predicted[channel] for predicted in predictions), strict=True)
                 gap = means[0] - means[1]
                 gap = _fourier.within_half_turn(gap) if channel in problem.model.angles else gap
                 total += 0.5 * e.independent[channel] * np.mean(gap**2 / (max(noises) + sum(variances)))

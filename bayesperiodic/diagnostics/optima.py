@@ -106,20 +106,20 @@ class Optimum:
         known |= {n: float(problem._given["priors"][n].quantile(0.5)) for n in problem.names if n not in known}
         orbits = {e.name: self.orbits[e.name] for e in problem.experiments}
         theta = np.array([known[name] for name in problem.names])
-        found = nearest_optimum(problem, theta, guesses_of(problem._given["model"], orbits))
-        if found is None or found[1].status not in ENDED:
+        nearest = nearest_optimum(problem, theta, guesses_of(problem._given["model"], orbits))
+        if nearest is None or nearest[1].status not in ENDED:
             return None
-        return Optimum(problem, found[0], found[1].iterate, names)
+        return Optimum(problem, nearest[0], nearest[1].iterate, names)
 
 
 def distinct(one: Optimum, other: Optimum) -> bool:
     """Return whether the likelihood of one fit is significantly larger than that of another."""
     likelihood = one.problem.likelihood
     fits = (likelihood.whitened(state.iterate.here.residuals, one.iterate.noise) for state in (one, other))
-    own, others = (np.concatenate(parts) for parts in fits)
+    first, others = (np.concatenate(parts) for parts in fits)
     # |r + d|² − |r|² varies by 2 d·r, r being normal. Its scatter over the components, as Vuong has it, says nothing
     # where one of them, such as the frequency of a cycle, makes the whole difference.
-    return bool(others @ others - own @ own > DISTINCT * 2.0 * np.linalg.norm(others - own))
+    return bool(others @ others - first @ first > DISTINCT * 2.0 * np.linalg.norm(others - first))
 
 
 def held_out_error(state: Optimum) -> float:
@@ -129,15 +129,15 @@ def held_out_error(state: Optimum) -> float:
         return np.nan
     whole, fractions = problem.anchored(state.iterate.theta, state.orbits), []
     for e in problem.experiments:
-        errors = {name: own for name, own in problem.input_errors.items() if name != e.name}
+        errors = {name: wave for name, wave in problem.input_errors.items() if name != e.name}
         try:
             rest = problem.with_experiments([other for other in problem.experiments if other is not e])
         except ValueError:  # fewer values than the parameters need
             return np.nan
-        found = state.with_problem(rest.with_input_errors(errors), state.names)
-        if found is None:
+        optimum = state.with_problem(rest.with_input_errors(errors), state.names)
+        if optimum is None:
             return np.inf
-        outputs, converged = whole.outputs(found.iterate.theta[None])
+        outputs, converged = whole.outputs(optimum.iterate.theta[None])
         if not converged.all():
             return np.inf
         for channel, measured in e.outputs.items():

@@ -62,7 +62,7 @@ def bands(
     """Return the bands of outputs (draws, points) and residual variances (draws,) at the draws that converged."""
     count = converged.size
     scores = ndtri((np.arange(NOISE_LEVELS) + 0.5) / NOISE_LEVELS)
-    found: list[dict[str, dict[str, np.ndarray]]] = [{e.name: {} for e in problem.experiments} for _ in BAND_QUANTILES]
+    limits: list[dict[str, dict[str, np.ndarray]]] = [{e.name: {} for e in problem.experiments} for _ in BAND_QUANTILES]
     for e in problem.experiments:
         for channel in e.outputs:
             variance = variances.get((e.name, channel), np.zeros(count))
@@ -70,9 +70,9 @@ def bands(
             noise = np.sqrt(variance)[:, None, None] * scores[:, None]
             values = (expected[:, None] + noise)[converged].reshape(-1, expected.shape[1])
             levels = np.median(expected[converged], axis=0), *np.quantile(values, BAND_QUANTILES[1:], axis=0)
-            for band, level in zip(found, levels, strict=True):
+            for band, level in zip(limits, levels, strict=True):
                 band[e.name][channel] = level
-    median, low, high = found
+    median, low, high = limits
     return Bands(median, low, high, PROBABILITY, count, int(count - converged.sum()))
 
 
@@ -147,7 +147,7 @@ def _transient(problem: Problem, theta: np.ndarray, run: Run, experiment: str | 
     if not signals:
         raise RuntimeError(f"run: failed at all {len(theta)} draws, last with: {last}") from last
     levels = {output: np.quantile(values, BAND_QUANTILES, axis=0) for output, values in signals.items()}
-    median, low, high = ({output: found[i] for output, found in levels.items()} for i in range(3))
+    median, low, high = ({output: quantiles[i] for output, quantiles in levels.items()} for i in range(3))
     return Transient(time, median, low, high, PROBABILITY, len(theta), dict(failures))
 
 
@@ -229,8 +229,8 @@ class Prediction(Bands):
     @property
     def findings(self) -> dict[str, str]:
         """Rejections in words, by row of the table; other orbits by experiment; the conflict of prior and data."""
-        found = {f"experiment {name}": reason for name, reason in self.other_orbits.items()}
-        return found | rejections(self.table) | ({"prior conflict": self.prior_conflict} if self.prior_conflict else {})
+        texts = {f"experiment {name}": reason for name, reason in self.other_orbits.items()}
+        return texts | rejections(self.table) | ({"prior conflict": self.prior_conflict} if self.prior_conflict else {})
 
     @property
     def concerns_noise(self) -> bool:
@@ -334,8 +334,8 @@ def predict(
     components = iter(problem.likelihood.simulate(noise, np.random.default_rng(posterior.seed)))
     replicates = {}
     for name, observation in problem.observations.items():
-        own = list(islice(components, len(observation.blocks)))
-        for channel, values in observation.replicates(solved.response(name), own).items():
+        parts = list(islice(components, len(observation.blocks)))
+        for channel, values in observation.replicates(solved.response(name), parts).items():
             replicates[name, channel] = values[converged]
     here = anchored.linearise(peak)
     if not here.converged:
@@ -348,8 +348,8 @@ def predict(
         objective = replace(objective, log_variance_factor=bias_correction(problem, estimate))
         estimate = objective.iterate(here, estimate.noise)
     if estimate is not None:
-        found, alone = prior_conflict(problem, estimate)
-        conflict = found.text
+        conflicting, alone = prior_conflict(problem, estimate)
+        conflict = conflicting.text
         if conflict:
             # The prior must not count as misfit of the model, which is tested where the data alone are fitted best.
             here, noise, replicates = alone.here, alone.noise[None], {}

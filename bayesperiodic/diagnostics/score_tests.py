@@ -56,7 +56,7 @@ class ScoreTests:
         solutions = here.simulator.solutions(optimum.theta)
         effects = _effects(problem, optimum.theta, solutions, terms)
         finite = np.isfinite(np.concatenate(effects, axis=1)).all(axis=1)
-        effects = [np.where(finite[:, None], own, 0.0) for own in effects]
+        effects = [np.where(finite[:, None], effect, 0.0) for effect in effects]
         self.widths = _widths(likelihood.whitened(_deviations(problem), noise), likelihood.whitened(effects, noise))
         joined = [np.concatenate([s, c]) for s, c in zip(here.changes, effects, strict=True)]
         white, parameters = Whitened(problem, Compared(list(here.residuals), joined), noise), len(problem.names)
@@ -68,12 +68,12 @@ class ScoreTests:
     def _p(self, problem: Problem, optimum: Iterate, white: Whitened, parameters: int) -> np.ndarray:
         """Return the p-values (terms,)."""
         blocks, known = white.blocks, [white.spectrum(i) for i in range(len(white.blocks))]
-        if all(own is not None or block.kind == KNOWN for own, block in zip(known, blocks, strict=True)):
+        if all(spectrum is not None or block.kind == KNOWN for spectrum, block in zip(known, blocks, strict=True)):
             parts = [white.in_units_of_noise(i) for i in range(len(blocks))]
             tests, weights = _projected(parts, parameters), [np.full(part[0].size, np.inf) for part in parts]
-            for i, own in enumerate(known):
-                if own is not None:
-                    weights[i] = own[1][white.parts[i][2]]
+            for i, spectrum in enumerate(known):
+                if spectrum is not None:
+                    weights[i] = spectrum[1][white.parts[i][2]]
             # Degrees of freedom of the measured variances that the variance of a score consists of.
             shares = tests.effects**2 / np.maximum(np.sum(tests.effects**2, axis=1), np.finfo(float).tiny)[:, None]
             freedom = 1.0 / np.maximum(shares @ (1.0 / np.concatenate(weights)), 1e-9)
@@ -98,8 +98,8 @@ class ScoreTests:
         while left:
             cosine = self._effects[left] @ self._effects[left[0]] / (size[left] * size[left[0]])
             same = 1.0 - cosine**2 < SAME_EFFECT
-            yield sorted(int(i) for i, own in zip(left, same, strict=True) if own)
-            left = [i for i, own in zip(left, same, strict=True) if not own]
+            yield sorted(int(i) for i, alike in zip(left, same, strict=True) if alike)
+            left = [i for i, alike in zip(left, same, strict=True) if not alike]
 
 
 class _Projected(NamedTuple):
@@ -116,9 +116,9 @@ class _Projected(NamedTuple):
 
     def gains(self) -> np.ndarray:
         """Return the part of the residual's square that each effect explains (terms,)."""
-        own = np.sum(self.effects**2, axis=1)
+        squares = np.sum(self.effects**2, axis=1)
         score = (self.effects @ self.residual) ** 2
-        return np.divide(score, own, out=np.zeros(own.size), where=self.identifiable)
+        return np.divide(score, squares, out=np.zeros(squares.size), where=self.identifiable)
 
 
 def _projected(parts: Sequence[Sequence[np.ndarray]], parameters: int) -> _Projected:
@@ -150,7 +150,7 @@ def variable_deviations(problem: Problem, fit: MapEstimate) -> dict[str, float]:
 
 def lags_to_try(fit: MapEstimate) -> list[float]:
     """Return lags [s] of terms with memory, which cover all experiments."""
-    rates = [2.0 * np.pi * own.frequency / own.periods for own in fit.solutions.values()]
+    rates = [2.0 * np.pi * solution.frequency / solution.periods for solution in fit.solutions.values()]
     ends = SHORTEST_LAG / max(rates), LONGEST_LAG / min(rates)
     return np.geomspace(*ends, 1 + int(np.ceil(np.log(ends[1] / ends[0]) / np.log(LARGEST_LAG_FACTOR)))).tolist()
 
@@ -172,7 +172,7 @@ def _effects(
     NaN for terms that are not finite along an orbit.
     """
     where = np.array([places(problem.model).index(term.place) for term in terms], dtype=int)
-    outputs, found = len(problem.model.outputs), []
+    outputs, effects = len(problem.model.outputs), []
     for e in problem.experiments:
         equations, z, parameters = _at(problem, theta, e, solutions[e.name])
         listed = [term.expression.xreplace({MEMORY: sp.Integer(0)}) for term in terms]
@@ -190,23 +190,23 @@ def _effects(
         caused = np.full((len(terms), sum(sizes)), np.nan)
         if moved is not None:
             caused[finite] = predicted_changes(problem, e, equations, theta, z, moved)[finite]
-        found += np.split(caused, np.cumsum(sizes)[:-1], axis=1)
-    return found
+        effects += np.split(caused, np.cumsum(sizes)[:-1], axis=1)
+    return effects
 
 
 def _deviations(problem: Problem) -> list[np.ndarray]:
     """Return the components of the measured outputs less their means, one array (size,) a block."""
-    found: list[np.ndarray] = []
+    deviations: list[np.ndarray] = []
     for e in problem.experiments:
         seen = problem.observations[e.name]
-        found += seen.errors(np.stack([e.outputs[c] - e.outputs[c].mean() for c in seen.channels], axis=-1))
-    return found
+        deviations += seen.errors(np.stack([e.outputs[c] - e.outputs[c].mean() for c in seen.channels], axis=-1))
+    return deviations
 
 
 def _widths(data: Sequence[np.ndarray], effects: Sequence[np.ndarray]) -> np.ndarray:
     """Return the coefficients (terms,) whose effect on one of the blocks is as large as its data."""
     sizes = np.array([np.linalg.norm(c, axis=1) for c in effects])
-    wanted = np.array([np.linalg.norm(own) for own in data])[:, None]
+    wanted = np.array([np.linalg.norm(part) for part in data])[:, None]
     ratio = np.divide(wanted, sizes, out=np.full(sizes.shape, np.inf), where=(sizes > 0.0) & (wanted > 0.0))
     least = ratio.min(axis=0)
     return np.where(np.isfinite(least), least, 1.0)

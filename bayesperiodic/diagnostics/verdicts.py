@@ -75,9 +75,9 @@ def wasserstein_distance(sample: Sample, mean: float, sd: float) -> tuple[float,
     """
     if not np.isfinite(sd):
         return np.inf, np.nan
-    own = float(sample.whole.std())
+    draws_sd = float(sample.whole.std())
     value, spread = sample.estimate(lambda x: wasserstein(x, mean, sd))
-    return value / own, float(np.hypot(spread / own, WASSERSTEIN_FLOOR / np.sqrt(sample.size)))
+    return value / draws_sd, float(np.hypot(spread / draws_sd, WASSERSTEIN_FLOOR / np.sqrt(sample.size)))
 
 
 def radii(points: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -169,16 +169,16 @@ def marginal_verdict(sample: Sample, mean: float, sd: float, support: tuple[floa
         return WIDE
     if _elsewhere(sample, mean, sd) or has_other_mode(sample, mean):
         return WRONG_MODE
-    own = float(sample.whole.std())
-    low = _end(sample, mean, sd, own)
-    high = _end(Sample(-sample.whole, -sample.batches, sample.size, sample.ensembles), -mean, sd, own)
+    draws_sd = float(sample.whole.std())
+    low = _end(sample, mean, sd, draws_sd)
+    high = _end(Sample(-sample.whole, -sample.batches, sample.size, sample.ensembles), -mean, sd, draws_sd)
     if low == high == FINE:
         distance, error = wasserstein_distance(sample, mean, sd)
         return WRONG_SHAPE if distance - ERRORS * error > END_SHIFT else FINE
-    if _piled(sample, support, own):
+    if _piled(sample, support, draws_sd):
         return WRONG_SHAPE
     quantiles = np.quantile(sample.whole, [END_PROBABILITY, 1.0 - END_PROBABILITY])
-    outwards = np.array([mean - END * sd - quantiles[0], quantiles[1] - mean - END * sd]) / own
+    outwards = np.array([mean - END * sd - quantiles[0], quantiles[1] - mean - END * sd]) / draws_sd
     if np.all(outwards > 0.5 * END_SHIFT):
         return NARROW
     return WIDE if np.all(outwards < -0.5 * END_SHIFT) else WRONG_SHAPE
@@ -188,13 +188,13 @@ def _unconverged(sample: Sample, mean: float) -> str:
     return WRONG_MODE if all(has_other_mode(ensemble, mean) for ensemble in sample.by_ensemble()) else UNCONVERGED
 
 
-def _end(sample: Sample, mean: float, sd: float, own: float) -> str:
+def _end(sample: Sample, mean: float, sd: float, draws_sd: float) -> str:
     """Return the verdict on the lower end of the 90 % interval; `own` is the sd of the draws."""
     end = mean - END * sd
-    beyond, error = sample.below(end - END_SHIFT * own, END_PROBABILITY)
+    beyond, error = sample.below(end - END_SHIFT * draws_sd, END_PROBABILITY)
     if beyond > END_PROBABILITY + ERRORS * error:
         return NARROW
-    beyond, error = sample.below(end + END_SHIFT * own, END_PROBABILITY)
+    beyond, error = sample.below(end + END_SHIFT * draws_sd, END_PROBABILITY)
     return WIDE if beyond < END_PROBABILITY - ERRORS * error else FINE
 
 
@@ -205,13 +205,13 @@ def _elsewhere(sample: Sample, mean: float, sd: float) -> bool:
     return any(within < OTHER_MODE_PROBABILITY - ERRORS * error for within, error in (low, high))
 
 
-def _piled(sample: Sample, support: tuple[float, float], own: float) -> bool:
+def _piled(sample: Sample, support: tuple[float, float], draws_sd: float) -> bool:
     """Return whether more than 5 % of the draws lie within a quarter of their sd of an end of the support.
 
     A normal posterior truncated two sds from its centre has 1.8 % there, one truncated at its centre 12 %.
     """
     bounds = [end for end in support if np.isfinite(end)]
-    near = [sample.fraction(lambda x, e=end: np.abs(x - e) < AT_END * own, PILED) for end in bounds]  # type: ignore[misc]
+    near = [sample.fraction(lambda x, e=end: np.abs(x - e) < AT_END * draws_sd, PILED) for end in bounds]  # type: ignore[misc]
     return any(fraction > PILED + ERRORS * error for fraction, error in near)
 
 
@@ -243,12 +243,12 @@ def joint_verdict(
         return WIDE
     if has_other_mode(along, float(mean @ direction)):
         return WRONG_MODE
-    found = _ellipsoids(sampled(radii(points, mean, covariance)), mean.size)
-    if found == FINE:
+    verdict = _ellipsoids(sampled(radii(points, mean, covariance)), mean.size)
+    if verdict == FINE:
         return WRONG_SHAPE if pareto_k[0] - pareto_k[1] > USABLE_K else FINE
     if _ellipsoids(sampled(radii(points, own_mean, own_covariance)), mean.size) != FINE:
         return WRONG_SHAPE
-    return WRONG_SHAPE if _ellipsoids(sampled(radii(points, own_mean, covariance)), mean.size) == FINE else found
+    return WRONG_SHAPE if _ellipsoids(sampled(radii(points, own_mean, covariance)), mean.size) == FINE else verdict
 
 
 def ellipsoid_radii(levels: np.ndarray, dimension: int) -> np.ndarray:
@@ -258,10 +258,10 @@ def ellipsoid_radii(levels: np.ndarray, dimension: int) -> np.ndarray:
 
 def _ellipsoids(distances: Sample, dimension: int) -> str:
     """Return whether the ellipsoids contain as many draws as expected."""
-    found = set()
+    verdicts = set()
     for level, radius in zip(ELLIPSOID_LEVELS, ellipsoid_radii(np.array(ELLIPSOID_LEVELS), dimension), strict=True):
         larger, error = distances.below(RADIUS_FACTOR * radius, level)
-        found |= {NARROW} if larger < level - ERRORS * error else set()
+        verdicts |= {NARROW} if larger < level - ERRORS * error else set()
         smaller, error = distances.below(radius / RADIUS_FACTOR, level)
-        found |= {WIDE} if smaller > level + ERRORS * error else set()
-    return found.pop() if len(found) == 1 else WRONG_SHAPE if found else FINE
+        verdicts |= {WIDE} if smaller > level + ERRORS * error else set()
+    return verdicts.pop() if len(verdicts) == 1 else WRONG_SHAPE if verdicts else FINE

@@ -223,8 +223,8 @@ class Model:
     def smooth_signs(self) -> tuple[sp.Expr, ...]:
         """The tanh and arctan terms in the equations whose arguments vary along an orbit."""
         moving = {*self.state_symbols.values(), *self.input_symbols.values(), self.time_symbols["tau"]}
-        found = set().union(*(e.atoms(sp.tanh, sp.atan) for e in self.equations))
-        return tuple(sorted((sign for sign in found if sign.free_symbols & moving), key=sp.default_sort_key))
+        atoms = set().union(*(e.atoms(sp.tanh, sp.atan) for e in self.equations))
+        return tuple(sorted((sign for sign in atoms if sign.free_symbols & moving), key=sp.default_sort_key))
 
     @cached_property
     def softened(self) -> "Model":

@@ -23,15 +23,15 @@ def parsed(text: str) -> Unit | None:
     over, *under = plain.split("/")
     if not over.strip() or len(under) > 1:
         return None
-    found: Unit = {}
+    unit: Unit = {}
     for sign, part in zip((1.0, -1.0), (over, *under), strict=False):
         for word in part.split():
             if word == "1":
                 continue
             if not (factor := UNIT_POWER.fullmatch(word)):
                 return None
-            found = product(found, {factor[1]: sign * float(factor[2] or 1)})
-    return found
+            unit = product(unit, {factor[1]: sign * float(factor[2] or 1)})
+    return unit
 
 
 def product(one: Unit, other: Unit, power: float = 1.0) -> Unit:
@@ -44,8 +44,8 @@ def written(unit: Unit) -> str:
     """Return a unit as text, such as ``"N/m^2"``; "1" for none."""
 
     def side(sign: int) -> str:
-        own = {name: sign * exponent for name, exponent in unit.items() if sign * exponent > 0}
-        return " ".join(name if exponent == 1 else f"{name}^{exponent:g}" for name, exponent in own.items())
+        factors = {name: sign * exponent for name, exponent in unit.items() if sign * exponent > 0}
+        return " ".join(name if exponent == 1 else f"{name}^{exponent:g}" for name, exponent in factors.items())
 
     over, under = side(1), side(-1)
     return (over or "1") + (f"/({under})" if " " in under else f"/{under}" if under else "")
@@ -70,20 +70,20 @@ def unit_of(expression: sp.Expr, units: Mapping[sp.Symbol, Unit]) -> Unit | None
     if isinstance(expression, sp.Symbol):
         return units.get(expression)
     parts = [unit_of(part, units) for part in expression.args]
-    known = [own for own in parts if own is not None]
+    known = [summand for summand in parts if summand is not None]
     if isinstance(expression, sp.Mul):
         total: Unit = {}
-        for own in known:
-            total = product(total, own)
+        for summand in known:
+            total = product(total, summand)
         return total if len(known) == len(parts) else None
     if isinstance(expression, sp.Pow):
         base, power = parts[0], expression.args[1]
         return product({}, base, float(power)) if base is not None and power.is_number else None
     if isinstance(expression, sp.Add):
         sized = [u for u, part in zip(parts, expression.args, strict=True) if u is not None and not part.is_number]
-        for own in sized[1:]:
-            if not same(sized[0], own):
-                raise ValueError(f"a sum of {written(sized[0])} and {written(own)}")
+        for summand in sized[1:]:
+            if not same(sized[0], summand):
+                raise ValueError(f"a sum of {written(sized[0])} and {written(summand)}")
         return sized[0] if sized else None
     if isinstance(expression, sp.Abs):
         return parts[0]

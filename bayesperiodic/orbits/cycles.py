@@ -183,21 +183,21 @@ def _distinct(
     noise = float(maps.noise.max())
     tolerance = max(SAME_CYCLE, 3.0 * noise)
     # Each cycle with the first points and the shift of each of its close returns, (returns, 2).
-    found: list[tuple[np.ndarray, list[np.ndarray]]] = []
+    groups: list[tuple[np.ndarray, list[np.ndarray]]] = []
     for k in np.argsort(step, kind="stable"):
         if step[k] > max(CONVERGED_CORRECTION, 0.1 * noise):
             break
         if has_shorter_period(chains[k], maps.wrap, tolerance):
             continue
-        for cycle, group in found:
+        for cycle, group in groups:
             distance, shift = shift_between(chains[k], cycle, maps.wrap)
             if distance < tolerance:
                 group.append(np.stack([members[k], np.full(len(members[k]), shift)]))
                 break
         else:
-            found.append((maps.wrap(chains[k]), [np.stack([members[k], np.zeros_like(members[k])])]))
+            groups.append((maps.wrap(chains[k]), [np.stack([members[k], np.zeros_like(members[k])])]))
     result = []
-    for cycle, group in found:
+    for cycle, group in groups:
         steps = np.arange(len(cycle) + 1)
         starts, shifts = np.concatenate(group, axis=1)
         expected = cycle[(steps + shifts[:, None]) % len(cycle)]
@@ -328,7 +328,7 @@ def box_orbits(
     """
     count = int(2.25 * neighbours)
     iterates = [_iterated(maps, section, k) for k in range(1, period + 1)]
-    found: list[tuple[MapCycle, Estimate]] = []
+    orbits: list[tuple[MapCycle, Estimate]] = []
     for centre, members in _recurrent_boxes(maps, section, period, box):
         fit = iterates[-1].fit(centre[None], count, 1)
         step = newton_step(maps.wrap(fit.value - centre)[None], fit.jacobian[None])[0, 0]
@@ -349,11 +349,11 @@ def box_orbits(
             np.zeros(2 * period + 2),
             _turns(maps, fits[-1].value[0] - points[0]),
         )
-        if any(shift_between(points, other.points, maps.wrap)[0] < 2.0 * box for _, other in found):
+        if any(shift_between(points, other.points, maps.wrap)[0] < 2.0 * box for _, other in orbits):
             continue
         away = maps.distance(section[members], points[0])
-        found.append((MapCycle(points, len(members), int(members[np.argmin(away)]), 0), estimate))
-    return found
+        orbits.append((MapCycle(points, len(members), int(members[np.argmin(away)]), 0), estimate))
+    return orbits
 
 
 def _iterated(maps: ReturnMap, section: np.ndarray, steps: int) -> ReturnMap:

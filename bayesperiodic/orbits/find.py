@@ -96,12 +96,12 @@ def find_orbits(
     neighbours, box = _checks.integer("neighbours", neighbours, 16), _checks.positive("box", box)
     scaled = _scaled(section, neighbours)
     if method == "boxes":
-        found = [pair for p in wanted for pair in cycles.box_orbits(scaled.maps, scaled.points, p, neighbours, box)]
+        pairs = [pair for p in wanted for pair in cycles.box_orbits(scaled.maps, scaled.points, p, neighbours, box)]
     else:
         atlas = Atlas(scaled.maps, _search_count(scaled.maps, neighbours))
-        found = [pair for p in wanted for pair in _chained(scaled, atlas, p, neighbours)]
+        pairs = [pair for p in wanted for pair in _chained(scaled, atlas, p, neighbours)]
     quality_count = _search_count(scaled.maps, FEWEST_NEIGHBOURS)
-    orbits = [_orbit(section, scaled, *pair, _quality(scaled, *pair, quality_count)) for pair in found]
+    orbits = [_orbit(section, scaled, *pair, _quality(scaled, *pair, quality_count)) for pair in pairs]
     return Orbits(_finished(orbits, scaled), values=section.values, method=method)
 
 
@@ -148,7 +148,7 @@ def _search_count(maps: ReturnMap, neighbours: int) -> int:
 
 def _chained(scaled: _ScaledSection, atlas: Atlas, period: int, neighbours: int) -> list[tuple[MapCycle, Estimate]]:
     maps = scaled.maps
-    found: list[tuple[MapCycle, Estimate]] = []
+    pairs: list[tuple[MapCycle, Estimate]] = []
 
     def same(one: Estimate, other: Estimate) -> bool:
         distance, _ = cycles.shift_between(one.points, other.points, maps.wrap)
@@ -159,9 +159,9 @@ def _chained(scaled: _ScaledSection, atlas: Atlas, period: int, neighbours: int)
         if estimate is None or not (sd := _largest_sd(estimate)) < LARGEST_SD:
             continue
         repeats = cycles.has_shorter_period(estimate.points, maps.wrap, max(2e-3, 3.0 * sd))
-        if not repeats and not any(same(estimate, other) for _, other in found):
-            found.append((candidate, estimate))
-    return found
+        if not repeats and not any(same(estimate, other) for _, other in pairs):
+            pairs.append((candidate, estimate))
+    return pairs
 
 
 def _largest_sd(estimate: Estimate) -> float:

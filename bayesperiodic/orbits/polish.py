@@ -94,7 +94,7 @@ def polish_orbits(
     polisher = _Polisher(model, given.orbits, parameters, inputs or {}, parameter_sd or {}, samples, scheme, tolerance)
     results = [(orbit, *polisher.polish(orbit)) for orbit in given]
     rejected = [*given.rejected, *((orbit, reason) for orbit, _, reason in results if reason)]
-    polished = [found for _, found, reason in results if not reason]
+    polished = [solved for _, solved, reason in results if not reason]
     kept: list[int] = []
     for i in sorted(range(len(polished)), key=lambda i: -polished[i].returns):
         for k in kept:
@@ -166,9 +166,9 @@ class _Polisher:
         """Return the orbit with its solution and an empty reason, or unchanged with the reason for its rejection."""
         first = ""
         for winding, states in self._starts(orbit):
-            found, reason = self._solve(orbit, winding, states)
+            solved, reason = self._solve(orbit, winding, states)
             if not reason:
-                return found, ""
+                return solved, ""
             first = first or reason
         return orbit, first or "the model's states diverge from its section points"
 
@@ -366,13 +366,13 @@ def _sign_mismatch(orbit: Orbit) -> str:
     The sign of a multiplier with modulus above 1 cannot change along a branch.
     """
     assert orbit.solution is not None
-    measured, own = orbit.eigenvalues[0], orbit.solution.multipliers[0]
+    measured, computed = orbit.eigenvalues[0], orbit.solution.multipliers[0]
     sd = np.sqrt(orbit.joint_covariance[orbit.points.size, orbit.points.size])
-    both_real = max(abs(np.angle(value**2)) for value in (measured, own)) < REAL
-    sure = both_real and sd < SURE and min(abs(measured), abs(own)) > 1.0
-    if not sure or measured.real * own.real > 0.0:
+    both_real = max(abs(np.angle(value**2)) for value in (measured, computed)) < REAL
+    sure = both_real and sd < SURE and min(abs(measured), abs(computed)) > 1.0
+    if not sure or measured.real * computed.real > 0.0:
         return ""
-    return f"the solution is another orbit: its multiplier is {own.real:.4g}, the measured one {measured.real:.4g}"
+    return f"the solution is another orbit: its multiplier is {computed.real:.4g}, the measured one {measured.real:.4g}"
 
 
 @in_one_thread

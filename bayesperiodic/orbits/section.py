@@ -119,9 +119,9 @@ class PoincareSection(Result):
         signals = _signals(recording, names, angle_names)
         time = recording.time
         if recording.sampling_rate < FEWEST_SAMPLES * frequency:
-            found = f"{recording.sampling_rate / frequency:.3g}"
+            rate = f"{recording.sampling_rate / frequency:.3g}"
             raise ValueError(
-                f"recording: must have at least {FEWEST_SAMPLES} samples a period, got {found}. For samples taken once "
+                f"recording: must have at least {FEWEST_SAMPLES} samples a period, got {rate}. For samples taken once "
                 "a period, use from_points."
             )
         first = int(np.ceil((time[0] - origin) * frequency - 1e-9))
@@ -357,7 +357,7 @@ def _upward_crossings(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
     band = 0.1 * signal.std()
     marks = np.flatnonzero(np.abs(signal) > band)
     up = np.flatnonzero((signal[marks[:-1]] < 0.0) & (signal[marks[1:]] > 0.0))
-    found = []
+    crossings = []
     for low, high in zip(marks[up], marks[up + 1], strict=True):
         span = slice(max(low - 2, 0), high + 3)
         centre = 0.5 * (time[low] + time[high])
@@ -365,8 +365,8 @@ def _upward_crossings(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
         real = roots[np.abs(roots.imag) < 1e-9].real + centre
         inside = real[(real >= time[low]) & (real <= time[high])]
         if inside.size:
-            found.append(inside[np.argmin(np.abs(inside - centre))])
-    return np.array(found)
+            crossings.append(inside[np.argmin(np.abs(inside - centre))])
+    return np.array(crossings)
 
 
 def _estimate(time: np.ndarray, signals: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -388,8 +388,8 @@ def _estimate(time: np.ndarray, signals: np.ndarray, at: np.ndarray) -> tuple[np
         wide, gain, _ = _fit(time, signals, at, half)
         squared = (wide - narrow) ** 2
         bias = squared.mean(0) - variance * (narrow_gain.mean() - gain.mean())
-        found = unbiased & (bias > 2.0 * squared.std(0) / np.sqrt(len(at)))
-        first_biased[found], unbiased[found] = half, False
+        biased = unbiased & (bias > 2.0 * squared.std(0) / np.sqrt(len(at)))
+        first_biased[biased], unbiased[biased] = half, False
         halves.append(half)
     values, sd = narrow.copy(), np.sqrt(variance * narrow_gain.mean())
     for channel in range(count):

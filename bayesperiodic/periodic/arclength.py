@@ -182,13 +182,13 @@ class Tracer:
         self, start: BranchPoint, z: np.ndarray, values: np.ndarray, rows: np.ndarray, corner: np.ndarray, step: float
     ) -> tuple[BranchPoint, int] | None:
         targets = np.einsum("rps,ps->r", rows, z) + corner @ values
-        found = self.parametrised.solve(z, values, rows, corner, targets, self._value_scales)
-        if found.code != CONVERGED:
+        solved = self.parametrised.solve(z, values, rows, corner, targets, self._value_scales)
+        if solved.code != CONVERGED:
             return None
-        tangent = self.tangent(found.z, found.values, start.tangent)
+        tangent = self.tangent(solved.z, solved.values, start.tangent)
         if tangent is None:
             return None
-        return BranchPoint(found.z, found.values, tangent, start.distance + step), len(found.history)
+        return BranchPoint(solved.z, solved.values, tangent, start.distance + step), len(solved.history)
 
     def _conditions(self, z: np.ndarray, tangent: Change) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and corner of: distance along a tangent; for an autonomous model, the phase against z."""

@@ -92,11 +92,11 @@ class Batch:
         for e, (equations, anchor) in enumerate(zip(sets, anchors, strict=True)):
             if anchor.sensitivities is None:
                 continue
-            own = Factors(*(part[e] for part in factors))
+            anchored = Factors(*(part[e] for part in factors))
             sensitivities[e] = anchor.sensitivities
             columns = equations.residual_jacobian(anchor.z, anchor.parameters)
-            if not equations.factorise(columns, anchor.z, own):
-                own.ends[0] = NO_FACTORS
+            if not equations.factorise(columns, anchor.z, anchored):
+                anchored.ends[0] = NO_FACTORS
             left[e], change = smallest_singular_vectors(equations, anchor.z, columns)
             gradient[e] = stiffness_gradient(equations, anchor.z, anchor.parameters, sensitivities[e], left[e], change)
             right[e] = change[:, : first.count]

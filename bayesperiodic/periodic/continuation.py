@@ -310,15 +310,15 @@ def _parametrised(
     model = equations.model
     allowed = [*model.parameters, *model.inputs, *([] if model.autonomous else [FREQUENCY])]
     _checks.one_of("vary", vary, allowed)
-    own, own_values = ((FREQUENCY,), [equations.frequency]) if model.autonomous else ((), [])
+    free, own_values = ((FREQUENCY,), [equations.frequency]) if model.autonomous else ((), [])
     if vary in model.inputs:
         column, width = model.inputs.index(vary), len(model.inputs)
         change = np.zeros_like(equations.inputs)
         change[:, column::width] = equations.inputs[:, column::width]
         base = replace(equations, inputs=equations.inputs - change)
-        return ParametrisedEquations(base, parameters, (INPUTS, *own), change), np.array([1.0, *own_values])
+        return ParametrisedEquations(base, parameters, (INPUTS, *free), change), np.array([1.0, *own_values])
     value = equations.frequency if vary == FREQUENCY else parameters[model.parameters.index(vary)]
-    return ParametrisedEquations(equations, parameters, (vary, *own)), np.array([value, *own_values])
+    return ParametrisedEquations(equations, parameters, (vary, *free)), np.array([value, *own_values])
 
 
 def _solution(parametrised: ParametrisedEquations, point: BranchPoint, sensitivities: bool = False) -> PeriodicSolution:
@@ -346,11 +346,11 @@ def _special_points(
     solved: Callable[[BranchPoint], PeriodicSolution], tracer: Tracer, before: BranchPoint, after: BranchPoint
 ) -> list[BranchPoint]:
     """Return the folds and period doublings between two neighbouring points, in order."""
-    found: list[BranchPoint] = []
+    points: list[BranchPoint] = []
     for kind, test in ((FOLD, _fold_test), (PERIOD_DOUBLING, lambda point: _doubling_test(solved(point)))):
         if test(before) * test(after) < 0.0:
-            found += _locate(tracer, before, after, kind, test)
-    return sorted(found, key=lambda point: point.distance)
+            points += _locate(tracer, before, after, kind, test)
+    return sorted(points, key=lambda point: point.distance)
 
 
 def _locate(
@@ -428,15 +428,15 @@ def solutions_at(model: Model, branch: Branch, value: float) -> tuple[PeriodicSo
     if branch.vary not in (*model.parameters, FREQUENCY):
         raise ValueError(f"branch: must be one in a parameter or the frequency, got one in the input {branch.vary!r}.")
     value = _checks.finite_number("value", value)
-    found = []
+    orbits = []
     for (low, before), (high, after) in pairwise(zip(branch.values, branch.solutions, strict=True)):
         if low <= value < high or high < value <= low:
-            found.append(_between(model, branch.vary, value, before, after, (value - low) / (high - low)))
+            orbits.append(_between(model, branch.vary, value, before, after, (value - low) / (high - low)))
     if branch.values[-1] == value:
-        found.append(_between(model, branch.vary, value, branch[-1], branch[-1], 0.0))
-    if not found:
+        orbits.append(_between(model, branch.vary, value, branch[-1], branch[-1], 0.0))
+    if not orbits:
         raise ValueError(_absent(branch, value))
-    return tuple(found)
+    return tuple(orbits)
 
 
 def _between(

@@ -220,7 +220,7 @@ class PeriodicEquations:
     def winding(self) -> dict[str, int]:
         """Turns of each angle per response period."""
         turns = np.rint(self.drift * self.grid.periods / (2 * np.pi)).astype(int).tolist()
-        return {s: own for s, own in zip(self.model.states, turns, strict=True) if s in self.model.angles}
+        return {s: turn for s, turn in zip(self.model.states, turns, strict=True) if s in self.model.angles}
 
     def at_frequency(self, frequency: float) -> "PeriodicEquations":
         """Return the same equations at another frequency, the inputs unchanged as functions of tau."""

@@ -125,10 +125,10 @@ def floquet(matrix: np.ndarray, period: float) -> Floquet:
     splits, right = _invariant_bases(groups)
     _, left = _invariant_bases(np.swapaxes(groups[::-1], 1, 2), splits)
     left = np.roll(left[::-1], 1, axis=0)
-    found: list[tuple[complex, np.ndarray, np.ndarray]] = []
+    modes: list[tuple[complex, np.ndarray, np.ndarray]] = []
     for start, stop in zip([0, *splits], [*splits, size], strict=True):
-        found += _block(groups, *_eigenspaces(right, left, start, stop))
-    exponents, v, w = (np.array(part) for part in zip(*found, strict=True))
+        modes += _block(groups, *_eigenspaces(right, left, start, stop))
+    exponents, v, w = (np.array(part) for part in zip(*modes, strict=True))
     order = np.argsort(-exponents.real, kind="stable")
     return Floquet(exponents[order], steps, length, v[order], w[order])
 
@@ -143,10 +143,10 @@ def leading_multipliers(matrix: np.ndarray, period: float, count: int) -> np.nda
     points, size, _ = matrix.shape
     steps = _transfer_matrices(matrix, period / points)
     if count == 1:
-        found, logarithm, sign = _kernels().dominant_multiplier(
+        dominant, logarithm, sign = _kernels().dominant_multiplier(
             steps, np.full(size, 1.0 / np.sqrt(size)), POWER_ROUNDS, DECOUPLED
         )
-        if found:
+        if dominant:
             with np.errstate(over="ignore"):
                 return np.array([sign * np.exp(logarithm)], dtype=complex)
     products, _ = _harmless_products(steps)
@@ -256,7 +256,7 @@ def _block(groups: np.ndarray, x: np.ndarray, y: np.ndarray) -> list[tuple[compl
         product, growth = product / scale, growth + np.log(scale)
     values, vectors = np.linalg.eig(product)
     adjoint = np.linalg.inv(vectors)
-    found = []
+    modes = []
     for value, c, d in zip(values, vectors.T, adjoint, strict=True):
         with np.errstate(divide="ignore"):
             exponent = complex(np.log(complex(value)) + growth)
@@ -269,5 +269,5 @@ def _block(groups: np.ndarray, x: np.ndarray, y: np.ndarray) -> list[tuple[compl
             d = small[g].T @ d
             d = d / np.linalg.norm(d)
             across[g] = y[g] @ (gram[g].T @ d)
-        found.append((exponent, along, across))
-    return found
+        modes.append((exponent, along, across))
+    return modes

@@ -111,12 +111,12 @@ def hopf_points(
 
     grid = np.linspace(low, high, INTERVALS + 1)
     rates = [growth(value) for value in grid]
-    found = []
+    points = []
     for (a, b), (before, after) in zip(pairwise(grid), pairwise(rates), strict=True):
         if before * after < 0.0 or (after == 0.0 and before != 0.0):
             value = float(brentq(growth, a, b, xtol=1e-13 * max(abs(a), abs(b)), rtol=1e-14))
-            found.append(_describe(equations, at(value), vary, value))
-    return tuple(found)
+            points.append(_describe(equations, at(value), vary, value))
+    return tuple(points)
 
 
 def emerging_cycle(
@@ -165,13 +165,13 @@ def emerging_cycle(
     ((state, size),) = amplitude.items()
     _checks.one_of("amplitude", state, model.states)
     size = _checks.positive(f"amplitude[{state!r}]", size)
-    own = point.mode[model.states.index(state)]
-    if not abs(own) > OSCILLATING:
+    component = point.mode[model.states.index(state)]
+    if not abs(component) > OSCILLATING:
         moving = [name for name, part in zip(model.states, point.mode, strict=True) if abs(part) > OSCILLATING]
         raise ValueError(f"amplitude: must be of a state that the oscillation moves, {moving}, got {state!r}.")
     equations = PeriodicEquations.build(model, None, frequency=point.frequency, samples=samples, scheme=scheme)
     theta = np.array([point.parameters[n] for n in model.parameters])
-    shape = point.mode * size / own
+    shape = point.mode * size / component
     wave = np.exp(2j * np.pi * equations.grid.tau)
     z = np.array([point.equilibrium[n] for n in model.states]) + np.real(wave[:, None] * shape)
     rows = np.zeros((2, *z.shape))
@@ -179,9 +179,9 @@ def emerging_cycle(
     values = np.array([point.value, point.frequency])
     parametrised = ParametrisedEquations(equations, theta, (point.vary, FREQUENCY))
     scales = np.maximum(np.abs(values), 1.0)
-    found = parametrised.solve(z, values, rows, np.zeros((2, 2)), np.array([size, 0.0]), scales)
-    equations, theta = parametrised.at(found.values)
-    return describe(equations, theta, found, "Hopf point", sensitivities=False)
+    solved = parametrised.solve(z, values, rows, np.zeros((2, 2)), np.array([size, 0.0]), scales)
+    equations, theta = parametrised.at(solved.values)
+    return describe(equations, theta, solved, "Hopf point", sensitivities=False)
 
 
 def _leading(equations: PeriodicEquations, theta: np.ndarray) -> tuple[complex, np.ndarray, np.ndarray]:

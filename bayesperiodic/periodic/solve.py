@@ -347,14 +347,14 @@ def solve_free(
                 "fixes the phase."
             )
     equations = replace(equations, frequency=frequency)
-    found = solve_autonomous(equations, theta, z, frequency)
-    equations = equations.at_frequency(float(found.values[0]))
-    code = found.code
+    solved = solve_autonomous(equations, theta, z, frequency)
+    equations = equations.at_frequency(float(solved.values[0]))
+    code = solved.code
     orbits = equations.bordered_kernels
-    shorter = code == CONVERGED and orbits.has_shorter_period(found.z)
-    if shorter or (code != NOT_FINITE and orbits.has_shrunk(found.z, z)):
+    shorter = code == CONVERGED and orbits.has_shorter_period(solved.z)
+    if shorter or (code != NOT_FINITE and orbits.has_shrunk(solved.z, z)):
         code = OTHER_ORBIT
-    return equations, equations.checked(found._replace(code=code)), found_by
+    return equations, equations.checked(solved._replace(code=code)), found_by
 
 
 def _steps_of_transitions(equations: PeriodicEquations, theta: np.ndarray, z: np.ndarray) -> float:

@@ -353,7 +353,7 @@ class JointPrior:
         for key, prior in self.blocks.items():
             if isinstance(prior, Univariate):
                 columns.setdefault(prior, []).append(self._columns[key])
-        return [(prior, own) for prior, own in columns.items() if len(own) > 1]
+        return [(prior, places) for prior, places in columns.items() if len(places) > 1]
 
     @cached_property
     def _alone(self) -> list[str | tuple[str, ...]]:

@@ -85,7 +85,7 @@ class Checkpoint:
             return MemoryBackend(), {}
         try:
             backend = MemoryBackend(read_sealed(self._path))
-            found, state = (
+            mark, state = (
                 str(backend.file.attrs.get(MARK, "no run of this package")),
                 json.loads(backend.file[RUN][()]),
             )
@@ -95,9 +95,9 @@ class Checkpoint:
                 f"checkpoint: must be an intact file, got {str(self._path)!r} ({error}); name another file or delete "
                 "it."
             ) from None
-        if found != self._mark:
-            (problem, _, settings), (own, _, wanted) = found.partition("; "), self._mark.partition("; ")
-            other = ", ".join(changed_parts(problem, own))
+        if mark != self._mark:
+            (problem, _, settings), (current, _, wanted) = mark.partition("; "), self._mark.partition("; ")
+            other = ", ".join(changed_parts(problem, current))
             raise ValueError(
                 f"checkpoint: must be a file of this run ({wanted}), got {str(self._path)!r} of another run "
                 f"({f'a problem with other {other}' if other else settings}); name another file or delete it."

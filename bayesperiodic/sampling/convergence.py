@@ -131,13 +131,13 @@ def stop_rule(
     first one. If there are several optima, `modes` (ensembles, steps, walkers) contains that of each draw: the
     fractions of those that are visited must meet the criteria too, and their times follow those of the coordinates.
     """
-    tau, own = autocorrelation_time(kept), kept.shape[-1]
-    missing = unmet_criteria(kept, tau, last[:own] if last.size else np.full(own, np.inf), labels)
+    tau, count = autocorrelation_time(kept), kept.shape[-1]
+    missing = unmet_criteria(kept, tau, last[:count] if last.size else np.full(count, np.inf), labels)
     if modes is None or len(visited := np.unique(modes)) < 2:
         return tau, missing
     inside = (modes[..., None] == visited[1:]).astype(float)
     of_modes = autocorrelation_time(inside)
-    before = last[own:] if last.size == own + of_modes.size else np.full(of_modes.size, np.inf)
+    before = last[count:] if last.size == count + of_modes.size else np.full(of_modes.size, np.inf)
     names = [f"mode {row}" for row in visited[1:]]
     weights = [f"weights of modes: {text}" for text in unmet_criteria(inside, of_modes, before, names)]
     return np.concatenate([tau, of_modes]), missing + weights
@@ -153,22 +153,22 @@ def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: 
     `kept` are chains (ensembles, steps, walkers, coordinates); `tau` and `last` are autocorrelation times [steps] of
     the coordinates, now and at the previous check; `labels` are the names of the coordinates.
     """
-    found = []
+    unmet = []
     if not np.isfinite(tau).all():
         still = [label for label, time in zip(labels, tau, strict=True) if not np.isfinite(time)]
         return [f"{', '.join(map(repr, still))} not moving, as every proposal is refused"]
     needed = LENGTHS if kept.shape[2] > 1 else LENGTHS_ALONE
     if (lengths := kept.shape[1] / tau.max()) < needed:
-        found.append(f"length only {lengths:.0f} tau")
+        unmet.append(f"length only {lengths:.0f} tau")
     if (change := np.max(np.abs(tau - last) / tau)) > TAU_CHANGE:
-        found.append(f"tau changed by {change:.0%}" if np.isfinite(change) else "tau known from one check alone")
+        unmet.append(f"tau changed by {change:.0%}" if np.isfinite(change) else "tau known from one check alone")
     if (spread := quantile_spread(kept).max()) > QUANTILE_SPREAD:
-        found.append(f"quantiles of the ensembles {spread:.2f} sd apart")
-    if not found and (alone := _furthest(kept, tau)) > STUCK_DISTANCE:
-        found.append(f"walkers that stay apart, by {alone:.0f} standard errors")
-    if not found and (worst := max(map(rhat, np.moveaxis(as_chains(kept), -1, 0)))) > RHAT:
-        found.append(f"R-hat {worst:.3f}")
-    return found
+        unmet.append(f"quantiles of the ensembles {spread:.2f} sd apart")
+    if not unmet and (alone := _furthest(kept, tau)) > STUCK_DISTANCE:
+        unmet.append(f"walkers that stay apart, by {alone:.0f} standard errors")
+    if not unmet and (worst := max(map(rhat, np.moveaxis(as_chains(kept), -1, 0)))) > RHAT:
+        unmet.append(f"R-hat {worst:.3f}")
+    return unmet
 
 
 def _furthest(kept: np.ndarray, tau: np.ndarray) -> float:

@@ -380,8 +380,8 @@ def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, time: dic
     simulation, variables, largest = density.simulator.solve(theta, keep=True, polish=True), {}, []
     for e in problem.experiments:
         observation, failed = problem.observations[e.name], simulation.statuses(e.name) != CONVERGED
-        own, components = components[: len(observation.blocks)], components[len(observation.blocks) :]
-        for channel, values in observation.replicates(simulation.response(e.name), own).items():
+        parts, components = components[: len(observation.blocks)], components[len(observation.blocks) :]
+        for channel, values in observation.replicates(simulation.response(e.name), parts).items():
             values[failed] = np.nan
             variables[f"{e.name} {channel}"] = ((CHAIN, DRAW, time[e.name]), values.reshape(*shape, -1))
         largest.append(density.simulator.largest_multipliers(theta, e.name, simulation).reshape(shape))
@@ -485,10 +485,10 @@ def tree(
     }
     if problem.input_errors:
         variables: dict[str, Any] = {}
-        for name, own in problem.input_errors.items():
-            variables[f"{name} {EXPECTED}"] = ((f"{name} error",), own.expected)
-            variables[f"{name} {LOADINGS}"] = ((f"{name} component", f"{name} error"), own.loadings)
-            variables[f"{name} {CAUSED}"] = ((f"{name} component",), own.caused)
+        for name, errors in problem.input_errors.items():
+            variables[f"{name} {EXPECTED}"] = ((f"{name} error",), errors.expected)
+            variables[f"{name} {LOADINGS}"] = ((f"{name} component", f"{name} error"), errors.loadings)
+            variables[f"{name} {CAUSED}"] = ((f"{name} component",), errors.caused)
         groups[INPUT_NOISE] = xr.Dataset(variables)
     result = xr.DataTree.from_dict(groups)
     result.attrs = {

@@ -219,8 +219,8 @@ def _bridge(
     constant = constant + float(np.linalg.slogdet(transform.axes)[1])
 
     def log_ratios(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found = density.evaluate(transform.unwhiten(u), threads=None)
-        return found.log_prob + constant - mixture.log_density(u), found.status
+        evaluation = density.evaluate(transform.unwhiten(u), threads=None)
+        return evaluation.log_prob + constant - mixture.log_density(u), evaluation.status
 
     at_draws = log_ratios(kept.reshape(-1, dimension))[0].reshape(kept.shape[:-1])
     at_mixture, status = log_ratios(mixture.draw(DRAWS_EACH, generator))
@@ -278,8 +278,8 @@ def _priors(problem: Problem) -> Iterator[tuple[str, Any]]:
 
 def _check_normalised(argument: str, prior: Any) -> None:
     """Refuse a prior whose integral is not one; those of this package and of SciPy are known to be normalised."""
-    own = not isinstance(prior, FromScipy) and type(prior).__module__.startswith("bayesperiodic.")
-    if own or (isinstance(prior, FromScipy) and as_written(prior.distribution).startswith("scipy.stats.")):
+    built_in = not isinstance(prior, FromScipy) and type(prior).__module__.startswith("bayesperiodic.")
+    if built_in or (isinstance(prior, FromScipy) and as_written(prior.distribution).startswith("scipy.stats.")):
         return
     ends = [prior.support[0], *prior.quantile(np.linspace(0.0, 1.0, 17)[1:-1]), prior.support[1]]
     with warnings.catch_warnings():
@@ -327,20 +327,20 @@ def _notes(problem: Problem, improper: dict[str, str]) -> Iterator[str]:
 
 def _alarms(posterior: Posterior, first: _Bridge, second: _Bridge) -> list[str]:
     """Return the reasons not to rely on the evidence, in words."""
-    found = []
+    alarms = []
     overlap, missed = min(first.overlap, second.overlap), max(first.missed, second.missed)
     failed = max(first.failed, second.failed)
     if not posterior.converged:
-        found.append(f"the draws have not converged ({posterior.reason}). Sample longer, see max_steps.")
+        alarms.append(f"the draws have not converged ({posterior.reason}). Sample longer, see max_steps.")
     if overlap < OVERLAP:
-        found.append(f"posterior and mixture overlap by {overlap:.2g} alone (should be at least {OVERLAP}).")
+        alarms.append(f"posterior and mixture overlap by {overlap:.2g} alone (should be at least {OVERLAP}).")
     if missed > FRACTION:
-        found.append(f"the mixture fitted to one half of the draws misses {missed:.1%} of the other half.")
+        alarms.append(f"the mixture fitted to one half of the draws misses {missed:.1%} of the other half.")
     if abs(first.log - second.log) > DIFFERENT_ESTIMATES * np.hypot(first.error, second.error):
-        found.append(
+        alarms.append(
             f"the two halves of the ensembles give {first.log:.2f} ± {first.error:.2g} and {second.log:.2f} ± "
             f"{second.error:.2g}. Sample longer, see max_steps."
         )
     if failed > FRACTION:
-        found.append(f"{failed:.1%} of the points of the mixture have no periodic solution, and count as impossible.")
-    return found
+        alarms.append(f"{failed:.1%} of the points of the mixture have no periodic solution, and count as impossible.")
+    return alarms

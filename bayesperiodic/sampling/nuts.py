@@ -191,12 +191,12 @@ class _Chains:
 
     def posterior(self, version: str, seed: int) -> Posterior:
         """End the chains and return their draws with nutpie's statistics."""
-        found = [chain.sampler.abort()["sample_stats"] for chain in self.chains]
+        statistics = [chain.sampler.abort()["sample_stats"] for chain in self.chains]
         stats = {
-            ours: np.stack([np.asarray(one[theirs])[0, : self.steps] for one in found])
+            ours: np.stack([np.asarray(one[theirs])[0, : self.steps] for one in statistics])
             for ours, theirs in STATISTICS.items()
         }
-        log_density = np.stack([np.asarray(one["logp"])[0, : self.steps] for one in found])
+        log_density = np.stack([np.asarray(one["logp"])[0, : self.steps] for one in statistics])
         if diverged := int(stats["diverging"].sum()):
             lost = f"{diverged} of {log_density.size} trajectories diverged"
             self.reason += f", {lost}"

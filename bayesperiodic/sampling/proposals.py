@@ -130,9 +130,9 @@ def fit_mixture(draws: np.ndarray, candidates: Sequence[StudentMixture] = ()) ->
         if count > 1 and len(train) < PER_COMPONENT * count * draws.shape[2]:
             break
         fitted = _fitted(train, count, curvature)
-        found = {nu: float(_with_wider(fitted, nu).log_density(test).mean()) for nu in (HEAVY_TAILS, LIGHT_TAILS)}
-        if (score := max(found.values())) > best + (LEAST_GAIN if size else 0.0):
-            best, size, degrees, chosen, worse = score, count, max(found, key=found.__getitem__), None, 0
+        scores = {nu: float(_with_wider(fitted, nu).log_density(test).mean()) for nu in (HEAVY_TAILS, LIGHT_TAILS)}
+        if (score := max(scores.values())) > best + (LEAST_GAIN if size else 0.0):
+            best, size, degrees, chosen, worse = score, count, max(scores, key=scores.__getitem__), None, 0
         elif (worse := worse + 1) == 2:
             break
     return _with_wider(chosen) if chosen else _with_wider(_fitted(points, size, _curvature(points, bent)), degrees)
@@ -186,9 +186,9 @@ def _fitted(draws: np.ndarray, count: int, curvature: np.ndarray) -> StudentMixt
     fit = GaussianMixture(count, reg_covar=REGULAR * draws.var(axis=0).min(), random_state=0, tol=1e-2).fit
     with _libraries().limit(limits=1), warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # a mixture that is not the best one is a proposal too
-        found = fit(draws)
-    factors = np.linalg.cholesky(found.covariances_)
-    return StudentMixture(found.weights_, found.means_, factors, np.full(count, HEAVY_TAILS), curvature)
+        mixture = fit(draws)
+    factors = np.linalg.cholesky(mixture.covariances_)
+    return StudentMixture(mixture.weights_, mixture.means_, factors, np.full(count, HEAVY_TAILS), curvature)
 
 
 @cache
@@ -202,8 +202,8 @@ def _with_wider(mixture: StudentMixture, degrees: float | None = None) -> Studen
     count = len(mixture.weights)
     weights = np.concatenate([(1.0 - WIDER_WEIGHT) * mixture.weights, WIDER_WEIGHT * mixture.weights])
     factors, means = np.concatenate([mixture.factors, WIDER_FACTOR * mixture.factors]), np.tile(mixture.means, (2, 1))
-    own = mixture.degrees if degrees is None else np.full(count, degrees)
-    return StudentMixture(weights, means, factors, np.append(own, np.full(count, HEAVY_TAILS)), mixture.curvature)
+    tails = mixture.degrees if degrees is None else np.full(count, degrees)
+    return StudentMixture(weights, means, factors, np.append(tails, np.full(count, HEAVY_TAILS)), mixture.curvature)
 
 
 # Fraction of the steps that propose from the mixture, if there is one; the other steps move within the ensembles.
@@ -301,7 +301,7 @@ def moves(ensembles: int, mixture: MixtureMove | None) -> list[tuple[emcee.moves
     Of the steps within ensembles, seven in ten are differential evolution, two are stretch moves, and one is
     differential evolution of full length, which can jump between modes.
     """
-    own = 1.0 if mixture is None else 1.0 - MIXTURE_STEPS
+    share = 1.0 if mixture is None else 1.0 - MIXTURE_STEPS
     within = (emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)
-    found = [(WithinEnsembles(move, ensembles), own * fraction) for move, fraction in within]
-    return found if mixture is None else [*found, (mixture, MIXTURE_STEPS)]
+    weighted = [(WithinEnsembles(move, ensembles), share * fraction) for move, fraction in within]
+    return weighted if mixture is None else [*weighted, (mixture, MIXTURE_STEPS)]

@@ -211,7 +211,7 @@ def sample(
     size = _checked_walkers(walkers, problem, variances)
     settings = f"seed {seed}, {ensembles} ensembles of {size} walkers, {start}, {coordinates}, {variances}"
     if fit.input_errors:
-        settings += f", input noise {digest([astuple(own) for own in fit.input_errors.values()])}"
+        settings += f", input noise {digest([astuple(wave) for wave in fit.input_errors.values()])}"
     opened = nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings)
     with interrupted_by_termination(), opened as store:
         backend, saved = (emcee.backends.Backend(), {}) if store is None else store.load()
@@ -225,15 +225,15 @@ def sample(
         state = {"anchor": anchor.tolist(), "guesses": lists} | saved
         run = _EnsembleRun(density, fit, seed, start, (ensembles, size), backend, state)
         run.go(max_steps, store, executor, progress)
-        found = run.posterior()
-    if found.converged and coordinates == NATURAL and problem.logarithmic.any():
+        posterior = run.posterior()
+    if posterior.converged and coordinates == NATURAL and problem.logarithmic.any():
         warnings.warn(
             "coordinates: 'natural' can miss the tails of a ridge although the stop rule has passed, which makes "
             "standard deviations up to 5 % too small; compare with the default, 'ridge'.",
             UserWarning,
             stacklevel=3,
         )
-    return found
+    return posterior
 
 
 def _checked_walkers(walkers: int | None, problem: Problem, variances: str) -> int:
@@ -351,9 +351,10 @@ class _EnsembleRun:
         calls = CallCount()
 
         def log_prob(u: np.ndarray) -> np.ndarray:
-            found = evaluate(self.transform.unwhiten(u))
-            calls.add(found.status)
-            return np.column_stack([found.log_prob, found.moments]) if found.moments.size else found.log_prob
+            evaluation = evaluate(self.transform.unwhiten(u))
+            calls.add(evaluation.status)
+            log_prob, moments = evaluation.log_prob, evaluation.moments
+            return np.column_stack([log_prob, moments]) if moments.size else log_prob
 
         np.random.RandomState().set_state(self.walk.random_state)  # raises, where emcee would go on with another one
         sampler = emcee.EnsembleSampler(
@@ -451,7 +452,7 @@ class _EnsembleRun:
         if self.density.collapsed:
             moments = self._by_ensemble(self.backend.get_blobs(discard=first)).reshape(*kept.shape[:-1], -1)
             kept, log_density = self.density.with_variances(kept, log_density, moments, self.redraws)
-        found = gather(
+        posterior = gather(
             self.density.with_settings(variances=SAMPLED),
             kept,
             log_density,
@@ -463,8 +464,8 @@ class _EnsembleRun:
             seed=self.seed,
         )
         if self.state["mixture"]:
-            found.tree["proposal"] = xr.DataTree(self._proposal())
-        return found
+            posterior.tree["proposal"] = xr.DataTree(self._proposal())
+        return posterior
 
     def _proposal(self) -> xr.Dataset:
         """Return the mixture, with the acceptance of its steps since the last fit.
@@ -491,8 +492,8 @@ class _EnsembleRun:
 def _evaluate_pieces(pool: TaskPool, points: np.ndarray) -> Evaluation:
     """Return the evaluation of points (points, dimension), computed by the workers piece by piece."""
     pieces = [points[k : k + PIECE] for k in range(0, len(points), PIECE)]
-    found = dict(pool.run(_evaluate, pieces))
-    parts = [found[number] for number in range(len(pieces))]
+    evaluations = dict(pool.run(_evaluate, pieces))
+    parts = [evaluations[number] for number in range(len(pieces))]
     return Evaluation(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 

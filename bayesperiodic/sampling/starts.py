@@ -23,8 +23,8 @@ FEWEST_WALKERS, LEAST_MASS = 2, 1e-3
 
 def laplace_approximation(density: SamplingCoordinates, fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and covariance in sampling coordinates; raise a ValueError if the estimate has none."""
-    found = _laplace(density, fit)
-    if found is None:
+    laplace = _laplace(density, fit)
+    if laplace is None:
         remedy = "run map_estimate from another start"
         if fit.undetermined:
             remedy = f"fix what the data do not determine ({'; '.join(fit.undetermined)})"
@@ -36,7 +36,7 @@ def laplace_approximation(density: SamplingCoordinates, fit: MapEstimate) -> tup
             "fit: its joint covariance must be finite, got none, so there is no Laplace approximation to start from; "
             f"{remedy}, or take start='prior'."
         )
-    return found
+    return laplace
 
 
 def _laplace(density: SamplingCoordinates, mode: MapEstimate | Mode) -> tuple[np.ndarray, np.ndarray] | None:
@@ -78,8 +78,8 @@ def start_points(
         factor = SPREAD[start] * covariance_cholesky(covariance)
         return lambda count: mean + generator.standard_normal((count, mean.size)) @ factor.T
 
-    (_, _, own), *others = laplace_modes(density, fit)
-    points = _finite(density, calls, drawn(*own), walkers, start)
+    (_, _, first), *others = laplace_modes(density, fit)
+    points = _finite(density, calls, drawn(*first), walkers, start)
     left = walkers
     for _, mass, laplace in others:
         count = min(max(FEWEST_WALKERS, round(mass * walkers)), left - FEWEST_WALKERS)
@@ -97,12 +97,12 @@ def laplace_modes(
 
     The first one is the estimate. Raises a ValueError if it has no Laplace approximation.
     """
-    found = [(0, 1.0 - sum(mode.mass for mode in fit.other_modes), laplace_approximation(density, fit))]
+    modes = [(0, 1.0 - sum(mode.mass for mode in fit.other_modes), laplace_approximation(density, fit))]
     for row, mode in enumerate(fit.other_modes, 1):
         laplace = _laplace(density, mode)
         if laplace is not None and mode.mass > LEAST_MASS:
-            found.append((row, mode.mass, laplace))
-    return found
+            modes.append((row, mode.mass, laplace))
+    return modes
 
 
 def laplace_mixture(density: SamplingCoordinates, fit: MapEstimate) -> tuple[StudentMixture, np.ndarray]:
@@ -150,9 +150,9 @@ def _finite(
         candidates = drawn(wanted)
         tried += wanted
         if len(candidates):
-            found = density.evaluate(candidates, threads=None)
-            calls.add(found.status)
-            points = np.concatenate([points, candidates[np.isfinite(found.log_prob)]])
+            evaluation = density.evaluate(candidates, threads=None)
+            calls.add(evaluation.status)
+            points = np.concatenate([points, candidates[np.isfinite(evaluation.log_prob)]])
     if len(points) < (wanted if needed is None else needed):
         other = "give a converged fit of this problem, or start='prior'"
         remedy = "narrow the priors, see prior_predictive(problem)" if start == FROM_PRIOR else other

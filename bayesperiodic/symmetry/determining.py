@@ -176,27 +176,27 @@ def _circuits(vectors: np.ndarray, weights: np.ndarray, tries: int = 200) -> lis
     The rows of reduced echelon forms are such combinations; the orders of the columns are random, with a fixed seed.
     """
     random = np.random.default_rng(0)
-    found: set[tuple[int, ...]] = set()
+    supports: set[tuple[int, ...]] = set()
     columns = vectors.shape[1]
     for trial in range(tries if len(vectors) > 1 else 1):
         # Heavy columns are the first pivots, so that each appears in one row only.
         order = np.lexsort((random.permutation(columns), -weights)) if trial % 2 else random.permutation(columns)
         for row in _reduced(vectors[:, order])[0]:
-            found.add(tuple(sorted(int(c) for c in order[np.flatnonzero(row)])))
-    return sorted(found, key=lambda support: (weights[list(support)].sum(), support))
+            supports.add(tuple(sorted(int(c) for c in order[np.flatnonzero(row)])))
+    return sorted(supports, key=lambda support: (weights[list(support)].sum(), support))
 
 
 def integer_circuits(vectors: np.ndarray, weights: np.ndarray) -> list[np.ndarray]:
     """Return combinations of integer vectors with minimal supports, in the smallest integers."""
-    found = []
+    circuits = []
     for support in _circuits(vectors, weights) if len(vectors) else []:
         rest = [c for c in range(vectors.shape[1]) if c not in support]
         exact = DomainMatrix.from_Matrix(sp.Matrix(vectors[:, rest].T.tolist() or [[0] * len(vectors)]))
         combination = integer_rows(exact.convert_to(sp.QQ).nullspace())[0]
         vector = combination @ vectors
         sign = np.sign(np.sign(vector).sum()) or np.sign(vector[support[0]])
-        found.append(sign * vector // np.gcd.reduce(vector))
-    return found
+        circuits.append(sign * vector // np.gcd.reduce(vector))
+    return circuits
 
 
 def integer_rows(matrix: DomainMatrix) -> np.ndarray:
@@ -240,8 +240,8 @@ class Algebra:
         """Return polynomials proportional to expressions of known functions, reduced by the relations."""
         elements = [self.field.from_expr(self._replaced(e)) for e in expressions]
         common = reduce(lambda a, b: a.lcm(b), (e.denom for e in elements))
-        found = [e.numer * common.exquo(e.denom) for e in elements]
-        return [n.rem(self._divisors) for n in found] if self._divisors else found
+        numerators = [e.numer * common.exquo(e.denom) for e in elements]
+        return [n.rem(self._divisors) for n in numerators] if self._divisors else numerators
 
     def is_zero(self, expression: sp.Expr) -> bool:
         """Return whether an expression vanishes identically."""
@@ -336,7 +336,7 @@ def lie_derivative(field: Mapping[sp.Symbol, sp.Expr], expression: sp.Expr) -> s
 
 def _terms(system: System) -> list[BasisField]:
     """Return the basis: every parameter, and every state with terms affine in the states and inputs."""
-    found = [BasisField(n, sp.S.One, {s: sp.S.One}, True) for n, s in system.parameters.items()]
+    basis = [BasisField(n, sp.S.One, {s: sp.S.One}, True) for n, s in system.parameters.items()]
     signals = [(n, order) for n, order in system.orders.items()] + [(n, 2) for n in system.inputs]
     for state, order in system.orders.items():
         targets = [system.symbols["d" * k + state] for k in range(order + 1)]
@@ -344,8 +344,8 @@ def _terms(system: System) -> list[BasisField]:
         for name, highest in signals:
             jets = [system.symbols["d" * k + name] for k in range(highest + 1)]
             chains += [jets[k : k + order + 1] for k in range(highest - order + 1)]
-        found += [BasisField(state, c[0], dict(zip(targets, c, strict=True)), False) for c in chains]
-    return found
+        basis += [BasisField(state, c[0], dict(zip(targets, c, strict=True)), False) for c in chains]
+    return basis
 
 
 @dataclass(frozen=True)
@@ -395,16 +395,16 @@ class Determining:
 
         The support must determine z up to a factor.
         """
-        own = sorted(support)
-        columns = [*own, *range(len(self.terms), self.matrix.shape[1])]
+        places = sorted(support)
+        columns = [*places, *range(len(self.terms), self.matrix.shape[1])]
         part = self.matrix[:, columns]
         chosen = _reduced(part.T)[1]
         domain = sp.QQ[tuple(self.unknowns)]
         entries = [[domain.ring.from_dict(dict(self.rows[i].get(c, {}))) for c in columns] for i in chosen]
         matrix = DomainMatrix(entries, (len(chosen), len(columns)), domain)
         vector = matrix.to_field().to_sparse().nullspace().to_Matrix().row(0)
-        exact = _primitive(list(vector)[: len(own)])
-        return {c: self.algebra.original(e) for c, e in zip(own, exact, strict=True) if e != 0}
+        exact = _primitive(list(vector)[: len(places)])
+        return {c: self.algebra.original(e) for c, e in zip(places, exact, strict=True) if e != 0}
 
 
 def determining_equations(system: System) -> Determining:
@@ -474,8 +474,8 @@ class Generator:
     def minus(self, other: "Generator", factor: sp.Expr) -> "Generator":
         """Return self − factor · other."""
 
-        def difference(own: dict, its: dict) -> dict:
-            moves = {k: sp.factor(own.get(k, 0) - factor * its.get(k, 0)) for k in dict.fromkeys((*own, *its))}
+        def difference(these: dict, its: dict) -> dict:
+            moves = {k: sp.factor(these.get(k, 0) - factor * its.get(k, 0)) for k in dict.fromkeys((*these, *its))}
             return {k: v for k, v in moves.items() if v != 0}
 
         parameters, states, moves = map(difference, self._parts, other._parts)
@@ -521,13 +521,13 @@ def _scalings(equations: Determining) -> list[dict[int, int]]:
     exact = DomainMatrix([[sp.QQ(row.get(c, 0)) for c in range(size)] for row in table], (len(table), size), sp.QQ)
     whole = integer_rows(exact.to_sparse().nullspace())
     parameters = [place for place, k in enumerate(columns) if terms[k].is_parameter]
-    found: list[dict[int, int]] = []
+    scalings: list[dict[int, int]] = []
     taken = np.empty((0, len(parameters)), dtype=np.int64)
     for vector in integer_circuits(whole, np.append(equations.weights[columns], np.zeros(len(diagonal), dtype=int))):
         if _rank(np.vstack([taken, vector[parameters]])) > len(taken):
             taken = np.vstack([taken, vector[parameters]])
-            found.append({k: int(w) for k, w in zip(columns, vector, strict=False) if w})
-    return found
+            scalings.append({k: int(w) for k, w in zip(columns, vector, strict=False) if w})
+    return scalings
 
 
 def _generator(

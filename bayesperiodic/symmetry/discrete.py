@@ -26,7 +26,7 @@ def discrete_flows(system: System, generators: Sequence[Generator], determined: 
     """
     images = [*_sign_changes(system, generators), *_exchanges(system, list(determined))]
     flows = (Flow(Generator({}, {}, {}), IDENTITY, image) for image in images)
-    return [flow for found in flows if (flow := verified(system, found)) is not None]
+    return [flow for candidate in flows if (flow := verified(system, candidate)) is not None]
 
 
 def _sign_changes(system: System, generators: Sequence[Generator]) -> list[dict[sp.Symbol, sp.Expr]]:
@@ -39,7 +39,7 @@ def _sign_changes(system: System, generators: Sequence[Generator]) -> list[dict[
         _parity(sp.expand(expression), bits, constraints)
     constraints += [_parity(sp.expand(y), bits, constraints) for y in system.outputs.values()]
     basis = _null_space(constraints, len(members))
-    own = (1 << len(system.parameters)) - 1
+    parameter_bits = (1 << len(system.parameters)) - 1
     symbols = set(system.parameters.values())
     taken = [
         sum(bits[s] for s, move in g.field.items() if s in symbols and sp.cancel(move / s) % 2)
@@ -47,11 +47,11 @@ def _sign_changes(system: System, generators: Sequence[Generator]) -> list[dict[
         if g.scaling
     ]
     every = range(1, 1 << len(basis)) if len(basis) <= MOST_COMBINED else (1 << i for i in range(len(basis)))
-    found = [reduce(int.__xor__, (b for i, b in enumerate(basis) if chosen >> i & 1), 0) for chosen in every]
+    combinations = [reduce(int.__xor__, (b for i, b in enumerate(basis) if chosen >> i & 1), 0) for chosen in every]
     result = []
-    for change in sorted(found, key=lambda f: ((f & own).bit_count(), f.bit_count(), f)):
-        if change & own and _is_independent(change & own, taken):
-            taken.append(change & own)
+    for change in sorted(combinations, key=lambda f: ((f & parameter_bits).bit_count(), f.bit_count(), f)):
+        if change & parameter_bits and _is_independent(change & parameter_bits, taken):
+            taken.append(change & parameter_bits)
             result.append({s: -s for i, symbols in enumerate(members) if change >> i & 1 for s in symbols})
     return result
 
@@ -63,18 +63,18 @@ def _parity(e: sp.Expr, bits: Mapping[sp.Symbol, int], constraints: list[int]) -
     """
     if e.is_Symbol or e.is_number:
         return bits.get(e, 0)
-    own = [_parity(argument, bits, constraints) for argument in e.args]
+    parities = [_parity(argument, bits, constraints) for argument in e.args]
     if e.is_Add:
-        constraints += [own[0] ^ other for other in own[1:]]
-        return own[0]
+        constraints += [parities[0] ^ other for other in parities[1:]]
+        return parities[0]
     if e.is_Mul:
-        return reduce(int.__xor__, own)
+        return reduce(int.__xor__, parities)
     if e.is_Pow and e.exp.is_Integer:
-        return own[0] if e.exp % 2 else 0
+        return parities[0] if e.exp % 2 else 0
     if isinstance(e, ODD):
-        return own[0]
+        return parities[0]
     if not isinstance(e, EVEN_FUNCTIONS):
-        constraints += own
+        constraints += parities
     return 0
 
 
@@ -112,17 +112,17 @@ def _exchanges(system: System, determined: Sequence[str]) -> list[dict[sp.Symbol
     states = [dict(zip(jets[a] + jets[b], jets[b] + jets[a], strict=True)) for a, b in pairs]
     try:
         evaluated = sp.lambdify(symbols, [equations, slopes, sp.Matrix(list(system.outputs.values()))], "numpy")
-        found = []
+        exchanges = []
         for a, b in combinations([system.parameters[n] for n in determined], 2):
             for moved in ({}, *states):
                 image = {a: b, b: a} | moved
                 columns = [highest.index(image.get(h, h)) for h in highest]
                 if _holds(evaluated, symbols, image, columns):
-                    found.append(image)
+                    exchanges.append(image)
                     break
     except (TypeError, NameError, AttributeError, np.linalg.LinAlgError):
         return []
-    return found
+    return exchanges
 
 
 def _holds(

@@ -107,7 +107,7 @@ def null_directions(system: System) -> list[tuple[dict[sp.Symbol, float], np.nda
     T. Scanlon, SIAM Journal on Applied Algebra and Geometry 6, 2022, 339-367).
     """
     random = np.random.default_rng(7)
-    found = []
+    samples = []
     for _ in range(VALUES):
         theta = random.uniform(0.5, 1.5, len(system.parameters))
         known = random.uniform(0.5, 1.5, len(system.known))
@@ -122,8 +122,8 @@ def null_directions(system: System) -> list[tuple[dict[sp.Symbol, float], np.nda
         _, singular, directions = np.linalg.svd(sensitivities / unit)
         without = directions[np.count_nonzero(singular > ZERO_SINGULAR_VALUE * singular[0]) :] / unit
         values = dict(zip((*system.parameters.values(), *system.known.values()), [*theta, *known], strict=True))
-        found.append((values, np.linalg.qr(without.T)[0].T))
-    return found
+        samples.append((values, np.linalg.qr(without.T)[0].T))
+    return samples
 
 
 def _sensitivities(
@@ -259,10 +259,10 @@ def directions_of(system: System, generators: Sequence[Generator]) -> Directions
     symbols = (*system.parameters.values(), *system.known.values())
     general = {s: 0.5 + (0.618 * k) % 1 for k, s in enumerate(symbols, 1)}
     names = tuple(system.parameters)
-    found = null_directions(system) if names else []
-    if not found:
+    samples = null_directions(system) if names else []
+    if not samples:
         return Directions(_explained(system, generators, general), names, general)
-    values, rows = min(found, key=lambda pair: len(pair[1]))
+    values, rows = min(samples, key=lambda pair: len(pair[1]))
     explained = _explained(system, generators, values)
     rest = rows - rows @ explained.T @ explained
     unexplained = tuple(
@@ -272,7 +272,7 @@ def directions_of(system: System, generators: Sequence[Generator]) -> Directions
     located = {symbol for switch in system.signs for symbol in switch.free_symbols}
     if unexplained and located & set(system.parameters.values()):
         return Directions(explained, names, values)
-    return Directions(rows, names, values, len(found), unexplained)
+    return Directions(rows, names, values, len(samples), unexplained)
 
 
 def _explained(system: System, generators: Sequence[Generator], values: dict[sp.Symbol, float]) -> np.ndarray:
@@ -399,7 +399,7 @@ def coefficients_of(system: System) -> dict[sp.Expr, bool]:
     parameters = (*system.parameters.values(), *system.known.values())
     drive = {system.symbols["tau"], *(system.symbols[d + n] for d in ("", "d", "dd") for n in system.inputs)}
     moving = set(system.symbols.values())
-    found: dict[sp.Expr, bool] = {}
+    coefficients: dict[sp.Expr, bool] = {}
 
     def collect(expression: sp.Expr) -> None:
         parts: dict[sp.Expr, sp.Expr] = {}
@@ -410,14 +410,14 @@ def coefficients_of(system: System) -> dict[sp.Expr, bool]:
         for rest, coefficient in parts.items():
             ratio = sp.factor(sp.cancel(coefficient / leading)).as_independent(*parameters, as_Add=False)[1]
             if ratio.free_symbols:
-                found[ratio] = found.get(ratio, False) or bool(rest.free_symbols & drive)
+                coefficients[ratio] = coefficients.get(ratio, False) or bool(rest.free_symbols & drive)
             for function in sorted(rest.atoms(sp.Function), key=sp.default_sort_key):
                 for argument in function.args:
                     collect(argument)
 
     for expression in system.expressions:
         collect(expression)
-    return found
+    return coefficients
 
 
 def combinations_of(

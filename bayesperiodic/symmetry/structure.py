@@ -297,8 +297,8 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
     generators = [flow.generator if flow else symmetry for symmetry, flow in zip(symmetries, flows, strict=True)]
     directions = invariants.directions_of(system, generators)
     coefficients = invariants.coefficients_of(system)
-    found = invariants.combinations_of(system, generators, [f for f in flows if f], directions, coefficients)
-    combinations = {c: written(c, names).removeprefix("-") for c in found}
+    invariant = invariants.combinations_of(system, generators, [f for f in flows if f], directions, coefficients)
+    combinations = {c: written(c, names).removeprefix("-") for c in invariant}
     settled = [n for n in system.parameters if n not in directions.moved]
     discrete = discrete_flows(system, generators, settled) if system.parameters else []
     return Structure(
@@ -347,10 +347,10 @@ def _table(
             verdict = "not determined" if alone else "only in combination"
             partners = [] if alone else directions.partners(parameter)
         else:
-            own = [c for c in coefficients if symbol in c.free_symbols and not c.free_symbols & unsure]
-            own = [] if any(c.free_symbols == {symbol} for c in own) else own
-            own.sort(key=lambda c: not coefficients[c])
-            enters = [written(c, names).removeprefix("-") + " (in the drive)" * coefficients[c] for c in own]
+            shown = [c for c in coefficients if symbol in c.free_symbols and not c.free_symbols & unsure]
+            shown = [] if any(c.free_symbols == {symbol} for c in shown) else shown
+            shown.sort(key=lambda c: not coefficients[c])
+            enters = [written(c, names).removeprefix("-") + " (in the drive)" * coefficients[c] for c in shown]
         rows[parameter] = {
             "verdict": verdict,
             "enters": "; ".join(enters),

@@ -49,31 +49,31 @@ def broyden(functions, grid, setting, band, pivots, border, target, z, states, c
         below[0, 0] = folded_product(z, border.rows[0], grid) - target
         solve_bordered(band, pivots, border, right, below)
         unfold(right[0], grid, change)
-        own = taken[iteration]
-        own[points * count] = -below[0, 0] / first
+        step = taken[iteration]
+        step[points * count] = -below[0, 0] / first
         for i in range(points):
             for s in range(count):
-                own[i * count + s] = -change[i, s] / unit[s]
-        if iteration > 0 and not dot(own, own) < SECANT_RATE**2 * squares[iteration - 1]:
+                step[i * count + s] = -change[i, s] / unit[s]
+        if iteration > 0 and not dot(step, step) < SECANT_RATE**2 * squares[iteration - 1]:
             return False, iteration + 1, frequency
         for k in range(iteration):
-            share = dot(taken[k], own) / squares[k]
+            share = dot(taken[k], step) / squares[k]
             if k < iteration - 1:
-                for i in range(own.size):
-                    own[i] += share * taken[k + 1, i]
+                for i in range(step.size):
+                    step[i] += share * taken[k + 1, i]
             else:
-                for i in range(own.size):
-                    own[i] /= 1.0 - share
-        squares[iteration] = dot(own, own)
+                for i in range(step.size):
+                    step[i] /= 1.0 - share
+        squares[iteration] = dot(step, step)
         full = 0.0
-        for i in range(own.size):
-            full = max(full, abs(own[i]))
-        if not (full < OFF_ANCHOR and squares[iteration] > 0.0) or not frequency + own[points * count] * first > 0.0:
+        for i in range(step.size):
+            full = max(full, abs(step[i]))
+        if not (full < OFF_ANCHOR and squares[iteration] > 0.0) or not frequency + step[points * count] * first > 0.0:
             return full == 0.0, iteration + 1, frequency
         for i in range(points):
             for s in range(count):
-                z[i, s] += own[i * count + s] * unit[s]
-        frequency += own[points * count] * first
+                z[i, s] += step[i * count + s] * unit[s]
+        frequency += step[points * count] * first
         if full <= STEP_TOLERANCE or (iteration > 0 and full**2 <= STEP_TOLERANCE * previous):
             return True, iteration + 1, frequency
         previous = full
@@ -165,7 +165,7 @@ def follow_many(functions, grid, sets, orbits, parameters, start, stop, whole, w
     outputs, borders = grid_function_at(functions.outputs), orbits.border
     sets_count, points, count = orbits.z.shape
     size = points * count
-    own = Border(
+    bordering = Border(
         np.empty((2, size)), np.empty((1, size)), np.zeros((1, 1)), np.empty((2, 4)), np.empty(2, dtype=np.int64)
     )
     history, change, inputs = np.empty((MOST_NEWTON_STEPS, 3)), np.empty((points, count)), np.empty_like(sets.inputs[0])
@@ -196,7 +196,7 @@ def follow_many(functions, grid, sets, orbits, parameters, start, stop, whole, w
                 code = CONVERGED
             elif wanted:
                 code, more, f = continue_from_anchor(
-                    functions, grid, setting, anchor, orientation, own, z, history, work
+                    functions, grid, setting, anchor, orientation, bordering, z, history, work
                 )
                 used += more
             if code == CONVERGED and is_jagged(z, sets.inputs[e]):

@@ -157,12 +157,12 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
     predicted, change, reached = np.empty((points, count)), np.empty((points, count)), np.empty(count)
     columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MOST_NEWTON_STEPS, 3))
     bands, pivots, inverses, gains, transfers, ends, interfaces, interface_pivots = all_factors
-    own = Factors(
+    fresh = Factors(
         np.empty_like(bands[0]), np.empty_like(pivots[0]), np.empty_like(inverses[0]), np.empty_like(gains[0]),
         np.empty_like(transfers[0]), np.empty_like(ends[0]), np.empty_like(interfaces[0]),
         np.empty_like(interface_pivots[0]),
     )  # fmt: skip
-    work = Workspace(states, columns, np.empty((0, 0)), own)
+    work = Workspace(states, columns, np.empty((0, 0)), fresh)
     nothing, table = np.empty(0), np.empty((0, 0))
     unknowns = Unknowns(nothing, nothing, nothing, table, np.empty((0, 0, 0)), -1)
     border = Border(table, table, table, table, np.empty(0, dtype=np.int64))

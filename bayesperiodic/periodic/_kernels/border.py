@@ -218,8 +218,8 @@ def bordered_step(functions, grid, setting, unknowns, border, states, columns, z
     unfold(right[0], grid, step)
     for k in range(borders):
         change[k] = below[0, k]
-        own = abs(change[k]) / max(unknowns.scales[k], abs(unknowns.values[k]))
-        size = max(size, own) if own < np.inf else np.inf
+        relative = abs(change[k]) / max(unknowns.scales[k], abs(unknowns.values[k]))
+        size = max(size, relative) if relative < np.inf else np.inf
     return size, orientation
 
 

@@ -371,8 +371,8 @@ def back_substitute(grid, factors, right):
                 # The latest points last: only these delay the sum.
                 for d in range(reach - 1, -1, -1):
                     for s in range(count):
-                        own = ((k * reach + d) * count + e) * count + s
-                        value += rows[own] * before[(k + reach - 1 - d) * count + s]
+                        place = ((k * reach + d) * count + e) * count + s
+                        value += rows[place] * before[(k + reach - 1 - d) * count + s]
                 after[k * count + e] = value
         start = stop
     block = reach * count
