@@ -8,6 +8,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -26,44 +27,15 @@ OTHER = "path: must contain a result of this version of bayesperiodic"
 REMEDY = "load it with the version that saved it, or compute it again"
 # Metadata of fields that are left out of files; they have defaults.
 NOT_STORED = {"stored": False}
-# Module of every class in files. Modules are named, not imported: this module is below them.
-MODULES = {
-    "Bands": "bayesperiodic.diagnostics.predictive",
-    "Branch": "bayesperiodic.periodic.continuation",
-    "BranchPrediction": "bayesperiodic.diagnostics.branch_prediction",
-    "Calibration": "bayesperiodic.diagnostics.calibration",
-    "Comparison": "bayesperiodic.diagnostics.comparison",
-    "Evidence": "bayesperiodic.sampling.evidence",
-    "Experiment": "bayesperiodic.data.experiment",
-    "FourierScheme": "bayesperiodic.periodic.schemes",
-    "HopfPoint": "bayesperiodic.periodic.hopf",
-    "Identifiability": "bayesperiodic.diagnostics.identifiability",
-    "InputErrors": "bayesperiodic.likelihood.input_noise",
-    "MapEstimate": "bayesperiodic.estimation.result",
-    "MissingTerms": "bayesperiodic.diagnostics.missing_terms",
-    "Mode": "bayesperiodic.estimation.modes",
-    "ModelComparison": "bayesperiodic.diagnostics.model_comparison",
-    "NoiseSplit": "bayesperiodic.estimation.result",
-    "Orbit": "bayesperiodic.orbits.orbit",
-    "Orbits": "bayesperiodic.orbits.orbit",
-    "PeriodicSolution": "bayesperiodic.periodic.solution",
-    "PoincareSection": "bayesperiodic.orbits.section",
-    "Posterior": "bayesperiodic.sampling.draws",
-    "Prediction": "bayesperiodic.diagnostics.predictive",
-    "PriorConflict": "bayesperiodic.estimation.conflict",
-    "PriorPredictive": "bayesperiodic.diagnostics.predictive",
-    "Profile": "bayesperiodic.estimation.profile",
-    "Recording": "bayesperiodic.data.recording",
-    "Scheme": "bayesperiodic.periodic.schemes",
-    "Step": "bayesperiodic.diagnostics.missing_terms",
-    "Structure": "bayesperiodic.symmetry.structure",
-    "Symmetry": "bayesperiodic.symmetry.structure",
-    "Transient": "bayesperiodic.diagnostics.predictive",
-    "Whiteness": "bayesperiodic.estimation.result",
-}
+# Modules in files are paths below this package, without private names: nothing outside of it can be named.
+MODULE = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
 
 
-class Result:
+class Storable:
+    """Base class of dataclasses of plain data that files may contain; `load` finds them in their modules."""
+
+
+class Result(Storable):
     """Base class of frozen dataclasses of plain data, with a `save` method; `load` reads them."""
 
     def save(self, path: str | Path) -> None:
@@ -110,8 +82,8 @@ def write_sealed(path: str | Path, content: memoryview) -> None:
 
 def read_sealed(path: str | Path) -> bytes:
     """Return the content of a file; raise a ValueError if its checksum is missing or wrong."""
-    content, found, digest = Path(path).read_bytes().rpartition(SEAL)
-    if not found:
+    content, seal, digest = Path(path).read_bytes().rpartition(SEAL)
+    if not seal:
         raise ValueError("it has no checksum; it was cut off, or not written by this version of bayesperiodic")
     if hashlib.sha256(content).hexdigest().encode() != digest:
         raise ValueError("its content has changed since it was written")
@@ -180,7 +152,7 @@ def load(path: str | Path) -> Any:
             stored = file.get(ARRAYS, {})
             arrays = {key: stored[key][()] for key in stored}
         result = _decode(header, arrays, content)
-        if type(result).__name__ not in MODULES:
+        if not isinstance(result, Storable):
             raise ValueError(f"it contains a {type(result).__name__}")
     except Exception as error:  # whatever HDF5, JSON, NumPy and xarray raise for files that someone has made up
         if str(error).startswith(OTHER):
@@ -196,11 +168,12 @@ def load(path: str | Path) -> Any:
 def _encode(value: Any, arrays: dict[str, Any], trees: list[Any]) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         kind = type(value)
-        if MODULES.get(kind.__name__) != kind.__module__:
+        module = kind.__module__.removeprefix(f"{__package__}.")
+        if _class(module, kind.__name__) is not kind:
             raise TypeError(f"result: must consist of plain data and results of bayesperiodic, got {kind.__name__}.")
         stored = [f.name for f in fields(value) if f.metadata.get("stored", True)]
         content = {name: _encode(getattr(value, name), arrays, trees) for name in stored}
-        return {"result": kind.__name__, "fields": content}
+        return {"result": kind.__name__, "module": module, "fields": content}
     if isinstance(value, np.ndarray):
         key = str(len(arrays))
         arrays[key] = value
@@ -238,14 +211,24 @@ def _decode(value: Any, arrays: dict[str, Any], whole: io.BytesIO) -> Any:
     if "tree" in value:
         return _read_tree(whole)
     name = str(value["result"])
-    if name not in MODULES:
+    kind = _class(str(value.get("module")), name)
+    if kind is None:
         raise ValueError(f"{OTHER}, got class {name!r}; {REMEDY}.")
-    kind = getattr(import_module(MODULES[name]), name)
     content = {field: _decode(item, arrays, whole) for field, item in value["fields"].items()}
     needed = {f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING}
     if not needed <= content.keys() <= {f.name for f in fields(kind)}:
         raise ValueError(f"{OTHER}, got other fields of {name}; {REMEDY}.")
     return kind(**content)
+
+
+def _class(module: str, name: str) -> Any:
+    """Return the `Storable` class of a module of this package, or None; no other module is imported."""
+    path = Path(__file__).parent.joinpath(*module.split(".")).with_suffix(".py")
+    if not MODULE.fullmatch(module) or not path.is_file():
+        return None
+    kind = vars(import_module(f"{__package__}.{module}")).get(name)
+    defined = isinstance(kind, type) and issubclass(kind, Storable) and kind.__module__ == f"{__package__}.{module}"
+    return kind if defined and is_dataclass(kind) else None
 
 
 def _read_tree(content: io.BytesIO) -> Any:

@@ -5,6 +5,7 @@ import json
 import os
 import pkgutil
 import re
+import subprocess
 import sys
 import typing
 from contextlib import contextmanager
@@ -142,10 +143,13 @@ def test_every_flipped_byte_is_noticed(solved, tmp_path):
     "header",
     [
         "[" * 100_000, "{}", "3", '"text"', "null", '{"array": "7"}', '{"result": "MapEstimate"}', '{"tree": true}',
-        '{"result": "MapEstimate", "fields": {}}', '{"mapping": [[[], 1]]}', '{"mapping": 3}', '{"sequence": 4}',
-        '{"table": 5}', '{"result": {}, "fields": []}', '{"result": "Scheme", "fields": {"name": 1, "order": "x"}}',
-        '{"result": "Experiment", "fields": {"name": "a", "frequency": {}, "outputs": 3, "samples": -1}}',
-        '{"sequence": [{"result": "NoiseSplit", "fields": {"measurement": 1, "model": 2, "total": 3}}]}',
+        '{"result": "MapEstimate", "module": "estimation.result", "fields": {}}', '{"mapping": [[[], 1]]}',
+        '{"mapping": 3}', '{"sequence": 4}', '{"table": 5}', '{"result": {}, "fields": []}',
+        '{"result": "Scheme", "module": "periodic.schemes", "fields": {"name": 1, "order": "x"}}',
+        '{"result": "Experiment", "module": "data.experiment", "fields": '
+        '{"name": "a", "frequency": {}, "outputs": 3, "samples": -1}}',
+        '{"sequence": [{"result": "NoiseSplit", "module": "estimation.result", "fields": '
+        '{"measurement": 1, "model": 2, "total": 3}}]}',
     ],
 )  # fmt: skip
 def test_made_up_files_are_refused_by_one_error(tmp_path, header):
@@ -188,19 +192,19 @@ def test_error_names_the_missing_folder(tmp_path):
         experiment.save(tmp_path / "nowhere" / "run.h5")
 
 
-def classes_in_files() -> list[tuple[str, str]]:
-    """Return names and modules of all results and of the dataclasses that they contain."""
+def classes_in_files() -> set[type]:
+    """Return all results and the dataclasses that they contain."""
     for module in pkgutil.walk_packages(bp.__path__, "bayesperiodic."):
         if "_kernels" not in module.name:
             importlib.import_module(module.name)
-    found = set()
+    kinds = set()
 
     def visit(kind):
         for argument in typing.get_args(kind):
             visit(argument)
-        if isinstance(kind, type) and kind.__module__.startswith("bayesperiodic.") and kind not in found:
+        if isinstance(kind, type) and kind.__module__.startswith("bayesperiodic.") and kind not in kinds:
             if dataclasses.is_dataclass(kind):
-                found.add(kind)
+                kinds.add(kind)
                 hints = typing.get_type_hints(kind, localns={"pd": pd})  # which some modules import for types alone
                 for field in dataclasses.fields(kind):
                     if field.metadata != _io.NOT_STORED:
@@ -209,35 +213,69 @@ def classes_in_files() -> list[tuple[str, str]]:
                 visit(subclass)
 
     visit(_io.Result)
-    return sorted((kind.__name__, kind.__module__) for kind in found)
+    return kinds
 
 
-def test_table_of_classes_contains_every_result_and_no_other_class():
-    assert classes_in_files() == sorted(_io.MODULES.items())
+def test_every_result_and_all_that_it_contains_can_be_loaded_from_the_module_that_defines_it():
+    for kind in classes_in_files():
+        assert _io._class(kind.__module__.removeprefix("bayesperiodic."), kind.__name__) is kind
+
+
+def test_new_process_loads_a_result_whose_module_it_has_not_imported(solved, tmp_path):
+    solved[1].save(tmp_path / "fit.h5")
+    code = (
+        "import sys, bayesperiodic as bp; assert 'bayesperiodic.estimation.result' not in sys.modules; "
+        f"print(type(bp.load({str(tmp_path / 'fit.h5')!r})).__name__)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "MapEstimate"
 
 
 @pytest.mark.parametrize(
-    "kind",
+    "module, kind",
     [
-        "subprocess:Popen",
-        "Popen",
-        "antigravity",
-        "Iterate",
-        "__import__",
-        "bayesperiodic.of_old:MapEstimate",
-        "bayesperiodic.estimation.result:MapEstimate",
-        ["MapEstimate"],
+        ("", "MapEstimate"),
+        ("antigravity", "MapEstimate"),
+        ("subprocess", "Popen"),
+        ("evil", "MapEstimate"),
+        ("..evil", "MapEstimate"),
+        ("../evil", "MapEstimate"),
+        ("evil\n", "MapEstimate"),
+        ("bayesperiodic.estimation.result", "MapEstimate"),
+        ("estimation", "MapEstimate"),
+        ("estimation.of_old", "MapEstimate"),
+        ("estimation.result", "Popen"),
+        ("estimation.result", "__import__"),
+        ("estimation.result", "Experiment"),
+        ("estimation.result", ["MapEstimate"]),
+        ("_io", "Result"),
+        ("periodic._kernels.newton", "MapEstimate"),
+        (["estimation.result"], "MapEstimate"),
     ],
 )
-def test_file_cannot_import_or_create_other_classes(solved, tmp_path, kind):
+def test_file_cannot_import_or_create_other_classes(solved, tmp_path, monkeypatch, module, kind):
+    (tmp_path / "evil.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
     solved[1].save(tmp_path / "fit.h5")
     before = set(sys.modules)
     with changed(tmp_path / "fit.h5") as file:
-        file.attrs["bayesperiodic_result"] = json.dumps({"result": kind, "fields": {"args": "true"}})
+        header = {"result": kind, "module": module, "fields": {"args": "true"}}
+        file.attrs["bayesperiodic_result"] = json.dumps(header)
     message = f"path: must contain a result of this version of bayesperiodic, got class {str(kind)!r}; load it with"
     with pytest.raises(ValueError, match=re.escape(message)):
         bp.load(tmp_path / "fit.h5")
     assert set(sys.modules) == before
+
+
+def test_result_of_an_earlier_version_without_modules_is_refused(solved, tmp_path):
+    solved[1].save(tmp_path / "fit.h5")
+    with changed(tmp_path / "fit.h5") as file:
+        header = json.loads(file.attrs["bayesperiodic_result"])
+        del header["module"]
+        file.attrs["bayesperiodic_result"] = json.dumps(header)
+    with pytest.raises(ValueError, match="result of this version of bayesperiodic, got class 'MapEstimate'; load it"):
+        bp.load(tmp_path / "fit.h5")
 
 
 def test_result_with_an_object_of_another_class_cannot_be_saved(tmp_path):

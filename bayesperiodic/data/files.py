@@ -10,6 +10,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -49,18 +50,56 @@ UNIT_TOKEN = re.compile(
 )
 
 
-def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None) -> dict[str, np.ndarray]:
-    """Return named columns of a CSV file; the header is the first line with all of these names.
+@dataclass(frozen=True)
+class Format:
+    """A format of files with named columns.
 
-    The column `label` may contain text.
+    ``columns(file, wanted)`` returns all names in the file and the values of the wanted ones among them. Any error that
+    it raises is reported with `kind`, unless its message begins with the name of an argument.
     """
+
+    kind: str  # what a file must be, for errors
+    columns: Callable[[Path, list[str]], Stored]
+
+    def read(self, path: str | Path, wanted: Iterable[str], label: str | None = None) -> dict[str, np.ndarray]:
+        """Return named columns of numbers; the column `label` may contain text."""
+        wanted, file = [*wanted], existing(path)
+        try:
+            names, stored = self.columns(file, wanted)
+        except Exception as error:  # whatever zipfile, zlib, NumPy and HDF5 raise for damaged files
+            if str(error).startswith(("path: ", "column ")):
+                raise
+            reason = error if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            raise ValueError(f"path: must be {self.kind}, got {str(path)!r} ({reason}).") from None
+        for column in wanted:
+            _checks.one_of(f"column of {file.name}", column, names)
+        return {column: _column(file, column, stored[column], column == label) for column in wanted}
+
+
+def _column(file: Path, column: str, values: Any, text: bool) -> np.ndarray:
+    """Return a column of numbers, or of texts too."""
+    argument, array = f"column {column!r} of {file.name}", np.squeeze(np.asarray(values))
+    if array.dtype == object and not text:
+        import pandas as pd
+
+        rows = np.flatnonzero(pd.isna(pd.to_numeric(array, errors="coerce")) & pd.notna(array))
+        got = f"{array[rows[0]]!r} in data row {rows[0] + 1}" if rows.size else "numbers too long to be read"
+        raise ValueError(f"{argument}: must contain numbers, with a decimal point, got {got}.")
+    if array.ndim != 1 or (array.dtype.kind not in "fiub" and not text):
+        raise ValueError(
+            f"{argument}: must be one column of real numbers, got shape {np.shape(values)} and type {array.dtype}."
+        )
+    return array if text else array.astype(float)
+
+
+def _csv_columns(file: Path, wanted: list[str]) -> Stored:
+    """Return names and wanted columns of a CSV file; the header is the first line with all of these names."""
     import pandas as pd
 
-    columns, file = [*columns], existing(path)
     _refuse_zeros(file)
     try:
-        names, lines, more, separator = _header(file, columns)
-        places = {column: _place(path, names, column) for column in columns}
+        names, lines, more, separator = _header(file, wanted)
+        places = {column: _place(file, names, column) for column in wanted}
         with file.open(encoding="utf-8-sig", newline="") as text, warnings.catch_warnings():
             _skip(text, lines, separator)
             warnings.simplefilter("error", pd.errors.ParserWarning)
@@ -82,27 +121,14 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
             )
     except (pd.errors.ParserError, pd.errors.ParserWarning) as error:
         _check_fields(file, names, lines, separator)
-        raise ValueError(f"path: must be a CSV file with a header line, got {str(path)!r} ({error}).") from None
+        raise ValueError(f"path: must be a CSV file with a header line, got {str(file)!r} ({error}).") from None
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"path: must be a CSV file with a header line, got {str(path)!r} ({error}).") from None
+        raise ValueError(f"path: must be a CSV file with a header line, got {str(file)!r} ({error}).") from None
     if table.empty:
-        raise ValueError(f"path: must be a CSV file with rows of data, got {str(path)!r}, which has none.")
+        raise ValueError(f"path: must be a CSV file with rows of data, got {str(file)!r}, which has none.")
     if table.iloc[:, len(names) :].notna().any(axis=None) or table[len(names) - 1].isna().any():
         _check_fields(file, names, lines, separator)
-    result = {}
-    for column, place in places.items():
-        values = table[place]
-        if column == label:
-            result[column] = values.to_numpy()
-            continue
-        if not pd.api.types.is_numeric_dtype(values):
-            row = np.flatnonzero(pd.to_numeric(values, errors="coerce").isna() & values.notna())
-            got = f"{values.iloc[row[0]]!r} in data row {row[0] + 1}" if row.size else "numbers too long to be read"
-            raise ValueError(
-                f"column {column!r} of {file.name}: must contain numbers, with a decimal point, got {got}."
-            )
-        result[column] = _numbers(path, column, values.to_numpy())
-    return result
+    return names, {column: table[place].to_numpy() for column, place in places.items()}
 
 
 def _refuse_zeros(file: Path) -> None:
@@ -120,12 +146,12 @@ def _header(file: Path, columns: list[str]) -> tuple[list[str], int, int, str]:
 
     The separator is the first one for which a line contains all columns, or else that with most of them.
     """
-    found: list[tuple[list[str], int, int, str]] = []
+    headers: list[tuple[list[str], int, int, str]] = []
     for separator in SEPARATORS:
-        found.append((*_line_of_names(file, columns, separator), separator))
-        if {*columns} <= {*found[-1][0]}:
-            return found[-1]
-    best = max(found, key=lambda header: len({*columns} & {*header[0]}))
+        headers.append((*_line_of_names(file, columns, separator), separator))
+        if {*columns} <= {*headers[-1][0]}:
+            return headers[-1]
+    best = max(headers, key=lambda header: len({*columns} & {*header[0]}))
     if _is_no_header(best[0]):
         raise ValueError(
             "path: must be a CSV file whose first line names the columns, separated by commas, semicolons or tabs, got "
@@ -138,14 +164,16 @@ def _line_of_names(file: Path, columns: list[str], separator: str) -> tuple[list
     """Return the names in the line with most columns, the number of lines up to there, and of fields that follow."""
     with file.open(encoding="utf-8-sig", newline="") as lines:
         rows = csv.reader(lines, delimiter=separator, skipinitialspace=True)
-        found = [([name.strip() for name in row], rows.line_num) for row in itertools.islice(rows, PREAMBLE) if row]
-    if not found:
+        candidates = [
+            ([name.strip() for name in row], rows.line_num) for row in itertools.islice(rows, PREAMBLE) if row
+        ]
+    if not candidates:
         raise ValueError(f"path: must be a CSV file with a header line, got {str(file)!r}, which is empty.")
     # Without a line of all names, that with most of them tells what is missing.
-    place = max(range(len(found)), key=lambda i: len({*columns} & {*found[i][0]}))
-    names, number = found[place]
+    place = max(range(len(candidates)), key=lambda i: len({*columns} & {*candidates[i][0]}))
+    names, number = candidates[place]
     names = names[: max((i for i, name in enumerate(names, 1) if name), default=len(names))]  # no trailing commas
-    return names, number, max((len(row) - len(names) for row, _ in found[place + 1 : place + 2]), default=0)
+    return names, number, max((len(row) - len(names) for row, _ in candidates[place + 1 : place + 2]), default=0)
 
 
 def _check_fields(file: Path, names: list[str], lines: int, separator: str) -> None:
@@ -170,74 +198,52 @@ def _skip(text: TextIO, lines: int, separator: str) -> Iterator[list[str]]:
     return rows
 
 
-def _place(path: str | Path, names: list[str], column: str) -> int:
-    _checks.one_of(f"column of {Path(path).name}", column, names)
+def _place(file: Path, names: list[str], column: str) -> int:
+    _checks.one_of(f"column of {file.name}", column, names)
     if (count := names.count(column)) > 1:
         places = [i + 1 for i, name in enumerate(names) if name == column]
         raise ValueError(
-            f"column of {Path(path).name}: must be the name of one column, got {column!r}, the name of {count} "
+            f"column of {file.name}: must be the name of one column, got {column!r}, the name of {count} "
             f"(columns {', '.join(map(str, places))}); rename them in the file."
         )
     return names.index(column)
 
 
-def read_npz(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return named arrays of an NPZ file, without loading pickled objects."""
-    kind = "an NPZ file of named arrays (numpy.savez) without pickled objects, or be read by from_csv or from_mat"
-    return _read(path, columns, _npz_arrays, kind)
-
-
-def read_mat(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return named variables of a MAT file, version 5 or 7.3."""
-    import h5py
-
-    reader = _hdf5_arrays if h5py.is_hdf5(existing(path)) else _mat5_arrays
-    return _read(path, columns, reader, "a MAT file of version 5 or 7.3")
-
-
-def _read(
-    path: str | Path, columns: Iterable[str], arrays: Callable[[Path, set[str]], Stored], kind: str
-) -> dict[str, np.ndarray]:
-    """Return named arrays; arrays(file, wanted) returns all names in the file, and the wanted arrays among them."""
-    columns, file = [*columns], existing(path)
-    try:
-        names, found = arrays(file, {*columns})
-    except Exception as error:  # whatever zipfile, zlib, NumPy and HDF5 raise for damaged files
-        reason = error if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-        raise ValueError(f"path: must be {kind}, got {str(path)!r} ({reason}).") from None
-    for column in columns:
-        _checks.one_of(f"column of {file.name}", column, names)
-    return {column: _numbers(path, column, found[column]) for column in columns}
-
-
-def _npz_arrays(file: Path, wanted: set[str]) -> Stored:
+def _npz_columns(file: Path, wanted: list[str]) -> Stored:
     """Return names and wanted arrays of an NPZ file; whole members are read, because only they have a checksum."""
-    found = {}
+    arrays = {}
     with zipfile.ZipFile(file) as archive:
         members = [(member, member.filename.removesuffix(".npy")) for member in archive.infolist()]
         for member, name in members:
             if name not in wanted:
                 continue
-            if name in found:
+            if name in arrays:
                 raise ValueError(f"it has two arrays {name!r}")
             _check_size(name, member.file_size)
             content = io.BytesIO(archive.read(member))
-            found[name] = np.lib.format.read_array(content, allow_pickle=False)
+            arrays[name] = np.lib.format.read_array(content, allow_pickle=False)
             if content.read(1):
                 raise ValueError(f"its array {name!r} has another size than its header says")
-    return [name for _, name in members], found
+    return [name for _, name in members], arrays
 
 
-def _hdf5_arrays(file: Path, wanted: set[str]) -> Stored:
+def _mat_columns(file: Path, wanted: list[str]) -> Stored:
+    """Return names and wanted arrays of a MAT file, version 5 or 7.3."""
+    import h5py
+
+    return (_hdf5_columns if h5py.is_hdf5(file) else _mat5_columns)(file, wanted)
+
+
+def _hdf5_columns(file: Path, wanted: list[str]) -> Stored:
     """Return names and wanted arrays of a MAT file, version 7.3."""
     import h5py
 
-    found = {}
+    arrays = {}
     with h5py.File(file, "r") as archive:
         names = [name for name in archive if isinstance(name, str)]  # bytes are no text
-        for name in wanted & {*names}:
-            item, own = archive[name], isinstance(archive.get(name, getlink=True), h5py.HardLink)
-            if not own or not isinstance(item, h5py.Dataset) or item.is_virtual or item.external:
+        for name in {*wanted} & {*names}:
+            item, inside = archive[name], isinstance(archive.get(name, getlink=True), h5py.HardLink)
+            if not inside or not isinstance(item, h5py.Dataset) or item.is_virtual or item.external:
                 raise ValueError(f"its variable {name!r} is not an array in this file")
             kind = np.bytes_(item.attrs.get("MATLAB_class", b"double")).decode()
             if kind not in (*NUMERIC.values(), "logical") or item.attrs.get("MATLAB_empty"):
@@ -245,8 +251,8 @@ def _hdf5_arrays(file: Path, wanted: set[str]) -> Stored:
             _check_size(name, item.nbytes)
             if not _is_stored(item):
                 raise ValueError(f"parts of its variable {name!r} are missing")
-            found[name] = item[()]
-    return names, found
+            arrays[name] = item[()]
+    return names, arrays
 
 
 def _is_stored(item: Any) -> bool:
@@ -261,7 +267,7 @@ def _is_stored(item: Any) -> bool:
     return stored == {(place, 0) for place in itertools.product(*places)}
 
 
-def _mat5_arrays(file: Path, wanted: set[str]) -> Stored:
+def _mat5_columns(file: Path, wanted: list[str]) -> Stored:
     """Return names and wanted arrays of a MAT file, version 5, after MathWorks' "MAT-File Format".
 
     scipy.io.loadmat ends the process with a segmentation fault for some damaged files.
@@ -270,7 +276,7 @@ def _mat5_arrays(file: Path, wanted: set[str]) -> Stored:
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise ValueError("it has no header of version 5; an older version is converted by save('-v7') in MATLAB")
-    names, found = [], {}
+    names, arrays = [], {}
     for kind, data in _elements(memoryview(content)[128:], order):
         stream = zlib.decompressobj()
         if compressed := kind == COMPRESSED:
@@ -281,14 +287,14 @@ def _mat5_arrays(file: Path, wanted: set[str]) -> Stored:
         names.append(name)
         if name not in wanted:
             continue
-        if name in found:
+        if name in arrays:
             raise ValueError(f"it has two variables {name!r}")
         if compressed:
             data = memoryview(bytes(data) + stream.decompress(stream.unconsumed_tail, LARGEST))
             if not stream.eof:
                 raise ValueError(f"its variable {name!r} is cut off or has more than {LARGEST / 1e9:.3g} GB")
-        found[name] = _array(*_variable(data, order), order)
-    return names, found
+        arrays[name] = _array(*_variable(data, order), order)
+    return names, arrays
 
 
 def _elements(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
@@ -325,6 +331,14 @@ def _array(name: str, flags: int, shape: list[int], parts: Iterator[tuple[int, m
     return array.reshape(shape)
 
 
+CSV = Format("a CSV file with a header line", _csv_columns)
+NPZ = Format(
+    "an NPZ file of named arrays (numpy.savez) without pickled objects, or be read by from_csv or from_mat",
+    _npz_columns,
+)
+MAT = Format("a MAT file of version 5 or 7.3", _mat_columns)
+
+
 def _check_size(name: str, size: int) -> None:
     if size > LARGEST:
         raise ValueError(f"its array {name!r} has more than {LARGEST / 1e9:.3g} GB")
@@ -346,16 +360,6 @@ def _is_no_header(names: list[str]) -> bool:
         return bool([float(name) for name in names])
     except ValueError:
         return False
-
-
-def _numbers(path: str | Path, column: str, values: Any) -> np.ndarray:
-    argument = f"column {column!r} of {Path(path).name}"
-    array = np.squeeze(np.asarray(values))
-    if array.ndim != 1 or array.dtype.kind not in "fiub":
-        raise ValueError(
-            f"{argument}: must be one column of real numbers, got shape {np.shape(values)} and type {array.dtype}."
-        )
-    return array.astype(float)
 
 
 def convert(name: str, values: np.ndarray, unit: float | Sequence[str]) -> np.ndarray:

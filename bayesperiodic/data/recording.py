@@ -11,7 +11,7 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import one_thread
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.data.files import Units, convert, read_csv, read_mat, read_npz
+from bayesperiodic.data.files import CSV, MAT, NPZ, Format, Units, convert
 from bayesperiodic.data.folding import AUTO, Signals, automatic_periods, fold_signals, parts
 
 DROP, INTERPOLATE = "drop", "interpolate"
@@ -71,7 +71,7 @@ class Layout:
             return convert(key, values, self.units[key]) if key in self.units else values
 
         measured, given = (
-            {key: channel(key, own) for key, own in kind.items()} for kind in (self.outputs, self.inputs)
+            {key: channel(key, column) for key, column in kind.items()} for kind in (self.outputs, self.inputs)
         )
         return Recording(channel("time", seconds), measured, given, name)
 
@@ -94,6 +94,64 @@ class Layout:
                 f"at most {LONGEST_INTERPOLATION} successive values, and {longest} are missing."
             )
         return np.interp(axis, axis[known], values[known], left=np.nan, right=np.nan) if known.size else values
+
+
+def _read(
+    form: Format, path: str | Path, name: str | None, split: str | None, layout: tuple[Any, ...]
+) -> "Recording | list[Recording]":
+    """Return the recording in a file; with `split`, one for each part in which this column is constant."""
+    file, meaning = Path(path), Layout(Path(path).name, *layout)
+    name = name or file.stem
+    if split is None:
+        return meaning.recording(form.read(path, meaning.columns), name)
+    columns = form.read(path, dict.fromkeys([*meaning.columns, split]), split)
+    label = columns[split] if split in meaning.columns else columns.pop(split)
+    if any(lost := [value != value for value in label]):
+        row = lost.index(True) + 1
+        raise ValueError(f"split: must be a column without empty cells, got {split!r}, empty in data row {row}.")
+    for column, values in columns.items():
+        if values.size != label.size:
+            raise ValueError(
+                f"split: must be a column with one value per sample, got {split!r} with {label.size} values and "
+                f"{column!r} with {values.size}."
+            )
+    edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), label.size]
+    return [
+        meaning.recording(
+            {c: values[first:last] for c, values in columns.items()}, f"{name} {i}: {split} {label[first]}"
+        )
+        for i, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True), 1)
+    ]
+
+
+def _reader(name: str, form: Format, source: str, columns: str, refused: str) -> Any:
+    """Return a class method of this name that reads a format as `Recording.from_csv` reads its own."""
+
+    def read(
+        cls: type, path: str | Path, *, outputs: Mapping[str, str], inputs: Mapping[str, str] | None = None,
+        time: str | None = None, sampling_rate: float | None = None, units: Units | None = None,
+        missing: str | None = None, split: str | None = None, name: str | None = None,
+    ) -> "Recording | list[Recording]":  # fmt: skip
+        return _read(form, path, name, split, (outputs, inputs or {}, time, sampling_rate, units or {}, missing))
+
+    read.__name__, read.__qualname__ = name, f"Recording.{name}"
+    read.__doc__ = f"""Read a recording from the {source}.
+
+        Parameters
+        ----------
+        path, outputs, inputs, time, sampling_rate, units, missing, split, name
+            As for `from_csv`, with {columns} in place of columns.
+
+        Returns
+        -------
+        Recording, or list of Recording with `split`
+
+        Raises
+        ------
+        FileNotFoundError, ValueError
+            As for `from_csv`, and {refused}.
+        """
+    return classmethod(read)
 
 
 @dataclass(frozen=True)
@@ -255,73 +313,22 @@ class Recording(Result):
         >>> run.name, round(float(run.outputs["x"].max()), 3)
         ('run', 0.025)
         """
-        layout = Layout(Path(path).name, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
-        name = name or Path(path).stem
-        if split is None:
-            return layout.recording(read_csv(path, layout.columns), name)
-        columns = read_csv(path, dict.fromkeys([*layout.columns, split]), split)
-        label = columns[split] if split in layout.columns else columns.pop(split)
-        if any(lost := [value != value for value in label]):
-            row = lost.index(True) + 1
-            raise ValueError(f"split: must be a column without empty cells, got {split!r}, empty in data row {row}.")
-        edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), label.size]
-        return [
-            layout.recording(
-                {c: values[first:last] for c, values in columns.items()}, f"{name} {i}: {split} {label[first]}"
-            )
-            for i, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True), 1)
-        ]
+        return _read(CSV, path, name, split, (outputs, inputs or {}, time, sampling_rate, units or {}, missing))
 
-    @classmethod
-    def from_npz(
-        cls, path: str | Path, *, outputs: Mapping[str, str], inputs: Mapping[str, str] | None = None,
-        time: str | None = None, sampling_rate: float | None = None, units: Units | None = None,
-        missing: str | None = None, name: str | None = None,
-    ) -> "Recording":  # fmt: skip
-        """Read a recording from the named arrays of an NPZ file.
-
-        Parameters
-        ----------
-        path, outputs, inputs, time, sampling_rate, units, missing, name
-            As for `from_csv`, with arrays in place of columns.
-
-        Returns
-        -------
-        Recording
-
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            As for `from_csv`, and for a damaged file or an array of objects, which would have to be unpickled.
-        """
-        layout = Layout(Path(path).name, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
-        return layout.recording(read_npz(path, layout.columns), name or Path(path).stem)
-
-    @classmethod
-    def from_mat(
-        cls, path: str | Path, *, outputs: Mapping[str, str], inputs: Mapping[str, str] | None = None,
-        time: str | None = None, sampling_rate: float | None = None, units: Units | None = None,
-        missing: str | None = None, name: str | None = None,
-    ) -> "Recording":  # fmt: skip
-        """Read a recording from the variables of a MAT file, version 5 or 7.3.
-
-        Parameters
-        ----------
-        path, outputs, inputs, time, sampling_rate, units, missing, name
-            As for `from_csv`, with variables in place of columns.
-
-        Returns
-        -------
-        Recording
-
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            As for `from_csv`, and for a damaged file, one of version 4, or a variable that is not a vector of real
-            numbers.
-        """
-        layout = Layout(Path(path).name, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
-        return layout.recording(read_mat(path, layout.columns), name or Path(path).stem)
+    from_npz = _reader(
+        "from_npz",
+        NPZ,
+        "named arrays of an NPZ file",
+        "arrays",
+        "for a damaged file or an array of objects, which would have to be unpickled",
+    )
+    from_mat = _reader(
+        "from_mat",
+        MAT,
+        "variables of a MAT file, version 5 or 7.3",
+        "variables",
+        "for a damaged file, one of version 4, or a variable that is not a vector of real\n            numbers",
+    )
 
     def between(self, start: float, stop: float) -> "Recording":
         """Return the part with start ≤ time ≤ stop.
@@ -372,12 +379,12 @@ class Recording(Result):
         >>> [f"{run.name}: {run.fold(32).frequency:.2f} Hz" for run in runs]
         ['sweep 1: 1.00 Hz', 'sweep 2: 1.50 Hz']
         """
-        found = parts(self.time, next(iter((self.inputs or self.outputs).values())))
-        if not found:
+        pieces = parts(self.time, next(iter((self.inputs or self.outputs).values())))
+        if not pieces:
             raise ValueError(f"recording: must have a part of at least three cycles, got none in {self.name!r}.")
-        if len(found) == 1:
-            return [self._part(found[0], self.name)]
-        return [self._part(own, f"{self.name} {i}") for i, own in enumerate(found, 1)]
+        if len(pieces) == 1:
+            return [self._part(pieces[0], self.name)]
+        return [self._part(piece, f"{self.name} {i}") for i, piece in enumerate(pieces, 1)]
 
     def _part(self, samples: Any, name: str) -> "Recording":
         outputs, inputs = ({key: v[samples] for key, v in kind.items()} for kind in (self.outputs, self.inputs))

@@ -11,7 +11,7 @@ import pandas as pd
 from scipy import stats
 
 from bayesperiodic import _checks
-from bayesperiodic._io import NOT_STORED, Result
+from bayesperiodic._io import NOT_STORED, Result, Storable
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import ALL, adequacy
@@ -45,7 +45,7 @@ WORSE_RATIO = 2.0
 
 
 @dataclass(frozen=True)
-class Step:
+class Step(Storable):
     """One term added to the model.
 
     Parameters

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import chdtrc, chdtri, ndtr, ndtri, stdtrit
 
+from bayesperiodic._io import Storable
 from bayesperiodic._linalg import column_space
 from bayesperiodic.density.log_posterior import RIDGE, LogPosterior
 from bayesperiodic.density.problem import Problem
@@ -40,7 +41,7 @@ SHARE = 0.3
 
 
 @dataclass(frozen=True)
-class PriorConflict:
+class PriorConflict(Storable):
     """Test of the prior against the estimate by the data alone.
 
     Attributes

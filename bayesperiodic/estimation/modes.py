@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import softmax
 
+from bayesperiodic._io import Storable
 from bayesperiodic._linalg import covariance_eigh, hessian_eigh
 from bayesperiodic.estimation.gauss_newton import SINGULAR, End, Iterate, Objective, preference
 from bayesperiodic.estimation.laplace import JointLaplace
@@ -29,7 +30,7 @@ NOTABLE = 0.01
 
 
 @dataclass(frozen=True)
-class Mode:
+class Mode(Storable):
     """Optimum of the log-posterior other than the estimate, with the Laplace approximation there.
 
     `objective` is that of `MapEstimate.history`, `mass` the fraction of the posterior mass; `sd` are natural values,

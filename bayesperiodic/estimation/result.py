@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse_all
-from bayesperiodic._io import Result
+from bayesperiodic._io import Result, Storable
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.conflict import PriorConflict
 from bayesperiodic.estimation.gauss_newton import Iterate
@@ -29,7 +29,7 @@ ROUNDING = 1e-16
 
 
 @dataclass(frozen=True)
-class Whiteness:
+class Whiteness(Storable):
     """Test by M. S. Bartlett (An Introduction to Stochastic Processes, 1955) of a residual that repeats every period.
 
     `p` is the probability, for white residuals, of a cumulative periodogram at least as far from a straight line: the
@@ -56,7 +56,7 @@ def of_periodogram(power: np.ndarray) -> Whiteness:
 
 
 @dataclass(frozen=True)
-class NoiseSplit:
+class NoiseSplit(Storable):
     """Standard deviations of one value of a channel's mean period, in the channel's units.
 
     `measurement` follows from the scatter of the measured cycles, NaN if unknown; `total` is that of the residual,

@@ -21,6 +21,7 @@ import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks, _fourier
+from bayesperiodic._io import Storable
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.folding import neighbours_mean
 from bayesperiodic.models.model import DERIVATIVES, Model
@@ -38,7 +39,7 @@ InputNoise = str | Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class InputErrors:
+class InputErrors(Storable):
     """Errors of the inputs of one experiment, linearised about an estimate."""
 
     expected: np.ndarray  # (errors,), η̂

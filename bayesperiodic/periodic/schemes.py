@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from bayesperiodic import _checks
+from bayesperiodic._io import Storable
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.compiled import Grid
 
@@ -15,7 +16,7 @@ UNROLLED_OFFSETS = 5
 
 
 @dataclass(frozen=True)
-class Scheme:
+class Scheme(Storable):
     """A difference scheme for first and second derivatives on an equidistant cyclic grid.
 
     Parameters

@@ -7,7 +7,7 @@ import pandas as pd
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic._io import Result
+from bayesperiodic._io import Result, Storable
 from bayesperiodic.models.model import Model
 from bayesperiodic.symmetry import invariants
 from bayesperiodic.symmetry.determining import Generator, System, determining_equations, generators_of, system_of
@@ -16,7 +16,7 @@ from bayesperiodic.symmetry.invariants import Directions, Flow
 
 
 @dataclass(frozen=True)
-class Symmetry:
+class Symmetry(Storable):
     """Transformation of parameters, and of states that are not measured, that leaves all measured outputs unchanged.
 
     Its kind is "scaling", "shift" (which adds a constant to a parameter or a state, and may also transform others) or
