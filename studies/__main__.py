@@ -16,9 +16,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m studies", description="Without a name: list the studies.")
     parser.add_argument("name", nargs="?", help="the study to run")
     parser.add_argument("--data", type=Path, help="the measured file, instead of the places searched by default")
-    parser.add_argument("--out", type=Path, help="folder for results.json and figures (default figures/NAME)")
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument("--out", type=Path, help="folder for results.json and figures (default output/NAME)")
+    place.add_argument("--publish", action="store_true", help="into figures/NAME, the stored results that pages quote")
     parser.add_argument("--seed", type=int, default=1, help="of everything random (default 1)")
-    parser.add_argument("--quick", action="store_true", help="short chains, into figures/quick/NAME; not for quoting")
+    parser.add_argument("--quick", action="store_true", help="short chains, into output/quick/NAME; not for quoting")
     parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png", help="figures as pdf or svg too")
     parser.add_argument("--noise", type=float, default=1e-3, help="pendulum: fraction of the attractor (default 0.001)")
     parser.add_argument(
@@ -49,15 +51,24 @@ def main(arguments: list[str] | None = None) -> int:
     matplotlib.use("Agg")
     matplotlib.rcParams["savefig.format"] = options.format
     package = known[options.name].parent.name
-    options.out = options.out or Path("figures", *(["quick"] if options.quick else []), package)
+    options.quick = options.quick or options.guard
     try:
+        if options.publish and options.quick:
+            raise ValueError("--publish: must be a full run, got --quick or --guard.")
+        options.out = options.out or folder_of(package, publish=options.publish, quick=options.quick)
         if options.replicates < 0:
             raise ValueError(f"--replicates: must be at least 0, got {options.replicates}.")
         importlib.import_module(f"studies.{package}.run").run(options)
     except (ValueError, RuntimeError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    print(f"written to {options.out}/")
     return 0
+
+
+def folder_of(package: str, *, publish: bool, quick: bool) -> Path:
+    """Return the default folder of a study: ignored by git, or with `publish` the one of its stored results."""
+    return Path("figures", package) if publish else Path("output", *(["quick"] if quick else []), package)
 
 
 def _first_line(main_file: Path) -> str:

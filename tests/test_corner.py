@@ -7,15 +7,16 @@ import corner
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 from matplotlib.contour import ContourSet
 from scipy.stats import multivariate_normal, norm
 
 import bayesperiodic as bp
-from bayesperiodic.plot import pairs, regions
+from bayesperiodic.plot import grid, regions
 from bayesperiodic.plot.style import ENSEMBLES
 from bayesperiodic.problem.parameters import support
 from bayesperiodic.sampling.convergence import arviz
-from tests.drawn import posterior_of
+from tests.drawn import faults, posterior_of
 
 COUNT = 20_000
 REAL, POSITIVE = (-np.inf, np.inf), (0.0, np.inf)
@@ -220,7 +221,7 @@ def test_labels_quantiles_and_titles_are_those_of_corner():
     ],
 )
 def test_titles_have_two_digits_of_the_shorter_error(interval, title):
-    assert pairs.with_errors(*interval) == title
+    assert grid.with_errors(*interval) == title
 
 
 def test_the_density_of_one_quantity_vanishes_in_the_tails():
@@ -248,6 +249,91 @@ def test_figures_and_draws_work_with_corner_and_arviz(solved):
     theirs = corner.corner(posterior.data, var_names=names, bins=10)
     assert [theirs.axes[k].get_xlabel() for k in (2, 3)] == names
     assert arviz().plot_pair(posterior.data, var_names=names) is not None
+
+
+def two_quantities(seed, size=4000):
+    a, b = np.random.default_rng(seed).standard_normal((2, size))
+    return {"a": 10.0 + 0.1 * a, "b": 1e-7 * np.exp(b)}
+
+
+def histogram(axes, number=0):
+    """Return heights and edges of a step histogram."""
+    x, y = axes.patches[number].get_xy().T
+    return y[1:-1:2], np.append(x[1:-1:2], x[-1])
+
+
+def test_the_style_corner_draws_histograms_and_quantiles_of_all_draws():
+    draws = two_quantities(2)
+    drawn = posterior_of(draws, units={"a": "m", "b": "kg"})
+    figure = bp.plot.corner(drawn, style="corner", bins=30, quantiles=[0.16, 0.5, 0.84], show_titles=True)
+    for place, name in ((0, "a"), (3, "b")):
+        heights, edges = np.histogram(draws[name], bins=30, density=True)
+        assert histogram(figure.axes[place])[0] == pytest.approx(heights)
+        assert histogram(figure.axes[place])[1] == pytest.approx(edges)
+        assert figure.axes[place].get_xlim() == pytest.approx((draws[name].min(), draws[name].max()))
+        dashed = [line.get_xdata()[0] for line in figure.axes[place].lines]
+        assert dashed == pytest.approx(np.quantile(draws[name], [0.16, 0.5, 0.84]))
+        low, middle, high = np.quantile(draws[name], [0.05, 0.5, 0.95])
+        assert figure.axes[place].get_title() == grid.with_errors(low, middle, high)
+    points = figure.axes[2].lines[0].get_xydata()
+    assert points == pytest.approx(np.stack([draws["a"], draws["b"]], axis=-1))
+    assert [figure.axes[k].get_xlabel() for k in (2, 3)] == ["a\n[m]", "b\n[10⁻⁶ kg]"]
+    assert faults(figure) == []
+
+
+def test_the_style_corner_draws_several_posteriors_into_one_figure():
+    first, second = two_quantities(3), two_quantities(4, size=1000)
+    second["a"] += 1.0
+    one = bp.plot.corner(posterior_of(first), style="corner", hist_kwargs={"label": "first"}, truths={"a": 10.0})
+    both = bp.plot.corner(posterior_of(second), style="corner", fig=one)
+    assert both is one and len(both.axes) == 4
+    for number, draws in enumerate((first, second)):
+        assert histogram(both.axes[0], number)[0] == pytest.approx(np.histogram(draws["a"], 20, density=True)[0])
+    low, high = (f(np.append(first["a"], second["a"])) for f in (np.min, np.max))
+    assert both.axes[0].get_xlim() == pytest.approx((low, high)) == both.axes[2].get_xlim()
+    (legend,) = both.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["first", "MCMC 2", "truth"]
+    colours = [line.get_color() for line in legend.get_lines()]
+    assert [to_hex(colour).upper() for colour in colours] == [*ENSEMBLES[:2], "#000000"]
+    assert faults(both) == []
+    with pytest.raises(ValueError, match="figure: must have no axes or 1, got 4"):
+        bp.plot.corner(posterior_of(first), style="corner", names=["a"], figure=both)
+
+
+@pytest.mark.parametrize("names", [["a"], ["a", "b"]])
+def test_the_style_corner_marks_truths_also_beyond_the_draws(names):
+    draws = two_quantities(5)
+    figure = bp.plot.corner(posterior_of(draws), style="corner", names=names, truths={"a": 12.0})
+    assert positions(figure.axes[0], "#000000") == ([12.0], [])
+    assert figure.axes[0].get_xlim()[1] > 12.0 and figure.axes[0].get_xlim()[0] == pytest.approx(draws["a"].min())
+    if len(names) > 1:
+        assert positions(figure.axes[2], "#000000") == ([12.0], []) and positions(figure.axes[3], "#000000") == ([], [])
+        assert figure.axes[2].get_xlim() == figure.axes[0].get_xlim()
+    assert faults(figure) == []
+
+
+def test_options_of_the_other_style_are_refused(solved):
+    problem, fit, posterior = solved
+    for arguments, message in (
+        ({"style": "histograms"}, "style: must be one of 'regions', 'corner', got 'histograms'"),
+        ({"bins": 30, "smooth": 1.0}, "style: must be 'corner' for the options bins, smooth, got 'regions'"),
+        ({"style": "corner", "laplace": fit}, "style: must be 'regions' for the options laplace, got 'corner'"),
+        ({"style": "corner", "laplace": fit, "problem": problem}, "options laplace, problem, got 'corner'"),
+        ({"style": "corner", "bin": 30}, "options: must be one of .*, got 'bin'. Did you mean 'bins'"),
+        ({"truth": {"k": 1.0}}, "options: must be one of .*, got 'truth'. Did you mean 'truths'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            bp.plot.corner(posterior, **arguments)
+    constant = posterior_of({"a": np.full(40, 3.0), "b": np.linspace(0.0, 1.0, 40)})
+    with pytest.raises(ValueError, match="names: must be quantities that vary, got a; leave them out"):
+        bp.plot.corner(constant, style="corner")
+
+
+def test_caveats_on_every_posterior_of_a_figure_are_stated():
+    draws = two_quantities(6)
+    figure = bp.plot.corner(replace(posterior_of(draws), converged=False), style="corner")
+    bp.plot.corner(posterior_of(draws), style="corner", figure=figure)
+    assert figure.legends[0].get_title().get_text() == "NOT CONVERGED"
 
 
 def test_supports_are_stored_with_the_draws_and_guessed_without(solved):

@@ -1,14 +1,20 @@
 """Source distribution and wheel: built, installed into a folder of their own, and used outside the clone."""
 
+import ast
+import re
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
+IMPORTED_AS = {"scikit-learn": "sklearn"}
+WITHOUT_IMPORT = {"h5netcdf": "the engine by which xarray reads and writes netCDF"}
+OF_OTHERS = {"llvmlite": "numba requires the one version that it works with"}
 FIRST_SOLVE = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -28,6 +34,22 @@ def built(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dist")
     subprocess.run([sys.executable, "-m", "build", "-o", str(folder), str(ROOT)], check=True, capture_output=True)
     return next(folder.glob("*.tar.gz")), next(folder.glob("*.whl"))
+
+
+def test_every_required_distribution_is_imported_and_every_import_is_required():
+    imported = set()
+    for path in (ROOT / "bayesperiodic").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                imported.add(node.module.split(".")[0])
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    required = {re.match(r"[\w-]+", line)[0] for line in project["dependencies"]}
+    optional = {re.match(r"[\w-]+", line)[0] for lines in project["optional-dependencies"].values() for line in lines}
+    assert {name for name in required if IMPORTED_AS.get(name, name) not in imported} == WITHOUT_IMPORT.keys()
+    known = {IMPORTED_AS.get(name, name) for name in required | optional} | sys.stdlib_module_names | {"bayesperiodic"}
+    assert imported - known == OF_OTHERS.keys()
 
 
 @pytest.mark.document

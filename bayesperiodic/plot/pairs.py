@@ -1,5 +1,6 @@
 """Figures of draws: all pairs and the marginal distributions, with the Laplace approximation."""
 
+import inspect
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,22 +12,25 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from scipy.stats import norm
 
 from bayesperiodic import _checks
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.plot import regions, style
+from bayesperiodic.plot import regions
+from bayesperiodic.plot.grid import MANY, arrange, interval_title, write_labels, write_legend
+from bayesperiodic.plot.histograms import OPTIONS, draw_histograms
 from bayesperiodic.plot.style import (
     COLOURS,
     ENSEMBLES,
     LABEL_LENGTH,
     LAPLACE,
-    SUPERSCRIPTS,
     caveats_of,
     chosen,
+    draw_marginal,
     draws_label,
+    panel_grid,
+    panels,
     styled,
 )
 from bayesperiodic.problem.description import check_fingerprint, check_results
@@ -36,15 +40,11 @@ from bayesperiodic.sampling.draws import MODE, Posterior
 LEVELS = (0.5, 0.9)
 LEVELS_TEXT = "50 and 90 %"
 MOST_NAMES = 8
-# Panels of more names are smaller, and their labels have this size [points] and length.
-MANY, SMALL, SHORT = 6, 7, 18
-# Room between panels [inches]; part of an axis at each end without ticks, whose labels would touch those of the next.
-ROOM, FREE = 0.06, 0.08
-# Quantiles that a panel shows, and the margin around them; quantiles of titles.
-SHOWN, MARGIN, TITLE = (0.003, 0.997), 0.06, (0.05, 0.5, 0.95)
+# Length of the labels of many small panels.
+SHORT = 18
+# Quantiles that a panel shows, and the margin around them.
+SHOWN, MARGIN = (0.003, 0.997), 0.06
 BINS, TAILS = 40, (0.0005, 0.9995)
-# Range of the powers of ten of ticks without an offset or a common factor.
-WHOLE = (-5, 10)
 TALLEST = 2.5
 TRUTH: dict[str, Any] = {"color": COLOURS["measured"], "lw": 1.1}
 PRIOR: dict[str, Any] = {"color": "0.35", "lw": 0.8, "ls": ":"}
@@ -63,6 +63,8 @@ def corner(
     quantiles: Sequence[float] = (),
     show_titles: bool = False,
     figure: Figure | None = None,
+    style: str = "regions",
+    **options: Any,
 ) -> Figure:
     """Draw all pairs of parameters, with the ellipses of the Laplace approximation on top.
 
@@ -73,15 +75,18 @@ def corner(
     without a Laplace approximation have no ellipse. Where the draws belong to several optima, see `Posterior.modes`,
     each has its own regions and colour, and its number at the mean. A grey line marks zero where a panel contains it.
 
-    Of the package corner (Foreman-Mackey, J. Open Source Softw. 1 (2016) 24) this has the layout and the arguments, so
-    that its functions `overplot_points` and `overplot_lines` draw into the figure. It draws `Posterior.data` too.
+    With style="corner" the package corner (Foreman-Mackey, J. Open Source Softw. 1 (2016) 24) draws histograms of all
+    draws and contours of two-dimensional histograms, by default at its levels of 12, 39, 68 and 86 %. Several
+    posteriors are drawn into one figure by `figure`, each in its own colour. The functions `overplot_points` and
+    `overplot_lines` of corner draw into figures of both styles.
 
     Parameters
     ----------
     posterior : Posterior
     laplace : MapEstimate, optional
+        For style="regions" only.
     problem : Problem, optional
-        Of the draws, whose priors are then drawn on the diagonal as thin lines.
+        Of the draws, whose priors are then drawn on the diagonal as thin lines; for style="regions" only.
     names : sequence of str, optional
         Full names such as "k", "theta16[run 7]" and "variance[force]", in the order of the rows; by default all.
     truths : mapping of str to float, optional
@@ -91,8 +96,16 @@ def corner(
     quantiles : sequence of float
         To mark by dashed lines on the diagonal.
     show_titles : bool
-        Write the median and the ends of the central 90 % interval above the diagonal.
+        Write the median and the ends of the central 90 % interval above the diagonal; of several posteriors, those of
+        the last one.
     figure : Figure, optional
+        Without axes, or with style="corner" one of the same quantities, which is drawn over.
+    style : {"regions", "corner"}
+    **options
+        Of `corner.corner`, for style="corner" only: bins, color, contour_kwargs, contourf_kwargs, data_kwargs, fig (the
+        same as `figure`), fill_contours, hist_bin_factor, hist_kwargs, levels, no_fill_contours, pcolor_kwargs,
+        plot_contours, plot_datapoints, plot_density, range, scale_hist, smooth, smooth1d, title_fmt, title_kwargs,
+        title_quantiles, titles, truth_color. The label in `hist_kwargs` is that of the legend.
 
     Returns
     -------
@@ -101,7 +114,8 @@ def corner(
     Raises
     ------
     ValueError
-        For an unknown name, an estimate or a problem of other draws, or a wrong number of labels.
+        For an unknown name, an estimate or a problem of other draws, a wrong number of labels, or an option of the
+        other style.
 
     Warns
     -----
@@ -113,10 +127,11 @@ def corner(
     >>> figure = bp.plot.corner(posterior, laplace=fit, problem=problem, names=["c", "k"])
     >>> len(figure.axes), figure.axes[2].get_xlabel().splitlines()
     (4, ['c', '[N s/m]'])
-    >>> import corner
-    >>> same = corner.corner(posterior.data, var_names=["c", "k"])
+    >>> first = bp.plot.corner(posterior, style="corner", names=["c", "k"], bins=30, show_titles=True)
+    >>> both = bp.plot.corner(posterior, style="corner", names=["c", "k"], figure=first)
     """
     _checks.instance("posterior", posterior, Posterior)
+    _check_style(style, {"laplace": laplace, "problem": problem}, options)
     if problem is not None:
         check_results(problem, posterior=posterior)
     if names is None and len(posterior.names) > MOST_NAMES:
@@ -133,20 +148,37 @@ def corner(
     if not all(0.0 < q < 1.0 for q in quantiles):
         raise ValueError(f"quantiles: must be between 0 and 1, got {list(quantiles)}.")
     side = (1.9, 1.55, 1.25)[(len(names) > 3) + (len(names) > MANY)] * len(names) + 0.8
-    figure = figure or plt.figure(figsize=(max(side, 3.2), max(side, 3.2)))
+    figure = options.pop("fig", None) or figure or plt.figure(figsize=(max(side, 3.2), max(side, 3.2)))
     if isinstance(figure, Figure):  # and no part of one
         figure.set_layout_engine("none")
-    panels = _Panels.of(figure, posterior, names, dict(truths or {}))
-    handles = [*panels.draw_draws(quantiles, show_titles)]
-    if laplace is not None:
-        handles += panels.draw_laplace(*normal_approximation(posterior, names, laplace))
-    if problem is not None:
-        handles += panels.draw_priors(problem)
-    handles += panels.draw_lines()
     length = SHORT if len(names) > MANY else LABEL_LENGTH
-    panels.write_labels([draws_label(posterior, name, length) for name in names] if labels is None else labels)
-    panels.arrange(panels.write_legend(handles, caveats_of(posterior)))
+    labels = [draws_label(posterior, name, length) for name in names] if labels is None else labels
+    if style == "corner":
+        options |= {"quantiles": [*quantiles], "show_titles": show_titles}
+        draw_histograms(figure, posterior, dict(zip(names, labels, strict=True)), truths or {}, options)
+        return figure
+    drawn = _Panels.of(figure, posterior, names, dict(truths or {}))
+    handles = [*drawn.draw_draws(quantiles, show_titles)]
+    if laplace is not None:
+        handles += drawn.draw_laplace(*normal_approximation(posterior, names, laplace))
+    if problem is not None:
+        handles += drawn.draw_priors(problem)
+    handles += drawn.draw_lines()
+    write_labels(drawn.grid, labels)
+    arrange(drawn.grid, write_legend(drawn.grid, handles, caveats_of(posterior)))
     return figure
+
+
+def _check_style(style: str, of_regions: Mapping[str, Any], options: Mapping[str, Any]) -> None:
+    """Raise a ValueError for an unknown style or option, or for options of the other style."""
+    _checks.one_of("style", style, ("regions", "corner"))
+    known = [name for name in inspect.signature(corner).parameters if name != "options"]
+    for name in options:
+        _checks.one_of("options", name, [*known, *OPTIONS])
+    other = [*options] if style == "regions" else [name for name, value in of_regions.items() if value is not None]
+    if other:
+        required = "corner" if style == "regions" else "regions"
+        raise ValueError(f"style: must be {required!r} for the options {', '.join(other)}, got {style!r}.")
 
 
 @dataclass(frozen=True)
@@ -221,8 +253,7 @@ class _Panels:
             for value in np.quantile(self.draws[:, k], [*quantiles]):
                 axes.axvline(value, color="black", lw=0.8, ls="--")
             if show_titles:
-                low, middle, high = np.quantile(self.draws[:, k], TITLE)
-                axes.set_title(with_errors(low, middle, high))
+                axes.set_title(interval_title(self.draws[:, k]))
 
     def draw_laplace(self, mean: np.ndarray, covariance: np.ndarray) -> Iterator[Any]:
         """Draw ellipses and densities of the normal distribution, and yield the entry of the legend."""
@@ -262,46 +293,6 @@ class _Panels:
                     self.grid[k, j].axhline(value, **look)
         if any(name in self.truths for name in self.names):
             yield plt.Line2D([], [], label="truth", **TRUTH)
-
-    def write_labels(self, labels: Sequence[str]) -> None:
-        """Write the names and the ticks at the left and the lower edge."""
-        last, small = len(self.names) - 1, {"size": SMALL} if len(self.names) > MANY else {}
-        for (i, j), axes in np.ndenumerate(self.grid):
-            if j > i:
-                continue
-            for axis in (axes.xaxis, axes.yaxis) if j < i else (axes.xaxis,):
-                _set_ticks(axis)
-            axes.tick_params(axis="x", labelbottom=i == last, labelrotation=45)
-            axes.tick_params(axis="y", labelleft=j == 0 and i > 0)
-            plt.setp(axes.get_xticklabels(), ha="right", rotation_mode="anchor")
-            for axis in (axes.xaxis, axes.yaxis):
-                axis.get_offset_text().set_visible(False)
-            if i == last:
-                axes.set_xlabel(_with_factor(axes.xaxis, labels[j]), **small)
-            if j == 0 and i > 0:
-                axes.set_ylabel(_with_factor(axes.yaxis, labels[i]), **small)
-        self.grid[0, 0].figure.align_labels()
-
-    def write_legend(self, handles: list[Any], title: str) -> float:
-        """Write the legend into the upper right corner, and return the height that it needs above a single panel."""
-        figure = self.grid[0, 0].figure
-        legend = figure.legend(handles=handles, title=title or None, loc="upper right", handlelength=1.4)
-        return legend.get_window_extent().height if len(self.names) == 1 else 0.0
-
-    def arrange(self, above: float) -> None:
-        """Put panels of one size as closely as their labels allow; `above` is the height of the legend [pixels]."""
-        figure, last = self.grid[0, 0].figure, len(self.names) - 1
-        boxes = {place: (axes.get_tightbbox(), axes.bbox) for place, axes in np.ndenumerate(self.grid)}
-        column, row = [boxes[i, 0] for i in range(last + 1)], [boxes[last, j] for j in range(last + 1)]
-        left, bottom = (max(inner.p0[k] - outer.p0[k] for outer, inner in line) for k, line in enumerate((column, row)))
-        outer, inner = boxes[0, 0]
-        title, gap, (width, height) = outer.y1 - inner.y1, ROOM * figure.dpi, figure.bbox.size
-        x, y = (left + 2.0 * gap) / width, (bottom + 2.0 * gap) / height
-        top = 1.0 - (title + above + 2.0 * gap) / height
-        each = [(1.0 - x - gap / width + gap / width) / (last + 1), (top - y + (title + gap) / height) / (last + 1)]
-        for (i, j), axes in np.ndenumerate(self.grid):
-            size = each[0] - gap / width, each[1] - (title + gap) / height
-            axes.set_position((x + j * each[0], y + (last - i) * each[1], *size))
 
 
 def _groups(posterior: Posterior) -> list[_Group]:
@@ -344,44 +335,6 @@ def draw_ellipses(axes: Axes, mean: np.ndarray, covariance: np.ndarray) -> None:
         radius = np.sqrt(-2.0 * np.log(1.0 - level))
         x, y = (m + radius * sd * wave for m, sd, wave in zip(mean, sds, (across, up), strict=True))
         axes.plot(x, y, zorder=5, **LAPLACE | {"lw": 1.2})
-
-
-def with_errors(low: float, middle: float, high: float) -> str:
-    """Return a value and the distances to the ends of an interval, to two digits of the shorter one."""
-    shorter = min(high - middle, middle - low)
-    digits = 1 - int(np.floor(np.log10(shorter))) if shorter > 0.0 else 4
-    if digits < -3 or digits > 6:
-        power = int(np.floor(np.log10(max(abs(middle), shorter))))
-        scaled = [value / 10.0**power for value in (low, middle, high)]
-        return rf"{with_errors(*scaled)} $\times\,10^{{{power}}}$"
-    texts = [f"{round(value, digits) + 0.0:.{max(digits, 0)}f}" for value in (middle, high - middle, middle - low)]
-    return rf"${texts[0]}^{{+{texts[1]}}}_{{-{texts[2]}}}$"
-
-
-def _set_ticks(axis: Any) -> None:
-    """Set two or three ticks, away from the ends, and write them without an offset."""
-    low, high = axis.get_view_interval()
-    room = FREE * (high - low)
-    for count in (3, 4, 5, 7):
-        ticks = MaxNLocator(count, steps=[1, 2, 5, 10]).tick_values(low, high)
-        ticks = ticks[(ticks >= low + room) & (ticks <= high - room)]
-        if len(ticks) > 1:
-            break
-    axis.set_ticks(ticks)
-    formatter = ScalarFormatter(useOffset=False)
-    formatter.set_powerlimits(WHOLE)
-    axis.set_major_formatter(formatter)
-
-
-def _with_factor(axis: Any, label: str) -> str:
-    """Return a label with the common factor of the ticks in its unit, because it would overlap the panels."""
-    formatter = axis.get_major_formatter()
-    formatter.set_locs(axis.get_majorticklocs().tolist())
-    factor, (name, _, unit) = formatter.get_offset(), label.rpartition("\n[")
-    if not factor:
-        return label
-    power = "10" + factor.removeprefix("1e").translate(SUPERSCRIPTS)
-    return f"{name}\n[{power} {unit}" if name else f"{label}\n[{power}]"
 
 
 def normal_approximation(
@@ -438,15 +391,15 @@ def marginals(
     if laplace is not None:
         mean, covariance = normal_approximation(posterior, names, laplace)
         sd = np.sqrt(np.diag(covariance))
-    columns, rows = style.panel_grid(len(names))
+    columns, rows = panel_grid(len(names))
     figure = figure or plt.figure(figsize=(2.4 * columns + 0.4, 2.3 * rows + 0.6), layout="constrained")
-    panels = style.panels(figure, len(names))
-    for i, (axes, name) in enumerate(zip(panels, names, strict=True)):
+    grid = panels(figure, len(names))
+    for i, (axes, name) in enumerate(zip(grid, names, strict=True)):
         draws = posterior.draws(name)
         density, edges = np.histogram(draws, BINS, tuple(np.quantile(draws, TAILS)), density=True)
-        style.draw_marginal(axes, edges, density, float(mean[i]), float(sd[i]))
+        draw_marginal(axes, edges, density, float(mean[i]), float(sd[i]))
         axes.set_xlabel(draws_label(posterior, name))
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
     if text := caveats_of(posterior):
         figure.suptitle(text, x=0.99, ha="right", fontsize="medium")
     return figure

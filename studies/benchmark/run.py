@@ -53,8 +53,6 @@ def run(options: argparse.Namespace) -> None:
         cold_start.run(options)
         return
     before = read_kept(KEPT) if options.guard else None
-    if options.guard:
-        options.quick, options.out = True, KEPT.parent.parent / "quick" / "benchmark"
     watch, kept = common.Stopwatch(), options.out / PARTS
     found: dict[str, Any] = {"seed": options.seed, "quick": options.quick, "cores": os.cpu_count()}
     found["load_average"] = [*os.getloadavg()] if hasattr(os, "getloadavg") else None
@@ -122,7 +120,7 @@ def _source(options: argparse.Namespace, name: str) -> str:
 def read_kept(path: Path) -> dict[str, Any]:
     """Return the kept results for the guard."""
     if not path.is_file():
-        raise FileNotFoundError(f"--guard: {path} does not exist; run the whole study first.")
+        raise FileNotFoundError(f"--guard: {path} does not exist; run the study with --publish first.")
     return json.loads(path.read_text(encoding="utf-8"))
 
 

@@ -13,6 +13,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from scipy import stats
 
+import bayesperiodic as bp
 from studies import common
 from studies.sampling import cost as sampling_cost
 from studies.sampling import efficiency
@@ -51,6 +52,7 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("figures", "drawing"):
         # The ridge is the last case.
         figures = {"ridge": draw_ridge(runs), "samplers": draw_samplers(found["efficiency"])}
+        figures["branches"] = draw_branches(ridge)
         paths = common.save_figures(options.out, figures)
     print("\n" + tables(found) + "\n")
     results = {"seed": options.seed, "quick": options.quick} | found
@@ -177,6 +179,21 @@ def draw_ridge(runs: Mapping[str, Any]) -> Figure:
     below[0].set_ylabel("density of a")
     figure.suptitle("The ridge a·b = 1 ± 2 %, priors N(1, 1) cut at zero")
     return figure
+
+
+def draw_branches(ridge: sampling_ridge.Runs) -> Figure:
+    """Draw the ridge with priors over both signs, and over it the one with priors cut at zero.
+
+    The package corner draws single points, so that a branch with 1 % of the mass is visible.
+    """
+    figure = None
+    for name, label in (("uncut_prior", "priors over both signs"), ("natural", "priors cut at zero")):
+        figure = bp.plot.corner(
+            ridge[name][0], style="corner", names=["a", "b"], figure=figure, bins=60, plot_contours=False,
+            plot_density=False, hist_kwargs={"label": label}, data_kwargs={"alpha": 0.4},
+        )  # fmt: skip
+    assert figure is not None
+    return common.titled(figure, "The ridge a·b = 1 ± 2 %: the draws and their densities")
 
 
 def draw_samplers(found: Mapping[str, Any]) -> Figure:

@@ -293,7 +293,7 @@ def test_guard_compares_ratios_and_names_the_worse_ones(tmp_path):
     assert len(lines) == 2 and "shooting" in lines[0] and "floor" in lines[1]
     assert targets.worse(results(1.0, 0.5, 0.5), results(2.0, 0.2, 0.5)) == []
     kept = tmp_path / "results.json"
-    with pytest.raises(FileNotFoundError, match="run the whole study first"):
+    with pytest.raises(FileNotFoundError, match="run the study with --publish first"):
         benchmark.read_kept(kept)
     kept.write_text(json.dumps(results(2.0, 0.5)), encoding="utf-8")
     with pytest.raises(RuntimeError, match="shooting"):

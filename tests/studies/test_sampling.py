@@ -235,7 +235,7 @@ def test_rows_compare_values_with_their_limits():
 def test_figures_are_there_small_and_not_empty(done):
     folder, _, printed = done
     figures = sorted(folder.glob("*.png"))
-    assert [path.name for path in figures] == ["ridge.png", "samplers.png"]
+    assert [path.name for path in figures] == ["branches.png", "ridge.png", "samplers.png"]
     for path in figures:
         assert str(path) in printed
         assert path.stat().st_size <= 200_000
