@@ -79,7 +79,7 @@ def with_guesses(problem: Description, theta: np.ndarray) -> Description:
         z = equations.static_guess(problem.parameters(theta[None], e.name)[0])
         states = z + equations.drift * equations.grid.tau[:, None]
         near[e.name] = dict(zip(problem.model.states, states.T.copy(), strict=True))
-    fit = _SimultaneousFit(problem.with_experiments(replace(e, guess=near[e.name]) for e in problem.experiments))
+    fit = _SimultaneousFit(problem.replace(experiments=[replace(e, guess=near[e.name]) for e in problem.experiments]))
     for e in problem.experiments:
         if e.guess == DATA:
             near[e.name] = fit._states(e.name, fit.orbit_of_any_mean(e.name, theta))
@@ -90,8 +90,9 @@ def with_guesses(problem: Description, theta: np.ndarray) -> Description:
                 f"guess of experiment {name!r}: must be finite, got nan for {lost[0]!r} from the data; give the states "
                 "as a mapping, or start nearer to the truth."
             )
-    return problem.with_experiments(
-        replace(e, guess=found.states[e.name]) if e.guess == DATA else e for e in problem.experiments
+    states = found.states
+    return problem.replace(
+        experiments=[replace(e, guess=states[e.name]) if e.guess == DATA else e for e in problem.experiments]
     )
 
 
@@ -103,14 +104,14 @@ def measured_orbits(
     The orbits solve the equations only as far as the outputs leave them free; `near` are the states of other orbits
     from which they start. Returned with them is the problem whose experiments have these orbits as their guesses.
     """
-    fit = _SimultaneousFit(problem.with_experiments(replace(e, guess=near[e.name]) for e in problem.experiments))
+    fit = _SimultaneousFit(problem.replace(experiments=[replace(e, guess=near[e.name]) for e in problem.experiments]))
     misfit, before, turns = np.inf, np.inf, 0
     while turns < most and not before - misfit < SMALL_STEP:
         fit.guess = {name: fit.measured_orbit(name, theta) for name in fit.guess}
         theta = fit.parameters_along_guesses(theta)
         misfit, before, turns = fit._misfit(theta), misfit, turns + 1
     states = {name: fit._states(name, z) for name, z in fit.guess.items()}
-    guessed = problem.with_experiments(replace(e, guess=states[e.name]) for e in problem.experiments)
+    guessed = problem.replace(experiments=[replace(e, guess=states[e.name]) for e in problem.experiments])
     return guessed, InitialEstimate(theta, states, "")
 
 
