@@ -168,9 +168,16 @@ class Problem(Description):
         Returns
         -------
         Problem
+
+        Raises
+        ------
+        ValueError
+            For an unknown experiment.
         """
         if same(self.input_errors, errors):
             return self
+        for name in errors:
+            _checks.one_of("errors", name, [e.name for e in self.experiments])
         if not (self._last and same(self._last[0].input_errors, errors)):
             self._last[:] = [self._with(errors, None)]
         return self._last[0]
