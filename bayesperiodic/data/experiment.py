@@ -173,8 +173,8 @@ class Experiment(Result):
         object.__setattr__(self, "independent", counts)
         self._check_multipliers()
         self._check_covariance(measured * len(self.outputs))
-        for given in fields(self):
-            object.__setattr__(self, given.name, _read_only(getattr(self, given.name)))
+        for member in fields(self):
+            object.__setattr__(self, member.name, _read_only(getattr(self, member.name)))
 
     def _measured(self, kind: str, values: ArrayLike) -> ArrayLike:
         """Return the values of a channel, with zeros at points of an output that the mask excludes."""

@@ -41,7 +41,7 @@ class Information:
         guesses = {e.name: fit.solutions[e.name].states for e in problem.experiments}
         here = problem.anchored(theta, guesses).density().linearise(theta)
         noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
-        changes = problem.likelihood.whitened(here.changes, noise)
+        changes = problem.likelihood.whitened(here.jacobian, noise)
         slopes = np.where(logs, theta, 1.0)
         design = np.concatenate(changes, axis=1) * slopes[:, None]
         ends = [

@@ -104,7 +104,7 @@ def _by_the_data(problem: Problem, estimate: Iterate) -> Iterate:
     logs = problem.logarithmic
     width = np.where(logs, problem.joint_prior.log_widths, problem.joint_prior.widths)
     units = width * np.where(logs, estimate.theta, 1.0)
-    changes = units[:, None] * np.concatenate(_white(problem, estimate.here.changes, estimate), axis=1)
+    changes = units[:, None] * np.concatenate(_white(problem, estimate.here.jacobian, estimate), axis=1)
     residuals = np.concatenate(_white(problem, estimate.here.residuals, estimate))
     if not np.isfinite(changes).all() or not residuals.any():
         return estimate
@@ -178,7 +178,7 @@ def _tested(problem: Problem, estimate: Iterate) -> PriorConflict:
     width = np.where(logs, prior.log_widths, prior.widths)
     offset = np.where(logs, np.log(estimate.theta / np.where(logs, centre, 1.0)), estimate.theta - centre)
     units = width[:, None] * prior.correlation_root
-    changes = units.T @ (slopes[:, None] * np.concatenate(_white(problem, estimate.here.changes, estimate), axis=1))
+    changes = units.T @ (slopes[:, None] * np.concatenate(_white(problem, estimate.here.jacobian, estimate), axis=1))
     residuals = np.concatenate(_white(problem, estimate.here.residuals, estimate))
     if not np.isfinite(changes).all():
         changes = np.zeros_like(changes)
