@@ -32,7 +32,7 @@ def gradient_error(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> fl
 
 
 def _conditional_sd(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    changes = warm.likelihood.whitened(warm.density().linearise(theta).changes, noise)
+    changes = warm.likelihood.whitened(warm.density().linearise(theta).jacobian, noise)
     information = sum((own**2).sum(axis=-1) for own in changes)
     return 1.0 / np.sqrt(information + np.diag(warm.joint_prior.curvature(theta)))
 

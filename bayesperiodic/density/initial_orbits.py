@@ -45,7 +45,7 @@ class Linear:
     correction: np.ndarray  # −g_z⁻¹ g (points, states), Newton's step at fixed parameters
     response: np.ndarray  # −g_z⁻¹ g_θ (names, points, states)
     residuals: list[np.ndarray]  # of the corrected orbit, (size,) a block
-    changes: list[np.ndarray]  # derivatives of the predicted components by θ, (names, size) a block
+    jacobian: list[np.ndarray]  # derivatives of the predicted components by θ, (names, size) a block
 
 
 class InitialEstimate(NamedTuple):
@@ -79,19 +79,20 @@ def with_guesses(problem: Description, theta: np.ndarray) -> Description:
         z = equations.static_guess(problem.parameters(theta[None], e.name)[0])
         states = z + equations.drift * equations.grid.tau[:, None]
         near[e.name] = dict(zip(problem.model.states, states.T.copy(), strict=True))
-    fit = _SimultaneousFit(problem.with_experiments(replace(e, guess=near[e.name]) for e in problem.experiments))
+    fit = _SimultaneousFit(problem.replace(experiments=[replace(e, guess=near[e.name]) for e in problem.experiments]))
     for e in problem.experiments:
         if e.guess == DATA:
             near[e.name] = fit._states(e.name, fit.orbit_of_any_mean(e.name, theta))
-    _, found = measured_orbits(problem, theta, near, FEW_TURNS)
-    for name, states in found.states.items():
+    _, estimate = measured_orbits(problem, theta, near, FEW_TURNS)
+    for name, states in estimate.states.items():
         if lost := [state for state, values in states.items() if not np.isfinite(values).all()]:
             raise ValueError(
                 f"guess of experiment {name!r}: must be finite, got nan for {lost[0]!r} from the data; give the states "
                 "as a mapping, or start nearer to the truth."
             )
-    return problem.with_experiments(
-        replace(e, guess=found.states[e.name]) if e.guess == DATA else e for e in problem.experiments
+    orbits = estimate.states
+    return problem.replace(
+        experiments=[replace(e, guess=orbits[e.name]) if e.guess == DATA else e for e in problem.experiments]
     )
 
 
@@ -103,14 +104,14 @@ def measured_orbits(
     The orbits solve the equations only as far as the outputs leave them free; `near` are the states of other orbits
     from which they start. Returned with them is the problem whose experiments have these orbits as their guesses.
     """
-    fit = _SimultaneousFit(problem.with_experiments(replace(e, guess=near[e.name]) for e in problem.experiments))
+    fit = _SimultaneousFit(problem.replace(experiments=[replace(e, guess=near[e.name]) for e in problem.experiments]))
     misfit, before, turns = np.inf, np.inf, 0
     while turns < most and not before - misfit < SMALL_STEP:
         fit.guess = {name: fit.measured_orbit(name, theta) for name in fit.guess}
         theta = fit.parameters_along_guesses(theta)
         misfit, before, turns = fit._misfit(theta), misfit, turns + 1
     states = {name: fit._states(name, z) for name, z in fit.guess.items()}
-    guessed = problem.with_experiments(replace(e, guess=states[e.name]) for e in problem.experiments)
+    guessed = problem.replace(experiments=[replace(e, guess=states[e.name]) for e in problem.experiments])
     return guessed, InitialEstimate(theta, states, "")
 
 
@@ -136,10 +137,10 @@ class _SimultaneousFit:
             total, count = 0.0, 0
             hessian, gradient = np.zeros((theta.size, theta.size)), np.zeros(theta.size)
             for name, z in self.guess.items():
-                own, equations = self.maps[name], self.equations[name]
-                at = np.ascontiguousarray(own.values(theta[None])[0, :-1])
+                mapped, equations = self.maps[name], self.equations[name]
+                at = np.ascontiguousarray(mapped.values(theta[None])[0, :-1])
                 g = _weighed(equations, equations.residual_jacobian(z, at)[:, : equations.count, None]).ravel()
-                by = _weighed(equations, equations.derivatives(z, at).g_theta @ own.slopes(theta)[:-1])
+                by = _weighed(equations, equations.derivatives(z, at).g_theta @ mapped.slopes(theta)[:-1])
                 by = by.reshape(g.size, theta.size)
                 hessian, gradient = hessian + by.T @ by, gradient - by.T @ g
                 total, count = total + g @ g, count + g.size
@@ -250,8 +251,8 @@ class _SimultaneousFit:
 
     def _linearise(self, name: str, z: np.ndarray, theta: np.ndarray) -> Linear | None:
         """Return one experiment's equations linearised at an orbit and θ; None where ∂g/∂z is singular."""
-        equations, own = self.equations[name], self.maps[name]
-        parameters, slopes = np.ascontiguousarray(own.values(theta[None])[0]), own.slopes(theta)
+        equations, mapped = self.equations[name], self.maps[name]
+        parameters, slopes = np.ascontiguousarray(mapped.values(theta[None])[0]), mapped.slopes(theta)
         at, by = parameters[:-1], slopes[:-1]
         d, columns = equations.derivatives(z, at), equations.residual_jacobian(z, at)
         factors = equations.factors(columns)
@@ -269,9 +270,9 @@ class _SimultaneousFit:
 
     def _information(self, linear: dict[str, Linear], noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the data's part of the Hessian and of the gradient of the log-density by θ."""
-        changes = [c for one in linear.values() for c in one.changes]
+        jacobian = [part for one in linear.values() for part in one.jacobian]
         residuals = [r for one in linear.values() for r in one.residuals]
-        white = np.concatenate(self.likelihood.whitened(changes, noise), axis=1)
+        white = np.concatenate(self.likelihood.whitened(jacobian, noise), axis=1)
         return white @ white.T, white @ np.concatenate(self.likelihood.whitened(residuals, noise))
 
     def _step(self, hessian: np.ndarray, gradient: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, float]:

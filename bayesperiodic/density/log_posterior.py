@@ -24,7 +24,7 @@ SAMPLED, COLLAPSED = "sampled", "collapsed"
 class Linearisation:
     """Residuals at one θ (names,) and their Jacobian (de Kraker et al. 1997, eq. 4-5).
 
-    Derivatives by `changes` need a simulator anchored at θ. With `polish` the solves are as accurate as possible;
+    The `jacobian` needs a simulator anchored at θ. With `polish` the solves are as accurate as possible;
     without it the residuals are those of `LogPosterior.evaluate`.
     """
 
@@ -70,12 +70,12 @@ class Linearisation:
         return {name: here.response(name) for name in self._observations}
 
     @cached_property
-    def changes(self) -> list[np.ndarray]:
+    def jacobian(self) -> list[np.ndarray]:
         """Derivatives of the predicted components by θ, one array (names, size) a block; NaN where singular."""
         result = []
         for name, observation in self._observations.items():
             response = self._responses[name]
-            directions = self.simulator.changes(self.theta, name, response, self._simulation.z(name)[0])
+            directions = self.simulator.jacobian(self.theta, name, response, self._simulation.z(name)[0])
             if directions is None:
                 result += [np.full((self.theta.size, block.size), np.nan) for block in observation.blocks]
             else:
@@ -96,15 +96,16 @@ class Linearisation:
         """Return Σ by_residual · ∂residual/∂θ, (names,) by experiment; NaN where the derivatives do not exist.
 
         `by_residual` has one array (size,) a block. `adjoint` takes one transposed solve an experiment (driven models)
-        instead of `changes`.
+        instead of `jacobian`.
         """
         if adjoint:
             by_response = self._comparisons.vjp(self._simulation, self.residuals.like(by_residual))
-            return {name: -own for name, own in self.simulator.vjp(self.theta, self._simulation, *by_response).items()}
+            by_theta = self.simulator.vjp(self.theta, self._simulation, *by_response)
+            return {name: -gradient for name, gradient in by_theta.items()}
         result, start, blocks = {}, 0, list(by_residual)
         for name, observation in self._observations.items():
             stop = start + len(observation.blocks)
-            pairs = zip(self.changes[start:stop], blocks[start:stop], strict=True)
+            pairs = zip(self.jacobian[start:stop], blocks[start:stop], strict=True)
             result[name] = -np.sum([s @ w for s, w in pairs], axis=0)
             start = stop
         return result
@@ -196,9 +197,9 @@ class LogPosterior(SamplingCoordinates):
         fit together, see `simultaneous_fit`: at the medians other orbits may be nearer, or none may exist.
         """
         theta = problem.median() if theta is None else theta
-        found = simultaneous_fit(problem, theta)
-        if found is not None and found.states:
-            return cls(problem, Simulator.start(problem, found.theta, found.states))
+        estimate = simultaneous_fit(problem, theta)
+        if estimate is not None and estimate.states:
+            return cls(problem, Simulator.start(problem, estimate.theta, estimate.states))
         return cls(problem, Simulator.start(problem, theta))
 
     def anchored(self, theta: np.ndarray, guesses: Guesses | None = None) -> "LogPosterior":
@@ -350,9 +351,9 @@ class LogPosterior(SamplingCoordinates):
 
     def outputs(self, theta: np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
         """Return the predicted outputs at θ (draws, names) and whether the solves converged, see `Problem.outputs`."""
-        found = self.simulator.solve(theta)
-        predicted = {name: o.predicted(found.response(name)) for name, o in self.problem.observations.items()}
-        return predicted, found.status == CONVERGED
+        simulation = self.simulator.solve(theta)
+        predicted = {name: o.predicted(simulation.response(name)) for name, o in self.problem.observations.items()}
+        return predicted, simulation.status == CONVERGED
 
     def _integrals(self, moments: np.ndarray) -> np.ndarray:
         """Return ln ∫ exp(−½ [n ln v + M/v]) p(v) dv of each collapsed variance."""

@@ -39,14 +39,14 @@ def other_orbit(observation: Observation, response: Response) -> str:
 
 
 def _differences(observation: Observation, response: Response) -> Iterator[str]:
-    e, own = observation.experiment, np.stack(list(observation.predicted(response).values()), axis=-1)
-    (own, own_turns), (data, turns) = (_unwound(x, observation.angles) for x in (own, observation.data))
+    e, outputs = observation.experiment, np.stack(list(observation.predicted(response).values()), axis=-1)
+    (model, model_turns), (data, turns) = (_unwound(x, observation.angles) for x in (outputs, observation.data))
     if e.mask is None:
-        for channel, found, measured in zip(observation.channels, own_turns, turns, strict=True):
-            if found != measured:
-                yield f"the model's {channel} makes {found} turns in a period, the recorded one {measured}"
+        for channel, predicted, measured in zip(observation.channels, model_turns, turns, strict=True):
+            if predicted != measured:
+                yield f"the model's {channel} makes {predicted} turns in a period, the recorded one {measured}"
     for period in [d for d in range(1, e.periods) if e.periods % d == 0]:
-        followed = _followed(observation, own, data, period)
+        followed = _followed(observation, model, data, period)
         if followed < FOLLOWED:
             yield (
                 f"the model's orbit has period {period}, the recording has period {e.periods} ({followed:.0%} of the "
@@ -65,20 +65,20 @@ def _unwound(signals: np.ndarray, angles: list[bool]) -> tuple[np.ndarray, np.nd
     return values - 2 * np.pi * turns * np.arange(len(values))[:, None] / len(values), turns
 
 
-def _followed(observation: Observation, own: np.ndarray, measured: np.ndarray, period: int) -> float:
+def _followed(observation: Observation, model: np.ndarray, measured: np.ndarray, period: int) -> float:
     """Return the variance of the model's subharmonics of a shorter period over that of the measured ones, if any."""
     e, power = observation.experiment, np.zeros(2)
     if e.mask is not None:
-        off = np.abs(own - np.roll(own, period * e.samples, axis=0))
-        return 0.0 if np.all(off <= SAME * np.ptp(own, axis=0)) else np.inf
+        off = np.abs(model - np.roll(model, period * e.samples, axis=0))
+        return 0.0 if np.all(off <= SAME * np.ptp(model, axis=0)) else np.inf
     for c, channel in enumerate(observation.channels):
-        highest = min(e.harmonics.get(channel, len(own)), _fourier.highest_harmonic(len(own)))
+        highest = min(e.harmonics.get(channel, len(model)), _fourier.highest_harmonic(len(model)))
         lines = np.arange(1, highest + 1)
         lines = lines[lines % (e.periods // period) != 0]
-        found, data = (np.abs(_fourier.coefficients(x[:, c], highest)[lines]) ** 2 for x in (own, measured))
+        predicted, data = (np.abs(_fourier.coefficients(x[:, c], highest)[lines]) ** 2 for x in (model, measured))
         variance = 2.0 * measured[:, c].var()
         if data.sum() > PRESENT * variance and _significant(observation, channel, lines, data):
-            power += np.array([found.sum(), data.sum()]) / variance
+            power += np.array([predicted.sum(), data.sum()]) / variance
     return float(power[0] / power[1]) if power[1] else np.inf
 
 

@@ -1,7 +1,6 @@
 """Problem: a model, experiments and priors, and the posterior density they define."""
 
 from collections.abc import Mapping
-from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -11,17 +10,17 @@ from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE, SAMPLED, Evaluation, LogPosterior
 from bayesperiodic.density.responses import Guesses, Simulator
-from bayesperiodic.likelihood.input_noise import InputErrors, same
-from bayesperiodic.likelihood.likelihood import Likelihood
-from bayesperiodic.likelihood.observation import Observation
+from bayesperiodic.likelihood.input_noise import EXACT, InputErrors, same
 from bayesperiodic.periodic.solution import PeriodicSolution
-from bayesperiodic.problem.description import Description
+from bayesperiodic.problem.description import Description, written_out
 
 METHODS = ("adjoint", "forward")
 
 
 class Problem(Description):
     r"""A model, experiments and priors, and the posterior density that they define.
+
+    A problem is immutable; `replace` returns another one.
 
     The density ([1]_, eq. 5-6) is over (θ, log φ), φ the noise parameters. With independent errors, the paper's model,
     φ is the variance of each channel with Jeffreys' prior 1/v, and the density is
@@ -91,15 +90,29 @@ class Problem(Description):
     ((3,), 'converged')
     """
 
+    _anchors: Simulator | None = None
+
+    def _with(self, input_errors: Mapping[str, InputErrors], anchors: Simulator | None) -> "Problem":
+        """Return the problem that the constructor has validated, with a density of other errors of inputs or anchors.
+
+        All that depends on them is computed anew.
+        """
+        other = object.__new__(type(self))
+        given = {n: v for n, v in vars(self).items() if not isinstance(getattr(type(self), n, None), cached_property)}
+        vars(other).update(given, input_errors=dict(input_errors), _anchors=anchors)
+        return other
+
     @cached_property
     def _densities(self) -> dict[tuple[str, str], LogPosterior]:
+        """The densities that were asked for, by coordinates and variances."""
         return {}
 
     def density(self, *, coordinates: str = RIDGE, variances: str = SAMPLED) -> LogPosterior:
         """Return the log-posterior over the sampling coordinates.
 
-        Its periodic solves are anchored at the medians of the priors, see `LogPosterior.start`, or where `anchored`
-        has put them. The first call computes the anchors.
+        It is a function of the problem, the anchors of its periodic solves and the errors of the inputs. The anchors
+        are at the medians of the priors, see `LogPosterior.start`, or where `anchored` has put them. The first call
+        computes the anchors.
 
         Parameters
         ----------
@@ -113,7 +126,9 @@ class Problem(Description):
         """
         settings = coordinates, variances
         if settings not in self._densities:
-            first = next(iter(self._densities.values()), None) or LogPosterior.start(self)
+            first = next(iter(self._densities.values()), None)
+            if first is None:
+                first = LogPosterior(self, self._anchors) if self._anchors else LogPosterior.start(self)
             self._densities[settings] = first.with_settings(coordinates=coordinates, variances=variances)
         return self._densities[settings]
 
@@ -135,13 +150,10 @@ class Problem(Description):
         ValueError
             For unknown or missing names, or arrays of another length.
         """
-        values, other = self.vector(theta), copy(self)
+        values = self.vector(theta)
         if guesses is None:
-            density = self.density().anchored(values)
-        else:
-            density = LogPosterior(self, Simulator.start(self, values, guesses))
-        other._densities = {(density.coordinates, SAMPLED): density}
-        return other
+            return self._with(self.input_errors, self.density().simulator.anchored(values))
+        return self._with(self.input_errors, Simulator.start(self, values, guesses))
 
     def with_input_errors(self, errors: Mapping[str, InputErrors]) -> "Problem":
         """Return the same problem with the errors of its inputs, linearised about an estimate.
@@ -156,23 +168,19 @@ class Problem(Description):
         Returns
         -------
         Problem
+
+        Raises
+        ------
+        ValueError
+            For an unknown experiment.
         """
         if same(self.input_errors, errors):
             return self
-        if self._last and same(self._last[0].input_errors, errors):
-            return self._last[0]
-        other, own = copy(self), self.likelihood
-        other.__dict__.pop("_densities", None)
-        other.input_errors = dict(errors)
-        other.observations = {}
-        for name, seen in self.observations.items():
-            caused = errors[name].parts([block.size for block in seen.blocks]) if name in errors else None
-            delayed = self.parameter_maps[name].delayed
-            other.observations[name] = Observation(seen.experiment, self.model, delayed, caused)
-        loadings = {name: one.loadings for name, one in errors.items()}
-        other.likelihood = Likelihood(own.model, own.blocks, own.fixed, loadings)
-        self._last[:] = [other]
-        return other
+        for name in errors:
+            _checks.one_of("errors", name, [e.name for e in self.experiments])
+        if not (self._last and same(self._last[0].input_errors, errors)):
+            self._last[:] = [self._with(errors, None)]
+        return self._last[0]
 
     @cached_property
     def _last(self) -> list["Problem"]:
@@ -180,12 +188,12 @@ class Problem(Description):
         return []
 
     def planned(self, experiment: Experiment, noise: Mapping[str, float]) -> "Problem":
-        """Return the problem of an experiment that may be made, alone, with exact inputs and this one's parameters.
+        """Return the problem of an experiment that may be made, alone, with exact inputs.
 
         Parameters
         ----------
         experiment : Experiment
-            With the name of one of this problem's experiments, whose parameters are its own.
+            With the name of one of this problem's experiments. The parameters that act there are free.
         noise : mapping of str to float
             The noise parameters by their full names, known.
 
@@ -193,20 +201,23 @@ class Problem(Description):
         -------
         Problem
         """
-        other, seen = copy(self), Observation(experiment, self.model, self.parameter_maps[experiment.name].delayed)
-        names = {name for block in seen.blocks for name in self.noise.parameter_names(block)}
-        other.experiments, other.observations, other.input_errors = (experiment,), {experiment.name: seen}, {}
-        other.likelihood = Likelihood(self.noise, seen.blocks, {name: noise[name] for name in names})
-        other._densities = {}
-        return other
+        run = experiment.name
+        acting = [self.names[i] for i in self.parameter_maps[run].columns.values()]
+        blocks = self.observations[run].blocks
+        known = {name: noise[name] for block in blocks for name in self.noise.parameter_names(block)}
+        changes = {
+            "experiments": [experiment], "priors": {name: self.joint_prior.marginals[name] for name in acting},
+            "fixed": {name: {run: v[run]} for name, v in self.fixed.items() if run in v} | known, "input_noise": EXACT,
+        }  # fmt: skip
+        return Problem(**written_out(self) | changes)
 
     def _evaluated(self, evaluate: str, theta: Any, variances: Any, threads: int | None = None) -> np.ndarray:
         values, noise = self.vector(theta), self.noise_values(variances)
         if noise.shape[:-1] != values.shape[:-1]:
             noise = np.broadcast_to(noise, (*values.shape[:-1], noise.shape[-1]))
         flat = values.reshape(-1, values.shape[-1]), noise.reshape(-1, noise.shape[-1])
-        found: Evaluation = getattr(self.density(coordinates=NATURAL), evaluate)(*flat, threads)
-        return found.log_prob.reshape(values.shape[:-1])
+        evaluation: Evaluation = getattr(self.density(coordinates=NATURAL), evaluate)(*flat, threads)
+        return evaluation.log_prob.reshape(values.shape[:-1])
 
     def log_likelihood(
         self, theta: Mapping[str, float] | np.ndarray, variances: Any, threads: int | None = None

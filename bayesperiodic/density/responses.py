@@ -46,10 +46,10 @@ class Simulator:
         if guesses is not None:
             _checks.same_names("guesses", guesses, [e.name for e in problem.experiments])
         experiments = with_guesses(problem, theta).experiments if guesses is None else problem.experiments
-        own = {
+        chosen = {
             e.name: (e if guesses is None else replace(e, guess=guesses[e.name])).guess or "static" for e in experiments
         }
-        return cls(problem, own, {}, {}).anchored(theta)
+        return cls(problem, chosen, {}, {}).anchored(theta)
 
     def __getstate__(self) -> dict[str, Any]:
         # The factors at the anchors are computed again; the anchors are kept to the last bit.
@@ -57,13 +57,14 @@ class Simulator:
 
     def anchored(self, theta: np.ndarray) -> "Simulator":
         """Return the simulator anchored at θ (names,), solved from the present anchors, else from the guesses."""
-        found = self.solve(theta[None], keep=True, polish=True) if self._anchors else None
+        simulation = self.solve(theta[None], keep=True, polish=True) if self._anchors else None
         anchors: dict[str, Anchor] = {}
         derivatives: dict[str, Sensitivities | None] = {}
         for name, equations in self.problem.equations.items():
             parameters = self.problem.parameters(theta[None], name)[0]
-            if found is not None and found.statuses(name)[0] == CONVERGED:
-                here, z = equations.at_frequency(float(found.response(name).frequency[0])), found.z(name)[0]
+            if simulation is not None and simulation.statuses(name)[0] == CONVERGED:
+                here = equations.at_frequency(float(simulation.response(name).frequency[0]))
+                z = simulation.z(name)[0]
             else:
                 here, (z, code, *_) = self._from_guess(name, parameters)
                 if code != CONVERGED:
@@ -128,7 +129,7 @@ class Simulator:
         wherever multipliers are measured. With `whole` a θ counts only if every solve converges; where one has failed,
         other experiments may be skipped.
         """
-        found = []
+        groups = []
         for experiments, maps, batch, multipliers in self._batches:
             values = maps.values(theta)
             parameters = values[..., :-1]
@@ -143,8 +144,8 @@ class Simulator:
                     self._log_multipliers(e, solved.z[i], solved.frequency[i], parameters[i], status[i])
                     for i, e in enumerate(experiments)
                 ]
-            found.append(GroupSolution(solved.outputs, solved.frequency, values, logarithms, solved.z, status))
-        return Simulation(found, self._places)
+            groups.append(GroupSolution(solved.outputs, solved.frequency, values, logarithms, solved.z, status))
+        return Simulation(groups, self._places)
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
         """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""
@@ -165,13 +166,13 @@ class Simulator:
         result = np.full((len(z), measured.size), np.nan)
         for i in np.flatnonzero(status == CONVERGED):
             equations = self.problem.equations[experiment.name].at_frequency(float(frequency[i]))
-            found = orbit_multipliers(equations, parameters[i], z[i], measured.size)
-            if found.size < measured.size:
+            multipliers = orbit_multipliers(equations, parameters[i], z[i], measured.size)
+            if multipliers.size < measured.size:
                 status[i] = SINGULAR
-            elif np.any(np.sign(found.real) != np.sign(measured)):
+            elif np.any(np.sign(multipliers.real) != np.sign(measured)):
                 status[i] = OTHER_ORBIT
             else:
-                result[i] = np.log(np.abs(found))
+                result[i] = np.log(np.abs(multipliers))
         return result
 
     def largest_multipliers(self, theta: np.ndarray, experiment: str, simulation: Simulation) -> np.ndarray:
@@ -185,14 +186,14 @@ class Simulator:
 
     def solutions(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
         """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""
-        found, solutions = self.solve(theta[None], keep=True, polish=True), {}
+        simulation, solutions = self.solve(theta[None], keep=True, polish=True), {}
         for name, equations in self.problem.equations.items():
-            here = equations.at_frequency(float(found.response(name).frequency[0]))
-            parameters, code = self.problem.parameters(theta[None], name)[0], int(found.statuses(name)[0])
-            solutions[name] = describe(here, parameters, Solved(found.z(name)[0], code, np.empty((0, 3))))
+            here = equations.at_frequency(float(simulation.response(name).frequency[0]))
+            parameters, code = self.problem.parameters(theta[None], name)[0], int(simulation.statuses(name)[0])
+            solutions[name] = describe(here, parameters, Solved(simulation.z(name)[0], code, np.empty((0, 3))))
         return solutions
 
-    def changes(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:
+    def jacobian(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:
         """Return the derivatives of a response at the anchor by θ, (names, …); None where they do not exist."""
         slopes, derivative = self.problem.parameter_maps[experiment].slopes(theta), self._derivatives[experiment]
         if derivative is None:
@@ -200,10 +201,10 @@ class Simulator:
         outputs = np.tensordot(slopes[:-1], derivative.outputs, (0, 0))
         multipliers = np.zeros((theta.size, 0))
         if response.log_multipliers.size:
-            multipliers = self._multiplier_changes(theta, experiment, z, response)
+            multipliers = self._multiplier_jacobian(theta, experiment, z, response)
         return Response(outputs, slopes[:-1].T @ derivative.frequency, multipliers, slopes[-1])
 
-    def _multiplier_changes(self, theta: np.ndarray, experiment: str, z: np.ndarray, response: Response) -> np.ndarray:
+    def _multiplier_jacobian(self, theta: np.ndarray, experiment: str, z: np.ndarray, response: Response) -> np.ndarray:
         """Return ∂ log|μ|/∂θ at the anchor, (names, multipliers)."""
         anchor, directions = self._anchors[experiment], self.problem.parameter_maps[experiment].slopes(theta)[:-1].T
         assert anchor.sensitivities is not None and anchor.frequency_sensitivities is not None
@@ -247,8 +248,8 @@ class Simulator:
         for e in self.problem.experiments:
             if e.multipliers is not None:
                 response = simulation.at(0).response(e.name)
-                changes = self._multiplier_changes(theta, e.name, simulation.z(e.name)[0], response)
-                result[e.name] = result[e.name] + changes @ by_multipliers[e.name]
+                jacobian = self._multiplier_jacobian(theta, e.name, simulation.z(e.name)[0], response)
+                result[e.name] = result[e.name] + jacobian @ by_multipliers[e.name]
         return result
 
 

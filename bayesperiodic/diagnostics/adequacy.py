@@ -262,9 +262,9 @@ class Whitened:
         self.groups = [variances[0] if variances else KNOWN for variances in names]
         each = zip(self.groups, names, strict=True)
         self.known = frozenset(group for group, variances in each if set(variances) <= set(likelihood.fixed))
-        white = zip(*(likelihood.whitened(part, noise) for part in (here.residuals, here.changes)), strict=True)
+        white = zip(*(likelihood.whitened(part, noise) for part in (here.residuals, here.jacobian)), strict=True)
         self.parts = [used(block, *both) for block, both in zip(self.blocks, white, strict=True)]
-        self._plain, self._likelihood, self._noise = (here.residuals, here.changes), likelihood, noise
+        self._plain, self._likelihood, self._noise = (here.residuals, here.jacobian), likelihood, noise
         self._experiments = {e.name: e for e in problem.experiments}
 
     def spectrum(self, index: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -350,7 +350,7 @@ def used(block: Block, *parts: np.ndarray) -> list[np.ndarray]:
 def _size(problem: Problem, here: Linearisation, index: int, white: Whitened) -> tuple[float, float]:
     """Return p of a residual larger than the measured or known noise, and the fraction of model error."""
     block = white.blocks[index]
-    if not _testable(here.residuals[index], here.changes[index]):
+    if not _testable(here.residuals[index], here.jacobian[index]):
         return NOT_TESTED, NOT_TESTED
     if not (block.measured > 0.0 or white.groups[index] in white.known):
         return NOT_TESTED, NOT_TESTED

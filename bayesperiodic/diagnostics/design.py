@@ -37,11 +37,11 @@ class Information:
     @classmethod
     def of(cls, problem: Problem, fit: MapEstimate) -> "Information":
         """Compute the information at an estimate with known noise parameters."""
-        theta, logs = problem.vector(fit.theta), problem.logarithmic
+        theta, logs = problem.vector({name: fit.theta[name] for name in problem.names}), problem.logarithmic
         guesses = {e.name: fit.solutions[e.name].states for e in problem.experiments}
         here = problem.anchored(theta, guesses).density().linearise(theta)
         noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
-        jacobian = problem.likelihood.whitened(here.changes, noise)
+        jacobian = problem.likelihood.whitened(here.jacobian, noise)
         slopes = np.where(logs, theta, 1.0)
         design = np.concatenate(jacobian, axis=1) * slopes[:, None]
         ends = [
@@ -164,4 +164,7 @@ def _added(problem: Problem, fit: MapEstimate, run: Experiment, candidate: Furth
     with warnings.catch_warnings():
         # The estimate has already warned about a coarse grid.
         warnings.simplefilter("ignore", UserWarning)
-        return Information.of(planned, fit).matrix
+        added = Information.of(planned, fit).matrix
+    result, acting = np.zeros((len(problem.names),) * 2), [problem.names.index(name) for name in planned.names]
+    result[np.ix_(acting, acting)] = added
+    return result

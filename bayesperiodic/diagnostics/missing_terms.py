@@ -162,7 +162,7 @@ class MissingTerms(Result):
             If there are fewer steps, or the result was loaded from a file.
         """
         problem, terms = self._first(k)
-        return extended(problem._given["model"], {name: term for name, (term, _) in terms.items()})
+        return extended(problem.settings["model"], {name: term for name, (term, _) in terms.items()})
 
     def problem(self, k: int | None = None) -> Problem:
         """Return the problem of that model, ready to be fitted and sampled.
@@ -342,7 +342,7 @@ def missing_terms(
     _checks.integer("keep", keep, 1)
     if not 0.0 < _checks.finite_number("false_discovery_rate", false_discovery_rate) < 1.0:
         raise ValueError(f"false_discovery_rate: must be between 0 and 1, got {false_discovery_rate!r}.")
-    model = problem._given["model"]
+    model = problem.settings["model"]
     terms = given(model, candidates or {})
     wanted = (outputs,) * len(model.outputs) + (equations,) * len(model.states)
     terms += generated(model, list(compress(places(model), wanted)), variable_deviations(stated, fit))
@@ -355,7 +355,7 @@ class _Search:
     """Candidates of one problem, and the steps."""
 
     def __init__(self, problem: Problem, terms: list[Term], rate: float, keep: int, lags: list[float]):
-        self.problem, self.model, self.rate, self.keep = problem, problem._given["model"], rate, keep
+        self.problem, self.model, self.rate, self.keep = problem, problem.settings["model"], rate, keep
         self.lags, self.terms = lags, {str(term): term for term in terms}
         self.names = dict(zip(self.terms, coefficient_names(self.model, terms), strict=True))
         self.keys = {name: key for key, name in self.names.items()}

@@ -511,6 +511,7 @@ def _predicted(
     level, guesses = np.median(noise, axis=0), posterior.guesses([run], problem.model.states)
     variances = problem.likelihood.value_variances(level)
     planned = problem.planned(replace(e, inputs=inputs), dict(zip(problem.noise_names, level.tolist(), strict=True)))
+    theta = theta[:, [problem.names.index(name) for name in planned.names]]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of a coarse grid, which the estimate has given
         outputs, converged = planned.anchored(np.median(theta, axis=0), guesses).outputs(theta)

@@ -35,8 +35,7 @@ def problem_of(
     problem: Problem, model: Model, terms: Mapping[str, tuple[Term, float]], zero: Mapping[str, Term]
 ) -> Problem:
     """Return the problem with another model, whose coefficients have normal priors of given widths or are zero."""
-    settings = dict(problem._given)
-    priors, fixed = dict(settings["priors"]), dict(settings["fixed"])
+    priors, fixed = dict(problem.settings["priors"]), dict(problem.settings["fixed"])
     for name, (term, width) in terms.items():
         priors[name] = Normal(0.0, width)
         if term.force is not None:
@@ -47,7 +46,7 @@ def problem_of(
         model, {e.name: e.guess for e in problem.experiments if e.guess and not isinstance(e.guess, str)}
     )
     experiments = [replace(e, guess=orbits.get(e.name, e.guess)) for e in problem.experiments]
-    return Problem(experiments=experiments, **settings | {"priors": priors, "fixed": fixed, "model": model})
+    return problem.replace(model=model, experiments=experiments, priors=priors, fixed=fixed)
 
 
 def guesses_of(model: Model, orbits: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
@@ -103,10 +102,10 @@ class Optimum:
     def with_problem(self, problem: Problem, names: tuple[str, ...]) -> "Optimum | None":
         """Return the optimum of a problem with other terms, from here on; None if there is none."""
         known = dict(zip(self.problem.names, self.iterate.theta.tolist(), strict=True))
-        known |= {n: float(problem._given["priors"][n].quantile(0.5)) for n in problem.names if n not in known}
+        known |= {n: float(problem.settings["priors"][n].quantile(0.5)) for n in problem.names if n not in known}
         orbits = {e.name: self.orbits[e.name] for e in problem.experiments}
         theta = np.array([known[name] for name in problem.names])
-        nearest = nearest_optimum(problem, theta, guesses_of(problem._given["model"], orbits))
+        nearest = nearest_optimum(problem, theta, guesses_of(problem.settings["model"], orbits))
         if nearest is None or nearest[1].status not in ENDED:
             return None
         return Optimum(problem, nearest[0], nearest[1].iterate, names)

@@ -58,7 +58,7 @@ class ScoreTests:
         finite = np.isfinite(np.concatenate(effects, axis=1)).all(axis=1)
         effects = [np.where(finite[:, None], effect, 0.0) for effect in effects]
         self.widths = _widths(likelihood.whitened(_deviations(problem), noise), likelihood.whitened(effects, noise))
-        joined = [np.concatenate([s, c]) for s, c in zip(here.changes, effects, strict=True)]
+        joined = [np.concatenate([s, c]) for s, c in zip(here.jacobian, effects, strict=True)]
         white, parameters = Whitened(problem, Compared(list(here.residuals), joined), noise), len(problem.names)
         plain = _projected(white.parts, parameters)
         self._effects, self.identifiable = plain.effects, finite & plain.identifiable
@@ -80,7 +80,7 @@ class ScoreTests:
             statistic = tests.gains()
         else:
             likelihood, noise, here = problem.likelihood, optimum.noise, optimum.here
-            jacobian, residuals = (likelihood.whitened(part, noise) for part in (here.changes, here.residuals))
+            jacobian, residuals = (likelihood.whitened(part, noise) for part in (here.jacobian, here.residuals))
             information = problem.joint_prior.curvature(optimum.theta) + sum(s @ s.T for s in jacobian)
             variances = residual_variances(likelihood, jacobian, residuals, noise, information)
             sds = [np.sqrt(np.maximum(used(b, v)[0], 1e-12)) for b, v in zip(blocks, variances, strict=True)]

@@ -1,7 +1,6 @@
 """Conflict between prior and data: the prior predictive distribution of the estimate by the data alone."""
 
 from collections.abc import Iterator
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,8 +13,9 @@ from bayesperiodic._linalg import column_space
 from bayesperiodic.density.log_posterior import RIDGE, LogPosterior
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, bias_correction, climb
-from bayesperiodic.priors.joint import JointPrior, MultivariateNormal
+from bayesperiodic.priors.joint import MultivariateNormal
 from bayesperiodic.priors.single import LogNormal, TruncatedNormal
+from bayesperiodic.problem.description import written_out
 
 LEVEL = 0.01
 # Largest error, in widths of the prior, of a direction that is tested: the data have 1 % of the prior's information.
@@ -105,7 +105,7 @@ def _by_the_data(problem: Problem, estimate: Iterate) -> Iterate:
     logs = problem.logarithmic
     width = np.where(logs, problem.joint_prior.log_widths, problem.joint_prior.widths)
     units = width * np.where(logs, estimate.theta, 1.0)
-    changes = units[:, None] * np.concatenate(_white(problem, estimate.here.changes, estimate), axis=1)
+    changes = units[:, None] * np.concatenate(_white(problem, estimate.here.jacobian, estimate), axis=1)
     residuals = np.concatenate(_white(problem, estimate.here.residuals, estimate))
     if not np.isfinite(changes).all() or not residuals.any():
         return estimate
@@ -147,13 +147,13 @@ def _from_elsewhere(problem: Problem, found: Iterate, members: tuple[str, ...]) 
 
 def _almost_flat(problem: Problem, near: Iterate, factor: np.ndarray) -> Objective:
     """Return the objective with the priors widened by factors (names,)."""
-    wide = copy(problem)
-    wide.joint_prior = _widened(problem, factor)
+    wide = Problem(**written_out(problem) | {"priors": _widened(problem, factor)})
+    wide = wide.with_input_errors(problem.input_errors)
     density = LogPosterior(wide, near.here.simulator, coordinates=RIDGE)
     return Objective(density, bias_correction(wide, near))
 
 
-def _widened(problem: Problem, factor: np.ndarray) -> JointPrior:
+def _widened(problem: Problem, factor: np.ndarray) -> dict[Any, Any]:
     """Return normal priors, of the logarithm if positive, that are wider by factors (names,); the same where it is 1.
 
     The supports of other parameters than positive ones do not change. A joint prior is widened as a whole.
@@ -169,7 +169,7 @@ def _widened(problem: Problem, factor: np.ndarray) -> JointPrior:
             blocks[key] = LogNormal(float(prior.median()[i]), float(wider * prior.log_widths[i]))
         elif wider > 1.0:
             blocks[key] = TruncatedNormal(float(prior.median()[i]), float(wider * prior.widths[i]), *block.support)
-    return JointPrior(prior.names, blocks)
+    return blocks
 
 
 def _tested(problem: Problem, estimate: Iterate) -> PriorConflict:
@@ -179,7 +179,7 @@ def _tested(problem: Problem, estimate: Iterate) -> PriorConflict:
     width = np.where(logs, prior.log_widths, prior.widths)
     offset = np.where(logs, np.log(estimate.theta / np.where(logs, centre, 1.0)), estimate.theta - centre)
     units = width[:, None] * prior.correlation_root
-    changes = units.T @ (slopes[:, None] * np.concatenate(_white(problem, estimate.here.changes, estimate), axis=1))
+    changes = units.T @ (slopes[:, None] * np.concatenate(_white(problem, estimate.here.jacobian, estimate), axis=1))
     residuals = np.concatenate(_white(problem, estimate.here.residuals, estimate))
     if not np.isfinite(changes).all():
         changes = np.zeros_like(changes)

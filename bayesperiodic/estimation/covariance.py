@@ -61,7 +61,7 @@ def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarra
     """
     likelihood, prior = problem.likelihood, problem.joint_prior.curvature(estimate.theta)
     changes, residuals = (
-        likelihood.whitened(vectors, estimate.noise) for vectors in (estimate.here.changes, estimate.here.residuals)
+        likelihood.whitened(vectors, estimate.noise) for vectors in (estimate.here.jacobian, estimate.here.residuals)
     )
     information = prior + sum(s @ s.T for s in changes)
     if not np.isfinite(information).all():
@@ -296,7 +296,7 @@ def _with_errors(problem: Problem, estimate: Iterate, covariance: np.ndarray) ->
     """Return the least squares whose solution, with the errors of the inputs eliminated, is the estimate."""
     likelihood, scale = problem.likelihood, np.sqrt(np.diag(covariance))
     count, first = sum(one.parts[0].shape[1] for one in likelihood.shared), scale.size
-    changes = [np.pad(s * scale[:, None], ((0, count), (0, 0))) for s in estimate.here.changes]
+    changes = [np.pad(s * scale[:, None], ((0, count), (0, 0))) for s in estimate.here.jacobian]
     prior = problem.joint_prior.curvature(estimate.theta)
     if not count:
         hessian = scaled(information(problem, estimate)[0] + prior, scale)
@@ -385,7 +385,7 @@ def doubling_shift(
 
 def _shift(problem: Problem, estimate: Iterate, moved: list[np.ndarray], covariance: np.ndarray) -> np.ndarray:
     """Return the Gauss-Newton step of θ, in sds (names,), for changes of the residuals, one array (size,) a block."""
-    changes = problem.likelihood.whitened(estimate.here.changes, estimate.noise)
+    changes = problem.likelihood.whitened(estimate.here.jacobian, estimate.noise)
     white = problem.likelihood.whitened(moved, estimate.noise)
     right = np.sum([s @ r for s, r in zip(changes, white, strict=True)], axis=0)
     with np.errstate(invalid="ignore"):

@@ -101,7 +101,7 @@ class Objective:
 
 def information(problem: Description, iterate: Iterate) -> tuple[np.ndarray, np.ndarray]:
     """Return the data's part of H of eq. (8), (names, names), and of its gradient, (names,)."""
-    changes = np.concatenate(problem.likelihood.whitened(iterate.here.changes, iterate.noise), axis=1)
+    changes = np.concatenate(problem.likelihood.whitened(iterate.here.jacobian, iterate.noise), axis=1)
     residuals = np.concatenate(problem.likelihood.whitened(iterate.here.residuals, iterate.noise))
     return changes @ changes.T, changes @ residuals
 
@@ -116,7 +116,7 @@ def inverse_hessian(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def changes_by_variance(problem: Description, iterate: Iterate) -> dict[str, np.ndarray]:
     """Return the whitened Jacobian (names, components) of the values behind each unknown variance, by its name."""
-    changes = problem.likelihood.whitened(iterate.here.changes, iterate.noise)
+    changes = problem.likelihood.whitened(iterate.here.jacobian, iterate.noise)
     return {
         group[0]: np.concatenate([changes[b] for b in members], axis=1)
         for group, members in problem.likelihood.groups()

@@ -39,7 +39,7 @@ NARROWEST = 1e-12
 
 
 class Description:
-    """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction."""
+    """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction and immutable."""
 
     def __init__(
         self,
@@ -60,15 +60,17 @@ class Description:
             raise ValueError(f"priors: must be a mapping of names to priors, got {priors!r}.")
         self.noise, self.experiments = as_noise(noise), _checked_experiments(model, experiments)
         local = local if isinstance(local, str) else tuple(local)
-        self._given: dict[str, Any] = {
-            "model": model, "priors": dict(priors), "fixed": dict(fixed or {}), "tied": tied, "local": local,
-            "noise": noise, "scheme": scheme, "input_noise": input_noise,
-        }  # fmt: skip
         self.input_noise = checked(input_noise, model.inputs, self.experiments)
+        self._settings: dict[str, Any] = {
+            "model": model, "experiments": self.experiments, "priors": dict(priors), "fixed": dict(fixed or {}),
+            "tied": dict(tied or {}), "local": local, "noise": noise, "scheme": scheme,
+            "input_noise": input_noise if isinstance(input_noise, str) else self.input_noise,
+        }  # fmt: skip
         if self.input_noise == JOINT:
             model, errors, none = with_errors_as_parameters(model, self.experiments)
             priors, fixed = {**priors, **errors}, {**(fixed or {}), **none}
-            local = (*local,) + tuple(name for name in model.parameters if name not in self._given["model"].parameters)
+            plain = self._settings["model"].parameters
+            local = (*local,) + tuple(name for name in model.parameters if name not in plain)
         self.model, self.scheme = model, scheme or default_scheme(model)
         find_scheme(self.scheme)
         if not self.noise.flat and any(e.mask is not None for e in self.experiments):
@@ -78,7 +80,6 @@ class Description:
                     f"{_checks.shortened(input_noise)}; take noise='independent' or 'measured', or whole periods."
                 )
             self.input_noise = EXACT if self.input_noise == MEASURED else self.input_noise
-        self.input_errors: dict[str, InputErrors] = {}
         measured = {channel for experiment in self.experiments for channel in experiment.outputs}
         self.channels = tuple(channel for channel in model.outputs if channel in measured)
         runs = [e.name for e in self.experiments]
@@ -97,11 +98,22 @@ class Description:
             for run in runs
         }
         self.ties = self._ties()
-        self.observations = {
-            e.name: Observation(e, model, self.parameter_maps[e.name].delayed) for e in self.experiments
-        }
-        self.likelihood = self._likelihood(fixed)
+        self.input_errors: dict[str, InputErrors] = {}
+        self._noise_values = self._checked_noise_values(fixed)
         self._check_counts()
+        self._complete = True
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if "_complete" in vars(self):
+            changed = f"replace({name}=…)" if name in self._settings else "replace(…)"
+            raise AttributeError(
+                f"{name}: must not be assigned or deleted, because a problem is immutable; problem.{changed} returns "
+                f"another one. The arguments of replace are {', '.join(self._settings)}."
+            )
+        super().__setattr__(name, value)
+
+    def __delattr__(self, name: str) -> None:
+        self.__setattr__(name, None)
 
     def _free_phases(self, priors: Any, fixed: Mapping[str, Any], tied: Mapping[str, Any]) -> dict[str, Uniform]:
         """Return the priors of the delays that an autonomous model needs and that were not given."""
@@ -113,7 +125,27 @@ class Description:
             if f"{SHIFT}[{e.name}]" not in priors
         }
 
-    def _likelihood(self, fixed: Mapping[str, Any]) -> Likelihood:
+    @cached_property
+    def observations(self) -> dict[str, Observation]:
+        """Comparison of outputs with the data of every experiment, less what the errors of the inputs caused."""
+        result = {}
+        for e in self.experiments:
+            delayed, errors = self.parameter_maps[e.name].delayed, self.input_errors.get(e.name)
+            result[e.name] = Observation(e, self.model, delayed)
+            if errors is not None:
+                caused = errors.parts([block.size for block in result[e.name].blocks])
+                result[e.name] = Observation(e, self.model, delayed, caused)
+        return result
+
+    @cached_property
+    def likelihood(self) -> Likelihood:
+        """Likelihood of the residuals, the errors of the inputs integrated out."""
+        blocks = [block for observation in self.observations.values() for block in observation.blocks]
+        loadings = {name: errors.loadings for name, errors in self.input_errors.items()}
+        return Likelihood(self.noise, blocks, self._noise_values, loadings)
+
+    def _checked_noise_values(self, fixed: Mapping[str, Any]) -> dict[str, float]:
+        """Return the known noise parameters."""
         blocks = [block for observation in self.observations.values() for block in observation.blocks]
         known = {name: value for name, value in fixed.items() if name not in self.fixed}
         names = tuple(dict.fromkeys(n for block in blocks for n in self.noise.parameter_names(block)))
@@ -126,7 +158,7 @@ class Description:
         for name, value in known.items():
             _checks.one_of("fixed", name, (*self.model.parameters, SHIFT, *names))
             _checks.positive(f"fixed[{name!r}]", value)
-        return Likelihood(self.noise, blocks, known)
+        return known
 
     def _check_free(self, fixed: Mapping[str, Any]) -> None:
         known = {*fixed, *(local_name(name, run) for name, by_run in self.fixed.items() for run in by_run)}
@@ -180,6 +212,42 @@ class Description:
         """Σn, the independent values behind all unknown and known variances."""
         return sum(self.likelihood.counts.values())
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The arguments of the constructor by name."""
+        return dict(self._settings)
+
+    def replace(self, **changes: Any) -> Self:
+        """Return the problem with other arguments of the constructor.
+
+        They are validated as the constructor does. Periodic solves start at the medians of the priors again, and the
+        errors of inputs are those of no estimate.
+
+        Parameters
+        ----------
+        **changes
+            Arguments of the constructor: model, experiments, priors, fixed, tied, local, noise, scheme, input_noise.
+            For experiments without those that have local parameters see `with_experiments`.
+
+        Returns
+        -------
+        Problem
+
+        Raises
+        ------
+        ValueError
+            For another argument, and as the constructor does.
+
+        Examples
+        --------
+        >>> coarse = problem.replace(priors={**problem.priors, "k": bp.LogNormal(2.0, 1.0)}, noise="measured")
+        >>> coarse.priors["k"], coarse.noise.name, problem.noise.name
+        (LogNormal(median=2.0, spread=1.0), 'measured', 'independent')
+        """
+        for name in changes:
+            _checks.one_of("replace", name, self._settings)
+        return type(self)(**self._settings | changes)
+
     def with_experiments(self, experiments: Iterable[Experiment]) -> Self:
         """Return the same problem with other data, or with some of its experiments.
 
@@ -203,12 +271,12 @@ class Description:
         ends = tuple(local_name("", name) for name in gone)
         priors, fixed = (
             {key: value for key, value in given.items() if not (isinstance(key, str) and key.endswith(ends))}
-            for given in (self._given["priors"], self._given["fixed"])
+            for given in (self._settings["priors"], self._settings["fixed"])
         )
         for name, value in fixed.items():
             if isinstance(value, Mapping):
                 fixed[name] = {run: number for run, number in value.items() if run not in gone}
-        return type(self)(experiments=chosen, **self._given | {"priors": priors, "fixed": fixed})
+        return self.replace(experiments=chosen, priors=priors, fixed=fixed)
 
     @property
     def tied(self) -> dict[str, str]:
@@ -301,8 +369,8 @@ class Description:
     @property
     def noisy_inputs(self) -> dict[str, list[str]]:
         """Inputs whose errors are integrated out, by experiment; without experiments that have none."""
-        found = {e.name: noisy_inputs(e, self.input_noise) for e in self.experiments}
-        return {name: inputs for name, inputs in found.items() if inputs}
+        every = {e.name: noisy_inputs(e, self.input_noise) for e in self.experiments}
+        return {name: inputs for name, inputs in every.items() if inputs}
 
     def true_inputs(self, experiment: Experiment) -> dict[str, np.ndarray]:
         """Return the inputs of the model in an experiment: the measured ones less their expected errors.
@@ -335,7 +403,7 @@ class Description:
         }
 
     def __getstate__(self) -> dict[str, Any]:
-        # Compiled functions cannot be pickled; they are loaded again where they are needed. Copies have other anchors.
+        # Compiled functions cannot be pickled; they are loaded again where they are needed.
         return {key: value for key, value in self.__dict__.items() if key not in ("equations", "_last")}
 
     def parameters(self, theta: np.ndarray, experiment: str) -> np.ndarray:
@@ -370,12 +438,23 @@ class Description:
         return dict(zip(self.names, draws.T.copy(), strict=True))
 
     def __repr__(self) -> str:
-        noisy = ", ".join(dict.fromkeys(name for own in self.noisy_inputs.values() for name in own))
+        noisy = ", ".join(dict.fromkeys(name for inputs in self.noisy_inputs.values() for name in inputs))
         return (
             f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
             f"channels: {', '.join(self.channels)} with {self.counted:.0f} independent values, {self.noise.name} noise"
             f"{f', noise of {noisy} integrated out' if noisy else ''})"
         )
+
+
+def written_out(problem: Description) -> dict[str, Any]:
+    """Return arguments of the constructor with every prior and value by its full name.
+
+    Errors of inputs that are parameters belong to the model.
+    """
+    return problem.settings | {
+        "model": problem.model, "priors": problem.priors, "fixed": problem.fixed | problem.likelihood.fixed,
+        "local": problem.local, "input_noise": EXACT if problem.input_noise == JOINT else problem.input_noise,
+    }  # fmt: skip
 
 
 # What makes or computes each kind of result again.

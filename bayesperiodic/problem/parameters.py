@@ -192,27 +192,27 @@ def pack(
     """
     shape = next(iter(columns.values())).shape
     packed = {}
-    for variable, own in dims.items():
-        places = list(product(*(coords[dim] for dim in own)))
+    for variable, further in dims.items():
+        places = list(product(*(coords[dim] for dim in further)))
         values = np.full((*shape, len(places)), np.nan)
         for i, place in enumerate(places):
             values[..., i] = columns.get(full_name(variable, place), np.nan)
-        sizes = [len(coords[dim]) for dim in own]
-        packed[variable] = (CHAIN, DRAW, *own), values.reshape(*shape, *sizes)
+        sizes = [len(coords[dim]) for dim in further]
+        packed[variable] = (CHAIN, DRAW, *further), values.reshape(*shape, *sizes)
     return packed
 
 
 def places(group: xr.Dataset) -> dict[str, tuple[str, dict[str, str]]]:
     """Return where everything is that the draws hold, by full name: the variable, and its place by dim."""
-    found = {}
+    result = {}
     for key, values in group.data_vars.items():
         first, variable = values.isel({CHAIN: 0, DRAW: 0}), str(key)
         dims = [dim for dim in (CHANNEL, EXPERIMENT) if dim in first.dims]
         for place in product(*(group[dim].values.tolist() for dim in dims)):
             at = dict(zip(dims, place, strict=True))
             if not np.isnan(float(first.sel(at))):
-                found[full_name(variable, place)] = (variable, at)
-    return found
+                result[full_name(variable, place)] = (variable, at)
+    return result
 
 
 def column(group: xr.Dataset, name: str) -> np.ndarray:

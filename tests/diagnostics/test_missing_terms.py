@@ -100,7 +100,7 @@ def test_what_a_term_explains_is_what_is_left_without_it(damped):
     here, whitened = optimum.here, problem.likelihood.whitened
     r, j, c = (
         np.concatenate(whitened(part, optimum.noise), axis=-1)
-        for part in (here.residuals, here.changes, _effects(problem, theta, fit.solutions, terms[:1]))
+        for part in (here.residuals, here.jacobian, _effects(problem, theta, fit.solutions, terms[:1]))
     )
     count = [min(b.size, round(b.count)) for b in problem.likelihood.blocks]
     starts = np.cumsum([0, *(b.size for b in problem.likelihood.blocks)])

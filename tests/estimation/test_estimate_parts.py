@@ -265,7 +265,7 @@ def test_nothing_is_tested_or_approximated_where_derivatives_or_the_density_do_n
     priors = {"k": bp.LogNormal(800.0, 0.1), "c": bp.Uniform(0.0, 90.0), "coulomb": bp.Normal(20.0, 10.0)}
     problem = bp.Problem(LINEAR, [data], priors=priors)
     size = problem.likelihood.blocks[0].size
-    here = SimpleNamespace(changes=[np.full((3, size), np.nan)], residuals=[np.ones(size)])
+    here = SimpleNamespace(jacobian=[np.full((3, size), np.nan)], residuals=[np.ones(size)])
     estimate = SimpleNamespace(theta=np.array([880.0, 41.0, 22.0]), here=here, noise=np.array([9.0]))
     tested = conflict._tested(problem, estimate)
     assert np.isnan([tested.joint, tested.p]).all() and tested.members == ()

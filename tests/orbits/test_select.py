@@ -21,7 +21,7 @@ def test_the_information_is_the_inverse_covariance_of_the_estimate(polished):
     orbit, names = polished[2], ["l", "k3"]
     problem = section_problem([orbit.experiment(samples=400)], *names)
     at = problem.density().linearise(np.array([PENDULUM[name] for name in names]))
-    changes = np.concatenate(problem.likelihood.whitened(at.changes, np.ones(1)), axis=1)
+    changes = np.concatenate(problem.likelihood.whitened(at.jacobian, np.ones(1)), axis=1)
     expected = changes @ changes.T * np.outer([0.3, 4.5e-4], [0.3, 4.5e-4])
     assert orbit_information(orbit, names) == pytest.approx(expected, rel=1e-5)
 
