@@ -1,8 +1,8 @@
 """Laplace approximation over all sampling coordinates, from the exact Hessian; directions without information."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,8 +16,9 @@ STEP = 1e-3
 NOISE_STEP = 1e-4
 
 
-class JointLaplace(NamedTuple):
-    """Mode of a density in sampling coordinates, see `MapEstimate.joint_mode`, and its log-density."""
+@dataclass(frozen=True)
+class JointLaplace:
+    """Mode of a density in sampling coordinates, see `MapEstimate.joint_mode`, its covariance and its log-density."""
 
     mode: dict[str, float]
     covariance: pd.DataFrame
