@@ -23,9 +23,11 @@ from .diagnostics.predictive import Prediction as Prediction
 from .diagnostics.predictive import PriorPredictive as PriorPredictive
 from .diagnostics.predictive import predict as predict
 from .diagnostics.predictive import prior_predictive as prior_predictive
+from .estimation.check import check as check
 from .estimation.map_estimate import map_estimate as map_estimate
 from .estimation.profile import Profile as Profile
 from .estimation.profile import profile as profile
+from .estimation.result import FitCheck as FitCheck
 from .estimation.result import MapEstimate as MapEstimate
 from .likelihood import noise as noise
 from .models import elements as elements

@@ -114,7 +114,9 @@ def test_corner_takes_the_noise_from_the_joint_laplace_approximation(solved):
     _, fit, posterior = solved
     name = "variance[force]"
     joint = fit.joint_covariance * 9.0
-    axes = bp.plot.corner(posterior, laplace=replace(fit, joint_covariance=joint), names=[name, "k"]).axes
+    axes = bp.plot.corner(
+        posterior, laplace=replace(fit, joint=replace(fit.joint, covariance=joint)), names=[name, "k"]
+    ).axes
     values = axes[2].lines[-1].get_xydata()
     top = fit.joint_mode[name] * (1.0 + 3.0 * np.sqrt(fit.joint_covariance.loc[name, name] * -2.0 * np.log(0.1)))
     assert values[:, 0].max() == pytest.approx(top, rel=1e-3)
@@ -125,7 +127,7 @@ def test_corner_draws_given_names_and_no_ellipse_without_an_approximation(solved
     _, fit, posterior = solved
     figure = bp.plot.corner(posterior, laplace=fit, names=("coulomb", "k"))
     assert labels(figure) == {"k\n[N/m]", "coulomb\n[N]"}
-    without = replace(fit, joint_mode={}, joint_covariance=fit.joint_covariance * np.nan)
+    without = replace(fit, joint=replace(fit.joint, mode={}, covariance=fit.joint_covariance * np.nan))
     axes = np.array(bp.plot.corner(posterior, laplace=without).axes).reshape(4, 4)
     assert len(axes[1, 0].lines) == 2 and not axes[3, 0].lines
     assert len(bp.plot.corner(posterior, names=["k"]).axes[0].lines) == 1

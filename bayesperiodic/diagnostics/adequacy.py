@@ -15,7 +15,8 @@ from bayesperiodic._verdicts import BAD, GOOD, NEUTRAL, with_tone
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.log_posterior import Linearisation
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.estimation.result import MapEstimate, of_periodogram
+from bayesperiodic.estimation.check import of_periodogram
+from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.noise import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
 
 ABSORBED = 1e-3

@@ -430,7 +430,7 @@ def _ranks(
     """Return the ranks of the truth in the Laplace approximation and among the draws."""
     problem = campaign.problem.with_experiments(experiments)
     try:
-        fit = map_estimate(problem, progress=False)
+        fit = map_estimate(problem, checks=False, progress=False)
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
         return {"status": "no estimate", "error": str(error)}
     result: dict[str, Any] = {"map": fit.status, "stop_rule": False}

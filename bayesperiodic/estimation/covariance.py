@@ -12,7 +12,7 @@ from bayesperiodic._linalg import TINY, covariance_eigh, hessian_scale, scaled
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import orbit_multipliers
-from bayesperiodic.estimation.gauss_newton import Iterate, changes_by_variance, information
+from bayesperiodic.estimation.gauss_newton import Iterate, changes_by_variance, information, inverse_hessian
 from bayesperiodic.likelihood.input_noise import (
     InputErrors,
     InputNoise,
@@ -198,6 +198,24 @@ def variance_parts(
             once, freedom = moved @ moved.T, max(left + _worth(problem, estimate, name), 1.0)
             parts[name] = VariancePart(once, (once @ own) @ moved.T, max(left, 1.0), freedom)
     return parts
+
+
+class Uncertainty(NamedTuple):
+    """Information of the data on θ, inverse of H of eq. (8), and the covariance with uncertain noise parameters."""
+
+    information: np.ndarray  # (names, names)
+    inverse: np.ndarray  # (names, names)
+    lost: np.ndarray  # (names,) parameters of directions without curvature
+    parts: dict[str, VariancePart]
+    covariance: np.ndarray  # (names, names)
+
+
+def uncertainty(problem: Problem, estimate: Iterate, log_variance_factor: float | np.ndarray) -> Uncertainty:
+    """Return the uncertainty at an estimate; the factor is what `bias_correction` returns."""
+    data, _ = information(problem, estimate)
+    inverse, lost = inverse_hessian(data + problem.joint_prior.curvature(estimate.theta))
+    parts = variance_parts(problem, estimate, inverse, log_variance_factor)
+    return Uncertainty(data, inverse, lost, parts, with_uncertain_noise(problem, estimate, inverse, parts))
 
 
 def degrees_of_freedom(inverse: np.ndarray, parts: Mapping[str, VariancePart]) -> np.ndarray:

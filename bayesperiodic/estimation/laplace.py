@@ -1,12 +1,13 @@
 """Laplace approximation over all sampling coordinates, from the exact Hessian; directions without information."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from bayesperiodic._io import Storable
 from bayesperiodic._linalg import covariance_eigh, hessian_eigh, hessian_scale, scaled
 from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.estimation.gauss_newton import SINGULAR, Iterate, Objective, climb
@@ -16,8 +17,9 @@ STEP = 1e-3
 NOISE_STEP = 1e-4
 
 
-class JointLaplace(NamedTuple):
-    """Mode of a density in sampling coordinates, see `MapEstimate.joint_mode`, and its log-density."""
+@dataclass(frozen=True)
+class JointLaplace(Storable):
+    """Mode of a density in sampling coordinates, see `MapEstimate.joint_mode`, its covariance and its log-density."""
 
     mode: dict[str, float]
     covariance: pd.DataFrame

@@ -2,8 +2,8 @@
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache, partial
-from typing import Any
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -15,17 +15,12 @@ from bayesperiodic.density.initial_orbits import InitialEstimate, measured_orbit
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE, Linearisation, LogPosterior
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import Simulator
-from bayesperiodic.estimation.conflict import prior_conflict
+from bayesperiodic.estimation.check import MOST_UNEXPLAINED, check_warnings, checked
 from bayesperiodic.estimation.covariance import (
-    caused_by_inputs,
     degrees_of_freedom,
-    doubling_shift,
     estimated_inputs,
     input_loadings,
-    input_nonlinearity,
-    robust_covariance,
-    variance_parts,
-    with_uncertain_noise,
+    uncertainty,
 )
 from bayesperiodic.estimation.gauss_newton import (
     MAX_ITERATIONS,
@@ -35,31 +30,23 @@ from bayesperiodic.estimation.gauss_newton import (
     at_ends,
     climb,
     corrected,
-    information,
-    inverse_hessian,
     preference,
     resumed,
 )
-from bayesperiodic.estimation.laplace import COMBINED, SILENT, joint_laplace, undetermined
+from bayesperiodic.estimation.laplace import joint_laplace
 from bayesperiodic.estimation.modes import default_starts, notable, weighed, with_images
-from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, noise_split
+from bayesperiodic.estimation.result import MapEstimate, NoiseEstimate, Search, TrueInputs
 from bayesperiodic.estimation.units import compared_with_data, unit_error
-from bayesperiodic.likelihood.input_noise import EXACT, FEWEST_CYCLES, ROUGH
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.problem.description import fingerprint
 
-NOISE_SHARE = 0.1
-LARGEST_SHIFT, LARGEST_NONLINEARITY = 0.1, 0.3
-SHOWN = 3
+MOST_SHOWN_MODES = 3
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
-MOST_UNEXPLAINED = 0.5
 # Most linearisations of errors of the inputs, the steps between two, and the change [sds] that ends them.
 MOST_ROUNDS, BETWEEN, SETTLED = 40, 5, 1e-5
 # Seconds after which the progress bar is shown.
 SHOWN_AFTER = 2.0
-# Value of a field of MapEstimate that is computed at its first use.
-deferred: Any = partial
 
 
 @in_one_thread
@@ -69,6 +56,7 @@ def map_estimate(
     start: Mapping[str, float] | None = None,
     starts: int | None = None,
     seed: int = 0,
+    checks: bool = True,
     progress: bool = True,
 ) -> MapEstimate:
     r"""Find the MAP point by staged Gauss-Newton, and the Laplace covariance there.
@@ -110,6 +98,9 @@ def map_estimate(
         together: eight for 2000 (states × points × experiments) or fewer, one for more than 8000.
     seed : int
         Of these draws.
+    checks : bool
+        Make the checks of `check`, which take about as long as the iteration from a good start; without them
+        `MapEstimate.checks` is None, for repeated fits.
     progress : bool
         Show the iterations, with the objective and the step in standard deviations.
 
@@ -125,12 +116,9 @@ def map_estimate(
     Warns
     -----
     UserWarning
-        If the noise of the measured inputs causes more than a tenth of an output's residual, if twice as many points
-        would move an estimate by more than a tenth of its standard deviation, if an estimate lies at the end of its
-        prior's support, if the prior and the data are in conflict, if another optimum has more than 1 % of the
-        posterior mass by its Laplace approximation, if more than half of a channel's variance is unexplained, if the
-        data do not determine a parameter or a combination of parameters, and if the orbit of an experiment is not the
-        measured one.
+        If an estimate lies at the end of its prior's support, if another optimum has more than 1 % of the posterior
+        mass by its Laplace approximation, if data contain no noise, if the orbit of an experiment is not the measured
+        one, and as `check` does.
 
     References
     ----------
@@ -150,6 +138,7 @@ def map_estimate(
     if starts is None:
         starts = default_starts(problem) if start is None else 1
     _checks.integer("starts", starts, 1)
+    _checks.instance("checks", checks, bool)
     first = _first_iterate(problem, theta)
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
@@ -167,7 +156,7 @@ def map_estimate(
     objective, found = corrected(objective, best)
     ends = [found if end is best else end and resumed(objective, end) for end in ends]
     modes = with_images(objective, [end for end in ends if end], partial(_climb, objective, progress=progress))
-    result = _describe(problem, objective, modes, tuple(_outcome(problem, end) for end in ends))
+    result = _describe(problem, objective, modes, tuple(_outcome(problem, end) for end in ends), checks)
     for text in estimation_warnings(problem, result):
         warnings.warn(text, UserWarning, stacklevel=3)
     return result
@@ -316,115 +305,73 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
 def _outcome(problem: Problem, end: End | None) -> dict[str, float]:
     if end is None:
         return {"objective": -np.inf} | dict.fromkeys(problem.names, np.nan)
-    return {"objective": end.iterate.objective} | dict(zip(problem.names, end.iterate.theta.tolist(), strict=True))
+    return {"objective": end.iterate.objective} | _by_name(problem, end.iterate.theta)
 
 
 def _describe(
-    problem: Problem, objective: Objective, modes: Sequence[End], starts: tuple[dict[str, float], ...]
+    problem: Problem, objective: Objective, modes: Sequence[End], starts: tuple[dict[str, float], ...], checks: bool
 ) -> MapEstimate:
     best, status, history = modes[0]
-    names, likelihood = problem.names, problem.likelihood
-    data, _ = information(problem, best)
-    solutions = best.here.simulator.solutions(best.theta)
-    acting = np.diag(data) * problem.joint_prior.widths**2 > INFORMED
-    conflict, _ = prior_conflict(problem, best)
-    inverse, lost = inverse_hessian(data + problem.joint_prior.curvature(best.theta))
-    parts = variance_parts(problem, best, inverse, objective.log_variance_factor)
-    covariance = with_uncertain_noise(problem, best, inverse, parts).copy()
-    shift = doubling_shift(problem, best, solutions, covariance)
-    shift[lost] = np.nan
-    curved = input_nonlinearity(problem, best, solutions, covariance)
+    names, noise_names = problem.names, problem.likelihood.counts
+    factor = objective.log_variance_factor
+    uncertain = uncertainty(problem, best, factor)
+    covariance, lost = uncertain.covariance.copy(), uncertain.lost
     covariance[lost], covariance[:, lost] = np.nan, np.nan
     covariance[lost, lost] = np.inf
-    found, residuals = estimated_inputs(problem, best), best.here.compared()
-    loadings = problem.likelihood.loadings or input_loadings(problem, best.theta, solutions, ROUGH)
+    acting = np.diag(uncertain.information) * problem.joint_prior.widths**2 > INFORMED
     sampled = objective.density.with_settings(coordinates=RIDGE)
-    joint = cache(partial(in_one_thread(joint_laplace), sampled, best))
-    others = [joint_laplace(sampled, end.iterate) for end in modes[1:]]
-    noise = dict(zip(problem.noise_names, best.noise.tolist(), strict=True))
-    rms = {c: _pooled(problem, c, residuals) for c in problem.channels}
-    return MapEstimate(
+    joints = [joint_laplace(sampled, end.iterate) for end in modes]
+    residuals = best.here.compared()
+    fit = MapEstimate(
         status=STATUSES[OTHER_ORBIT] if best.here.other_orbits else status,
-        theta=dict(zip(names, best.theta.tolist(), strict=True)),
-        sd=_sd(problem, covariance),
-        robust_sd=deferred(_robust_sd, problem, best, inverse, lost),
-        variances={_short(name): noise[name] for name in likelihood.counts},
-        noise=noise,
-        noise_prior=problem.noise.prior_text,
+        theta=_by_name(problem, best.theta),
         covariance=pd.DataFrame(covariance, index=list(names), columns=list(names)),
-        joint_mode=deferred(lambda: joint().mode),
-        joint_covariance=deferred(lambda: joint().covariance),
-        degrees_of_freedom=dict(zip(names, degrees_of_freedom(inverse, parts).tolist(), strict=True)),
-        independent={_short(name): count for name, count in likelihood.counts.items()},
-        solutions=solutions,
+        degrees_of_freedom=_by_name(problem, degrees_of_freedom(uncertain.inverse, uncertain.parts)),
+        joint=joints[0],
+        noise_estimate=NoiseEstimate(
+            dict(zip(problem.noise_names, best.noise.tolist(), strict=True)),
+            problem.noise.prior_text,
+            {_short(name): count for name, count in noise_names.items()},
+        ),
+        solutions=best.here.simulator.solutions(best.theta),
         residuals=residuals,
-        rms=rms,
+        rms={c: _pooled(problem, c, residuals) for c in problem.channels},
         fvu=_fractions_left(problem, residuals),
-        whiteness=channel_whiteness(problem, best),
-        noise_split=noise_split(problem, found.residuals, objective.log_variance_factor),
-        input_noise=caused_by_inputs(problem, loadings),
-        inputs={e.name: problem.true_inputs(e) for e in problem.experiments},
-        input_sd=found.sd,
-        input_errors=problem.input_errors,
-        input_nonlinearity=dict(zip(names, curved.tolist(), strict=True)),
-        doubling_shift=dict(zip(names, shift.tolist(), strict=True)),
-        other_orbits=best.here.other_orbits,
-        at_ends=tuple(np.array(names)[acting & (at_ends(objective, best) != 0.0)].tolist()),
-        prior_conflict=conflict,
-        undetermined=undetermined(data, best.theta, names, problem.logarithmic, partial(_data_change, problem, best)),
-        history=history,
-        starts=starts,
-        other_modes=weighed(problem, modes, [joint(), *others]) if others else (),
-        fingerprint=fingerprint(problem),
+        true_inputs=TrueInputs(
+            {e.name: problem.true_inputs(e) for e in problem.experiments},
+            estimated_inputs(problem, best).sd,
+            problem.input_errors,
+        ),
+        search=Search(
+            history,
+            starts,
+            tuple(np.array(names)[acting & (at_ends(objective, best) != 0.0)].tolist()),
+            best.here.other_orbits,
+            weighed(problem, modes, joints) if len(modes) > 1 else (),
+        ),
         tied=_tied_slopes(problem, best.theta),
+        fingerprint=fingerprint(problem),
     )
+    return replace(fit, checks=checked(problem, best, uncertain, factor, fit.solutions)) if checks else fit
 
 
-def _data_change(problem: Problem, estimate: Iterate, theta: np.ndarray) -> float:
-    """Return the norm of the residuals' change at another θ, in units of the noise; infinite without a solution."""
-    there = estimate.here.moved(theta)
-    if problem.model.autonomous:
-        there = there.anchored()
-    if not there.converged:
-        return np.inf
-    change = [there - here for there, here in zip(there.residuals, estimate.here.residuals, strict=True)]
-    return float(np.linalg.norm(np.concatenate(problem.likelihood.whitened(change, estimate.noise))))
-
-
-def _sd(problem: Problem, covariance: np.ndarray) -> dict[str, float]:
-    with np.errstate(invalid="ignore"):
-        return dict(zip(problem.names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-
-
-@in_one_thread
-def _robust_sd(problem: Problem, estimate: Iterate, inverse: np.ndarray, lost: np.ndarray) -> dict[str, float]:
-    robust = robust_covariance(problem, estimate, inverse)
-    robust[lost, lost] = np.inf
-    return _sd(problem, robust)
+def _by_name(problem: Problem, values: np.ndarray) -> dict[str, float]:
+    return dict(zip(problem.names, values.tolist(), strict=True))
 
 
 def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
-    """Yield the warnings about an estimate."""
+    """Yield the warnings about an estimate, and those about its checks if there are any."""
     for name, reason in fit.other_orbits.items():
         yield (
             f"Experiment {name!r} was fitted by another orbit than the recorded one: {reason}. The estimate is not "
             "valid. Give the experiment a guess of its states (Experiment.guess), start={…} nearer to the truth, or "
             "another model."
         )
-    yield from _input_noise(problem, fit)
     for channel in fit.without_noise:
         yield (
             f"The data of {channel!r} contain no noise: the residual's rms of {fit.rms[channel]:.2g} is a rounding "
             "error, and standard deviations that follow from it mean nothing. Add noise to simulated data, or give its "
             f"variance, fixed={{'variance[{channel}]': …}}."
-        )
-    shifts = {name: shift for name, shift in fit.doubling_shift.items() if abs(shift) > LARGEST_SHIFT}
-    shifts = {} if fit.without_noise else shifts
-    if shifts:
-        worst = max(shifts, key=lambda name: abs(shifts[name]))
-        yield (
-            f"Twice as many points would move {worst!r} by {shifts[worst]:.2g} of its standard deviation; take more "
-            f"samples than {max(e.samples for e in problem.experiments)}, or a scheme of higher order."
         )
     for name in fit.at_ends:
         low, high = problem.joint_prior.supports[name]
@@ -432,78 +379,15 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             f"The estimate of {name!r}, {fit.theta[name]:.6g}, lies at the end of its prior's support ({low:g}, "
             f"{high:g}); standard deviations do not describe the posterior there. Sample it, or widen the prior."
         )
-    if fit.prior_conflict.text:
-        yield (
-            f"{fit.prior_conflict.text}. The estimate is a compromise that neither supports; its standard deviation "
-            "does not show it. Check units, prior and data, try map_estimate(starts=8), or widen the prior."
-        )
-    yield from _unexplained(fit)
-    if (not fit.converged or max(fit.fvu.values()) > MOST_UNEXPLAINED) and (text := unit_error(problem)):
-        yield text
     if others := notable(fit.other_modes):
+        shown = "; ".join(map(repr, others[:MOST_SHOWN_MODES]))
         yield (
             f"{len(others) + 1} separate optima fit the data: the estimate, with {fit.modes['mass'].iloc[0]:.0%} of "
-            f"the posterior mass by Laplace, and {'; '.join(map(repr, others[:SHOWN]))}. Standard deviations describe "
-            "the first one only. Sample the posterior, or give priors that exclude the others."
+            f"the posterior mass by Laplace, and {shown}. Standard deviations "
+            "describe the first one only. Sample the posterior, or give priors that exclude the others."
         )
-    silent = [text for text in fit.undetermined if text.endswith(SILENT)]
-    if silent:
-        named = ", ".join(repr(text.removesuffix(f": {SILENT}")) for text in silent)
-        yield f"The data do not depend on {named}; its posterior equals its prior. Fix it."
-    yield from _combined(problem, [text for text in fit.undetermined if text not in silent])
-
-
-def _input_noise(problem: Problem, fit: MapEstimate) -> Iterator[str]:
-    """Yield the warnings about inputs that are taken as exact, and about errors of inputs that are too large."""
-    rates = max(problem.model.input_derivatives().values(), default=0)
-    for channel, noise in fit.input_noise.items() if problem.input_noise == EXACT else ():
-        if noise > NOISE_SHARE * fit.rms[channel]:
-            yield (
-                f"The noise of the measured inputs{', differentiated,' if rates else ''} causes {noise:.3g} in "
-                f"{channel!r}, {noise / fit.rms[channel]:.0%} of the residual's {fit.rms[channel]:.3g}, but the inputs "
-                f"are taken as exact. Fold at least {FEWEST_CYCLES} cycles, and take input_noise='measured', or give "
-                "the noise in input_noise={…}."
-            )
-    if curved := {n: own for n, own in fit.input_nonlinearity.items() if not own < LARGEST_NONLINEARITY}:
-        worst = max(curved, key=lambda name: np.nan_to_num(curved[name], nan=np.inf))
-        yield (
-            "The errors of the inputs are too large to be linearised: what is not linear in them changes "
-            f"{worst!r} by {curved[worst]:.2g} of its standard deviation. Average more cycles, or compare with "
-            "input_noise='joint', in which they are parameters."
-        )
-
-
-def _combined(problem: Problem, found: Sequence[str]) -> Iterator[str]:
-    """Yield the warnings about parameters that the data determine only together with others."""
-    for text in found:
-        if text.startswith(COMBINED):
-            yield (
-                f"The data do not determine {text}: near the estimate, a joint change of these leaves the outputs as "
-                "they are to first order. Fix one of the parameters, or give priors that determine it."
-            )
-    directions = [text for text in found if not text.startswith(COMBINED)]
-    if directions:
-        more = len(directions) - SHOWN
-        scaled = {part.partition(" → ")[0] for text in directions for part in text.split(", ") if "·t" in part}
-        signed = [n for n, log in zip(problem.names, problem.logarithmic, strict=True) if n in scaled and not log]
-        shown = "; or under ".join(directions[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
-        yield (
-            f"The data do not change under {shown}, for any t. In these directions the posterior equals the prior; fix "
-            "one of the parameters, or report the combination that does not change."
-            + f" {', '.join(signed)}: LogNormal priors, if the signs are known, make sampling easier."
-            * bool(signed)
-        )
-
-
-def _unexplained(fit: MapEstimate) -> Iterator[str]:
-    """Yield a warning about channels that the estimate does not explain, unless most of it is measured noise."""
-    for channel, fraction in fit.fvu.items():
-        split = fit.noise_split.get(channel)
-        if fraction > MOST_UNEXPLAINED and not (split is not None and split.measurement > split.model):
-            yield (
-                f"The estimate leaves {fraction:.1%} of the variance of {channel!r} unexplained. If this is not noise, "
-                "try other starts (starts=8) and check the units and the priors."
-            )
+    if fit.checks is not None:
+        yield from check_warnings(problem, fit)
 
 
 def _short(name: str) -> str:

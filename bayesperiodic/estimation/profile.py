@@ -15,13 +15,11 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import hessian_scale, in_one_thread, scaled
 from bayesperiodic._parallel import TaskPool, checked_executor
-from bayesperiodic.density.log_posterior import NATURAL, Linearisation, LogPosterior
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.density.responses import Simulator
-from bayesperiodic.estimation.gauss_newton import PRESSED, Iterate, Objective, bias_correction, climb
-from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.estimation.check import at_estimate
+from bayesperiodic.estimation.gauss_newton import PRESSED, Iterate, Objective, climb
+from bayesperiodic.estimation.result import MapEstimate, written
 from bayesperiodic.priors.single import Prior
-from bayesperiodic.problem.description import check_results
 from bayesperiodic.problem.parameters import SHIFT
 
 # Distance of points, as the change of the root of the drop; growth, shortening and smallest size of steps.
@@ -310,7 +308,7 @@ class Profile(Result):
     def __repr__(self) -> str:
         text = f"Profile, 90 % intervals:\n{self.table.to_string(float_format='{:.5g}'.format)}"
         if self.improvement > BETTER:
-            text += f"\nThe log-density is higher by {self.improvement:.3g} at {_written(self.best)}."
+            text += f"\nThe log-density is higher by {self.improvement:.3g} at {written(self.best)}."
         return text
 
 
@@ -380,7 +378,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     """
     _checks.instance("problem", problem, Problem)
     chosen, executor = _checked_names(problem, names), checked_executor(executor)
-    objective, peak = _at_estimate(problem, fit)
+    objective, peak = at_estimate(problem, fit)
     with TaskPool(executor, (objective, peak)) as pool:
         found = dict(pool.run(_followed, [problem.names.index(name) for name in chosen]))
     top, best, units = peak.objective, peak.theta, problem.model.units | {SHIFT: "s"}
@@ -403,7 +401,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     if result.improvement > BETTER:
         warnings.warn(
             f"The log-density is higher by {result.improvement:.3g} than at the estimate where "
-            f"{_written(result.best)}; start there, map_estimate(problem, start=profile.best), and profile again.",
+            f"{written(result.best)}; start there, map_estimate(problem, start=profile.best), and profile again.",
             UserWarning,
             stacklevel=3,
         )
@@ -420,24 +418,6 @@ def _checked_names(problem: Problem, names: Sequence[str] | None) -> tuple[str, 
     return tuple(dict.fromkeys(names))
 
 
-def _at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate]:
-    """Return the objective and its iterate at the estimate, anchored at the estimate's solutions."""
-    problem = check_results(problem, fit=fit)
-    theta, noise = problem.vector(fit.theta), np.array([fit.noise[name] for name in problem.noise_names])
-    guesses = {name: s.states for name, s in fit.solutions.items()}
-    density = LogPosterior(problem, Simulator.start(problem, theta, guesses), coordinates=NATURAL)
-    here = Linearisation(theta, density.simulator, density.comparisons)
-    factor = bias_correction(problem, Iterate(theta, here, noise, np.nan)) if here.converged else 1.0
-    objective = Objective(density, factor)
-    peak = objective.iterate(here, noise)
-    if peak is None:
-        raise ValueError(
-            f"fit: must have a finite log-posterior, got {_written(fit.theta)}, where it is not. Give an estimate of "
-            "this problem."
-        )
-    return objective, objective.anchored(peak)
-
-
 def _followed(
     start: tuple[Objective, Iterate], column: int
 ) -> tuple[tuple[float, float], np.ndarray, np.ndarray, np.ndarray]:
@@ -448,7 +428,3 @@ def _followed(
     density = [np.nan if iterate is None else iterate.objective for iterate in iterates]
     paths = [missing if iterate is None else iterate.theta for iterate in iterates]
     return ridge.limits(), np.array(values), np.array(density), np.array(paths)
-
-
-def _written(theta: dict[str, float]) -> str:
-    return ", ".join(f"{name} = {value:.6g}" for name, value in theta.items())

@@ -1,11 +1,10 @@
-"""MapEstimate: the MAP point, its Laplace approximations, and tests of the residual."""
+"""Results: the MAP point with its Laplace approximations, and the checks of an estimate."""
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from functools import partial
+from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -14,12 +13,10 @@ from scipy.special import stdtrit
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse_all
 from bayesperiodic._io import Result, Storable
-from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.conflict import PriorConflict
-from bayesperiodic.estimation.gauss_newton import Iterate
+from bayesperiodic.estimation.laplace import JointLaplace
 from bayesperiodic.estimation.modes import Mode, notable
 from bayesperiodic.likelihood.input_noise import InputErrors
-from bayesperiodic.likelihood.noise import POINTS, SPECTRAL
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.priors.joint import MultivariateNormal
 from bayesperiodic.problem.parameters import checked_key, in_experiment, local_hint, local_names
@@ -41,20 +38,6 @@ class Whiteness(Storable):
     lag1: float
 
 
-def of_periodogram(power: np.ndarray) -> Whiteness:
-    """Test whether the squared amplitudes of harmonics 1, 2, … are those of white noise (Bartlett 1955)."""
-    from scipy.stats import kstest
-
-    if power.size < 2 or power.sum() == 0.0:
-        return Whiteness(1.0, 0.0)
-    harmonic = np.arange(1, power.size + 1)
-    cumulative = np.cumsum(power)[:-1] / power.sum()
-    lag = 2.0 * np.pi / (2 * power.size + 1)
-    return Whiteness(
-        float(kstest(cumulative, "uniform").pvalue), float(np.sum(power * np.cos(lag * harmonic)) / power.sum())
-    )
-
-
 @dataclass(frozen=True)
 class NoiseSplit(Storable):
     """Standard deviations of one value of a channel's mean period, in the channel's units.
@@ -68,39 +51,123 @@ class NoiseSplit(Storable):
     total: float
 
 
-def noise_split(
-    problem: Problem, residuals: Sequence[np.ndarray], log_variance_factor: float | np.ndarray
-) -> dict[str, NoiseSplit]:
-    """Return the split of every channel with compared time histories; the factor is 1 − p/n of eq. (7)."""
-    sums = {channel: np.zeros(4) for channel in problem.channels}
-    blocks = problem.likelihood.blocks
-    factors = np.broadcast_to(log_variance_factor, len(blocks))
-    for block, r, one in zip(blocks, residuals, factors, strict=True):
-        if block.kind in (SPECTRAL, POINTS):
-            square = block.weight * float(r @ r)
-            sums[block.channel] += [block.count, block.count * one, square, block.count * block.measured]
-    result = {}
-    for channel, (count, left, square, measured) in sums.items():
-        if count:
-            total, measurement = square / left, measured / count
-            result[channel] = NoiseSplit(*np.sqrt([measurement, max(total - measurement, 0.0), total]).tolist())
-    return result
+@dataclass(frozen=True)
+class FitCheck(Result):
+    """Checks of an estimate, made by `check`.
+
+    Attributes
+    ----------
+    robust_sd : dict of str to float
+        Standard deviations that are valid for residuals that deviate from the noise model (sandwich covariance with the
+        residual's smoothed spectrum); if they differ much from `MapEstimate.sd`, the noise model is wrong.
+    whiteness : dict of str to Whiteness
+        Of the residuals in units of the noise model, by channel; with several experiments p is the smallest, corrected
+        for their number, lag1 the mean.
+    noise_split : dict of str to NoiseSplit
+        Measurement noise and model error of each channel.
+    input_noise : dict of str to float
+        Standard deviation that the noise of the measured inputs causes in each channel.
+    input_nonlinearity : dict of str to float
+        By what each estimate is changed by the part of the outputs that is not linear in the errors of the inputs, in
+        standard deviations: root mean square over errors drawn given the estimate. NaN if a solve fails.
+    doubling_shift : dict of str to float
+        Change of each estimate on twice as many points, in standard deviations; NaN if those solves fail.
+    prior_conflict : PriorConflict
+        Test of the prior against the estimate by the data alone, with its p-values and, if there is one, the conflict
+        in words (``text``).
+    undetermined : tuple of str
+        Changes of parameters, in words, that change no output, confirmed by a change of 10 %, or "a combination of …"
+        where only a small change leaves the outputs as they are; in these directions the posterior equals the prior.
+
+    Examples
+    --------
+    >>> fit.checks.whiteness["displacement"].p > 0.01, fit.checks.undetermined
+    (True, ())
+    """
+
+    robust_sd: dict[str, float]
+    whiteness: dict[str, Whiteness]
+    noise_split: dict[str, NoiseSplit]
+    input_noise: dict[str, float]
+    input_nonlinearity: dict[str, float]
+    doubling_shift: dict[str, float]
+    prior_conflict: PriorConflict
+    undetermined: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        columns = {"robust sd": self.robust_sd, "shift on twice the points": self.doubling_shift}
+        lines = ["FitCheck", pd.DataFrame(columns).map("{:.3g}".format).to_string()]
+        return "\n".join([*lines, "Residuals", pd.DataFrame(self.by_channel()).T.to_string(), *self.remarks()])
+
+    def by_channel(self) -> dict[str, dict[str, str]]:
+        """Return the split of the noise and the test of whiteness of each channel, as printed."""
+        rows = {}
+        for channel, white in self.whiteness.items():
+            split = self.noise_split.get(channel, NoiseSplit(np.nan, np.nan, np.nan))
+            known = np.isfinite(split.measurement)
+            rows[channel] = {
+                "measurement noise": f"{split.measurement:.3g}" if known else "-",
+                "model error": f"{split.model:.3g}" if known else "-",
+                "whiteness p": f"{white.p:.2g}" if np.isfinite(white.p) else "-",
+            }
+        return rows
+
+    def remarks(self) -> list[str]:
+        """Return sentences on a conflict with the prior and on what the data do not determine."""
+        conflict = [f"{self.prior_conflict.text}."] if self.prior_conflict.text else []
+        return [*conflict, *(f"Not determined by the data: {text}." for text in self.undetermined)]
 
 
-def channel_whiteness(problem: Problem, estimate: Iterate) -> dict[str, Whiteness]:
-    """Return `MapEstimate.whiteness`; NaN where only single points were compared."""
-    white = problem.likelihood.whitened(estimate.here.residuals, estimate.noise)
-    tests: dict[str, list[Whiteness]] = {channel: [] for channel in problem.channels}
-    for block, r in zip(problem.likelihood.blocks, white, strict=True):
-        if block.kind == SPECTRAL:
-            complete = np.bincount(block.harmonic) == 2
-            tests[block.channel].append(of_periodogram(np.bincount(block.harmonic, r**2)[complete]))
-    return {
-        channel: Whiteness(min(1.0, len(found) * min(t.p for t in found)), float(np.mean([t.lag1 for t in found])))
-        if found
-        else Whiteness(np.nan, np.nan)
-        for channel, found in tests.items()
-    }
+@dataclass(frozen=True)
+class NoiseEstimate(Storable):
+    """Noise parameters of an estimate by their full names, their prior in words, and the values behind variances."""
+
+    values: dict[str, float]
+    prior: str
+    independent: dict[str, float]
+
+
+@dataclass(frozen=True)
+class TrueInputs(Storable):
+    """True inputs by experiment and input, their standard deviations, and the errors of the measured ones."""
+
+    values: dict[str, dict[str, np.ndarray]]
+    sd: dict[str, dict[str, np.ndarray]]
+    errors: dict[str, InputErrors]
+
+
+@dataclass(frozen=True)
+class Search(Storable):
+    """How an estimate was found: objective at each step, all starts, and what the iteration ended at."""
+
+    history: np.ndarray
+    starts: tuple[dict[str, float], ...]
+    at_ends: tuple[str, ...]
+    other_orbits: dict[str, str]
+    other_modes: tuple[Mode, ...]
+
+
+def _part(group: str, name: str, text: str) -> Any:
+    """Return a property that reads a field of a group."""
+
+    def read(self: "MapEstimate") -> Any:
+        return getattr(getattr(self, group), name)
+
+    return property(read, doc=text)
+
+
+def _check(name: str) -> Any:
+    """Return a property that reads a field of the checks, and raises a ValueError if there are none."""
+
+    def read(self: "MapEstimate") -> Any:
+        if self.checks is None:
+            raise ValueError(
+                f"checks: must be made before {name!r} is used, got an estimate with checks=False; run "
+                "bp.check(problem, fit), or replace(fit, checks=bp.check(problem, fit))."
+            )
+        return getattr(self.checks, name)
+
+    return property(read, doc=f"`FitCheck.{name}` of `checks`; a ValueError without them.")
 
 
 @dataclass(frozen=True)
@@ -112,78 +179,34 @@ class MapEstimate(Result):
     status : str
         "converged", "stalled" (no step increased the objective, though one of more than a thousandth of a standard
         deviation was left), "iterations" (their limit was reached), "singular" or "other orbit" (see `other_orbits`).
-    theta, sd : dict of str to float
-        Estimates and their standard deviations, in natural values and the parameters' units.
-    robust_sd : dict of str to float
-        Standard deviations that are valid for residuals that deviate from the noise model (sandwich covariance with the
-        residual's smoothed spectrum); if they differ much from `sd`, the noise model is wrong.
-    variances : dict of str to float
-        Noise variance of each channel (or "channel, experiment") as the noise model defines it, for `Independent` noise
-        that of one measured sample, and "scale"; by eq. (7) or fixed.
-    noise : dict of str to float
-        All noise parameters by their full names.
-    noise_prior : str
-        Prior of the variances, in words.
+    theta : dict of str to float
+        Estimates, in natural values and the parameters' units.
     covariance : DataFrame (names × names)
         Inverse of H of eq. (8) at these variances, increased where unknown ones make the weights of channels and priors
         uncertain (Kenward and Roger); for `Circulant` noise, with its unknown correlation integrated out.
-    joint_mode : dict of str to float
-        Mode of the density in sampling coordinates: natural values of parameters and free noise parameters.
-    joint_covariance : DataFrame
-        Inverse of the exact Hessian there; NaN if it is no maximum. Sampling coordinates are the logarithms of noise
-        parameters and of parameters whose prior's support is (0, ∞), and the other parameters.
     degrees_of_freedom : dict of str to float
         Of Student's t of each parameter: the values that determine the variances its standard deviation rests on, less
         what the estimate takes up of them (Satterthwaite); infinite if that rests on known variances and the prior.
-    independent : dict of str to float
-        Independent values behind each variance.
+    joint : JointLaplace
+        Normal approximation in sampling coordinates: `joint_mode` and `joint_covariance`.
+    noise_estimate : NoiseEstimate
+        `noise`, `noise_prior` and `independent`.
     solutions : dict of str to PeriodicSolution
         By experiment.
     residuals : dict of str to dict of str to array (points,)
-        y − ŷ within the kept harmonics, by experiment and channel.
+        y − ŷ within the kept harmonics, by experiment and channel, with the estimated `inputs`.
     rms, fvu : dict of str to float
         Root mean square of each channel's residuals, and the fraction of the measured variance that they are.
-    whiteness : dict of str to Whiteness
-        Of the residuals in units of the noise model, by channel; with several experiments p is the smallest, corrected
-        for their number, lag1 the mean.
-    noise_split : dict of str to NoiseSplit
-        Measurement noise and model error of each channel.
-    input_noise : dict of str to float
-        Standard deviation that the noise of the measured inputs causes in each channel.
-    inputs, input_sd : dict of str to dict of str to array (points,)
-        By experiment and input, the estimated true inputs and their standard deviations given the estimate, in the
-        inputs' units; the measured ones and zero where ``Problem(input_noise=…)`` takes them as exact. `residuals`,
-        `rms`, `fvu` and `noise_split` are those with the estimated inputs.
-    input_errors : dict of str to InputErrors
-        By experiment with noisy inputs: independent standard normal errors of the inputs, `expected` (errors,), what
-        they cause in the predicted components, `caused` (components,), and the derivatives of the residual by them,
-        `loadings` L (components, errors), at the estimate; L·Lᵀ is what they add to the covariance of the residual.
-    input_nonlinearity : dict of str to float
-        By what each estimate is changed by the part of the outputs that is not linear in the errors of the inputs, in
-        standard deviations: root mean square over errors drawn given the estimate. NaN if a solve fails.
-    doubling_shift : dict of str to float
-        Change of each estimate on twice as many points, in standard deviations; NaN if those solves fail.
-    at_ends : tuple of str
-        Parameters that the data act upon and whose estimate lies at the end of their prior's support.
-    other_orbits : dict of str to str
-        Experiments whose fitted orbit is not the measured one (prime period, turns of angles, or order of the forcing
-        periods), with the reason in words.
-    prior_conflict : PriorConflict
-        Test of the prior against the estimate by the data alone, with its p-values and, if there is one, the conflict
-        in words (``text``).
-    undetermined : tuple of str
-        Changes of parameters, in words, that change no output, confirmed by a change of 10 %, or "a combination of …"
-        where only a small change leaves the outputs as they are; in these directions the posterior equals the prior.
-    history : array (iterations,)
-        The objective before each step and at the end.
-    starts : tuple of dict of str to float
-        Of every start, the objective reached (−inf: none) under "objective", and the estimates.
-    other_modes : tuple of Mode
-        Separate optima other than the estimate whose objective is lower by less than 30, see `modes`.
-    fingerprint : str
-        Digests of the problem, by which results of another problem are refused.
+    true_inputs : TrueInputs
+        `inputs`, `input_sd` and `input_errors`.
+    search : Search
+        `history`, `starts`, `at_ends`, `other_orbits` and `other_modes`.
     tied : dict of str to dict of str to float
         Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
+    fingerprint : str
+        Digests of the problem, by which results of another problem are refused.
+    checks : FitCheck, optional
+        What `check` gives, whose fields are attributes of the estimate too; None with ``map_estimate(checks=False)``.
 
     Examples
     --------
@@ -199,49 +222,73 @@ class MapEstimate(Result):
 
     status: str
     theta: dict[str, float]
-    sd: dict[str, float]
-    robust_sd: dict[str, float]
-    variances: dict[str, float]
-    noise: dict[str, float]
-    noise_prior: str
     covariance: pd.DataFrame
-    joint_mode: dict[str, float]
-    joint_covariance: pd.DataFrame
     degrees_of_freedom: dict[str, float]
-    independent: dict[str, float]
+    joint: JointLaplace
+    noise_estimate: NoiseEstimate
     solutions: dict[str, PeriodicSolution]
     residuals: dict[str, dict[str, np.ndarray]]
     rms: dict[str, float]
     fvu: dict[str, float]
-    whiteness: dict[str, Whiteness]
-    noise_split: dict[str, NoiseSplit]
-    input_noise: dict[str, float]
-    inputs: dict[str, dict[str, np.ndarray]]
-    input_sd: dict[str, dict[str, np.ndarray]]
-    input_errors: dict[str, InputErrors]
-    input_nonlinearity: dict[str, float]
-    doubling_shift: dict[str, float]
-    at_ends: tuple[str, ...]
-    other_orbits: dict[str, str]
-    prior_conflict: PriorConflict
-    undetermined: tuple[str, ...]
-    history: np.ndarray
-    starts: tuple[dict[str, float], ...]
-    other_modes: tuple[Mode, ...]
-    fingerprint: str
+    true_inputs: TrueInputs
+    search: Search
     tied: dict[str, dict[str, float]]
+    fingerprint: str
+    checks: FitCheck | None = None
 
-    if not TYPE_CHECKING:
-        # Fields that take long and that few users need are functions until they are used.
-        def __getattribute__(self, name: str) -> Any:
-            value = super().__getattribute__(name)
-            if isinstance(value, partial):
-                value = value()
-                object.__setattr__(self, name, value)
-            return value
+    joint_mode = _part(
+        "joint", "mode", "Mode in sampling coordinates: natural values of parameters and free noise parameters."
+    )
+    joint_covariance = _part(
+        "joint", "covariance",
+        "Inverse of the exact Hessian there; NaN if it is no maximum. Sampling coordinates are the logarithms of noise "
+        "parameters and of parameters whose prior's support is (0, ∞), and the other parameters.",
+    )  # fmt: skip
+    noise = _part("noise_estimate", "values", "All noise parameters by their full names.")
+    noise_prior = _part("noise_estimate", "prior", "Prior of the variances, in words.")
+    independent = _part("noise_estimate", "independent", "Independent values behind each variance.")
+    inputs = _part(
+        "true_inputs", "values",
+        "Estimated true inputs (points,) by experiment and input, in their units; the measured ones where "
+        "``Problem(input_noise=…)`` takes them as exact.",
+    )  # fmt: skip
+    input_sd = _part("true_inputs", "sd", "Their standard deviations (points,) given the estimate; zero if exact.")
+    input_errors = _part(
+        "true_inputs", "errors",
+        "By experiment with noisy inputs: independent standard normal errors, `expected` (errors,), what they cause in "
+        "the predicted components, `caused` (components,), and the derivatives of the residual by them, `loadings` L "
+        "(components, errors), at the estimate; L·Lᵀ is what they add to the covariance of the residual.",
+    )  # fmt: skip
+    history = _part("search", "history", "The objective before each step and at the end, (iterations,).")
+    starts = _part("search", "starts", 'Of every start the "objective" reached (−inf: none), and the estimates.')
+    at_ends = _part(
+        "search", "at_ends", "Parameters that the data act upon and whose estimate lies at the end of their support."
+    )
+    other_orbits = _part(
+        "search", "other_orbits",
+        "Experiments whose fitted orbit is not the measured one (prime period, turns of angles, or order of the "
+        "forcing periods), with the reason in words.",
+    )  # fmt: skip
+    other_modes = _part(
+        "search", "other_modes", "Separate optima whose objective is lower by less than 30, see `modes`."
+    )
+    robust_sd, whiteness, noise_split = _check("robust_sd"), _check("whiteness"), _check("noise_split")
+    input_noise, input_nonlinearity = _check("input_noise"), _check("input_nonlinearity")
+    doubling_shift, prior_conflict = _check("doubling_shift"), _check("prior_conflict")
+    undetermined = _check("undetermined")
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+    @property
+    def sd(self) -> dict[str, float]:
+        """Standard deviations, from `covariance`."""
+        return sds(self.covariance)
+
+    @property
+    def variances(self) -> dict[str, float]:
+        """Noise variance of each channel (or "channel, experiment"), and "scale"; by eq. (7) or fixed.
+
+        As the noise model defines it: for `Independent` noise that of one measured sample.
+        """
+        return {name: self.noise.get(f"variance[{name}]", self.noise.get(name)) for name in self.independent}
 
     @property
     def converged(self) -> bool:
@@ -251,9 +298,9 @@ class MapEstimate(Result):
     @property
     def modes(self) -> pd.DataFrame:
         """Separate optima, the estimate first: objective, fraction of the mass by Laplace, and parameters."""
-        own = {"objective": float(self.history[-1]), "mass": 1.0 - sum(mode.mass for mode in self.other_modes)}
+        best = {"objective": float(self.history[-1]), "mass": 1.0 - sum(mode.mass for mode in self.other_modes)}
         rows = [{"objective": mode.objective, "mass": mode.mass} | mode.theta for mode in self.other_modes]
-        return pd.DataFrame([own | self.theta, *rows])
+        return pd.DataFrame([best | self.theta, *rows])
 
     def other_values(self, name: str) -> list[float]:
         """Return the values of a parameter at other optima with more than 1 % of the mass, where they differ.
@@ -434,42 +481,49 @@ class MapEstimate(Result):
         status = self.status if self.converged else f"NOT CONVERGED: {self.status}; try another start, or starts=8"
         if self.without_noise:
             status = f"{self.status}; {', '.join(self.without_noise)} without noise"
+        sd, robust = self.sd, self.checks and self.checks.robust_sd
         rows = {
-            name: (f"{value:.6g}", f"{self.sd[name]:.3g}", f"{self.robust_sd[name]:.3g}")
+            name: (f"{value:.6g}", f"{sd[name]:.3g}", *([f"{robust[name]:.3g}"] if robust else []))
             for name, value in self.theta.items()
-        } | {name: (f"{value:.4g}", "-", "-") for name, value in self.noise.items()}
-        estimates = pd.DataFrame.from_dict(rows, orient="index", columns=["estimate", "Laplace sd", "robust sd"])
-        channels = {}
-        for channel, rms in self.rms.items():
-            split = self.noise_split.get(channel, NoiseSplit(np.nan, np.nan, np.nan))
-            known, p = np.isfinite(split.measurement), self.whiteness[channel].p
-            channels[channel] = {
-                "rms": f"{rms:.4g}",
-                "unexplained variance": f"{self.fvu[channel]:.2%}",
-                "measurement noise": f"{split.measurement:.3g}" if known else "-",
-                "model error": f"{split.model:.3g}" if known else "-",
-                "whiteness p": f"{p:.2g}" if np.isfinite(p) else "-",
-            }
+        } | {name: (f"{value:.4g}", *"-" * (2 if robust else 1)) for name, value in self.noise.items()}
+        columns = ["estimate", "Laplace sd", "robust sd"][: 3 if robust else 2]
+        estimates, more = pd.DataFrame.from_dict(rows, orient="index", columns=columns), {}
+        if self.checks:
+            more = self.checks.by_channel()
+        channels = {
+            channel: {"rms": f"{rms:.4g}", "unexplained variance": f"{self.fvu[channel]:.2%}"} | more.get(channel, {})
+            for channel, rms in self.rms.items()
+        }
         residuals = pd.DataFrame.from_dict(channels, orient="index")
         lines = [f"MapEstimate ({status})", estimates.to_string(), "Residuals", residuals.to_string()]
         lines += [f"The noise has the {self.noise_prior}."] if self.noise else []
-        if self.input_errors:
-            caused = ", ".join(f"{sd:.3g} in {channel}" for channel, sd in self.input_noise.items())
+        if self.input_errors and self.checks:
+            caused = ", ".join(f"{sd:.3g} in {channel}" for channel, sd in self.checks.input_noise.items())
             lines.append(f"The noise of the inputs, included in the covariance, causes {caused}.")
         lines += [
             f"The orbit is another one than the recorded one in {name!r}: {text}."
             for name, text in self.other_orbits.items()
         ]
-        lines += [f"{self.prior_conflict.text}."] if self.prior_conflict.text else []
-        lines += [f"Not determined by the data: {text}." for text in self.undetermined]
+        lines += self.checks.remarks() if self.checks else ["Not checked, see bp.check(problem, fit)."]
         lines += [f"Another optimum: {mode!r}." for mode in notable(self.other_modes)]
         return "\n".join(lines)
+
+
+def sds(covariance: pd.DataFrame) -> dict[str, float]:
+    """Return the roots of the diagonal of a covariance."""
+    with np.errstate(invalid="ignore"):
+        return dict(zip(covariance.index, np.sqrt(np.diag(covariance)).tolist(), strict=True))
 
 
 def orbit_advice(fit: MapEstimate) -> str:
     """Return what to do first if orbits of a fit are not the measured ones; empty otherwise."""
     runs = ", ".join(map(repr, fit.other_orbits))
     return f"first fit the measured orbit of {runs}, see fit.other_orbits" if runs else ""
+
+
+def written(theta: dict[str, float]) -> str:
+    """Return the names and values of parameters, as in messages."""
+    return ", ".join(f"{name} = {value:.6g}" for name, value in theta.items())
 
 
 def _carried(matrix: np.ndarray, gradients: list[np.ndarray]) -> np.ndarray:

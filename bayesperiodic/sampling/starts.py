@@ -26,7 +26,7 @@ def laplace_approximation(density: SamplingCoordinates, fit: MapEstimate) -> tup
     laplace = _laplace(density, fit)
     if laplace is None:
         remedy = "run map_estimate from another start"
-        if fit.undetermined:
+        if fit.checks and fit.undetermined:
             remedy = f"fix what the data do not determine ({'; '.join(fit.undetermined)})"
         elif fit.at_ends:
             remedy = f"widen the prior of {', '.join(map(repr, fit.at_ends))}, which is at the end of its support"

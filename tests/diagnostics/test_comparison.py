@@ -337,7 +337,7 @@ def test_undetermined_parameters_get_the_verdict_too_wide(solved):
     covariance = fit.covariance.copy()
     covariance.loc["k"], covariance["k"] = np.nan, np.nan
     covariance.loc["k", "k"] = np.inf
-    blind = replace(fit, covariance=covariance, joint_covariance=fit.joint_covariance * np.nan)
+    blind = replace(fit, covariance=covariance, joint=replace(fit.joint, covariance=fit.joint_covariance * np.nan))
     found = bp.compare(problem, blind, posterior)
     assert found.table["verdict"].to_dict() == {"k": "too wide", "c": "fine", "coulomb": "fine"}
     assert found.table.loc["k", "recommendation"] == "report a combination that the data determine"

@@ -311,7 +311,9 @@ def test_coefficients_have_units_and_sums_of_different_dimensions_are_refused():
 def test_an_estimate_on_another_orbit_is_refused(damped):
     problem, fit = damped
     with pytest.raises(ValueError, match="fit: must be an estimate on the measured orbits, .* 'run 0', see"):
-        bp.missing_terms(problem, replace(fit, other_orbits={"run 0": "it has another period"}))
+        bp.missing_terms(
+            problem, replace(fit, search=replace(fit.search, other_orbits={"run 0": "it has another period"}))
+        )
 
 
 def test_prediction_of_experiments_left_out_decides_between_terms_that_fit_alike(monkeypatch, damped):

@@ -10,7 +10,6 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.density.log_posterior import LogPosterior
-from bayesperiodic.estimation import map_estimate
 from bayesperiodic.estimation.laplace import undetermined
 from bayesperiodic.sampling.starts import laplace_approximation
 from tests.known import LINEAR, formula_model, grid, linear_experiment, linear_regressors
@@ -331,25 +330,6 @@ def test_noise_is_split_into_measurement_noise_and_model_error():
     assert split.measurement == pytest.approx(3.0)
     assert split.total == pytest.approx(np.sqrt(total), rel=1e-6)
     assert split.model == pytest.approx(np.sqrt(total - 9.0), rel=1e-6)
-
-
-def test_joint_laplace_and_robust_sd_are_computed_at_their_first_use(monkeypatch):
-    problem, calls = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS), []
-    for name in ("joint_laplace", "robust_covariance"):
-        monkeypatch.setattr(map_estimate, name, counted(getattr(map_estimate, name), calls))
-    fit = bp.map_estimate(problem, progress=False)
-    assert calls == []
-    assert fit.joint_covariance is fit.joint_covariance and fit.joint_mode == fit.joint_mode
-    assert fit.robust_sd == fit.robust_sd
-    assert calls == ["joint_laplace", "robust_covariance"]
-
-
-def counted(function, calls):
-    def count(*arguments):
-        calls.append(function.__name__)
-        return function(*arguments)
-
-    return count
 
 
 def test_estimate_is_pickled_with_all_its_values():

@@ -1,5 +1,6 @@
 """Parts of the robust covariance and of the test of the prior, against explicit sums, optimisation and closed forms."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -333,10 +334,10 @@ def test_masses_are_densities_times_the_volumes_of_the_laplace_approximations():
     assert mode.mass == pytest.approx(volumes[1] / sum(volumes))
     assert (mode.theta, mode.objective) == ({"a": 5.0, "b": -2.0}, -4.0)
     assert mode.sd == pytest.approx({"a": 5.0 * 0.3, "b": 1e-4})
-    laplaces[0] = laplaces[0]._replace(covariance=pd.DataFrame(np.full((2, 2), np.nan), names, names))
+    laplaces[0] = replace(laplaces[0], covariance=pd.DataFrame(np.full((2, 2), np.nan), names, names))
     (mode,) = modes.weighed(problem, ends, laplaces)
     assert mode.mass == pytest.approx(1.0 / (1.0 + np.exp(-9.0)))
-    laplaces[0] = laplaces[0]._replace(log_density=np.nan)
+    laplaces[0] = replace(laplaces[0], log_density=np.nan)
     assert np.isnan(modes.weighed(problem, ends, laplaces)[0].mass)
 
 

@@ -1,5 +1,6 @@
 """When an estimate gives a warning and what that says; ends of profile intervals; whiteness and the split of noise."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,9 +8,10 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from bayesperiodic.estimation import map_estimate, profile, result
+from bayesperiodic.estimation import check, map_estimate, profile, result
+from bayesperiodic.estimation.check import of_periodogram
 from bayesperiodic.estimation.modes import Mode
-from bayesperiodic.estimation.result import MapEstimate, NoiseSplit, of_periodogram
+from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit
 from bayesperiodic.likelihood.noise import KNOWN, SPECTRAL
 
 
@@ -20,6 +22,7 @@ def fitted(**changes):
         "doubling_shift": {"a": 0.0, "b": np.nan}, "at_ends": (), "theta": {"a": 1.25, "b": 3.0},
         "prior_conflict": SimpleNamespace(text=""), "fvu": {"y": 0.1}, "converged": True, "other_modes": (),
         "undetermined": (), "noise_split": {}, "input_errors": {}, "input_nonlinearity": {"a": 0.29, "b": 0.0},
+        "checks": True,
     }  # fmt: skip
     return SimpleNamespace(**(given | changes))
 
@@ -91,7 +94,7 @@ def test_ends_of_the_support_and_conflicts_are_named():
 
 
 def test_unexplained_variance_counts_from_one_half_on_unless_it_is_measured_noise(monkeypatch):
-    monkeypatch.setattr(map_estimate, "unit_error", lambda problem: "Check the units.")
+    monkeypatch.setattr(check, "unit_error", lambda problem: "Check the units.")
     first, units = warnings_of(fvu={"y": 0.512})
     assert first.startswith("The estimate leaves 51.2% of the variance of 'y' unexplained. If this is not noise")
     assert units == "Check the units."
@@ -167,7 +170,7 @@ def test_noise_is_split_by_channel_and_whiteness_is_corrected_for_the_experiment
     likelihood = SimpleNamespace(blocks=blocks, whitened=lambda vectors, noise: vectors)
     given = SimpleNamespace(channels=("y", "z", "w"), likelihood=likelihood)
     estimate = SimpleNamespace(here=SimpleNamespace(residuals=residuals), noise=None)
-    split = result.noise_split(given, estimate.here.residuals, np.array([0.9, 0.7, 0.5, 1.0]))
+    split = check.noise_split(given, estimate.here.residuals, np.array([0.9, 0.7, 0.5, 1.0]))
     total = (residuals[0] @ residuals[0] + residuals[1] @ residuals[1]) / (7 * 0.9 + 7 * 0.7)
     assert list(split) == ["y", "z"]
     expected = NoiseSplit(np.sqrt(0.2), np.sqrt(total - 0.2), np.sqrt(total))
@@ -175,7 +178,7 @@ def test_noise_is_split_by_channel_and_whiteness_is_corrected_for_the_experiment
         (expected.measurement, expected.model, expected.total)
     )
     assert (split["z"].measurement, split["z"].model) == pytest.approx((np.sqrt(50.0), 0.0))
-    white = result.channel_whiteness(given, estimate)
+    white = check.channel_whiteness(given, estimate)
     each = [of_periodogram(np.bincount([0, 1, 1, 2, 2, 3, 3], r**2)[1:]) for r in residuals[:2]]
     assert white["y"].p == pytest.approx(min(1.0, 2 * min(e.p for e in each)))
     assert white["y"].lag1 == pytest.approx(np.mean([e.lag1 for e in each]))
@@ -208,11 +211,15 @@ def test_steps_end_nine_tenths_of_the_way_to_the_end_or_at_the_limit():
 
 
 def test_a_printed_estimate_lists_what_is_known_of_it():
-    white = {"y": SimpleNamespace(p=0.0321), "z": SimpleNamespace(p=np.nan)}
+    checks = FitCheck(
+        robust_sd={"a": 0.0612, "b": 0.4}, whiteness={"y": SimpleNamespace(p=0.0321), "z": SimpleNamespace(p=np.nan)},
+        noise_split={"y": NoiseSplit(1.5, 1.25, 2.0), "z": NoiseSplit(np.nan, 1.0, 1.0)}, input_noise={},
+        input_nonlinearity={}, doubling_shift={"a": 0.01, "b": np.nan}, prior_conflict=SimpleNamespace(text=""),
+        undetermined=(),
+    )  # fmt: skip
     fit = fitted(
-        status="converged", sd={"a": 0.0512, "b": 0.3}, robust_sd={"a": 0.0612, "b": 0.4}, rms={"y": 2.0, "z": 0.5},
+        status="converged", sd={"a": 0.0512, "b": 0.3}, checks=checks, rms={"y": 2.0, "z": 0.5},
         noise={"variance[y]": 4.0, "variance[z]": 0.25}, noise_prior="prior 1/v", fvu={"y": 0.1234, "z": 0.5},
-        whiteness=white, noise_split={"y": NoiseSplit(1.5, 1.25, 2.0), "z": NoiseSplit(np.nan, 1.0, 1.0)},
     )  # fmt: skip
     table = [
         "            estimate Laplace sd robust sd",
@@ -229,8 +236,8 @@ def test_a_printed_estimate_lists_what_is_known_of_it():
     expected = ["MapEstimate (converged)", *table, *noise, *residuals, "The noise has the prior 1/v."]
     assert MapEstimate.__repr__(fit).split("\n") == expected
     fit.converged, fit.status, fit.noise = False, "stalled", {}
-    fit.other_orbits, fit.prior_conflict.text = {"run": "half the period"}, "Prior and data disagree"
-    fit.undetermined = ("a: no output depends on it",)
+    fit.other_orbits, checks.prior_conflict.text = {"run": "half the period"}, "Prior and data disagree"
+    fit.checks = replace(checks, undetermined=("a: no output depends on it",))
     fit.other_modes = (
         Mode({"a": 2.0}, {"a": 0.1}, -1.0, 0.2, {}, pd.DataFrame()),
         Mode({"a": 3.0}, {"a": 0.1}, -1.0, 0.001, {}, pd.DataFrame()),
@@ -246,6 +253,16 @@ def test_a_printed_estimate_lists_what_is_known_of_it():
     ]
     fit.without_noise = ("y", "z")
     assert MapEstimate.__repr__(fit).startswith("MapEstimate (stalled; y, z without noise)\n")
+    assert repr(fit.checks).split("\n") == [
+        "FitCheck", "  robust sd shift on twice the points", "a    0.0612                      0.01",
+        "b       0.4                       nan", "Residuals", "  measurement noise model error whiteness p",
+        "y               1.5        1.25       0.032", "z                 -           -           -",
+        "Prior and data disagree.", "Not determined by the data: a: no output depends on it.",
+    ]  # fmt: skip
+    fit.checks = None
+    lines = MapEstimate.__repr__(fit).split("\n")
+    assert lines[1:3] == ["  estimate Laplace sd", "a     1.25     0.0512"]
+    assert "Not checked, see bp.check(problem, fit)." in lines
 
 
 def test_channels_of_rounding_errors_are_without_noise_if_their_variance_is_unknown():

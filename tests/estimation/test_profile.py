@@ -193,7 +193,7 @@ def test_the_way_back_climbs_only_where_it_does_not_meet_the_known_point(linear,
 
 
 def test_a_known_point_is_met_by_the_same_parameters_and_residuals_that_are_not_better(linear):
-    objective, peak = profiles._at_estimate(*linear[:2])
+    objective, peak = profiles.at_estimate(*linear[:2])
     ridge, sd = Ridge(objective, 0, peak), np.array(list(linear[1].sd.values()))
     near, far = (objective.at(peak.theta + np.array([0, s, 0]) * sd, peak.here, peak.noise) for s in (0.01, 2.0))
     assert ridge._meets(near, peak) and not ridge._meets(peak, near)

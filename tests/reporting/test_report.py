@@ -111,7 +111,12 @@ def test_fit_with_warnings_is_marked(solved, tmp_path):
     problem = problem.with_experiments([replace(problem.experiments[0], synthetic=True)])
     white = {"force": replace(fit.whiteness["force"], p=1e-5)}
     wider = {name: (3.01 if name == "k" else 3.0) * sd for name, sd in fit.sd.items()}
-    fit = replace(fit, status="stalled", at_ends=("k",), whiteness=white, robust_sd=wider)
+    fit = replace(
+        fit,
+        status="stalled",
+        search=replace(fit.search, at_ends=("k",)),
+        checks=replace(fit.checks, whiteness=white, robust_sd=wider),
+    )
     text = Page(bp.report(problem, fit, None, tmp_path / "r.html").read_text(encoding="utf-8")).text
     for words in ("! synthetic data", "✕ stalled", "lies at the end of its prior's support", "3 times as large (k)"):
         assert words in text
@@ -269,7 +274,7 @@ def test_errors_that_are_not_linear_are_stated_by_the_largest_or_a_failed_solve(
     fit, _ = gain_page(tmp_path, [gain_run()], "measured")
     problem = bp.Problem(GAIN, [gain_run()], priors={"a": bp.Normal(0.0, 10.0)})
     for curved, stated in ((0.35, "by up to 0.35 standard deviations (a)"), (np.nan, "by up to – standard deviations")):
-        other = replace(fit, input_nonlinearity={"a": curved})
+        other = replace(fit, checks=replace(fit.checks, input_nonlinearity={"a": curved}))
         page = Page(bp.report(problem, other, None, tmp_path / "r.html").read_text(encoding="utf-8"))
         assert f"What is not linear in it changes estimates {stated}" in page.text
 

@@ -242,11 +242,15 @@ def test_estimate_of_another_problem_is_rejected(known_variance):
 def test_error_without_a_laplace_approximation_names_the_alternative(known_variance):
     problem, fit = known_variance
     for known, step in (
-        ({"undetermined": ("k → k·t, c → c·t",)}, r"fix what the data do not determine \(k → k·t, c → c·t\)"),
-        ({"at_ends": ("k",)}, "widen the prior of 'k', which is at the end of its support"),
+        (
+            {"checks": replace(fit.checks, undetermined=("k → k·t, c → c·t",))},
+            r"fix what the data do not determine \(k → k·t, c → c·t\)",
+        ),
+        ({"search": replace(fit.search, at_ends=("k",))}, "widen the prior of 'k', which is at the end of its support"),
         ({}, "run map_estimate from another start"),
+        ({"checks": None}, "run map_estimate from another start"),
     ):
-        lost = replace(fit, joint_covariance=fit.joint_covariance * np.nan, **known)
+        lost = replace(fit, joint=replace(fit.joint, covariance=fit.joint_covariance * np.nan), **known)
         with pytest.raises(ValueError, match=f"no Laplace approximation .*{step}, or take start='prior'"):
             bp.sample(problem, lost, seed=1, **PAIR)
 
