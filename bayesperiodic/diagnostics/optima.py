@@ -9,7 +9,7 @@ import numpy as np
 from bayesperiodic._linalg import TINY, hessian_scale, scaled
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.candidates import Term, lag_names
-from bayesperiodic.estimation.gauss_newton import SINGULAR, Iterate, Objective
+from bayesperiodic.estimation.gauss_newton import NO_CURVATURE, Iterate, Objective
 from bayesperiodic.estimation.map_estimate import nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
@@ -84,7 +84,7 @@ class Optimum:
         the second derivatives of the outputs, which make it a maximum, are neglected.
         """
         values, _ = self._curvature()
-        return bool(values[0] > SINGULAR * values[-1])
+        return bool(values[0] > NO_CURVATURE * values[-1])
 
     @property
     def evidence(self) -> float:

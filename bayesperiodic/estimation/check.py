@@ -25,7 +25,7 @@ from bayesperiodic.estimation.covariance import (
     uncertainty,
 )
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, bias_correction
-from bayesperiodic.estimation.laplace import COMBINED, SILENT, undetermined
+from bayesperiodic.estimation.laplace import IN_COMBINATION, SILENT, undetermined
 from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit, Whiteness, sds, written
 from bayesperiodic.estimation.units import unit_error
 from bayesperiodic.likelihood.input_noise import EXACT, FEWEST_CYCLES, ROUGH
@@ -243,12 +243,12 @@ def _input_noise(problem: Problem, fit: MapEstimate) -> Iterator[str]:
 def _combined(problem: Problem, texts: Sequence[str]) -> Iterator[str]:
     """Yield the warnings about parameters that the data determine only together with others."""
     for text in texts:
-        if text.startswith(COMBINED):
+        if text.startswith(IN_COMBINATION):
             yield (
                 f"The data do not determine {text}: near the estimate, a joint change of these leaves the outputs as "
                 "they are to first order. Fix one of the parameters, or give priors that determine it."
             )
-    directions = [text for text in texts if not text.startswith(COMBINED)]
+    directions = [text for text in texts if not text.startswith(IN_COMBINATION)]
     if directions:
         more = len(directions) - MOST_DIRECTIONS
         scaled = {part.partition(" → ")[0] for text in directions for part in text.split(", ") if "·t" in part}

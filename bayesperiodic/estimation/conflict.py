@@ -17,16 +17,16 @@ from bayesperiodic.priors.joint import MultivariateNormal
 from bayesperiodic.priors.single import LogNormal, TruncatedNormal
 from bayesperiodic.problem.description import written_out
 
-LEVEL = 0.01
+CONFLICT_LEVEL = 0.01
 # Largest error, in widths of the prior, of a direction that is tested: the data have 1 % of the prior's information.
 WIDENING = 10.0
 # Factor by which the priors are widened where the data estimate alone.
 ALMOST_FLAT = 100.0
 # Expected gain in 2 ln L by a step without the prior, below which the MAP estimate is that of the data.
-NEAR = 0.5
+NEGLIGIBLE_GAIN = 0.5
 PRECISION = 1e-12
 # Widths of the priors of parameters in conflict from which further starts of the estimate by the data are drawn.
-SCALES = (3.0, 10.0, 30.0, 100.0, 30.0, 10.0)
+START_WIDTHS = (3.0, 10.0, 30.0, 100.0, 30.0, 10.0)
 # Midpoints of the normal scores of a prior, and their probabilities.
 EDGES = np.linspace(-7.5, 7.5, 241)
 SCORES, MASSES = 0.5 * (EDGES[1:] + EDGES[:-1]), np.diff(ndtr(EDGES))
@@ -35,8 +35,8 @@ PEAKS = slice(5, -5, 10)
 # Width of each part of a prior, in its spacing, for a density without ripples.
 SMOOTHING = 0.75
 VARIANCES = (np.arange(32) + 0.5) / 32
-TAILS = np.array([0.05, 0.95])
-SMALLEST = 1e-300
+INTERVAL_TAILS = np.array([0.05, 0.95])
+SMALLEST_PROBABILITY = 1e-300
 SHARE = 0.3
 
 
@@ -91,13 +91,13 @@ def prior_conflict(problem: Problem, estimate: Iterate) -> tuple[PriorConflict, 
     """
     # The estimate by the data may pass points of no meaning.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        found = _by_the_data(problem, estimate)
-        tested = _tested(problem, found)
+        alone = _by_the_data(problem, estimate)
+        tested = _tested(problem, alone)
         if tested.members:
             # The maximum next to the prior may be a local one.
-            found = max(_from_elsewhere(problem, found, tested.members), key=lambda iterate: iterate.objective)
-            tested = _tested(problem, found)
-        return tested, found
+            alone = max(_from_elsewhere(problem, alone, tested.members), key=lambda iterate: iterate.objective)
+            tested = _tested(problem, alone)
+        return tested, alone
 
 
 def _by_the_data(problem: Problem, estimate: Iterate) -> Iterate:
@@ -118,7 +118,7 @@ def _by_the_data(problem: Problem, estimate: Iterate) -> Iterate:
     vectors, sizes, components = np.linalg.svd(changes, full_matrices=False)
     along = sizes * (components @ residuals)
     step = vectors @ (along / (sizes**2 + WIDENING**-2))
-    if np.sum(along**2 / (sizes**2 + WIDENING**-2)) < NEAR:
+    if np.sum(along**2 / (sizes**2 + WIDENING**-2)) < NEGLIGIBLE_GAIN:
         return estimate
     factor = np.where(np.sum(changes**2, axis=1) > WIDENING**-2, np.maximum(ALMOST_FLAT, WIDENING * np.abs(step)), 1.0)
     objective = _almost_flat(problem, estimate, factor)
@@ -126,21 +126,21 @@ def _by_the_data(problem: Problem, estimate: Iterate) -> Iterate:
     return estimate if first is None else climb(objective, objective.anchored(first)).iterate
 
 
-def _from_elsewhere(problem: Problem, found: Iterate, members: tuple[str, ...]) -> Iterator[Iterate]:
+def _from_elsewhere(problem: Problem, alone: Iterate, members: tuple[str, ...]) -> Iterator[Iterate]:
     """Yield the estimate found, and those from draws of the prior, which is widened for parameters in conflict."""
     inside = np.isin(problem.names, members)
-    objective = _almost_flat(problem, found, np.where(inside, ALMOST_FLAT, 1.0))
-    yield replace(found, objective=objective.density.objective(found.here, found.noise, objective.log_variance_factor))
+    objective = _almost_flat(problem, alone, np.where(inside, ALMOST_FLAT, 1.0))
+    yield replace(alone, objective=objective.density.objective(alone.here, alone.noise, objective.log_variance_factor))
     generator, median = np.random.default_rng(0), problem.joint_prior.median()
     wide = objective.density.problem.joint_prior
-    for scale, theta in zip(SCALES, problem.joint_prior.sample(len(SCALES), generator), strict=True):
+    for scale, theta in zip(START_WIDTHS, problem.joint_prior.sample(len(START_WIDTHS), generator), strict=True):
         factor = scale / ALMOST_FLAT
         drawn = wide.sample(1, generator)[0]
         logs = problem.logarithmic & inside
         theta[inside] = median[inside] + factor * (drawn[inside] - median[inside])
         theta[logs] = median[logs] * (drawn[logs] / median[logs]) ** factor
         here = objective.density.linearise(theta)
-        first = objective.iterate(here, found.noise)
+        first = objective.iterate(here, alone.noise)
         if first is not None:
             yield climb(objective, first).iterate
 
@@ -200,11 +200,11 @@ def _tested(problem: Problem, estimate: Iterate) -> PriorConflict:
     along = (vectors.T @ np.linalg.solve(units, deviations))[tested]
     parts = along**2 / (1.0 + np.outer(sizes[tested] ** -2.0, ratio))
     joint = float(np.mean(chdtrc(tested.sum(), parts.sum(axis=0)))) if tested.any() else np.nan
-    reach = stdtrit(min(freedom, 1e9), TAILS[:, None]) * sd
+    reach = stdtrit(min(freedom, 1e9), INTERVAL_TAILS[:, None]) * sd
     data = np.where(
         logs, np.where(logs, centre, 1.0) * np.exp(np.where(logs, alone + reach, 0.0)), centre + alone + reach
     )
-    given = np.array([marginal.quantile(TAILS) for marginal in prior.marginals.values()]).T
+    given = np.array([marginal.quantile(INTERVAL_TAILS) for marginal in prior.marginals.values()]).T
     columns = {"data_low": data[0], "data_high": data[1], "prior_low": given[0], "prior_high": given[1], "p": p}
     loads = np.abs(vectors[:, tested][:, np.argmax(parts.mean(axis=1))]) if tested.any() else np.zeros(len(p))
     return _summary(pd.DataFrame(columns, index=[*problem.names]), joint, loads)
@@ -219,9 +219,9 @@ def _summary(table: pd.DataFrame, joint: float, loads: np.ndarray) -> PriorConfl
     else:
         smallest = float(min(1.0, 2.0 * joint, *(2.0 * known.size * known)))
     members: tuple[str, ...] = ()
-    if smallest < LEVEL:
-        own = p < LEVEL
-        members = tuple(table.index[own if own.any() else loads > SHARE * loads.max()])
+    if smallest < CONFLICT_LEVEL:
+        outlying = p < CONFLICT_LEVEL
+        members = tuple(table.index[outlying if outlying.any() else loads > SHARE * loads.max()])
     return PriorConflict(table, joint, smallest, members)
 
 
@@ -243,8 +243,8 @@ def _scores(prior: np.ndarray, value: float, sd: np.ndarray) -> np.ndarray:
         return np.exp(-0.5 * ((at - prior) / smooth) ** 2) / smooth @ MASSES
 
     each = (value - prior) / spread
-    below, above = (np.maximum(ndtr(sign * each) @ MASSES, SMALLEST) for sign in (1.0, -1.0))
+    below, above = (np.maximum(ndtr(sign * each) @ MASSES, SMALLEST_PROBABILITY) for sign in (1.0, -1.0))
     tail = np.where(below < above, ndtri(below), -ndtri(above))
     highest = np.max([density(at) for at in (0.0, *prior[PEAKS])], axis=0)
-    drop = np.sqrt(2.0 * np.log(np.maximum(highest / np.maximum(density(value), SMALLEST * highest), 1.0)))
+    drop = np.sqrt(2.0 * np.log(np.maximum(highest / np.maximum(density(value), SMALLEST_PROBABILITY * highest), 1.0)))
     return np.sign(tail) * np.minimum(np.abs(tail), drop)

@@ -32,13 +32,13 @@ from bayesperiodic.periodic.solve import solve_driven, solve_free
 
 # Correlation lengths tried, in response periods, and the prior probability of white noise, the alternative to them.
 LENGTHSCALES = np.geomspace(1e-3, 3.0, 40)
-WHITE = 0.5
-ROUNDS, SETTLED = 10, 1e-3
-RIDGE = 1e-12
+WHITE_PROBABILITY = 0.5
+SPECTRUM_ROUNDS, SETTLED_SPECTRUM = 10, 1e-3
+LEAST_INFORMATION = 1e-12
 # Pairs of errors of the inputs that are tried.
-PROBES = 8
+INPUT_PROBES = 8
 # Change of the logarithm of a variance in a difference.
-STEP = 1e-4
+VARIANCE_STEP = 1e-4
 
 
 def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarray) -> np.ndarray:
@@ -101,7 +101,7 @@ def _caused_variances(likelihood: Likelihood, noise: np.ndarray) -> list[np.ndar
         for b, part in zip(shared.members, shared.parts, strict=True):
             vectors[b] = part.T
         white = likelihood.whitened(vectors, noise)
-        result = [own + np.sum(moved**2, axis=0) for own, moved in zip(result, white, strict=True)]
+        result = [variance + np.sum(moved**2, axis=0) for variance, moved in zip(result, white, strict=True)]
     return result
 
 
@@ -116,21 +116,21 @@ def _residual_variance(
     scale = hessian_scale(information)
     others = scaled(information - s @ s.T, scale)
     values, vectors = np.linalg.eigh(0.5 * (others + others.T))
-    others = (vectors * np.maximum(values, RIDGE)) @ vectors.T
+    others = (vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T
     s, score = s * scale[:, None], (s * scale[:, None]) @ r
-    own = (s / shape[:, None, :]) @ s.T
+    gram = (s / shape[:, None, :]) @ s.T
     pull = (r / shape) @ s.T
     size = np.ones(len(shape))
-    for _ in range(ROUNDS):
-        total = own / size[:, None, None] + others
+    for _ in range(SPECTRUM_ROUNDS):
+        total = gram / size[:, None, None] + others
         step = np.linalg.solve(total, (pull / size[:, None] - score)[..., None])[..., 0]
         square = (r - step @ s) ** 2 / shape
         taken = np.einsum("am,gam->gm", s, np.linalg.solve(total, s / shape[:, None, :])) / size[:, None]
         # Expected squares: the independent values per component, less those removed by the fit.
         left = np.maximum(block.weight - taken, 0.0)
         before = size
-        size = np.maximum(square.sum(axis=1), TINY) / np.maximum(left.sum(axis=1), RIDGE)
-        if np.allclose(size, before, rtol=SETTLED, atol=0.0):
+        size = np.maximum(square.sum(axis=1), TINY) / np.maximum(left.sum(axis=1), LEAST_INFORMATION)
+        if np.allclose(size, before, rtol=SETTLED_SPECTRUM, atol=0.0):
             break
     misfit = square.sum(axis=1) / size + np.einsum("ga,ab,gb->g", step, others, step) + 2.0 * step @ score
     logarithms = block.weight * np.sum(np.log(size[:, None] * shape), axis=1) + np.linalg.slogdet(total)[1]
@@ -148,7 +148,7 @@ def _shapes(block: Block, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     lengths = np.concatenate([[0.0], LENGTHSCALES])
     shape = unit**2 / (1.0 + (2 * np.pi * lengths[:, None] * block.harmonic) ** 2)
     weight = np.exp(LENGTHSCALE.log_prob(LENGTHSCALES)) * LENGTHSCALES
-    weight = np.concatenate([[WHITE], (1.0 - WHITE) * weight / weight.sum()])
+    weight = np.concatenate([[WHITE_PROBABILITY], (1.0 - WHITE_PROBABILITY) * weight / weight.sum()])
     return shape / shape.mean(axis=1, keepdims=True), np.log(weight)
 
 
@@ -162,8 +162,8 @@ def _smoothed(block: Block, square: np.ndarray, left: np.ndarray) -> np.ndarray:
         np.convolve(np.bincount(block.harmonic, values, highest + 1), weights)[middle]
         for values, weights in ((square, window), (left, window), (left, window**2))
     )
-    freedom = expected**2 / np.maximum(doubled, RIDGE)
-    ratio = power / np.maximum(expected, RIDGE) * _excess(freedom) / _excess(np.sum(left))
+    freedom = expected**2 / np.maximum(doubled, LEAST_INFORMATION)
+    ratio = power / np.maximum(expected, LEAST_INFORMATION) * _excess(freedom) / _excess(np.sum(left))
     return ratio[block.harmonic]
 
 
@@ -193,10 +193,10 @@ def variance_parts(
     changes = changes_by_variance(problem, estimate)
     factors = np.broadcast_to(log_variance_factor, len(likelihood.blocks))
     for (name, *_), members in likelihood.groups():
-        if (own := changes.get(name)) is not None:
-            moved, left = inverse @ own, likelihood.counts[name] * float(factors[members[0]])
+        if (jacobian := changes.get(name)) is not None:
+            moved, left = inverse @ jacobian, likelihood.counts[name] * float(factors[members[0]])
             once, freedom = moved @ moved.T, max(left + _worth(problem, estimate, name), 1.0)
-            parts[name] = VariancePart(once, (once @ own) @ moved.T, max(left, 1.0), freedom)
+            parts[name] = VariancePart(once, (once @ jacobian) @ moved.T, max(left, 1.0), freedom)
     return parts
 
 
@@ -244,14 +244,14 @@ def _worth(problem: Problem, estimate: Iterate, variance: str) -> float:
     likelihood, noise = problem.likelihood, problem.noise
     if not noise.proper:
         return -float(noise.spare)
-    ends = estimate.noise[likelihood.names.index(variance)] * np.exp(np.array([-STEP, STEP]))
+    ends = estimate.noise[likelihood.names.index(variance)] * np.exp(np.array([-VARIANCE_STEP, VARIANCE_STEP]))
     slopes = noise.log_prior(VARIANCE, ends, likelihood.measured[variance])[1]
-    return -float(slopes.sum() + (slopes[1] - slopes[0]) / STEP)
+    return -float(slopes.sum() + (slopes[1] - slopes[0]) / VARIANCE_STEP)
 
 
 # Values tried of the first parameter of a spectrum's shape and of any other, between these quantiles of their priors.
-MANY, FEW = 60, 9
-TAIL = 0.005
+MANY_SHAPES, FEW_SHAPES = 60, 9
+SHAPE_TAIL = 0.005
 UPDATES, JITTER = 3, 1e-12
 
 
@@ -326,8 +326,8 @@ def _with_errors(problem: Problem, estimate: Iterate, covariance: np.ndarray) ->
         for b, part in zip(one.members, one.parts, strict=True):
             changes[b][first:last] = part.T
         first = last
-    for own, precision in zip(changes, likelihood.precisions(range(len(changes)), estimate.noise), strict=True):
-        hessian += (own * precision) @ own.T
+    for jacobian, precision in zip(changes, likelihood.precisions(range(len(changes)), estimate.noise), strict=True):
+        hessian += (jacobian * precision) @ jacobian.T
     return _Linear(scale, hessian, changes, estimated_inputs(problem, estimate).residuals)
 
 
@@ -348,22 +348,22 @@ def _mixture(
     others = fit.hessian - (s * now) @ s.T + JITTER * np.eye(len(s))
     pull, names = -(s * now) @ r, fit.scale.size
     points, log_prior = _points(problem)
-    log_posterior, found = np.empty(len(points)), np.empty((len(points), names, names))
+    log_posterior, covariances = np.empty(len(points)), np.empty((len(points), names, names))
     for i, shape in enumerate(_spectra(problem, blocks, np.column_stack([np.ones(len(points)), points]))):
-        own = weight / shape
-        gram, along = (s * own) @ s.T, s @ (own * r)
-        variance = float(np.sum(own * r**2)) / freedom
+        precision = weight / shape
+        gram, along = (s * precision) @ s.T, s @ (precision * r)
+        variance = float(np.sum(precision * r**2)) / freedom
         for _ in range(UPDATES):
             factors = lu_factor(gram / variance + others, check_finite=False)
             step = lu_solve(factors, along / variance + pull, check_finite=False)
             left = r - step @ s
-            variance = max(float(np.sum(own * left**2)) / freedom, TINY)
-        misfit = np.sum(own * left**2) / variance + step @ others @ step - 2.0 * step @ pull
+            variance = max(float(np.sum(precision * left**2)) / freedom, TINY)
+        misfit = np.sum(precision * left**2) / variance + step @ others @ step - 2.0 * step @ pull
         logarithms = float(np.sum(weight * np.log(variance * shape)) + np.sum(np.log(np.abs(np.diag(factors[0])))))
         log_posterior[i] = log_prior[i] - 0.5 * (misfit + logarithms)
         inverse = lu_solve(factors, np.eye(len(s), names), check_finite=False)
-        found[i] = inverse[:names] + np.outer(step[:names], step[:names])
-    return np.tensordot(_probabilities(log_posterior), found, 1)
+        covariances[i] = inverse[:names] + np.outer(step[:names], step[:names])
+    return np.tensordot(_probabilities(log_posterior), covariances, 1)
 
 
 def _spectra(problem: Problem, blocks: list[Block], values: np.ndarray) -> np.ndarray:
@@ -375,8 +375,8 @@ def _points(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Return shape parameters (points, parameters) spread over their priors, and their log-weights."""
     axes, weights = [], []
     for number, prior in enumerate(problem.noise.shape_priors.values()):
-        ends = np.log(prior.quantile(np.array([TAIL, 1.0 - TAIL])))
-        values = np.exp(np.linspace(ends[0], ends[1], MANY if number == 0 else FEW))
+        ends = np.log(prior.quantile(np.array([SHAPE_TAIL, 1.0 - SHAPE_TAIL])))
+        values = np.exp(np.linspace(ends[0], ends[1], MANY_SHAPES if number == 0 else FEW_SHAPES))
         axes.append(values)
         weights.append(prior.log_prob(values) + np.log(values))
     grid = np.meshgrid(*axes, indexing="ij")
@@ -418,14 +418,14 @@ def input_nonlinearity(
     The root mean square over pairs of opposite errors, normal given the estimate; NaN if one of the solves fails.
     """
     random, shifts = np.random.default_rng(0), []
-    roots = {name: np.linalg.cholesky(own) for name, own in estimated_inputs(problem, estimate).covariances.items()}
-    for _ in range(PROBES if roots else 0):
+    roots = {name: np.linalg.cholesky(one) for name, one in estimated_inputs(problem, estimate).covariances.items()}
+    for _ in range(INPUT_PROBES if roots else 0):
         moved: list[np.ndarray] = []
         for e in problem.experiments:
             observation = problem.observations[e.name]
             here = list(estimate.here.residuals)[len(moved) :][: len(observation.blocks)]
             if e.name not in roots:
-                moved += [np.zeros_like(own) for own in here]
+                moved += [np.zeros_like(part) for part in here]
                 continue
             errors, measured = roots[e.name] @ random.standard_normal(len(roots[e.name])), problem.input_errors[e.name]
             ends = []
@@ -436,7 +436,7 @@ def input_nonlinearity(
                 if response is None:
                     return np.full(estimate.theta.size, np.nan)
                 ends.append(observation.residuals(response))
-            moved += [0.5 * (up + down) - own for up, down, own in zip(*ends, here, strict=True)]
+            moved += [0.5 * (up + down) - part for up, down, part in zip(*ends, here, strict=True)]
         shifts.append(_shift(problem, estimate, moved, covariance))
     return np.sqrt(np.mean(np.square(shifts), axis=0)) if shifts else np.zeros(estimate.theta.size)
 
@@ -469,9 +469,9 @@ def _solved(
     if solved.code != CONVERGED:
         return None
     count = 0 if experiment.multipliers is None else experiment.multipliers.size
-    found = orbit_multipliers(equations, parameters, solved.z, count)
+    multipliers = orbit_multipliers(equations, parameters, solved.z, count)
     outputs = equations.outputs(solved.z, parameters)[::finer]
-    return Response(outputs, np.array(equations.frequency), np.log(np.abs(found)), np.array(delay))
+    return Response(outputs, np.array(equations.frequency), np.log(np.abs(multipliers)), np.array(delay))
 
 
 def input_loadings(
@@ -481,7 +481,7 @@ def input_loadings(
 
     Without those whose problem is singular.
     """
-    found = {}
+    loadings = {}
     for e in problem.experiments:
         changes, solution = directions(e, problem.model.inputs, noise), solutions[e.name]
         if not len(changes):
@@ -491,8 +491,8 @@ def input_loadings(
         moved = input_sensitivities(equations, z, parameters, changes)
         if moved is not None:
             caused = predicted_changes(problem, e, equations, theta, z, moved)
-            found[e.name] = (caused - _common(problem, e, noise)).T
-    return found
+            loadings[e.name] = (caused - _common(problem, e, noise)).T
+    return loadings
 
 
 def predicted_changes(
@@ -530,9 +530,9 @@ def caused_by_inputs(problem: Problem, loadings: Mapping[str, np.ndarray]) -> di
     variances: dict[str, list[float]] = {channel: [0.0] for channel in problem.channels}
     for name, matrix in loadings.items():
         blocks = problem.observations[name].blocks
-        for block, own in zip(blocks, np.split(matrix, np.cumsum([b.size for b in blocks])[:-1]), strict=True):
+        for block, part in zip(blocks, np.split(matrix, np.cumsum([b.size for b in blocks])[:-1]), strict=True):
             if block.channel in variances:
-                variances[block.channel].append(float(np.sum(np.mean(own**2, axis=0))))
+                variances[block.channel].append(float(np.sum(np.mean(part**2, axis=0))))
     return {channel: float(np.sqrt(np.mean(v[1:] or v))) for channel, v in variances.items()}
 
 
@@ -565,9 +565,9 @@ def estimated_inputs(
             expected = np.zeros(matrix.shape[1]) if before is None else before.expected
             sizes, response = [residuals[b].size for b in members], matrix + _common(problem, e, problem.input_noise).T
             moved = np.split(response @ expected, np.cumsum(sizes)[:-1])
-            own = [residuals[b] - part for b, part in zip(members, moved, strict=True)]
+            exact = [residuals[b] - part for b, part in zip(members, moved, strict=True)]
             precisions = likelihood.precisions(members, estimate.noise)
-            expected, covariance, remaining = expected_errors(matrix, own, precisions)
+            expected, covariance, remaining = expected_errors(matrix, exact, precisions)
             if remaining.any():
                 errors[e.name] = InputErrors(expected, remaining, response @ expected)
                 covariances[e.name] = covariance

@@ -11,19 +11,19 @@ from bayesperiodic.density.log_posterior import Linearisation, LogPosterior
 from bayesperiodic.likelihood.noise_estimate import estimate_noise
 from bayesperiodic.problem.description import Description
 
-MAX_ITERATIONS = 100
-MAX_HALVINGS = 30
+MAX_STEPS = 100
+MAX_STEP_HALVINGS = 30
 SCALED_STEP = 1e-8
-SMALL_STEP, SMALL_GAIN = 1e-4, 1e-12
+CONVERGED_STEP, SMALL_GAIN = 1e-4, 1e-12
 # A step that gains less than the rounding errors of the objective, which are up to 1e-7 [standard deviations].
-NEGLIGIBLE = 1e-3
-SINGULAR = 1e-13
-MAX_ROUNDS, PRESSED, LONGEST = 10, 1e-3, 3.0
-LOST = 1e-6
+NEGLIGIBLE_STEP = 1e-3
+NO_CURVATURE = 1e-13
+MAX_ROUNDS, PRESSED, LONGEST_MOVE = 10, 1e-3, 3.0
+LOST_PART = 1e-6
 # Residuals whose sum of squares is no finite number.
 OVERFLOWS = 1e150
 # Change of the factors that ends the correction, and the largest part of its values that parameters may take up.
-SETTLED, MOST_TAKEN = 1e-6, 0.99
+SETTLED_FACTOR, MOST_TAKEN = 1e-6, 0.99
 
 
 @dataclass(frozen=True)
@@ -109,9 +109,9 @@ def information(problem: Description, iterate: Iterate) -> tuple[np.ndarray, np.
 def inverse_hessian(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the inverse of H without its directions of no curvature, and which parameters belong to these."""
     values, vectors, scale = hessian_eigh(hessian)
-    curved = np.abs(values) > SINGULAR * np.abs(values).max()
+    curved = np.abs(values) > NO_CURVATURE * np.abs(values).max()
     inverse = scaled((vectors[:, curved] / values[curved]) @ vectors[:, curved].T, scale)
-    return inverse, np.any(np.abs(vectors[:, ~curved]) > LOST, axis=1)
+    return inverse, np.any(np.abs(vectors[:, ~curved]) > LOST_PART, axis=1)
 
 
 def changes_by_variance(problem: Description, iterate: Iterate) -> dict[str, np.ndarray]:
@@ -145,27 +145,27 @@ def bias_correction(problem: Description, iterate: Iterate) -> np.ndarray:
     inverse, _ = inverse_hessian(hessian)
     changes = changes_by_variance(problem, iterate)
     for group, members in likelihood.groups():
-        if (own := changes.get(group[0])) is not None:
-            taken = float(np.sum(own * (inverse @ own))) / likelihood.counts[group[0]]
+        if (jacobian := changes.get(group[0])) is not None:
+            taken = float(np.sum(jacobian * (inverse @ jacobian))) / likelihood.counts[group[0]]
             result[members] = 1.0 - np.clip(taken, 0.0, MOST_TAKEN)
     return result
 
 
-def corrected(objective: Objective, found: End, report: Report = None) -> tuple[Objective, End]:
+def corrected(objective: Objective, end: End, report: Report = None) -> tuple[Objective, End]:
     """Climb again from the end of a climb with `bias_correction` at each new end, until its factors settle.
 
     Returns the last objective and end.
     """
     for _ in range(MAX_ROUNDS):
-        factor = bias_correction(objective.density.problem, found.iterate)
-        if np.all(np.abs(factor - objective.log_variance_factor) < SETTLED):
+        factor = bias_correction(objective.density.problem, end.iterate)
+        if np.all(np.abs(factor - objective.log_variance_factor) < SETTLED_FACTOR):
             break
         other = replace(objective, log_variance_factor=factor)
-        again = resumed(other, found, report)
+        again = resumed(other, end, report)
         if again is None:
             break
-        objective, found = other, again
-    return objective, found
+        objective, end = other, again
+    return objective, end
 
 
 def resumed(objective: Objective, end: End, report: Report = None) -> End | None:
@@ -182,7 +182,7 @@ def resumed(objective: Objective, end: End, report: Report = None) -> End | None
 
 def climb(
     objective: Objective, start: Iterate, held: np.ndarray | None = None, report: Report = None,
-    most: int = MAX_ITERATIONS,
+    most: int = MAX_STEPS,
 ) -> End:  # fmt: skip
     """Increase the objective from an anchored start until the steps are small, at most so many steps in a row.
 
@@ -228,20 +228,20 @@ def _ascend(
         if size < SCALED_STEP:
             return now, "converged", history
         damping, trial = 1.0, None
-        for _ in range(MAX_HALVINGS):
+        for _ in range(MAX_STEP_HALVINGS):
             trial = objective.at(objective.moved(now.theta, damping * step), now.here, now.noise)
             if trial is not None and trial.objective > now.objective:
                 break
             damping, trial = 0.5 * damping, None
-            if size < SMALL_STEP:
+            if size < CONVERGED_STEP:
                 return now, "converged", history
         if trial is None:
-            return now, "converged" if size < NEGLIGIBLE else "stalled", history
+            return now, "converged" if size < NEGLIGIBLE_STEP else "stalled", history
         gain, now = trial.objective - now.objective, objective.anchored(trial)
         history.append(now.objective)
         if report is not None:
             report(now, damping * size)
-        if size < SMALL_STEP and gain < SMALL_GAIN:
+        if size < CONVERGED_STEP and gain < SMALL_GAIN:
             return now, "converged", history
     return now, "iterations", history
 
@@ -253,7 +253,7 @@ def _curved(objective: Objective, iterate: Iterate, hessian: np.ndarray) -> np.n
     this prior is three widths of the parameter's own prior, or the distance to its median.
     """
     prior = objective.density.problem.joint_prior
-    longest = np.maximum(LONGEST * prior.widths, np.abs(iterate.theta - prior.median()))
+    longest = np.maximum(LONGEST_MOVE * prior.widths, np.abs(iterate.theta - prior.median()))
     weak = np.abs(np.diag(hessian)) * longest**2 < 1.0
     return np.where(np.diag(weak), np.diag(longest**-2.0), hessian) if weak.any() else hessian
 
@@ -266,7 +266,7 @@ def _step(hessian: np.ndarray, gradient: np.ndarray, held: np.ndarray) -> tuple[
         return step, 0.0
     values, vectors, scale = hessian_eigh(hessian[np.ix_(moving, moving)])
     values = np.abs(values)
-    along, curved = vectors.T @ (scale * gradient[moving]), values > SINGULAR * values.max()
+    along, curved = vectors.T @ (scale * gradient[moving]), values > NO_CURVATURE * values.max()
     along = np.where(curved, along / np.where(curved, values, 1.0), 0.0)
     step[moving] = scale * (vectors @ along)
     return step, float(np.sqrt(np.sum(values * along**2)))

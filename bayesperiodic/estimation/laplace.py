@@ -10,10 +10,10 @@ import pandas as pd
 from bayesperiodic._io import Storable
 from bayesperiodic._linalg import covariance_eigh, hessian_eigh, hessian_scale, scaled
 from bayesperiodic.density.log_posterior import LogPosterior
-from bayesperiodic.estimation.gauss_newton import SINGULAR, Iterate, Objective, climb
+from bayesperiodic.estimation.gauss_newton import NO_CURVATURE, Iterate, Objective, climb
 from bayesperiodic.problem.description import Description
 
-STEP = 1e-3
+THETA_STEP = 1e-3
 NOISE_STEP = 1e-4
 
 
@@ -43,7 +43,7 @@ def joint_laplace(density: LogPosterior, start: Iterate) -> JointLaplace:
     hessian = _hessian(objective, mode, free)
     if np.isfinite(hessian).all() and np.all(np.diag(hessian) > 0.0):
         curvatures, vectors, scale = hessian_eigh(hessian)
-        if curvatures.min() >= SINGULAR * curvatures.max():
+        if curvatures.min() >= NO_CURVATURE * curvatures.max():
             covariance.iloc[:, :] = scaled((vectors / curvatures) @ vectors.T, scale)
     values = [*mode.theta.tolist(), *mode.noise[free].tolist()]
     return JointLaplace(dict(zip(labels, values, strict=True)), covariance, mode.objective)
@@ -81,10 +81,10 @@ def _second_derivatives(objective: Objective, mode: Iterate) -> np.ndarray:
         ends = []
         for sign in (1.0, -1.0):
             theta = mode.theta.copy()
-            theta[list(group.values())] += sign * STEP * sd[list(group.values())]
+            theta[list(group.values())] += sign * THETA_STEP * sd[list(group.values())]
             ends.append(_gradients(problem, theta, mode))
         for experiment, column in group.items():
-            result[:, column] += (ends[0][experiment] - ends[1][experiment]) / (2.0 * STEP * sd[column])
+            result[:, column] += (ends[0][experiment] - ends[1][experiment]) / (2.0 * THETA_STEP * sd[column])
     return 0.5 * (result + result.T)
 
 
@@ -108,8 +108,8 @@ def _gradients(problem: Description, theta: np.ndarray, mode: Iterate) -> dict[s
     return there.vjp(by_residual, adjoint=not problem.model.autonomous)
 
 
-SHOWN = 0.05
-LARGEST = 4
+SHOWN_PART = 0.05
+LARGEST_EXPONENT = 4
 ROUNDED = 0.06
 
 
@@ -118,7 +118,7 @@ def reduced(directions: np.ndarray) -> np.ndarray:
     rows = directions.copy()
     for i in range(len(rows)):
         relative = np.abs(rows) / np.abs(rows).max(axis=1, keepdims=True)
-        column = int(np.argmax(relative[i] > SHOWN))
+        column = int(np.argmax(relative[i] > SHOWN_PART))
         rows[i] /= rows[i, column]
         for j in range(len(rows)):
             if j != i:
@@ -128,15 +128,17 @@ def reduced(directions: np.ndarray) -> np.ndarray:
 
 def exponents(direction: np.ndarray) -> list[Fraction] | None:
     """Return a direction in logarithms as simple fractions, the first positive; None if there are none nearby."""
-    shown = np.abs(direction) > SHOWN * np.abs(direction).max()
+    shown = np.abs(direction) > SHOWN_PART * np.abs(direction).max()
     smallest = np.abs(direction[shown]).min()
     for unit in (smallest, np.abs(direction).max()):
-        found = [Fraction(float(v / unit)).limit_denominator(LARGEST) for v in np.where(shown, direction, 0.0)]
-        errors = [abs(float(f) - v / unit) for f, v in zip(found, direction, strict=True)]
-        largest, lost = max(abs(f) for f in found), any(not f for f, s in zip(found, shown, strict=True) if s)
-        if largest <= LARGEST and not lost and max(errors) < ROUNDED * max(1.0, float(largest)):
-            sign = 1 if next(f for f in found if f) > 0 else -1
-            return [sign * f for f in found]
+        fractions = [
+            Fraction(float(v / unit)).limit_denominator(LARGEST_EXPONENT) for v in np.where(shown, direction, 0.0)
+        ]
+        errors = [abs(float(f) - v / unit) for f, v in zip(fractions, direction, strict=True)]
+        largest, lost = max(abs(f) for f in fractions), any(not f for f, s in zip(fractions, shown, strict=True) if s)
+        if largest <= LARGEST_EXPONENT and not lost and max(errors) < ROUNDED * max(1.0, float(largest)):
+            sign = 1 if next(f for f in fractions if f) > 0 else -1
+            return [sign * f for f in fractions]
     return None
 
 
@@ -153,23 +155,27 @@ def combinations(direction: np.ndarray, names: Sequence[str], logarithmic: np.nd
     >>> combinations(np.array([1.0, -1.0]), ["a", "b"], np.array([False, False]))
     ['a + b']
     """
-    shown = np.flatnonzero(np.abs(direction) > SHOWN * np.abs(direction).max())
-    own, direction, powers = [names[i] for i in shown.tolist()], direction[shown], logarithmic[shown]
+    shown = np.flatnonzero(np.abs(direction) > SHOWN_PART * np.abs(direction).max())
+    involved, direction, powers = [names[i] for i in shown.tolist()], direction[shown], logarithmic[shown]
     if shown.size < 2 or powers.any() != powers.all():
         return []
     if not powers.all():
         pivot = int(np.argmax(np.abs(direction)))
         return [
-            _sum(own[pivot], -float(direction[pivot] / direction[i]), own[i]) for i in range(shown.size) if i != pivot
+            _sum(involved[pivot], -float(direction[pivot] / direction[i]), involved[i])
+            for i in range(shown.size)
+            if i != pivot
         ]
     rational = exponents(direction)
     if rational is None:
         return []
     pivot = min(range(len(rational)), key=lambda i: (abs(rational[i]), i))
     ratios = [r / rational[pivot] for r in rational]
-    if max(max(abs(r.numerator), r.denominator) for r in ratios) > LARGEST:
+    if max(max(abs(r.numerator), r.denominator) for r in ratios) > LARGEST_EXPONENT:
         return []
-    return [_product(own[i], ratios[i], own[pivot], first=i < pivot) for i in range(len(rational)) if i != pivot]
+    return [
+        _product(involved[i], ratios[i], involved[pivot], first=i < pivot) for i in range(len(rational)) if i != pivot
+    ]
 
 
 def _product(name: str, ratio: Fraction, other: str, *, first: bool) -> str:
@@ -178,10 +184,10 @@ def _product(name: str, ratio: Fraction, other: str, *, first: bool) -> str:
     def power(name: str, exponent: int) -> str:
         return name if exponent == 1 else f"{name}**{exponent}"
 
-    own, its = power(name, ratio.denominator), power(other, abs(ratio.numerator))
+    first_power, other_power = power(name, ratio.denominator), power(other, abs(ratio.numerator))
     if ratio > 0:
-        return f"{own}/{its}"
-    return f"{own}*{its}" if first else f"{its}*{own}"
+        return f"{first_power}/{other_power}"
+    return f"{first_power}*{other_power}" if first else f"{other_power}*{first_power}"
 
 
 def _sum(name: str, ratio: float, other: str) -> str:
@@ -197,7 +203,7 @@ def in_words(direction: np.ndarray, names: Sequence[str], logarithmic: np.ndarra
     >>> in_words(np.array([0.5, -1.0]), ["a", "b"], np.array([True, True]))
     'a → a·t, b → b·t^-2'
     """
-    shown = np.flatnonzero(np.abs(direction) > SHOWN * np.abs(direction).max())
+    shown = np.flatnonzero(np.abs(direction) > SHOWN_PART * np.abs(direction).max())
     powers = [i for i in shown if logarithmic[i]]
     unit = direction[powers[0]] if powers else direction[shown[np.argmax(np.abs(direction[shown]))]]
     simple = exponents(direction[shown]) if len(powers) == shown.size else None
@@ -217,10 +223,10 @@ NEARLY_SINGULAR = 1e-10
 SILENT = "no output depends on it"
 # Relative size of the finite change at which a statement is tested, and the largest change of the data, relative to
 # that by one of the parameters alone, that counts as none.
-TESTED, UNCHANGED = 0.1, 1e-4
+TESTED_CHANGE, UNCHANGED = 0.1, 1e-4
 # Least relative effect of a parameter that belongs to a direction.
 INVOLVED = 1e-3
-COMBINED = "a combination of "
+IN_COMBINATION = "a combination of "
 
 
 def undetermined(
@@ -245,12 +251,12 @@ def undetermined(
     slopes = np.where(theta != 0.0, theta, 1.0)
     information = scaled(information, slopes)
     size = np.sqrt(np.diag(information))
-    silent = [f"{name}: {SILENT}" for name, own in zip(names, size, strict=True) if own == 0.0]
+    silent = [f"{name}: {SILENT}" for name, effect in zip(names, size, strict=True) if effect == 0.0]
     acting = np.flatnonzero(size > 0.0)
     if not acting.size:
         return tuple(silent)
     values, vectors, _ = covariance_eigh(information[np.ix_(acting, acting)], size[acting])
-    found = []
+    combined = []
     for effects in reduced(vectors[:, values < NEARLY_SINGULAR].T):
         involved = np.abs(effects) > INVOLVED * np.abs(effects).max()
         direction = np.zeros(len(names))
@@ -262,9 +268,9 @@ def undetermined(
                 break
         else:
             listed = [names[int(i)] for i in shown]
-            text = COMBINED + " and ".join(filter(None, [", ".join(listed[:-1]), listed[-1]]))
-        found.append(text)
-    return tuple(silent + found)
+            text = IN_COMBINATION + " and ".join(filter(None, [", ".join(listed[:-1]), listed[-1]]))
+        combined.append(text)
+    return tuple(silent + combined)
 
 
 def by_powers(direction: np.ndarray, theta: np.ndarray, names: Sequence[str]) -> tuple[str, np.ndarray]:
@@ -277,7 +283,7 @@ def by_powers(direction: np.ndarray, theta: np.ndarray, names: Sequence[str]) ->
     powers[shown] = np.array(simple, dtype=float) / float(simple[0])
     factors = [f"·t^{power:.3g}" if power != 1.0 else "·t" for power in powers[shown]]
     text = ", ".join(f"{names[int(i)]} → {names[int(i)]}{f}" for i, f in zip(shown, factors, strict=True))
-    return text, theta * (1.0 + TESTED) ** (powers / np.abs(powers).max())
+    return text, theta * (1.0 + TESTED_CHANGE) ** (powers / np.abs(powers).max())
 
 
 def by_sums(direction: np.ndarray, theta: np.ndarray, names: Sequence[str]) -> tuple[str, np.ndarray]:
@@ -289,4 +295,4 @@ def by_sums(direction: np.ndarray, theta: np.ndarray, names: Sequence[str]) -> t
     terms = [("" if abs(r) == 1.0 else f"{abs(r):.6g}·", "+" if r > 0.0 else "−") for r in ratios[shown]]
     text = ", ".join(f"{names[int(i)]} → {names[int(i)]} {b} {a}t" for i, (a, b) in zip(shown, terms, strict=True))
     scale = np.min(np.where(theta != 0.0, np.abs(theta), 1.0)[shown] / np.abs(ratios[shown]))
-    return text, theta + TESTED * scale * ratios
+    return text, theta + TESTED_CHANGE * scale * ratios

@@ -23,7 +23,7 @@ from bayesperiodic.estimation.covariance import (
     uncertainty,
 )
 from bayesperiodic.estimation.gauss_newton import (
-    MAX_ITERATIONS,
+    MAX_STEPS,
     End,
     Iterate,
     Objective,
@@ -44,7 +44,7 @@ MOST_SHOWN_MODES = 3
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
 # Most linearisations of errors of the inputs, the steps between two, and the change [sds] that ends them.
-MOST_ROUNDS, BETWEEN, SETTLED = 40, 5, 1e-5
+MOST_LINEARISATIONS, STEPS_BETWEEN, SETTLED_INPUTS = 40, 5, 1e-5
 # Seconds after which the progress bar is shown.
 SHOWN_AFTER = 2.0
 
@@ -153,8 +153,8 @@ def map_estimate(
         objective = _objective(noisy, moved.iterate.here)
         ends, problem = [moved if end is best else _moved(noisy, end) for end in ends], noisy
         best = moved
-    objective, found = corrected(objective, best)
-    ends = [found if end is best else end and resumed(objective, end) for end in ends]
+    objective, settled = corrected(objective, best)
+    ends = [settled if end is best else end and resumed(objective, end) for end in ends]
     modes = with_images(objective, [end for end in ends if end], partial(_climb, objective, progress=progress))
     result = _describe(problem, objective, modes, tuple(_outcome(problem, end) for end in ends), checks)
     for text in estimation_warnings(problem, result):
@@ -178,7 +178,7 @@ def nearest_optimum(
 
 def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Problem, End]:
     """Return problem and end of the climb with the errors of the inputs, linearised about the estimate."""
-    for _ in range(MOST_ROUNDS if problem.noisy_inputs else 0):
+    for _ in range(MOST_LINEARISATIONS if problem.noisy_inputs else 0):
         now, before = end.iterate, problem.input_errors
         loadings = input_loadings(problem, now.theta, now.here.simulator.solutions(now.theta), problem.input_noise)
         errors = estimated_inputs(problem, now, loadings).errors
@@ -186,17 +186,17 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
         objective, first = _of_problem(problem, now)
         if first is None:
             break
-        end = _climb(objective, first, progress, BETWEEN)
+        end = _climb(objective, first, progress, STEPS_BETWEEN)
         step = end.iterate.theta - now.theta
-        moved = [own.expected - (before[n].expected if n in before else np.inf) for n, own in errors.items()]
-        still = all(np.abs(own).max(initial=0.0) < SETTLED for own in moved)
-        if still and step @ objective.hessian_and_gradient(end.iterate)[0] @ step < SETTLED**2:
+        moved = [one.expected - (before[n].expected if n in before else np.inf) for n, one in errors.items()]
+        still = all(np.abs(change).max(initial=0.0) < SETTLED_INPUTS for change in moved)
+        if still and step @ objective.hessian_and_gradient(end.iterate)[0] @ step < SETTLED_INPUTS**2:
             return problem, resumed(objective, end) or end
     if problem.noisy_inputs:
         warnings.warn(
             "The errors of the inputs could not be linearised: estimate or inputs still move when this is repeated, by "
-            f"more than {SETTLED:g} of their standard deviations. Average more cycles, or take input_noise='joint', in "
-            "which they are parameters.",
+            f"more than {SETTLED_INPUTS:g} of their standard deviations. Average more cycles, or take "
+            "input_noise='joint', in which they are parameters.",
             UserWarning,
             stacklevel=4,
         )
@@ -227,23 +227,23 @@ def _first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:
     """Return the anchored iterate at a start; None if the log-posterior is not finite there."""
     if not np.isfinite(problem.joint_prior.log_prob(theta)):
         return None
-    found = simultaneous_fit(problem, theta)
-    if found is not None and found.states:
-        near = _linearised(problem, theta, found)
+    initial = simultaneous_fit(problem, theta)
+    if initial is not None and initial.states:
+        near = _linearised(problem, theta, initial)
         iterate = _objective(problem, near).iterate(near, problem.likelihood.guess())
         if iterate is not None:
             return iterate
-    if found is not None and all(e.mask is not None for e in problem.experiments):
+    if initial is not None and all(e.mask is not None for e in problem.experiments):
         return None
     near = _linearised(problem, theta, None)
     return _objective(problem, near).iterate(near, problem.likelihood.guess())
 
 
-def _linearised(problem: Problem, theta: np.ndarray, found: InitialEstimate | None) -> Linearisation:
+def _linearised(problem: Problem, theta: np.ndarray, initial: InitialEstimate | None) -> Linearisation:
     """Return residuals and Jacobian where orbits and parameters fit together, or else at θ."""
-    if found is None or not found.states:
+    if initial is None or not initial.states:
         return problem.density().linearise(theta)
-    return LogPosterior(problem, Simulator.start(problem, found.theta, found.states)).linearise(found.theta)
+    return LogPosterior(problem, Simulator.start(problem, initial.theta, initial.states)).linearise(initial.theta)
 
 
 def _from_draw(objective: Objective, first: Iterate, theta: np.ndarray, progress: bool) -> End | None:
@@ -254,7 +254,7 @@ def _from_draw(objective: Objective, first: Iterate, theta: np.ndarray, progress
         return None if other is None else _climb(objective, objective.anchored(other), progress)
 
 
-def _climb(objective: Objective, first: Iterate, progress: bool, most: int = MAX_ITERATIONS) -> End:
+def _climb(objective: Objective, first: Iterate, progress: bool, most: int = MAX_STEPS) -> End:
     with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress, delay=SHOWN_AFTER) as bar:
 
         def report(iterate: Iterate, size: float) -> None:
@@ -297,9 +297,9 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
     solutions = {name: solution.states for name, solution in end.here.simulator.solutions(end.theta).items()}
     for theta in (start, end.theta):
         guessed, measured = measured_orbits(problem, theta, solutions)
-        for found in (measured, simultaneous_fit(guessed, measured.theta)):
-            if found is not None and found.states:
-                yield _linearised(problem, found.theta, found)
+        for initial in (measured, simultaneous_fit(guessed, measured.theta)):
+            if initial is not None and initial.states:
+                yield _linearised(problem, initial.theta, initial)
 
 
 def _outcome(problem: Problem, end: End | None) -> dict[str, float]:
@@ -383,8 +383,8 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
         shown = "; ".join(map(repr, others[:MOST_SHOWN_MODES]))
         yield (
             f"{len(others) + 1} separate optima fit the data: the estimate, with {fit.modes['mass'].iloc[0]:.0%} of "
-            f"the posterior mass by Laplace, and {shown}. Standard deviations "
-            "describe the first one only. Sample the posterior, or give priors that exclude the others."
+            f"the posterior mass by Laplace, and {shown}. Standard deviations describe the first one only. Sample the "
+            "posterior, or give priors that exclude the others."
         )
     if fit.checks is not None:
         yield from check_warnings(problem, fit)
@@ -431,15 +431,15 @@ def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
             "is not finite."
         )
     values += "" if given_start else " (the priors' medians)"
-    found = simultaneous_fit(problem, theta)
-    if found is not None and found.blocked:
+    initial = simultaneous_fit(problem, theta)
+    if initial is not None and initial.blocked:
         where = "the other experiments' orbits are" if len(problem.experiments) > 1 else "it is an orbit"
         return (
-            f"start: must be a point from which the orbits can be followed, got {values}; {found.blocked!r} cannot be "
-            f"followed from its guess to parameters at which {where}. Leave it out if it may be no orbit, or give "
+            f"start: must be a point from which the orbits can be followed, got {values}; {initial.blocked!r} cannot "
+            f"be followed from its guess to parameters at which {where}. Leave it out if it may be no orbit, or give "
             "start={…} nearer to the truth."
         )
-    near = _linearised(problem, theta, found)
+    near = _linearised(problem, theta, initial)
     failed = ", ".join(f"{name!r} ({status})" for name, status in near.statuses.items() if status != "converged")
     ended = f"without the orbit of {failed}" if failed else "well, but the outputs or the noise are not finite"
     cures = "start={…}, or priors with other medians, at which problem.solve(theta) converges."

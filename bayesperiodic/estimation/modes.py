@@ -10,19 +10,19 @@ from scipy.special import softmax
 
 from bayesperiodic._io import Storable
 from bayesperiodic._linalg import covariance_eigh, hessian_eigh
-from bayesperiodic.estimation.gauss_newton import SINGULAR, End, Iterate, Objective, preference
+from bayesperiodic.estimation.gauss_newton import NO_CURVATURE, End, Iterate, Objective, preference
 from bayesperiodic.estimation.laplace import JointLaplace
 from bayesperiodic.periodic.schemes import FourierScheme, find_scheme
 from bayesperiodic.problem.description import Description
 
 # Default number of starts: at most 8, and at most this number of unknowns of all starts and experiments. A dense
 # scheme counts as many times more as its grid is longer than 50 points.
-MOST_STARTS, UNKNOWNS, DENSE = 8, 16_000, 50
+MOST_STARTS, MOST_UNKNOWNS, DENSE = 8, 16_000, 50
 # Ends of the iteration are separate optima if their distance exceeds one standard deviation of the Laplace
 # approximation at one of them. Optima whose objective is lower than the best one's by more than 30 are left out.
-APART, LOWEST, MOST_MODES = 1.0, 30.0, 16
+SEPARATE_SDS, LOWEST_OBJECTIVE, MOST_MODES = 1.0, 30.0, 16
 # A converged end is preferred to one that has not converged if their objectives differ by less.
-EQUAL = 1e-3
+EQUAL_OBJECTIVES = 1e-3
 # Smallest density of an image, relative to the optimum's, and largest number of signs changed in all combinations.
 CREDIBLE, MOST_SIGNS = 1e-3, 4
 # Mass of another optimum above which the estimate alone does not describe the posterior.
@@ -51,7 +51,7 @@ class Mode(Storable):
     def differs(self, name: str, value: float, sd: float) -> bool:
         """Return whether a parameter is further than one sd, the smaller one, from its value at the estimate."""
         widths = [width for width in (sd, self.sd[name]) if np.isfinite(width)]
-        return bool(abs(self.theta[name] - value) > APART * min(widths, default=np.inf))
+        return bool(abs(self.theta[name] - value) > SEPARATE_SDS * min(widths, default=np.inf))
 
 
 def default_starts(problem: Description) -> int:
@@ -59,7 +59,7 @@ def default_starts(problem: Description) -> int:
     points = [e.samples * e.periods for e in problem.experiments]
     dense = isinstance(find_scheme(problem.scheme), FourierScheme)
     unknowns = len(problem.model.states) * sum(p * (max(1.0, p / DENSE) if dense else 1.0) for p in points)
-    return int(np.clip(UNKNOWNS / unknowns, 1, MOST_STARTS))
+    return int(np.clip(MOST_UNKNOWNS / unknowns, 1, MOST_STARTS))
 
 
 def with_images(objective: Objective, ends: Sequence[End], climbed: Callable[[Iterate], End]) -> list[End]:
@@ -73,38 +73,38 @@ def with_images(objective: Objective, ends: Sequence[End], climbed: Callable[[It
     fewest = len(ends[0].iterate.here.other_orbits)
     ends = [end for end in ends if len(end.iterate.here.other_orbits) == fewest]
     settled = [end for end in ends if end.status == "converged"]
-    equal = [end for end in settled if end.iterate.objective > ends[0].iterate.objective - EQUAL]
-    found = [(equal or ends)[0]]
+    equal = [end for end in settled if end.iterate.objective > ends[0].iterate.objective - EQUAL_OBJECTIVES]
+    optima = [(equal or ends)[0]]
     for end in settled:
-        if _is_separate(objective, end.iterate.theta, found):
-            found.append(end)
-    waiting = list(found)
-    while waiting and len(found) < MOST_MODES:
+        if _is_separate(objective, end.iterate.theta, optima):
+            optima.append(end)
+    waiting = list(optima)
+    while waiting and len(optima) < MOST_MODES:
         here = waiting.pop(0).iterate
         for image in _credible_images(objective, here):
-            start = objective.at(image, here.here, here.noise) if _is_separate(objective, image, found) else None
+            start = objective.at(image, here.here, here.noise) if _is_separate(objective, image, optima) else None
             if start is None:
                 continue
             end = climbed(objective.anchored(start))
-            if not _is_separate(objective, end.iterate.theta, found):
+            if not _is_separate(objective, end.iterate.theta, optima):
                 continue
             if end.status == "converged" and len(end.iterate.here.other_orbits) == fewest:
-                found.append(end)
+                optima.append(end)
                 waiting.append(end)
-    found.sort(key=lambda end: -end.iterate.objective)
-    return [end for end in found if end.iterate.objective > found[0].iterate.objective - LOWEST]
+    optima.sort(key=lambda end: -end.iterate.objective)
+    return [end for end in optima if end.iterate.objective > optima[0].iterate.objective - LOWEST_OBJECTIVE]
 
 
-def _is_separate(objective: Objective, theta: np.ndarray, found: Sequence[End]) -> bool:
+def _is_separate(objective: Objective, theta: np.ndarray, optima: Sequence[End]) -> bool:
     """Return whether θ (names,) is further than a standard deviation from all optima found."""
-    return all(_distance(objective, theta, end.iterate) > APART for end in found)
+    return all(_distance(objective, theta, end.iterate) > SEPARATE_SDS for end in optima)
 
 
 def _distance(objective: Objective, theta: np.ndarray, mode: Iterate) -> float:
     """Return the distance in standard deviations, directions without curvature left out."""
     values, vectors, scale = hessian_eigh(objective.hessian_and_gradient(mode)[0])
     along = vectors.T @ ((theta - mode.theta) / scale)
-    curved = np.abs(values) > SINGULAR * np.abs(values).max()
+    curved = np.abs(values) > NO_CURVATURE * np.abs(values).max()
     return float(np.sqrt(np.sum(np.abs(values[curved]) * along[curved] ** 2)))
 
 
@@ -131,16 +131,16 @@ def images(problem: Description, theta: np.ndarray) -> np.ndarray:
     supports = problem.joint_prior.supports
     signed = [i for i, (low, high) in enumerate(supports.values()) if low < 0.0 < high]
     sizes = range(1, len(signed) + 1) if len(signed) <= MOST_SIGNS else (1, len(signed))
-    found = []
+    changed = []
     for columns in (list(c) for n in sizes for c in combinations(signed, n)):
         image = theta.copy()
         image[columns] *= -1.0
-        found.append(image)
+        changed.append(image)
     for i, j in combinations([i for i, name in enumerate(supports) if "[" not in name], 2):
         image = theta.copy()
         image[[i, j]] = theta[[j, i]]
-        found.append(image)
-    return np.array(found).reshape(-1, theta.size)
+        changed.append(image)
+    return np.array(changed).reshape(-1, theta.size)
 
 
 def weighed(problem: Description, ends: Sequence[End], laplaces: Sequence[JointLaplace]) -> tuple[Mode, ...]:

@@ -23,15 +23,15 @@ from bayesperiodic.priors.single import Prior
 from bayesperiodic.problem.parameters import SHIFT
 
 # Distance of points, as the change of the root of the drop; growth, shortening and smallest size of steps.
-SPACING, GROWTH, SHORTENED, SMALLEST = 0.5, 3.0, 0.25, 0.01
+ROOT_SPACING, STEP_GROWTH, SHORTENED, SHORTEST_STEP = 0.5, 3.0, 0.25, 0.01
 # Above the root 2.576 of a 99 % interval, so that the end of this interval lies between two points.
 FURTHEST = 2.8
 # A step leaves a tenth of the distance to the support's end. The last point leaves a millionth of the peak's distance,
 # because priors may vanish at the end, or is the outermost thousandth of the prior if that is closer.
-NEARER, NEAREST, TAIL = 0.1, 1e-6, 1e-3
-MOST_POINTS, MOST_FAILURES, MOST_ROUNDS = 60, 5, 5
+NEARER, NEAREST, OUTERMOST = 0.1, 1e-6, 1e-3
+MOST_PROFILE_POINTS, MOST_FAILURES, MOST_IMPROVEMENTS = 60, 5, 5
 # Gain of an improved point; curvature that is none; distance from a known iterate within which a climb leads to it.
-GAIN, CUT, MET = 1e-6, 1e-12, 0.1
+LEAST_GAIN, CUT, MET = 1e-6, 1e-12, 0.1
 
 
 class Point(NamedTuple):
@@ -61,7 +61,7 @@ class Ridge:
 
     def limits(self) -> tuple[float, float]:
         """Return the outermost values: close to the ends of the prior's support, or infinite."""
-        tails = self._prior.quantile(np.array([TAIL, 1.0 - TAIL]))
+        tails = self._prior.quantile(np.array([OUTERMOST, 1.0 - OUTERMOST]))
         below, above = (self._limit(end, tail) for end, tail in zip(self._prior.support, tails, strict=True))
         return below, above
 
@@ -78,8 +78,8 @@ class Ridge:
 
         If the way back raises an end, the profile is extended from there.
         """
-        step, points = SPACING * self._size(), [Point(self.at, self.peak)]
-        for _ in range(MOST_ROUNDS):
+        step, points = ROOT_SPACING * self._size(), [Point(self.at, self.peak)]
+        for _ in range(MOST_IMPROVEMENTS):
             top = max(point.iterate.objective for point in points if point.iterate is not None)
             below, above = self._outwards(points[0], -step, top), self._outwards(points[-1], step, top)
             if not below and not above:
@@ -99,13 +99,13 @@ class Ridge:
     def _outwards(self, start: Point, step: float, top: float) -> list[Point]:
         """Return points in one direction, each started from the previous one.
 
-        The root of twice the drop from the top changes by about `SPACING` from point to point; a step that changes it
-        by more than twice that is shortened, unless it is short already, which means that the density jumps.
+        The root of twice the drop from the top changes by about `ROOT_SPACING` from point to point; a step that changes
+        it by more than twice that is shortened, unless it is short already, which means that the density jumps.
         """
         end, limit = self._prior.support[step > 0.0], self.limits()[step > 0.0]
         points: list[Point] = []
         (now, here), first, overshot, failures = start, step, end, 0
-        while here is not None and now != limit and _root(top, here) <= FURTHEST and len(points) < MOST_POINTS:
+        while here is not None and now != limit and _root(top, here) <= FURTHEST and len(points) < MOST_PROFILE_POINTS:
             value = _next(now, step, end, limit)
             step, there = value - now, self._climbed(here, value)
             if there is None:
@@ -114,8 +114,8 @@ class Ridge:
                 if failures == MOST_FAILURES:
                     break
                 continue
-            ratio = SPACING / max(abs(_root(top, there) - _root(top, here)), SPACING / GROWTH)
-            if ratio < 0.5 and abs(step) > SMALLEST * min(abs(first), abs(now - end)):
+            ratio = ROOT_SPACING / max(abs(_root(top, there) - _root(top, here)), ROOT_SPACING / STEP_GROWTH)
+            if ratio < 0.5 and abs(step) > SHORTEST_STEP * min(abs(first), abs(now - end)):
                 step, overshot = step * max(ratio, SHORTENED), value
                 continue
             points.append(Point(value, there))
@@ -123,7 +123,7 @@ class Ridge:
             if ratio < 0.5:
                 step, overshot = first, end
                 continue
-            widest = max(1.0, 0.5 * (overshot - now) / step) if overshot * step > now * step else GROWTH
+            widest = max(1.0, 0.5 * (overshot - now) / step) if overshot * step > now * step else STEP_GROWTH
             step *= min(ratio, widest)
         return points
 
@@ -139,7 +139,9 @@ class Ridge:
             other = None
             if before is not None and (inwards or improved):
                 other = self._climbed(before, point.value, point.iterate)
-            improved = other is not None and (point.iterate is None or other.objective > point.iterate.objective + GAIN)
+            improved = other is not None and (
+                point.iterate is None or other.objective > point.iterate.objective + LEAST_GAIN
+            )
             kept.append(Point(point.value, other) if improved else point)
         return kept
 
@@ -147,18 +149,18 @@ class Ridge:
         """Return the best iterate with the parameter at a value, climbed from a neighbour; a known one if it is met."""
         plain = np.where(self._held, value, start.theta)
         tangent = start.theta + (value - start.theta[self.column]) * self._tangent(start)[0]
-        found = [self.objective.at(theta, start.here, start.noise) for theta in (tangent, plain)]
-        first = max(filter(None, found), key=lambda iterate: iterate.objective, default=None)
+        trials = [self.objective.at(theta, start.here, start.noise) for theta in (tangent, plain)]
+        first = max(filter(None, trials), key=lambda iterate: iterate.objective, default=None)
         if first is None or (known is not None and self._meets(first, known)):
             return known
         return climb(self.objective, self.objective.anchored(first), self._held).iterate
 
-    def _meets(self, found: Iterate, known: Iterate) -> bool:
+    def _meets(self, iterate: Iterate, known: Iterate) -> bool:
         """Return whether parameters and residuals are those of a known iterate, which is not worse."""
         likelihood, prior = self.objective.density.problem.likelihood, self.objective.density.problem.joint_prior
-        one, other = (np.concatenate(likelihood.whitened(i.here.residuals, known.noise)) for i in (found, known))
-        off = np.concatenate([one - other, (found.theta - known.theta) / prior.widths])
-        return bool(found.objective <= known.objective and off @ off < MET**2)
+        one, other = (np.concatenate(likelihood.whitened(i.here.residuals, known.noise)) for i in (iterate, known))
+        off = np.concatenate([one - other, (iterate.theta - known.theta) / prior.widths])
+        return bool(iterate.objective <= known.objective and off @ off < MET**2)
 
     @property
     def _held(self) -> np.ndarray:
@@ -192,9 +194,9 @@ def _next(now: float, step: float, end: float, limit: float) -> float:
     return now + step if np.isinf(end) else inside(now + step, end + NEARER * (now - end), limit)
 
 
-WIDEST = 0.99
+WIDEST_INTERVAL = 0.99
 BETTER = 1e-4
-CLOSED, ONE_SIDED, FLAT = "closed", "one-sided", "flat"
+CLOSED, ONE_SIDED, FLAT_PROFILE = "closed", "one-sided", "flat"
 
 
 @dataclass(frozen=True)
@@ -272,8 +274,8 @@ class Profile(Result):
         ValueError
             For any other probability.
         """
-        if not 0.0 < _checks.finite_number("probability", probability) <= WIDEST:
-            raise ValueError(f"probability: must be above 0 and at most {WIDEST}, got {probability!r}.")
+        if not 0.0 < _checks.finite_number("probability", probability) <= WIDEST_INTERVAL:
+            raise ValueError(f"probability: must be above 0 and at most {WIDEST_INTERVAL}, got {probability!r}.")
         level = float(ndtri(0.5 + 0.5 * probability))
         result = {}
         for name, values in self.values.items():
@@ -288,8 +290,8 @@ class Profile(Result):
 
         An informative prior also closes a profile.
         """
-        named = (FLAT, ONE_SIDED, CLOSED)
-        return {name: named[int(np.isfinite(ends).sum())] for name, ends in self.interval(WIDEST).items()}
+        named = (FLAT_PROFILE, ONE_SIDED, CLOSED)
+        return {name: named[int(np.isfinite(ends).sum())] for name, ends in self.interval(WIDEST_INTERVAL).items()}
 
     @property
     def table(self) -> pd.DataFrame:
@@ -318,8 +320,8 @@ def _crossing(values: np.ndarray, roots: np.ndarray, level: float, limit: float)
     Infinite if they stay below it up to the limit; NaN if solves fail before, or no root is below the level.
     """
     top = int(np.nanargmin(roots))
-    found = top + np.flatnonzero(np.isfinite(roots[top:]))
-    values, roots = values[found], roots[found]
+    finite = top + np.flatnonzero(np.isfinite(roots[top:]))
+    values, roots = values[finite], roots[finite]
     inside = np.flatnonzero(roots <= level)
     if not inside.size:
         return np.nan
@@ -380,11 +382,11 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     chosen, executor = _checked_names(problem, names), checked_executor(executor)
     objective, peak = at_estimate(problem, fit)
     with TaskPool(executor, (objective, peak)) as pool:
-        found = dict(pool.run(_followed, [problem.names.index(name) for name in chosen]))
+        followed = dict(pool.run(_followed, [problem.names.index(name) for name in chosen]))
     top, best, units = peak.objective, peak.theta, problem.model.units | {SHIFT: "s"}
     values, density, paths, limits = {}, {}, {}, {}
     for number, name in enumerate(chosen):
-        limits[name], values[name], density[name], paths[name] = found[number]
+        limits[name], values[name], density[name], paths[name] = followed[number]
         if np.nanmax(density[name]) > top:
             top, best = np.nanmax(density[name]), paths[name][np.nanargmax(density[name])]
     result = Profile(

@@ -22,7 +22,7 @@ from bayesperiodic.priors.joint import MultivariateNormal
 from bayesperiodic.problem.parameters import checked_key, in_experiment, local_hint, local_names
 
 # Fraction of a channel's variance below which its residual consists of rounding errors of the periodic solves.
-ROUNDING = 1e-16
+ROUNDING_VARIANCE = 1e-16
 
 
 @dataclass(frozen=True)
@@ -475,7 +475,7 @@ class MapEstimate(Result):
     def without_noise(self) -> tuple[str, ...]:
         """Channels of unknown variance whose residuals are rounding errors: no standard deviation follows from them."""
         names = {name.partition(", ")[0] for name in self.independent}
-        return tuple(c for c, fraction in self.fvu.items() if c in names and fraction < ROUNDING)
+        return tuple(c for c, fraction in self.fvu.items() if c in names and fraction < ROUNDING_VARIANCE)
 
     def __repr__(self) -> str:
         status = self.status if self.converged else f"NOT CONVERGED: {self.status}; try another start, or starts=8"

@@ -10,7 +10,7 @@ from bayesperiodic.periodic.equations import FREQUENCY
 from bayesperiodic.periodic.floquet import first_order_matrix
 
 # Experiments named in a message, and the powers of ten that point to a unit.
-SHOWN, UNIT_DECADES = 3, 2.0
+SHOWN_EXPERIMENTS, UNIT_DECADES = 3, 2.0
 
 
 class Scales(NamedTuple):
@@ -25,7 +25,7 @@ def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
 
     The frequency of the model is that of the eigenvalue whose modulus is nearest to the measured frequency.
     """
-    found = {}
+    scales = {}
     for e in problem.experiments:
         equations, parameters = problem.equations[e.name], problem.parameters(theta[None], e.name)[0]
         measured, modelled = {FREQUENCY: e.frequency}, {}
@@ -43,8 +43,8 @@ def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
                 for channel, values in e.outputs.items():
                     measured[channel] = 0.5 * float(np.ptp(values))
                     modelled[channel] = 0.5 * float(np.ptp(outputs[:, problem.model.outputs.index(channel)]))
-        found[e.name] = Scales(measured, {name: size for name, size in modelled.items() if 0.0 < size < np.inf})
-    return found
+        scales[e.name] = Scales(measured, {name: size for name, size in modelled.items() if 0.0 < size < np.inf})
+    return scales
 
 
 def _quantity(name: str) -> str:
@@ -57,17 +57,17 @@ def compared_with_data(problem: Problem, theta: np.ndarray) -> str:
     for run, (measured, modelled) in _scales(problem, theta).items():
         parts = [f"{_quantity(name)} {measured[name]:.3g} against {size:.3g}" for name, size in modelled.items()]
         lines += [f"{run!r}: {', '.join(parts)}"] if parts else []
-    more = f"; and {len(lines) - SHOWN} more" if len(lines) > SHOWN else ""
-    return f"Measured against the linearised model: {'; '.join(lines[:SHOWN])}{more}." if lines else ""
+    more = f"; and {len(lines) - SHOWN_EXPERIMENTS} more" if len(lines) > SHOWN_EXPERIMENTS else ""
+    return f"Measured against the linearised model: {'; '.join(lines[:SHOWN_EXPERIMENTS])}{more}." if lines else ""
 
 
 def unit_error(problem: Problem, theta: np.ndarray | None = None) -> str:
     """Return a sentence if data and model at θ, or at the medians, differ by powers of ten in every experiment."""
     theta = problem.median() if theta is None else theta
-    found, texts = list(_scales(problem, theta).values()), []
-    for name in found[0].modelled if found else ():
-        ratios = [one.measured[name] / one.modelled[name] for one in found if name in one.modelled]
-        decades = np.log10(np.median(ratios)) if len(ratios) == len(found) and min(ratios) > 0.0 else 0.0
+    scales, texts = list(_scales(problem, theta).values()), []
+    for name in scales[0].modelled if scales else ():
+        ratios = [one.measured[name] / one.modelled[name] for one in scales if name in one.modelled]
+        decades = np.log10(np.median(ratios)) if len(ratios) == len(scales) and min(ratios) > 0.0 else 0.0
         if abs(decades) >= UNIT_DECADES:
             texts.append(f"the measured {_quantity(name)} is 1e{round(decades):+d} times that of the linearised model")
     if not texts:
