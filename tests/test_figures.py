@@ -196,7 +196,7 @@ def test_colours_can_be_told_apart_in_grey():
     assert cycle == [*style.ENSEMBLES]
     for least, colours in ((9.0, style.ENSEMBLES), (8.0, style.COLOURS.values())):
         assert np.diff(np.sort([lightness(colour) for colour in colours])).min() > least
-    assert style.LAPLACE["ls"] == "--"
+    assert style.LAPLACE_STYLE["ls"] == "--"
 
 
 def test_clipped_and_overlapping_texts_are_found():

@@ -18,7 +18,7 @@ from bayesperiodic.periodic.continuation import FOLD, PERIOD_DOUBLING, Branch
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, styled
 
-MEASURES = ("amplitude", "maximum", "section", "period")
+BRANCH_MEASURES = ("amplitude", "maximum", "section", "period")
 MARKERS = {FOLD: "o", PERIOD_DOUBLING: "D"}
 
 
@@ -87,7 +87,7 @@ def branch(
     output = known[0] if output is None else output
     _checks.one_of("output", output, known)
     if not callable(measure):
-        _checks.one_of("measure", measure, MEASURES)
+        _checks.one_of("measure", measure, BRANCH_MEASURES)
     if ax is None:
         ax = (figure or plt.figure(figsize=(7.0, 4.6), layout="constrained")).add_subplot()
     factor = 2 * np.pi if angular and branch.vary == "frequency" else 1.0
@@ -181,15 +181,15 @@ def _stabilities(branch: Branch | BranchPrediction) -> set[bool]:
     return {stable for stable, _ in _runs(branch)}
 
 
-MOST_POINTS = 20_000
+MOST_POINTS_DRAWN = 20_000
 PERIOD_MARKERS = "osD^vP*X"
-COLUMNS = 6
-MEASURED, MODEL = "closest measured cycle", "orbit of the model"
-CYCLES: dict[str, dict[str, Any]] = {
-    MEASURED: {"color": COLOURS["measured"], "lw": 2.2, "alpha": 0.45},
-    MODEL: {"color": COLOURS["map"], "lw": 1.0},
+ORBITS_ACROSS = 6
+CLOSEST_CYCLE, MODEL_CYCLE = "closest measured cycle", "orbit of the model"
+CYCLE_STYLES: dict[str, dict[str, Any]] = {
+    CLOSEST_CYCLE: {"color": COLOURS["measured"], "lw": 2.2, "alpha": 0.45},
+    MODEL_CYCLE: {"color": COLOURS["map"], "lw": 1.0},
 }
-POINTS: dict[str, Any] = {"color": ENSEMBLES[1], "marker": "o", "ls": "", "mec": "black", "mew": 0.6}
+POINT_STYLE: dict[str, Any] = {"color": ENSEMBLES[1], "marker": "o", "ls": "", "mec": "black", "mew": 0.6}
 
 
 @styled
@@ -231,7 +231,7 @@ def section(
     _checks.instance("section", section, PoincareSection)
     if ax is None:
         ax = (figure or plt.figure(figsize=(7.0, 5.2), layout="constrained")).add_subplot()
-    every = 1 + len(section.points) // MOST_POINTS
+    every = 1 + len(section.points) // MOST_POINTS_DRAWN
     shown = section.points[::every]
     name = "section" if every == 1 else f"section, one point in {every}"
     ax.plot(*shown.T, ",", color="0.65", rasterized=True, zorder=1)
@@ -284,7 +284,7 @@ def orbits(
     _checks.instance("orbits", orbits, (Orbits, list, tuple))
     if not len(orbits):
         raise ValueError("orbits: must be at least one, got none.")
-    rows = -(-len(orbits) // COLUMNS)
+    rows = -(-len(orbits) // ORBITS_ACROSS)
     columns = -(-len(orbits) // rows)
     figure = figure or plt.figure(figsize=(1.9 * columns + 0.6, 1.85 * rows + 0.7), layout="constrained")
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
@@ -298,7 +298,7 @@ def orbits(
     figure.supxlabel(across, fontsize="medium")
     figure.supylabel(up, fontsize="medium")
     drawn = {label for orbit in orbits for label in _cycles(orbit)}
-    looks = {"section points": POINTS} | {label: look for label, look in CYCLES.items() if label in drawn}
+    looks = {"section points": POINT_STYLE} | {label: look for label, look in CYCLE_STYLES.items() if label in drawn}
     handles = [plt.Line2D([], [], label=label, **look) for label, look in looks.items()]
     figure.legend(handles=handles, loc="outside upper center", ncols=3, frameon=False, fontsize="small")
     return figure
@@ -309,8 +309,8 @@ def _portrait(ax: Axes, orbit: Orbit) -> None:
         x, y = (np.angle(np.exp(1j * signals[c])) if c in orbit.angles else signals[c] for c in orbit.coordinates)
         # Angles jump at ±π.
         jump = np.flatnonzero(np.abs(np.diff(x)) > np.pi) + 1 if orbit.angles else np.empty(0, dtype=int)
-        ax.plot(np.insert(x, jump, np.nan), np.insert(y, jump, np.nan), **CYCLES[label])
-    ax.plot(*orbit.points.T, ms=4.5, zorder=4, **POINTS)
+        ax.plot(np.insert(x, jump, np.nan), np.insert(y, jump, np.nan), **CYCLE_STYLES[label])
+    ax.plot(*orbit.points.T, ms=4.5, zorder=4, **POINT_STYLE)
     turns = "" if orbit.winding is None else f", winding {orbit.winding}".replace("-", "−")
     ax.set_title(f"period {orbit.period}{turns}\n$\\mu$ = {_multiplier(orbit)}", fontsize="x-small")
     ax.tick_params(labelsize="x-small")
@@ -318,10 +318,11 @@ def _portrait(ax: Axes, orbit: Orbit) -> None:
 
 def _cycles(orbit: Orbit) -> dict[str, Mapping[str, np.ndarray]]:
     """Return the measured cycle and that of the model, closed, by their labels."""
-    found = {} if orbit.cycle is None else {MEASURED: orbit.cycle}
+    cycles = {} if orbit.cycle is None else {CLOSEST_CYCLE: orbit.cycle}
     if orbit.solution is not None:
-        found[MODEL] = {c: np.append(v, v[0]) for c, v in orbit.solution.outputs.items() if c in orbit.coordinates}
-    return found
+        outputs = orbit.solution.outputs.items()
+        cycles[MODEL_CYCLE] = {c: np.append(v, v[0]) for c, v in outputs if c in orbit.coordinates}
+    return cycles
 
 
 def _multiplier(orbit: Orbit) -> str:

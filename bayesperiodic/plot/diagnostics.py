@@ -18,20 +18,20 @@ from bayesperiodic.diagnostics.model_comparison import DECISIVE, SMALLEST_GAIN, 
 from bayesperiodic.diagnostics.verdicts import ELLIPSOID_LEVELS, END_SHIFT, ERRORS, FINE
 from bayesperiodic.estimation.profile import CLOSED, Profile
 from bayesperiodic.plot import style
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, LAPLACE, axis_label, chosen, styled, wrapped_label
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, LAPLACE_STYLE, axis_label, chosen, styled, wrapped_label
 
-LEVEL = 0.99
+BAND_LEVEL = 0.99
 # Factor on the height of the histogram axes, for the legend.
 HEADROOM = 1.45
-TITLES = "count per bin / expected", "distribution function − diagonal", "coverage − probability"
-ACROSS = (
+RANK_TITLES = "count per bin / expected", "distribution function − diagonal", "coverage − probability"
+RANK_AXES = (
     "position of the truth in the posterior",
     "position of the truth in the posterior",
     "probability of the interval",
 )
-LABELS = {"mcmc": "MCMC", "laplace": "Laplace"}
-LINES = {"mcmc": "-", "laplace": "--"}
-BAND: dict[str, Any] = {"color": "grey", "alpha": 0.25, "lw": 0}
+METHOD_LABELS = {"mcmc": "MCMC", "laplace": "Laplace"}
+METHOD_LINES = {"mcmc": "-", "laplace": "--"}
+BAND_STYLE: dict[str, Any] = {"color": "grey", "alpha": 0.25, "lw": 0}
 
 
 @styled
@@ -71,16 +71,20 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
         for method in CALIBRATED_METHODS:
             values = calibration.positions[method][name]
             values = np.sort(values[np.isfinite(values)])
-            _histogram(row[0], values, method, f"{LABELS[method]}: {verdicts[method, name]}")
-            points, size = uniformity.evaluation_points(), values.size
-            banded = method == CALIBRATED_METHODS[0] and size
+            _histogram(row[0], values, method, f"{METHOD_LABELS[method]}: {verdicts[method, name]}")
+            points, size, banded = (
+                uniformity.evaluation_points(),
+                values.size,
+                method == CALIBRATED_METHODS[0] and values.size,
+            )
             steps = np.searchsorted(values, points, side="right") / max(size, 1)
-            _deviation(row[1], steps, uniformity.ecdf_band(size, LEVEL) if banded else None, method)
+            _deviation(row[1], steps, uniformity.ecdf_band(size, BAND_LEVEL) if banded else None, method)
             covered = np.array([uniformity.coverage(values, level) for level in points])
-            _deviation(row[2], covered, uniformity.binomial_band(size, points, 1.0 - LEVEL) if banded else None, method)
+            band = uniformity.binomial_band(size, points, 1.0 - BAND_LEVEL) if banded else None
+            _deviation(row[2], covered, band, method)
         row[0].set(ylim=(0.0, HEADROOM * row[0].get_ylim()[1]), ylabel=wrapped_label(name, ""))
         row[0].legend(frameon=False, fontsize="small", loc="upper center")
-    for top, bottom, title, label in zip(grid[0], grid[-1], TITLES, ACROSS, strict=True):
+    for top, bottom, title, label in zip(grid[0], grid[-1], RANK_TITLES, RANK_AXES, strict=True):
         top.set_title(title, fontsize="medium")
         bottom.set_xlabel(label)
     figure.suptitle(f"{calibration.replicates} synthetic campaigns; bands of 99 %", fontsize="medium")
@@ -92,9 +96,9 @@ def _histogram(axes: Axes, values: np.ndarray, method: str, label: str) -> None:
     counts, edges = np.histogram(values, bins, (0.0, 1.0))
     expected = max(values.size, 1) / bins
     if method == CALIBRATED_METHODS[0] and values.size:
-        low, high = uniformity.binomial_band(values.size, np.array(1.0 / bins), 1.0 - LEVEL)
-        axes.axhspan(float(low) * bins, float(high) * bins, **BAND)
-    axes.stairs(counts / expected, edges, color=COLOURS[method], ls=LINES[method], lw=1.6, label=label)
+        low, high = uniformity.binomial_band(values.size, np.array(1.0 / bins), 1.0 - BAND_LEVEL)
+        axes.axhspan(float(low) * bins, float(high) * bins, **BAND_STYLE)
+    axes.stairs(counts / expected, edges, color=COLOURS[method], ls=METHOD_LINES[method], lw=1.6, label=label)
     axes.set_xlim(0.0, 1.0)
 
 
@@ -102,8 +106,8 @@ def _deviation(axes: Axes, values: np.ndarray, band: tuple[np.ndarray, np.ndarra
     """Draw a function of the evaluation points minus the points themselves, with its band."""
     points = uniformity.evaluation_points()
     if band is not None:
-        axes.fill_between(points, band[0] - points, band[1] - points, **BAND)
-    axes.plot(points, values - points, color=COLOURS[method], ls=LINES[method], lw=1.4)
+        axes.fill_between(points, band[0] - points, band[1] - points, **BAND_STYLE)
+    axes.plot(points, values - points, color=COLOURS[method], ls=METHOD_LINES[method], lw=1.4)
     axes.set_xlim(0.0, 1.0)
 
 
@@ -175,7 +179,7 @@ def _quantiles(axes: Axes, comparison: Comparison, names: Sequence[str]) -> None
     wrong = table[table["verdict"] != FINE].sort_values("wasserstein", ascending=False).index[: len(LOOKS)]
     axes.axline((0.0, 0.0), slope=1.0, color=COLOURS["laplace"], lw=1.4, ls="--")
     reach = np.array([-LIMIT, LIMIT])
-    axes.fill_between(reach, reach - END_SHIFT, reach + END_SHIFT, **BAND)
+    axes.fill_between(reach, reach - END_SHIFT, reach + END_SHIFT, **BAND_STYLE)
     unnamed = "fine" if set(table["verdict"]) == {FINE} or len(wrong) == sum(table["verdict"] != FINE) else "others"
     plain: dict[str, Any] = {"color": "black", "lw": 0.8, "label": unnamed}
     looks = {
@@ -256,18 +260,18 @@ def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Fig
 
 def _profile_panel(axes: Axes, profile: Profile, name: str) -> None:
     values, density = profile.values[name], profile.log_density[name]
-    at, sd, found, bottom = profile.map[name], profile.sd[name], np.isfinite(density), DEEPEST - profile.improvement
+    at, sd, solved, bottom = profile.map[name], profile.sd[name], np.isfinite(density), DEEPEST - profile.improvement
     wide = values[0] > 0.0 and values[-1] > 100.0 * values[0]
     curve, peak, laplace, failed = PROFILE_LEGEND
-    axes.plot(values[found], density[found], ".-", color=COLOURS["map"], lw=1.6, ms=5, label=curve)
+    axes.plot(values[solved], density[solved], ".-", color=COLOURS["map"], lw=1.6, ms=5, label=curve)
     axes.plot(at, -profile.improvement, "o", color=COLOURS["map"], ms=6, label=peak)
     if np.isfinite(sd):
         x = np.geomspace(values[0], values[-1], 400) if wide else _laplace_range(profile, name)
         parabola = -profile.improvement - 0.5 * ((x - at) / sd) ** 2
-        axes.plot(x, parabola, zorder=1.5, label=laplace, **LAPLACE)
-    if not found.all():
-        low = np.full(np.sum(~found), 0.97 * bottom)
-        axes.plot(values[~found], low, "x", color=COLOURS["measured"], ms=5, label=failed)
+        axes.plot(x, parabola, zorder=1.5, label=laplace, **LAPLACE_STYLE)
+    if not solved.all():
+        low = np.full(np.sum(~solved), 0.97 * bottom)
+        axes.plot(values[~solved], low, "x", color=COLOURS["measured"], ms=5, label=failed)
     axes.axhline(AT_90, color="grey", lw=0.8, ls=":", zorder=1)
     places = ("axes fraction", "data"), "offset points"
     axes.annotate("90 %", (1, AT_90), (-3, 1), *places, color="grey", ha="right", va="bottom")
@@ -332,7 +336,7 @@ def models(comparison: ModelComparison, *, figure: Figure | None = None) -> Figu
     )
     rows = np.arange(len(table))
     for axes, (title, label, values, errors, band) in zip(figure.subplots(1, 3, sharey=True), panels, strict=True):
-        axes.axvspan(-band, band, **BAND)
+        axes.axvspan(-band, band, **BAND_STYLE)
         axes.axvline(0.0, color="grey", lw=0.8)
         axes.errorbar(values, rows, xerr=2.0 * errors, fmt="o", color=COLOURS["measured"], ms=5, capsize=3)
         axes.set(xlabel=label, ylim=(len(table) - 0.5, -0.5))
@@ -340,8 +344,8 @@ def models(comparison: ModelComparison, *, figure: Figure | None = None) -> Figu
         if np.isnan(np.asarray(values, dtype=float)).all():
             axes.annotate("not available", (0.5, 0.5), xycoords="axes fraction", ha="center", va="center")
     single = runs.pivot(index="model", columns="experiment", values="elpd").reindex(table.index)
-    for _, own in (single - single.iloc[0]).items():
-        figure.axes[2].plot(own, rows + 0.2, "o", color=COLOURS["mcmc"], ms=4, mfc="none", zorder=1)
+    for _, differences in (single - single.iloc[0]).items():
+        figure.axes[2].plot(differences, rows + 0.2, "o", color=COLOURS["mcmc"], ms=4, mfc="none", zorder=1)
     names = [wrapped_label(str(name), "") for name in table.index]
     chances = ["" if np.isnan(p) else f"\nprobability {p:.2g}" for p in table["probability"]]
     figure.axes[0].set_yticks(rows, [f"{name}{chance}" for name, chance in zip(names, chances, strict=True)])

@@ -17,9 +17,9 @@ from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, caveats_of,
 from bayesperiodic.problem.description import check_results
 from bayesperiodic.sampling.draws import Posterior
 
-MEASURED: dict[str, Any] = {"color": COLOURS["measured"], "marker": "o"}
-FITTED: dict[str, Any] = {"color": COLOURS["map"], "ls": "--", "marker": "x"}
-BAND: dict[str, Any] = {"color": COLOURS["mcmc"], "alpha": 0.45}
+MEASURED_STYLE: dict[str, Any] = {"color": COLOURS["measured"], "marker": "o"}
+FITTED_STYLE: dict[str, Any] = {"color": COLOURS["map"], "ls": "--", "marker": "x"}
+PREDICTION_STYLE: dict[str, Any] = {"color": COLOURS["mcmc"], "alpha": 0.45}
 # Standard deviations of a normal distribution within which 90 % are.
 NINETY = 1.645
 MOST_STEPS, BOX = 300, {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1.5}
@@ -87,8 +87,8 @@ def fit(
     for row, (e, name) in enumerate(noisy, 2 * len(shown)):
         axes, half = figure.add_subplot(grid[row]), NINETY * estimate.input_sd[e.name][name]
         error = e.inputs[name] - estimate.inputs[e.name][name]
-        axes.fill_between(e.time, error - half, error + half, lw=0, label="90 %", **BAND)
-        axes.plot(e.time, error, lw=1.2, label="MAP", **FITTED | {"marker": None})
+        axes.fill_between(e.time, error - half, error + half, lw=0, label="90 %", **PREDICTION_STYLE)
+        axes.plot(e.time, error, lw=1.2, label="MAP", **FITTED_STYLE | {"marker": None})
         axes.axhline(0.0, lw=1.0, color=COLOURS["measured"])
         if row == 2 * len(shown):
             axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 0.95), borderpad=0.0)
@@ -114,9 +114,9 @@ def draw_period(
         low, high = prediction.low[e.name][channel], prediction.high[e.name][channel]
         _band(top, e, low, high, f"{100 * prediction.probability:.0f} % predictive band")
         _band(below, e, low - predicted, high - predicted, "_")
-    _curve(top, e, e.time, e.outputs[channel], lw=1.6, label=_measured(problem, e.cycles), **MEASURED)
-    _curve(top, e, e.time, predicted, lw=1.2, label="MAP", **FITTED)
-    _curve(below, e, e.time, residual, lw=1.0, **MEASURED)
+    _curve(top, e, e.time, e.outputs[channel], lw=1.6, label=_measured(problem, e.cycles), **MEASURED_STYLE)
+    _curve(top, e, e.time, predicted, lw=1.2, label="MAP", **FITTED_STYLE)
+    _curve(below, e, e.time, residual, lw=1.0, **MEASURED_STYLE)
     below.axhline(0.0, lw=1.0, color=COLOURS["map"], ls="--")
     unit = problem.model.units.get(channel, "")
     top.set(ylabel=axis_label(channel, unit), title=axis_label(e.name))
@@ -136,9 +136,9 @@ def _curve(axes: Axes, e: Experiment, x: np.ndarray, y: np.ndarray, closed: bool
 
 def _band(axes: Axes, e: Experiment, low: np.ndarray, high: np.ndarray, label: str) -> None:
     if e.mask is None:
-        axes.fill_between(e.time, low, high, lw=0, label=label, **BAND)
+        axes.fill_between(e.time, low, high, lw=0, label=label, **PREDICTION_STYLE)
     else:
-        axes.vlines(e.time[e.mask], low[e.mask], high[e.mask], lw=8, label=label, **BAND)
+        axes.vlines(e.time[e.mask], low[e.mask], high[e.mask], lw=8, label=label, **PREDICTION_STYLE)
 
 
 @styled
@@ -189,8 +189,8 @@ def loops(
         rate = _fourier.on_grid(_fourier.derivative(amplitudes, e.frequency / e.periods), measured.size)
         labels = (_measured(problem, e.cycles), "MAP") if number == 0 else (None, None)
         for axes, across in ((left, e.inputs[input]), (right, rate)):
-            _curve(axes, e, across, measured, closed=True, lw=1.6, label=labels[0], **MEASURED)
-            _curve(axes, e, across, predicted, closed=True, lw=1.2, label=labels[1], **FITTED)
+            _curve(axes, e, across, measured, closed=True, lw=1.6, label=labels[0], **MEASURED_STYLE)
+            _curve(axes, e, across, predicted, closed=True, lw=1.2, label=labels[1], **FITTED_STYLE)
     unit = problem.model.units.get(input, "")
     left.set(xlabel=axis_label(input, unit), ylabel=axis_label(output, problem.model.units.get(output, "")))
     right.set_xlabel(axis_label(f"rate of {input}", f"{unit}/s" if unit else ""))

@@ -7,20 +7,20 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
-from bayesperiodic.plot.style import SUPERSCRIPTS
+from bayesperiodic.plot.style import TO_SUPERSCRIPTS
 
 # Panels of more names are smaller, and their labels have this size [points].
-MANY, SMALL = 6, 7
+MANY_NAMES, SMALL_LABEL_SIZE = 6, 7
 # Room between panels [inches]; part of an axis at each end without ticks, whose labels would touch those of the next.
-ROOM, FREE = 0.06, 0.08
+PANEL_GAP, FREE_END = 0.06, 0.08
 TITLE_QUANTILES = (0.05, 0.5, 0.95)
 # Range of the powers of ten of ticks without an offset or a common factor.
-WHOLE = (-5, 10)
+PLAIN_POWERS = (-5, 10)
 
 
 def write_labels(grid: np.ndarray, labels: Sequence[str]) -> None:
     """Write the names and the ticks at the left and the lower edge."""
-    last, small = len(grid) - 1, {"size": SMALL} if len(grid) > MANY else {}
+    last, small = len(grid) - 1, {"size": SMALL_LABEL_SIZE} if len(grid) > MANY_NAMES else {}
     for (i, j), axes in np.ndenumerate(grid):
         if j > i:
             continue
@@ -52,7 +52,7 @@ def arrange(grid: np.ndarray, above: float) -> None:
     column, row = [boxes[i, 0] for i in range(last + 1)], [boxes[last, j] for j in range(last + 1)]
     left, bottom = (max(inner.p0[k] - outer.p0[k] for outer, inner in line) for k, line in enumerate((column, row)))
     outer, inner = boxes[0, 0]
-    title, gap, (width, height) = outer.y1 - inner.y1, ROOM * figure.dpi, figure.bbox.size
+    title, gap, (width, height) = outer.y1 - inner.y1, PANEL_GAP * figure.dpi, figure.bbox.size
     x, y = (left + 2.0 * gap) / width, (bottom + 2.0 * gap) / height
     top = 1.0 - (title + above + 2.0 * gap) / height
     each = [(1.0 - x - gap / width + gap / width) / (last + 1), (top - y + (title + gap) / height) / (last + 1)]
@@ -81,7 +81,7 @@ def with_errors(low: float, middle: float, high: float) -> str:
 def _set_ticks(axis: Any) -> None:
     """Set two or three ticks, away from the ends, and write them without an offset."""
     low, high = axis.get_view_interval()
-    room = FREE * (high - low)
+    room = FREE_END * (high - low)
     for count in (3, 4, 5, 7):
         ticks = MaxNLocator(count, steps=[1, 2, 5, 10]).tick_values(low, high)
         ticks = ticks[(ticks >= low + room) & (ticks <= high - room)]
@@ -89,7 +89,7 @@ def _set_ticks(axis: Any) -> None:
             break
     axis.set_ticks(ticks)
     formatter = ScalarFormatter(useOffset=False)
-    formatter.set_powerlimits(WHOLE)
+    formatter.set_powerlimits(PLAIN_POWERS)
     axis.set_major_formatter(formatter)
 
 
@@ -100,5 +100,5 @@ def _with_factor(axis: Any, label: str) -> str:
     factor, (name, _, unit) = formatter.get_offset(), label.rpartition("\n[")
     if not factor:
         return label
-    power = "10" + factor.removeprefix("1e").translate(SUPERSCRIPTS)
+    power = "10" + factor.removeprefix("1e").translate(TO_SUPERSCRIPTS)
     return f"{name}\n[{power} {unit}" if name else f"{label}\n[{power}]"

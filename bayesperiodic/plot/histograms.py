@@ -13,14 +13,14 @@ from bayesperiodic.sampling.convergence import arviz
 from bayesperiodic.sampling.draws import Posterior
 
 #: Options of `corner.corner` that are passed on; the others set labels and ticks, or are those of ArviZ.
-OPTIONS = (
+CORNER_OPTIONS = (
     "bins", "color", "contour_kwargs", "contourf_kwargs", "data_kwargs", "fig", "fill_contours", "hist_bin_factor",
     "hist_kwargs", "levels", "no_fill_contours", "pcolor_kwargs", "plot_contours", "plot_datapoints", "plot_density",
     "range", "scale_hist", "smooth", "smooth1d", "title_fmt", "title_kwargs", "title_quantiles", "titles",
     "truth_color",
 )  # fmt: skip
-TITLES = ("title_fmt", "title_quantiles", "titles")
-TRUTH = "truth"
+TITLE_OPTIONS = ("title_fmt", "title_quantiles", "titles")
+TRUTH_LABEL = "truth"
 # Room beyond a true value outside the range of the draws, as a part of the axis.
 ROOM_BEYOND = 0.05
 
@@ -46,10 +46,11 @@ def draw_histograms(
     constant = [name for name, values in zip(names, draws.T, strict=True) if np.ptp(values) == 0.0]
     if constant and "range" not in options:
         raise ValueError(f"names: must be quantities that vary, got {', '.join(constant)}; leave them out.")
-    before = [label for label in figure.axes[0].get_legend_handles_labels()[1] if label != TRUTH] if figure.axes else []
+    before = figure.axes[0].get_legend_handles_labels()[1] if figure.axes else []
+    before = [label for label in before if label != TRUTH_LABEL]
     defaults: dict[str, Any] = {"color": ENSEMBLES[len(before) % len(ENSEMBLES)], "truth_color": COLOURS["measured"]}
     defaults["title_quantiles"] = TITLE_QUANTILES
-    if not any(name in options for name in TITLES):
+    if not any(name in options for name in TITLE_OPTIONS):
         defaults |= {"titles": [interval_title(values) for values in draws.T], "title_fmt": None}
     histogram = {"label": f"MCMC {len(before) + 1}" if before else "MCMC", "lw": 1.4}
     if options.get("smooth1d") is None:  # a line otherwise
@@ -63,7 +64,7 @@ def draw_histograms(
     grid = np.reshape(np.array(figure.axes, dtype=object), (len(names), len(names)))
     for k, value in enumerate(marks):
         if value is not None:
-            grid[k, k].lines[-1].set_label(TRUTH)
+            grid[k, k].lines[-1].set_label(TRUTH_LABEL)
             if "range" not in options:
                 _contain(grid, k, value)
     write_labels(grid, [*labels.values()])
@@ -92,8 +93,8 @@ def _legend(grid: np.ndarray, caveats: str) -> float:
         titles.insert(0, legend.get_title().get_text())
         legend.remove()
     handles = [
-        Line2D([], [], color=_colour(handle), lw=1.4 if label == TRUTH else 4.0, label=label)
-        for label, handle in sorted(entries.items(), key=lambda entry: entry[0] == TRUTH)
+        Line2D([], [], color=_colour(handle), lw=1.4 if label == TRUTH_LABEL else 4.0, label=label)
+        for label, handle in sorted(entries.items(), key=lambda entry: entry[0] == TRUTH_LABEL)
     ]
     every = dict.fromkeys(part for title in titles for part in title.split(", ") if part)
     return write_legend(grid, handles, ", ".join(every))

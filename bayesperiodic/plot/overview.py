@@ -18,8 +18,8 @@ from bayesperiodic.plot.style import axis_label, styled
 from bayesperiodic.problem.description import check_results
 from bayesperiodic.sampling.draws import Posterior
 
-COLUMNS, MOST_NAMES = 58, 6
-WHITE = 0.01
+LINE_LENGTH, MOST_NAMES_LISTED = 58, 6
+SMALLEST_WHITE_P = 0.01
 
 
 @styled
@@ -53,7 +53,7 @@ def summary(problem: Problem, fit: MapEstimate, posterior: Posterior, *, figure:
     ['displacement [m]', 'residual [m]']
     """
     problem = check_results(problem, fit=fit, posterior=posterior)
-    found, compared = identifiability(problem, fit, posterior, profile=False), compare(problem, fit, posterior)
+    identified, compared = identifiability(problem, fit, posterior, profile=False), compare(problem, fit, posterior)
     figure = figure or plt.figure(figsize=(10.0, 5.6))
     parts: Any = figure.subfigures(1, 2, width_ratios=[1.15, 1.0])
     left, right = parts
@@ -63,10 +63,11 @@ def summary(problem: Problem, fit: MapEstimate, posterior: Posterior, *, figure:
     worst = max(having, key=lambda e: float((fit.residuals[e.name][channel] ** 2).sum()))
     top, bottom = _fit_and_residual(left)
     draw_period(top, bottom, problem, fit, worst, channel)
-    names = _worst(problem, posterior, found, compared)
+    names = _worst(problem, posterior, identified, compared)
     corner(posterior, laplace=fit, problem=problem, names=names, figure=cast(Figure, above))
     text = "\n".join(
-        textwrap.fill(line, COLUMNS, subsequent_indent="   ") for line in _words(fit, posterior, found, compared)
+        textwrap.fill(line, LINE_LENGTH, subsequent_indent="   ")
+        for line in _words(fit, posterior, identified, compared)
     )
     below.text(0.02, 0.97, axis_label(text), va="top", linespacing=1.35)
     return figure
@@ -77,25 +78,25 @@ def _fit_and_residual(figure: SubFigure) -> Any:
     return figure.subplots(2, 1, sharex=True, gridspec_kw=grid)
 
 
-def _worst(problem: Problem, posterior: Posterior, found: Identifiability, compared: Comparison) -> list[str]:
+def _worst(problem: Problem, posterior: Posterior, identified: Identifiability, compared: Comparison) -> list[str]:
     """Return the two worst parameters in the order of the problem; of one parameter it and a noise parameter."""
-    fine = compared.table["verdict"].reindex(found.table.index, fill_value=FINE) == FINE
-    ranks = found.table.assign(determined=found.table["verdict"] == DETERMINED, fine=fine)
+    fine = compared.table["verdict"].reindex(identified.table.index, fill_value=FINE) == FINE
+    ranks = identified.table.assign(determined=identified.table["verdict"] == DETERMINED, fine=fine)
     worst = ranks.sort_values(["determined", "fine", "contraction"], kind="stable").index[:2]
     others = [name for name in posterior.names if name not in problem.names]
     return [*(name for name in problem.names if name in worst), *others][:2]
 
 
-def _words(fit: MapEstimate, posterior: Posterior, found: Identifiability, compared: Comparison) -> Iterator[str]:
+def _words(fit: MapEstimate, posterior: Posterior, identified: Identifiability, compared: Comparison) -> Iterator[str]:
     for channel, unexplained in fit.fvu.items():
         p = fit.whiteness[channel].p
-        white = "" if p != p else f"; the residual is {'white' if p > WHITE else 'NOT white'} (p = {p:.2g})"
+        white = "" if p != p else f"; the residual is {'white' if p > SMALLEST_WHITE_P else 'NOT white'} (p = {p:.2g})"
         yield f"Fit: {100.0 * (1.0 - unexplained):.4g} % of the variance of {channel} explained{white}."
-    for verdict, members in found.table.groupby("verdict", sort=False).groups.items():
+    for verdict, members in identified.table.groupby("verdict", sort=False).groups.items():
         names = [str(name) for name in members]
-        more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-        yield f"{str(verdict).capitalize()}: {', '.join(names[:MOST_NAMES])}{more}."
-    for name, remedy in [(n, text) for n, text in found.table["remedy"].items() if text][:1]:
+        more = f" and {len(names) - MOST_NAMES_LISTED} more" if len(names) > MOST_NAMES_LISTED else ""
+        yield f"{str(verdict).capitalize()}: {', '.join(names[:MOST_NAMES_LISTED])}{more}."
+    for name, remedy in [(n, text) for n, text in identified.table["remedy"].items() if text][:1]:
         yield f"Recommendation for {name}: {remedy}."
     joint = compared.joint
     advice = f"; {joint['recommendation']}" if joint["verdict"] != FINE else ""

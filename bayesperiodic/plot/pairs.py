@@ -18,13 +18,13 @@ from bayesperiodic import _checks
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot import regions
-from bayesperiodic.plot.grid import MANY, arrange, interval_title, write_labels, write_legend
-from bayesperiodic.plot.histograms import OPTIONS, draw_histograms
+from bayesperiodic.plot.grid import MANY_NAMES, arrange, interval_title, write_labels, write_legend
+from bayesperiodic.plot.histograms import CORNER_OPTIONS, draw_histograms
 from bayesperiodic.plot.style import (
     COLOURS,
     ENSEMBLES,
     LABEL_LENGTH,
-    LAPLACE,
+    LAPLACE_STYLE,
     caveats_of,
     chosen,
     draw_marginal,
@@ -37,18 +37,18 @@ from bayesperiodic.problem.description import check_fingerprint, check_results
 from bayesperiodic.problem.parameters import support
 from bayesperiodic.sampling.draws import MODE, Posterior
 
-LEVELS = (0.5, 0.9)
+REGION_LEVELS = (0.5, 0.9)
 LEVELS_TEXT = "50 and 90 %"
-MOST_NAMES = 8
+MOST_NAMES_DRAWN = 8
 # Length of the labels of many small panels.
-SHORT = 18
+SHORT_LABEL_LENGTH = 18
 # Quantiles that a panel shows, and the margin around them.
-SHOWN, MARGIN = (0.003, 0.997), 0.06
-BINS, TAILS = 40, (0.0005, 0.9995)
-TALLEST = 2.5
-TRUTH: dict[str, Any] = {"color": COLOURS["measured"], "lw": 1.1}
-PRIOR: dict[str, Any] = {"color": "0.35", "lw": 0.8, "ls": ":"}
-ZERO: dict[str, Any] = {"color": "0.75", "lw": 0.8, "zorder": 0.5}
+PANEL_QUANTILES, PANEL_MARGIN = (0.003, 0.997), 0.06
+BINS, HISTOGRAM_QUANTILES = 40, (0.0005, 0.9995)
+TALLEST_LAPLACE = 2.5
+TRUTH_STYLE: dict[str, Any] = {"color": COLOURS["measured"], "lw": 1.1}
+PRIOR_STYLE: dict[str, Any] = {"color": "0.35", "lw": 0.8, "ls": ":"}
+ZERO_STYLE: dict[str, Any] = {"color": "0.75", "lw": 0.8, "zorder": 0.5}
 
 
 @styled
@@ -134,7 +134,7 @@ def corner(
     _check_style(style, {"laplace": laplace, "problem": problem}, options)
     if problem is not None:
         check_results(problem, posterior=posterior)
-    if names is None and len(posterior.names) > MOST_NAMES:
+    if names is None and len(posterior.names) > MOST_NAMES_DRAWN:
         warnings.warn(
             f"names: {len(posterior.names)} quantities are many for one figure; choose some, such as "
             f"names={list(posterior.names[:3])}.",
@@ -147,11 +147,11 @@ def corner(
         raise ValueError(f"labels: must be {len(names)}, one per name, got {len(labels)}.")
     if not all(0.0 < q < 1.0 for q in quantiles):
         raise ValueError(f"quantiles: must be between 0 and 1, got {list(quantiles)}.")
-    side = (1.9, 1.55, 1.25)[(len(names) > 3) + (len(names) > MANY)] * len(names) + 0.8
+    side = (1.9, 1.55, 1.25)[(len(names) > 3) + (len(names) > MANY_NAMES)] * len(names) + 0.8
     figure = options.pop("fig", None) or figure or plt.figure(figsize=(max(side, 3.2), max(side, 3.2)))
     if isinstance(figure, Figure):  # and no part of one
         figure.set_layout_engine("none")
-    length = SHORT if len(names) > MANY else LABEL_LENGTH
+    length = SHORT_LABEL_LENGTH if len(names) > MANY_NAMES else LABEL_LENGTH
     labels = [draws_label(posterior, name, length) for name in names] if labels is None else labels
     if style == "corner":
         options |= {"quantiles": [*quantiles], "show_titles": show_titles}
@@ -174,7 +174,7 @@ def _check_style(style: str, of_regions: Mapping[str, Any], options: Mapping[str
     _checks.one_of("style", style, ("regions", "corner"))
     known = [name for name in inspect.signature(corner).parameters if name != "options"]
     for name in options:
-        _checks.one_of("options", name, [*known, *OPTIONS])
+        _checks.one_of("options", name, [*known, *CORNER_OPTIONS])
     other = [*options] if style == "regions" else [name for name, value in of_regions.items() if value is not None]
     if other:
         required = "corner" if style == "regions" else "regions"
@@ -207,13 +207,13 @@ class _Panels:
     def of(cls, figure: Figure, posterior: Posterior, names: tuple[str, ...], truths: dict[str, float]) -> "_Panels":
         """Return the empty panels, with their limits."""
         draws = np.stack([posterior.draws(name) for name in names], axis=-1)
-        ends = np.quantile(draws, SHOWN, axis=0).T
+        ends = np.quantile(draws, PANEL_QUANTILES, axis=0).T
         for i, name in enumerate(names):
             if name in truths:
                 ends[i] = min(ends[i, 0], truths[name]), max(ends[i, 1], truths[name])
         width = np.ptp(ends, axis=1)
         width[width == 0.0] = np.maximum(np.abs(ends[:, 0]), 1.0)[width == 0.0]
-        limits = ends + MARGIN * np.stack([-width, width], axis=-1)
+        limits = ends + PANEL_MARGIN * np.stack([-width, width], axis=-1)
         grid = figure.subplots(len(names), len(names), squeeze=False)
         for (i, j), axes in np.ndenumerate(grid):
             axes.set_xlim(*limits[j])
@@ -237,15 +237,15 @@ class _Panels:
         """Draw regions and densities of all groups, and yield the entries of the legend."""
         for group in self.groups:
             for axes, pair in self.pairs():
-                own = self.draws[group.members][:, pair]
-                draw_regions(axes, own, [self.supports[k] for k in pair], group.colour)
+                points = self.draws[group.members][:, pair]
+                draw_regions(axes, points, [self.supports[k] for k in pair], group.colour)
                 if group.mark:
-                    axes.plot(*own.mean(axis=0), marker=f"${group.mark}$", color="black", ms=6, zorder=6)
+                    axes.plot(*points.mean(axis=0), marker=f"${group.mark}$", color="black", ms=6, zorder=6)
             for k, axes in enumerate(np.diag(self.grid)):
-                found = regions.density(self.draws[group.members, k][:, None], [self.supports[k]])
-                height = found.values * group.members.mean()
-                axes.fill_between(found.nodes[0], height, color=group.colour, alpha=0.4, lw=0)
-                axes.plot(found.nodes[0], height, color=group.colour, lw=1.4)
+                estimate = regions.density(self.draws[group.members, k][:, None], [self.supports[k]])
+                height = estimate.values * group.members.mean()
+                axes.fill_between(estimate.nodes[0], height, color=group.colour, alpha=0.4, lw=0)
+                axes.plot(estimate.nodes[0], height, color=group.colour, lw=1.4)
             look: dict[str, Any] = {"marker": f"${group.mark}$", "mec": "black", "mfc": "black"} if group.mark else {}
             yield plt.Line2D([], [], color=group.colour, lw=5, alpha=0.7, label=group.label, **look)
         for k, axes in enumerate(np.diag(self.grid)):
@@ -262,13 +262,13 @@ class _Panels:
         for k in np.flatnonzero(known).tolist():
             axes, sd = self.grid[k, k], np.sqrt(variances[k])
             x = np.union1d(self._across(k), np.linspace(mean[k] - 4.0 * sd, mean[k] + 4.0 * sd, 200))
-            axes.plot(x, norm.pdf(x, mean[k], sd), **LAPLACE)
+            axes.plot(x, norm.pdf(x, mean[k], sd), **LAPLACE_STYLE)
             highest = axes.get_ylim()[1]
-            axes.set_ylim(0.0, min(max(highest, 1.08 * norm.pdf(0.0) / sd), TALLEST * highest))
+            axes.set_ylim(0.0, min(max(highest, 1.08 * norm.pdf(0.0) / sd), TALLEST_LAPLACE * highest))
         for axes, pair in self.pairs():
             if known[pair].all():
                 draw_ellipses(axes, mean[pair], covariance[np.ix_(pair, pair)])
-        yield plt.Line2D([], [], label=f"Laplace, {LEVELS_TEXT}", **LAPLACE)
+        yield plt.Line2D([], [], label=f"Laplace, {LEVELS_TEXT}", **LAPLACE_STYLE)
 
     def draw_priors(self, problem: Problem) -> Iterator[Any]:
         """Draw the priors on the diagonal, and yield the entry of the legend."""
@@ -276,23 +276,23 @@ class _Panels:
             if name in problem.joint_prior.marginals:
                 x = self._across(k)
                 density = np.exp(problem.joint_prior.marginals[name].log_prob(x))
-                self.grid[k, k].plot(x, np.where(np.isfinite(density), density, np.nan), **PRIOR)
-        yield plt.Line2D([], [], label="prior", **PRIOR)
+                self.grid[k, k].plot(x, np.where(np.isfinite(density), density, np.nan), **PRIOR_STYLE)
+        yield plt.Line2D([], [], label="prior", **PRIOR_STYLE)
 
     def draw_lines(self) -> Iterator[Any]:
         """Draw lines at zero and at the true values, and yield the entry of the legend."""
         for axes in np.diag(self.grid):
             axes.set_yticks([])
         for k, (low, high) in enumerate(self.limits):
-            marks: list[tuple[float, dict[str, Any]]] = [(0.0, ZERO)] if low < 0.0 < high else []
-            marks += [(self.truths[self.names[k]], TRUTH)] if self.names[k] in self.truths else []
+            marks: list[tuple[float, dict[str, Any]]] = [(0.0, ZERO_STYLE)] if low < 0.0 < high else []
+            marks += [(self.truths[self.names[k]], TRUTH_STYLE)] if self.names[k] in self.truths else []
             for value, look in marks:
                 for i in range(k, len(self.names)):
                     self.grid[i, k].axvline(value, **look)
                 for j in range(k):
                     self.grid[k, j].axhline(value, **look)
         if any(name in self.truths for name in self.names):
-            yield plt.Line2D([], [], label="truth", **TRUTH)
+            yield plt.Line2D([], [], label="truth", **TRUTH_STYLE)
 
 
 def _groups(posterior: Posterior) -> list[_Group]:
@@ -304,21 +304,21 @@ def _groups(posterior: Posterior) -> list[_Group]:
     mode = posterior.tree["sample_stats"].to_dataset()[MODE].to_numpy().ravel()
     label = "optimum {}: {:.1f} ± {:.1g} %"
     return [
-        _Group(label.format(row, 100 * own["mass"], 100 * own["mcse_mass"]), colour, mode == row, str(row))
-        for (row, own), colour in zip(table.iterrows(), cycle(ENSEMBLES), strict=False)
+        _Group(label.format(row, 100 * optimum["mass"], 100 * optimum["mcse_mass"]), colour, mode == row, str(row))
+        for (row, optimum), colour in zip(table.iterrows(), cycle(ENSEMBLES), strict=False)
     ]
 
 
 def draw_regions(axes: Axes, draws: np.ndarray, supports: list[regions.Support], colour: str) -> None:
     """Draw the regions that contain 50 and 90 % of the draws (n, 2)."""
-    found = regions.density(draws, supports)
-    half, most = found.levels(LEVELS)
-    shown = found.values >= most
+    estimate = regions.density(draws, supports)
+    half, most = estimate.levels(REGION_LEVELS)
+    shown = estimate.values >= most
     crop = tuple(
         slice(max(np.flatnonzero(line)[0] - 2, 0), np.flatnonzero(line)[-1] + 3)
         for line in (shown.any(axis=1), shown.any(axis=0))
     )
-    mesh = [values[crop] for values in (*found.nodes, found.values)]
+    mesh = [values[crop] for values in (*estimate.nodes, estimate.values)]
     for level, opacity in ((most, 0.35), (half, 0.6)):
         axes.contourf(*mesh, levels=[level, np.inf], colors=[colour], alpha=opacity)
     axes.contour(*mesh, levels=[most, max(half, np.nextafter(most, np.inf))], colors=[colour], linewidths=0.9)
@@ -331,10 +331,10 @@ def draw_ellipses(axes: Axes, mean: np.ndarray, covariance: np.ndarray) -> None:
     turn = np.linspace(0.0, 2 * np.pi, 200)
     across = np.cos(turn)
     up = correlation * across + np.sqrt(max(1.0 - correlation**2, 0.0)) * np.sin(turn)
-    for level in LEVELS:
+    for level in REGION_LEVELS:
         radius = np.sqrt(-2.0 * np.log(1.0 - level))
         x, y = (m + radius * sd * wave for m, sd, wave in zip(mean, sds, (across, up), strict=True))
-        axes.plot(x, y, zorder=5, **LAPLACE | {"lw": 1.2})
+        axes.plot(x, y, zorder=5, **LAPLACE_STYLE | {"lw": 1.2})
 
 
 def normal_approximation(
@@ -396,7 +396,7 @@ def marginals(
     grid = panels(figure, len(names))
     for i, (axes, name) in enumerate(zip(grid, names, strict=True)):
         draws = posterior.draws(name)
-        density, edges = np.histogram(draws, BINS, tuple(np.quantile(draws, TAILS)), density=True)
+        density, edges = np.histogram(draws, BINS, tuple(np.quantile(draws, HISTOGRAM_QUANTILES)), density=True)
         draw_marginal(axes, edges, density, float(mean[i]), float(sd[i]))
         axes.set_xlabel(draws_label(posterior, name))
     figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)

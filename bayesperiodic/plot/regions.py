@@ -20,25 +20,25 @@ from scipy.ndimage import map_coordinates
 Support = tuple[float, float]
 
 # Nodes per axis: of the first mesh, and where kernels would be narrower than RESOLVED of its cells.
-NODES, FINE, RESOLVED = 256, 1024, 3.0
+FIRST_NODES, FINE_2D, RESOLVED = 256, 1024, 3.0
 FINE_1D = 8192
 # Draws beyond these quantiles widen no mesh; half-widths of the kernels that are tried, in cells and in sds.
-ENDS, ROOM, NARROWEST, WIDEST, WIDTHS = (0.0003, 0.9997), 0.08, 0.7, 0.6, 32
+MESH_QUANTILES, MESH_ROOM, NARROWEST_KERNEL, WIDEST_KERNEL, KERNEL_WIDTHS = (0.0003, 0.9997), 0.08, 0.7, 0.6, 32
 # Cross-validation is noisy: the widest kernel with an error larger by this fraction of ∫f² is as good, for n draws the
 # larger one of the first number and the second times n to the power of the third.
-TOLERANCE = 0.001, 2.0, -0.8
+SCORE_TOLERANCE = 0.001, 2.0, -0.8
 # Factors on the width of the kernels, where the density is high and low.
-FACTORS = np.geomspace(0.7, 10.0, 8)
+KERNEL_FACTORS = np.geomspace(0.7, 10.0, 8)
 # Half-width [sds] that no kernel in the tails exceeds, unless all do: wider ones would pile up at the ends of the mesh.
 IN_TAILS = 0.3
 # Ends of supports that are nearer than this many sds to a draw are edges of the mesh.
-NEAR = 0.5
+NEAR_EDGE = 0.5
 # Quantiles, and their ratio below which the density of a positive quantity does not vanish at zero.
-LOWEST, VANISHING, CORRELATED = (0.002, 0.02), 0.2, 0.9
+LOWEST_QUANTILES, VANISHING_RATIO, RIDGE_CORRELATION = (0.002, 0.02), 0.2, 0.9
 # Points of the curve that is the trend of one quantity in the other, and the sd about it, relative to that about a
 # line, below which it is removed; distance of the ends of its extrapolation.
-KNOTS, CURVED, FAR = 48, 0.3, 100.0
-TINY, SMALL = float(np.finfo(float).tiny), 1e-9
+KNOTS, CURVED_RATIO, FAR_KNOT = 48, 0.3, 100.0
+SMALLEST_VALUE, LEAST_ROOM = float(np.finfo(float).tiny), 1e-9
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ def density(draws: np.ndarray, supports: Sequence[Support]) -> Density:
     """Return the density of draws (n, k), k = 1 or 2, in natural values; order: chain by chain."""
     chart = Chart.of(draws, supports)
     points = chart.inward(draws)
-    estimate = KernelEstimate.of(points, chart.edges, NODES)
+    estimate = KernelEstimate.of(points, chart.edges, FIRST_NODES)
     if estimate.cells < RESOLVED:
-        estimate = KernelEstimate.of(points, chart.edges, FINE if points.shape[1] == 2 else FINE_1D)
+        estimate = KernelEstimate.of(points, chart.edges, FINE_2D if points.shape[1] == 2 else FINE_1D)
     axes, values = estimate.on_nodes(max(1, int(estimate.cells / RESOLVED)))
     nodes = chart.outward(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
     values = values * chart.jacobian(nodes)
@@ -99,9 +99,9 @@ class Chart:
         trend: Callable[[np.ndarray], np.ndarray] = np.zeros_like
         if len(order) == 2 and not np.isfinite(edges[order[1]]).any():
             choices = [order] if np.isfinite(edges[order[0]]).any() else [order, order[::-1]]
-            found = [_trend(v[:, one], v[:, other]) for one, other in choices]
-            best = int(np.argmin([rest for _, rest in found]))
-            order, (trend, rest) = choices[best], found[best]
+            trends = [_trend(v[:, one], v[:, other]) for one, other in choices]
+            best = int(np.argmin([rest for _, rest in trends]))
+            order, (trend, rest) = choices[best], trends[best]
             scale[order[1]] *= rest
             trend = _divided(trend, rest)
         return cls(supports, logarithmic, order, centre[order], scale[order], trend, [edges[k] for k in order])
@@ -130,12 +130,12 @@ class Chart:
         slope = np.full(x.shape[:-1], 1.0 / np.prod(self.scale))
         for k, logarithmic in enumerate(self.logarithmic):
             if logarithmic:
-                slope = slope / np.maximum(x[..., k], TINY)
+                slope = slope / np.maximum(x[..., k], SMALLEST_VALUE)
         return slope
 
 
 def _logarithm(x: np.ndarray) -> np.ndarray:
-    return np.log(np.maximum(x, TINY))
+    return np.log(np.maximum(x, SMALLEST_VALUE))
 
 
 def _logarithmic(draws: np.ndarray, supports: Sequence[Support]) -> list[bool]:
@@ -143,31 +143,31 @@ def _logarithmic(draws: np.ndarray, supports: Sequence[Support]) -> list[bool]:
     positive = [support == (0.0, np.inf) for support in supports]
     if len(positive) == 2 and all(positive):
         logarithms = _logarithm(draws).T
-        if logarithms.std(axis=1).all() and abs(np.corrcoef(logarithms)[0, 1]) > CORRELATED:
+        if logarithms.std(axis=1).all() and abs(np.corrcoef(logarithms)[0, 1]) > RIDGE_CORRELATION:
             return positive
-    few, more = np.quantile(draws, LOWEST, axis=0)
-    return [p and bool(one > VANISHING * other) for p, one, other in zip(positive, few, more, strict=True)]
+    few, more = np.quantile(draws, LOWEST_QUANTILES, axis=0)
+    return [p and bool(one > VANISHING_RATIO * other) for p, one, other in zip(positive, few, more, strict=True)]
 
 
 def _edges(v: np.ndarray, support: Sequence[float]) -> Support:
     """Return the ends of a support that are near to draws, infinite otherwise."""
     low, high = map(float, support)
-    return low if v.min() - low < NEAR else -np.inf, high if high - v.max() < NEAR else np.inf
+    return low if v.min() - low < NEAR_EDGE else -np.inf, high if high - v.max() < NEAR_EDGE else np.inf
 
 
 def _trend(x: np.ndarray, y: np.ndarray) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
     """Return the mean of y given x, a line unless a curve explains much more, and the sd of the rest."""
-    slope = float(x @ y / max(x @ x, TINY))
+    slope = float(x @ y / max(x @ x, SMALLEST_VALUE))
     line, straight = (lambda t: slope * t), float((y - slope * x).std())
     members = np.array_split(np.argsort(x), min(KNOTS, max(1, len(x) // 50)))
     knots = np.array([[x[m].mean(), y[m].mean()] for m in members]).T
     knots = knots[:, np.flatnonzero(np.diff(knots[0], prepend=-np.inf) > 1e-6)]
     if knots.shape[1] > 3:
         first, last = knots[:, 0] - knots[:, 1], knots[:, -1] - knots[:, -2]
-        far = [knots[:, 0] + FAR * first / abs(first[0]), knots[:, -1] + FAR * last / last[0]]
+        far = [knots[:, 0] + FAR_KNOT * first / abs(first[0]), knots[:, -1] + FAR_KNOT * last / last[0]]
         curve = PchipInterpolator(*np.column_stack([far[0], knots, far[1]]))
         curved = float((y - curve(x)).std())
-        if 0.0 < curved < CURVED * straight:
+        if 0.0 < curved < CURVED_RATIO * straight:
             return curve, curved
     return line, straight if straight > 0.0 else 1.0
 
@@ -188,30 +188,34 @@ class KernelEstimate:
     @classmethod
     def of(cls, points: np.ndarray, edges: Sequence[Support], nodes: int) -> "KernelEstimate":
         """Return the estimate from points (n, k) on so many cells per axis."""
-        low, high = np.quantile(points, ENDS, axis=0)
-        room, given = ROOM * (high - low) + SMALL, np.array(edges)
+        low, high = np.quantile(points, MESH_QUANTILES, axis=0)
+        room, given = MESH_ROOM * (high - low) + LEAST_ROOM, np.array(edges)
         ends = np.where(np.isfinite(given), given, np.stack([low - room, high + room], axis=-1))
         steps = (ends[:, 1] - ends[:, 0]) / nodes
         places = np.floor((points - ends[:, 0]) / steps).astype(int)
         inside = np.all((places >= 0) & (places < nodes), axis=1)
         counter = _Counter(nodes, points.shape[1], ends[:, 1] - ends[:, 0])
         halves = [counter.spectrum(part[keep]) for part, keep in zip(_halves(places), _halves(inside), strict=True)]
-        widths = np.geomspace(NARROWEST * steps.max(), WIDEST, WIDTHS)
+        widths = np.geomspace(NARROWEST_KERNEL * steps.max(), WIDEST_KERNEL, KERNEL_WIDTHS)
         scores = np.array([counter.score(halves, width) for width in widths])
-        tolerance = max(TOLERANCE[0], TOLERANCE[1] * len(points) ** TOLERANCE[2])
+        tolerance = max(SCORE_TOLERANCE[0], SCORE_TOLERANCE[1] * len(points) ** SCORE_TOLERANCE[2])
         width = float(widths[scores >= scores.max() - tolerance * abs(scores.max())].max())
         pilot = counter.smooth(0.5 * (halves[0] + halves[1]), width)
         places = places[inside]
         at = np.maximum(pilot[tuple(places.T)], 1e-9 * pilot.max())
         factor = np.minimum(np.sqrt(at.mean() / at), max(IN_TAILS / width, 1.0))
-        group = np.clip(np.log(factor / FACTORS[0]) / np.log(FACTORS[1] / FACTORS[0]), 0.0, len(FACTORS) - 1.0)
+        group = np.clip(
+            np.log(factor / KERNEL_FACTORS[0]) / np.log(KERNEL_FACTORS[1] / KERNEL_FACTORS[0]),
+            0.0,
+            len(KERNEL_FACTORS) - 1.0,
+        )
         whole: Any = 0.0
-        for number, own in enumerate(FACTORS):
+        for number, multiple in enumerate(KERNEL_FACTORS):
             weight = np.maximum(1.0 - np.abs(group - number), 0.0) / len(points)
             if weight.any():
-                whole = whole + counter.spectrum(places, weight) * counter.kernel(width * own)
+                whole = whole + counter.spectrum(places, weight) * counter.kernel(width * multiple)
         values = np.maximum(idctn(whole, norm="ortho"), 0.0) / np.prod(steps)
-        return cls(ends[:, 0], steps, values, float(width * FACTORS[0] / steps.max()))
+        return cls(ends[:, 0], steps, values, float(width * KERNEL_FACTORS[0] / steps.max()))
 
     @cached_property
     def padded(self) -> np.ndarray:

@@ -20,8 +20,8 @@ from bayesperiodic.sampling.draws import Posterior
 COLOURS = {"measured": "#000000", "map": "#0072B2", "laplace": "#D55E00", "mcmc": "#56B4E9"}
 #: Colours of Okabe and Ito, and of Tol, of different lightness: they can be told apart in grey too.
 ENSEMBLES = ("#0072B2", "#E69F00", "#009E73", "#882255", "#DDCC77", "#332288")
-LAPLACE: dict[str, Any] = {"color": COLOURS["laplace"], "lw": 1.6, "ls": "--"}
-LABEL_LENGTH, ACROSS = 24, 4
+LAPLACE_STYLE: dict[str, Any] = {"color": COLOURS["laplace"], "lw": 1.6, "ls": "--"}
+LABEL_LENGTH, PANELS_ACROSS = 24, 4
 SHEET = "bayesperiodic.plot.figures"
 Arguments = ParamSpec("Arguments")
 
@@ -61,12 +61,12 @@ def wrapped_label(name: str, unit: str, length: int = LABEL_LENGTH) -> str:
     return axis_label(lines, unit).replace(" [", "\n[")
 
 
-SUPERSCRIPTS = str.maketrans("-−0123456789", "⁻⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+TO_SUPERSCRIPTS = str.maketrans("-−0123456789", "⁻⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def axis_label(name: str, unit: str = "") -> str:
     """Return a name with its unit, if any, escaped for matplotlib; powers in the unit are superscripts."""
-    powers = re.sub(r"(?:\^|\*\*)\(?(-?\d+)\)?(?![\d./])", lambda found: found[1].translate(SUPERSCRIPTS), unit)
+    powers = re.sub(r"(?:\^|\*\*)\(?(-?\d+)\)?(?![\d./])", lambda match: match[1].translate(TO_SUPERSCRIPTS), unit)
     text = f"{name} [{powers}]" if unit not in ("", "1") else name
     return text.replace("$", r"\$")
 
@@ -84,13 +84,13 @@ def chosen(names: Sequence[str] | None, every: tuple[str, ...], argument: str = 
     return tuple(names)
 
 
-def panel_grid(count: int, across: int = ACROSS) -> tuple[int, int]:
+def panel_grid(count: int, across: int = PANELS_ACROSS) -> tuple[int, int]:
     """Return the numbers of columns and rows of so many panels."""
     columns = min(count, across)
     return columns, -(-count // columns)
 
 
-def panels(figure: FigureBase, count: int, across: int = ACROSS, sharey: bool = False) -> list[Axes]:
+def panels(figure: FigureBase, count: int, across: int = PANELS_ACROSS, sharey: bool = False) -> list[Axes]:
     """Create so many panels in a grid."""
     columns, rows = panel_grid(count, across)
     grid = figure.subplots(rows, columns, sharey=sharey, squeeze=False).ravel()
@@ -106,7 +106,7 @@ def draw_marginal(axes: Axes, edges: np.ndarray, density: np.ndarray, mean: floa
     if np.isfinite(sd) and sd > 0.0:
         width, reach = edges[-1] - edges[0], 3.0 * sd
         x = np.linspace(max(mean - reach, edges[0] - 0.5 * width), min(mean + reach, edges[-1] + 0.5 * width), 300)
-        axes.plot(x, norm.pdf(x, mean, sd), label="Laplace", **LAPLACE)
+        axes.plot(x, norm.pdf(x, mean, sd), label="Laplace", **LAPLACE_STYLE)
     axes.set_ylim(bottom=0.0)
     axes.set_yticks([])
     axes.locator_params(axis="x", nbins=4)

@@ -21,9 +21,9 @@ from bayesperiodic.problem.description import check_results, fingerprint
 
 # Colours without another meaning, one for each channel; and that of the residual with the terms.
 CHANNELS, AFTER = ENSEMBLES[1:4], ENSEMBLES[2]
-HELD_OUT: dict[str, Any] = {"color": "grey", "ls": ":", "marker": "s", "ms": 4, "mfc": "white"}
+HELD_OUT_STYLE: dict[str, Any] = {"color": "grey", "ls": ":", "marker": "s", "ms": 4, "mfc": "white"}
 # Part of the axis to the left of the points, for their values.
-ROOM = 0.5
+ROOM_FOR_VALUES = 0.5
 
 
 @styled
@@ -78,14 +78,16 @@ def missing_terms(problem: Problem, fit: MapEstimate, found: MissingTerms, *, fi
     return figure
 
 
-def _steps(axes: Axes, found: MissingTerms) -> None:
+def _steps(axes: Axes, search: MissingTerms) -> None:
     """Draw the fraction of the variance that every model leaves unexplained, the given one at the top."""
-    models = (found.before, *found.steps)
+    models = (search.before, *search.steps)
     rows = np.arange(len(models))
     held_out = np.array([step.held_out for step in models])
     if np.isfinite(held_out).any():
-        axes.plot(held_out, rows, label="experiments left out", **HELD_OUT)
-    values = {channel: np.array([step.unexplained[channel] for step in models]) for channel in found.before.unexplained}
+        axes.plot(held_out, rows, label="experiments left out", **HELD_OUT_STYLE)
+    values = {
+        channel: np.array([step.unexplained[channel] for step in models]) for channel in search.before.unexplained
+    }
     for number, (channel, left) in enumerate(values.items()):
         axes.plot(left, rows, "o-", color=CHANNELS[number % len(CHANNELS)], lw=1.6, ms=5, label=axis_label(channel))
         for row, value in zip(rows, left, strict=True):
@@ -96,26 +98,27 @@ def _steps(axes: Axes, found: MissingTerms) -> None:
     axes.set(xscale="log", xlabel="unexplained variance", ylim=(len(models) - 0.6, -0.6))
     if known.size:
         low, high = np.log10([known.min(), known.max()])
-        axes.set_xlim(10.0 ** (low - ROOM * max(high - low, 1.0)), 10.0 ** (high + 0.1 * max(high - low, 1.0)))
-    axes.set_yticks(rows, ["given model", *(axis_label(f"+ {step.term}\nin {step.place}") for step in found.steps)])
+        width = max(high - low, 1.0)
+        axes.set_xlim(10.0 ** (low - ROOM_FOR_VALUES * width), 10.0 ** (high + 0.1 * width))
+    axes.set_yticks(rows, ["given model", *(axis_label(f"+ {step.term}\nin {step.place}") for step in search.steps)])
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(axis="x", color="0.9")
     axes.legend(frameon=False, fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
 
 
-def _residuals(panels: list[Axes], problem: Problem, found: MissingTerms, shown: dict[str, MapEstimate]) -> None:
+def _residuals(panels: list[Axes], problem: Problem, search: MissingTerms, shown: dict[str, MapEstimate]) -> None:
     """Draw one channel's residual of each estimate against a variable of the first term, coloured by another."""
     fit = next(iter(shown.values()))
-    place = found.steps[0].place if found.steps else ""
+    place = search.steps[0].place if search.steps else ""
     channel = place if place in problem.channels else max(fit.fvu, key=lambda name: fit.fvu[name])
     having = [e for e in problem.experiments if channel in e.outputs]
-    e = max(having, key=lambda own: float(np.sum(fit.residuals[own.name][channel] ** 2)))
-    (across, x), *others = _variables(problem, fit, found, e).items()
+    e = max(having, key=lambda run: float(np.sum(fit.residuals[run.name][channel] ** 2)))
+    (across, x), *others = _variables(problem, fit, search, e).items()
     mask = slice(None) if e.mask is None else e.mask
-    reach = 1.08 * max(float(np.abs(own.residuals[e.name][channel][mask]).max()) for own in shown.values())
+    reach = 1.08 * max(float(np.abs(estimate.residuals[e.name][channel][mask]).max()) for estimate in shown.values())
     points: Any = None
-    for number, (axes, (title, own)) in enumerate(zip(panels, shown.items(), strict=True)):
-        residual = own.residuals[e.name][channel]
+    for number, (axes, (title, estimate)) in enumerate(zip(panels, shown.items(), strict=True)):
+        residual = estimate.residuals[e.name][channel]
         axes.axhline(0.0, color="grey", lw=0.8, zorder=0)
         if others:
             colour = others[0][1][mask]
@@ -134,11 +137,11 @@ def _residuals(panels: list[Axes], problem: Problem, found: MissingTerms, shown:
         panels[0].figure.colorbar(points, ax=panels, label=others[0][0], pad=0.02)
 
 
-def _variables(problem: Problem, fit: MapEstimate, found: MissingTerms, e: Experiment) -> dict[str, np.ndarray]:
+def _variables(problem: Problem, fit: MapEstimate, search: MissingTerms, e: Experiment) -> dict[str, np.ndarray]:
     """Return the variables of the first term along an orbit, by their labels; the time for a term without any."""
     model = problem.model
-    if found._terms:
-        term, _ = found._terms[found.steps[0].name]
+    if search._terms:
+        term, _ = search._terms[search.steps[0].name]
         expression = term.force or term.expression
         names = model.state_symbols | model.input_symbols
         powers = {
@@ -150,7 +153,7 @@ def _variables(problem: Problem, fit: MapEstimate, found: MissingTerms, e: Exper
         if chosen:
             listed = [names[name] for name in chosen]
             values = along_orbit(problem, problem.vector(fit.theta), e, fit.solutions[e.name], listed)
-            return {_label(problem, name): own for name, own in zip(chosen, values, strict=True)}
+            return {_label(problem, name): column for name, column in zip(chosen, values, strict=True)}
     return {"time in the period [s]": e.time}
 
 

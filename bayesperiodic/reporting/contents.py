@@ -34,7 +34,7 @@ from bayesperiodic.sampling.draws import Posterior
 
 # Level of the whiteness test, and the ratio of robust to Laplace sd above which the report warns.
 NOT_WHITE, LARGE_RATIO = 0.01, 1.5
-LONGEST, MOST_PANELS = 120, 7
+LONGEST_PRIOR, MOST_PANELS = 120, 7
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "xarray", "matplotlib")
 
 
@@ -231,7 +231,7 @@ def _roles(problem: Problem, plain: str) -> Iterator[tuple[str, str, str]]:
     partners = {name: key for key in problem.priors if isinstance(key, tuple) for name in key}
     for name in (n for n in problem.names if n.partition("[")[0] == plain):
         prior = repr(problem.joint_prior.marginals[name])
-        prior = prior if len(prior) <= LONGEST else f"{prior[:LONGEST]}…"
+        prior = prior if len(prior) <= LONGEST_PRIOR else f"{prior[:LONGEST_PRIOR]}…"
         others = ", ".join(other for other in partners.get(name, ()) if other != name)
         yield name, "free", prior + (f", jointly with {others}" if others else "")
     if plain in problem.tied:

@@ -47,8 +47,8 @@ def columns(rows: Rows) -> list[tuple[str, bool]]:
 
 def heads(rows: Rows) -> list[tuple[str, int]]:
     """Return the common heads with the number of columns below each; empty without any."""
-    found = [title.rpartition(": ")[0] for title in (rows[0] if rows else ())]
-    return [(head, len(list(columns))) for head, columns in groupby(found)] if any(found) else []
+    shared = [title.rpartition(": ")[0] for title in (rows[0] if rows else ())]
+    return [(head, len(list(columns))) for head, columns in groupby(shared)] if any(shared) else []
 
 
 def code(name: str) -> Markup:
@@ -58,7 +58,7 @@ def code(name: str) -> Markup:
 
 NOTHING = "–"
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-SMALLEST, LARGEST = 1e-2, 1e6
+SMALLEST_PLAIN, LARGEST_PLAIN = 1e-2, 1e6
 
 
 def number(value: float, digits: int = 3) -> Number:
@@ -92,7 +92,7 @@ def counted(count: int, what: str) -> str:
 
 def unit(text: str) -> str:
     """Format a unit with raised powers, without line breaks."""
-    raised = re.sub(r"\^(-?\d+)", lambda found: found[1].translate(RAISED), text).replace(" ", "\u00a0")
+    raised = re.sub(r"\^(-?\d+)", lambda match: match[1].translate(RAISED), text).replace(" ", "\u00a0")
     return raised or NOTHING
 
 
@@ -110,7 +110,7 @@ class Rounding:
         if not known:
             return cls(0, 3)
         size, step = max(known), abs(sd) if isfinite(sd) and sd != 0.0 else 1e-2 * max(known)
-        exponent = 0 if SMALLEST <= size < LARGEST else floor(log10(size))
+        exponent = 0 if SMALLEST_PLAIN <= size < LARGEST_PLAIN else floor(log10(size))
         return cls(exponent, max(0, 2 - floor(log10(step)) + exponent))
 
     def text(self, value: float) -> Number:
@@ -168,11 +168,11 @@ def symbol(name: str) -> Markup:
 
 def _names(model: Model) -> dict[sp.Symbol, tuple[str, int]]:
     """Return the name and the order of the derivative of each symbol."""
-    found = {model.time_symbols["tau"]: ("tau", 0), model.time_symbols["frequency"]: ("f", 0)}
-    found |= {symbol: (name, 0) for name, symbol in model.parameter_symbols.items()}
+    meanings = {model.time_symbols["tau"]: ("tau", 0), model.time_symbols["frequency"]: ("f", 0)}
+    meanings |= {symbol: (name, 0) for name, symbol in model.parameter_symbols.items()}
     for names, symbols in ((model.states, model.state_symbols), (model.inputs, model.input_symbols)):
-        found |= {symbols["d" * order + name]: (name, order) for name in names for order in range(3)}
-    return found
+        meanings |= {symbols["d" * order + name]: (name, order) for name in names for order in range(3)}
+    return meanings
 
 
 class _Printer(MathMLPresentationPrinter):
