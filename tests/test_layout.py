@@ -14,6 +14,8 @@ REASONS = {
     "Model": "the definition of a model: name, variables, equations, outputs, units; five are required",
     "Problem": "model, experiments, parameters and noise; two and the priors are required, the rest are keywords",
     "Recording.from_csv": "the columns of a file, gaps in them and several records; path and outputs are required",
+    "Recording.from_mat": "those of from_csv",
+    "Recording.from_npz": "those of from_csv",
     "calibrate": "the settings of a campaign and of the estimates in it; three are required",
     "plot.corner": "options of a figure, those of the package corner among them; one argument is required",
     "plot.branch": "options of a figure; one argument is required",

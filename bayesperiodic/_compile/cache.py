@@ -8,7 +8,6 @@ and built again; if the folder cannot be used, the kernels are compiled in memor
 
 import gc
 import hashlib
-import inspect
 import json
 import os
 import platform
@@ -16,6 +15,7 @@ import shutil
 import stat
 import sys
 import tempfile
+import threading
 import time
 import types
 import warnings
@@ -28,10 +28,13 @@ from typing import Any
 import llvmlite.binding
 import numba
 import platformdirs
-from numba.core import sigutils, typing
-from numba.core.compiler_lock import global_compiler_lock
-from numba.core.extending import _Intrinsic
-from numba.core.registry import cpu_target
+
+from bayesperiodic._compile import expectations
+
+try:
+    from numba.core.compiler_lock import global_compiler_lock
+except ImportError:
+    global_compiler_lock = threading.RLock()  # type: ignore[assignment]
 
 SOURCE, MANIFEST, BUILDING = "kernels.py", "manifest.json", "building-"
 # Age in seconds after which an unfinished entry is that of a killed process.
@@ -79,12 +82,17 @@ def load(
     return _execute(source, names, Path("<kernels compiled in memory>"), run or _run, cache=False)
 
 
-def is_stored(body: str, constants: Mapping[str, Any] | None = None) -> bool:
-    """Return whether the cache has an entry of a text without a shared module, or cannot have one."""
+def is_stored(body: str, constants: Mapping[str, Any] | None = None, unusable: bool = True) -> bool:
+    """Return whether the cache has an entry of a text without a shared module; `unusable` if it cannot have one."""
     try:
         return (_private_folder() / _digest(_definitions(body, constants, None)[0])).exists()
     except (CacheProblem, OSError):
-        return True
+        return unusable
+
+
+def internals_expected() -> bool:
+    """Return whether Numba's internals are those expected, see `expectations`."""
+    return expectations.met(load, is_stored)
 
 
 def declare(body: str, constants: Mapping[str, Any] | None = None) -> types.ModuleType:
@@ -133,7 +141,11 @@ def _remove(entry: Path) -> None:
 
 def _header() -> str:
     """Return the versions and the processor, on which the machine code depends besides the text."""
-    machine = " ".join(map(str, (platform.machine(), *cpu_target.target_context.codegen().magic_tuple())))
+    settings: Any = numba.config
+    name = settings.CPU_NAME or llvmlite.binding.get_host_cpu_name()
+    features = settings.CPU_FEATURES or llvmlite.binding.get_host_cpu_features().flatten()
+    route = "machine code" if internals_expected() else "njit"
+    machine = f"{platform.machine()} {llvmlite.binding.get_process_triple()} {name} {features}, {route}"
     versions = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, python {platform.python_version()}"
     return f"# {versions}, {machine}\n"
 
@@ -198,7 +210,7 @@ def _execute(
     source: str, names: Mapping[str, Any], path: Path, run: Callable[..., None], cache: bool
 ) -> types.ModuleType:
     module = types.ModuleType(f"bayesperiodic_kernels_{_digest(source)}")
-    own = {name: value for name, value in names.items() if not name.startswith("__")}
+    defined = {name: value for name, value in names.items() if not name.startswith("__")}
     module.__file__ = str(path)
     sys.modules[module.__name__] = module
     settings: Any = numba.config
@@ -207,65 +219,8 @@ def _execute(
         settings.CACHE_DIR = ""  # beside the source, where its digests are kept
         gc.set_threshold(0)  # looking for garbage takes a fifth of the compiler's time
         try:
-            run(source, own, path, module, cache=cache)
+            run(source, defined, path, module, cache=cache)
         finally:
             settings.CACHE_DIR = elsewhere
             gc.set_threshold(*thresholds)
     return module
-
-
-class Kernel(_Intrinsic):  # type: ignore[misc]
-    """A compiled function that Python calls as usual, and compiled code by its address.
-
-    Numba copies a called function into every caller and optimises it there again, which took more than a third of the
-    compile time of the driven solver. A kernel is called through a symbol instead, whose address the process knows once
-    it is compiled or loaded; errors are propagated as usual. The symbol is the name in its module, whose name is a
-    digest of its contents (see `load`): it stands for the same code in every process. A call takes some nanoseconds, so
-    functions that are called at every point of a grid are compiled with ``njit``.
-
-    With the option `no_cpython_wrapper`, which saves an eighth of the compile time, only compiled code may call it.
-    """
-
-    def __init__(self, function: Callable[..., Any], signature: Any, options: dict[str, Any]):
-        arguments, result = sigutils.normalize_signature(signature)
-        names, symbol = [f"a{k}" for k in range(len(arguments))], f"{function.__module__}.{function.__name__}"
-        if function.__globals__["DECLARED"]:
-            address = id(self)  # never called
-        else:
-            self.compiled = numba.njit(signature, **options)(function)
-            code = self.compiled.get_compile_result(result(*arguments))
-            address = code.library.get_pointer_to_function(code.fndesc.llvm_func_name)
-        llvmlite.binding.add_symbol(symbol, address)
-        called = types.SimpleNamespace(
-            mangled_name=symbol, restype=result, argtypes=arguments, args=names, noalias=False, inline=False
-        )
-
-        def typed(_: Any, *given: Any) -> Any:
-            def call(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-                return context.call_internal(builder, called, signature, values)
-
-            return (typing.signature(result, *arguments), call) if len(given) == len(arguments) else None
-
-        places = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY) for name in ("context", *names)]
-        typed.__signature__ = inspect.Signature(places)  # type: ignore[attr-defined]
-        super().__init__(function.__name__, typed)
-        self._register()
-
-    def __call__(self, *arguments: Any) -> Any:
-        """Run the compiled function."""
-        if self.compiled.targetoptions.get("no_cpython_wrapper"):
-            raise TypeError(f"{self._name}: must be called by compiled code, got a call from Python.")
-        return self.compiled(*arguments)
-
-
-def kernel(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Kernel]:
-    """Return a decorator that compiles a function with a signature as a `Kernel`, with options of ``numba.njit``."""
-    return lambda function: Kernel(function, signature, options)
-
-
-def inlined(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles a function by ``njit`` into its callers; in a declared module if it has any.
-
-    Python must not call it, if it has the option `no_cpython_wrapper`.
-    """
-    return lambda function: numba.njit(*[] if function.__globals__["DECLARED"] else [signature], **options)(function)

@@ -87,9 +87,6 @@ class Value:
     def __pos__(self) -> "Value":
         return self
 
-    def __invert__(self) -> "Value":
-        return Value(self.builder, self.builder.not_(self.value))
-
     def __abs__(self) -> "Value":
         return called("fabs", self)
 

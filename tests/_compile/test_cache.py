@@ -35,7 +35,7 @@ def four_times(x):
 
 # Kernels, and a module of functions that call them.
 KERNELS = """
-from bayesperiodic._compile.cache import inlined, kernel
+from bayesperiodic._compile.functions import inlined, kernel
 
 @inlined("float64(float64)", cache=CACHE)
 def next(x):
@@ -56,8 +56,9 @@ def combined(x):
 """
 PROGRAM = f"""
 from bayesperiodic._compile import machine_code
-from bayesperiodic._compile.cache import load
+from bayesperiodic._compile.cache import internals_expected, load
 from bayesperiodic.models.library import pendulum
+internals_expected()
 SMALL, NAMES = {SMALL!r}, {NAMES!r}
 compiled, append = [], machine_code._append
 machine_code._append = lambda *arguments: (compiled.append(arguments), append(*arguments))
@@ -70,6 +71,7 @@ FIRST, SECOND = f"{len(FUNCTIONS)} 0\n", "0 2\n"
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
+    cache.internals_expected()  # which fills another folder
     monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path))
     return tmp_path / "kernels"
 
@@ -106,6 +108,8 @@ def test_callers_of_declared_kernels_are_compiled_for_processes_that_have_the_ke
     cache.load(CALLERS, shared=cache.declare(KERNELS))
     program = f"""
 from bayesperiodic._compile import cache
+cache._announce = lambda: None
+cache.internals_expected()
 cache._build = None
 print(cache.load({CALLERS!r}, shared=cache.load({KERNELS!r})).combined(2.0))
 """
@@ -126,6 +130,7 @@ def test_two_processes_compile_half_of_the_solver_each(folder):
     program = """
 from bayesperiodic._compile import cache
 from bayesperiodic.periodic.compiled import kernels
+cache.internals_expected()
 built, build = [], cache._build
 cache._build = lambda source, *arguments: (built.append(source), build(source, *arguments))[1]
 kernels("newton", 1, (2, 3, 2))

@@ -3,7 +3,8 @@ import pytest
 from numba import njit
 
 from bayesperiodic._compile import machine_code
-from bayesperiodic._compile.code_generation import as_vector, compiled
+from bayesperiodic._compile.code_generation import compiled
+from bayesperiodic._compile.functions import as_vector
 from bayesperiodic.models.library import duffing, pendulum
 from tests.known import formula_model
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import types
 
-from bayesperiodic._compile.code_generation import as_vector, grid_function_at
+from bayesperiodic._compile.functions import as_vector, grid_function_at
 
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
     from bayesperiodic.periodic._kernels.batch import *

@@ -15,8 +15,7 @@ period:
 import numpy as np
 from numba import njit, types
 
-from bayesperiodic._compile.cache import inlined, kernel
-from bayesperiodic._compile.code_generation import as_vector
+from bayesperiodic._compile.functions import as_vector, inlined, kernel
 from bayesperiodic.periodic.compiled import *
 
 STATES, REACH, WIDTH, HALF = globals().get("SIZES", (0, 0, 0, 0))  # 0: any number, taken from the arrays

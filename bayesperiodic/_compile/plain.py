@@ -1,0 +1,73 @@
+"""Compilation by public functions of Numba alone, for versions whose internals are not those that are expected.
+
+Values are the same up to rounding; a model takes about 7 s to compile instead of 1 s, and the solver takes longer too.
+"""
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numba
+
+OPTIONS = "cache=CACHE, error_model='numpy'"
+# Functions of the generated texts, as in `machine_code`.
+HEAD = f"""
+import math
+from numba import cfunc, njit
+
+@njit({OPTIONS})
+def where(condition, one, other):
+    return float(one) if condition else float(other)
+
+@njit({OPTIONS})
+def sign(x):
+    return where(x > 0.0, 1.0, 0.0) - where(x < 0.0, 1.0, 0.0)
+
+@njit({OPTIONS})
+def step(x):
+    return 0.5 * (where(x > 0.0, 1.0, 0.0) + where(x >= 0.0, 1.0, 0.0))
+"""
+# The loop over the grid of a function of one point; the sums follow the last row.
+LOOP = f"""
+@cfunc(SIGNATURE, {OPTIONS})
+def {{name}}(states, inputs, parameters, tau, frequency, out):
+    flat = out.reshape(out.size)
+    sums = flat[states.shape[0] * {{rows}} :]
+    for number in range({{sums}}):
+        sums[number] = 0.0
+    for point in range(states.shape[0]):
+        row = flat[point * {{rows}} : (point + 1) * {{rows}}]
+        {{name}}_at(states[point], inputs[point], parameters, tau[point], frequency, row, sums)
+"""
+FUNCTION = re.compile(r"^def (\w+)\((.*), columns=\((\d+), (\d+), (\d+), (\d+)\)\):$", re.MULTILINE)
+
+
+def compile_functions(
+    source: str, _: Mapping[str, Any], path: Path, module: ModuleType, *, signature: Any, cache: bool
+) -> None:
+    """Define the addresses of a text's functions in a module, as `machine_code.compile_functions` does."""
+    heads = FUNCTION.findall(source)
+    points = FUNCTION.sub(rf"@njit({OPTIONS})\ndef \1_at(\2):", source)
+    points = re.sub(r"^( +sums\[\d+\]) = ", r"\1 += ", points, flags=re.MULTILINE)
+    loops = "".join(LOOP.format(name=name, rows=rows, sums=sums) for name, _, _, _, rows, sums in heads)
+    module.__dict__.update(CACHE=cache, SIGNATURE=signature)
+    exec(compile(HEAD + points + loops, str(path), "exec"), module.__dict__)
+    module.__dict__["library"] = [module.__dict__[name] for name, *_ in heads]
+    for function, (name, *_) in zip(module.__dict__["library"], heads, strict=True):
+        module.__dict__[name] = function.address
+
+
+def inlined(signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that compiles a function by ``njit`` into its callers; in a declared module if it has any.
+
+    Python must not call it, if it has the option `no_cpython_wrapper`.
+    """
+    return lambda function: numba.njit(*[] if function.__globals__["DECLARED"] else [signature], **options)(function)
+
+
+@numba.njit
+def as_vector(array: Any) -> Any:
+    """Return a C-contiguous array as a vector, for use in compiled code."""
+    return array.reshape(array.size)
