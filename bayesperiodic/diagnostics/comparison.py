@@ -20,7 +20,7 @@ from bayesperiodic.diagnostics.adequacy import misfit
 from bayesperiodic.diagnostics.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, USABLE_K, WIDE, Sample
 from bayesperiodic.estimation.modes import notable
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
-from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.problem.parameters import unit
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.draws import Posterior

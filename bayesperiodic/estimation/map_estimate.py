@@ -46,7 +46,7 @@ from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, nois
 from bayesperiodic.estimation.units import compared_with_data, unit_error
 from bayesperiodic.likelihood.input_noise import EXACT, FEWEST_CYCLES, ROUGH
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
-from bayesperiodic.problem.description import fingerprint
+from bayesperiodic.problem.fingerprint import fingerprint
 
 NOISE_SHARE = 0.1
 LARGEST_SHIFT, LARGEST_NONLINEARITY = 0.1, 0.3
