@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgb
 
 import bayesperiodic as bp
 from bayesperiodic.plot import style
-from bayesperiodic.problem.description import fingerprint
+from bayesperiodic.problem.fingerprint import fingerprint
 from tests.drawn import faults, posterior_of, texts
 from tests.problems import quadratic_damping
 

@@ -11,7 +11,7 @@ from matplotlib.path import Path
 
 import bayesperiodic as bp
 from bayesperiodic.plot import COLOURS
-from bayesperiodic.problem.description import fingerprint
+from bayesperiodic.problem.fingerprint import fingerprint
 from tests.problems import quadratic_damping
 
 

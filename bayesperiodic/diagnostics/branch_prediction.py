@@ -14,7 +14,7 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.predictive import BAND_QUANTILES, draws_of
 from bayesperiodic.periodic.continuation import FOLD, Branch, continue_periodic
 from bayesperiodic.periodic.equations import FREQUENCY
-from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.sampling.draws import Posterior
 
 BAND_MEASURES = AMPLITUDE, MAXIMUM = "amplitude", "maximum"

@@ -30,7 +30,7 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import JOINT, MEASURED, error_waves, noisy_inputs
 from bayesperiodic.likelihood.noise import EXPERIMENT, VARIANCE, Independent
 from bayesperiodic.priors.joint import as_prior
-from bayesperiodic.problem.description import fingerprint
+from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.sampling.draws import Posterior
 from bayesperiodic.sampling.sample import sample
 from bayesperiodic.simulation import NotSettled, steady_cycle

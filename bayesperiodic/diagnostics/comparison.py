@@ -30,7 +30,7 @@ from bayesperiodic.diagnostics.verdicts import (
 )
 from bayesperiodic.estimation.modes import notable
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
-from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.problem.parameters import unit
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.draws import Posterior

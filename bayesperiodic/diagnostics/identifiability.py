@@ -23,7 +23,7 @@ from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
-from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.problem.parameters import SHIFT, local_names
 from bayesperiodic.sampling.draws import Posterior
 from bayesperiodic.symmetry.determining import system_of, with_signs

@@ -38,7 +38,7 @@ from bayesperiodic.diagnostics.score_tests import ScoreTests, lags_to_try, varia
 from bayesperiodic.estimation.map_estimate import map_estimate, nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
-from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.fingerprint import check_results
 
 # Ratio of the errors in experiments that are left out from which on these tell two terms apart.
 WORSE_RATIO = 2.0

@@ -20,7 +20,7 @@ from bayesperiodic.diagnostics.predictive import draws_of, predict
 from bayesperiodic.diagnostics.verdicts import UNCONVERGED, USABLE_K
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.modes import default_starts
-from bayesperiodic.problem.description import check_results, digest
+from bayesperiodic.problem.fingerprint import check_results, digest
 from bayesperiodic.problem.parameters import CHAIN, DRAW, EXPERIMENT
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.draws import OBSERVATION, Posterior, log_likelihood_terms

@@ -31,7 +31,7 @@ from bayesperiodic.estimation.conflict import prior_conflict
 from bayesperiodic.estimation.gauss_newton import Objective, bias_correction
 from bayesperiodic.periodic import arclength
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
-from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.problem.parameters import CHAIN, DRAW
 from bayesperiodic.sampling.draws import Posterior
 

@@ -32,7 +32,7 @@ class Compared(NamedTuple):
     """Residual components (size,) and their derivatives (directions, size), one array a block."""
 
     residuals: list[np.ndarray]
-    changes: list[np.ndarray]
+    jacobian: list[np.ndarray]
 
 
 class ScoreTests:

@@ -38,7 +38,7 @@ from bayesperiodic.estimation.modes import default_starts, notable, weighed, wit
 from bayesperiodic.estimation.result import MapEstimate, NoiseEstimate, Search, TrueInputs
 from bayesperiodic.estimation.units import compared_with_data, unit_error
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
-from bayesperiodic.problem.description import fingerprint
+from bayesperiodic.problem.fingerprint import fingerprint
 
 MOST_SHOWN_MODES = 3
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.

@@ -14,7 +14,7 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.predictive import Prediction
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, caveats_of, chosen, draws_label, styled
-from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.sampling.draws import Posterior
 
 MEASURED_STYLE: dict[str, Any] = {"color": COLOURS["measured"], "marker": "o"}

@@ -15,7 +15,7 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot.estimates import draw_period
 from bayesperiodic.plot.pairs import corner
 from bayesperiodic.plot.style import axis_label, styled
-from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.sampling.draws import Posterior
 
 LINE_LENGTH, MOST_NAMES_LISTED = 58, 6

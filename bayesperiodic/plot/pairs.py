@@ -33,7 +33,7 @@ from bayesperiodic.plot.style import (
     panels,
     styled,
 )
-from bayesperiodic.problem.description import check_fingerprint, check_results
+from bayesperiodic.problem.fingerprint import check_fingerprint, check_results
 from bayesperiodic.problem.parameters import support
 from bayesperiodic.sampling.draws import MODE, Posterior
 

@@ -17,7 +17,7 @@ from bayesperiodic.diagnostics.score_tests import along_orbit
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot import style
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, styled
-from bayesperiodic.problem.description import check_results, fingerprint
+from bayesperiodic.problem.fingerprint import check_results, fingerprint
 
 # Colours without another meaning, one for each channel; and that of the residual with the terms.
 CHANNELS, AFTER = ENSEMBLES[1:4], ENSEMBLES[2]

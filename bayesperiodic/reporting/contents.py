@@ -26,7 +26,7 @@ from bayesperiodic.estimation.map_estimate import estimation_warnings
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import JOINT, MEASURED
 from bayesperiodic.periodic.schemes import find_scheme
-from bayesperiodic.problem.description import check_results, fingerprint
+from bayesperiodic.problem.fingerprint import check_results, fingerprint
 from bayesperiodic.problem.parameters import SHIFT, squared
 from bayesperiodic.reporting import html
 from bayesperiodic.reporting.html import Rows, code, number

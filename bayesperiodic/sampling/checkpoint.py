@@ -15,7 +15,8 @@ import h5py
 from filelock import FileLock, Timeout
 
 from bayesperiodic._io import draft_prefix, read_sealed, write_sealed
-from bayesperiodic.problem.description import Description, changed_parts, fingerprint
+from bayesperiodic.problem.description import Description
+from bayesperiodic.problem.fingerprint import changed_parts, fingerprint
 
 PATIENCE = 20.0
 MARK, RUN = "fingerprint", "run"

@@ -19,7 +19,8 @@ from bayesperiodic.likelihood.input_noise import InputErrors
 from bayesperiodic.likelihood.noise import SCALE
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 from bayesperiodic.priors.joint import MultivariateNormal
-from bayesperiodic.problem.description import Description, fingerprint
+from bayesperiodic.problem.description import Description
+from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.problem.parameters import (
     CHAIN,
     CHANNEL,

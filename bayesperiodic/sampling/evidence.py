@@ -18,7 +18,7 @@ from bayesperiodic.likelihood.noise import SCALE, VARIANCE
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.priors.joint import FromScipy, as_prior, as_written
 from bayesperiodic.priors.single import LOG_ROOT_TWO_PI, Uniform
-from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.problem.parameters import CHAIN, DRAW, SHIFT, local_name
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.draws import Posterior

@@ -36,7 +36,7 @@ from bayesperiodic.density.log_posterior import (
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import Simulator
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.problem.description import digest
+from bayesperiodic.problem.fingerprint import digest
 from bayesperiodic.sampling.checkpoint import Checkpoint
 from bayesperiodic.sampling.convergence import PASSES, stop_rule
 from bayesperiodic.sampling.draws import Posterior, gather

@@ -9,7 +9,7 @@ from scipy.special import ndtri
 import bayesperiodic as bp
 from bayesperiodic.estimation import profile as profiles
 from bayesperiodic.estimation.profile import Ridge
-from bayesperiodic.problem.description import fingerprint
+from bayesperiodic.problem.fingerprint import fingerprint
 from tests.known import LINEAR, formula_model, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])

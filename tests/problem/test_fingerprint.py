@@ -9,7 +9,7 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
-from bayesperiodic.problem.description import changed_parts, check_results, fingerprint
+from bayesperiodic.problem.fingerprint import changed_parts, check_results, fingerprint
 from tests.known import LINEAR, grid
 
 TAU = grid(32)

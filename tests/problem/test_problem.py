@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
-from bayesperiodic.problem.description import fingerprint
+from bayesperiodic.problem.fingerprint import fingerprint
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors, normal_posterior
 
 TRUTH = np.array([900.0, 40.0, 25.0])

@@ -50,7 +50,7 @@ def test_chains_of_ties_and_nonlinear_ones_have_exact_slopes():
 
 
 def test_ties_are_part_of_the_fingerprint():
-    from bayesperiodic.problem.description import fingerprint
+    from bayesperiodic.problem.fingerprint import fingerprint
 
     assert fingerprint(problem({"c": "0.05*k"})) != fingerprint(problem({"c": "0.06*k"}))
 
