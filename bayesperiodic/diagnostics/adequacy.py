@@ -156,7 +156,7 @@ def adequacy(
     The linearisation is that at a draw near the best fit. Noise parameters are draws (draws, noise_names), replicates
     of the data (draws, points) by experiment and channel, NaN outside the mask and for failed solves.
     """
-    shapes = np.median(noise, axis=0)[None] if problem.noise.flat else noise[:: max(1, len(noise) // SHAPES)]
+    shapes = np.median(noise, axis=0)[None] if problem.likelihood.white else noise[:: max(1, len(noise) // SHAPES)]
     rows: dict[str, dict[str, Any]] = {}
     white = [Whitened(problem, here, shape) for shape in shapes]
     for i, block in enumerate(problem.likelihood.blocks):

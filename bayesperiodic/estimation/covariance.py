@@ -350,7 +350,8 @@ def _mixture(
 
 def _spectra(problem: Problem, blocks: list[Block], values: np.ndarray) -> np.ndarray:
     """Return the variances of the components of all blocks, (…, components)."""
-    return np.concatenate([problem.noise.spectrum(block, values)[0] for block in blocks], axis=-1)
+    every = (np.broadcast_to(problem.noise.spectrum(b, values)[0], (*values.shape[:-1], b.size)) for b in blocks)
+    return np.concatenate(list(every), axis=-1)
 
 
 def _points(problem: Problem) -> tuple[np.ndarray, np.ndarray]:

@@ -1,1 +1,3 @@
 """Comparison of predicted responses with data."""
+
+from bayesperiodic.likelihood import noise as noise

@@ -71,7 +71,7 @@ class Description:
             local = (*local,) + tuple(name for name in model.parameters if name not in self._given["model"].parameters)
         self.model, self.scheme = model, scheme or default_scheme(model)
         find_scheme(self.scheme)
-        if not self.noise.flat and any(e.mask is not None for e in self.experiments):
+        if self.noise.correlates_points and any(e.mask is not None for e in self.experiments):
             if isinstance(self.input_noise, Mapping):
                 raise ValueError(
                     f"input_noise: must be 'joint' or 'exact' for points of a mask with {self.noise.name!r} noise, got "

@@ -54,7 +54,7 @@ def dense(likelihood: Likelihood, values: np.ndarray, loadings: np.ndarray) -> n
     for i, b in enumerate(BLOCKS):
         if plain[i] is None:
             own = [likelihood.names.index(n) for n in likelihood.model.parameter_names(b)]
-            plain[i] = likelihood.model.spectrum(b, values[own])[0]
+            plain[i] = np.broadcast_to(likelihood.model.spectrum(b, values[own])[0], b.size)
     return np.diag(np.concatenate(plain)) + loadings @ loadings.T
 
 
