@@ -492,4 +492,4 @@ def _inside(e: Experiment, prediction: Bands) -> float:
         (values >= prediction.low[e.name][channel]) & (values <= prediction.high[e.name][channel])
         for channel, values in e.outputs.items()
     ]
-    return float(np.mean(within if e.mask is None else np.array(within)[:, e.mask]))
+    return float(np.mean(np.array(within)[:, e.measured_points]))

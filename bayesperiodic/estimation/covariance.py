@@ -13,6 +13,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import orbit_multipliers
 from bayesperiodic.estimation.gauss_newton import Iterate, changes_by_variance, information
+from bayesperiodic.likelihood.block import Block
 from bayesperiodic.likelihood.input_noise import (
     InputErrors,
     InputNoise,
@@ -23,7 +24,7 @@ from bayesperiodic.likelihood.input_noise import (
     true_inputs,
 )
 from bayesperiodic.likelihood.likelihood import Likelihood
-from bayesperiodic.likelihood.noise import LENGTHSCALE, SPECTRAL, VARIANCE, Block
+from bayesperiodic.likelihood.noise import LENGTHSCALE, VARIANCE
 from bayesperiodic.likelihood.observation import Response
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, input_sensitivities
@@ -87,7 +88,7 @@ def residual_variances(
         likelihood.blocks, changes, residuals, units, _caused_variances(likelihood, noise), strict=True
     ):
         variance = np.ones(block.size)
-        if block.kind == SPECTRAL:
+        if block.spectral:
             variance = _residual_variance(block, s, r, unit, information) if r.any() else np.zeros(block.size)
         known.append(np.maximum(variance, least))
     return known
@@ -279,7 +280,7 @@ def _without_negative(matrix: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 def _is_shaped(problem: Problem, group: tuple[str, ...], members: list[int]) -> bool:
     """Return whether a group of unknown noise parameters, for whole periods, has others than a variance."""
     shaped = any(name.partition("[")[0] in problem.noise.shape_priors for name in group)
-    spectral = all(problem.likelihood.blocks[b].kind == SPECTRAL for b in members)
+    spectral = all(problem.likelihood.blocks[b].spectral for b in members)
     return shaped and spectral and set(group) <= set(problem.free_noise)
 
 
@@ -451,7 +452,7 @@ def _solved(
         solved, _ = solve_driven(equations, parameters, near)
     if solved.code != CONVERGED:
         return None
-    count = 0 if experiment.multipliers is None else experiment.multipliers.size
+    count = experiment.measured_multipliers.size
     found = orbit_multipliers(equations, parameters, solved.z, count)
     outputs = equations.outputs(solved.z, parameters)[::finer]
     return Response(outputs, np.array(equations.frequency), np.log(np.abs(found)), np.array(delay))
@@ -488,10 +489,7 @@ def predicted_changes(
 ) -> np.ndarray:
     """Return the changes of the predicted components of all blocks (directions, components) along sensitivities."""
     values = problem.parameter_maps[experiment.name].values(theta[None])[0]
-    count, none = (
-        experiment.multipliers.size if experiment.multipliers is not None else 0,
-        np.zeros(len(moved.frequency)),
-    )
+    count, none = experiment.measured_multipliers.size, np.zeros(len(moved.frequency))
     outputs = equations.outputs(z, np.ascontiguousarray(values[:-1]))
     here = Response(outputs, np.array(equations.frequency), np.empty(count), np.array(values[-1]))
     along = Response(moved.outputs, moved.frequency, np.zeros((none.size, count)), none)

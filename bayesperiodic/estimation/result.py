@@ -19,7 +19,6 @@ from bayesperiodic.estimation.conflict import PriorConflict
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.modes import Mode, notable
 from bayesperiodic.likelihood.input_noise import InputErrors
-from bayesperiodic.likelihood.noise import POINTS, SPECTRAL
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.priors.joint import MultivariateNormal
 from bayesperiodic.problem.parameters import checked_key, in_experiment, local_hint, local_names
@@ -76,7 +75,7 @@ def noise_split(
     blocks = problem.likelihood.blocks
     factors = np.broadcast_to(log_variance_factor, len(blocks))
     for block, r, one in zip(blocks, residuals, factors, strict=True):
-        if block.kind in (SPECTRAL, POINTS):
+        if block.timed:
             square = block.weight * float(r @ r)
             sums[block.channel] += [block.count, block.count * one, square, block.count * block.measured]
     result = {}
@@ -92,7 +91,7 @@ def channel_whiteness(problem: Problem, estimate: Iterate) -> dict[str, Whitenes
     white = problem.likelihood.whitened(estimate.here.residuals, estimate.noise)
     tests: dict[str, list[Whiteness]] = {channel: [] for channel in problem.channels}
     for block, r in zip(problem.likelihood.blocks, white, strict=True):
-        if block.kind == SPECTRAL:
+        if block.spectral:
             complete = np.bincount(block.harmonic) == 2
             tests[block.channel].append(of_periodogram(np.bincount(block.harmonic, r**2)[complete]))
     return {

@@ -1,32 +1,17 @@
 """The log-likelihood of residuals under a noise model, and its derivatives."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from bayesperiodic import _checks, _fourier
+from bayesperiodic import _checks
+from bayesperiodic.likelihood.block import Block
 from bayesperiodic.likelihood.input_noise import Shared
-from bayesperiodic.likelihood.noise import (
-    CHANNEL,
-    CORRELATED,
-    EXPERIMENT,
-    JEFFREYS,
-    KNOWN,
-    POINTS,
-    PROPORTIONAL,
-    SCALE,
-    SPECTRAL,
-    VARIANCE,
-    Block,
-    Noise,
-)
-
-# Slopes of variances that are known.
-NO_PARAMETERS = np.ones((1, 0))
+from bayesperiodic.likelihood.noise import CHANNEL, EXPERIMENT, JEFFREYS, VARIANCE, Noise
+from bayesperiodic.likelihood.section_points import SCALE
 
 
 class Residuals(Sequence[np.ndarray]):
@@ -183,13 +168,9 @@ class Likelihood:
         """
         result = {}
         for block, columns in zip(self.blocks, self._columns, strict=True):
-            if block.kind in (SPECTRAL, POINTS):
-                own, count = values[..., columns], max(block.points, 1)
-                harmonic = np.minimum(np.arange(count), count - np.arange(count))
-                if block.kind == POINTS:
-                    averaged = block.averaged * count / block.size
-                    block = replace(block, harmonic=harmonic, size=count, averaged=averaged)
-                result[block.experiment, block.channel] = self.model.spectrum(block, own)[0].mean(axis=-1)
+            if (whole := block.whole_period()) is not None:
+                variances = self.model.spectrum(whole, values[..., columns])[0]
+                result[block.experiment, block.channel] = variances.mean(axis=-1)
         for one in self.shared:
             caused = one.caused(self.precisions(one.members, values))
             for b, own in zip(one.members, caused, strict=True):
@@ -219,10 +200,7 @@ class Likelihood:
 
     def _mean_variance(self, b: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean variance (…,) of a block's components, and the part proportional to its parameter."""
-        own = values[..., self._columns[b]]
-        if self.blocks[b].kind == CORRELATED:
-            return own[..., 0], own[..., 0]
-        return self.model.mean_variance(self.blocks[b], own)
+        return self.blocks[b].mean_variance(self.model, values[..., self._columns[b]])
 
     def _prior_slopes(self, values: np.ndarray) -> np.ndarray:
         """Return the derivatives of `log_prior` by the logarithms of the parameters, (…, names)."""
@@ -302,7 +280,7 @@ class Likelihood:
         rows = []
         for b, _, order, starts in self._parts:
             block = self.blocks[b]
-            spectral = block.kind == SPECTRAL and not self._is_even[b]
+            spectral = block.spectral and not self._is_even[b]
             harmonic = block.harmonic[order][starts] if spectral else np.full(len(starts), np.nan)
             rows += [(block.experiment, block.channel, h, block.weight) for h in harmonic]
         columns = zip(*rows, strict=True)
@@ -313,15 +291,7 @@ class Likelihood:
         """Of each block its index, labels of its observations, values in their order, and where each begins."""
         found = []
         for b, block in enumerate(self.blocks):
-            name, place, end = "value" if block.channel == SCALE else block.channel, np.arange(block.size), ""
-            if self._is_dense(block):
-                place = np.zeros(block.size, dtype=int)
-            elif block.kind == SPECTRAL and not self._is_even[b]:
-                name, place = f"{name}, harmonic", block.harmonic
-            elif block.kind in (SPECTRAL, POINTS):
-                points = block.size if block.kind == SPECTRAL else block.points
-                place = place if block.kind == SPECTRAL else np.rint(block.position * points).astype(int)
-                name, end = f"{name}, at", f"/{points} of the period"
+            name, place, end = block.places(self._is_even[b], b in self._dense_groups)
             order = np.argsort(place, kind="stable")
             numbers, starts = np.unique(place[order], return_index=True)
             labels = [f"{name} {i}{end}" for i in numbers]
@@ -338,8 +308,7 @@ class Likelihood:
                 continue
             group = self._group_of[b]
             variances = self._spectrum(group, values)[0]
-            if group.block.kind == SPECTRAL and self._is_even[b]:
-                r = _fourier.from_components(r, r.shape[-1])
+            r = self.blocks[b].independent(r, self._is_even[b])
             squares = shared[b] if b in shared else group.weight * r**2 / variances
             each = group.weight * np.log(variances) + squares
             found.append(-0.5 * np.add.reduceat(each[..., order], starts, axis=-1))
@@ -408,18 +377,17 @@ class Likelihood:
         """Return groups whose components have one variance, others, and the blocks whose components are correlated."""
         groups: dict[Any, list[int]] = {}
         for b, (block, columns) in enumerate(zip(self.blocks, self._columns, strict=True)):
-            alike = b if block.kind in (CORRELATED, KNOWN) else self.model.alike(block)
-            groups.setdefault((block.kind, alike, tuple(columns), block.size, block.weight), []).append(b)
+            key = type(block), block.alike(self.model), tuple(columns), block.size, block.weight
+            groups.setdefault(key, []).append(b)
         even: list[_Group] = []
         uneven: list[_Group] = []
         dense: list[int] = []
         for members in groups.values():
             block, columns = self.blocks[members[0]], self._columns[members[0]]
-            if self._is_dense(block):
+            if block.is_dense(self.model):
                 dense += members
                 continue
-            weight = 1.0 if block.kind == KNOWN else block.weight
-            group = _Group(members, block, slice(columns[0], columns[-1] + 1) if columns else slice(0), weight)
+            group = _Group(members, block, slice(columns[0], columns[-1] + 1) if columns else slice(0), block.weight)
             (even if self._checked_size(group) == 1 else uneven).append(group)
         return even, uneven, dense
 
@@ -430,17 +398,13 @@ class Likelihood:
         try:
             variances, slopes = map(np.shape, self._spectrum(group, np.ones(len(self.names))))
         except (IndexError, ValueError):
-            if block.kind != POINTS:
+            if not block.refusal(self.model):
                 raise
             variances, slopes = (), ()
         if len(variances) == 1 and variances[0] in sizes and slopes in [(size, count) for size in sizes]:
             return variances[0]
-        if block.kind == POINTS:
-            raise ValueError(
-                f"noise: must have a method `covariance` for the points of a mask, got {self.model.name!r}; experiment "
-                f"{block.experiment!r} has {block.size} points of {block.channel!r}, which have no harmonics, so that "
-                "`spectrum` gives no variances of them. Implement `covariance`, or compare whole periods."
-            )
+        if reason := block.refusal(self.model):
+            raise ValueError(reason)
         raise ValueError(
             f"noise: must have a spectrum of shapes (…, 1) or (…, {block.size}) and (…, 1, {count}) or (…, "
             f"{block.size}, {count}) for {block.channel!r} of {block.experiment!r}, got {variances} and {slopes} from "
@@ -449,10 +413,7 @@ class Likelihood:
 
     def _spectrum(self, group: _Group, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the variances (…, size) or (…, 1) of a group's components, and their slopes by its parameters."""
-        if group.block.kind == KNOWN:
-            return np.ones((*values.shape[:-1], 1)), NO_PARAMETERS
-        own = values[..., group.columns]
-        return (own, PROPORTIONAL) if group.block.kind == CORRELATED else self.model.spectrum(group.block, own)
+        return group.block.spectrum(self.model, values[..., group.columns])
 
     def _even_variances(self, values: np.ndarray) -> np.ndarray:
         """Return the variances (…, blocks) of the blocks of `_even_blocks`."""
@@ -495,10 +456,6 @@ class Likelihood:
         """Return weights over variances of the components of some blocks, (…, size), or (…, 1) if they are the same."""
         groups = [self._group_of[b] for b in members]
         return [group.weight / self._spectrum(group, values)[0] for group in groups]
-
-    def _is_dense(self, block: Block) -> bool:
-        """Return whether the components of a block are correlated: points under noise that is not white."""
-        return block.kind == POINTS and self.model.correlates_points
 
     def _dense_values(self, b: int, r: np.ndarray, values: np.ndarray, log_variance_factor: float) -> np.ndarray:
         """Return the log-likelihoods (…,) of a block whose components are correlated."""
@@ -599,7 +556,7 @@ class Likelihood:
         result = []
         for b, (block, columns) in enumerate(zip(self.blocks, self._columns, strict=True)):
             white = generator.standard_normal((len(values), block.size))
-            if self._is_dense(block):
+            if b in self._dense_groups:
                 factors = np.linalg.cholesky([self.model.covariance(block, row)[0] for row in values[:, columns]])
                 white = np.einsum("dij,dj->di", factors, white)
             else:

@@ -14,44 +14,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesperiodic import _checks
+from bayesperiodic.likelihood.block import PROPORTIONAL, Block
 from bayesperiodic.priors.joint import as_prior
 from bayesperiodic.priors.single import LogNormal, Prior
-
-SPECTRAL, POINTS, CORRELATED, KNOWN = "spectral", "points", "correlated", "known"
-SCALE = "scale"
-
-
-@dataclass(frozen=True)
-class Block:
-    """Description of one vector of residual components.
-
-    A `channel` is an output; "scale" for all section values of an experiment together, "multipliers" or "frequency".
-    The `kind` is "spectral" for real Fourier components, which are independent and have variance v under white noise of
-    variance v; "points" for values at the points of a mask; "correlated" for values whitened by their given covariance,
-    up to one unknown factor; "known" for values in units of their known standard deviations.
-    """
-
-    experiment: str
-    channel: str
-    kind: str
-    count: float  # independent values behind the components
-    size: int  # number of components
-    harmonic: np.ndarray  # (size,), of the response period, of each spectral component
-    position: np.ndarray  # (size,), of each point, in response periods
-    points: int  # grid points of the response period
-    averaged: float  # measured samples behind the components
-    measured: float  # variance of one value that the scatter of the cycles explains; NaN if unknown
-
-    @property
-    def weight(self) -> float:
-        """Independent values per component."""
-        return self.count / self.size
-
-    @property
-    def counted(self) -> bool:
-        """Whether the variance is unknown, so that eq. (7) counts the values."""
-        return self.kind != KNOWN
-
 
 __all__ = ["Circulant", "Independent", "Measured", "Noise"]
 
@@ -59,8 +24,6 @@ CHANNEL, EXPERIMENT = "channel", "experiment"
 JEFFREYS, FLAT = "jeffreys", "flat"
 VARIANCE = "variance"
 
-# Logarithmic slope of a variance that is proportional to the only noise parameter.
-PROPORTIONAL = np.ones((1, 1))
 # A residual correlated over a few per cent of a period is what smooth model errors leave.
 LENGTHSCALE = LogNormal(0.03, 1.5)
 FLOOR = LogNormal(0.01, 2.0)
@@ -105,6 +68,16 @@ class Noise(ABC):
         """The priors of the spectrum's parameters beyond the variance."""
         return {}
 
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of noise parameters of a channel, the variance first."""
+        return VARIANCE, *self.shape_priors
+
+    @property
+    def separate(self) -> bool:
+        """Whether each experiment has its own noise parameters."""
+        return self.per == EXPERIMENT
+
     def __post_init__(self) -> None:
         _checks.one_of("per", self.per, (CHANNEL, EXPERIMENT))
         if isinstance(self.prior, str):
@@ -142,7 +115,7 @@ class Noise(ABC):
         ValueError
             If a scatter that the model needs is unknown.
         """
-        for block in (b for b in blocks if b.kind in (SPECTRAL, POINTS)):
+        for block in (b for b in blocks if b.timed):
             if self.needs_scatter and not block.measured > 0.0:
                 raise ValueError(
                     f"noise: must be 'independent' without measured scatter, got {self.name!r}; experiment "
@@ -180,11 +153,7 @@ class Noise(ABC):
         tuple of str
             The variance first; none where the errors are known.
         """
-        if block.kind == KNOWN:
-            return ()
-        if block.kind == CORRELATED:
-            return (SCALE if self.per == CHANNEL else f"{SCALE}[{block.experiment}]",)
-        return tuple(f"{kind}[{self.label(block)}]" for kind in (VARIANCE, *self.shape_priors))
+        return block.parameter_names(self)
 
     @abstractmethod
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -448,7 +417,7 @@ class Circulant(Noise):
         """Refuse experiments on different grids that share a correlation, see `Noise.check`."""
         super().check(blocks)
         points: dict[str, int] = {}
-        for block in (b for b in blocks if b.kind in (SPECTRAL, POINTS)):
+        for block in (b for b in blocks if b.timed):
             if points.setdefault(self.label(block), block.points) != block.points:
                 raise ValueError(
                     f"noise: must have per='experiment' for grids that differ, got {self.name!r}; experiments with "

@@ -6,7 +6,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from bayesperiodic.likelihood.likelihood import Likelihood
-from bayesperiodic.likelihood.noise import CORRELATED, FLAT, JEFFREYS, SCALE, VARIANCE, Independent
+from bayesperiodic.likelihood.noise import FLAT, JEFFREYS, VARIANCE, Independent
+from bayesperiodic.likelihood.section_points import SCALE
 
 LOWEST, HIGHEST = 25.0, 8.0
 TINY = np.finfo(float).tiny
@@ -37,7 +38,7 @@ def estimate_noise(
         factor = float(np.broadcast_to(log_variance_factor, len(residuals))[members[0]])
         chosen = [residuals[b] for b in members]
         count = sum(block.count for block in blocks)
-        plain = isinstance(likelihood.model, Independent) or all(block.kind == CORRELATED for block in blocks)
+        plain = isinstance(likelihood.model, Independent) or not any(block.timed for block in blocks)
         corrected = count * factor - {JEFFREYS: 0.0, FLAT: 2.0}.get(str(likelihood.model.prior), np.inf)
         columns = [likelihood.names.index(name) for name in group]
         if plain and corrected > 0.0:

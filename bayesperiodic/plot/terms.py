@@ -111,7 +111,7 @@ def _residuals(panels: list[Axes], problem: Problem, found: MissingTerms, shown:
     having = [e for e in problem.experiments if channel in e.outputs]
     e = max(having, key=lambda own: float(np.sum(fit.residuals[own.name][channel] ** 2)))
     (across, x), *others = _variables(problem, fit, found, e).items()
-    mask = slice(None) if e.mask is None else e.mask
+    mask = e.measured_points
     reach = 1.08 * max(float(np.abs(own.residuals[e.name][channel][mask]).max()) for own in shown.values())
     points: Any = None
     for number, (axes, (title, own)) in enumerate(zip(panels, shown.items(), strict=True)):
