@@ -51,6 +51,7 @@ class Block(ABC):
 
     counted: ClassVar[bool] = False  # whether the variance is unknown, so that eq. (7) counts the values
     timed: ClassVar[bool] = False  # whether the components are values of one channel along the period
+    spectral: ClassVar[bool] = False  # whether they are Fourier components of one channel
     multipliers: ClassVar[int] = 0  # Floquet multipliers that are compared
 
     @classmethod
@@ -84,11 +85,6 @@ class Block(ABC):
     def weight(self) -> float:
         """Independent values per component."""
         return self.count / self.size if self.counted else 1.0
-
-    @property
-    def spectral(self) -> bool:
-        """Whether the components are Fourier components of one channel."""
-        return self.harmonic.size > 0
 
     @property
     def description(self) -> str:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -20,6 +20,8 @@ ROOT_TWO = math.sqrt(2.0)
 @dataclass(frozen=True, eq=False)
 class MeanPeriod(Timed):
     """Real Fourier components of one channel, which are independent and have variance v under white noise."""
+
+    spectral: ClassVar[bool] = True
 
     @classmethod
     def of(cls, experiment: Experiment, model: Model) -> "list[MeanPeriod]":
