@@ -1,7 +1,7 @@
 """Experiments: one measured period on an equidistant grid, with its uncertainty."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -163,7 +163,7 @@ class Experiment(Result):
             _checks.one_of("error_slopes", name, self.inputs)
             for channel in slopes:
                 _checks.one_of(f"error_slopes[{name!r}]", channel, self.outputs)
-        measured = points if self.mask is None else int(self.mask.sum())
+        measured = int(self.measured_points.sum())
         _checks.integer("cycles", self.cycles, 1)
         if self.averaged is not None:
             object.__setattr__(self, "averaged", _checks.integer("averaged", self.averaged, 1))
@@ -178,10 +178,10 @@ class Experiment(Result):
 
     def _measured(self, kind: str, values: ArrayLike) -> ArrayLike:
         """Return the values of a channel, with zeros at points of an output that the mask excludes."""
-        array = np.asarray(values)
-        if self.mask is None or kind == "inputs" or array.shape != self.mask.shape or array.dtype.kind not in "fiu":
+        array, mask = np.asarray(values), self.measured_points
+        if mask.all() or kind == "inputs" or array.shape != mask.shape or array.dtype.kind not in "fiu":
             return values
-        return np.where(self.mask, array, 0.0)
+        return np.where(mask, array, 0.0)
 
     def _check_multipliers(self) -> None:
         if self.multipliers is None:
@@ -201,7 +201,7 @@ class Experiment(Result):
             object.__setattr__(self, "multiplier_sd", sd)
 
     def _check_covariance(self, values: int) -> None:
-        logarithms = 0 if self.multipliers is None else self.multipliers.size
+        logarithms = self.measured_multipliers.size
         if self.covariance is None:
             if logarithms and self.multiplier_sd is None:
                 raise ValueError("multipliers: must have standard deviations; give multiplier_sd.")
@@ -294,6 +294,43 @@ class Experiment(Result):
     def time(self) -> np.ndarray:
         """Time within the response period [s], (samples·periods,)."""
         return self.tau / self.frequency
+
+    @property
+    def measured_points(self) -> np.ndarray:
+        """The points at which the outputs were measured, bool (samples·periods,)."""
+        return np.ones(self.samples * self.periods, dtype=bool) if self.mask is None else self.mask
+
+    @property
+    def measured_multipliers(self) -> np.ndarray:
+        """The Floquet multipliers that were measured, (multipliers,); none by default."""
+        return np.empty(0) if self.multipliers is None else self.multipliers
+
+    def without_multipliers(self) -> "Experiment":
+        """Return the experiment without its multipliers.
+
+        Returns
+        -------
+        Experiment
+        """
+        count, covariance = self.measured_multipliers.size, self.covariance
+        if count and covariance is not None and self.multiplier_sd is None:
+            covariance = covariance[:-count, :-count]
+        return replace(self, multipliers=None, multiplier_sd=None, covariance=covariance) if count else self
+
+    def compared(self, channel: str, values: np.ndarray) -> np.ndarray:
+        """Return what is compared of signals: the harmonics kept, or the values at the points of the mask.
+
+        Parameters
+        ----------
+        channel : str
+        values : array (…, samples·periods)
+
+        Returns
+        -------
+        array (…, samples·periods)
+            Zero at points that were not measured.
+        """
+        return self.project(channel, values) if self.mask is None else np.where(self.mask, values, 0.0)
 
     def project(self, channel: str, values: np.ndarray) -> np.ndarray:
         """Project signals onto the harmonics that the measured channel keeps.

@@ -118,7 +118,7 @@ def measured_orbits(
 class _SimultaneousFit:
     def __init__(self, problem: Description):
         self.problem, self.maps = problem, problem.parameter_maps
-        experiments = [_without_multipliers(e) for e in problem.experiments]
+        experiments = [e.without_multipliers() for e in problem.experiments]
         self.observations = {e.name: Observation(e, problem.model, self.maps[e.name].delayed) for e in experiments}
         blocks = [block for observation in self.observations.values() for block in observation.blocks]
         self.likelihood = Likelihood(problem.noise, blocks, problem.likelihood.fixed)
@@ -348,13 +348,3 @@ def _size(change: np.ndarray, z: np.ndarray) -> float:
     """Return the largest change (points, states) in units of the range of each state of an orbit."""
     spread = np.ptp(z, axis=0)
     return float(np.max(np.abs(change) / np.where(spread > 0.0, spread, 1.0)))
-
-
-def _without_multipliers(experiment: Experiment) -> Experiment:
-    if experiment.multipliers is None:
-        return experiment
-    covariance = experiment.covariance
-    if covariance is not None and experiment.multiplier_sd is None:
-        size = len(covariance) - experiment.multipliers.size
-        covariance = covariance[:size, :size]
-    return replace(experiment, multipliers=None, multiplier_sd=None, covariance=covariance)

@@ -11,7 +11,7 @@ from bayesperiodic.density.initial_orbits import simultaneous_fit
 from bayesperiodic.density.orbit_check import other_orbit
 from bayesperiodic.density.responses import Guesses, Simulator
 from bayesperiodic.likelihood.likelihood import Residuals
-from bayesperiodic.likelihood.noise import FLAT, JEFFREYS, KNOWN, SPECTRAL, Circulant, Independent
+from bayesperiodic.likelihood.noise import FLAT, JEFFREYS, Circulant, Independent
 from bayesperiodic.likelihood.observation import Comparisons, Response, Simulation
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
 from bayesperiodic.periodic.solution import PeriodicSolution
@@ -324,7 +324,7 @@ class LogPosterior(SamplingCoordinates):
         if not np.isfinite(value):
             return -np.inf, *zeros, CONVERGED
         by_residual, by_noise = self.problem.likelihood.gradients(here.residuals, noise)
-        if forward or any(e.multipliers is not None for e in self.problem.experiments):
+        if forward or any(o.multipliers for o in self.problem.observations.values()):
             here = here.anchored()
         by_theta = np.add.reduce(list(here.vjp(by_residual, adjoint=not forward).values()))
         by_theta, _ = self.add_prior(theta, by_theta)
@@ -392,7 +392,7 @@ def collapsible(problem: Description) -> tuple[str, ...]:
     if problem.likelihood.shared:
         return ()
     noise, counts = problem.noise, problem.likelihood.counts
-    shaped = isinstance(noise, Circulant) and all(b.kind in (SPECTRAL, KNOWN) for b in problem.likelihood.blocks)
+    shaped = isinstance(noise, Circulant) and all(b.spectral or not b.counted for b in problem.likelihood.blocks)
     closed = (isinstance(noise, Independent) or shaped) and noise.prior in (JEFFREYS, FLAT)
     known = all(name in counts for name in problem.free_noise)
     return tuple(name for name in problem.free_noise if closed and name in counts and (known or not shaped))

@@ -32,8 +32,8 @@ def other_orbit(observation: Observation, response: Response) -> str:
     reason = next(_differences(observation, response), "")
     if not reason:
         return ""
-    mask, left = observation.experiment.mask, observation.compared(response).values()
-    measured = (observation.data if mask is None else observation.data[mask]).T
+    left = observation.compared(response).values()
+    measured = observation.data[observation.experiment.measured_points].T
     share = max(np.sum(e**2) / np.sum((y - y.mean()) ** 2) for y, e in zip(measured, left, strict=True))
     return f"{reason}; {share:.1%} of the variance of the recording is unexplained"
 
@@ -41,7 +41,7 @@ def other_orbit(observation: Observation, response: Response) -> str:
 def _differences(observation: Observation, response: Response) -> Iterator[str]:
     e, outputs = observation.experiment, np.stack(list(observation.predicted(response).values()), axis=-1)
     (model, model_turns), (data, turns) = (_unwound(x, observation.angles) for x in (outputs, observation.data))
-    if e.mask is None:
+    if observation.whole:
         for channel, predicted, measured in zip(observation.channels, model_turns, turns, strict=True):
             if predicted != measured:
                 yield f"the model's {channel} makes {predicted} turns in a period, the recorded one {measured}"
@@ -68,7 +68,7 @@ def _unwound(signals: np.ndarray, angles: list[bool]) -> tuple[np.ndarray, np.nd
 def _followed(observation: Observation, model: np.ndarray, measured: np.ndarray, period: int) -> float:
     """Return the variance of the model's subharmonics of a shorter period over that of the measured ones, if any."""
     e, power = observation.experiment, np.zeros(2)
-    if e.mask is not None:
+    if not observation.whole:
         off = np.abs(model - np.roll(model, period * e.samples, axis=0))
         return 0.0 if np.all(off <= SAME * np.ptp(model, axis=0)) else np.inf
     for c, channel in enumerate(observation.channels):
@@ -101,6 +101,6 @@ def _significant(observation: Observation, channel: str, lines: np.ndarray, powe
 def _log_likelihood(observation: Observation, response: Response, ahead: int) -> float:
     """Return the log-likelihood of the data, maximised over the variances, some forcing periods ahead."""
     e, left = observation.experiment, observation.compared(response, ahead)
-    counts = {c: e.independent[c] if e.mask is None else np.count_nonzero(e.mask) for c in left}
+    counts = {c: e.independent[c] if observation.whole else np.count_nonzero(e.measured_points) for c in left}
     squares = {c: max(float(np.sum(x**2)), np.finfo(float).tiny) for c, x in left.items()}
     return float(sum(-0.5 * counts[c] * np.log(squares[c]) for c in left))

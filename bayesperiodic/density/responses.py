@@ -109,7 +109,7 @@ class Simulator:
                 group,
                 ParameterMaps([self.problem.parameter_maps[e.name] for e in group]),
                 kind([self.problem.equations[e.name] for e in group], [self._anchors[e.name] for e in group]),
-                any(e.multipliers is not None for e in group),
+                any(self.problem.observations[e.name].multipliers for e in group),
             )
             for group in self.groups
         ]
@@ -160,8 +160,8 @@ class Simulator:
         self, experiment: Experiment, z: np.ndarray, frequency: np.ndarray, parameters: np.ndarray, status: np.ndarray
     ) -> np.ndarray:
         """Return log|μ| (solves, multipliers) of those that were measured; "other orbit" where a sign differs."""
-        measured = experiment.multipliers
-        if measured is None:
+        measured = experiment.measured_multipliers
+        if not measured.size:
             return np.empty((len(z), 0))
         result = np.full((len(z), measured.size), np.nan)
         for i in np.flatnonzero(status == CONVERGED):
@@ -245,11 +245,11 @@ class Simulator:
             by_parameter[:, maps.moving] = batch.vjp(values[:, :-1], solved.z[:, 0], by_outputs[g], maps.moving)
             by_parameter[:, -1] = by_delay[g]
             result |= zip((e.name for e in experiments), maps.vjp(values, by_parameter), strict=True)
-        for e in self.problem.experiments:
-            if e.multipliers is not None:
-                response = simulation.at(0).response(e.name)
-                jacobian = self._multiplier_jacobian(theta, e.name, simulation.z(e.name)[0], response)
-                result[e.name] = result[e.name] + jacobian @ by_multipliers[e.name]
+        for name, by_logarithm in by_multipliers.items():
+            if by_logarithm.size:
+                response = simulation.at(0).response(name)
+                jacobian = self._multiplier_jacobian(theta, name, simulation.z(name)[0], response)
+                result[name] = result[name] + jacobian @ by_logarithm
         return result
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from scipy import stats
-from scipy.fft import dct
 
 from bayesperiodic._linalg import column_space
 from bayesperiodic._verdicts import BAD, GOOD, NEUTRAL, with_tone
@@ -17,7 +16,7 @@ from bayesperiodic.density.log_posterior import Linearisation
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.check import of_periodogram
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.likelihood.noise import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
+from bayesperiodic.likelihood.block import Block
 
 ABSORBED = 1e-3
 NOT_TESTED = float("nan")
@@ -159,11 +158,11 @@ def adequacy(
     The linearisation is that at a draw near the best fit. Noise parameters are draws (draws, noise_names), replicates
     of the data (draws, points) by experiment and channel, NaN outside the mask and for failed solves.
     """
-    shapes = np.median(noise, axis=0)[None] if problem.noise.flat else noise[:: max(1, len(noise) // SHAPES)]
+    shapes = np.median(noise, axis=0)[None] if problem.likelihood.white else noise[:: max(1, len(noise) // SHAPES)]
     rows: dict[str, dict[str, Any]] = {}
     white = [Whitened(problem, here, shape) for shape in shapes]
     for i, block in enumerate(problem.likelihood.blocks):
-        if block.kind == KNOWN:
+        if not block.counted:
             continue
         # The spectrum of correlated noise is known from draws only: the p of the realised residual is their mean.
         whiteness, harmonics, harmonic = np.array([w.spectral_tests(i) for w in white]).T
@@ -260,7 +259,7 @@ class Whitened:
         likelihood = problem.likelihood
         self.blocks = likelihood.blocks
         names = [problem.noise.parameter_names(block) for block in self.blocks]
-        self.groups = [variances[0] if variances else KNOWN for variances in names]
+        self.groups = [variances[0] if variances else "known" for variances in names]
         each = zip(self.groups, names, strict=True)
         self.known = frozenset(group for group, variances in each if set(variances) <= set(likelihood.fixed))
         white = zip(*(likelihood.whitened(part, noise) for part in (here.residuals, here.jacobian)), strict=True)
@@ -280,7 +279,7 @@ class Whitened:
         of the spectrum of repeated quantisation errors is not known, and whiteness is not tested where they prevail.
         """
         r, j, harmonic = self.parts[index]
-        if self.blocks[index].kind == CORRELATED or not _testable(r, j):
+        if not self.blocks[index].timed or not _testable(r, j):
             return NOT_TESTED, NOT_TESTED, NOT_TESTED
         unexplained = self.in_measured_units(index) or Unexplained(r, j, harmonic)
         spectrum = self.spectrum(index)
@@ -340,12 +339,10 @@ def _testable(r: np.ndarray, j: np.ndarray) -> bool:
 
 def used(block: Block, *parts: np.ndarray) -> list[np.ndarray]:
     """Return the components (…, used) for the tests, points as cosine components along the period, and harmonics."""
-    harmonic = block.harmonic if block.kind == SPECTRAL else (np.arange(block.size) + 1) // 2
-    number = min(block.size, int(np.rint(block.count))) if block.kind in (SPECTRAL, POINTS) else block.size
+    harmonic = block.wave_numbers
+    number = min(block.size, int(np.rint(block.count))) if block.timed else block.size
     order = np.sort(np.argsort(harmonic, kind="stable")[:number])
-    if block.kind == POINTS:
-        parts = tuple(dct(part, norm="ortho", axis=-1) for part in parts)
-    return [part[..., order] for part in (*parts, harmonic)]
+    return [part[..., order] for part in (*map(block.along_period, parts), harmonic)]
 
 
 def _size(problem: Problem, here: Linearisation, index: int, white: Whitened) -> tuple[float, float]:
@@ -387,7 +384,7 @@ def measured_spectrum(experiment: Experiment, block: Block) -> tuple[np.ndarray,
     """
     variance = experiment.amplitude_variance.get(block.channel)
     freedom = experiment.amplitude_freedom.get(block.channel)
-    if block.kind != SPECTRAL or variance is None or freedom is None or block.size != 2 * variance.size - 1:
+    if not block.spectral or variance is None or freedom is None or block.size != 2 * variance.size - 1:
         return None
     if not np.all(variance > 0.0):
         return None
@@ -412,7 +409,7 @@ def _amplitude(problem: Problem, block: Block, replicates: Mapping[tuple[str, st
     if (block.experiment, block.channel) not in replicates:
         return NOT_TESTED
     e = next(e for e in problem.experiments if e.name == block.experiment)
-    mask = slice(None) if e.mask is None else e.mask
+    mask = e.measured_points
     values = replicates[block.experiment, block.channel][:, mask]
     rms = values[np.isfinite(values).all(axis=1)].std(axis=1)
     sd = rms.std(ddof=1) if rms.size > 1 else 0.0

@@ -340,8 +340,7 @@ def check_supported(problem: Problem) -> None:
     for e in problem.experiments:
         turns = [e.winding] if isinstance(e.winding, int) else [*e.winding.values()]
         excluded = {
-            "a mask": e.mask is not None,
-            "multipliers": e.multipliers is not None,
+            **{block.description: not block.spectral for block in problem.observations[e.name].blocks},
             f"periods = {e.periods}": e.periods > 1,
             "a winding number": any(turns),
             "a delay (shift)": problem.parameter_maps[e.name].delayed,

@@ -194,7 +194,7 @@ def _data(problem: Problem) -> dict[str, str]:
     """Return digests of what the likelihood is a density of, by name; inputs are not data."""
     digests = {f"{f} of experiment {e.name!r}": digest(getattr(e, f)) for e in problem.experiments for f in FIELDS}
     for block in problem.likelihood.blocks:
-        values = block.kind, block.count, block.size, block.channel in problem.model.angles
+        values = type(block).__name__, block.count, block.size, block.channel in problem.model.angles
         digests[f"values of {block.channel!r} of experiment {block.experiment!r}"] = digest(values)
     return digests
 
@@ -517,7 +517,7 @@ def _predicted(
         outputs, converged = planned.anchored(np.median(theta, axis=0), guesses).outputs(theta)
     result = {}
     for channel, values in outputs[run].items():
-        kept = e.project(channel, values)[:, slice(None) if e.mask is None else e.mask]
+        kept = e.project(channel, values)[:, e.measured_points]
         kept = kept[converged] if converged.mean() > 0.5 else np.full_like(kept, np.nan)
         result[channel] = kept.mean(axis=0), kept.var(axis=0), float(variances.get((run, channel), np.nan))
     return result

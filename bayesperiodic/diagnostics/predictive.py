@@ -370,7 +370,7 @@ def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:
         notes.append(f"The draws have not converged ({posterior.reason}), so bands and p-values are provisional.")
     if problem.input_errors:
         notes.append("What the noise of the inputs can cause is part of the covariance of the residual, and no misfit.")
-    if not problem.noise.flat and table["size"].drop(ALL).isna().any():
+    if not problem.likelihood.white and table["size"].drop(ALL).isna().any():
         notes.append(
             f"{problem.noise.name.capitalize()} noise takes a correlated misfit as noise; only the scatter of the "
             "measured cycles would reveal it, and it is not known for all channels."
@@ -492,4 +492,4 @@ def _inside(e: Experiment, prediction: Bands) -> float:
         (values >= prediction.low[e.name][channel]) & (values <= prediction.high[e.name][channel])
         for channel, values in e.outputs.items()
     ]
-    return float(np.mean(within if e.mask is None else np.array(within)[:, e.mask]))
+    return float(np.mean(np.array(within)[:, e.measured_points]))

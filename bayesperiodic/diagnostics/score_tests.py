@@ -16,7 +16,6 @@ from bayesperiodic.diagnostics.candidates import MEMORY, Term, factors, places, 
 from bayesperiodic.estimation.covariance import predicted_changes, residual_variances
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.likelihood.noise import KNOWN
 from bayesperiodic.periodic.equations import PeriodicEquations, respond
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 
@@ -68,7 +67,7 @@ class ScoreTests:
     def _p(self, problem: Problem, optimum: Iterate, white: Whitened, parameters: int) -> np.ndarray:
         """Return the p-values (terms,)."""
         blocks, known = white.blocks, [white.spectrum(i) for i in range(len(white.blocks))]
-        if all(spectrum is not None or block.kind == KNOWN for spectrum, block in zip(known, blocks, strict=True)):
+        if all(spectrum is not None or not block.counted for spectrum, block in zip(known, blocks, strict=True)):
             parts = [white.in_units_of_noise(i) for i in range(len(blocks))]
             tests, weights = _projected(parts, parameters), [np.full(part[0].size, np.inf) for part in parts]
             for i, spectrum in enumerate(known):

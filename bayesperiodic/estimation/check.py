@@ -29,9 +29,8 @@ from bayesperiodic.estimation.laplace import IN_COMBINATION, SILENT, undetermine
 from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit, Whiteness, sds, written
 from bayesperiodic.estimation.units import unit_error
 from bayesperiodic.likelihood.input_noise import EXACT, FEWEST_CYCLES, ROUGH
-from bayesperiodic.likelihood.noise import POINTS, SPECTRAL
 from bayesperiodic.periodic.solution import PeriodicSolution
-from bayesperiodic.problem.description import check_results
+from bayesperiodic.problem.fingerprint import check_results
 
 # Part of a residual that noise of inputs taken as exact may cause, and changes [sds] by the grid and by what is not
 # linear in the errors of the inputs, above which there is a warning.
@@ -167,7 +166,7 @@ def noise_split(
     blocks = problem.likelihood.blocks
     factors = np.broadcast_to(log_variance_factor, len(blocks))
     for block, r, one in zip(blocks, residuals, factors, strict=True):
-        if block.kind in (SPECTRAL, POINTS):
+        if block.timed:
             square = block.weight * float(r @ r)
             sums[block.channel] += [block.count, block.count * one, square, block.count * block.measured]
     result = {}
@@ -183,7 +182,7 @@ def channel_whiteness(problem: Problem, estimate: Iterate) -> dict[str, Whitenes
     white = problem.likelihood.whitened(estimate.here.residuals, estimate.noise)
     tests: dict[str, list[Whiteness]] = {channel: [] for channel in problem.channels}
     for block, r in zip(problem.likelihood.blocks, white, strict=True):
-        if block.kind == SPECTRAL:
+        if block.spectral:
             complete = np.bincount(block.harmonic) == 2
             tests[block.channel].append(of_periodogram(np.bincount(block.harmonic, r**2)[complete]))
     return {

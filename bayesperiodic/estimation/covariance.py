@@ -13,6 +13,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import orbit_multipliers
 from bayesperiodic.estimation.gauss_newton import Iterate, changes_by_variance, information, inverse_hessian
+from bayesperiodic.likelihood.block import Block
 from bayesperiodic.likelihood.input_noise import (
     InputErrors,
     InputNoise,
@@ -23,7 +24,7 @@ from bayesperiodic.likelihood.input_noise import (
     true_inputs,
 )
 from bayesperiodic.likelihood.likelihood import Likelihood
-from bayesperiodic.likelihood.noise import LENGTHSCALE, SPECTRAL, VARIANCE, Block
+from bayesperiodic.likelihood.noise import LENGTHSCALE, VARIANCE
 from bayesperiodic.likelihood.observation import Response
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, input_sensitivities
@@ -87,7 +88,7 @@ def residual_variances(
         likelihood.blocks, changes, residuals, units, _caused_variances(likelihood, noise), strict=True
     ):
         variance = np.ones(block.size)
-        if block.kind == SPECTRAL:
+        if block.spectral:
             variance = _residual_variance(block, s, r, unit, information) if r.any() else np.zeros(block.size)
         known.append(np.maximum(variance, least))
     return known
@@ -297,7 +298,7 @@ def _without_negative(matrix: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 def _is_shaped(problem: Problem, group: tuple[str, ...], members: list[int]) -> bool:
     """Return whether a group of unknown noise parameters, for whole periods, has others than a variance."""
     shaped = any(name.partition("[")[0] in problem.noise.shape_priors for name in group)
-    spectral = all(problem.likelihood.blocks[b].kind == SPECTRAL for b in members)
+    spectral = all(problem.likelihood.blocks[b].spectral for b in members)
     return shaped and spectral and set(group) <= set(problem.free_noise)
 
 
@@ -368,7 +369,8 @@ def _mixture(
 
 def _spectra(problem: Problem, blocks: list[Block], values: np.ndarray) -> np.ndarray:
     """Return the variances of the components of all blocks, (…, components)."""
-    return np.concatenate([problem.noise.spectrum(block, values)[0] for block in blocks], axis=-1)
+    every = (np.broadcast_to(problem.noise.spectrum(b, values)[0], (*values.shape[:-1], b.size)) for b in blocks)
+    return np.concatenate(list(every), axis=-1)
 
 
 def _points(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
@@ -468,7 +470,7 @@ def _solved(
         solved, _ = solve_driven(equations, parameters, near)
     if solved.code != CONVERGED:
         return None
-    count = 0 if experiment.multipliers is None else experiment.multipliers.size
+    count = experiment.measured_multipliers.size
     multipliers = orbit_multipliers(equations, parameters, solved.z, count)
     outputs = equations.outputs(solved.z, parameters)[::finer]
     return Response(outputs, np.array(equations.frequency), np.log(np.abs(multipliers)), np.array(delay))
@@ -505,10 +507,7 @@ def predicted_changes(
 ) -> np.ndarray:
     """Return the changes of the predicted components of all blocks (directions, components) along sensitivities."""
     values = problem.parameter_maps[experiment.name].values(theta[None])[0]
-    count, none = (
-        experiment.multipliers.size if experiment.multipliers is not None else 0,
-        np.zeros(len(moved.frequency)),
-    )
+    count, none = experiment.measured_multipliers.size, np.zeros(len(moved.frequency))
     outputs = equations.outputs(z, np.ascontiguousarray(values[:-1]))
     here = Response(outputs, np.array(equations.frequency), np.empty(count), np.array(values[-1]))
     along = Response(moved.outputs, moved.frequency, np.zeros((none.size, count)), none)

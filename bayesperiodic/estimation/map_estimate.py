@@ -233,7 +233,7 @@ def _first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:
         iterate = _objective(problem, near).iterate(near, problem.likelihood.guess())
         if iterate is not None:
             return iterate
-    if initial is not None and all(e.mask is not None for e in problem.experiments):
+    if initial is not None and not any(o.whole for o in problem.observations.values()):
         return None
     near = _linearised(problem, theta, None)
     return _objective(problem, near).iterate(near, problem.likelihood.guess())
@@ -412,11 +412,7 @@ def _fractions_left(problem: Problem, residuals: Mapping[str, Mapping[str, np.nd
 
 def _pooled(problem: Problem, channel: str, signals: Mapping[str, Mapping[str, np.ndarray]]) -> float:
     """Return the root mean square of a channel over the measured points of all experiments."""
-    values = [
-        signals[e.name][channel][slice(None) if e.mask is None else e.mask]
-        for e in problem.experiments
-        if channel in e.outputs
-    ]
+    values = [signals[e.name][channel][e.measured_points] for e in problem.experiments if channel in e.outputs]
     return float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
 
 

@@ -1,28 +1,17 @@
 """The log-likelihood of residuals under a noise model, and its derivatives."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from bayesperiodic import _checks, _fourier
+from bayesperiodic import _checks
+from bayesperiodic.likelihood.block import Block
 from bayesperiodic.likelihood.input_noise import Shared
-from bayesperiodic.likelihood.noise import (
-    CHANNEL,
-    CORRELATED,
-    EXPERIMENT,
-    JEFFREYS,
-    KNOWN,
-    POINTS,
-    SCALE,
-    SPECTRAL,
-    VARIANCE,
-    Block,
-    Noise,
-)
+from bayesperiodic.likelihood.noise import CHANNEL, EXPERIMENT, JEFFREYS, VARIANCE, Noise
+from bayesperiodic.likelihood.section_points import SCALE
 
 
 class Residuals(Sequence[np.ndarray]):
@@ -82,6 +71,15 @@ class Residuals(Sequence[np.ndarray]):
         return result
 
 
+class _Group(NamedTuple):
+    """Blocks whose components have the same variances."""
+
+    members: list[int]
+    block: Block  # the first of them
+    columns: slice  # noise parameters among all
+    weight: float  # independent values per component, one for values in units of their standard deviation
+
+
 class Likelihood:
     """Log-likelihood of the residuals of a problem's blocks under a noise model, and its derivatives.
 
@@ -107,11 +105,17 @@ class Likelihood:
         self.free = tuple(name for name in self.names if name not in fixed)
         self._columns = [[self.names.index(name) for name in model.parameter_names(block)] for block in blocks]
         self._free = [self.names.index(name) for name in self.free]
+        self._even, self._uneven, self._dense_groups = self._sorted_groups()
         self.shared = []
         for experiment, matrix in self.loadings.items():
             members = [b for b, block in enumerate(self.blocks) if block.experiment == experiment]
             if matrix.any():
                 self.shared.append(Shared(members, [self.blocks[b].size for b in members], matrix))
+
+    @property
+    def white(self) -> bool:
+        """Whether the components of every block are independent and have the same variance."""
+        return not self._uneven and not self._dense_groups
 
     def groups(self) -> list[tuple[tuple[str, ...], list[int]]]:
         """Return the noise parameters that belong together, by name, and the indices of their blocks."""
@@ -146,28 +150,16 @@ class Likelihood:
 
         S is the spectrum for a variance of 1; all its other parameters have to be known.
         """
-        if self.model.flat:
-            squares, gains = Residuals.of(residuals).squares, self._gains
-        else:
-            squares, gains = Residuals.of(self._unit(residuals)).squares, np.ones(len(self.blocks))
-        return self._summed(block.weight / gains[b] * squares[..., b] for b, block in enumerate(self.blocks))
-
-    @cached_property
-    def _gains(self) -> np.ndarray:
-        """Variances (blocks,) of components for variances of 1."""
-        return np.array([self.model.gain(block) for block in self.blocks])
-
-    def _unit(self, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return the residuals over the square roots of the spectra for variances of 1."""
-        values = np.array([self.fixed.get(name, 1.0) for name in self.names])
-        result = list(residuals)
-        for members in self._alike:
-            block, columns = self.blocks[members[0]], self._columns[members[0]]
-            if block.kind == SPECTRAL:
-                scale = np.sqrt(self._variances(block, np.array([1.0, *values[columns[1:]]]))[0])
-                for b in members:
-                    result[b] = residuals[b] / scale
-        return result
+        units = np.array([self.fixed.get(name, 1.0) for name in self.names])
+        units[[columns[0] for columns in self._columns if columns]] = 1.0
+        squares = np.array(Residuals.of(residuals).squares)
+        if self._even:
+            squares[..., self._even_blocks] /= self._even_variances(units)
+        for group in self._uneven:
+            variances = self._spectrum(group, units)[0]
+            for b in group.members:
+                squares[..., b] = np.add.reduce(residuals[b] ** 2 / variances, axis=-1)
+        return self._summed(block.weight * squares[..., b] for b, block in enumerate(self.blocks))
 
     def value_variances(self, values: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
         """Return the variance (…,) of one value of each channel, by (experiment, channel), where it has its own.
@@ -176,13 +168,9 @@ class Likelihood:
         """
         result = {}
         for block, columns in zip(self.blocks, self._columns, strict=True):
-            if block.kind in (SPECTRAL, POINTS):
-                own, count = values[..., columns], max(block.points, 1)
-                harmonic = np.minimum(np.arange(count), count - np.arange(count))
-                if block.kind == POINTS:
-                    averaged = block.averaged * count / block.size
-                    block = replace(block, harmonic=harmonic, size=count, averaged=averaged)
-                result[block.experiment, block.channel] = self.model.spectrum(block, own)[0].mean(axis=-1)
+            if (whole := block.whole_period()) is not None:
+                variances = self.model.spectrum(whole, values[..., columns])[0]
+                result[block.experiment, block.channel] = variances.mean(axis=-1)
         for one in self.shared:
             caused = one.caused(self.precisions(one.members, values))
             for b, own in zip(one.members, caused, strict=True):
@@ -202,22 +190,33 @@ class Likelihood:
         total = np.zeros(values.shape[:-1])
         for kind, columns, measured in self._kinds:
             total = total + self.model.log_prior(kind, values[..., columns], measured)[0].sum(axis=-1)
-        for column, block, spectrum in self._spectra_of_errors:
-            total = total + self.model.jeffreys_factor(block, values[..., column], spectrum)
+        for _, b, added in self._spectra_of_errors:
+            mean = self._mean_variance(b, values)[0][..., None]
+            # With variances V + λ Jeffreys' prior is √(Σ 1/(V + λ)²), the root of the information, in place of 1/V;
+            # the density has no integral otherwise where errors of the inputs can explain all components.
+            share = mean / (mean + added)
+            total = total + 0.5 * np.log(np.add.reduce(share * share, axis=-1) / added.size)
         return total
+
+    def _mean_variance(self, b: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean variance (…,) of a block's components, and the part proportional to its parameter."""
+        return self.blocks[b].mean_variance(self.model, values[..., self._columns[b]])
 
     def _prior_slopes(self, values: np.ndarray) -> np.ndarray:
         """Return the derivatives of `log_prior` by the logarithms of the parameters, (…, names)."""
         slopes = np.zeros(values.shape)
         for kind, columns, measured in self._kinds:
             slopes[..., columns] = self.model.log_prior(kind, values[..., columns], measured)[1]
-        for column, block, spectrum in self._spectra_of_errors:
-            slopes[..., column] += self.model.jeffreys_slope(block, values[..., column], spectrum)
+        for column, b, added in self._spectra_of_errors:
+            mean, proportional = self._mean_variance(b, values)
+            share = mean[..., None] / (mean[..., None] + added)
+            slope = np.mean(share**2 * (1.0 - share), axis=-1) / np.mean(share**2, axis=-1)
+            slopes[..., column] += slope * proportional / mean
         return slopes
 
     @cached_property
-    def _spectra_of_errors(self) -> list[tuple[int, Block, np.ndarray]]:
-        """Column of each free variance with Jeffreys' prior, a block, and the eigenvalues of L·Lᵀ of all its blocks."""
+    def _spectra_of_errors(self) -> list[tuple[int, int, np.ndarray]]:
+        """Column and a block of each free variance with Jeffreys' prior, and eigenvalues of L·Lᵀ of all its blocks."""
         found: dict[int, list[tuple[int, np.ndarray]]] = {}
         if self.model.prior == JEFFREYS:
             for one in self.shared:
@@ -229,7 +228,7 @@ class Likelihood:
             with_errors = {b for b, _ in own}
             others = [b for b, columns in enumerate(self._columns) if columns[:1] == [column] and b not in with_errors]
             rest = [np.zeros(self.blocks[b].size) for b in others]
-            result.append((column, self.blocks[own[0][0]], np.maximum(np.concatenate([v for _, v in own] + rest), 0.0)))
+            result.append((column, own[0][0], np.maximum(np.concatenate([v for _, v in own] + rest), 0.0)))
         return result
 
     @cached_property
@@ -254,7 +253,7 @@ class Likelihood:
         bias correction of eq. (7), see `gauss_newton.bias_correction`.
         """
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            total = (self._flat if self.model.flat else self._by_kind)(residuals, values, log_variance_factor)
+            total = self._without_inputs(residuals, values, log_variance_factor)
             for one in self.shared:
                 own, precisions = [residuals[b] for b in one.members], self.precisions(one.members, values)
                 total = total + one.log_likelihood(own, precisions, _mean(log_variance_factor, one))
@@ -281,7 +280,7 @@ class Likelihood:
         rows = []
         for b, _, order, starts in self._parts:
             block = self.blocks[b]
-            spectral = block.kind == SPECTRAL and not self.model.flat
+            spectral = block.spectral and not self._is_even[b]
             harmonic = block.harmonic[order][starts] if spectral else np.full(len(starts), np.nan)
             rows += [(block.experiment, block.channel, h, block.weight) for h in harmonic]
         columns = zip(*rows, strict=True)
@@ -292,15 +291,7 @@ class Likelihood:
         """Of each block its index, labels of its observations, values in their order, and where each begins."""
         found = []
         for b, block in enumerate(self.blocks):
-            name, place, end = "value" if block.channel == SCALE else block.channel, np.arange(block.size), ""
-            if self._is_dense(block):
-                place = np.zeros(block.size, dtype=int)
-            elif block.kind == SPECTRAL and not self.model.flat:
-                name, place = f"{name}, harmonic", block.harmonic
-            elif block.kind in (SPECTRAL, POINTS):
-                points = block.size if block.kind == SPECTRAL else block.points
-                place = place if block.kind == SPECTRAL else np.rint(block.position * points).astype(int)
-                name, end = f"{name}, at", f"/{points} of the period"
+            name, place, end = block.places(self._is_even[b], b in self._dense_groups)
             order = np.argsort(place, kind="stable")
             numbers, starts = np.unique(place[order], return_index=True)
             labels = [f"{name} {i}{end}" for i in numbers]
@@ -311,22 +302,15 @@ class Likelihood:
         """Return the log-likelihoods (…, observations) of the `observations`, which sum to that of `__call__`."""
         found, shared = [], self._shared_terms(residuals, values)
         for b, _, order, starts in self._parts:
-            block, phi, r = self.blocks[b], values[..., self._columns[b]], residuals[b]
-            if self._is_dense(block):
-                found.append(self._together([r], block, phi, 1.0)[..., None])
+            r = residuals[b]
+            if b not in self._group_of:
+                found.append(self._dense_values(b, r, values, 1.0)[..., None])
                 continue
-            if b in shared:
-                each = shared[b]
-                if block.kind != KNOWN:
-                    each = each + block.weight * np.log(self._variances(block, phi)[0])
-                found.append(-0.5 * np.add.reduceat(each[..., order], starts, axis=-1))
-                continue
-            if block.kind == SPECTRAL and self.model.flat:
-                r = _fourier.from_components(r, block.size)
-            each = r**2
-            if block.kind != KNOWN:
-                variances = self._variances(block, phi)[0]
-                each = block.weight * (np.log(variances) + each / variances)
+            group = self._group_of[b]
+            variances = self._spectrum(group, values)[0]
+            r = self.blocks[b].independent(r, self._is_even[b])
+            squares = shared[b] if b in shared else group.weight * r**2 / variances
+            each = group.weight * np.log(variances) + squares
             found.append(-0.5 * np.add.reduceat(each[..., order], starts, axis=-1))
         return np.concatenate(found, axis=-1)
 
@@ -345,43 +329,43 @@ class Likelihood:
             found |= zip(one.members, parts, strict=True)
         return found
 
-    def _by_kind(
+    def _without_inputs(
         self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
     ) -> np.ndarray:
-        """Return the log-likelihood (…,) of errors whose spectrum is not flat, alike blocks together.
-
-        Without the squares of blocks that share errors of inputs.
-        """
+        """Return the log-likelihood (…,) without the squares of blocks that share errors of inputs."""
         total = np.zeros(values.shape[:-1])
-        residuals = [r * alone if self.shared else r for r, alone in zip(residuals, self._alone, strict=True)]
-        for members in self._alike:
-            own = values[..., self._columns[members[0]]]
-            factor = float(np.broadcast_to(log_variance_factor, len(residuals))[members[0]])
-            total = total + self._together([residuals[b] for b in members], self.blocks[members[0]], own, factor)
+        if self._even:
+            total = self._even_total(residuals, values, log_variance_factor)
+        for group in self._uneven:
+            variances = self._spectrum(group, values)[0]
+            factor = len(group.members) * self._factor(log_variance_factor, group)
+            terms = factor * np.log(variances)
+            if alone := [b for b in group.members if self._alone[b]]:
+                terms = terms + sum(residuals[b] ** 2 for b in alone) / variances
+            total = total - 0.5 * group.weight * np.add.reduce(terms, axis=-1)
+        for b in self._dense_groups:
+            total = total + self._dense_values(b, residuals[b], values, self._factor(log_variance_factor, b))
         return total
 
-    def _flat(
+    def _even_total(
         self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
     ) -> np.ndarray:
-        """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat.
-
-        Without the squares of blocks that share errors of inputs.
-        """
-        at, known, columns, sizes, weights, measured = self._levels
-        v = self.model.level(values[..., columns] * self._gains[at], measured)
+        """Return the log-likelihood (…,) of blocks whose components all have the same variance."""
+        at, sizes, weights = self._even_blocks, self._even_sizes, self._even_weights
+        variances = self._even_variances(values)
         factor = log_variance_factor if isinstance(log_variance_factor, float) else log_variance_factor[at]
-        terms = factor * sizes * np.log(v)
-        squares = np.zeros(len(self.blocks))
+        terms = factor * sizes * np.log(variances)
         if np.any(self._alone):
             squares = Residuals.of(residuals).squares
             squares = squares * self._alone if self.shared else squares
-            terms = terms + squares[..., at] / v
+            terms = terms + squares[..., at] / variances
         # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
-        terms = np.ascontiguousarray(weights * terms)
-        total = np.add.reduce(terms, axis=-1)
-        if known.size:
-            total = total + np.add.reduce(np.ascontiguousarray(squares[..., known]), axis=-1)
-        return -0.5 * total
+        return -0.5 * np.add.reduce(np.ascontiguousarray(weights * terms), axis=-1)
+
+    def _factor(self, log_variance_factor: float | np.ndarray, group: "_Group | int") -> float:
+        """Return the factor of the logarithms of one group or block."""
+        b = group if isinstance(group, int) else group.members[0]
+        return log_variance_factor if isinstance(log_variance_factor, float) else float(log_variance_factor[b])
 
     @cached_property
     def _alone(self) -> np.ndarray:
@@ -389,73 +373,96 @@ class Likelihood:
         with_errors = {b for one in self.shared for b in one.members}
         return np.array([0.0 if b in with_errors else 1.0 for b in range(len(self.blocks))])
 
-    @cached_property
-    def _levels(self) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return blocks with a variance, the others, and of the first the column, size, weight and measured value."""
-        known = np.array([block.kind == KNOWN for block in self.blocks], dtype=bool)
-        own = [(block, columns[0]) for block, columns in zip(self.blocks, self._columns, strict=True) if columns]
-        return (
-            np.flatnonzero(~known) if known.any() else slice(None),
-            np.flatnonzero(known),
-            np.array([column for _, column in own], dtype=int),
-            np.array([block.size for block, _ in own], dtype=float),
-            np.array([block.weight for block, _ in own]),
-            np.array([0.0 if block.kind == CORRELATED else block.measured for block, _ in own]),
-        )
-
-    @cached_property
-    def _alike(self) -> list[list[int]]:
-        """The indices of blocks whose components have the same variances: whole periods, averaged over as much data."""
+    def _sorted_groups(self) -> tuple[list[_Group], list[_Group], list[int]]:
+        """Return groups whose components have one variance, others, and the blocks whose components are correlated."""
         groups: dict[Any, list[int]] = {}
         for b, (block, columns) in enumerate(zip(self.blocks, self._columns, strict=True)):
-            measured = block.measured if self.model.needs_scatter else None
-            key = (tuple(columns), block.weight, block.averaged, block.points, measured, block.harmonic.tobytes())
-            groups.setdefault(key if block.kind == SPECTRAL else b, []).append(b)
-        return list(groups.values())
+            key = type(block), block.alike(self.model), tuple(columns), block.size, block.weight
+            groups.setdefault(key, []).append(b)
+        even: list[_Group] = []
+        uneven: list[_Group] = []
+        dense: list[int] = []
+        for members in groups.values():
+            block, columns = self.blocks[members[0]], self._columns[members[0]]
+            if block.is_dense(self.model):
+                dense += members
+                continue
+            group = _Group(members, block, slice(columns[0], columns[-1] + 1) if columns else slice(0), block.weight)
+            (even if self._checked_size(group) == 1 else uneven).append(group)
+        return even, uneven, dense
 
-    def _together(
-        self, residuals: list[np.ndarray], block: Block, values: np.ndarray, log_variance_factor: float
-    ) -> np.ndarray:
-        """Return the log-likelihood (…,) of blocks like this one."""
-        r = residuals[0]
-        if block.kind == KNOWN:
-            return -0.5 * _square(r)
-        if self._is_dense(block):
-            flat, rows = values.reshape(-1, values.shape[-1]), r.reshape(-1, r.shape[-1])
-            each = [self._dense(block, row, v, log_variance_factor)[0] for row, v in zip(rows, flat, strict=True)]
-            return np.array(each).reshape(values.shape[:-1])
-        if block.kind == CORRELATED:
-            v = values[..., 0]
-            return -0.5 * block.weight * (log_variance_factor * block.size * np.log(v) + _square(r) / v)
-        variances = self._variances(block, values)[0]
-        squares = sum(r**2 for r in residuals)
-        terms = len(residuals) * log_variance_factor * np.log(variances) + squares / variances
-        return -0.5 * block.weight * np.sum(terms, axis=-1)
+    def _checked_size(self, group: _Group) -> int:
+        """Return the number of variances that the spectrum of a group has, one or one each component."""
+        block, count = group.block, len(self._columns[group.members[0]])
+        sizes = (1, block.size)
+        try:
+            variances, slopes = map(np.shape, self._spectrum(group, np.ones(len(self.names))))
+        except (IndexError, ValueError):
+            if not block.refusal(self.model):
+                raise
+            variances, slopes = (), ()
+        if len(variances) == 1 and variances[0] in sizes and slopes in [(size, count) for size in sizes]:
+            return variances[0]
+        if reason := block.refusal(self.model):
+            raise ValueError(reason)
+        raise ValueError(
+            f"noise: must have a spectrum of shapes (…, 1) or (…, {block.size}) and (…, 1, {count}) or (…, "
+            f"{block.size}, {count}) for {block.channel!r} of {block.experiment!r}, got {variances} and {slopes} from "
+            f"{self.model.name!r}."
+        )
+
+    def _spectrum(self, group: _Group, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variances (…, size) or (…, 1) of a group's components, and their slopes by its parameters."""
+        return group.block.spectrum(self.model, values[..., group.columns])
+
+    def _even_variances(self, values: np.ndarray) -> np.ndarray:
+        """Return the variances (…, blocks) of the blocks of `_even_blocks`."""
+        each = [self._spectrum(group, values)[0] for group in self._even]
+        joined = each[0] if len(each) == 1 else np.concatenate(each, axis=-1)
+        return joined[..., self._even_places]
+
+    @cached_property
+    def _even_blocks(self) -> Any:
+        """Indices of the blocks of `_even`; a slice where they are all."""
+        order = [b for group in self._even for b in group.members]
+        return slice(None) if order == list(range(len(self.blocks))) else np.array(order, dtype=int)
+
+    @cached_property
+    def _even_places(self) -> Any:
+        """The group of each of `_even_blocks`."""
+        places = [g for g, group in enumerate(self._even) for _ in group.members]
+        return slice(None) if len(places) == len(self._even) else np.array(places, dtype=int)
+
+    @cached_property
+    def _even_sizes(self) -> np.ndarray:
+        return np.array([group.block.size for group in self._even for _ in group.members], dtype=float)
+
+    @cached_property
+    def _even_weights(self) -> np.ndarray:
+        return np.array([group.weight for group in self._even for _ in group.members])
+
+    @cached_property
+    def _is_even(self) -> list[bool]:
+        """Whether the components of each block all have the same variance."""
+        even = {b for group in self._even for b in group.members}
+        return [b in even for b in range(len(self.blocks))]
+
+    @cached_property
+    def _group_of(self) -> dict[int, _Group]:
+        """The group of each block whose components are independent."""
+        return {b: group for group in (*self._even, *self._uneven) for b in group.members}
 
     def precisions(self, members: Sequence[int], values: np.ndarray) -> list[np.ndarray]:
         """Return weights over variances of the components of some blocks, (…, size), or (…, 1) if they are the same."""
-        result = []
-        for b in members:
-            block, phi = self.blocks[b], values[..., self._columns[b]]
-            if self.model.flat and block.kind == SPECTRAL:
-                result.append(block.weight / self.model.level(phi[..., :1] * self._gains[b], block.measured))
-                continue
-            if block.kind == KNOWN:
-                result.append(np.ones((*values.shape[:-1], 1)))
-                continue
-            variances = self._variances(block, phi)[0]
-            result.append(block.weight / (variances[..., :1] if self.model.flat else variances))
-        return result
+        groups = [self._group_of[b] for b in members]
+        return [group.weight / self._spectrum(group, values)[0] for group in groups]
 
-    def _is_dense(self, block: Block) -> bool:
-        """Return whether the components of a block are correlated: points under noise that is not white."""
-        return block.kind == POINTS and not self.model.flat
-
-    def _variances(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if block.kind == CORRELATED:
-            shape = (*values.shape[:-1], block.size)
-            return np.broadcast_to(values[..., :1], shape), np.ones((*shape, 1))
-        return self.model.spectrum(block, values)
+    def _dense_values(self, b: int, r: np.ndarray, values: np.ndarray, log_variance_factor: float) -> np.ndarray:
+        """Return the log-likelihoods (…,) of a block whose components are correlated."""
+        rows, own = r.reshape(-1, r.shape[-1]), values[..., self._columns[b]].reshape(-1, len(self._columns[b]))
+        pairs = zip(rows, own, strict=True)
+        each = [self._dense(self.blocks[b], row, phi, log_variance_factor)[0] for row, phi in pairs]
+        return np.array(each).reshape(values.shape[:-1])
 
     def _dense(
         self, block: Block, r: np.ndarray, values: np.ndarray, log_variance_factor: float
@@ -481,8 +488,22 @@ class Likelihood:
         self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray = 1.0
     ) -> tuple[Sequence[np.ndarray], np.ndarray]:
         """Return the gradients of log-likelihood plus log-prior of φ, by each block's residual and by ln φ (names,)."""
-        find = self._flat_gradients if self.model.flat else self._gradients_by_kind
-        by_residual, by_value = find(Residuals.of(residuals), values, log_variance_factor)
+        residuals, by_value = Residuals.of(residuals), self._prior_slopes(values)
+        by_residual: Any = [np.empty(0)] * len(self.blocks)
+        if self._even:
+            by_residual = self._even_gradients(residuals, values, log_variance_factor, by_value)
+            by_residual = list(by_residual) if self._uneven or self._dense_groups else by_residual
+        for group in self._uneven:
+            variances, slopes = self._spectrum(group, values)
+            stack, factor = np.stack([residuals[b] for b in group.members]), self._factor(log_variance_factor, group)
+            for b, r in zip(group.members, stack, strict=True):
+                by_residual[b] = -group.weight * r / variances
+            by_logarithm = 0.5 * group.weight * np.add.reduce(stack**2 / variances - factor, axis=0)
+            by_value[group.columns] += np.add.reduce(by_logarithm[:, None] * slopes, axis=0)
+        for b in self._dense_groups:
+            columns, factor = self._columns[b], self._factor(log_variance_factor, b)
+            _, by_residual[b], by_phi = self._dense(self.blocks[b], residuals[b], values[columns], factor)
+            by_value[columns] += by_phi
         if not self.shared:
             return by_residual, by_value
         total = list(by_residual)
@@ -491,65 +512,39 @@ class Likelihood:
             found = one.gradients(own, precisions, _mean(log_variance_factor, one))
             for b, more, by_precision in zip(one.members, *found, strict=True):
                 total[b] = total[b] + more
-                if columns := self._columns[b]:
-                    by_value[columns] -= by_precision @ self._variances(self.blocks[b], values[columns])[1]
+                group = self._group_of[b]
+                slopes = self._spectrum(group, values)[1]
+                by_value[group.columns] -= np.add.reduce(by_precision[:, None] * slopes, axis=0)
         return total, by_value
 
-    def _gradients_by_kind(
-        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
-    ) -> tuple[list[np.ndarray], np.ndarray]:
-        """Return the gradients by each block's residual and by ln φ (names,) under errors that are not white."""
-        slopes = self._prior_slopes(values)
-        by_residual: list[np.ndarray] = [np.empty(0)] * len(self.blocks)
-        for members in self._alike:
-            block, columns = self.blocks[members[0]], self._columns[members[0]]
-            own = np.stack([residuals[b] for b in members])
-            factor = float(np.broadcast_to(log_variance_factor, len(self.blocks))[members[0]])
-            if block.kind == KNOWN:
-                by_residual[members[0]] = -own[0]
-                continue
-            if self._is_dense(block):
-                _, by_residual[members[0]], by_phi = self._dense(block, own[0], values[columns], factor)
-            else:
-                variances, change = self._variances(block, values[columns])
-                for b, r in zip(members, own, strict=True):
-                    by_residual[b] = -block.weight * r / variances
-                by_phi = 0.5 * block.weight * np.sum(own**2 / variances - factor, axis=0) @ change
-            slopes[columns] += by_phi
-        return by_residual, slopes
-
-    def _flat_gradients(
-        self, residuals: Residuals, values: np.ndarray, log_variance_factor: float | np.ndarray
-    ) -> tuple[Residuals, np.ndarray]:
-        """Return the gradients by each block's residual and by ln φ (names,) under errors whose spectrum is flat."""
-        by_value, squares = self._prior_slopes(values), residuals.squares
-        at, _, columns, sizes, weights, measured = self._levels
-        raised = values[columns] * self._gains[at]
-        v = self.model.level(raised, measured)
-        by_square = np.full(len(self.blocks), -0.5)
-        by_square[at] = -0.5 * weights / v
-        # V is proportional to v, or to v plus what is measured.
-        factor = np.broadcast_to(log_variance_factor, len(self.blocks))[at]
-        by_level = 0.5 * weights * (squares[at] / v - factor * sizes) * raised / v
-        np.add.at(by_value, columns, by_level)
-        return residuals.scaled(2.0 * by_square), by_value
+    def _even_gradients(
+        self, residuals: Residuals, values: np.ndarray, log_variance_factor: float | np.ndarray, by_value: np.ndarray
+    ) -> Residuals:
+        """Return the gradients by the residuals of blocks with one variance, and add those by ln φ to `by_value`."""
+        at, weights, spectra = self._even_blocks, self._even_weights, [self._spectrum(g, values) for g in self._even]
+        variances = np.concatenate([spectrum for spectrum, _ in spectra])[self._even_places]
+        factor = log_variance_factor if isinstance(log_variance_factor, float) else log_variance_factor[at]
+        by_logarithm = 0.5 * weights * (residuals.squares[at] / variances - factor * self._even_sizes)
+        by_square, start = np.zeros(len(self.blocks)), 0
+        by_square[at] = -0.5 * weights / variances
+        for group, (_, slopes) in zip(self._even, spectra, strict=True):
+            stop = start + len(group.members)
+            by_value[group.columns] += np.add.reduce(by_logarithm[start:stop]) * slopes[0]
+            start = stop
+        return residuals.scaled(2.0 * by_square)
 
     def whitened(self, vectors: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
         """Return vectors (…, size), one a block, in units of the noise: their squares sum to −2 log-likelihood."""
         result = list(vectors)
-        for members in self._alike:
-            block, columns, first = self.blocks[members[0]], self._columns[members[0]], members[0]
-            if block.kind == KNOWN:
-                continue
-            if self._is_dense(block):
-                covariance, _ = self.model.covariance(block, values[columns])
-                rows = vectors[first].reshape(-1, block.size)
-                white = solve_triangular(np.linalg.cholesky(covariance), rows.T, lower=True)
-                result[first] = np.sqrt(block.weight) * white.T.reshape(vectors[first].shape)
-            else:
-                scale = np.sqrt(block.weight / self._variances(block, values[columns])[0])
-                for b in members:
-                    result[b] = vectors[b] * scale
+        for group in (*self._even, *self._uneven):
+            scale = np.sqrt(group.weight / self._spectrum(group, values)[0])
+            for b in group.members:
+                result[b] = vectors[b] * scale
+        for b in self._dense_groups:
+            block = self.blocks[b]
+            covariance, _ = self.model.covariance(block, values[self._columns[b]])
+            white = solve_triangular(np.linalg.cholesky(covariance), vectors[b].reshape(-1, block.size).T, lower=True)
+            result[b] = np.sqrt(block.weight) * white.T.reshape(vectors[b].shape)
         for one in self.shared:
             joint = one.whitened([result[b] for b in one.members], self.precisions(one.members, values))
             for b, own in zip(one.members, joint, strict=True):
@@ -559,13 +554,13 @@ class Likelihood:
     def simulate(self, values: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:
         """Return noise at values (draws, names): components (draws, size), one array a block."""
         result = []
-        for block, columns in zip(self.blocks, self._columns, strict=True):
+        for b, (block, columns) in enumerate(zip(self.blocks, self._columns, strict=True)):
             white = generator.standard_normal((len(values), block.size))
-            if self._is_dense(block):
+            if b in self._dense_groups:
                 factors = np.linalg.cholesky([self.model.covariance(block, row)[0] for row in values[:, columns]])
                 white = np.einsum("dij,dj->di", factors, white)
-            elif block.kind != KNOWN:
-                white *= np.sqrt(self._variances(block, values[:, columns])[0])
+            else:
+                white *= np.sqrt(self._spectrum(self._group_of[b], values)[0])
             result.append(white)
         for one in self.shared:
             errors = generator.standard_normal((len(values), one.parts[0].shape[1]))

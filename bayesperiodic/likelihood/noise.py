@@ -6,52 +6,17 @@ per component. The noise parameters φ are positive, and densities are over thei
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
 
 from bayesperiodic import _checks
+from bayesperiodic.likelihood.block import PROPORTIONAL, Block
 from bayesperiodic.priors.joint import as_prior
 from bayesperiodic.priors.single import LogNormal, Prior
-
-SPECTRAL, POINTS, CORRELATED, KNOWN = "spectral", "points", "correlated", "known"
-SCALE = "scale"
-
-
-@dataclass(frozen=True)
-class Block:
-    """Description of one vector of residual components.
-
-    A `channel` is an output; "scale" for all section values of an experiment together, "multipliers" or "frequency".
-    The `kind` is "spectral" for real Fourier components, which are independent and have variance v under white noise of
-    variance v; "points" for values at the points of a mask; "correlated" for values whitened by their given covariance,
-    up to one unknown factor; "known" for values in units of their known standard deviations.
-    """
-
-    experiment: str
-    channel: str
-    kind: str
-    count: float  # independent values behind the components
-    size: int  # number of components
-    harmonic: np.ndarray  # (size,), of the response period, of each spectral component
-    position: np.ndarray  # (size,), of each point, in response periods
-    points: int  # grid points of the response period
-    averaged: float  # measured samples behind the components
-    measured: float  # variance of one value that the scatter of the cycles explains; NaN if unknown
-
-    @property
-    def weight(self) -> float:
-        """Independent values per component."""
-        return self.count / self.size
-
-    @property
-    def counted(self) -> bool:
-        """Whether the variance is unknown, so that eq. (7) counts the values."""
-        return self.kind != KNOWN
-
 
 __all__ = ["Circulant", "Independent", "Measured", "Noise"]
 
@@ -67,6 +32,9 @@ FLOOR = LogNormal(0.01, 2.0)
 @dataclass(frozen=True)
 class Noise(ABC):
     """What the noise models share.
+
+    A noise model is a subclass with a `name` and `spectrum`, the variances of the Fourier components of whole periods.
+    Where these differ, values at the points of a mask also need `covariance`.
 
     Parameters
     ----------
@@ -93,13 +61,22 @@ class Noise(ABC):
     prior: Any = field(default=JEFFREYS, kw_only=True)
 
     name: ClassVar[str]
-    flat: ClassVar[bool] = True
     needs_scatter: ClassVar[bool] = False
 
     @property
     def shape_priors(self) -> dict[str, Prior]:
         """The priors of the spectrum's parameters beyond the variance."""
         return {}
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of noise parameters of a channel, the variance first."""
+        return VARIANCE, *self.shape_priors
+
+    @property
+    def separate(self) -> bool:
+        """Whether each experiment has its own noise parameters."""
+        return self.per == EXPERIMENT
 
     def __post_init__(self) -> None:
         _checks.one_of("per", self.per, (CHANNEL, EXPERIMENT))
@@ -136,21 +113,19 @@ class Noise(ABC):
         Raises
         ------
         ValueError
-            If a scatter that the model needs is unknown, or experiments on different grids share a correlation.
+            If a scatter that the model needs is unknown.
         """
-        points: dict[str, int] = {}
-        for block in (b for b in blocks if b.kind in (SPECTRAL, POINTS)):
+        for block in (b for b in blocks if b.timed):
             if self.needs_scatter and not block.measured > 0.0:
                 raise ValueError(
                     f"noise: must be 'independent' without measured scatter, got {self.name!r}; experiment "
                     f"{block.experiment!r} has no scatter of {block.channel!r}. Give scatter and cycles."
                 )
-            if not self.flat and points.setdefault(self.label(block), block.points) != block.points:
-                raise ValueError(
-                    f"noise: must have per='experiment' for grids that differ, got {self.name!r}; experiments with "
-                    f"{points[self.label(block)]} and {block.points} points in the response period share the "
-                    f"correlation of {block.channel!r}. Or give all the same samples and periods."
-                )
+
+    @property
+    def correlates_points(self) -> bool:
+        """Whether the values at the points of a mask have a covariance of their own instead of equal variances."""
+        return type(self).covariance is not Noise.covariance
 
     def label(self, block: Block) -> str:
         """Return the text in brackets of the names of a block's noise parameters.
@@ -178,40 +153,7 @@ class Noise(ABC):
         tuple of str
             The variance first; none where the errors are known.
         """
-        if block.kind == KNOWN:
-            return ()
-        if block.kind == CORRELATED:
-            return (SCALE if self.per == CHANNEL else f"{SCALE}[{block.experiment}]",)
-        return tuple(f"{kind}[{self.label(block)}]" for kind in (VARIANCE, *self.shape_priors))
-
-    def gain(self, block: Block) -> float:
-        """Return the variance V that a variance v of 1 gives to the components of a block, if the spectrum is flat.
-
-        Parameters
-        ----------
-        block : Block
-
-        Returns
-        -------
-        float
-        """
-        return 1.0
-
-    def level(self, value: np.ndarray, measured: Any) -> np.ndarray:
-        """Return V of errors whose spectrum is flat.
-
-        Parameters
-        ----------
-        value : array (…)
-            The variance v [channel's unit squared], times `gain`.
-        measured : float or array (…)
-            What the scatter of the cycles explains of the variance of the mean period.
-
-        Returns
-        -------
-        array (…)
-        """
-        return value
+        return block.parameter_names(self)
 
     @abstractmethod
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -225,14 +167,31 @@ class Noise(ABC):
 
         Returns
         -------
-        variances : array (…, size)
-            V_j of the residual components.
-        slopes : array (…, size, parameters)
-            ∂ ln V_j/∂ ln φ.
+        variances : array (…, size) or (…, 1)
+            V_j of the residual components; one where they are all the same, as those of white noise.
+        slopes : array (…, size, parameters) or (…, 1, parameters)
+            ∂ ln V_j/∂ ln φ. The leading axes may be missing where they do not depend on the values.
         """
+
+    def alike(self, block: Block) -> Hashable:
+        """Return what `spectrum` depends on besides the values: blocks with equal keys are evaluated together.
+
+        Parameters
+        ----------
+        block : Block
+
+        Returns
+        -------
+        hashable
+            By default every block has its own spectrum.
+        """
+        return block.experiment, block.channel
 
     def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the covariance of the residuals at the points of a mask, and its derivatives.
+
+        It is used only by models that override it; others take the values of a channel as independent, with the
+        variances of `spectrum`.
 
         Parameters
         ----------
@@ -247,7 +206,8 @@ class Noise(ABC):
             By ln φ.
         """
         variances, slopes = self.spectrum(block, values)
-        return np.diag(variances), np.stack([np.diag(variances * slope) for slope in slopes.T])
+        every = np.broadcast_to(variances, block.size)
+        return np.diag(every), np.stack([np.diag(every * slope) for slope in slopes.T])
 
     def has_constant_prior(self, kind: str) -> bool:
         """Return whether `log_prior` of a kind of noise parameters is zero wherever they are.
@@ -272,7 +232,7 @@ class Noise(ABC):
             "variance", "lengthscale" or "floor".
         value : array (…)
         measured : float or array (…)
-            As in `level`.
+            What the scatter of the cycles explains of the variance of the mean period.
 
         Returns
         -------
@@ -289,51 +249,21 @@ class Noise(ABC):
             return np.log(value), np.ones_like(value)
         return _over_logarithm(self._proper_prior, value)
 
-    def jeffreys_factor(self, block: Block, value: np.ndarray, added: np.ndarray) -> np.ndarray:
-        """Return by what Jeffreys' prior of a variance is smaller where errors of the inputs add variances.
-
-        With components of variances V + λ it is √(Σ 1/(V + λ)²), the root of the information, instead of 1/V; without
-        it the density has no integral where errors of the inputs can explain all components.
+    def mean_variance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean variance of a block's components, and the part of it that is proportional to the variance.
 
         Parameters
         ----------
         block : Block
-            One of those with this variance.
-        value : array (…)
-            The variance.
-        added : array (components,)
-            Variances λ that the inputs' errors add.
+        values : array (…, parameters)
+            Of the block's noise parameters, the variance first.
 
         Returns
         -------
-        array (…)
-            The logarithm.
+        mean, proportional : array (…)
         """
-        total = self._mean_variance(block, value)[0][..., None]
-        share = total / (total + added)
-        return np.asarray(0.5 * np.log(np.add.reduce(share * share, axis=-1) / added.size))
-
-    def jeffreys_slope(self, block: Block, value: np.ndarray, added: np.ndarray) -> np.ndarray:
-        """Return the derivative of `jeffreys_factor` by the logarithm of the variance.
-
-        Parameters
-        ----------
-        block, value, added
-            As for `jeffreys_factor`.
-
-        Returns
-        -------
-        array (…)
-        """
-        total, from_value = self._mean_variance(block, value)
-        share = total[..., None] / (total[..., None] + added)
-        slope = np.mean(share**2 * (1.0 - share), axis=-1) / np.mean(share**2, axis=-1)
-        return np.asarray(slope * from_value / total)
-
-    def _mean_variance(self, block: Block, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean variance (…,) of a block's components, and the part of it that the variance causes."""
-        from_value = value * (self.gain(block) if self.flat else block.size / block.points)
-        return self.level(from_value, block.measured) if block.kind != CORRELATED else from_value, from_value
+        variances, slopes = self.spectrum(block, values)
+        return variances.mean(axis=-1), (variances * slopes[..., 0]).mean(axis=-1)
 
     @cached_property
     def _proper_prior(self) -> Prior:
@@ -374,13 +304,12 @@ class Independent(Noise):
     name: ClassVar[str] = "independent"
 
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return V = v·N/M."""
-        shape = (*values.shape[:-1], block.size)
-        return np.broadcast_to(values[..., :1] * self.gain(block), shape), np.ones((*shape, 1))
+        """Return V = v·N/M, components over measured samples."""
+        return values * (block.size / block.averaged), PROPORTIONAL
 
-    def gain(self, block: Block) -> float:
-        """Return N/M, components over measured samples."""
-        return block.size / block.averaged if block.kind in (SPECTRAL, POINTS) else 1.0
+    def alike(self, block: Block) -> Hashable:
+        """Return N/M."""
+        return block.size / block.averaged
 
 
 @dataclass(frozen=True)
@@ -413,13 +342,12 @@ class Measured(Noise):
 
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return V = scatter²/cycles + v."""
-        shape = (*values.shape[:-1], block.size)
-        total = np.broadcast_to(self.level(values[..., :1], block.measured), shape)
-        return total, (values[..., :1] / total)[..., None]
+        total = values + block.measured
+        return total, (values / total)[..., None]
 
-    def level(self, value: np.ndarray, measured: Any) -> np.ndarray:
-        """Return V = scatter²/cycles + v."""
-        return value + measured
+    def alike(self, block: Block) -> Hashable:
+        """Return scatter²/cycles."""
+        return block.measured
 
     def has_constant_prior(self, kind: str) -> bool:
         """Return False: Jeffreys' prior is not constant over ln v here."""
@@ -474,7 +402,6 @@ class Circulant(Noise):
     kernel: str = field(default="matern", kw_only=True)
 
     name: ClassVar[str] = "circulant"
-    flat: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -485,6 +412,27 @@ class Circulant(Noise):
         """The priors of the spectrum's shape."""
         shape: dict[str, Prior] = {"lengthscale": LENGTHSCALE}
         return shape | ({"floor": FLOOR} if self.kernel == "matern" else {})
+
+    def check(self, blocks: Sequence[Block]) -> None:
+        """Refuse experiments on different grids that share a correlation, see `Noise.check`."""
+        super().check(blocks)
+        points: dict[str, int] = {}
+        for block in (b for b in blocks if b.timed):
+            if points.setdefault(self.label(block), block.points) != block.points:
+                raise ValueError(
+                    f"noise: must have per='experiment' for grids that differ, got {self.name!r}; experiments with "
+                    f"{points[self.label(block)]} and {block.points} points in the response period share the "
+                    f"correlation of {block.channel!r}. Or give all the same samples and periods."
+                )
+
+    def mean_variance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return v·N/n twice, the mean over all harmonics of the grid."""
+        variance = values[..., 0] * (block.size / block.points)
+        return variance, variance
+
+    def alike(self, block: Block) -> Hashable:
+        """Return the grid and the harmonics."""
+        return block.points, block.harmonic.tobytes()
 
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return V = v·S_h·N/n, S with mean 1 over the harmonics of the grid."""
@@ -502,8 +450,7 @@ class Circulant(Noise):
 
     def _spectrum(self, harmonic: np.ndarray, points: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return v·S at harmonics and its logarithmic slopes, S with mean 1 over a grid of points."""
-        on_grid = np.arange(points // 2 + 1)
-        repeated = np.where((on_grid == 0) | (2 * on_grid == points), 1.0, 2.0) / points
+        on_grid, repeated = _harmonics_of_grid(points)
         power, slope = self._kernel_spectrum(on_grid, values)
         mean = np.sum(repeated * power, axis=-1, keepdims=True)
         mean_slope = np.sum(repeated * power * slope, axis=-1, keepdims=True) / mean
@@ -522,6 +469,13 @@ class Circulant(Noise):
         if self.kernel == "exponential":
             return 1.0 / (1.0 + square), -2.0 * square / (1.0 + square)
         return (3.0 + square) ** -2, -4.0 * square / (3.0 + square)
+
+
+@lru_cache
+def _harmonics_of_grid(points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the harmonics of a grid, and the fraction of its components that each has."""
+    on_grid = np.arange(points // 2 + 1)
+    return on_grid, np.where((on_grid == 0) | (2 * on_grid == points), 1.0, 2.0) / points
 
 
 NAMED: dict[str, type[Noise]] = {model.name: model for model in (Independent, Measured, Circulant)}

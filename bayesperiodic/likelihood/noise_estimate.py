@@ -6,7 +6,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from bayesperiodic.likelihood.likelihood import Likelihood
-from bayesperiodic.likelihood.noise import CORRELATED, FLAT, JEFFREYS, SCALE, VARIANCE, Independent
+from bayesperiodic.likelihood.noise import FLAT, JEFFREYS, VARIANCE, Independent
+from bayesperiodic.likelihood.section_points import SCALE
 
 LOWEST, HIGHEST = 25.0, 8.0
 TINY = np.finfo(float).tiny
@@ -29,25 +30,23 @@ def estimate_noise(
         without = Likelihood(likelihood.model, likelihood.blocks, likelihood.fixed)
         centre = estimate_noise(without, residuals, start, log_variance_factor)
         return _maximise(likelihood, residuals, start, centre, log_variance_factor)
-    values = start.copy()
+    values, moments = start.copy(), likelihood.moments(residuals)
     for group, members in likelihood.groups():
         if not set(group) & set(likelihood.free):
             continue
         blocks = [likelihood.blocks[b] for b in members]
         factor = float(np.broadcast_to(log_variance_factor, len(residuals))[members[0]])
         chosen = [residuals[b] for b in members]
-        total = sum(
-            block.weight / likelihood.model.gain(block) * float(r @ r) for block, r in zip(blocks, chosen, strict=True)
-        )
         count = sum(block.count for block in blocks)
-        plain = isinstance(likelihood.model, Independent) or all(block.kind == CORRELATED for block in blocks)
+        plain = isinstance(likelihood.model, Independent) or not any(block.timed for block in blocks)
         corrected = count * factor - {JEFFREYS: 0.0, FLAT: 2.0}.get(str(likelihood.model.prior), np.inf)
         columns = [likelihood.names.index(name) for name in group]
         if plain and corrected > 0.0:
-            values[columns[0]] = max(total / corrected, TINY)
+            values[columns[0]] = max(float(moments[group[0]]) / corrected, TINY)
             continue
         held = {name: values[i] for name, i in zip(group, columns, strict=True) if name in likelihood.fixed}
         part = Likelihood(likelihood.model, blocks, held)
+        total = sum(block.weight * float(r @ r) for block, r in zip(blocks, chosen, strict=True))
         size = np.where([name.startswith((VARIANCE, SCALE)) for name in group], max(total / count, TINY), part.guess())
         values[columns] = _maximise(part, chosen, values[columns], size, factor)
     return values

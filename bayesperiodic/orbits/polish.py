@@ -461,7 +461,7 @@ def orbit_information(orbit: Orbit, parameters: list[str], model: Model | None =
         _checks.one_of("parameters", name, solution.parameters)
     experiment = orbit.experiment(samples=solution.samples, multipliers=model is not None)
     by_name = multiplier_sensitivities(model, solution) if model is not None else {}
-    count = 0 if experiment.multipliers is None else experiment.multipliers.size
+    count = experiment.measured_multipliers.size
     columns = []
     for name in parameters:
         column = _slopes(orbit, solution, name).ravel()

@@ -127,18 +127,20 @@ def draw_period(
 
 def _curve(axes: Axes, e: Experiment, x: np.ndarray, y: np.ndarray, closed: bool = False, **look: Any) -> None:
     """Draw a curve without markers, or points without a line for masked data."""
-    if e.mask is None:
+    at = e.measured_points
+    if at.all():
         at = np.arange(x.size + closed) % x.size
         axes.plot(x[at], y[at], **look | {"marker": None})
     else:
-        axes.plot(x[e.mask], y[e.mask], **look | {"ls": "none"})
+        axes.plot(x[at], y[at], **look | {"ls": "none"})
 
 
 def _band(axes: Axes, e: Experiment, low: np.ndarray, high: np.ndarray, label: str) -> None:
-    if e.mask is None:
+    at = e.measured_points
+    if at.all():
         axes.fill_between(e.time, low, high, lw=0, label=label, **PREDICTION_STYLE)
     else:
-        axes.vlines(e.time[e.mask], low[e.mask], high[e.mask], lw=8, label=label, **PREDICTION_STYLE)
+        axes.vlines(e.time[at], low[at], high[at], lw=8, label=label, **PREDICTION_STYLE)
 
 
 @styled

@@ -114,7 +114,7 @@ def _residuals(panels: list[Axes], problem: Problem, search: MissingTerms, shown
     having = [e for e in problem.experiments if channel in e.outputs]
     e = max(having, key=lambda run: float(np.sum(fit.residuals[run.name][channel] ** 2)))
     (across, x), *others = _variables(problem, fit, search, e).items()
-    mask = slice(None) if e.mask is None else e.mask
+    mask = e.measured_points
     reach = 1.08 * max(float(np.abs(estimate.residuals[e.name][channel][mask]).max()) for estimate in shown.values())
     points: Any = None
     for number, (axes, (title, estimate)) in enumerate(zip(panels, shown.items(), strict=True)):

@@ -21,6 +21,7 @@ from bayesperiodic.likelihood.input_noise import (
     true_inputs,
     with_errors_as_parameters,
 )
+from bayesperiodic.likelihood.kinds import blocks_of
 from bayesperiodic.likelihood.likelihood import Likelihood
 from bayesperiodic.likelihood.noise import EXPERIMENT, Noise, as_noise
 from bayesperiodic.likelihood.observation import Observation
@@ -70,7 +71,7 @@ class Description:
             local = (*local,) + tuple(name for name in model.parameters if name not in plain)
         self.model, self.scheme = model, scheme or default_scheme(model)
         find_scheme(self.scheme)
-        if not self.noise.flat and any(e.mask is not None for e in self.experiments):
+        if any(b.is_dense(self.noise) for e in self.experiments for b in blocks_of(e, model)):
             if isinstance(self.input_noise, Mapping):
                 raise ValueError(
                     f"input_noise: must be 'joint' or 'exact' for points of a mask with {self.noise.name!r} noise, got "
@@ -516,13 +517,8 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
         _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
         if not e.outputs:
             raise ValueError(f"outputs of experiment {e.name!r}: must have at least one channel, got {{}}.")
-        for channel, values in e.outputs.items():
+        for channel in e.outputs:
             _checks.one_of(f"outputs of experiment {e.name!r}", channel, model.outputs)
-            if e.mask is None and e.covariance is None and np.ptp(values) == 0.0:
-                raise ValueError(
-                    f"outputs of experiment {e.name!r}: {channel!r} is constant ({values[0]:g}); a channel must vary "
-                    "over the period, or tells nothing about its variance."
-                )
         if e.guess == DATA and model.autonomous:
             raise ValueError(
                 f"guess of experiment {e.name!r}: must be states for {model.name!r}, which is autonomous, got {DATA!r}."

@@ -191,9 +191,10 @@ def channels(given: ReportInputs) -> Rows:
     """Return the table of the channels."""
     rows: list[dict[str, str]] = []
     for e in given.problem.experiments:
-        masked = "output" if e.mask is None else f"output, at {np.sum(e.mask)} points"
-        outputs = e.outputs if e.mask is None else {channel: values[e.mask] for channel, values in e.outputs.items()}
-        every = [("input", *item) for item in e.inputs.items()] + [(masked, *item) for item in outputs.items()]
+        at = e.measured_points
+        measured = "output" if at.all() else f"output, at {np.sum(at)} points"
+        outputs = {channel: values[at] for channel, values in e.outputs.items()}
+        every = [("input", *item) for item in e.inputs.items()] + [(measured, *item) for item in outputs.items()]
         rows += [
             {
                 "Channel": code(channel),

@@ -16,7 +16,7 @@ from bayesperiodic._expressions import parse_all
 from bayesperiodic._io import Result
 from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.likelihood.input_noise import InputErrors
-from bayesperiodic.likelihood.noise import SCALE
+from bayesperiodic.likelihood.section_points import SCALE
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 from bayesperiodic.priors.joint import MultivariateNormal
 from bayesperiodic.problem.description import Description

@@ -14,7 +14,8 @@ from bayesperiodic._io import Result
 from bayesperiodic._linalg import covariance_cholesky, in_one_thread
 from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.likelihood.noise import SCALE, VARIANCE
+from bayesperiodic.likelihood.noise import VARIANCE
+from bayesperiodic.likelihood.section_points import SCALE
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.priors.joint import FromScipy, as_prior, as_written
 from bayesperiodic.priors.single import LOG_ROOT_TWO_PI, Uniform

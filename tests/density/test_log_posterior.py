@@ -10,15 +10,21 @@ from scipy.integrate import quad
 import bayesperiodic as bp
 from bayesperiodic import noise
 from bayesperiodic.density.log_posterior import SamplingCoordinates, collapsible
-from bayesperiodic.likelihood.noise import KNOWN, POINTS, SPECTRAL
+from bayesperiodic.likelihood.mean_period import MeanPeriod
+from bayesperiodic.likelihood.multipliers import Multipliers
+from bayesperiodic.likelihood.samples import Samples
 from tests.known import LINEAR, SADDLE_NODE, linear_experiment
 
 PRIORS = {"k": bp.LogNormal(800.0, 0.1), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
 
+HARMONIC = {MeanPeriod: [np.array([0, 1, 2, 3, 4, 1, 2, 3, 4])], Samples: [], Multipliers: []}
 
-def description(model, free=("variance[y]",), counts=("variance[y]",), kinds=(SPECTRAL,)):
+
+def description(model, free=("variance[y]",), counts=("variance[y]",), kinds=(MeanPeriod,)):
     likelihood = SimpleNamespace(
-        counts=dict.fromkeys(counts, 9.0), blocks=[SimpleNamespace(kind=k) for k in kinds], shared=[]
+        counts=dict.fromkeys(counts, 9.0),
+        blocks=[kind("run", "y", 9.0, 9, *HARMONIC[kind]) for kind in kinds],
+        shared=[],
     )
     return SimpleNamespace(noise=model, likelihood=likelihood, free_noise=free)
 
@@ -30,14 +36,14 @@ BOTH = ("variance[y]", "lengthscale[y]")
     ("problem", "expected"),
     [
         (description(noise.Independent()), ("variance[y]",)),
-        (description(noise.Independent(prior="flat"), kinds=(POINTS,)), ("variance[y]",)),
+        (description(noise.Independent(prior="flat"), kinds=(Samples,)), ("variance[y]",)),
         (description(noise.Independent(prior=bp.InverseGamma(2.0, 1.0))), ()),
         (description(noise.Independent(), free=("variance[y]", "other")), ("variance[y]",)),
         (description(noise.Independent(), free=()), ()),
         (description(noise.Measured()), ()),
         (description(noise.Circulant()), ("variance[y]",)),
-        (description(noise.Circulant(), kinds=(SPECTRAL, KNOWN)), ("variance[y]",)),
-        (description(noise.Circulant(), kinds=(SPECTRAL, POINTS)), ()),
+        (description(noise.Circulant(), kinds=(MeanPeriod, Multipliers)), ("variance[y]",)),
+        (description(noise.Circulant(), kinds=(MeanPeriod, Samples)), ()),
         (description(noise.Circulant(), free=BOTH), ()),
         (description(noise.Circulant(prior="flat")), ("variance[y]",)),
         (description(noise.Circulant(prior=bp.InverseGamma(2.0, 1.0))), ()),

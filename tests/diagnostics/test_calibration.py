@@ -158,7 +158,7 @@ def test_failures_are_counted_by_kind():
          r"must have proper priors, got the Jeffreys prior 1/v of 'variance\[force\]'"),
         (lambda: bp.Problem(LINEAR, [run()], priors=PRIORS, noise=FLAT), "the flat prior"),
         (lambda: bp.Problem(LINEAR, [run()], priors=PRIORS, noise="circulant"), "got 'circulant'"),
-        (lambda: linear().with_experiments([masked()]), "got .* with a mask"),
+        (lambda: linear().with_experiments([masked()]), "got .* with .* points of a mask"),
         (lambda: bp.Problem(LINEAR, [run()], priors=PRIORS | {"shift": bp.Normal(0.0, 1e-3)}, noise=INVERSE_GAMMA),
          r"got .* with a delay \(shift\)"),
         (lambda: bp.Problem(bp.models.van_der_pol, [cycle_run()], priors={"mu": bp.LogNormal(1.5, 0.3)},

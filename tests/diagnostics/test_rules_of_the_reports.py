@@ -11,7 +11,9 @@ from scipy.fft import dct
 import bayesperiodic as bp
 from bayesperiodic.diagnostics import adequacy, identifiability
 from bayesperiodic.diagnostics.adequacy import Unexplained
-from bayesperiodic.likelihood.noise import CORRELATED, POINTS, SPECTRAL, Block
+from bayesperiodic.likelihood.mean_period import MeanPeriod
+from bayesperiodic.likelihood.samples import Samples
+from bayesperiodic.likelihood.section_points import SectionPoints
 
 ROW = {
     "p_negative": np.nan, "p_negative_mcse": np.nan, "other_values": "", "profile": "", "collinearity": 1.0,
@@ -224,17 +226,17 @@ def test_a_noise_model_is_in_question_unless_the_noise_was_measured():
 
 
 def block(kind, size, count, harmonic=()):
-    return Block("run", "y", kind, count, size, np.array(harmonic, dtype=int), np.zeros(0), 16, 99.0, np.nan)
+    return kind("run", "y", count, size, np.array(harmonic, dtype=int), np.zeros(0), 16, 99.0, np.nan)
 
 
 def test_components_of_the_lowest_harmonics_are_used():
     values = np.arange(14.0).reshape(2, 7)
-    spectral = block(SPECTRAL, 7, 4.6, [0, 1, 2, 3, 1, 2, 3])
+    spectral = block(MeanPeriod, 7, 4.6, [0, 1, 2, 3, 1, 2, 3])
     part, harmonic = adequacy.used(spectral, values)
     assert harmonic.tolist() == [0, 1, 2, 1, 2] and part.tolist() == values[:, [0, 1, 2, 4, 5]].tolist()
-    points, harmonic = adequacy.used(block(POINTS, 7, 5.4), values)
+    points, harmonic = adequacy.used(block(Samples, 7, 5.4), values)
     assert points == pytest.approx(dct(values, norm="ortho")[:, :5]) and harmonic.tolist() == [0, 1, 1, 2, 2]
-    same, harmonic = adequacy.used(block(CORRELATED, 7, 3.0), values)
+    same, harmonic = adequacy.used(block(SectionPoints, 7, 3.0), values)
     assert same.tolist() == values.tolist() and harmonic.tolist() == [0, 1, 1, 2, 2, 3, 3]
 
 
@@ -243,16 +245,16 @@ def test_unequal_variances_reduce_the_degrees_of_freedom():
     given = {"outputs": {"y": np.zeros(8)}, "samples": 8, "cycles": 5, "harmonics": {"y": 2}}
     e = bp.Experiment("run", 1.0, amplitude_variance={"y": variance}, **given)
     each = np.array([1.0, 2.0, 2.0, 0.5, 0.5])
-    assert adequacy._evenness(e, block(SPECTRAL, 5, 5.0)) == pytest.approx(each.sum() ** 2 / (5 * np.sum(each**2)))
-    assert adequacy._evenness(bp.Experiment("run", 1.0, **given), block(SPECTRAL, 5, 5.0)) == 1.0
+    assert adequacy._evenness(e, block(MeanPeriod, 5, 5.0)) == pytest.approx(each.sum() ** 2 / (5 * np.sum(each**2)))
+    assert adequacy._evenness(bp.Experiment("run", 1.0, **given), block(MeanPeriod, 5, 5.0)) == 1.0
     freedom = {"y": np.array([4.0, 8.0, 9.0])}
     e = bp.Experiment("run", 1.0, amplitude_variance={"y": variance}, amplitude_freedom=freedom, **given)
-    found = adequacy.measured_spectrum(e, block(SPECTRAL, 5, 5.0))
+    found = adequacy.measured_spectrum(e, block(MeanPeriod, 5, 5.0))
     assert found[0] == pytest.approx([5.0, 10.0, 2.5]) and found[1].tolist() == [4.0, 8.0, 9.0]
-    assert adequacy.measured_spectrum(e, block(SPECTRAL, 7, 5.0)) is None
-    assert adequacy.measured_spectrum(e, block(POINTS, 5, 5.0)) is None
+    assert adequacy.measured_spectrum(e, block(MeanPeriod, 7, 5.0)) is None
+    assert adequacy.measured_spectrum(e, block(Samples, 5, 5.0)) is None
     zero = bp.Experiment("run", 1.0, amplitude_variance={"y": variance * [0, 1, 1]}, amplitude_freedom=freedom, **given)
-    assert adequacy.measured_spectrum(zero, block(SPECTRAL, 5, 5.0)) is None
+    assert adequacy.measured_spectrum(zero, block(MeanPeriod, 5, 5.0)) is None
 
 
 @pytest.mark.parametrize("own", [1.3, -0.4])
@@ -265,10 +267,10 @@ def test_p_of_the_amplitude_is_that_of_a_prediction_by_students_t(own):
     replicates = np.concatenate([replicates, np.full((1, 8), np.nan)])
     problem = SimpleNamespace(experiments=[e])
     score = (1.0 + 0.1 * own - sizes.mean()) / (sizes.std(ddof=1) * np.sqrt(1.25))
-    found = adequacy._amplitude(problem, block(SPECTRAL, 5, 5.0), {("run", "y"): replicates})
+    found = adequacy._amplitude(problem, block(MeanPeriod, 5, 5.0), {("run", "y"): replicates})
     assert found == pytest.approx(2.0 * stats.t.sf(abs(score), 3))
-    assert np.isnan(adequacy._amplitude(problem, block(SPECTRAL, 5, 5.0), {}))
-    assert np.isnan(adequacy._amplitude(problem, block(SPECTRAL, 5, 5.0), {("run", "y"): replicates[3:]}))
+    assert np.isnan(adequacy._amplitude(problem, block(MeanPeriod, 5, 5.0), {}))
+    assert np.isnan(adequacy._amplitude(problem, block(MeanPeriod, 5, 5.0), {("run", "y"): replicates[3:]}))
 
 
 def test_p_of_the_harmonic_content_is_that_of_f_tests_by_bonferroni():

@@ -15,12 +15,12 @@ from bayesperiodic.estimation.gauss_newton import End, _step, inverse_hessian
 from bayesperiodic.estimation.laplace import JointLaplace, joint_laplace
 from bayesperiodic.estimation.modes import Mode, images, notable
 from bayesperiodic.likelihood.input_noise import MEASURED, directions
-from bayesperiodic.likelihood.noise import SPECTRAL, Block
+from bayesperiodic.likelihood.mean_period import MeanPeriod
 from tests.known import LINEAR, formula_model, linear_experiment
 
 HIGHEST = 9
 HARMONIC = np.array([0, *np.repeat(np.arange(1, HIGHEST + 1), 2)])
-BLOCK = Block("run", "y", SPECTRAL, 15.2, 19, HARMONIC, np.zeros(0), 32, 200.0, np.nan)
+BLOCK = MeanPeriod("run", "y", 15.2, 19, HARMONIC, np.zeros(0), 32, 200.0, np.nan)
 
 
 def test_a_variance_exceeds_its_estimate_by_the_mean_of_the_inverse_chi_square():

@@ -12,7 +12,8 @@ from bayesperiodic.estimation import check, map_estimate, profile, result
 from bayesperiodic.estimation.check import of_periodogram
 from bayesperiodic.estimation.modes import Mode
 from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit
-from bayesperiodic.likelihood.noise import KNOWN, SPECTRAL
+from bayesperiodic.likelihood.mean_period import MeanPeriod
+from bayesperiodic.likelihood.multipliers import Multipliers
 
 
 def fitted(**changes):
@@ -139,9 +140,9 @@ def test_outcome_of_a_failed_start_has_no_values():
 
 def test_root_mean_square_is_pooled_over_the_measured_points():
     experiments = [
-        SimpleNamespace(name="one", outputs={"y": 0}, mask=None),
-        SimpleNamespace(name="two", outputs={"y": 0}, mask=np.array([True, False])),
-        SimpleNamespace(name="three", outputs={}, mask=None),
+        SimpleNamespace(name="one", outputs={"y": 0}, measured_points=np.ones(3, dtype=bool)),
+        SimpleNamespace(name="two", outputs={"y": 0}, measured_points=np.array([True, False])),
+        SimpleNamespace(name="three", outputs={}),
     ]
     signals = {"one": {"y": np.array([1.0, 2.0, 3.0])}, "two": {"y": np.array([4.0, 50.0])}}
     found = map_estimate._pooled(SimpleNamespace(experiments=experiments), "y", signals)
@@ -158,14 +159,12 @@ def test_whiteness_is_the_distance_of_the_cumulative_periodogram():
 
 
 def test_noise_is_split_by_channel_and_whiteness_is_corrected_for_the_experiments():
-    def block(channel, measured, kind=SPECTRAL):
-        harmonic = np.array([0, 1, 1, 2, 2, 3, 3])
-        return SimpleNamespace(
-            channel=channel, kind=kind, weight=0.8, count=0.8 * 7, measured=measured, harmonic=harmonic
-        )
+    def block(channel, measured, kind=MeanPeriod):
+        harmonic = [np.array([0, 1, 1, 2, 2, 3, 3])] if kind is MeanPeriod else []
+        return kind("run", channel, 0.8 * 7, 7, *harmonic, measured=measured)
 
     generator = np.random.default_rng(0)
-    blocks = [block("y", 0.1), block("y", 0.3), block("z", 50.0), block("w", 1.0, KNOWN)]
+    blocks = [block("y", 0.1), block("y", 0.3), block("z", 50.0), block("w", 1.0, Multipliers)]
     residuals = list(generator.standard_normal((4, 7)))
     likelihood = SimpleNamespace(blocks=blocks, whitened=lambda vectors, noise: vectors)
     given = SimpleNamespace(channels=("y", "z", "w"), likelihood=likelihood)

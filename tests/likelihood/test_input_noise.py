@@ -14,18 +14,20 @@ import bayesperiodic as bp
 from bayesperiodic import _fourier
 from bayesperiodic.diagnostics import calibration
 from bayesperiodic.diagnostics.adequacy import misfit
+from bayesperiodic.likelihood.block import Block
 from bayesperiodic.likelihood.input_noise import pooled, same
 from bayesperiodic.likelihood.likelihood import Likelihood
-from bayesperiodic.likelihood.noise import KNOWN, SPECTRAL, Block
+from bayesperiodic.likelihood.mean_period import MeanPeriod
+from bayesperiodic.likelihood.multipliers import Multipliers
 from tests.known import formula_model, grid
 
 QUIET = {"progress": False}
 HARMONIC = np.array([0, 1, 2, 3, 1, 2, 3])
 
 
-def block(channel: str, kind: str = SPECTRAL, weight: float = 1.0, measured: float = 0.02) -> Block:
-    size = HARMONIC.size if kind == SPECTRAL else 2
-    return Block("run", channel, kind, weight * size, size, HARMONIC, np.empty(0), 16, 4.0 * size, measured)
+def block(channel: str, kind: type[Block] = MeanPeriod, weight: float = 1.0, measured: float = 0.02) -> Block:
+    size = HARMONIC.size if kind is MeanPeriod else 2
+    return kind("run", channel, weight * size, size, HARMONIC, np.empty(0), 16, 4.0 * size, measured)
 
 
 NOISES = {
@@ -35,7 +37,7 @@ NOISES = {
     "flat": bp.noise.Independent(prior="flat"),
     "proper": bp.noise.Independent(prior=bp.InverseGamma(3, 2)),
 }
-BLOCKS = [block("x"), block("y"), block("multipliers", KNOWN)]
+BLOCKS = [block("x"), block("y"), block("multipliers", Multipliers)]
 
 
 @pytest.fixture(params=NOISES)
@@ -50,11 +52,11 @@ def case(request: pytest.FixtureRequest) -> tuple[Likelihood, list[np.ndarray], 
 
 def dense(likelihood: Likelihood, values: np.ndarray, loadings: np.ndarray) -> np.ndarray:
     """Return the covariance of all components."""
-    plain = [np.ones(2) if b.kind == KNOWN else None for b in BLOCKS]
+    plain = [np.ones(2) if not b.counted else None for b in BLOCKS]
     for i, b in enumerate(BLOCKS):
         if plain[i] is None:
             own = [likelihood.names.index(n) for n in likelihood.model.parameter_names(b)]
-            plain[i] = likelihood.model.spectrum(b, values[own])[0]
+            plain[i] = np.broadcast_to(likelihood.model.spectrum(b, values[own])[0], b.size)
     return np.diag(np.concatenate(plain)) + loadings @ loadings.T
 
 

@@ -5,21 +5,23 @@ import pytest
 
 from bayesperiodic import noise
 from bayesperiodic.likelihood.likelihood import Likelihood, Residuals
-from bayesperiodic.likelihood.noise import CORRELATED, POINTS, SPECTRAL, Block
+from bayesperiodic.likelihood.mean_period import MeanPeriod
+from bayesperiodic.likelihood.samples import Samples
+from bayesperiodic.likelihood.section_points import SectionPoints
 
 
-def block(kind=SPECTRAL, size=9, **changes):
+def block(kind=MeanPeriod, size=9, **changes):
     half = np.arange(1, (size + 1) // 2)
     given = {
-        "experiment": "run", "channel": "y", "kind": kind, "count": float(size), "size": size,
-        "harmonic": np.array([0, *half, *half]) if kind == SPECTRAL else np.empty(0),
-        "position": np.array([0, 1, 4, 5, 9, 13, 14, 17, 19]) / 20 if kind == POINTS else np.empty(0),
+        "experiment": "run", "channel": "y", "count": float(size), "size": size,
+        "harmonic": np.array([0, *half, *half]) if kind is MeanPeriod else np.empty(0),
+        "position": np.array([0, 1, 4, 5, 9, 13, 14, 17, 19]) / 20 if kind is Samples else np.empty(0),
         "points": 20, "averaged": 10.0 * size, "measured": 0.7,
     }  # fmt: skip
-    return Block(**(given | changes))
+    return kind(**(given | changes))
 
 
-@pytest.mark.parametrize(("kind", "size"), [(SPECTRAL, 9), (POINTS, 9)])
+@pytest.mark.parametrize(("kind", "size"), [(MeanPeriod, 9), (Samples, 9)])
 def test_variance_of_one_value_of_white_noise_is_that_of_a_mean_of_ten_samples(kind, size):
     """The values of nine components or points are means of ninety samples."""
     model = Likelihood(noise.Independent(), [block(kind, size)], {})
@@ -29,7 +31,7 @@ def test_variance_of_one_value_of_white_noise_is_that_of_a_mean_of_ten_samples(k
 
 
 def test_whole_sections_have_no_variance_of_their_own():
-    blocks = [block(CORRELATED, 4, channel="scale"), block()]
+    blocks = [block(SectionPoints, 4, channel="scale"), block()]
     model = Likelihood(noise.Independent(), blocks, {})
     assert list(model.value_variances(np.array([2.0, 3.0]))) == [("run", "y")]
 
@@ -56,9 +58,7 @@ def test_moments_are_weighted_squares_in_units_of_the_spectrum():
     r = [np.arange(1.0, 10.0), np.full(9, 2.0)]
     blocks = [block(count=4.5), block(experiment="two")]
     model = Likelihood(noise.Independent(), blocks, {})
-    assert model.moments(r)["variance[y]"] == pytest.approx(
-        (0.5 * np.sum(r[0] ** 2) + 36.0) / model.model.gain(blocks[0])
-    )
+    assert model.moments(r)["variance[y]"] == pytest.approx((0.5 * np.sum(r[0] ** 2) + 36.0) / (9 / 90.0))
     circulant = noise.Circulant(kernel="exponential")
     shaped = Likelihood(circulant, blocks, {"lengthscale[y]": 0.1})
     spectrum = circulant.spectrum(blocks[0], np.array([1.0, 0.1]))[0]

@@ -9,9 +9,13 @@ from scipy import integrate, linalg, optimize, stats
 import bayesperiodic as bp
 from bayesperiodic import noise
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, climb
+from bayesperiodic.likelihood.block import Block
 from bayesperiodic.likelihood.likelihood import Likelihood
-from bayesperiodic.likelihood.noise import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
+from bayesperiodic.likelihood.mean_period import MeanPeriod
+from bayesperiodic.likelihood.multipliers import Multipliers
 from bayesperiodic.likelihood.noise_estimate import estimate_noise
+from bayesperiodic.likelihood.samples import Samples
+from bayesperiodic.likelihood.section_points import SectionPoints
 from tests.known import LINEAR, difference, formula_model, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])
@@ -57,22 +61,21 @@ def log_likelihood(model, experiment: bp.Experiment, **values: float) -> float:
     return float(problem.log_likelihood(POINT, {f"{kind}[force]": value for kind, value in values.items()}))
 
 
-def block(kind: str = SPECTRAL, size: int = 9, count: float | None = None, **changes) -> Block:
+def block(kind: type[Block] = MeanPeriod, size: int = 9, count: float | None = None, **changes) -> Block:
     half = np.arange(1, (size + 1) // 2)
     positions = np.array([0, 1, 4, 5, 9, 13, 14, 17, 19])[:size] / 20
     given = {
         "experiment": "run",
         "channel": "force",
-        "kind": kind,
         "count": float(size) if count is None else count,
         "size": size,
-        "harmonic": np.array([0, *half, *half]) if kind == SPECTRAL else np.empty(0),
-        "position": positions if kind == POINTS else np.empty(0),
+        "harmonic": np.array([0, *half, *half]) if kind is MeanPeriod else np.empty(0),
+        "position": positions if kind is Samples else np.empty(0),
         "points": max(20, size),
         "averaged": float(size),
         "measured": 0.7,
     }
-    return Block(**(given | changes))
+    return kind(**(given | changes))
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -316,10 +319,10 @@ BLOCKS = [
     block(),
     block(count=6.5, experiment="other", measured=0.3, averaged=50.0),
     block(experiment="longer", averaged=200.0),
-    block(POINTS, size=7),
-    block(POINTS, size=5, count=3.5, channel="rate"),
-    block(CORRELATED, size=4, channel="scale", measured=np.nan),
-    block(KNOWN, size=2, count=0.0, channel="multipliers", measured=np.nan),
+    block(Samples, size=7),
+    block(Samples, size=5, count=3.5, channel="rate"),
+    block(SectionPoints, size=4, channel="scale", measured=np.nan),
+    block(Multipliers, size=2, count=0.0, channel="multipliers", measured=np.nan),
 ]
 
 
@@ -505,7 +508,7 @@ def test_the_model_error_is_found_beside_the_measurement_noise(measured):
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("points", [False, True])
 def test_noise_estimate_maximises_the_density_of_the_spectrum(kernel, points):
-    blocks = [block(POINTS)] if points else spectral_residuals()[0]
+    blocks = [block(Samples)] if points else spectral_residuals()[0]
     generator = np.random.default_rng(9)
     residuals = [np.cumsum(generator.standard_normal(b.size)) for b in blocks]
     likelihood = Likelihood(noise.Circulant(kernel=kernel), blocks, {})

@@ -1,0 +1,74 @@
+"""Measured Floquet multipliers, compared as log|μ|."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.likelihood.block import Linear, Signals, common, measured_channels, times
+from bayesperiodic.likelihood.section_points import values_at, whitening
+from bayesperiodic.models.model import Model
+
+MULTIPLIERS = "multipliers"
+
+
+@dataclass(frozen=True, eq=False)
+class Multipliers(Linear):
+    """Logarithms of multipliers in units of their standard deviations, given the errors of the section points."""
+
+    at: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))  # (points,), on the grid
+    slopes: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))  # (size, values), regression on the values
+    whitening: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))  # (size, size)
+
+    @classmethod
+    def of(cls, experiment: Experiment, model: Model) -> "list[Multipliers]":
+        """Return one block of experiments with multipliers."""
+        e, count = experiment, experiment.measured_multipliers.size
+        if not count:
+            return []
+        at = np.empty(0, dtype=int)
+        slopes = np.zeros((count, 0))
+        if e.multiplier_sd is not None:
+            root = np.diag(1.0 / e.multiplier_sd)
+        else:
+            assert e.covariance is not None
+            at = np.flatnonzero(e.measured_points)
+            size = at.size * len(measured_channels(e, model))
+            cross = e.covariance[size:, :size]
+            slopes = np.linalg.solve(e.covariance[:size, :size], cross.T).T
+            root = whitening(e.covariance[size:, size:] - slopes @ cross.T)
+        return [cls(count=0.0, size=count, at=at, slopes=slopes, whitening=root, **common(e, MULTIPLIERS))]
+
+    @property
+    def multipliers(self) -> int:  # type: ignore[override]
+        """Floquet multipliers that are compared."""
+        return self.size
+
+    @property
+    def description(self) -> str:
+        """What is compared, in words."""
+        return f"{self.size} Floquet multipliers"
+
+    @property
+    def log_scale(self) -> float:
+        """The logarithm of the determinant of what whitens the logarithms."""
+        return float(np.log(np.diag(self.whitening)).sum())
+
+    def components(self, moved: Signals) -> np.ndarray:
+        """Return the whitened logarithms, less what goes with the values."""
+        logarithms = moved.log_multipliers
+        if self.at.size:
+            logarithms = logarithms - times(self.slopes, values_at(moved.values, self.at))
+        return times(self.whitening, logarithms)
+
+    def errors(self, values: np.ndarray) -> np.ndarray:
+        """Return what errors of the measured outputs change."""
+        return self.components(Signals(values, np.zeros((*values.shape[:-2], self.size)), np.empty(0)))
+
+    def add_vjp(self, predicted: Any, weights: np.ndarray, total: Signals) -> None:
+        """Add the transposed whitening and regression."""
+        joint = weights @ self.whitening
+        total.log_multipliers[...] += joint
+        if self.at.size:
+            total.values[self.at] -= (joint @ self.slopes).reshape(self.at.size, -1)

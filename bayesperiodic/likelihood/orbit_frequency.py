@@ -1,0 +1,45 @@
+"""The measured frequency of the orbit of an autonomous model."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.likelihood.block import Linear, Signals, common
+from bayesperiodic.models.model import Model
+
+FREQUENCY = "frequency"
+
+
+@dataclass(frozen=True, eq=False)
+class OrbitFrequency(Linear):
+    """Frequency in units of its standard error."""
+
+    standard_error: float = 1.0  # [Hz]
+
+    @classmethod
+    def of(cls, experiment: Experiment, model: Model) -> "list[OrbitFrequency]":
+        """Return one block of every experiment of an autonomous model."""
+        if not model.autonomous:
+            return []
+        return [cls(count=0.0, size=1, standard_error=experiment.frequency_se, **common(experiment, FREQUENCY))]
+
+    @property
+    def description(self) -> str:
+        """What is compared, in words."""
+        return FREQUENCY
+
+    @property
+    def log_scale(self) -> float:
+        """Minus the logarithm of the standard error."""
+        return -math.log(self.standard_error)
+
+    def components(self, moved: Signals) -> np.ndarray:
+        """Return the frequency over its standard error."""
+        return np.asarray(moved.frequency)[..., None] / self.standard_error
+
+    def add_vjp(self, predicted: Any, weights: np.ndarray, total: Signals) -> None:
+        """Add the weight over the standard error."""
+        total.frequency[...] += weights[0] / self.standard_error
