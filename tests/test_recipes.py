@@ -83,3 +83,4 @@ def test_recipe_is_complete_and_works(title, failures):
 def test_there_is_a_recipe_for_every_kind():
     kinds = "noise model|scheme|prior|kind of data|reader|result|verdict|element|study"
     assert [title for title in RECIPES if re.fullmatch(f"An? ({kinds})", title)] == [*RECIPES]
+    assert len(RECIPES) == len(kinds.split("|"))
