@@ -59,7 +59,7 @@ def draw_histograms(
     marks = [truths.get(name) for name in names]
     several = len(names) > 1
     corner(draws, truths=marks if truths and several else None, fig=figure, **settings)
-    if not several and marks[0] is not None:  # corner 2.2.3 cannot mark the truth of a single quantity
+    if not several and marks[0] is not None:  # corner 2.3.0 cannot mark the truth of a single quantity
         figure.axes[0].axvline(marks[0], color=settings["truth_color"])
     grid = np.reshape(np.array(figure.axes, dtype=object), (len(names), len(names)))
     for k, value in enumerate(marks):
