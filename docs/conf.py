@@ -18,8 +18,8 @@ HERE = Path(__file__).parent
 for notebook in (HERE.parent / "studies" / "notebooks").glob("*.ipynb"):
     shutil.copy2(notebook, HERE / "tutorials" / notebook.name)
 shutil.copytree(HERE.parent / "studies" / "notebooks" / "sketches", HERE / "tutorials" / "sketches", dirs_exist_ok=True)
-# A public name whose module is elsewhere in the package.
-sys.modules["bayesperiodic.noise"] = bp.noise
+# Public names whose modules are elsewhere in the package.
+sys.modules |= {"bayesperiodic.noise": bp.noise, "bayesperiodic.elements": bp.elements}
 
 project, author = "bayesperiodic", "the bayesperiodic authors"
 release = importlib.metadata.version("bayesperiodic")

@@ -100,7 +100,7 @@ def map_estimate(
         Of these draws.
     checks : bool
         Make the checks of `check`, which take about as long as the iteration from a good start; without them
-        `MapEstimate.checks` is None, for repeated fits.
+        ``fit.checks`` is None, for repeated fits.
     progress : bool
         Show the iterations, with the objective and the step in standard deviations.
 

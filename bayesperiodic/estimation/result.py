@@ -167,7 +167,7 @@ def _check(name: str) -> Any:
             )
         return getattr(self.checks, name)
 
-    return property(read, doc=f"`FitCheck.{name}` of `checks`; a ValueError without them.")
+    return property(read, doc=f"`FitCheck.{name}` of ``checks``; a ValueError without them.")
 
 
 @dataclass(frozen=True)
