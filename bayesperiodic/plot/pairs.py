@@ -102,8 +102,8 @@ def corner(
         Without axes, or with style="corner" one of the same quantities, which is drawn over.
     style : {"regions", "corner"}
     **options
-        Of ``corner.corner``, for style="corner" only: bins, color, contour_kwargs, contourf_kwargs, data_kwargs, fig (the
-        same as `figure`), fill_contours, hist_bin_factor, hist_kwargs, levels, no_fill_contours, pcolor_kwargs,
+        Of ``corner.corner``, for style="corner" only: bins, color, contour_kwargs, contourf_kwargs, data_kwargs, fig
+        (the same as `figure`), fill_contours, hist_bin_factor, hist_kwargs, levels, no_fill_contours, pcolor_kwargs,
         plot_contours, plot_datapoints, plot_density, range, scale_hist, smooth, smooth1d, title_fmt, title_kwargs,
         title_quantiles, titles, truth_color. The label in `hist_kwargs` is that of the legend.
 
