@@ -28,8 +28,8 @@ from bayesperiodic._compile.cache import internals_expected, load
 GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
 FUNCTIONS = ("residual", "residual_jacobian", "outputs", "derivatives", "transitions")
 _ROWS, _VECTOR = types.float64[:, ::1], types.float64[::1]
-GRID = types.void(_ROWS, _ROWS, _VECTOR, _VECTOR, types.float64, _ROWS)
-GRID_FUNCTION = types.FunctionType(GRID)
+GRID_SIGNATURE_TYPE = types.void(_ROWS, _ROWS, _VECTOR, _VECTOR, types.float64, _ROWS)
+GRID_FUNCTION = types.FunctionType(GRID_SIGNATURE_TYPE)
 CALL = f"""
 from numba import njit
 from bayesperiodic._compile.code_generation import grid_function_at
@@ -188,7 +188,7 @@ class SymbolicModel:
         """
         moving = (*self.states, *self.inputs, *self.parameters, self.frequency)
         change = {symbol: sp.Symbol(f"c_{symbol.name}", real=True) for symbol in moving}
-        q, u, theta = ((*own, *map(change.get, own)) for own in (self.states, self.inputs, self.parameters))
+        q, u, theta = ((*symbols, *map(change.get, symbols)) for symbols in (self.states, self.inputs, self.parameters))
         arguments = self._arguments(q, u, (*theta, change[self.frequency]))
         changes = [
             sum((sp.diff(e, x) * dx for x, dx in change.items() if x in e.free_symbols), sp.S.Zero)
@@ -233,10 +233,13 @@ def grid_functions(source: str, names: Sequence[str]) -> list[GridFunction]:
 def compiled(source: str) -> ModuleType:
     """Return the addresses of the functions of a generated text, by their names, compiled or from the cache."""
     if not internals_expected():
-        return load(source, run=partial(plain.compile_functions, signature=GRID))
+        return load(source, run=partial(plain.compile_functions, signature=GRID_SIGNATURE_TYPE))
     from bayesperiodic._compile import machine_code
 
-    return load(f"# {machine_code.digest()}\n{source}", run=partial(machine_code.compile_functions, signature=GRID))
+    return load(
+        f"# {machine_code.digest()}\n{source}",
+        run=partial(machine_code.compile_functions, signature=GRID_SIGNATURE_TYPE),
+    )
 
 
 @cache
@@ -268,7 +271,7 @@ def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, 
     return "\n".join([head, *(lines or ["    pass"])]) + "\n"
 
 
-class _Printer(PythonCodePrinter):
+class _PythonPrinter(PythonCodePrinter):
     """SymPy's Python printer, with the functions of `machine_code` for conditions and generalised functions."""
 
     def _print_sign(self, expression: sp.Expr) -> str:
@@ -301,7 +304,7 @@ class _Printer(PythonCodePrinter):
 
 def _code(expression: sp.Expr) -> str:
     try:
-        text = _Printer({"strict": True, "allow_unknown_functions": False}).doprint(expression)
+        text = _PythonPrinter({"strict": True, "allow_unknown_functions": False}).doprint(expression)
     except PrintMethodNotImplementedError:
         text = "# not supported"
     if "#" in text or "\n" in text:

@@ -22,7 +22,7 @@ from numba.core import cgutils
 from numba.core.registry import cpu_target
 
 NO_GATHER, FIRST_LLVM = "+prefer-no-gather", 17  # and the first version of LLVM that has this feature
-NUMBER, TRUTH, INTEGER = ir.DoubleType(), ir.IntType(1), ir.IntType(64)
+LLVM_NUMBER, LLVM_TRUTH, INTEGER = ir.DoubleType(), ir.IntType(1), ir.IntType(64)
 MOST_FACTORS = 64
 INTRINSICS = {"sin", "cos", "sqrt", "log", "log2", "log10", "floor", "ceil", "copysign", "pow", "fabs"}
 FROM_C = {"tan", "asin", "acos", "sinh", "cosh", "asinh", "acosh", "atanh", "atan2", "hypot", "expm1", "log1p"}
@@ -50,7 +50,7 @@ def _arithmetic(instruction: str) -> tuple[Operation, Operation]:
 def _comparison(relation: str) -> Operation:
     def operation(self: "Value", other: Any) -> "Value":
         builder, compare = self.builder, self.builder.fcmp_ordered
-        if self.value.type == TRUTH:
+        if self.value.type == LLVM_TRUTH:
             compare = builder.icmp_unsigned
         elif relation == "!=":
             compare = builder.fcmp_unordered
@@ -67,9 +67,9 @@ class Value:
 
     def of(self, number: Any) -> ir.Value:
         """Return a number or another value as an operand."""
-        if self.value.type == NUMBER or isinstance(number, Value):
+        if self.value.type == LLVM_NUMBER or isinstance(number, Value):
             return _number(number)
-        return ir.Constant(TRUTH, int(number))
+        return ir.Constant(LLVM_TRUTH, int(number))
 
     __add__, __radd__ = _arithmetic("fadd")
     __sub__, __rsub__ = _arithmetic("fsub")
@@ -151,9 +151,9 @@ def called(name: str, *arguments: Any) -> Any:
         return getattr(math, name)(*arguments)
     if name in APPROXIMATED:
         return APPROXIMATED[name](*arguments)
-    name, kind = RENAMED.get(name, name), ir.FunctionType(NUMBER, [NUMBER] * len(arguments))
+    name, kind = RENAMED.get(name, name), ir.FunctionType(LLVM_NUMBER, [LLVM_NUMBER] * len(arguments))
     if name in INTRINSICS:
-        function = value.builder.module.declare_intrinsic(f"llvm.{name}", [NUMBER], kind)
+        function = value.builder.module.declare_intrinsic(f"llvm.{name}", [LLVM_NUMBER], kind)
     elif name in FROM_C:
         function = cgutils.get_or_insert_function(value.builder.module, kind, name)
     else:
@@ -170,7 +170,7 @@ def _power_of_two(exponent: Value) -> Value:
     """Return 2**exponent for a whole number from −1022 to 1023, by its bits."""
     builder = exponent.builder
     whole = builder.add(builder.fptosi(exponent.value, INTEGER), ir.Constant(INTEGER, 1023))
-    return Value(builder, builder.bitcast(builder.shl(whole, ir.Constant(INTEGER, 52)), NUMBER))
+    return Value(builder, builder.bitcast(builder.shl(whole, ir.Constant(INTEGER, 52)), LLVM_NUMBER))
 
 
 def _exp(x: Value) -> Value:
@@ -258,7 +258,7 @@ class _Sums:
 
 
 def _number(value: Any) -> ir.Value:
-    return value.value if isinstance(value, Value) else ir.Constant(NUMBER, float(value))
+    return value.value if isinstance(value, Value) else ir.Constant(LLVM_NUMBER, float(value))
 
 
 def compile_functions(

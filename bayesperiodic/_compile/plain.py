@@ -11,27 +11,27 @@ from typing import Any
 
 import numba
 
-OPTIONS = "cache=CACHE, error_model='numpy'"
+NJIT_OPTIONS = "cache=CACHE, error_model='numpy'"
 # Functions of the generated texts, as in `machine_code`.
-HEAD = f"""
+SOURCE_PREAMBLE = f"""
 import math
 from numba import cfunc, njit
 
-@njit({OPTIONS})
+@njit({NJIT_OPTIONS})
 def where(condition, one, other):
     return float(one) if condition else float(other)
 
-@njit({OPTIONS})
+@njit({NJIT_OPTIONS})
 def sign(x):
     return where(x > 0.0, 1.0, 0.0) - where(x < 0.0, 1.0, 0.0)
 
-@njit({OPTIONS})
+@njit({NJIT_OPTIONS})
 def step(x):
     return 0.5 * (where(x > 0.0, 1.0, 0.0) + where(x >= 0.0, 1.0, 0.0))
 """
 # The loop over the grid of a function of one point; the sums follow the last row.
 LOOP = f"""
-@cfunc(SIGNATURE, {OPTIONS})
+@cfunc(SIGNATURE, {NJIT_OPTIONS})
 def {{name}}(states, inputs, parameters, tau, frequency, out):
     flat = out.reshape(out.size)
     sums = flat[states.shape[0] * {{rows}} :]
@@ -41,19 +41,19 @@ def {{name}}(states, inputs, parameters, tau, frequency, out):
         row = flat[point * {{rows}} : (point + 1) * {{rows}}]
         {{name}}_at(states[point], inputs[point], parameters, tau[point], frequency, row, sums)
 """
-FUNCTION = re.compile(r"^def (\w+)\((.*), columns=\((\d+), (\d+), (\d+), (\d+)\)\):$", re.MULTILINE)
+FUNCTION_HEADER = re.compile(r"^def (\w+)\((.*), columns=\((\d+), (\d+), (\d+), (\d+)\)\):$", re.MULTILINE)
 
 
 def compile_functions(
     source: str, _: Mapping[str, Any], path: Path, module: ModuleType, *, signature: Any, cache: bool
 ) -> None:
     """Define the addresses of a text's functions in a module, as `machine_code.compile_functions` does."""
-    heads = FUNCTION.findall(source)
-    points = FUNCTION.sub(rf"@njit({OPTIONS})\ndef \1_at(\2):", source)
+    heads = FUNCTION_HEADER.findall(source)
+    points = FUNCTION_HEADER.sub(rf"@njit({NJIT_OPTIONS})\ndef \1_at(\2):", source)
     points = re.sub(r"^( +sums\[\d+\]) = ", r"\1 += ", points, flags=re.MULTILINE)
     loops = "".join(LOOP.format(name=name, rows=rows, sums=sums) for name, _, _, _, rows, sums in heads)
     module.__dict__.update(CACHE=cache, SIGNATURE=signature)
-    exec(compile(HEAD + points + loops, str(path), "exec"), module.__dict__)
+    exec(compile(SOURCE_PREAMBLE + points + loops, str(path), "exec"), module.__dict__)
     module.__dict__["library"] = [module.__dict__[name] for name, *_ in heads]
     for function, (name, *_) in zip(module.__dict__["library"], heads, strict=True):
         module.__dict__[name] = function.address

@@ -348,16 +348,16 @@ class Experiment(Result):
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
-        found = ""
+        text = ""
         if self.period_test is not None:
             row = self.period_test.loc[self.period_test.periods == self.periods].iloc[0]
-            found = f"; response period {self.periods} drive periods, chosen of 1 to {self.period_test.periods.max()}: "
-            found += f"it explains {row.explained:.1%} of the variance"
-            found += f", p = {row.p:.1g} without the lines it adds to its divisors" if self.periods > 1 else ""
+            text = f"; response period {self.periods} drive periods, chosen of 1 to {self.period_test.periods.max()}: "
+            text += f"it explains {row.explained:.1%} of the variance"
+            text += f", p = {row.p:.1g} without the lines it adds to its divisors" if self.periods > 1 else ""
         return (
             f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples per "
             f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
-            f"{found})"
+            f"{text})"
         )
 
 

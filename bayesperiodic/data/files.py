@@ -27,10 +27,10 @@ MISSING = [
 PREAMBLE, SEPARATORS = 1000, (",", ";", "\t")
 
 # Bytes of an array, against files that unpack to more than the memory.
-LARGEST = 2**31
+LARGEST_ARRAY = 2**31
 # Of MAT files, version 5: types of elements and of numbers, classes of arrays, flag of complex arrays, and the bytes in
 # which the name of a variable ends.
-INT32, MATRIX, COMPRESSED, COMPLEX, HEAD = 5, 14, 15, 0x800, 4096
+INT32, MAT_MATRIX, COMPRESSED, COMPLEX, HEADER_BYTES = 5, 14, 15, 0x800, 4096
 STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", INT32: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 NUMERIC = {
     6: "double", 7: "single", 8: "int8", 9: "uint8", 10: "int16", 11: "uint16", 12: "int32", 13: "uint32", 14: "int64",
@@ -42,10 +42,10 @@ Stored = tuple[Iterable[str], Mapping[str, Any]]
 
 LONGEST_UNIT = 100
 # Products, quotients and groups of names with an exponent of one digit; the only number is the 1 of "1/s".
-SUPERSCRIPTS = "¹²³⁰⁴⁵⁶⁷⁸⁹"
+SUPERSCRIPT_DIGITS = "¹²³⁰⁴⁵⁶⁷⁸⁹"
 UNIT_TOKEN = re.compile(
-    rf"(?:[^\W\d{SUPERSCRIPTS}]|[°%])[^\W{SUPERSCRIPTS}]*"
-    rf"(?:\s*(?:\*\*|\^)\s*[+-]?[0-9](?:\.5)?(?![\w.])|⁻?[{SUPERSCRIPTS}](?!\w))?"
+    rf"(?:[^\W\d{SUPERSCRIPT_DIGITS}]|[°%])[^\W{SUPERSCRIPT_DIGITS}]*"
+    rf"(?:\s*(?:\*\*|\^)\s*[+-]?[0-9](?:\.5)?(?![\w.])|⁻?[{SUPERSCRIPT_DIGITS}](?!\w))?"
     r"|1(?![\w.])|[()]|[*/·]|\s+"
 )
 
@@ -280,8 +280,8 @@ def _mat5_columns(file: Path, wanted: list[str]) -> Stored:
     for kind, data in _elements(memoryview(content)[128:], order):
         stream = zlib.decompressobj()
         if compressed := kind == COMPRESSED:
-            data = memoryview(stream.decompress(data, HEAD))[8:]
-        elif kind != MATRIX:
+            data = memoryview(stream.decompress(data, HEADER_BYTES))[8:]
+        elif kind != MAT_MATRIX:
             raise ValueError(f"it contains an element of type {kind}")
         name, *_ = _variable(data, order)
         names.append(name)
@@ -290,9 +290,9 @@ def _mat5_columns(file: Path, wanted: list[str]) -> Stored:
         if name in arrays:
             raise ValueError(f"it has two variables {name!r}")
         if compressed:
-            data = memoryview(bytes(data) + stream.decompress(stream.unconsumed_tail, LARGEST))
+            data = memoryview(bytes(data) + stream.decompress(stream.unconsumed_tail, LARGEST_ARRAY))
             if not stream.eof:
-                raise ValueError(f"its variable {name!r} is cut off or has more than {LARGEST / 1e9:.3g} GB")
+                raise ValueError(f"its variable {name!r} is cut off or has more than {LARGEST_ARRAY / 1e9:.3g} GB")
         arrays[name] = _array(*_variable(data, order), order)
     return names, arrays
 
@@ -340,8 +340,8 @@ MAT = Format("a MAT file of version 5 or 7.3", _mat_columns)
 
 
 def _check_size(name: str, size: int) -> None:
-    if size > LARGEST:
-        raise ValueError(f"its array {name!r} has more than {LARGEST / 1e9:.3g} GB")
+    if size > LARGEST_ARRAY:
+        raise ValueError(f"its array {name!r} has more than {LARGEST_ARRAY / 1e9:.3g} GB")
 
 
 def existing(path: str | Path) -> Path:

@@ -27,18 +27,18 @@ from bayesperiodic.likelihood.observation import Observation, Response
 from bayesperiodic.periodic.equations import CyclicFactors, PeriodicEquations, along
 from bayesperiodic.problem.description import Description
 
-MAX_ITERATIONS = 60
+MOST_ORBIT_STEPS = 60
 LARGEST_STEP = 0.7
 NONLINEAR, SMALLEST_SHARE = 0.5, 1e-3
-ON_ORBIT, SMALL_STEP = 1e-6, 1e-2
+ON_ORBIT, SMALL_TURN = 1e-6, 1e-2
 # Of the orbits that outputs show: harmonics of the forcing, weight of the equations, iterations; turns with θ.
-SEEN, EQUATIONS, ROUNDS, TURNS, FEW_TURNS = 8, 0.03, 5, 100, 5
+SEEN, EQUATIONS, SEEN_ROUNDS, TURNS, FEW_TURNS = 8, 0.03, 5, 100, 5
 # Means of a state that are tried, in standard deviations from the one found.
 MEANS = (1.0, -1.0, 2.0, -2.0)
 
 
 @dataclass(frozen=True)
-class Linear:
+class LinearisedOrbit:
     """One experiment's equations and outputs linearised where neither orbit nor parameters solve them."""
 
     factors: CyclicFactors  # of ∂g/∂z
@@ -106,7 +106,7 @@ def measured_orbits(
     """
     fit = _SimultaneousFit(problem.replace(experiments=[replace(e, guess=near[e.name]) for e in problem.experiments]))
     misfit, before, turns = np.inf, np.inf, 0
-    while turns < most and not before - misfit < SMALL_STEP:
+    while turns < most and not before - misfit < SMALL_TURN:
         fit.guess = {name: fit.measured_orbit(name, theta) for name in fit.guess}
         theta = fit.parameters_along_guesses(theta)
         misfit, before, turns = fit._misfit(theta), misfit, turns + 1
@@ -133,7 +133,7 @@ class _SimultaneousFit:
     def parameters_along_guesses(self, theta: np.ndarray) -> np.ndarray:
         """Return the θ near which the equations hold best along the experiments' guesses, by damped Gauss-Newton."""
         now = self._misfit(theta)
-        for _ in range(MAX_ITERATIONS):
+        for _ in range(MOST_ORBIT_STEPS):
             total, count = 0.0, 0
             hessian, gradient = np.zeros((theta.size, theta.size)), np.zeros(theta.size)
             for name, z in self.guess.items():
@@ -148,7 +148,7 @@ class _SimultaneousFit:
                 break
             weight = self.problem.counted / total
             step, size = self._step(weight * hessian, weight * gradient, theta)
-            if size < SMALL_STEP:
+            if size < SMALL_TURN:
                 break
             share = 1.0
             while share > SMALLEST_SHARE:
@@ -173,11 +173,11 @@ class _SimultaneousFit:
         at, (points, count) = parameters[:-1], z.shape
         phase = 2 * np.pi * np.outer(np.arange(SEEN * equations.grid.periods + 1), np.arange(points) / points)
         waves = np.concatenate([np.cos(phase), np.sin(phase[1:])])[: points - 1]
-        sizes = np.ptp(z, axis=0) + SMALL_STEP * np.abs(z).max()
+        sizes = np.ptp(z, axis=0) + SMALL_TURN * np.abs(z).max()
         basis = np.einsum("hn,st->hsnt", waves, np.diag(np.where(sizes > 0.0, sizes, 1.0)))
         basis = basis.reshape(-1, points, count)
         changes, none = equations.changes(basis), np.zeros(len(basis))
-        for _ in range(ROUNDS):
+        for _ in range(SEEN_ROUNDS):
             d, columns = equations.derivatives(z, at), equations.residual_jacobian(z, at)
             by_q = columns[:, count:].reshape(points, count, -1)
             here = Response(equations.outputs(z, at), np.array(equations.frequency), none[:0], parameters[-1])
@@ -228,7 +228,7 @@ class _SimultaneousFit:
     def iterate(self, theta: np.ndarray) -> InitialEstimate:
         """Return where the Gauss-Newton iteration in orbits and θ leads to from the guesses and a θ."""
         orbits, noise = self.guess, self.likelihood.guess()
-        for _ in range(MAX_ITERATIONS):
+        for _ in range(MOST_ORBIT_STEPS):
             linear = {}
             for name, z in orbits.items():
                 one = self._linearise(name, z, theta)
@@ -239,17 +239,17 @@ class _SimultaneousFit:
             step, size = self._step(*self._information(linear, noise), theta)
             off = {name: _size(one.correction, orbits[name]) for name, one in linear.items()}
             worst = max(off, key=lambda name: off[name])
-            if off[worst] < ON_ORBIT and size < SMALL_STEP:
+            if off[worst] < ON_ORBIT and size < SMALL_TURN:
                 return InitialEstimate(theta, {name: self._states(name, z) for name, z in orbits.items()}, "")
             theta, orbits, blocked = self._moved(linear, orbits, theta, step)
             if blocked:
                 return InitialEstimate(theta, {}, blocked)
         # Where the data leave a direction open, θ moves on along it while the orbits solve the equations.
-        if off[worst] < SMALL_STEP:
+        if off[worst] < SMALL_TURN:
             return InitialEstimate(theta, {name: self._states(name, z) for name, z in orbits.items()}, "")
         return InitialEstimate(theta, {}, worst)
 
-    def _linearise(self, name: str, z: np.ndarray, theta: np.ndarray) -> Linear | None:
+    def _linearise(self, name: str, z: np.ndarray, theta: np.ndarray) -> LinearisedOrbit | None:
         """Return one experiment's equations linearised at an orbit and θ; None where ∂g/∂z is singular."""
         equations, mapped = self.equations[name], self.maps[name]
         parameters, slopes = np.ascontiguousarray(mapped.values(theta[None])[0]), mapped.slopes(theta)
@@ -266,9 +266,11 @@ class _SimultaneousFit:
         here = Response(equations.outputs(z, at) + outputs[-1], frequency, none, parameters[-1])
         directions = Response(outputs[:-1], np.zeros(theta.size), np.zeros((theta.size, 0)), slopes[-1])
         observation = self.observations[name]
-        return Linear(factors, dz[-1], dz[:-1], observation.residuals(here), observation.changes(here, directions))
+        return LinearisedOrbit(
+            factors, dz[-1], dz[:-1], observation.residuals(here), observation.changes(here, directions)
+        )
 
-    def _information(self, linear: dict[str, Linear], noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _information(self, linear: dict[str, LinearisedOrbit], noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the data's part of the Hessian and of the gradient of the log-density by θ."""
         jacobian = [part for one in linear.values() for part in one.jacobian]
         residuals = [r for one in linear.values() for r in one.residuals]
@@ -291,7 +293,7 @@ class _SimultaneousFit:
         return step * min(1.0, LARGEST_STEP / max(longest, LARGEST_STEP)), float(np.sqrt(np.sum(values * along**2)))
 
     def _moved(
-        self, linear: dict[str, Linear], orbits: dict[str, np.ndarray], theta: np.ndarray, step: np.ndarray
+        self, linear: dict[str, LinearisedOrbit], orbits: dict[str, np.ndarray], theta: np.ndarray, step: np.ndarray
     ) -> tuple[np.ndarray, dict[str, np.ndarray], str]:
         """Return θ and the orbits a step further, so short that all equations are nearly linear; or what forbids it."""
         share, blocked = 1.0, next(iter(orbits))
@@ -312,7 +314,7 @@ class _SimultaneousFit:
         return theta, orbits, blocked
 
     def _orbit_moved(
-        self, name: str, linear: Linear, z: np.ndarray, change: np.ndarray, there: np.ndarray, share: float
+        self, name: str, linear: LinearisedOrbit, z: np.ndarray, change: np.ndarray, there: np.ndarray, share: float
     ) -> np.ndarray | None:
         """Return an orbit a step further, with one chord correction; None where the step is not nearly linear."""
         equations = self.equations[name]

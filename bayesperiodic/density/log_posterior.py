@@ -11,13 +11,13 @@ from bayesperiodic.density.initial_orbits import simultaneous_fit
 from bayesperiodic.density.orbit_check import other_orbit
 from bayesperiodic.density.responses import Guesses, Simulator
 from bayesperiodic.likelihood.likelihood import Residuals
-from bayesperiodic.likelihood.noise import FLAT, JEFFREYS, Circulant, Independent
+from bayesperiodic.likelihood.noise import FLAT_PRIOR, JEFFREYS, Circulant, Independent
 from bayesperiodic.likelihood.observation import Comparisons, Response, Simulation
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.problem.description import Description
 
-RIDGE, NATURAL = "ridge", "natural"
+RIDGE_COORDINATES, NATURAL = "ridge", "natural"
 SAMPLED, COLLAPSED = "sampled", "collapsed"
 
 
@@ -136,9 +136,9 @@ class SamplingCoordinates:
         Noise parameters that have a coordinate.
     """
 
-    def __init__(self, problem: Description, *, coordinates: str = RIDGE, variances: str = SAMPLED):
+    def __init__(self, problem: Description, *, coordinates: str = RIDGE_COORDINATES, variances: str = SAMPLED):
         self.problem, self.coordinates = problem, coordinates
-        self.logarithmic = problem.logarithmic & (coordinates == RIDGE)
+        self.logarithmic = problem.logarithmic & (coordinates == RIDGE_COORDINATES)
         self._logarithms = np.flatnonzero(self.logarithmic)
         self.collapsed = collapsible(problem) if variances == COLLAPSED else ()
         self.free = tuple(name for name in problem.free_noise if name not in self.collapsed)
@@ -179,7 +179,7 @@ class LogPosterior(SamplingCoordinates):
         problem: Description,
         simulator: Simulator,
         *,
-        coordinates: str = RIDGE,
+        coordinates: str = RIDGE_COORDINATES,
         variances: str = SAMPLED,
         comparisons: Comparisons | None = None,
     ):
@@ -364,7 +364,7 @@ class LogPosterior(SamplingCoordinates):
     def _shapes(self) -> np.ndarray:
         """Shape parameters of the inverse-gamma distributions of the collapsed variances."""
         counts = np.array([self.problem.likelihood.counts[name] for name in self.collapsed])
-        return 0.5 * counts - (1.0 if self.problem.noise.prior == FLAT else 0.0)
+        return 0.5 * counts - (1.0 if self.problem.noise.prior == FLAT_PRIOR else 0.0)
 
     def with_variances(
         self, points: np.ndarray, log_prob: np.ndarray, moments: np.ndarray, generator: np.random.Generator
@@ -393,6 +393,6 @@ def collapsible(problem: Description) -> tuple[str, ...]:
         return ()
     noise, counts = problem.noise, problem.likelihood.counts
     shaped = isinstance(noise, Circulant) and all(b.spectral or not b.counted for b in problem.likelihood.blocks)
-    closed = (isinstance(noise, Independent) or shaped) and noise.prior in (JEFFREYS, FLAT)
+    closed = (isinstance(noise, Independent) or shaped) and noise.prior in (JEFFREYS, FLAT_PRIOR)
     known = all(name in counts for name in problem.free_noise)
     return tuple(name for name in problem.free_noise if closed and name in counts and (known or not shaped))

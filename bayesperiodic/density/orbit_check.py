@@ -13,7 +13,7 @@ from scipy.stats import f as f_distribution
 from bayesperiodic import _fourier
 from bayesperiodic.likelihood.observation import Observation, Response
 
-LEVEL = 1e-3
+ORBIT_LEVEL = 1e-3
 # Variance of the subharmonics: its least fraction of the measured variance, and of the measured one for the same orbit.
 PRESENT, FOLLOWED = 1e-3, 0.25
 LOG_ODDS = 7.0
@@ -90,12 +90,12 @@ def _significant(observation: Observation, channel: str, lines: np.ndarray, powe
         noise = np.full(lines[-1] + 1, 2.0 * e.scatter[channel] ** 2 / e.cycles / (lines[-1] + 0.5))
     if noise is not None:
         power = power / np.maximum(noise[lines], np.finfo(float).tiny)
-        return bool(f_distribution.sf(power.mean(), 2 * lines.size, freedom) < LEVEL)
+        return bool(f_distribution.sf(power.mean(), 2 * lines.size, freedom) < ORBIT_LEVEL)
     low, high = np.array_split(power, 2)
     if not high.size:
         return True
     ratio = low.mean() / max(high.mean(), np.finfo(float).tiny)
-    return bool(f_distribution.sf(ratio, 2 * low.size, 2 * high.size) < LEVEL)
+    return bool(f_distribution.sf(ratio, 2 * low.size, 2 * high.size) < ORBIT_LEVEL)
 
 
 def _log_likelihood(observation: Observation, response: Response, ahead: int) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.density.log_posterior import NATURAL, RIDGE, SAMPLED, Evaluation, LogPosterior
+from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, SAMPLED, Evaluation, LogPosterior
 from bayesperiodic.density.responses import Guesses, Simulator
 from bayesperiodic.likelihood.input_noise import EXACT, InputErrors, same
 from bayesperiodic.periodic.solution import PeriodicSolution
@@ -107,7 +107,7 @@ class Problem(Description):
         """The densities that were asked for, by coordinates and variances."""
         return {}
 
-    def density(self, *, coordinates: str = RIDGE, variances: str = SAMPLED) -> LogPosterior:
+    def density(self, *, coordinates: str = RIDGE_COORDINATES, variances: str = SAMPLED) -> LogPosterior:
         """Return the log-posterior over the sampling coordinates.
 
         It is a function of the problem, the anchors of its periodic solves and the errors of the inputs. The anchors

@@ -27,8 +27,8 @@ from bayesperiodic.diagnostics.adequacy import holm
 from bayesperiodic.diagnostics.verdicts import NARROW, WIDE
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.likelihood.input_noise import JOINT, MEASURED, error_waves, noisy_inputs
-from bayesperiodic.likelihood.noise import EXPERIMENT, VARIANCE, Independent
+from bayesperiodic.likelihood.input_noise import FROM_CYCLES, JOINT, error_waves, noisy_inputs
+from bayesperiodic.likelihood.noise import PER_EXPERIMENT, VARIANCE, Independent
 from bayesperiodic.priors.joint import as_prior
 from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.sampling.draws import Posterior
@@ -388,7 +388,7 @@ def _measured(
     kept = {channel: e.harmonics.get(channel, limit) for channel in (*e.inputs, *e.outputs)}
     outputs = {}
     for channel in e.outputs:
-        place = f"{channel}, {e.name}" if problem.noise.per == EXPERIMENT else channel
+        place = f"{channel}, {e.name}" if problem.noise.per == PER_EXPERIMENT else channel
         noise = np.sqrt(variances[f"{VARIANCE}[{place}]"]) * generator.standard_normal(size)
         outputs[channel] = np.tile(cycle[channel], cycles) + noise
     time = np.arange(size) / (e.samples * e.frequency)
@@ -402,7 +402,7 @@ def _measured(
 
 def _input_noise(problem: Problem, e: Experiment, name: str, size: int, generator: Generator) -> np.ndarray:
     """Return noise of an input (size,): white with the measured variance, or of given covariance in all cycles."""
-    if problem.input_noise == MEASURED:
+    if problem.input_noise == FROM_CYCLES:
         variance = e.amplitude_variance[name]
         total = variance[0] + 0.5 * variance[1:].sum()
         return np.sqrt(total / (2 * variance.size - 1) * size) * generator.standard_normal(size)

@@ -380,7 +380,7 @@ def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:
 
 NO_ORBIT, ANOTHER_ORBIT, FAILED = "no orbit", "other orbit", "solver failed"
 PATH_VERDICTS = {
-    arclength.FOLD: (NO_ORBIT, "the branch ends in a fold"),
+    arclength.FOLDED: (NO_ORBIT, "the branch ends in a fold"),
     arclength.EQUILIBRIUM: (NO_ORBIT, "the cycle shrinks to an equilibrium"),
     arclength.SHORTER: (NO_ORBIT, "the orbit merges with one of a shorter period"),
     arclength.ROUND_FOLDS: (ANOTHER_ORBIT, "the branch folds back to another orbit at the same parameters"),

@@ -10,7 +10,7 @@ from scipy.special import chdtrc, chdtri, ndtr, ndtri, stdtrit
 
 from bayesperiodic._io import Storable
 from bayesperiodic._linalg import column_space
-from bayesperiodic.density.log_posterior import RIDGE, LogPosterior
+from bayesperiodic.density.log_posterior import RIDGE_COORDINATES, LogPosterior
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, bias_correction, climb
 from bayesperiodic.priors.joint import MultivariateNormal
@@ -23,7 +23,7 @@ WIDENING = 10.0
 # Factor by which the priors are widened where the data estimate alone.
 ALMOST_FLAT = 100.0
 # Expected gain in 2 ln L by a step without the prior, below which the MAP estimate is that of the data.
-NEGLIGIBLE_GAIN = 0.5
+LEAST_CONFLICT_GAIN = 0.5
 PRECISION = 1e-12
 # Widths of the priors of parameters in conflict from which further starts of the estimate by the data are drawn.
 START_WIDTHS = (3.0, 10.0, 30.0, 100.0, 30.0, 10.0)
@@ -118,7 +118,7 @@ def _by_the_data(problem: Problem, estimate: Iterate) -> Iterate:
     vectors, sizes, components = np.linalg.svd(changes, full_matrices=False)
     along = sizes * (components @ residuals)
     step = vectors @ (along / (sizes**2 + WIDENING**-2))
-    if np.sum(along**2 / (sizes**2 + WIDENING**-2)) < NEGLIGIBLE_GAIN:
+    if np.sum(along**2 / (sizes**2 + WIDENING**-2)) < LEAST_CONFLICT_GAIN:
         return estimate
     factor = np.where(np.sum(changes**2, axis=1) > WIDENING**-2, np.maximum(ALMOST_FLAT, WIDENING * np.abs(step)), 1.0)
     objective = _almost_flat(problem, estimate, factor)
@@ -149,7 +149,7 @@ def _almost_flat(problem: Problem, near: Iterate, factor: np.ndarray) -> Objecti
     """Return the objective with the priors widened by factors (names,)."""
     wide = Problem(**written_out(problem) | {"priors": _widened(problem, factor)})
     wide = wide.with_input_errors(problem.input_errors)
-    density = LogPosterior(wide, near.here.simulator, coordinates=RIDGE)
+    density = LogPosterior(wide, near.here.simulator, coordinates=RIDGE_COORDINATES)
     return Objective(density, bias_correction(wide, near))
 
 

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.initial_orbits import InitialEstimate, measured_orbits, simultaneous_fit
-from bayesperiodic.density.log_posterior import NATURAL, RIDGE, Linearisation, LogPosterior
+from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import Simulator
 from bayesperiodic.estimation.check import MOST_UNEXPLAINED, check_warnings, checked
@@ -319,7 +319,7 @@ def _describe(
     covariance[lost], covariance[:, lost] = np.nan, np.nan
     covariance[lost, lost] = np.inf
     acting = np.diag(uncertain.information) * problem.joint_prior.widths**2 > INFORMED
-    sampled = objective.density.with_settings(coordinates=RIDGE)
+    sampled = objective.density.with_settings(coordinates=RIDGE_COORDINATES)
     joints = [joint_laplace(sampled, end.iterate) for end in modes]
     residuals = best.here.compared()
     fit = MapEstimate(

@@ -23,7 +23,7 @@ from bayesperiodic.priors.single import Prior
 from bayesperiodic.problem.parameters import SHIFT
 
 # Distance of points, as the change of the root of the drop; growth, shortening and smallest size of steps.
-ROOT_SPACING, STEP_GROWTH, SHORTENED, SHORTEST_STEP = 0.5, 3.0, 0.25, 0.01
+ROOT_SPACING, STEP_WIDENING, SHORTENED, SHORTEST_STEP = 0.5, 3.0, 0.25, 0.01
 # Above the root 2.576 of a 99 % interval, so that the end of this interval lies between two points.
 FURTHEST = 2.8
 # A step leaves a tenth of the distance to the support's end. The last point leaves a millionth of the peak's distance,
@@ -31,7 +31,7 @@ FURTHEST = 2.8
 NEARER, NEAREST, OUTERMOST = 0.1, 1e-6, 1e-3
 MOST_PROFILE_POINTS, MOST_FAILURES, MOST_IMPROVEMENTS = 60, 5, 5
 # Gain of an improved point; curvature that is none; distance from a known iterate within which a climb leads to it.
-LEAST_GAIN, CUT, MET = 1e-6, 1e-12, 0.1
+LEAST_IMPROVEMENT, CUT, MET = 1e-6, 1e-12, 0.1
 
 
 class Point(NamedTuple):
@@ -114,7 +114,7 @@ class Ridge:
                 if failures == MOST_FAILURES:
                     break
                 continue
-            ratio = ROOT_SPACING / max(abs(_root(top, there) - _root(top, here)), ROOT_SPACING / STEP_GROWTH)
+            ratio = ROOT_SPACING / max(abs(_root(top, there) - _root(top, here)), ROOT_SPACING / STEP_WIDENING)
             if ratio < 0.5 and abs(step) > SHORTEST_STEP * min(abs(first), abs(now - end)):
                 step, overshot = step * max(ratio, SHORTENED), value
                 continue
@@ -123,7 +123,7 @@ class Ridge:
             if ratio < 0.5:
                 step, overshot = first, end
                 continue
-            widest = max(1.0, 0.5 * (overshot - now) / step) if overshot * step > now * step else STEP_GROWTH
+            widest = max(1.0, 0.5 * (overshot - now) / step) if overshot * step > now * step else STEP_WIDENING
             step *= min(ratio, widest)
         return points
 
@@ -140,7 +140,7 @@ class Ridge:
             if before is not None and (inwards or improved):
                 other = self._climbed(before, point.value, point.iterate)
             improved = other is not None and (
-                point.iterate is None or other.objective > point.iterate.objective + LEAST_GAIN
+                point.iterate is None or other.objective > point.iterate.objective + LEAST_IMPROVEMENT
             )
             kept.append(Point(point.value, other) if improved else point)
         return kept

@@ -18,7 +18,7 @@ from bayesperiodic.models.model import Model
 PROPORTIONAL, NO_PARAMETERS = np.ones((1, 1)), np.ones((1, 0))
 
 
-class Signals(NamedTuple):
+class ComparedSignals(NamedTuple):
     """What is compared: responses, their differences from the data, or derivatives along directions."""
 
     values: np.ndarray  # (…, points, channels) of the measured channels, turned and delayed
@@ -60,15 +60,15 @@ class Block(ABC):
         """Return the blocks of this kind that an experiment has, none if it has no data of this kind."""
 
     @abstractmethod
-    def compare(self, predicted: Signals, difference: Signals) -> np.ndarray:
+    def compare(self, predicted: ComparedSignals, difference: ComparedSignals) -> np.ndarray:
         """Return the components (…, size) of data minus prediction; the difference has angles within half a turn."""
 
     @abstractmethod
-    def changes(self, predicted: Signals, directions: Signals) -> np.ndarray:
+    def changes(self, predicted: ComparedSignals, directions: ComparedSignals) -> np.ndarray:
         """Return the derivatives (directions, size) of the predicted components at one prediction."""
 
     @abstractmethod
-    def add_vjp(self, predicted: Any, weights: np.ndarray, total: Signals) -> None:
+    def add_vjp(self, predicted: Any, weights: np.ndarray, total: ComparedSignals) -> None:
         """Add the derivatives of Σ weights · predicted components by one prediction to the arrays of `total`.
 
         Of blocks with a `layout` those of several experiments are added at once, without the prediction.
@@ -150,23 +150,23 @@ class Block(ABC):
         return ""
 
 
-class Linear(Block):
+class LinearBlock(Block):
     """A kind of data whose components are a linear function of what is predicted."""
 
     @abstractmethod
-    def components(self, moved: Signals) -> np.ndarray:
+    def components(self, moved: ComparedSignals) -> np.ndarray:
         """Return the components (…, size) of differences or derivatives."""
 
-    def compare(self, predicted: Signals, difference: Signals) -> np.ndarray:
+    def compare(self, predicted: ComparedSignals, difference: ComparedSignals) -> np.ndarray:
         """Return the components of the difference."""
         return self.components(difference)
 
-    def changes(self, predicted: Signals, directions: Signals) -> np.ndarray:
+    def changes(self, predicted: ComparedSignals, directions: ComparedSignals) -> np.ndarray:
         """Return the components of the derivatives."""
         return self.components(directions)
 
 
-class Timed(Linear):
+class Timed(LinearBlock):
     """Values of one output along the period, whose variance is a noise parameter."""
 
     counted: ClassVar[bool] = True
@@ -195,7 +195,7 @@ class Timed(Linear):
 
     def errors(self, values: np.ndarray) -> np.ndarray:
         """Return the components of errors of the measured outputs."""
-        return self.components(Signals(values, np.empty(0), np.empty(0)))
+        return self.components(ComparedSignals(values, np.empty(0), np.empty(0)))
 
 
 def common(experiment: Experiment, channel: str, place: int = 0) -> dict[str, Any]:

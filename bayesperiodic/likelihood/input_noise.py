@@ -27,14 +27,14 @@ from bayesperiodic.data.folding import neighbours_mean
 from bayesperiodic.models.model import DERIVATIVES, Model
 from bayesperiodic.priors.single import Normal
 
-EXACT, MEASURED, JOINT = "exact", "measured", "joint"
+EXACT, FROM_CYCLES, JOINT = "exact", "measured", "joint"
 # Measured noise in whatever number of cycles, to be compared with the residual where the inputs are taken as exact.
 ROUGH = "rough"
 # Cycles from which on the variances of an input's amplitudes are known well enough.
 FEWEST_CYCLES = 5
 # Variance of combined errors, relative to that of the outputs' errors, up to which they are left out; and squares of
 # singular values that are zero but for rounding, relative to the largest.
-NEGLIGIBLE, ROUNDING = 1e-3, 1e-18
+NEGLIGIBLE, ROUNDED_SQUARE = 1e-3, 1e-18
 InputNoise = str | Mapping[str, Any]
 
 
@@ -54,8 +54,8 @@ class InputErrors(Storable):
 def same(one: Mapping[str, InputErrors], other: Mapping[str, InputErrors]) -> bool:
     """Return whether two linearisations are equal."""
     return one.keys() == other.keys() and all(
-        all(np.array_equal(a, b) for a, b in zip(astuple(own), astuple(other[name]), strict=True))
-        for name, own in one.items()
+        all(np.array_equal(a, b) for a, b in zip(astuple(wave), astuple(other[name]), strict=True))
+        for name, wave in one.items()
     )
 
 
@@ -63,7 +63,7 @@ def noisy_inputs(experiment: Experiment, noise: InputNoise) -> list[str]:
     """Return the inputs of an experiment whose noise is known: measured, in enough cycles, or given."""
     if isinstance(noise, Mapping):
         return [name for name in experiment.inputs if name in noise]
-    known = noise == ROUGH or (noise == MEASURED and experiment.cycles >= FEWEST_CYCLES)
+    known = noise == ROUGH or (noise == FROM_CYCLES and experiment.cycles >= FEWEST_CYCLES)
     return [name for name in experiment.inputs if known and name in experiment.amplitude_variance]
 
 
@@ -81,8 +81,8 @@ def true_inputs(experiment: Experiment, noise: InputNoise, errors: InputErrors |
 def checked(given: InputNoise, inputs: Sequence[str], experiments: Sequence[Experiment]) -> InputNoise:
     """Return a valid argument `input_noise`, an array for each covariance, or raise a ValueError."""
     if isinstance(given, str):
-        _checks.one_of("input_noise", given, (EXACT, MEASURED, JOINT))
-        return given if any(noisy_inputs(e, MEASURED) for e in experiments) else EXACT
+        _checks.one_of("input_noise", given, (EXACT, FROM_CYCLES, JOINT))
+        return given if any(noisy_inputs(e, FROM_CYCLES) for e in experiments) else EXACT
     if not isinstance(given, Mapping):
         raise ValueError(f"input_noise: must be 'exact', 'measured', 'joint' or a mapping of inputs, got {given!r}.")
     for name in given:
@@ -148,10 +148,10 @@ def with_errors_as_parameters(
     priors: dict[str, Normal] = {}
     fixed: dict[str, dict[str, float]] = {}
     for name in model.inputs:
-        own = [e for e in experiments if name in noisy_inputs(e, MEASURED)]
-        if not own:
+        noisy = [e for e in experiments if name in noisy_inputs(e, FROM_CYCLES)]
+        if not noisy:
             continue
-        orders = range(1, 1 + max(kept(e, name) for e in own))
+        orders = range(1, 1 + max(kept(e, name) for e in noisy))
         waves = {f"{name}_mean": sp.Integer(1)} | {f"{name}_cos{h}": sp.cos(h * phase) for h in orders}
         waves |= {f"{name}_sin{h}": sp.sin(h * phase) for h in orders}
         symbols = {label: sp.Symbol(f"p_{label}", real=True) for label in waves}
@@ -164,7 +164,7 @@ def with_errors_as_parameters(
             changed[symbol] = symbol - error
             error = sp.diff(error, tau) * frequency
         for e in experiments:
-            sd = np.diag(_root(e, name, orders.stop - 1, MEASURED)) if e in own else np.zeros(len(waves))
+            sd = np.diag(_root(e, name, orders.stop - 1, FROM_CYCLES)) if e in noisy else np.zeros(len(waves))
             for label, value in zip(waves, sd.tolist(), strict=True):
                 if value > 0.0:
                     priors[f"{label}[{e.name}]"] = Normal(0.0, value)
@@ -192,8 +192,8 @@ def error_waves(experiment: Experiment, noise: InputNoise) -> tuple[list[str], n
             if amplitude.any():
                 where.append(name)
                 waves.append(amplitude)
-    widest = max((own.size for own in waves), default=0)
-    return where, np.array([np.pad(own, (0, widest - own.size)) for own in waves]).reshape(len(waves), widest)
+    widest = max((wave.size for wave in waves), default=0)
+    return where, np.array([np.pad(wave, (0, widest - wave.size)) for wave in waves]).reshape(len(waves), widest)
 
 
 def _root(experiment: Experiment, name: str, harmonics: int, noise: InputNoise) -> np.ndarray:
@@ -219,8 +219,8 @@ def directions(experiment: Experiment, names: Sequence[str], noise: InputNoise) 
     result = np.zeros((len(where), points, 3 * width))
     for order in range(3 if where else 0):
         rate = _fourier.derivative(waves, experiment.frequency / experiment.periods, order)
-        for own, name, values in zip(result, where, _fourier.on_grid(rate, points), strict=True):
-            own[:, order * width + names.index(name)] = values
+        for row, name, values in zip(result, where, _fourier.on_grid(rate, points), strict=True):
+            row[:, order * width + names.index(name)] = values
     return result
 
 
@@ -230,7 +230,7 @@ def errors_of_outputs(experiment: Experiment, channels: Sequence[str], noise: In
     points = experiment.samples * experiment.periods
     result = np.zeros((len(where), points, len(channels)))
     for i, (name, wave) in enumerate(zip(where, waves, strict=True)):
-        for channel, slope in experiment.error_slopes.get(name, {}).items() if noise == MEASURED else ():
+        for channel, slope in experiment.error_slopes.get(name, {}).items() if noise == FROM_CYCLES else ():
             size = min(slope.size, wave.size)
             result[i, :, channels.index(channel)] = _fourier.on_grid(slope[:size] * wave[:size], points)
     return result
@@ -243,7 +243,7 @@ def expected_errors(
 
     p are the precisions (size,) of e, by block.
     """
-    precision = np.concatenate([np.broadcast_to(own, own_r.shape) for own, own_r in zip(p, r, strict=True)])
+    precision = np.concatenate([np.broadcast_to(part, own_r.shape) for part, own_r in zip(p, r, strict=True)])
     root = np.sqrt(precision)[:, None]
     vectors, values, axes = np.linalg.svd(root * matrix, full_matrices=False)
     covariance = np.eye(matrix.shape[1]) - (axes.T * (values**2 / (1.0 + values**2))) @ axes
@@ -264,7 +264,7 @@ class Shared:
 
     def __init__(self, members: Sequence[int], sizes: Sequence[int], matrix: np.ndarray):
         vectors, values, _ = np.linalg.svd(matrix, full_matrices=False)
-        large = values**2 > ROUNDING * np.max(values**2, initial=0.0)
+        large = values**2 > ROUNDED_SQUARE * np.max(values**2, initial=0.0)
         self.members = tuple(members)
         self.parts = np.split(vectors[:, large] * values[large], np.cumsum(sizes)[:-1])
         self._grams = [part.T @ part for part in self.parts]
@@ -289,11 +289,11 @@ class Shared:
     def _system(self, r: Sequence[np.ndarray], p: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return S (…, errors, errors) and b (…, errors), point by point: products must not depend on their number."""
         matrix, vector = np.eye(self.parts[0].shape[1]), np.zeros(())
-        for part, gram, own, precision in zip(self.parts, self._grams, r, p, strict=True):
+        for part, gram, block, precision in zip(self.parts, self._grams, r, p, strict=True):
             even = precision.shape[-1] == 1
             added = gram * precision[..., None] if even else part.T @ (precision[..., None] * part)
             matrix = matrix + added
-            vector = vector + (part.T @ (precision * own)[..., None])[..., 0]
+            vector = vector + (part.T @ (precision * block)[..., None])[..., 0]
         return matrix, vector
 
     def _diagonal(self, p: Sequence[np.ndarray]) -> np.ndarray | None:
@@ -316,8 +316,8 @@ class Shared:
         logarithms = np.log(np.diagonal(np.linalg.cholesky(matrix), axis1=-2, axis2=-1)).sum(axis=-1)
         errors = np.linalg.solve(matrix, vector[..., None])
         square = np.sum(errors[..., 0] ** 2, axis=-1)
-        for part, own, precision in zip(self.parts, r, p, strict=True):
-            square = square + np.sum(precision * (own - (part @ errors)[..., 0]) ** 2, axis=-1)
+        for part, block, precision in zip(self.parts, r, p, strict=True):
+            square = square + np.sum(precision * (block - (part @ errors)[..., 0]) ** 2, axis=-1)
         return np.where(wrong, np.nan, -0.5 * square - factor * logarithms)
 
     def gradients(
@@ -327,11 +327,11 @@ class Shared:
         diagonal, (matrix, vector) = self._diagonal(p), self._system(r, p)
         inverse = np.linalg.inv(matrix) if diagonal is None else matrix
         by_residual, by_logarithm = [], []
-        for part, own, precision in zip(self.parts, r, p, strict=True):
+        for part, block, precision in zip(self.parts, r, p, strict=True):
             weighted = part @ inverse if diagonal is None else part / diagonal
             explained, taken = weighted @ vector, np.sum(weighted * part, axis=1)
             by_residual.append(precision * explained)
-            by_logarithm.append(precision * (explained * own - 0.5 * explained**2 - 0.5 * factor * taken))
+            by_logarithm.append(precision * (explained * block - 0.5 * explained**2 - 0.5 * factor * taken))
         return by_residual, by_logarithm
 
     def whitening(self, p: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from scipy.linalg import solve_triangular
 from bayesperiodic import _checks
 from bayesperiodic.likelihood.block import Block
 from bayesperiodic.likelihood.input_noise import Shared
-from bayesperiodic.likelihood.noise import CHANNEL, EXPERIMENT, JEFFREYS, VARIANCE, Noise
+from bayesperiodic.likelihood.noise import JEFFREYS, VARIANCE, Noise
 from bayesperiodic.likelihood.section_points import SCALE
 
 
@@ -48,14 +48,14 @@ class Residuals(Sequence[np.ndarray]):
         members: list[dict[int, np.ndarray]] = [{} for _ in self._stacks]
         for (stack, member), block in zip(self._places, blocks, strict=True):
             members[stack][member] = block
-        return Residuals([np.stack([own[m] for m in range(len(own))]) for own in members], self._places)
+        return Residuals([np.stack([group[m] for m in range(len(group))]) for group in members], self._places)
 
     def scaled(self, factors: np.ndarray) -> "Residuals":
         """Return the components (size,) of each block times its factor, factors (blocks,)."""
-        own = [np.empty((len(stack), 1)) for stack in self._stacks]
+        scales = [np.empty((len(stack), 1)) for stack in self._stacks]
         for (stack, member), factor in zip(self._places, factors, strict=True):
-            own[stack][member] = factor
-        return Residuals([stack * factor for stack, factor in zip(self._stacks, own, strict=True)], self._places)
+            scales[stack][member] = factor
+        return Residuals([stack * factor for stack, factor in zip(self._stacks, scales, strict=True)], self._places)
 
     def stacks(self) -> tuple[np.ndarray, ...]:
         """Return the arrays (members, …, size)."""
@@ -71,7 +71,7 @@ class Residuals(Sequence[np.ndarray]):
         return result
 
 
-class _Group(NamedTuple):
+class _AlikeBlocks(NamedTuple):
     """Blocks whose components have the same variances."""
 
     members: list[int]
@@ -121,7 +121,10 @@ class Likelihood:
         """Return the noise parameters that belong together, by name, and the indices of their blocks."""
         together = dict.fromkeys(tuple(columns) for columns in self._columns if columns)
         return [
-            (tuple(self.names[i] for i in group), [b for b, own in enumerate(self._columns) if tuple(own) == group])
+            (
+                tuple(self.names[i] for i in group),
+                [b for b, places in enumerate(self._columns) if tuple(places) == group],
+            )
             for group in together
         ]
 
@@ -173,9 +176,9 @@ class Likelihood:
                 result[block.experiment, block.channel] = variances.mean(axis=-1)
         for one in self.shared:
             caused = one.caused(self.precisions(one.members, values))
-            for b, own in zip(one.members, caused, strict=True):
+            for b, parameters in zip(one.members, caused, strict=True):
                 if (key := (self.blocks[b].experiment, self.blocks[b].channel)) in result:
-                    result[key] = result[key] + own
+                    result[key] = result[key] + parameters
         return result
 
     def complete(self, free: np.ndarray) -> np.ndarray:
@@ -217,18 +220,18 @@ class Likelihood:
     @cached_property
     def _spectra_of_errors(self) -> list[tuple[int, int, np.ndarray]]:
         """Column and a block of each free variance with Jeffreys' prior, and eigenvalues of L·Lᵀ of all its blocks."""
-        found: dict[int, list[tuple[int, np.ndarray]]] = {}
+        spectra: dict[int, list[tuple[int, np.ndarray]]] = {}
         if self.model.prior == JEFFREYS:
             for one in self.shared:
                 for b, matrix in zip(one.members, one.covariances, strict=True):
                     if self._columns[b] and self._columns[b][0] in self._free:
-                        found.setdefault(self._columns[b][0], []).append((b, np.linalg.eigvalsh(matrix)))
+                        spectra.setdefault(self._columns[b][0], []).append((b, np.linalg.eigvalsh(matrix)))
         result = []
-        for column, own in found.items():
-            with_errors = {b for b, _ in own}
+        for column, pairs in spectra.items():
+            with_errors = {b for b, _ in pairs}
             others = [b for b, columns in enumerate(self._columns) if columns[:1] == [column] and b not in with_errors]
             rest = [np.zeros(self.blocks[b].size) for b in others]
-            result.append((column, own[0][0], np.maximum(np.concatenate([v for _, v in own] + rest), 0.0)))
+            result.append((column, pairs[0][0], np.maximum(np.concatenate([v for _, v in pairs] + rest), 0.0)))
         return result
 
     @cached_property
@@ -255,8 +258,8 @@ class Likelihood:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             total = self._without_inputs(residuals, values, log_variance_factor)
             for one in self.shared:
-                own, precisions = [residuals[b] for b in one.members], self.precisions(one.members, values)
-                total = total + one.log_likelihood(own, precisions, _mean(log_variance_factor, one))
+                parts, precisions = [residuals[b] for b in one.members], self.precisions(one.members, values)
+                total = total + one.log_likelihood(parts, precisions, _mean(log_variance_factor, one))
         return np.where(np.isfinite(total), total, -np.inf)
 
     @cached_property
@@ -284,50 +287,52 @@ class Likelihood:
             harmonic = block.harmonic[order][starts] if spectral else np.full(len(starts), np.nan)
             rows += [(block.experiment, block.channel, h, block.weight) for h in harmonic]
         columns = zip(*rows, strict=True)
-        return {name: np.array(c) for name, c in zip((EXPERIMENT, CHANNEL, "harmonic", "weight"), columns, strict=True)}
+        return {
+            name: np.array(c) for name, c in zip(("experiment", "channel", "harmonic", "weight"), columns, strict=True)
+        }
 
     @cached_property
     def _parts(self) -> list[tuple[int, list[str], np.ndarray, np.ndarray]]:
         """Of each block its index, labels of its observations, values in their order, and where each begins."""
-        found = []
+        parts = []
         for b, block in enumerate(self.blocks):
             name, place, end = block.places(self._is_even[b], b in self._dense_groups)
             order = np.argsort(place, kind="stable")
             numbers, starts = np.unique(place[order], return_index=True)
             labels = [f"{name} {i}{end}" for i in numbers]
-            found.append((b, [name] if labels == [f"{block.channel} 0"] else labels, order, starts))
-        return found
+            parts.append((b, [name] if labels == [f"{block.channel} 0"] else labels, order, starts))
+        return parts
 
     def terms(self, residuals: Sequence[np.ndarray], values: np.ndarray) -> np.ndarray:
         """Return the log-likelihoods (…, observations) of the `observations`, which sum to that of `__call__`."""
-        found, shared = [], self._shared_terms(residuals, values)
+        terms, shared = [], self._shared_terms(residuals, values)
         for b, _, order, starts in self._parts:
             r = residuals[b]
             if b not in self._group_of:
-                found.append(self._dense_values(b, r, values, 1.0)[..., None])
+                terms.append(self._dense_values(b, r, values, 1.0)[..., None])
                 continue
             group = self._group_of[b]
             variances = self._spectrum(group, values)[0]
             r = self.blocks[b].independent(r, self._is_even[b])
             squares = shared[b] if b in shared else group.weight * r**2 / variances
             each = group.weight * np.log(variances) + squares
-            found.append(-0.5 * np.add.reduceat(each[..., order], starts, axis=-1))
-        return np.concatenate(found, axis=-1)
+            terms.append(-0.5 * np.add.reduceat(each[..., order], starts, axis=-1))
+        return np.concatenate(terms, axis=-1)
 
     def _shared_terms(self, residuals: Sequence[np.ndarray], values: np.ndarray) -> dict[int, np.ndarray]:
         """Return the squares of whitened components plus their parts of ln|S|, by block that shares errors."""
-        found: dict[int, np.ndarray] = {}
+        terms: dict[int, np.ndarray] = {}
         for one in self.shared:
             p = self.precisions(one.members, values)
             axes, squares = one.whitening(p)
-            scaled = [residuals[b] * np.sqrt(own) for b, own in zip(one.members, p, strict=True)]
+            scaled = [residuals[b] * np.sqrt(weights) for b, weights in zip(one.members, p, strict=True)]
             white = np.concatenate(scaled, axis=-1)
             along = (white[..., None, :] @ axes)[..., 0, :] * (1.0 - 1.0 / np.sqrt(1.0 + squares))
             white = white - (axes @ along[..., None])[..., 0]
             each = white**2 + np.sum(axes**2 * np.log1p(squares)[..., None, :], axis=-1)
             parts = np.split(each, np.cumsum([len(part) for part in one.parts])[:-1], axis=-1)
-            found |= zip(one.members, parts, strict=True)
-        return found
+            terms |= zip(one.members, parts, strict=True)
+        return terms
 
     def _without_inputs(
         self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
@@ -362,7 +367,7 @@ class Likelihood:
         # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
         return -0.5 * np.add.reduce(np.ascontiguousarray(weights * terms), axis=-1)
 
-    def _factor(self, log_variance_factor: float | np.ndarray, group: "_Group | int") -> float:
+    def _factor(self, log_variance_factor: float | np.ndarray, group: "_AlikeBlocks | int") -> float:
         """Return the factor of the logarithms of one group or block."""
         b = group if isinstance(group, int) else group.members[0]
         return log_variance_factor if isinstance(log_variance_factor, float) else float(log_variance_factor[b])
@@ -373,25 +378,27 @@ class Likelihood:
         with_errors = {b for one in self.shared for b in one.members}
         return np.array([0.0 if b in with_errors else 1.0 for b in range(len(self.blocks))])
 
-    def _sorted_groups(self) -> tuple[list[_Group], list[_Group], list[int]]:
+    def _sorted_groups(self) -> tuple[list[_AlikeBlocks], list[_AlikeBlocks], list[int]]:
         """Return groups whose components have one variance, others, and the blocks whose components are correlated."""
         groups: dict[Any, list[int]] = {}
         for b, (block, columns) in enumerate(zip(self.blocks, self._columns, strict=True)):
             key = type(block), block.alike(self.model), tuple(columns), block.size, block.weight
             groups.setdefault(key, []).append(b)
-        even: list[_Group] = []
-        uneven: list[_Group] = []
+        even: list[_AlikeBlocks] = []
+        uneven: list[_AlikeBlocks] = []
         dense: list[int] = []
         for members in groups.values():
             block, columns = self.blocks[members[0]], self._columns[members[0]]
             if block.is_dense(self.model):
                 dense += members
                 continue
-            group = _Group(members, block, slice(columns[0], columns[-1] + 1) if columns else slice(0), block.weight)
+            group = _AlikeBlocks(
+                members, block, slice(columns[0], columns[-1] + 1) if columns else slice(0), block.weight
+            )
             (even if self._checked_size(group) == 1 else uneven).append(group)
         return even, uneven, dense
 
-    def _checked_size(self, group: _Group) -> int:
+    def _checked_size(self, group: _AlikeBlocks) -> int:
         """Return the number of variances that the spectrum of a group has, one or one each component."""
         block, count = group.block, len(self._columns[group.members[0]])
         sizes = (1, block.size)
@@ -411,7 +418,7 @@ class Likelihood:
             f"{self.model.name!r}."
         )
 
-    def _spectrum(self, group: _Group, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _spectrum(self, group: _AlikeBlocks, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the variances (…, size) or (…, 1) of a group's components, and their slopes by its parameters."""
         return group.block.spectrum(self.model, values[..., group.columns])
 
@@ -448,7 +455,7 @@ class Likelihood:
         return [b in even for b in range(len(self.blocks))]
 
     @cached_property
-    def _group_of(self) -> dict[int, _Group]:
+    def _group_of(self) -> dict[int, _AlikeBlocks]:
         """The group of each block whose components are independent."""
         return {b: group for group in (*self._even, *self._uneven) for b in group.members}
 
@@ -459,8 +466,8 @@ class Likelihood:
 
     def _dense_values(self, b: int, r: np.ndarray, values: np.ndarray, log_variance_factor: float) -> np.ndarray:
         """Return the log-likelihoods (…,) of a block whose components are correlated."""
-        rows, own = r.reshape(-1, r.shape[-1]), values[..., self._columns[b]].reshape(-1, len(self._columns[b]))
-        pairs = zip(rows, own, strict=True)
+        rows, parameters = r.reshape(-1, r.shape[-1]), values[..., self._columns[b]].reshape(-1, len(self._columns[b]))
+        pairs = zip(rows, parameters, strict=True)
         each = [self._dense(self.blocks[b], row, phi, log_variance_factor)[0] for row, phi in pairs]
         return np.array(each).reshape(values.shape[:-1])
 
@@ -508,9 +515,9 @@ class Likelihood:
             return by_residual, by_value
         total = list(by_residual)
         for one in self.shared:
-            own, precisions = [residuals[b] for b in one.members], self.precisions(one.members, values)
-            found = one.gradients(own, precisions, _mean(log_variance_factor, one))
-            for b, more, by_precision in zip(one.members, *found, strict=True):
+            parts, precisions = [residuals[b] for b in one.members], self.precisions(one.members, values)
+            gradients = one.gradients(parts, precisions, _mean(log_variance_factor, one))
+            for b, more, by_precision in zip(one.members, *gradients, strict=True):
                 total[b] = total[b] + more
                 group = self._group_of[b]
                 slopes = self._spectrum(group, values)[1]
@@ -547,8 +554,8 @@ class Likelihood:
             result[b] = np.sqrt(block.weight) * white.T.reshape(vectors[b].shape)
         for one in self.shared:
             joint = one.whitened([result[b] for b in one.members], self.precisions(one.members, values))
-            for b, own in zip(one.members, joint, strict=True):
-                result[b] = own
+            for b, part in zip(one.members, joint, strict=True):
+                result[b] = part
         return result
 
     def simulate(self, values: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from bayesperiodic import _fourier
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.block import Block, Signals, Timed, common, measured_channels
+from bayesperiodic.likelihood.block import Block, ComparedSignals, Timed, common, measured_channels
 from bayesperiodic.models.model import Model
 
 LARGEST_TRANSFORM = 16_384
@@ -28,7 +28,7 @@ class MeanPeriod(Timed):
         """Return one block a channel, of experiments without a mask and a covariance."""
         if experiment.mask is not None or experiment.covariance is not None:
             return []
-        found, points = [], experiment.samples * experiment.periods
+        blocks, points = [], experiment.samples * experiment.periods
         highest = _fourier.highest_harmonic(points)
         for place, channel in enumerate(measured_channels(experiment, model)):
             values, kept = experiment.outputs[channel], experiment.harmonics.get(channel)
@@ -41,15 +41,15 @@ class MeanPeriod(Timed):
             nyquist = [points // 2] if kept is None and points % 2 == 0 else []
             harmonic = np.array([0, *harmonics, *harmonics, *nyquist])
             count = float(experiment.independent[channel])
-            found.append(cls(count=count, size=harmonic.size, harmonic=harmonic, **common(experiment, channel, place)))
-        return found
+            blocks.append(cls(count=count, size=harmonic.size, harmonic=harmonic, **common(experiment, channel, place)))
+        return blocks
 
     @property
     def layout(self) -> Hashable:
         """What blocks have in common whose experiments are compared all at once."""
         return self.points, self.channel, self.size
 
-    def components(self, moved: Signals) -> np.ndarray:
+    def components(self, moved: ComparedSignals) -> np.ndarray:
         """Return the Fourier components of the channel."""
         return self.transform(moved.values[..., self.place])
 
@@ -60,9 +60,9 @@ class MeanPeriod(Timed):
             self._transform(signal, result)
         else:  # In parts that stay in the cache; larger ones cost more for their memory than for the transform.
             step = max(1, LARGEST_TRANSFORM // self.points)
-            for own, components in zip(signal, result, strict=True):
-                for first in range(0, len(own), step):
-                    self._transform(own[first : first + step], components[first : first + step])
+            for values, components in zip(signal, result, strict=True):
+                for first in range(0, len(values), step):
+                    self._transform(values[first : first + step], components[first : first + step])
         return result
 
     def _transform(self, signal: np.ndarray, result: np.ndarray) -> None:
@@ -84,7 +84,7 @@ class MeanPeriod(Timed):
         """Return the transpose of `transform` applied to weights (…, size), its inverse but for a factor."""
         return _fourier.from_components(weights, self.points) * self.size / self.points
 
-    def add_vjp(self, predicted: Any, weights: np.ndarray, total: Signals) -> None:
+    def add_vjp(self, predicted: Any, weights: np.ndarray, total: ComparedSignals) -> None:
         """Add the transposed transform."""
         total.values[..., self.place] += self.spread(weights)
 

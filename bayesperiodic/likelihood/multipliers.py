@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.block import Linear, Signals, common, measured_channels, times
+from bayesperiodic.likelihood.block import ComparedSignals, LinearBlock, common, measured_channels, times
 from bayesperiodic.likelihood.section_points import values_at, whitening
 from bayesperiodic.models.model import Model
 
@@ -14,7 +14,7 @@ MULTIPLIERS = "multipliers"
 
 
 @dataclass(frozen=True, eq=False)
-class Multipliers(Linear):
+class Multipliers(LinearBlock):
     """Logarithms of multipliers in units of their standard deviations, given the errors of the section points."""
 
     at: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))  # (points,), on the grid
@@ -55,7 +55,7 @@ class Multipliers(Linear):
         """The logarithm of the determinant of what whitens the logarithms."""
         return float(np.log(np.diag(self.whitening)).sum())
 
-    def components(self, moved: Signals) -> np.ndarray:
+    def components(self, moved: ComparedSignals) -> np.ndarray:
         """Return the whitened logarithms, less what goes with the values."""
         logarithms = moved.log_multipliers
         if self.at.size:
@@ -64,9 +64,9 @@ class Multipliers(Linear):
 
     def errors(self, values: np.ndarray) -> np.ndarray:
         """Return what errors of the measured outputs change."""
-        return self.components(Signals(values, np.zeros((*values.shape[:-2], self.size)), np.empty(0)))
+        return self.components(ComparedSignals(values, np.zeros((*values.shape[:-2], self.size)), np.empty(0)))
 
-    def add_vjp(self, predicted: Any, weights: np.ndarray, total: Signals) -> None:
+    def add_vjp(self, predicted: Any, weights: np.ndarray, total: ComparedSignals) -> None:
         """Add the transposed whitening and regression."""
         joint = weights @ self.whitening
         total.log_multipliers[...] += joint

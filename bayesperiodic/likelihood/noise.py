@@ -20,8 +20,8 @@ from bayesperiodic.priors.single import LogNormal, Prior
 
 __all__ = ["Circulant", "Independent", "Measured", "Noise"]
 
-CHANNEL, EXPERIMENT = "channel", "experiment"
-JEFFREYS, FLAT = "jeffreys", "flat"
+PER_CHANNEL, PER_EXPERIMENT = "channel", "experiment"
+JEFFREYS, FLAT_PRIOR = "jeffreys", "flat"
 VARIANCE = "variance"
 
 # A residual correlated over a few per cent of a period is what smooth model errors leave.
@@ -57,7 +57,7 @@ class Noise(ABC):
     'prior InverseGamma(shape=3.0, scale=2.0)'
     """
 
-    per: str = field(default=CHANNEL, kw_only=True)
+    per: str = field(default=PER_CHANNEL, kw_only=True)
     prior: Any = field(default=JEFFREYS, kw_only=True)
 
     name: ClassVar[str]
@@ -76,12 +76,12 @@ class Noise(ABC):
     @property
     def separate(self) -> bool:
         """Whether each experiment has its own noise parameters."""
-        return self.per == EXPERIMENT
+        return self.per == PER_EXPERIMENT
 
     def __post_init__(self) -> None:
-        _checks.one_of("per", self.per, (CHANNEL, EXPERIMENT))
+        _checks.one_of("per", self.per, (PER_CHANNEL, PER_EXPERIMENT))
         if isinstance(self.prior, str):
-            _checks.one_of("prior", self.prior, (JEFFREYS, FLAT))
+            _checks.one_of("prior", self.prior, (JEFFREYS, FLAT_PRIOR))
             return
         prior = as_prior("prior", self.prior)
         if prior.support[0] < 0.0:
@@ -95,12 +95,12 @@ class Noise(ABC):
     @property
     def spare(self) -> int:
         """How many more values than free parameters the prior of a variance needs: the flat one diverges with two."""
-        return 2 if self.prior == FLAT else 0
+        return 2 if self.prior == FLAT_PRIOR else 0
 
     @property
     def prior_text(self) -> str:
         """The prior of a variance in words."""
-        return {JEFFREYS: "Jeffreys prior 1/v", FLAT: "flat prior"}.get(self.prior, f"prior {self.prior!r}")
+        return {JEFFREYS: "Jeffreys prior 1/v", FLAT_PRIOR: "flat prior"}.get(self.prior, f"prior {self.prior!r}")
 
     def check(self, blocks: Sequence[Block]) -> None:
         """Refuse data that this noise model cannot be used for.
@@ -139,7 +139,7 @@ class Noise(ABC):
         str
             The channel, followed by the experiment where each has its own.
         """
-        return block.channel if self.per == CHANNEL else f"{block.channel}, {block.experiment}"
+        return block.channel if self.per == PER_CHANNEL else f"{block.channel}, {block.experiment}"
 
     def parameter_names(self, block: Block) -> tuple[str, ...]:
         """Return the names of the noise parameters of a block.
@@ -245,7 +245,7 @@ class Noise(ABC):
             return _over_logarithm(self.shape_priors[kind], value)
         if self.has_constant_prior(kind):
             return np.zeros_like(value), np.zeros_like(value)
-        if self.prior == FLAT:
+        if self.prior == FLAT_PRIOR:
             return np.log(value), np.ones_like(value)
         return _over_logarithm(self._proper_prior, value)
 
@@ -445,8 +445,8 @@ class Circulant(Noise):
         variances, slopes = self._spectrum(harmonic, block.points, values)
         point = np.rint(block.position * block.points).astype(int)
         by_lag = np.fft.ifft(np.vstack([variances, slopes.T * variances])).real
-        found = by_lag[:, np.abs(point[:, None] - point[None, :])]
-        return found[0], found[1:]
+        matrix = by_lag[:, np.abs(point[:, None] - point[None, :])]
+        return matrix[0], matrix[1:]
 
     def _spectrum(self, harmonic: np.ndarray, points: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return v·S at harmonics and its logarithmic slopes, S with mean 1 over a grid of points."""

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import minimize
 
+from bayesperiodic._linalg import TINY
 from bayesperiodic.likelihood.likelihood import Likelihood
-from bayesperiodic.likelihood.noise import FLAT, JEFFREYS, VARIANCE, Independent
+from bayesperiodic.likelihood.noise import FLAT_PRIOR, JEFFREYS, VARIANCE, Independent
 from bayesperiodic.likelihood.section_points import SCALE
 
-LOWEST, HIGHEST = 25.0, 8.0
-TINY = np.finfo(float).tiny
+LOWEST_LOG_SCALE, HIGHEST_LOG_SCALE = 25.0, 8.0
 
 
 def estimate_noise(
@@ -39,7 +39,7 @@ def estimate_noise(
         chosen = [residuals[b] for b in members]
         count = sum(block.count for block in blocks)
         plain = isinstance(likelihood.model, Independent) or not any(block.timed for block in blocks)
-        corrected = count * factor - {JEFFREYS: 0.0, FLAT: 2.0}.get(str(likelihood.model.prior), np.inf)
+        corrected = count * factor - {JEFFREYS: 0.0, FLAT_PRIOR: 2.0}.get(str(likelihood.model.prior), np.inf)
         columns = [likelihood.names.index(name) for name in group]
         if plain and corrected > 0.0:
             values[columns[0]] = max(float(moments[group[0]]) / corrected, TINY)
@@ -75,9 +75,9 @@ def _maximise(
         return -value, -part.gradients(residuals, values, log_variance_factor)[1][free]
 
     middle = np.log(centre[free])
-    bounds = [(c - LOWEST, c + HIGHEST) for c in middle]
+    bounds = [(c - LOWEST_LOG_SCALE, c + HIGHEST_LOG_SCALE) for c in middle]
     here = np.clip(np.log(start[free]), *np.transpose(bounds))
-    found = minimize(
+    optimum = minimize(
         negative,
         min((here, middle), key=lambda x: negative(x)[0]),
         jac=True,
@@ -85,4 +85,4 @@ def _maximise(
         bounds=bounds,
         options={"gtol": 1e-9, "ftol": 1e-15, "maxiter": 500},
     )
-    return complete(found.x)
+    return complete(optimum.x)

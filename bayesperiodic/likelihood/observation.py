@@ -9,7 +9,7 @@ import numpy as np
 from bayesperiodic import _fourier
 from bayesperiodic._parallel import available_cores, in_threads
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.block import Block, Signals, measured_channels, measured_variance
+from bayesperiodic.likelihood.block import Block, ComparedSignals, measured_channels, measured_variance
 from bayesperiodic.likelihood.kinds import blocks_of
 from bayesperiodic.likelihood.likelihood import Residuals
 from bayesperiodic.models.model import Model
@@ -117,7 +117,7 @@ class Observation:
         self._shifted = delayed or model.autonomous
         self.data = np.stack([experiment.outputs[channel] for channel in self.channels], axis=-1)
         logarithms = np.log(np.abs(experiment.measured_multipliers))
-        self._measured = Signals(self.data, logarithms, np.array(experiment.frequency))
+        self._measured = ComparedSignals(self.data, logarithms, np.array(experiment.frequency))
         self._points = len(self.data)
 
     @cached_property
@@ -142,19 +142,19 @@ class Observation:
 
     def data_components(self) -> list[np.ndarray]:
         """Return the components (size,) of the measured values, without what errors of the inputs caused."""
-        found = [block.errors(self.data) for block in self.blocks]
-        return found if self.caused is None else [a - b for a, b in zip(found, self.caused, strict=True)]
+        components = [block.errors(self.data) for block in self.blocks]
+        return components if self.caused is None else [a - b for a, b in zip(components, self.caused, strict=True)]
 
     def residuals(self, response: Response) -> list[np.ndarray]:
         """Return the residual components, one array (…, size) a block."""
         measured, predicted = self._measured, self._signals(response)
-        difference = Signals(
+        difference = ComparedSignals(
             self._difference(response),
             measured.log_multipliers - predicted.log_multipliers,
             measured.frequency - predicted.frequency,
         )
-        found = [block.compare(predicted, difference) for block in self.blocks]
-        return found if self.caused is None else [a - b for a, b in zip(found, self.caused, strict=True)]
+        components = [block.compare(predicted, difference) for block in self.blocks]
+        return components if self.caused is None else [a - b for a, b in zip(components, self.caused, strict=True)]
 
     def errors(self, values: np.ndarray) -> list[np.ndarray]:
         """Return the components (…, size) of errors of the measured values (…, points, channels), an array a block."""
@@ -172,15 +172,18 @@ class Observation:
         if self._shifted:
             moved = self._shift(moved, self._fraction(response))
             moved = moved - self._rate(response) * self._fraction_changes(response, directions)[:, None, None]
-        along, predicted = Signals(moved, directions.log_multipliers, directions.frequency), self._signals(response)
+        along, predicted = (
+            ComparedSignals(moved, directions.log_multipliers, directions.frequency),
+            self._signals(response),
+        )
         return [block.changes(predicted, along) for block in self.blocks]
 
     def vjp(self, response: Response, weights: list[np.ndarray]) -> Response:
         """Return the derivatives of Σ weights · predicted components by everything in a forced model's response."""
         predicted = self._signals(response)
-        by = Signals(np.zeros_like(self.data), np.zeros(self.multipliers), np.zeros(()))
-        for block, own in zip(self.blocks, weights, strict=True):
-            block.add_vjp(predicted, own, by)
+        by = ComparedSignals(np.zeros_like(self.data), np.zeros(self.multipliers), np.zeros(()))
+        for block, weight in zip(self.blocks, weights, strict=True):
+            block.add_vjp(predicted, weight, by)
         total, by_delay = by.values, 0.0
         if self._shifted:
             fraction = float(response.frequency) / self.experiment.periods
@@ -203,8 +206,8 @@ class Observation:
         noise = np.full((len(components[0]), *self.data.shape), np.nan)
         if self.caused is not None:
             components = [a + b for a, b in zip(components, self.caused, strict=True)]
-        for block, own in zip(self.blocks, components, strict=True):
-            block.simulate(own, noise)
+        for block, component in zip(self.blocks, components, strict=True):
+            block.simulate(component, noise)
         values = self._predicted(response) + noise
         turned = self.data - _fourier.within_half_turn(self.data - values)
         return {n: (turned if self.angles[c] else values)[..., c] for c, n in enumerate(self.channels)}
@@ -217,9 +220,9 @@ class Observation:
         pairs = zip(self.channels, np.moveaxis(self._difference(response, ahead), -1, 0), strict=True)
         return {channel: self.experiment.compared(channel, e) for channel, e in pairs}
 
-    def _signals(self, response: Response) -> Signals:
+    def _signals(self, response: Response) -> ComparedSignals:
         """Return the prediction of what was measured."""
-        return Signals(self._predicted(response), response.log_multipliers, response.frequency)
+        return ComparedSignals(self._predicted(response), response.log_multipliers, response.frequency)
 
     def _difference(self, response: Response, ahead: int = 0) -> np.ndarray:
         """Return y − ŷ (…, points, channels), ŷ some forcing periods ahead, angles within half a turn."""
@@ -240,10 +243,10 @@ class Observation:
         """Return by what fraction of the response period the outputs are shifted, (…,)."""
         fraction = np.asarray(response.delay) * response.frequency / self.experiment.periods
         if self._free_phase:
-            own, reference = self._fundamentals(response.outputs), self._reference
+            amplitudes, reference = self._fundamentals(response.outputs), self._reference
             # In real numbers: the rounding of NumPy's complex products depends on how many there are.
-            cosine = np.sum(own.real * reference.real - own.imag * reference.imag, axis=-1)
-            sine = np.sum(own.real * reference.imag + own.imag * reference.real, axis=-1)
+            cosine = np.sum(amplitudes.real * reference.real - amplitudes.imag * reference.imag, axis=-1)
+            sine = np.sum(amplitudes.real * reference.imag + amplitudes.imag * reference.real, axis=-1)
             fraction = fraction + np.arctan2(sine, cosine) / (2 * np.pi)
         return fraction
 
@@ -333,12 +336,14 @@ class Comparisons:
             for m, observation in enumerate(group):
                 layouts.setdefault(observation.layout or observation.experiment.name, []).append(m)
             for members in layouts.values():
-                own = [group[m] for m in members]
-                each = zip(*(o.data_components() for o in own), strict=True) if own[0].layout else ()
+                members_of = [group[m] for m in members]
+                each = zip(*(o.data_components() for o in members_of), strict=True) if members_of[0].layout else ()
                 data = [np.stack(components)[:, None] for components in each]
-                self._parts.append(_Part(g, slice(None) if len(own) == len(group) else members, own, data))
-                blocks = range(stacks, stacks + len(own[0].blocks))
-                places |= {o.experiment.name: [(b, m) for b in blocks] for m, o in enumerate(own)}
+                self._parts.append(
+                    _Part(g, slice(None) if len(members_of) == len(group) else members, members_of, data)
+                )
+                blocks = range(stacks, stacks + len(members_of[0].blocks))
+                places |= {o.experiment.name: [(b, m) for b in blocks] for m, o in enumerate(members_of)}
                 stacks = blocks.stop
         self._places = [place for name in order for place in places[name]]
 
@@ -351,8 +356,8 @@ class Comparisons:
             if parts <= 1:
                 return Residuals(self._stacks(simulation), self._places)
             slices = [slice(solves * k // parts, solves * (k + 1) // parts) for k in range(parts)]
-            found = in_threads(lambda part: self._stacks(simulation.at(part)), slices, parts)
-        return Residuals([np.concatenate(own, axis=1) for own in zip(*found, strict=True)], self._places)
+            stacks = in_threads(lambda part: self._stacks(simulation.at(part)), slices, parts)
+        return Residuals([np.concatenate(stack, axis=1) for stack in zip(*stacks, strict=True)], self._places)
 
     def _stacks(self, simulation: Simulation) -> list[np.ndarray]:
         """Return the residual components of all parts, an array (experiments, solves, size) a block."""
@@ -361,7 +366,9 @@ class Comparisons:
             solved, first = simulation.groups[group], observations[0]
             if data:
                 values = solved.outputs[members][..., first.picked]
-                result += [own - block.errors(values) for own, block in zip(data, first.blocks, strict=True)]
+                result += [
+                    predicted - block.errors(values) for predicted, block in zip(data, first.blocks, strict=True)
+                ]
             else:
                 (member,) = range(len(solved.outputs))[members] if isinstance(members, slice) else members
                 result += [block[None] for block in first.residuals(solved.response(member))]
@@ -379,16 +386,16 @@ class Comparisons:
         by_delay, by_multipliers = [np.zeros(len(group.outputs)) for group in simulation.groups], {}
         stacks = iter(weights.stacks())
         for group, members, observations, data in self._parts:
-            first, own = observations[0], [next(stacks) for _ in observations[0].blocks]
+            first, pulls = observations[0], [next(stacks) for _ in observations[0].blocks]
             if data:
-                by = Signals(np.zeros((len(observations), *first.data.shape)), np.empty(0), np.empty(0))
-                for block, weight in zip(first.blocks, own, strict=True):
+                by = ComparedSignals(np.zeros((len(observations), *first.data.shape)), np.empty(0), np.empty(0))
+                for block, weight in zip(first.blocks, pulls, strict=True):
                     block.add_vjp(None, weight, by)
                 for c, column in enumerate(first.columns):
                     by_outputs[group][members, :, column] = by.values[..., c]
             else:
                 response = simulation.at(0).response(first.experiment.name)
-                found = first.vjp(response, [stack[0] for stack in own])
-                by_outputs[group][members], by_delay[group][members] = found.outputs, found.delay
-                by_multipliers[first.experiment.name] = found.log_multipliers
+                pulled = first.vjp(response, [stack[0] for stack in pulls])
+                by_outputs[group][members], by_delay[group][members] = pulled.outputs, pulled.delay
+                by_multipliers[first.experiment.name] = pulled.log_multipliers
         return by_outputs, by_delay, by_multipliers

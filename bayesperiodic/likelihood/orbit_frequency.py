@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.block import Linear, Signals, common
+from bayesperiodic.likelihood.block import ComparedSignals, LinearBlock, common
 from bayesperiodic.models.model import Model
 
 FREQUENCY = "frequency"
 
 
 @dataclass(frozen=True, eq=False)
-class OrbitFrequency(Linear):
+class OrbitFrequency(LinearBlock):
     """Frequency in units of its standard error."""
 
     standard_error: float = 1.0  # [Hz]
@@ -36,10 +36,10 @@ class OrbitFrequency(Linear):
         """Minus the logarithm of the standard error."""
         return -math.log(self.standard_error)
 
-    def components(self, moved: Signals) -> np.ndarray:
+    def components(self, moved: ComparedSignals) -> np.ndarray:
         """Return the frequency over its standard error."""
         return np.asarray(moved.frequency)[..., None] / self.standard_error
 
-    def add_vjp(self, predicted: Any, weights: np.ndarray, total: Signals) -> None:
+    def add_vjp(self, predicted: Any, weights: np.ndarray, total: ComparedSignals) -> None:
         """Add the weight over the standard error."""
         total.frequency[...] += weights[0] / self.standard_error

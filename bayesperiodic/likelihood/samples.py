@@ -8,7 +8,7 @@ import numpy as np
 from scipy.fft import dct
 
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.block import Block, Signals, Timed, common, measured_channels
+from bayesperiodic.likelihood.block import Block, ComparedSignals, Timed, common, measured_channels
 from bayesperiodic.models.model import Model
 
 
@@ -42,11 +42,11 @@ class Samples(Timed):
         """Indices of the points on the grid, (size,)."""
         return np.rint(self.position * self.points).astype(int)
 
-    def components(self, moved: Signals) -> np.ndarray:
+    def components(self, moved: ComparedSignals) -> np.ndarray:
         """Return the values at the points."""
         return moved.values[..., self.place].take(self._at, axis=-1)
 
-    def add_vjp(self, predicted: Any, weights: np.ndarray, total: Signals) -> None:
+    def add_vjp(self, predicted: Any, weights: np.ndarray, total: ComparedSignals) -> None:
         """Add the weights at the points."""
         total.values[self._at, self.place] += weights
 

@@ -8,14 +8,14 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.block import PROPORTIONAL, Linear, Signals, common, measured_channels, times
+from bayesperiodic.likelihood.block import PROPORTIONAL, ComparedSignals, LinearBlock, common, measured_channels, times
 from bayesperiodic.models.model import Model
 
 SCALE = "scale"
 
 
 @dataclass(frozen=True, eq=False)
-class SectionPoints(Linear):
+class SectionPoints(LinearBlock):
     """Values that are whitened by their covariance, which is known up to one factor, the noise parameter "scale"."""
 
     at: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))  # (points compared,), on the grid
@@ -43,11 +43,11 @@ class SectionPoints(Linear):
         """The logarithm of the determinant of what whitens the values."""
         return float(np.log(np.diag(self.whitening)).sum())
 
-    def components(self, moved: Signals) -> np.ndarray:
+    def components(self, moved: ComparedSignals) -> np.ndarray:
         """Return the whitened values."""
         return times(self.whitening, values_at(moved.values, self.at))
 
-    def add_vjp(self, predicted: Any, weights: np.ndarray, total: Signals) -> None:
+    def add_vjp(self, predicted: Any, weights: np.ndarray, total: ComparedSignals) -> None:
         """Add the transposed whitening."""
         total.values[self.at] += (weights @ self.whitening).reshape(self.at.size, -1)
 

@@ -273,7 +273,7 @@ def _passed(value: float, origin: float, until: float) -> float | None:
     return origin if direction * (value - origin) < 0.0 else None
 
 
-ARRIVED, ROUND_FOLDS, FOLD = "arrived", "round folds", "fold"
+ARRIVED, ROUND_FOLDS, FOLDED = "arrived", "round folds", "fold"
 EQUILIBRIUM, SHORTER, PATH_LOST = "equilibrium", "shorter period", "lost"
 PATH_STEP, MOST_PATH_POINTS = 0.1, 300
 
@@ -304,7 +304,7 @@ def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.nd
                 return ROUND_FOLDS if folded else ARRIVED
             folded |= bool(point.tangent[1][0] < 0.0)
             before = point.z
-    return FOLD if folded else PATH_LOST
+    return FOLDED if folded else PATH_LOST
 
 
 def _is_reversed(z: np.ndarray, before: np.ndarray) -> bool:

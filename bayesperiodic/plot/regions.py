@@ -38,7 +38,7 @@ LOWEST_QUANTILES, VANISHING_RATIO, RIDGE_CORRELATION = (0.002, 0.02), 0.2, 0.9
 # Points of the curve that is the trend of one quantity in the other, and the sd about it, relative to that about a
 # line, below which it is removed; distance of the ends of its extrapolation.
 KNOTS, CURVED_RATIO, FAR_KNOT = 48, 0.3, 100.0
-SMALLEST_VALUE, LEAST_ROOM = float(np.finfo(float).tiny), 1e-9
+SMALLEST_DENSITY, LEAST_ROOM = float(np.finfo(float).tiny), 1e-9
 
 
 @dataclass(frozen=True)
@@ -130,12 +130,12 @@ class Chart:
         slope = np.full(x.shape[:-1], 1.0 / np.prod(self.scale))
         for k, logarithmic in enumerate(self.logarithmic):
             if logarithmic:
-                slope = slope / np.maximum(x[..., k], SMALLEST_VALUE)
+                slope = slope / np.maximum(x[..., k], SMALLEST_DENSITY)
         return slope
 
 
 def _logarithm(x: np.ndarray) -> np.ndarray:
-    return np.log(np.maximum(x, SMALLEST_VALUE))
+    return np.log(np.maximum(x, SMALLEST_DENSITY))
 
 
 def _logarithmic(draws: np.ndarray, supports: Sequence[Support]) -> list[bool]:
@@ -157,7 +157,7 @@ def _edges(v: np.ndarray, support: Sequence[float]) -> Support:
 
 def _trend(x: np.ndarray, y: np.ndarray) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
     """Return the mean of y given x, a line unless a curve explains much more, and the sd of the rest."""
-    slope = float(x @ y / max(x @ x, SMALLEST_VALUE))
+    slope = float(x @ y / max(x @ x, SMALLEST_DENSITY))
     line, straight = (lambda t: slope * t), float((y - slope * x).std())
     members = np.array_split(np.argsort(x), min(KNOTS, max(1, len(x) // 50)))
     knots = np.array([[x[m].mean(), y[m].mean()] for m in members]).T

@@ -12,8 +12,8 @@ from bayesperiodic.data.experiment import DATA, Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.likelihood.input_noise import (
     EXACT,
+    FROM_CYCLES,
     JOINT,
-    MEASURED,
     InputErrors,
     InputNoise,
     checked,
@@ -23,7 +23,7 @@ from bayesperiodic.likelihood.input_noise import (
 )
 from bayesperiodic.likelihood.kinds import blocks_of
 from bayesperiodic.likelihood.likelihood import Likelihood
-from bayesperiodic.likelihood.noise import EXPERIMENT, Noise, as_noise
+from bayesperiodic.likelihood.noise import PER_EXPERIMENT, Noise, as_noise
 from bayesperiodic.likelihood.observation import Observation
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.equations import PeriodicEquations
@@ -33,7 +33,7 @@ from bayesperiodic.priors.single import Uniform
 from bayesperiodic.problem.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
 
 # Least width of a prior relative to its median; below it the log-posterior is not smooth in double precision.
-NARROWEST = 1e-12
+LEAST_WIDTH = 1e-12
 
 
 class Description:
@@ -50,7 +50,7 @@ class Description:
         local: Iterable[str] = (),
         noise: str | Noise = "independent",
         scheme: str | Scheme | None = None,
-        input_noise: InputNoise = MEASURED,
+        input_noise: InputNoise = FROM_CYCLES,
     ):
         if not isinstance(model, Model):
             raise ValueError(f"model: must be a Model, got {_checks.shortened(model)}.")
@@ -77,7 +77,7 @@ class Description:
                     f"input_noise: must be 'joint' or 'exact' for points of a mask with {self.noise.name!r} noise, got "
                     f"{_checks.shortened(input_noise)}; take noise='independent' or 'measured', or whole periods."
                 )
-            self.input_noise = EXACT if self.input_noise == MEASURED else self.input_noise
+            self.input_noise = EXACT if self.input_noise == FROM_CYCLES else self.input_noise
         measured = {channel for experiment in self.experiments for channel in experiment.outputs}
         self.channels = tuple(channel for channel in model.outputs if channel in measured)
         runs = [e.name for e in self.experiments]
@@ -170,10 +170,10 @@ class Description:
         """Refuse priors that are narrower than the rounding of their parameter."""
         sizes = np.spacing(np.abs(self.median())) / np.finfo(float).eps
         for name, width, size in zip(self.names, self.joint_prior.widths, sizes, strict=True):
-            if not width > NARROWEST * size:
+            if not width > LEAST_WIDTH * size:
                 raise ValueError(
-                    f"priors[{name!r}]: must be wider than {NARROWEST:g} of the median, got a width of {width:.3g}; a "
-                    f"known value is given by fixed={{{name!r}: …}}."
+                    f"priors[{name!r}]: must be wider than {LEAST_WIDTH:g} of the median, got a width of {width:.3g}; "
+                    f"a known value is given by fixed={{{name!r}: …}}."
                 )
 
     def _check_counts(self) -> None:
@@ -187,7 +187,9 @@ class Description:
             needed = len(acting) + self.noise.spare
             if group[0] in self.likelihood.free and count <= needed:
                 names = ", ".join(self.names[i] for i in acting)
-                shared = "Share it among experiments (per='channel'), fix" if self.noise.per == EXPERIMENT else "Fix"
+                shared = (
+                    "Share it among experiments (per='channel'), fix" if self.noise.per == PER_EXPERIMENT else "Fix"
+                )
                 raise ValueError(
                     f"priors: an unknown {group[0]!r} with the {self.noise.prior_text} must have more than {needed} "
                     f"independent values for {len(acting)} free parameters ({names}), got only {count:.0f}. {shared} "

@@ -24,7 +24,7 @@ from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction, predict
 from bayesperiodic.estimation.map_estimate import estimation_warnings
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.likelihood.input_noise import JOINT, MEASURED
+from bayesperiodic.likelihood.input_noise import FROM_CYCLES, JOINT
 from bayesperiodic.periodic.schemes import find_scheme
 from bayesperiodic.problem.fingerprint import check_results, fingerprint
 from bayesperiodic.problem.parameters import SHIFT, squared
@@ -60,7 +60,7 @@ class ReportInputs:
         problem: Problem,
         fit: MapEstimate,
         posterior: Posterior | None,
-        found: Identifiability | None,
+        identified: Identifiability | None,
         comparison: Comparison | None,
         prediction: Prediction | None,
         missing: MissingTerms | None,
@@ -74,8 +74,8 @@ class ReportInputs:
                 prediction = predict(problem, posterior) if prediction is None else prediction
             except RuntimeError as error:
                 no_prediction = str(error)
-        found = identifiability(problem, fit, posterior, profile=False) if found is None else found
-        _checks.same_names("identifiability", dict.fromkeys(found.table.index), problem.names)
+        identified = identifiability(problem, fit, posterior, profile=False) if identified is None else identified
+        _checks.same_names("identifiability", dict.fromkeys(identified.table.index), problem.names)
         if comparison is not None:
             remedy = "give the one of this problem, compare(problem, fit, posterior)"
             _checks.contains("comparison", comparison.table.index, problem.names, remedy)
@@ -85,7 +85,7 @@ class ReportInputs:
             _checks.instance("missing", missing, MissingTerms)
             if missing.fit(0).fingerprint != fingerprint(problem):
                 raise ValueError("missing: must be missing_terms(problem, fit) of this problem, got that of another.")
-        return cls(problem, fit, posterior, found, comparison, prediction, missing, no_prediction)
+        return cls(problem, fit, posterior, identified, comparison, prediction, missing, no_prediction)
 
     @property
     def synthetic(self) -> bool:
@@ -349,8 +349,8 @@ def input_noise(given: ReportInputs) -> str:
     if problem.input_noise == JOINT:
         text = "The errors of the inputs are parameters, with priors by the scatter of the cycles."
     elif noisy:
-        names = ", ".join(dict.fromkeys(name for own in noisy.values() for name in own))
-        source = "the scatter of the cycles" if problem.input_noise == MEASURED else "the problem, which states it"
+        names = ", ".join(dict.fromkeys(name for wave in noisy.values() for name in wave))
+        source = "the scatter of the cycles" if problem.input_noise == FROM_CYCLES else "the problem, which states it"
         text = f"The noise of the inputs ({names}), known from {source}, is " + (
             "integrated out: the covariance of the residual includes it, and so do standard deviations and intervals."
             if fit.input_errors
@@ -361,7 +361,7 @@ def input_noise(given: ReportInputs) -> str:
         text, before, after = "The inputs are taken as exact.", "would cause", "with the measured inputs"
     for channel, caused in fit.input_noise.items():
         sd, rms = number(caused), number(fit.rms[channel])
-        unit = "" if (own := given.unit(channel)) == html.NOTHING else f" {own}"
+        unit = "" if (wave := given.unit(channel)) == html.NOTHING else f" {wave}"
         if caused:
             text += f" Their noise {before} a standard deviation of {sd}{unit} in {channel}; "
             text += f"the rms of the residual {after} is {rms}{unit}."
@@ -389,24 +389,24 @@ def verdicts(given: ReportInputs) -> Rows:
     )
 
 
-def laplace(found: Comparison) -> Rows:
+def laplace(compared: Comparison) -> Rows:
     """Return the table of the comparison of Laplace with MCMC."""
     titles = {"shift": "Shift", "sd_ratio": "Ratio of sds", "skewness": "Skewness", "wasserstein": "Distance"}
     columns: dict[str, Any] = {"coordinate": ("Coordinate", code), "verdict": ("Verdict", badge)}
     columns |= {column: (title, html.Number) for column, title in titles.items()}
     two = html.Rounding(0, 2).text
-    pairs = {c: found.table[c].map(two) + " ± " + found.table[f"{c}_mcse"].map(two) for c in titles}
-    return _formatted(found.table.assign(**pairs), **columns, recommendation=("Recommendation", str))
+    pairs = {c: compared.table[c].map(two) + " ± " + compared.table[f"{c}_mcse"].map(two) for c in titles}
+    return _formatted(compared.table.assign(**pairs), **columns, recommendation=("Recommendation", str))
 
 
-def adequacy(found: Prediction) -> Rows:
+def adequacy(prediction: Prediction) -> Rows:
     """Return the table of the tests of the model."""
     columns: dict[str, Any] = {"label": ("Experiment and channel", str), "verdict": ("Verdict", badge)}
     columns |= {test: (f"p-values: {test}", html.p_value) for test in ADEQUACY_TESTS}
-    return _formatted(found.table, **columns, model_error_share=("Fraction of model error", html.percent))
+    return _formatted(prediction.table, **columns, model_error_share=("Fraction of model error", html.percent))
 
 
-def missing_terms(found: MissingTerms) -> Rows:
+def missing_terms(search: MissingTerms) -> Rows:
     """Return the table of the models with more and more terms, the given one first."""
     return [
         {
@@ -420,7 +420,7 @@ def missing_terms(found: MissingTerms) -> Rows:
             "Coefficient": number(step.coefficient, 4),
             "Robust sd": number(step.robust_sd),
         }
-        for step in (found.before, *found.steps)
+        for step in (search.before, *search.steps)
     ]
 
 

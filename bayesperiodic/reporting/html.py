@@ -149,21 +149,21 @@ TAGS = {
 
 def equations(model: Model) -> list[Markup]:
     """Return the equations of motion, one per state, with the terms that contain no state on the right-hand side."""
-    printer, states = _Printer(_names(model)), model.state_symbols.values()
+    printer, states = _MathPrinter(_names(model)), model.state_symbols.values()
     sides = [equation.as_independent(*states, as_Add=True) for equation in model.equations]
     return [printer.equation(left, -right) for right, left in sides]
 
 
 def outputs(model: Model) -> list[Markup]:
     """Return the output equations, one per channel."""
-    printer = _Printer(_names(model))
+    printer = _MathPrinter(_names(model))
     each = zip(model.outputs, model.output_expressions, strict=True)
     return [printer.equation(sp.Symbol(name), expression) for name, expression in each]
 
 
 def symbol(name: str) -> Markup:
     """Typeset a name: Greek letters, and digits and the parts after underscores as subscripts."""
-    return Markup(f"<math>{_Printer({}).text(sp.Symbol(name))}</math>")
+    return Markup(f"<math>{_MathPrinter({}).text(sp.Symbol(name))}</math>")
 
 
 def _names(model: Model) -> dict[sp.Symbol, tuple[str, int]]:
@@ -175,7 +175,7 @@ def _names(model: Model) -> dict[sp.Symbol, tuple[str, int]]:
     return meanings
 
 
-class _Printer(MathMLPresentationPrinter):
+class _MathPrinter(MathMLPresentationPrinter):
     """Printer of symbols by their names, with dots for time derivatives."""
 
     def __init__(self, names: dict[sp.Symbol, tuple[str, int]]):

@@ -16,8 +16,8 @@ from bayesperiodic._linalg import covariance_eigh
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 
 # Numbers of components and degrees of freedom that are tried; a larger mixture must raise the mean log-density of the
-# draws left out by more than LEAST_GAIN.
-COMPONENT_NUMBERS, HEAVY_TAILS, LIGHT_TAILS, LEAST_GAIN = (1, 2, 3, 4, 6, 8), 5.0, 30.0, 0.01
+# draws left out by more than LEAST_SCORE_GAIN.
+COMPONENT_NUMBERS, HEAVY_TAILS, LIGHT_TAILS, LEAST_SCORE_GAIN = (1, 2, 3, 4, 6, 8), 5.0, 30.0, 0.01
 WIDER_WEIGHT, WIDER_FACTOR = 0.1, 2.0
 # Most draws used in a fit, and draws needed per coordinate and component.
 MOST_FITTED_DRAWS, PER_COMPONENT = 6000, 20
@@ -131,7 +131,7 @@ def fit_mixture(draws: np.ndarray, candidates: Sequence[StudentMixture] = ()) ->
             break
         fitted = _fitted(train, count, curvature)
         scores = {nu: float(_with_wider(fitted, nu).log_density(test).mean()) for nu in (HEAVY_TAILS, LIGHT_TAILS)}
-        if (score := max(scores.values())) > best + (LEAST_GAIN if size else 0.0):
+        if (score := max(scores.values())) > best + (LEAST_SCORE_GAIN if size else 0.0):
             best, size, degrees, chosen, worse = score, count, max(scores, key=scores.__getitem__), None, 0
         elif (worse := worse + 1) == 2:
             break
@@ -156,7 +156,7 @@ def _coefficients(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def _bent(train: np.ndarray, test: np.ndarray) -> int:
     """Return how many of the first coordinates are curved: where products reduce the variance at the test points."""
-    dimension, gains = train.shape[1], {0: LEAST_GAIN}
+    dimension, gains = train.shape[1], {0: LEAST_SCORE_GAIN}
     for bent in sorted({1, 2, 3, dimension // 4, dimension // 2} & set(range(1, dimension))):
         known, new = _terms(train, bent), _terms(test, bent)
         straight, curved = (

@@ -26,7 +26,7 @@ from bayesperiodic._parallel import (
 from bayesperiodic.density.log_posterior import (
     COLLAPSED,
     NATURAL,
-    RIDGE,
+    RIDGE_COORDINATES,
     SAMPLED,
     Evaluation,
     LogPosterior,
@@ -79,7 +79,7 @@ def sample(
     walkers: int | None = None,
     max_steps: int = 20_000,
     start: str = FROM_LAPLACE,
-    coordinates: str = RIDGE,
+    coordinates: str = RIDGE_COORDINATES,
     variances: str = SAMPLED,
     sampler: str = EMCEE,
     checkpoint: str | Path | None = None,
@@ -190,7 +190,7 @@ def sample(
     _checks.integer("max_steps", max_steps, FEWEST_STEPS)
     _checks.integer("seed", seed, 0)
     _checks.one_of("start", start, STARTS)
-    _checks.one_of("coordinates", coordinates, (RIDGE, NATURAL))
+    _checks.one_of("coordinates", coordinates, (RIDGE_COORDINATES, NATURAL))
     _checks.one_of("variances", variances, (SAMPLED, COLLAPSED))
     _checks.one_of("sampler", sampler, (EMCEE, NUTS))
     if not isinstance(fit, MapEstimate):

@@ -135,7 +135,7 @@ def test_file_that_unpacks_to_more_than_the_limit_is_refused(tmp_path, kind, mon
     path = tmp_path / "bomb"
     path.write_bytes(saved(kind, COLUMNS | {"F": np.zeros(1_000_000)}))
     assert path.stat().st_size < 50_000
-    monkeypatch.setattr(files, "LARGEST", 7_000_000)
+    monkeypatch.setattr(files, "LARGEST_ARRAY", 7_000_000)
     with pytest.raises(ValueError, match=r"path: must be .*bomb.* more than 0\.007 GB"):
         read(path, kind)
 

@@ -14,7 +14,7 @@ from bayesperiodic.estimation import conflict, covariance, modes, units
 from bayesperiodic.estimation.gauss_newton import End, _step, inverse_hessian
 from bayesperiodic.estimation.laplace import JointLaplace, joint_laplace
 from bayesperiodic.estimation.modes import Mode, images, notable
-from bayesperiodic.likelihood.input_noise import MEASURED, directions
+from bayesperiodic.likelihood.input_noise import FROM_CYCLES, directions
 from bayesperiodic.likelihood.mean_period import MeanPeriod
 from tests.known import LINEAR, formula_model, linear_experiment
 
@@ -257,8 +257,8 @@ def test_perturbations_are_waves_of_one_sd_and_their_derivatives():
             wave = cosine * np.sin(h * phase) - sine * np.cos(h * phase)
             expected[row + 1, :, 2 * order + 1] = size * rate**order * wave
     order = [0, 1, 3, 2, 4]  # the mean, cosines, sines
-    assert directions(e, ("u", "v"), MEASURED) == pytest.approx(expected[order], abs=1e-12)
-    assert len(directions(bp.Experiment("run", 3.0, {"y": np.zeros(8)}, samples=8), (), MEASURED)) == 0
+    assert directions(e, ("u", "v"), FROM_CYCLES) == pytest.approx(expected[order], abs=1e-12)
+    assert len(directions(bp.Experiment("run", 3.0, {"y": np.zeros(8)}, samples=8), (), FROM_CYCLES)) == 0
 
 
 def test_nothing_is_tested_or_approximated_where_derivatives_or_the_density_do_not_exist():
