@@ -183,7 +183,7 @@ def _tableau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _integrate_periodic(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Return the same as `_integrate` for inputs that are Fourier series, by compiled code."""
     amplitudes, tau, ones = system.amplitudes(), time * system.frequency, np.ones(start.size)
-    function, dormand_prince = system.model.kernels.residual_jacobian, integration_kernels().dormand_prince
+    function, dormand_prince = system.model.kernels.residual_jacobian.address, integration_kernels().dormand_prince
 
     def path(tau: np.ndarray, absolute: np.ndarray, relative: np.ndarray) -> np.ndarray:
         states = np.empty((tau.size, start.size))

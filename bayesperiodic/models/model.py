@@ -14,7 +14,8 @@ import sympy as sp
 
 from bayesperiodic import _checks
 from bayesperiodic._compile.cache import load
-from bayesperiodic._compile.code_generation import GridFunction, Kernels, SymbolicModel, VjpKernels, grid_functions
+from bayesperiodic._compile.code_generation import Kernels, SymbolicModel, VjpKernels, grid_functions
+from bayesperiodic._compile.grid_function import GridFunction
 from bayesperiodic._expressions import parse
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
@@ -385,7 +386,7 @@ def integrate(
     orders = np.array(list(model.orders.values()))
     path = np.empty((kept, orders.sum()))
     start, inputs = np.array(start, dtype=float), np.ascontiguousarray(inputs)
-    function = model.kernels.residual_jacobian
+    function = model.kernels.residual_jacobian.address
     runge_kutta = integration_kernels().runge_kutta
     return path if runge_kutta(function, start, inputs, samples, parameters, frequency, orders, steps, path) else None
 

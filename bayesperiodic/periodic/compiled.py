@@ -20,6 +20,7 @@ import numpy as np
 from numba import types
 
 from bayesperiodic._compile.cache import declare, is_stored, load
+from bayesperiodic._compile.expectations import internals_expected
 from bayesperiodic._parallel import available_cores
 
 STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit", "not resolved")
@@ -229,7 +230,8 @@ def _kernels(name: str, sizes: tuple[int, ...]) -> ModuleType:
 
 
 def _constants(name: str, sizes: tuple[int, ...]) -> dict[str, Any]:
-    return {"SIZES": sizes, "BORDERED": SOURCES[name][1] == "border", "DEFINITIONS": _digest()}
+    route = "internals" if internals_expected() else "njit"
+    return {"SIZES": sizes, "BORDERED": SOURCES[name][1] == "border", "DEFINITIONS": _digest(), "COMPILED_BY": route}
 
 
 @contextmanager

@@ -3,15 +3,14 @@
 import numpy as np
 from numba import njit
 
-from bayesperiodic._compile.code_generation import GRID_SIGNATURE
+from bayesperiodic._compile.grid_function import grid_function_at
 
 ARRAY_2D, ARRAY_1D = "float64[:,::1]", "float64[::1]"
-FUNCTION = f"FunctionType({GRID_SIGNATURE})"
 OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
 @njit(
-    f"boolean({FUNCTION}, {ARRAY_1D}, float64, {ARRAY_1D}, float64, int64[::1], {ARRAY_2D}, {ARRAY_2D}, "
+    f"boolean(int64, {ARRAY_1D}, float64, {ARRAY_1D}, float64, int64[::1], {ARRAY_2D}, {ARRAY_2D}, "
     f"{ARRAY_2D}, {ARRAY_2D}, {ARRAY_2D}, {ARRAY_1D})",
     **OPTIONS,
 )
@@ -25,7 +24,7 @@ def slope(residual_jacobian, y, time, parameters, frequency, orders, states, row
             states[0, count + s] = y[extra]
             extra += 1
     tau[0, 0] = time
-    residual_jacobian(states, row, parameters, tau[0], frequency, columns)
+    grid_function_at(residual_jacobian)(states, row, parameters, tau[0], frequency, columns)
     highest, g = system[:count], system[count]
     for e in range(count):
         g[e] = -columns[0, e]
@@ -60,9 +59,7 @@ def slope(residual_jacobian, y, time, parameters, frequency, orders, states, row
     return True
 
 
-@njit(
-    f"boolean({FUNCTION}, {ARRAY_1D}, {ARRAY_2D}, int64, {ARRAY_1D}, float64, int64[::1], int64, {ARRAY_2D})", **OPTIONS
-)
+@njit(f"boolean(int64, {ARRAY_1D}, {ARRAY_2D}, int64, {ARRAY_1D}, float64, int64[::1], int64, {ARRAY_2D})", **OPTIONS)
 def runge_kutta(residual_jacobian, start, inputs, samples, parameters, frequency, orders, steps, path):
     """Fill `path` (kept, size) with the states before the last of the steps; see `models.model.integrate`.
 
@@ -115,7 +112,7 @@ def fill_inputs(amplitudes, time, row):
 
 
 @njit(
-    f"int64({FUNCTION}, complex128[:,::1], {ARRAY_1D}, float64, int64[::1], {ARRAY_1D}, {ARRAY_2D}, {ARRAY_2D}, "
+    f"int64(int64, complex128[:,::1], {ARRAY_1D}, float64, int64[::1], {ARRAY_1D}, {ARRAY_2D}, {ARRAY_2D}, "
     f"{ARRAY_1D}, {ARRAY_2D}, {ARRAY_1D}, {ARRAY_1D}, int64)",
     **OPTIONS,
 )
