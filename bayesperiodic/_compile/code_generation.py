@@ -8,7 +8,7 @@ Every generated function has the signature ``(states, inputs, parameters, tau, f
 - out (points, size): the result, one row per grid point.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import NamedTuple
@@ -248,9 +248,3 @@ def _code(expression: sp.Expr) -> str:
             f"{expression}, which cannot be compiled."
         )
     return text
-
-
-def as_columns(values: Iterable[np.ndarray], points: int) -> np.ndarray:
-    """Return signals as the columns of a C-contiguous array (points, signals)."""
-    stacked = [np.asarray(v, dtype=float) for v in values]
-    return np.ascontiguousarray(np.stack(stacked, axis=-1)) if stacked else np.empty((points, 0))

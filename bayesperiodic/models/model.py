@@ -360,6 +360,12 @@ def with_derivatives(space: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]
     return {d + n: sp.Symbol(f"{space}_{d}_{n}", real=True) for d in DERIVATIVES for n in names}
 
 
+def parameter_vector(model: Model, parameters: Mapping[str, float]) -> np.ndarray:
+    """Return the value of every parameter, (parameters,); raise a ValueError for other names and values."""
+    _checks.same_names("parameters", parameters, model.parameters)
+    return np.array([_checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
+
+
 @cache
 def integration_kernels() -> ModuleType:
     """Return the compiled functions of time integration."""

@@ -142,14 +142,7 @@ class Batch:
         _in_blocks(lambda block: solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads)
         return solution
 
-    def vjp(
-        self,
-        parameters: np.ndarray,
-        z: np.ndarray,
-        weights: np.ndarray,
-        moving: tuple[int, ...],
-        threads: int | None = None,
-    ) -> np.ndarray:
+    def vjp(self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, moving: tuple[int, ...]) -> np.ndarray:
         """Return Σ weights · ∂ŷ/∂θ (sets, moving) at one solution of every input set; NaN where it is singular.
 
         `weights` is (sets, points, channels); `moving` are the indices of the parameters θ.
@@ -165,7 +158,7 @@ class Batch:
             factors = empty_factors(grid, self._first.count)
             compiled.vjp_many(addresses, grid.packed, self._sets, *points, factors, *block, gradients)
 
-        _in_blocks(part, self._size, SMALLEST_BLOCK, threads, each=1)
+        _in_blocks(part, self._size, SMALLEST_BLOCK, None, each=1)
         return gradients
 
 
@@ -193,9 +186,8 @@ class AutonomousBatch:
         z, parameters = np.stack([a.z for a in anchors]), np.stack([a.parameters for a in anchors])
         known = [a.sensitivities is not None for a in anchors]
         sensitivities, slopes = np.zeros((*parameters.shape, *z.shape[1:])), np.zeros(parameters.shape)
-        for e, anchor in enumerate(anchors):
-            if anchor.sensitivities is not None and anchor.frequency_sensitivities is not None:
-                sensitivities[e], slopes[e] = anchor.sensitivities, anchor.frequency_sensitivities
+        for e in np.flatnonzero(known).tolist():
+            sensitivities[e], slopes[e] = anchors[e].sensitivities, anchors[e].frequency_sensitivities
         self._orbits = CycleAnchors(
             parameters,
             z,

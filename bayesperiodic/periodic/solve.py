@@ -3,11 +3,12 @@
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic.models.model import Model, integrate
+from bayesperiodic.models.model import Model, integrate, parameter_vector
 from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
@@ -19,39 +20,32 @@ SHARPENING = 2.0
 SMALLEST_SHARPENING = 1.02
 
 
-def raise_amplitude(equations: PeriodicEquations, parameters: np.ndarray, static: np.ndarray) -> Solved | None:
+def raise_amplitude(equations: PeriodicEquations, parameters: np.ndarray, static: np.ndarray) -> np.ndarray | None:
     """Continue the solution while the variation of the inputs about their means grows from zero; None if that fails."""
     if not equations.model.inputs:
         return None
-    mean = np.zeros_like(equations.inputs)
-    width = len(equations.model.inputs)
+    mean, width = np.zeros_like(equations.inputs), len(equations.model.inputs)
     mean[:, :width] = equations.inputs[:, :width].mean(axis=0)
     start = replace(equations, inputs=mean)
     scaled = ParametrisedEquations(start, parameters, (INPUTS,), equations.inputs - mean)
     beginning = start.solve(parameters, static)
-    if beginning.code != CONVERGED:
-        return None
     columns = start.residual_jacobian(beginning.z, parameters)
-    factors = start.factors(columns)
-    if not factors.regular:
+    if beginning.code != CONVERGED or not (factors := start.factors(columns)).regular:
         return None
     linear = factors.solve(scaled.slopes(np.zeros(1), beginning.z, columns)[0])
-    points = list(trace(scaled, beginning.z, np.zeros(1), until=1.0, step=0.1, size=np.ptp(linear, axis=0)))
-    if not points or points[-1].values[0] != 1.0:
-        return None
-    return equations.solve(parameters, points[-1].z)
+    *_, last = trace(scaled, beginning.z, np.zeros(1), until=1.0, step=0.1, size=np.ptp(linear, axis=0))
+    return last.z if last.values[0] == 1.0 else None
 
 
-def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndarray) -> Solved | None:
+def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndarray) -> np.ndarray | None:
     """Solve with softened signs first and sharpen them step by step; None if that fails or there are none."""
     if not equations.model.smooth_signs:
         return None
     soft = replace(equations, model=equations.model.softened)
-    sharpness, factor, z = SOFTEST, SHARPENING, guess
-    solved = soft.solve(np.append(parameters, sharpness), z)
+    solved = soft.solve(np.append(parameters, SOFTEST), guess)
     if solved.code != CONVERGED:
         return None
-    z = solved.z
+    sharpness, factor, z = SOFTEST, SHARPENING, solved.z
     while sharpness < 1.0:
         next_sharpness = min(1.0, sharpness * factor)
         solved = soft.solve(np.append(parameters, next_sharpness), z)
@@ -61,7 +55,7 @@ def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndar
             factor = np.sqrt(factor)
             if factor < SMALLEST_SHARPENING:
                 return None
-    return equations.solve(parameters, z)
+    return z
 
 
 PERIODS = 40
@@ -77,16 +71,14 @@ def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: 
     grid, count = equations.grid, equations.count
     second = [i for i, state in enumerate(equations.model.states) if equations.model.orders[state] == 2]
     half = _fourier.on_grid(_fourier.coefficients(equations.inputs.T), 2 * grid.points).T
-    path = integrate(
-        equations.model,
-        np.concatenate([start[0], equations.drift[second] * equations.frequency]),
-        half,
-        parameters,
-        frequency=equations.frequency,
-        samples=grid.samples,
-        steps=PERIODS * grid.points,
-        kept=grid.points,
-    )
+    state, steps = np.concatenate([start[0], equations.drift[second] * equations.frequency]), PERIODS * grid.points
+    settings: dict[str, Any] = {
+        "frequency": equations.frequency,
+        "samples": grid.samples,
+        "steps": steps,
+        "kept": grid.points,
+    }
+    path = integrate(equations.model, state, half, parameters, **settings)
     if path is None:
         return None
     z = path[:, :count] - equations.drift * (grid.tau[:, None] + (PERIODS - 1) * grid.periods)
@@ -95,12 +87,6 @@ def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: 
     z[:, turns] -= 2 * np.pi * np.round(z[0, turns] / (2 * np.pi))
     slip = np.abs(z[-1] - z[0])[angles]
     return None if np.any(slip > np.pi) else z
-
-
-def settle(equations: PeriodicEquations, parameters: np.ndarray, start: np.ndarray) -> Solved | None:
-    """Solve from the end of a time integration from rest at start[0]; None if that fails."""
-    settled = settled_period(equations, parameters, start)
-    return None if settled is None else equations.solve(parameters, settled)
 
 
 def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tuple[np.ndarray, float] | None:
@@ -113,16 +99,14 @@ def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tupl
     equilibrium = equations.static_guess(parameters)[0]
     rates = sum(model.orders.values()) - count
     start = np.concatenate([equilibrium + NUDGE * np.maximum(np.abs(equilibrium), 1.0), np.zeros(rates)])
-    path = integrate(
-        model,
-        start,
-        np.empty((2, 0)),
-        parameters,
-        frequency=equations.frequency,
-        samples=grid.samples,
-        steps=SETTLING_CYCLES * grid.samples,
-        kept=SETTLING_CYCLES * grid.samples // 4,
-    )
+    steps = SETTLING_CYCLES * grid.samples
+    settings: dict[str, Any] = {
+        "frequency": equations.frequency,
+        "samples": grid.samples,
+        "steps": steps,
+        "kept": steps // 4,
+    }
+    path = integrate(model, start, np.empty((2, 0)), parameters, **settings)
     if path is None:
         return None
     state = path[:, int(np.argmax(np.ptp(path[:, :count], axis=0) / (1.0 + np.abs(path[:, :count]).max(axis=0))))]
@@ -231,8 +215,7 @@ def solve_periodic(
     equations = PeriodicEquations.build(
         model, inputs, frequency=frequency, samples=samples, scheme=scheme, periods=periods, winding=winding
     )
-    _checks.same_names("parameters", parameters, model.parameters)
-    theta = np.array([_checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
+    theta = parameter_vector(model, parameters)
     if model.autonomous:
         equations, solved, found_by = solve_free(equations, theta, guess)
     else:
@@ -298,20 +281,20 @@ def solve_from(
 
     The first solve is returned if none converges.
     """
-    routes: dict[str, Callable[[], Solved | None]] = {
-        NEWTON: lambda: equations.solve(theta, start),
+    routes: dict[str, Callable[[], np.ndarray | None]] = {
+        NEWTON: lambda: start,
         "sharpness": lambda: sharpen(equations, theta, start),
     }
     if at_rest:
         routes["input amplitude"] = lambda: raise_amplitude(equations, theta, start)
-        routes["time integration"] = lambda: settle(equations, theta, start)
+        routes["time integration"] = lambda: settled_period(equations, theta, start)
     first = None
     for name, route in routes.items():
-        solved = route()
-        solved = solved and equations.checked(solved)
-        if solved is not None and solved.code == CONVERGED:
-            return solved, name
-        first = first or solved
+        if (guess := route()) is not None:
+            solved = equations.checked(equations.solve(theta, guess))
+            if solved.code == CONVERGED:
+                return solved, name
+            first = first or solved
     assert first is not None
     return first, NEWTON
 
