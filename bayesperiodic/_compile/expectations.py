@@ -40,6 +40,8 @@ def internals_expected() -> bool:
         if not settings.DISABLE_JIT:  # which `cache.load` refuses
             _check()
     except Exception as error:  # whatever Numba and LLVM raise when they are used in another way than they expect
+        if isinstance(error, ImportError) and str(error.name).startswith("bayesperiodic"):
+            raise  # an error of this package
         warnings.warn(
             f"Numba {numba.__version__} has other internals than those expected ({type(error).__name__}: {error}); "
             "functions are compiled by numba.njit, which takes longer. Install a version of Numba that bayesperiodic "
