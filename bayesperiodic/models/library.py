@@ -7,7 +7,8 @@ from typing import Any
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic.models.model import Model, smooth_sign
+from bayesperiodic.models.elements import smooth_sign
+from bayesperiodic.models.model import Model
 
 duffing = Model(
     "duffing",

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic.models.model import Model, integrate
+from bayesperiodic.models.model import Model
 from bayesperiodic.orbits.cycles import shift_between
 from bayesperiodic.orbits.orbit import TURN, Orbit, Orbits, counted_turns, resampled_cycle
 from bayesperiodic.orbits.section import wrapped
@@ -16,7 +16,7 @@ from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import PeriodicSolution, describe, multiplier_sensitivities
-from bayesperiodic.periodic.solve import solve_driven
+from bayesperiodic.periodic.solve import integrate, solve_driven
 
 # In units of the attractor's size: solutions that coincide, the largest range of a state of rest.
 SAME_SOLUTION, SMALLEST_MOTION = 1e-5, 1e-6
@@ -296,8 +296,7 @@ class _Polisher:
         samples, periods, count = self.samples, orbit.period, equations.count
         starts = self._phases(orbit, equations, orbit.points, rates=True)
         half = _fourier.on_grid(_fourier.coefficients(equations.inputs[:samples].T), 2 * samples).T
-        grid = {"samples": samples, "steps": samples + 1, "kept": samples + 1}
-        paths = [integrate(self.model, s, half, self.theta, frequency=equations.frequency, **grid) for s in starts]
+        paths = [integrate(equations, self.theta, start, half, samples + 1, samples + 1) for start in starts]
         segments = [path[:, :count] for path in paths if path is not None]
         if len(segments) < periods:
             return

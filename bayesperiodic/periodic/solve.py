@@ -3,12 +3,11 @@
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic.models.model import Model, integrate, parameter_vector
+from bayesperiodic.models.model import Model, integration_kernels, parameter_vector
 from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
@@ -63,6 +62,25 @@ SETTLING_CYCLES = 120
 NUDGE = 0.1
 
 
+def integrate(
+    equations: PeriodicEquations, parameters: np.ndarray, start: np.ndarray, inputs: np.ndarray, steps: int, kept: int
+) -> np.ndarray | None:
+    """Integrate by the classical fourth-order Runge-Kutta method on the grid; None if the states overflow.
+
+    `start` (size,) contains the states and then the rates of the second-order ones at tau = 0; `inputs`
+    (2·samples·periods, 3·inputs) u, u̇, ü at half steps over one response period, which is repeated. The result (kept,
+    size) contains `start`'s variables before each of the last steps.
+    """
+    orders, function = (
+        np.array(list(equations.model.orders.values())),
+        equations.model.kernels.residual_jacobian.address,
+    )
+    path = np.empty((kept, orders.sum()))
+    given = np.array(start, dtype=float), np.ascontiguousarray(inputs), equations.grid.samples, parameters
+    solved = integration_kernels().runge_kutta(function, *given, equations.frequency, orders, steps, path)
+    return path if solved else None
+
+
 def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: np.ndarray) -> np.ndarray | None:
     """Return z (points, states) over the last of `PERIODS` response periods, integrated from rest at start[0].
 
@@ -72,13 +90,7 @@ def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: 
     second = [i for i, state in enumerate(equations.model.states) if equations.model.orders[state] == 2]
     half = _fourier.on_grid(_fourier.coefficients(equations.inputs.T), 2 * grid.points).T
     state, steps = np.concatenate([start[0], equations.drift[second] * equations.frequency]), PERIODS * grid.points
-    settings: dict[str, Any] = {
-        "frequency": equations.frequency,
-        "samples": grid.samples,
-        "steps": steps,
-        "kept": grid.points,
-    }
-    path = integrate(equations.model, state, half, parameters, **settings)
+    path = integrate(equations, parameters, state, half, steps, grid.points)
     if path is None:
         return None
     z = path[:, :count] - equations.drift * (grid.tau[:, None] + (PERIODS - 1) * grid.periods)
@@ -100,13 +112,7 @@ def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tupl
     rates = sum(model.orders.values()) - count
     start = np.concatenate([equilibrium + NUDGE * np.maximum(np.abs(equilibrium), 1.0), np.zeros(rates)])
     steps = SETTLING_CYCLES * grid.samples
-    settings: dict[str, Any] = {
-        "frequency": equations.frequency,
-        "samples": grid.samples,
-        "steps": steps,
-        "kept": steps // 4,
-    }
-    path = integrate(model, start, np.empty((2, 0)), parameters, **settings)
+    path = integrate(equations, parameters, start, np.empty((2, 0)), steps, steps // 4)
     if path is None:
         return None
     state = path[:, int(np.argmax(np.ptp(path[:, :count], axis=0) / (1.0 + np.abs(path[:, :count]).max(axis=0))))]
