@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from functools import cache
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from scipy.integrate import DOP853, solve_ivp
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.recording import Recording
@@ -166,8 +166,6 @@ def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.n
 @cache
 def _tableau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return stages, nodes and error weights of the method of order 8, with the step's end as the last stage."""
-    from scipy.integrate import DOP853  # an import of half a second
-
     a = np.vstack([DOP853.A, DOP853.B])
     return a, np.append(DOP853.C, 1.0), np.stack([DOP853.E5, DOP853.E3])
 

@@ -207,13 +207,15 @@ def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, 
 
 
 class _PythonPrinter(PythonCodePrinter):
-    """SymPy's Python printer, with the functions of `machine_code` for conditions and generalised functions."""
+    """SymPy's Python printer, with the function `where` for conditions and generalised functions."""
 
     def _print_sign(self, expression: sp.Expr) -> str:
-        return f"sign({self._print(expression.args[0])})"
+        x = self._print(expression.args[0])
+        return f"(where({x} > 0.0, 1.0, 0.0) - where({x} < 0.0, 1.0, 0.0))"
 
     def _print_Heaviside(self, expression: sp.Expr) -> str:
-        return f"step({self._print(expression.args[0])})"
+        x = self._print(expression.args[0])
+        return f"(0.5*(where({x} > 0.0, 1.0, 0.0) + where({x} >= 0.0, 1.0, 0.0)))"
 
     def _print_DiracDelta(self, expression: sp.Expr) -> str:
         return "0.0"

@@ -136,16 +136,6 @@ def maximum(first: Any, *others: Any) -> Any:
     return first
 
 
-def sign(x: Any) -> Any:
-    """Return the sign, 0 at 0."""
-    return where(x > 0.0, 1.0, 0.0) - where(x < 0.0, 1.0, 0.0)
-
-
-def step(x: Any) -> Any:
-    """Return Heaviside's function, ½ at 0."""
-    return 0.5 * (where(x > 0.0, 1.0, 0.0) + where(x >= 0.0, 1.0, 0.0))
-
-
 def called(name: str, *arguments: Any) -> Any:
     """Return a function of the module `math`."""
     value = next((argument for argument in arguments if isinstance(argument, Value)), None)
@@ -227,7 +217,7 @@ class _Functions:
         return constant if isinstance(constant, float) else lambda *arguments: called(name, *arguments)
 
 
-SCOPE = {"math": _Functions(), "where": where, "min": minimum, "max": maximum, "sign": sign, "step": step}
+SCOPE = {"math": _Functions(), "where": where, "min": minimum, "max": maximum}
 
 
 class _Row:

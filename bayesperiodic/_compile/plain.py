@@ -14,7 +14,7 @@ import numba
 from bayesperiodic._compile.cache import load
 
 NJIT_OPTIONS = "cache=CACHE, error_model='numpy'"
-# Functions of the generated texts, as in `machine_code`.
+# What the generated texts use, as in `machine_code`.
 SOURCE_PREAMBLE = f"""
 import math
 from numba import cfunc, njit
@@ -23,14 +23,6 @@ from bayesperiodic._compile.grid_function import GRID_SIGNATURE
 @njit({NJIT_OPTIONS})
 def where(condition, one, other):
     return float(one) if condition else float(other)
-
-@njit({NJIT_OPTIONS})
-def sign(x):
-    return where(x > 0.0, 1.0, 0.0) - where(x < 0.0, 1.0, 0.0)
-
-@njit({NJIT_OPTIONS})
-def step(x):
-    return 0.5 * (where(x > 0.0, 1.0, 0.0) + where(x >= 0.0, 1.0, 0.0))
 """
 # The loop over the grid of a function of one point; the sums follow the last row.
 LOOP = f"""

@@ -11,7 +11,8 @@ import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic.models.model import DERIVATIVES, Model, Names, smooth_abs, smooth_sign, with_derivatives
+from bayesperiodic.models.elements import smooth_abs, smooth_sign
+from bayesperiodic.models.model import DERIVATIVES, Model, Names, with_derivatives
 from bayesperiodic.models.units import Unit, parsed, product, unit_of, written
 
 HIGHEST_DEGREE, HIGHEST_POWER = 3, 5

@@ -36,10 +36,9 @@ class Names:
         if name.startswith("_"):
             raise AttributeError(name)
         try:
-            _checks.one_of(self._kind, name, self._symbols)
+            return self[name]
         except ValueError as error:
             raise AttributeError(str(error)) from None
-        return self._symbols[name]
 
     def __getitem__(self, name: str) -> sp.Symbol:
         _checks.one_of(self._kind, name, self._symbols)
@@ -367,6 +366,12 @@ def parameter_vector(model: Model, parameters: Mapping[str, float]) -> np.ndarra
 
 
 @cache
+def dense_kernels(path: Path | None = None) -> ModuleType:
+    """Return the compiled solution of small dense systems, or the compiled functions of a source that uses it."""
+    text = (path or Path(__file__).with_name("_kernels") / "dense.py").read_text(encoding="utf-8")
+    return load(text, shared=dense_kernels() if path else None)
+
+
 def integration_kernels() -> ModuleType:
     """Return the compiled functions of time integration."""
-    return load(Path(__file__).with_name("_kernels").joinpath("integrate.py").read_text(encoding="utf-8"))
+    return dense_kernels(Path(__file__).with_name("_kernels") / "integrate.py")

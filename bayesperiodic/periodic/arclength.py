@@ -61,7 +61,7 @@ class ParametrisedEquations:
         given = equations.functions, equations.grid.packed, equations.setting(parameters), unknowns, equations.states(z)
         table = np.empty((len(z), equations.model.kernels.columns("derivatives")))
         equations.bordered_kernels.fill_slopes(*given, columns, table, folded)
-        return np.ascontiguousarray(folded.reshape(-1, *z.shape)[:, equations.grid.place])
+        return np.ascontiguousarray(folded.reshape(-1, *z.shape)[:, equations.grid.packed.place])
 
     def solve(
         self, z: np.ndarray, values: np.ndarray, rows: np.ndarray, corner: np.ndarray, scales: np.ndarray
@@ -70,8 +70,8 @@ class ParametrisedEquations:
 
         `rows` is (unknowns, points, states), `corner` (unknowns, unknowns); for the scales see `compiled.Unknowns`.
         """
-        border, targets = Border.empty(len(values), z.size), np.einsum("rps,ps->r", rows, z) + corner @ values
-        border.rows.reshape(rows.shape)[:, self.equations.grid.place] = rows
+        border, targets = Border.empty(len(values), z.size), np.sum(rows * z, axis=(1, 2)) + corner @ values
+        border.rows.reshape(rows.shape)[:, self.equations.grid.packed.place] = rows
         border.corner[:] = corner
         return self.equations.solve(self._base, z, self._unknowns(values, targets, scales), border)
 
@@ -269,7 +269,8 @@ def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.nd
     before = anchor.z
     with np.errstate(all="ignore"):
         for point in islice(trace(parametrised, anchor.z, values, until=1.0, step=PATH_STEP), MOST_PATH_POINTS):
-            if autonomous and _is_reversed(point.z, before):
+            # Beyond a Hopf point the cycle is the same one half a period later.
+            if autonomous and np.sum((point.z - point.z.mean(axis=0)) * (before - before.mean(axis=0))) <= 0.0:
                 return EQUILIBRIUM
             if equations.kernels.repetitions(point.z, equations.grid.periods) > once:
                 return SHORTER
@@ -278,8 +279,3 @@ def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.nd
             folded |= bool(point.tangent[1][0] < 0.0)
             before = point.z
     return FOLDED if folded else PATH_LOST
-
-
-def _is_reversed(z: np.ndarray, before: np.ndarray) -> bool:
-    """Return whether a cycle has passed through zero: beyond a Hopf point it is the same one half a period later."""
-    return bool(np.sum((z - z.mean(axis=0)) * (before - before.mean(axis=0))) <= 0.0)

@@ -102,17 +102,9 @@ class Batch:
             right[e] = change[:, : first.count]
         ranges = np.stack([np.ptp(a.z, axis=0) for a in anchors])
         ratios = np.divide(ranges, amplitude, out=np.full(ranges.shape, np.inf), where=amplitude > 0.0)
-        self._anchors = Anchors(
-            np.stack([a.parameters for a in anchors]),
-            np.stack([a.z for a in anchors]),
-            sensitivities,
-            amplitude,
-            gradient,
-            first.kernels.OFF_ANCHOR * ratios.min(axis=1),
-            factors,
-            left,
-            right,
-        )
+        parameters, z = np.stack([a.parameters for a in anchors]), np.stack([a.z for a in anchors])
+        near = first.kernels.OFF_ANCHOR * ratios.min(axis=1)
+        self._anchors = Anchors(parameters, z, sensitivities, amplitude, gradient, near, factors, left, right)
 
     @cached_property
     def _compiled(self) -> tuple[Callable[..., None], Functions]:
@@ -188,18 +180,11 @@ class AutonomousBatch:
         sensitivities, slopes = np.zeros((*parameters.shape, *z.shape[1:])), np.zeros(parameters.shape)
         for e in np.flatnonzero(known).tolist():
             sensitivities[e], slopes[e] = anchors[e].sensitivities, anchors[e].frequency_sensitivities
-        self._orbits = CycleAnchors(
-            parameters,
-            z,
-            frequency,
-            sensitivities,
-            slopes,
-            np.stack([f.band for f in factors]),
-            np.stack([f.pivots for f in factors]),
-            Border(*(np.stack(parts) for parts in zip(*(f.border for f in factors), strict=True))),
-            np.array([np.sum(e.phase_row(a.z) * a.z) for e, a in zip(here, anchors, strict=True)]),
-            np.where(known, [f.orientation for f in factors], 0.0),
-        )
+        band, pivots = np.stack([f.band for f in factors]), np.stack([f.pivots for f in factors])
+        border = Border(*(np.stack(parts) for parts in zip(*(f.border for f in factors), strict=True)))
+        target = np.array([np.sum(e.phase_row(a.z) * a.z) for e, a in zip(here, anchors, strict=True)])
+        bordered = band, pivots, border, target, np.where(known, [f.orientation for f in factors], 0.0)
+        self._orbits = CycleAnchors(parameters, z, frequency, sensitivities, slopes, *bordered)
 
     def solve(
         self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False, whole: bool = False

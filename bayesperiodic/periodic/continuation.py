@@ -19,7 +19,7 @@ from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.arclength import INPUTS, BranchPoint, ParametrisedEquations, Tracer, trace
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved, null_vector
-from bayesperiodic.periodic.solution import PeriodicSolution, describe, equations_of
+from bayesperiodic.periodic.solution import PeriodicSolution, describe, equations_of, settings_of
 from bayesperiodic.periodic.solve import solve_periodic
 
 if TYPE_CHECKING:
@@ -275,15 +275,13 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
         raise ValueError(
             f"solution: must have a multiplier near -1, got {solution.multipliers}. Take a period doubling of a branch."
         )
-    twice = PeriodicEquations.build(
-        model,
-        {name: np.tile(values, 2) for name, values in solution.inputs.items()},
-        frequency=solution.frequency / 2 if model.autonomous else solution.frequency,
-        samples=2 * solution.samples if model.autonomous else solution.samples,
-        scheme=solution.scheme,
-        periods=solution.periods if model.autonomous else 2 * solution.periods,
-        winding={name: 2 * turns for name, turns in solution.winding.items()},
-    )
+    settings = settings_of(solution) | {"winding": {name: 2 * turns for name, turns in solution.winding.items()}}
+    if model.autonomous:
+        settings |= {"frequency": solution.frequency / 2, "samples": 2 * solution.samples}
+    else:
+        settings |= {"periods": 2 * solution.periods}
+    inputs = {name: np.tile(values, 2) for name, values in solution.inputs.items()}
+    twice = PeriodicEquations.build(model, inputs, **settings)
     parametrised, values = _parametrised(twice, parameters, vary)
     start = np.tile(z, (2, 1))
     columns = twice.residual_jacobian(start, parameters)
@@ -422,17 +420,9 @@ def _between(
 ) -> PeriodicSolution:
     free = (1.0 - share) * before.frequency + share * after.frequency
     guess = {n: (1.0 - share) * before.states[n] + share * after.states[n] for n in before.states}
-    return solve_periodic(
-        model,
-        before.parameters | ({vary: value} if vary != FREQUENCY else {}),
-        before.inputs,
-        frequency=value if vary == FREQUENCY else free,
-        samples=before.samples,
-        scheme=before.scheme,
-        periods=before.periods,
-        winding=before.winding,
-        guess=guess,
-    )
+    parameters = before.parameters | ({vary: value} if vary != FREQUENCY else {})
+    settings = settings_of(before) | {"frequency": value if vary == FREQUENCY else free}
+    return solve_periodic(model, parameters, before.inputs, guess=guess, **settings)
 
 
 def _absent(branch: Branch, value: float) -> str:

@@ -38,7 +38,7 @@ class CyclicFactors:
     def __init__(self, grid: CyclicGrid, columns: np.ndarray, states: int, frequency: float, *border: Any):
         self._grid, self._states = grid, states
         self._compiled = kernels("linear", states, grid.stencil)
-        self._lower = grid.half_width * states + states - 1
+        self._lower = grid.packed.half_width * states + states - 1
         size = grid.points * states
         self.band = np.empty((size, 3 * self._lower + 1))
         self.pivots = np.empty(size, dtype=np.int64)
@@ -66,12 +66,12 @@ class CyclicFactors:
     def _fold(self, natural: np.ndarray) -> np.ndarray:
         """Return arrays (…, points, states) in the folded order, (arrays, size)."""
         folded = np.empty((natural.size // len(self.band), self._grid.points, self._states))
-        folded[:, self._grid.place] = natural.reshape(folded.shape)
+        folded[:, self._grid.packed.place] = natural.reshape(folded.shape)
         return folded.reshape(-1, len(self.band))
 
     def _unfold(self, folded: np.ndarray) -> np.ndarray:
         shaped = folded.reshape(-1, self._grid.points, self._states)
-        return np.ascontiguousarray(shaped[:, self._grid.place])
+        return np.ascontiguousarray(shaped[:, self._grid.packed.place])
 
 
 class BorderedFactors(CyclicFactors):
@@ -247,7 +247,7 @@ class PeriodicEquations:
     @cached_property
     def separated(self) -> bool:
         """True if even and odd points of an autonomous model are separate solutions, each of free phase."""
-        used = self.grid.offsets[self.grid.first != 0.0]
+        used = self.grid.offsets[self.grid.packed.first != 0.0]
         alone = self.model.autonomous and set(self.model.orders.values()) == {1} and self.grid.points % 2 == 0
         return alone and bool(np.all(used % 2))
 
@@ -335,7 +335,7 @@ def phase_row(grid: CyclicGrid, z: np.ndarray, states: np.ndarray) -> np.ndarray
     """Return the row (points, states) of the phase condition against z, given q, q̇, q̈ side by side."""
     folded = np.empty(z.size)
     kernels("border", z.shape[1], grid.stencil).phase_row(np.ascontiguousarray(z), states, grid.packed, folded)
-    return np.ascontiguousarray(folded.reshape(z.shape)[grid.place])
+    return np.ascontiguousarray(folded.reshape(z.shape)[grid.packed.place])
 
 
 def workspace(equations: PeriodicEquations, *, bordered: bool) -> Workspace:
@@ -352,7 +352,7 @@ def workspace(equations: PeriodicEquations, *, bordered: bool) -> Workspace:
 def empty_factors(grid: CyclicGrid, states: int, sets: tuple[int, ...] = ()) -> Factors:
     """Return arrays for the factors of the compiled functions, one for each of `sets`."""
     points, reach = grid.points, max(grid.reach, 1)
-    lower = grid.half_width * states + states - 1
+    lower = grid.packed.half_width * states + states - 1
     coupled = MAX_SEGMENTS * reach * states if grid.reach else 1
     return Factors(
         np.empty((*sets, points * states, 3 * lower + 1)),

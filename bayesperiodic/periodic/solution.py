@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ def estimate_error(solution: PeriodicSolution, z: np.ndarray) -> dict[str, float
         fine = _fourier.on_grid(_fourier.coefficients(z.T), grid.points).T
         g, jacobian = np.split(solution.twice_the_points, [count], axis=1)
     defect, slope, rates = -g, np.zeros_like(fine), []
-    for order, weights in ((1, grid.first), (2, grid.second)):
+    for order, weights in ((1, grid.packed.first), (2, grid.packed.second)):
         block = jacobian.reshape(len(fine), count, -1)[:, :, order * count : (order + 1) * count]
         rates.append(_derivative(fine, grid, weights, 1))
         slope += order * frequency ** (order - 1) * np.einsum("nes,ns->ne", block, rates[-1])
@@ -310,6 +311,11 @@ def describe(
     )
 
 
+def settings_of(solution: PeriodicSolution) -> dict[str, Any]:
+    """Return the keyword arguments of `solve_periodic` for the same frequency, grid and winding numbers."""
+    return {name: getattr(solution, name) for name in ("frequency", "samples", "scheme", "periods", "winding")}
+
+
 def equations_of(model: Model, solution: PeriodicSolution) -> tuple[PeriodicEquations, np.ndarray, np.ndarray]:
     """Return equations, parameters and z; raise a ValueError for a solution unconverged or of another model."""
     _checks.instance("model", model, Model)
@@ -320,15 +326,7 @@ def equations_of(model: Model, solution: PeriodicSolution) -> tuple[PeriodicEqua
         raise ValueError(
             f"solution: must have converged, got status {solution.status!r}. Solve again from another guess."
         )
-    equations = PeriodicEquations.build(
-        model,
-        solution.inputs,
-        frequency=solution.frequency,
-        samples=solution.samples,
-        scheme=solution.scheme,
-        periods=solution.periods,
-        winding=solution.winding,
-    )
+    equations = PeriodicEquations.build(model, solution.inputs, **settings_of(solution))
     parameters = np.array([solution.parameters[name] for name in model.parameters])
     return equations, parameters, periodic_part(equations, solution.states)
 

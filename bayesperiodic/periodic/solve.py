@@ -267,11 +267,17 @@ def _solution_warnings(
 def solve_driven(
     equations: PeriodicEquations, theta: np.ndarray, guess: str | Mapping[str, np.ndarray] | PeriodicSolution
 ) -> tuple[Solved, str]:
-    """Solve a driven problem from any guess; return the solve and how it was found (`PeriodicSolution.found_by`)."""
+    """Solve a driven problem from any guess; return the solve and how it was found (`PeriodicSolution.found_by`).
+
+    The status is "other orbit" if the solution repeats more often within the response period than the guess.
+    """
     if not isinstance(guess, str):
         start = as_guess(equations, guess)
         solved, found_by = solve_from(equations, theta, start)
-        return _same_orbit(equations, solved, start), found_by
+        times, periods = equations.kernels.repetitions, equations.grid.periods
+        if solved.code == CONVERGED and times(solved.z, periods) > times(start, periods):
+            solved = solved._replace(code=OTHER_ORBIT)
+        return solved, found_by
     _checks.one_of("guess", guess, GUESSES)
     if guess == "integration":
         settled = settled_period(equations, theta, equations.static_guess(theta))
@@ -303,14 +309,6 @@ def solve_from(
             first = first or solved
     assert first is not None
     return first, NEWTON
-
-
-def _same_orbit(equations: PeriodicEquations, solved: Solved, guess: np.ndarray) -> Solved:
-    """Return the solve, marked "other orbit" if it repeats more often within the response period than its guess."""
-    times, periods = equations.kernels.repetitions, equations.grid.periods
-    if solved.code == CONVERGED and times(solved.z, periods) > times(guess, periods):
-        return solved._replace(code=OTHER_ORBIT)
-    return solved
 
 
 def solve_free(
