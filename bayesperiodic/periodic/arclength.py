@@ -12,6 +12,7 @@ from bayesperiodic.periodic.compiled import CONVERGED, Border, Unknowns
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
 
 INPUTS, PARAMETERS = "all inputs", "all parameters"  # no model's parameter has a name with a space
+Change = tuple[np.ndarray, np.ndarray]  # parts for z (…, points, states) and for the unknowns' values (…, unknowns)
 
 
 @dataclass(frozen=True)
@@ -64,13 +65,14 @@ class ParametrisedEquations:
         return np.ascontiguousarray(folded.reshape(-1, *z.shape)[:, equations.grid.packed.place])
 
     def solve(
-        self, z: np.ndarray, values: np.ndarray, rows: np.ndarray, corner: np.ndarray, scales: np.ndarray
+        self, z: np.ndarray, values: np.ndarray, conditions: Change, targets: np.ndarray, scales: np.ndarray
     ) -> Solved:
-        """Solve g(z, values) = 0 from a guess of z and values, whose rows·z + corner·values is kept.
+        """Solve g(z, values) = 0 and rows·z + corner·values = targets from a guess of z and values.
 
-        `rows` is (unknowns, points, states), `corner` (unknowns, unknowns); for the scales see `compiled.Unknowns`.
+        The conditions are rows (unknowns, points, states) and corner (unknowns, unknowns); for the scales see
+        `compiled.Unknowns`.
         """
-        border, targets = Border.empty(len(values), z.size), np.sum(rows * z, axis=(1, 2)) + corner @ values
+        (rows, corner), border = conditions, Border.empty(len(values), z.size)
         border.rows.reshape(rows.shape)[:, self.equations.grid.packed.place] = rows
         border.corner[:] = corner
         return self.equations.solve(self._base, z, self._unknowns(values, targets, scales), border)
@@ -79,7 +81,8 @@ class ParametrisedEquations:
 def solve_autonomous(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, frequency: float) -> Solved:
     """Solve for an orbit of unknown frequency with the phase condition ∫ q_guess'·(q − q_guess) dτ = 0."""
     free, start = ParametrisedEquations(equations, parameters, (FREQUENCY,)), np.array([frequency])
-    return free.solve(z, start, equations.phase_row(z)[None], np.zeros((1, 1)), start)
+    row = equations.phase_row(z)
+    return free.solve(z, start, (row[None], np.zeros((1, 1))), np.array([np.sum(row * z)]), start)
 
 
 MAX_POINTS = 2000
@@ -87,9 +90,6 @@ SMALLEST_STEP = 1e-6
 LARGEST_TURN = 0.8
 FEW_ITERATIONS, MANY_ITERATIONS = 3, 6
 STEP_GROWTH = 1.5
-
-
-Change = tuple[np.ndarray, np.ndarray]  # of z (points, states) and of the unknowns' values (unknowns,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +161,8 @@ class Tracer:
     def _solve(
         self, start: BranchPoint, z: np.ndarray, values: np.ndarray, conditions: Change, step: float
     ) -> tuple[BranchPoint, int] | None:
-        solved = self.parametrised.solve(z, values, *conditions, self._value_scales)
+        targets = np.einsum("rps,ps->r", conditions[0], z) + conditions[1] @ values
+        solved = self.parametrised.solve(z, values, conditions, targets, self._value_scales)
         tangent = self.tangent(solved.z, solved.values, start.tangent) if solved.code == CONVERGED else None
         return tangent and (BranchPoint(solved.z, solved.values, tangent, start.distance + step), len(solved.history))
 

@@ -175,7 +175,7 @@ def emerging_cycle(
     values = np.array([point.value, point.frequency])
     parametrised = ParametrisedEquations(equations, theta, (point.vary, FREQUENCY))
     scales = np.maximum(np.abs(values), 1.0)
-    solved = parametrised.solve(z, values, rows, np.zeros((2, 2)), scales)
+    solved = parametrised.solve(z, values, (rows, np.zeros((2, 2))), np.array([size, 0.0]), scales)
     equations, theta = parametrised.at(solved.values)
     return describe(equations, theta, solved, "Hopf point", sensitivities=False)
 
