@@ -279,7 +279,7 @@ class JointPrior:
             blocks[key] = _joint(key, value) if isinstance(key, tuple) else as_prior(f"priors[{key!r}]", value)
         names = tuple(name for name in known if name in keys)
         ordered = dict.fromkeys(keys[name] for name in names)
-        return cls(names, {key: blocks[key] for key in ordered})
+        return cls(names, _checks.read_only({key: blocks[key] for key in ordered}))
 
     @cached_property
     def _columns(self) -> dict[str | tuple[str, ...], Any]:
