@@ -98,7 +98,7 @@ class Problem(Description):
     @cached_property
     def _densities(self) -> dict[tuple[str, str], LogPosterior]:
         """The densities that were asked for, by coordinates and variances."""
-        return {}
+        return {(RIDGE_COORDINATES, SAMPLED): LogPosterior.start(self)}
 
     def density(self, *, coordinates: str = RIDGE_COORDINATES, variances: str = SAMPLED) -> LogPosterior:
         """Return the log-posterior over the sampling coordinates.
@@ -119,9 +119,7 @@ class Problem(Description):
         """
         settings = coordinates, variances
         if settings not in self._densities:
-            first = next(iter(self._densities.values()), None)
-            if first is None:
-                first = LogPosterior(self, Simulator(self, self.anchors)) if self.anchors else LogPosterior.start(self)
+            first = next(iter(self._densities.values()))
             self._densities[settings] = first.with_settings(coordinates=coordinates, variances=variances)
         return self._densities[settings]
 
@@ -322,4 +320,4 @@ class Problem(Description):
         dict of str to PeriodicSolution
             By experiment; a solve that fails has another status than "converged".
         """
-        return self.density().solve(self.vector(theta))
+        return self.density().simulator.solutions(self.vector(theta))

@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.density.initial_orbits import with_guesses
+from bayesperiodic.density.initial_orbits import Guesses, experiments_guesses
 from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
 from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
@@ -21,7 +21,7 @@ from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.parameters import ParameterMaps
 
-Guesses = Mapping[str, Mapping[str, np.ndarray]]
+NO_HISTORY = np.empty((0, 3))
 
 
 class InitialOrbit(NamedTuple):
@@ -41,11 +41,12 @@ class Simulator:
     @classmethod
     def start(cls, problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> "Simulator":
         """Return the simulator anchored at θ (names,), solved from guesses, the experiments' own or the equilibrium."""
-        if guesses is not None:
+        if guesses is None:
+            chosen: dict[str, Any] = experiments_guesses(problem, theta)
+        else:
             _checks.same_names("guesses", guesses, [e.name for e in problem.experiments])
-        experiments = with_guesses(problem, theta).experiments if guesses is None else problem.experiments
-        chosen = [e if guesses is None else replace(e, guess=guesses[e.name]) for e in experiments]
-        return cls(problem, {e.name: _initial_orbit(problem, e.name, theta, e.guess or "static") for e in chosen})
+            chosen = {e.name: replace(e, guess=guesses[e.name]).guess for e in problem.experiments}
+        return cls(problem, {name: _initial_orbit(problem, name, theta, g or "static") for name, g in chosen.items()})
 
     def __getstate__(self) -> dict[str, Any]:
         # The factors at the anchors are computed again; the anchors are kept to the last bit.
@@ -55,12 +56,15 @@ class Simulator:
         """Return the simulator anchored at θ (names,), solved from the present anchors, else from the guesses."""
         simulation, anchors = self.solve(theta[None], keep=True, polish=True), {}
         for name, orbit in self.anchors.items():
-            solved = None
-            if simulation.statuses(name)[0] == CONVERGED:
-                frequency = float(simulation.response(name).frequency[0])
-                solved = self.problem.equations[name].at_frequency(frequency), simulation.z(name)[0]
+            converged = simulation.statuses(name)[0] == CONVERGED
+            solved = self._solved(simulation, name) if converged else None
             anchors[name] = _initial_orbit(self.problem, name, theta, orbit.guess, solved)
         return Simulator(self.problem, anchors)
+
+    def _solved(self, simulation: Simulation, experiment: str, i: int = 0) -> tuple[PeriodicEquations, np.ndarray]:
+        """Return the equations at the frequency of one of the solves, and its z."""
+        frequency = float(simulation.response(experiment).frequency[i])
+        return self.problem.equations[experiment].at_frequency(frequency), simulation.z(experiment)[i]
 
     @cached_property
     def groups(self) -> list[tuple[Experiment, ...]]:
@@ -124,12 +128,11 @@ class Simulator:
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
         """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""
-        anchor, parameters = self.anchors[experiment].anchor, self.problem.parameters(theta[None], experiment)[0]
-        return (
-            PATH_LOST
-            if anchor.sensitivities is None
-            else path_outcome(self.problem.equations[experiment], anchor, parameters)
-        )
+        anchor = self.anchors[experiment].anchor
+        if anchor.sensitivities is None:
+            return PATH_LOST
+        parameters = self.problem.parameters(theta[None], experiment)[0]
+        return path_outcome(self.problem.equations[experiment], anchor, parameters)
 
     def _log_multipliers(
         self, experiment: Experiment, z: np.ndarray, frequency: np.ndarray, parameters: np.ndarray, status: np.ndarray
@@ -153,19 +156,17 @@ class Simulator:
     def largest_multipliers(self, theta: np.ndarray, experiment: str, simulation: Simulation) -> np.ndarray:
         """Return the modulus (solves,) of the largest multiplier at θ (solves, names); NaN where the solve failed."""
         parameters, result = self.problem.parameters(theta, experiment), np.full(len(theta), np.nan)
-        frequency, z = simulation.response(experiment).frequency, simulation.z(experiment)
-        for i in np.flatnonzero(simulation.statuses(experiment) == CONVERGED):
-            equations = self.problem.equations[experiment].at_frequency(float(frequency[i]))
-            result[i] = np.abs(orbit_multipliers(equations, parameters[i], z[i], 1)).max(initial=0.0)
+        for i in np.flatnonzero(simulation.statuses(experiment) == CONVERGED).tolist():
+            equations, z = self._solved(simulation, experiment, i)
+            result[i] = np.abs(orbit_multipliers(equations, parameters[i], z, 1)).max(initial=0.0)
         return result
 
     def solutions(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
         """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""
         simulation, solutions = self.solve(theta[None], keep=True, polish=True), {}
-        for name, equations in self.problem.equations.items():
-            here = equations.at_frequency(float(simulation.response(name).frequency[0]))
-            parameters, code = self.problem.parameters(theta[None], name)[0], int(simulation.statuses(name)[0])
-            solutions[name] = describe(here, parameters, Solved(simulation.z(name)[0], code, np.empty((0, 3))))
+        for name in self.anchors:
+            (here, z), code = self._solved(simulation, name), int(simulation.statuses(name)[0])
+            solutions[name] = describe(here, self.problem.parameters(theta[None], name)[0], Solved(z, code, NO_HISTORY))
         return solutions
 
     def jacobian(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:
@@ -285,7 +286,7 @@ def _leading_multipliers_directly(
 
 
 def _described(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> PeriodicSolution:
-    return describe(equations, parameters, Solved(z, CONVERGED, np.empty((0, 3))), sensitivities=False)
+    return describe(equations, parameters, Solved(z, CONVERGED, NO_HISTORY), sensitivities=False)
 
 
 def _without_trivial(solution: PeriodicSolution, values: np.ndarray) -> np.ndarray:

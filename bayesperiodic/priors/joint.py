@@ -46,11 +46,9 @@ class MultivariateNormal(LogDensity):
     covariance: np.ndarray
 
     def __post_init__(self) -> None:
-        mean = _checks.finite_vector("mean", self.mean).copy()
-        covariance = _covariance("covariance", self.covariance, mean.size)
-        for name, array in (("mean", mean), ("covariance", covariance)):
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+        mean = _checks.finite_vector("mean", self.mean)
+        object.__setattr__(self, "mean", _checks.read_only(mean))
+        object.__setattr__(self, "covariance", _checks.read_only(_covariance("covariance", self.covariance, mean.size)))
 
     @property
     def dimension(self) -> int:

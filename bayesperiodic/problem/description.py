@@ -495,14 +495,13 @@ def _checked_local(
         _checks.one_of("local", name, every)
         if name in tied:
             raise ValueError(f"local: {name!r} is tied; it follows what it is tied to, so leave it out.")
-    if isinstance(priors, Mapping):
-        for key in priors:
-            for name in key if isinstance(key, tuple) else ():
-                if name in names:
-                    raise ValueError(
-                        f"priors[{key!r}]: {name!r} is local; a joint prior needs the names of single experiments, "
-                        f"such as '{name}[run]'."
-                    )
+    for key in priors:
+        for name in key if isinstance(key, tuple) else ():
+            if name in names:
+                raise ValueError(
+                    f"priors[{key!r}]: {name!r} is local; a joint prior needs the names of single experiments, such as "
+                    f"'{name}[run]'."
+                )
     return names if SHIFT in names else (*names, SHIFT)
 
 
