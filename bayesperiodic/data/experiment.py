@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +21,7 @@ MEANING, DATA = "samples·periods", "data"
 class Experiment(Result):
     """One response period of measured outputs and inputs.
 
-    Its arrays are read-only copies of those given.
+    Its arrays and mappings are read-only copies of those given.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ class Experiment(Result):
         self._check_multipliers()
         self._check_covariance(measured * len(self.outputs))
         for member in fields(self):
-            object.__setattr__(self, member.name, _read_only(getattr(self, member.name)))
+            object.__setattr__(self, member.name, _checks.read_only(getattr(self, member.name)))
 
     def _measured(self, kind: str, values: ArrayLike) -> ArrayLike:
         """Return the values of a channel, with zeros at points of an output that the mask excludes."""
@@ -359,16 +359,6 @@ class Experiment(Result):
             f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
             f"{text})"
         )
-
-
-def _read_only(value: Any) -> Any:
-    """Return arrays, also those in mappings, as copies that cannot be changed in place; other values as they are."""
-    if isinstance(value, Mapping):
-        return {key: _read_only(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray) and (value.flags.writeable or value.base is not None):
-        value = value.copy()
-        value.flags.writeable = False
-    return value
 
 
 def _checked_mask(given: ArrayLike, points: int) -> np.ndarray:

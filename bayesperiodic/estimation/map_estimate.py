@@ -296,8 +296,8 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
         return
     solutions = {name: solution.states for name, solution in end.here.simulator.solutions(end.theta).items()}
     for theta in (start, end.theta):
-        guessed, measured = measured_orbits(problem, theta, solutions)
-        for initial in (measured, simultaneous_fit(guessed, measured.theta)):
+        measured = measured_orbits(problem, theta, solutions)
+        for initial in (measured, simultaneous_fit(problem, measured.theta, measured.states)):
             if initial is not None and initial.states:
                 yield _linearised(problem, initial.theta, initial)
 
