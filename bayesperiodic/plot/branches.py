@@ -55,13 +55,8 @@ def branch(
         One per branch, for the legend.
     angular : bool
         Show frequencies as angular frequencies in rad/s.
-    figure : Figure, optional
     ax : Axes, optional
         To draw into, instead of a figure.
-
-    Returns
-    -------
-    Figure
 
     Raises
     ------
@@ -210,18 +205,8 @@ def section(
     orbits : Orbits or sequence of Orbit
     units : mapping of str to str, optional
         Units of the coordinates; angles are in rad.
-    figure : Figure, optional
     ax : Axes, optional
         To draw into, instead of a figure.
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For another object than a `PoincareSection`.
 
     Examples
     --------
@@ -264,11 +249,6 @@ def orbits(
         At least one.
     units : mapping of str to str, optional
         See `section`.
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
 
     Raises
     ------

@@ -45,17 +45,6 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
     Parameters
     ----------
     calibration : Calibration
-    figure : Figure, optional
-        With a constrained layout.
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For another object than a `Calibration`.
 
     Examples
     --------
@@ -129,17 +118,6 @@ def comparison(comparison: Comparison, *, names: Sequence[str] | None = None, fi
     comparison : Comparison
     names : sequence of str, optional
         By default all.
-    figure : Figure, optional
-        With a constrained layout.
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For an unknown name.
 
     Examples
     --------
@@ -227,16 +205,6 @@ def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Fig
     profile : Profile
     names : sequence of str, optional
         By default all.
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For a name without a profile.
 
     Examples
     --------
@@ -308,16 +276,6 @@ def models(comparison: ModelComparison, *, figure: Figure | None = None) -> Figu
     Parameters
     ----------
     comparison : ModelComparison
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For another object than a `ModelComparison`.
 
     Examples
     --------

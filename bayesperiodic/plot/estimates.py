@@ -46,16 +46,6 @@ def fit(
     prediction : Prediction, optional
     experiments : sequence of str, optional
         By default all.
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For an unknown name.
 
     Examples
     --------
@@ -160,11 +150,6 @@ def loops(
     estimate : MapEstimate
     output, input : str, optional
         By default the first of each.
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
 
     Raises
     ------
@@ -214,11 +199,6 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
     posterior : Posterior
     walkers : int
         Number of walkers per ensemble.
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
 
     Raises
     ------

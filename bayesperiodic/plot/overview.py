@@ -36,15 +36,7 @@ def summary(problem: Problem, fit: MapEstimate, posterior: Posterior, *, figure:
     fit : MapEstimate
     posterior : Posterior
     figure : Figure, optional
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For results of another problem.
+        To draw into: empty.
 
     Examples
     --------

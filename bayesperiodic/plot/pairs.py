@@ -107,10 +107,6 @@ def corner(
         plot_contours, plot_datapoints, plot_density, range, scale_hist, smooth, smooth1d, title_fmt, title_kwargs,
         title_quantiles, titles, truth_color. The label in `hist_kwargs` is that of the legend.
 
-    Returns
-    -------
-    Figure
-
     Raises
     ------
     ValueError
@@ -368,16 +364,6 @@ def marginals(
         For noise parameters see `corner`.
     names : sequence of str, optional
         See `corner`.
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For an unknown name, or an estimate of another problem.
 
     Examples
     --------

@@ -42,17 +42,6 @@ def missing_terms(problem: Problem, fit: MapEstimate, found: MissingTerms, *, fi
     problem : Problem
     fit : MapEstimate
     found : MissingTerms
-    figure : Figure, optional
-        With a constrained layout.
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For a fit or terms of another problem.
 
     Examples
     --------
