@@ -92,7 +92,7 @@ def branch(
         ax = (figure or plt.figure(figsize=(7.0, 4.6), layout="constrained")).add_subplot()
     factor, drawn = 2 * np.pi if angular and branch.vary == "frequency" else 1.0, set[str]()
     for b, colour in zip(branches, cycle(ENSEMBLES), strict=False):
-        draw = _draw_prediction if isinstance(b, BranchPrediction) else _draw_branch
+        draw: Any = _draw_prediction if isinstance(b, BranchPrediction) else _draw_branch
         drawn |= draw(ax, b, measure, output, factor, colour)
     varied = axis_label(branch.vary, branch.units.get(branch.vary, ""))
     ax.set_xlabel("angular frequency [rad/s]" if factor != 1.0 else varied)

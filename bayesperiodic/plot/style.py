@@ -113,6 +113,11 @@ def panels(figure: FigureBase, count: int, across: int = PANELS_ACROSS, sharey: 
     return list(grid[:count])
 
 
+def legend_entries(*panels: Axes) -> dict[str, Any]:
+    """Return the last artist of each label in the panels."""
+    return {label: artist for axes in panels for artist, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+
+
 def draw_marginal(axes: Axes, edges: np.ndarray, density: np.ndarray, mean: float, sd: float) -> None:
     """Draw a histogram of draws, and a normal density if its sd is finite."""
     axes.stairs(density, edges, color=COLOURS["mcmc"], alpha=0.45, fill=True)
