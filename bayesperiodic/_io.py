@@ -235,8 +235,6 @@ def _read_tree(content: io.BytesIO) -> Any:
     import xarray as xr
 
     with xr.open_datatree(content, engine="h5netcdf") as tree:
-        loaded = tree.load()
-    groups = {name: group.to_dataset() for name, group in loaded.children.items() if name != ARRAYS}
-    result = xr.DataTree.from_dict(groups)
-    result.attrs = {key: value for key, value in loaded.attrs.items() if key != HEADER}
+        result = tree.load().drop_nodes(ARRAYS, errors="ignore")
+    del result.attrs[HEADER]
     return result

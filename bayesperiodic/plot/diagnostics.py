@@ -5,7 +5,6 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import ndtri
