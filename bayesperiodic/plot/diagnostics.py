@@ -25,7 +25,7 @@ HEADROOM = 1.45
 RANK_TITLES = "count per bin / expected", "distribution function − diagonal", "coverage − probability"
 RANK_AXES = *["position of the truth in the posterior"] * 2, "probability of the interval"
 METHOD_LABELS = {"mcmc": "MCMC", "laplace": "Laplace"}
-METHOD_STYLES = {"mcmc": {"color": COLOURS["mcmc"]}, "laplace": {"color": COLOURS["laplace"], "ls": "--"}}
+METHOD_LINES = {"mcmc": "-", "laplace": "--"}
 BAND_STYLE: dict[str, Any] = {"color": "grey", "alpha": 0.25, "lw": 0}
 
 
@@ -79,7 +79,7 @@ def _histogram(axes: Axes, values: np.ndarray, method: str, label: str) -> None:
     if method == CALIBRATED_METHODS[0] and values.size:
         low, high = uniformity.binomial_band(values.size, np.array(1.0 / bins), 1.0 - BAND_LEVEL)
         axes.axhspan(float(low) * bins, float(high) * bins, **BAND_STYLE)
-    axes.stairs(counts / expected, edges, lw=1.6, label=label, **METHOD_STYLES[method])
+    axes.stairs(counts / expected, edges, color=COLOURS[method], ls=METHOD_LINES[method], lw=1.6, label=label)
     axes.set_xlim(0.0, 1.0)
 
 
@@ -88,7 +88,7 @@ def _deviation(axes: Axes, values: np.ndarray, band: tuple[np.ndarray, np.ndarra
     points = uniformity.evaluation_points()
     if band is not None:
         axes.fill_between(points, band[0] - points, band[1] - points, **BAND_STYLE)
-    axes.plot(points, values - points, lw=1.4, **METHOD_STYLES[method])
+    axes.plot(points, values - points, color=COLOURS[method], ls=METHOD_LINES[method], lw=1.4)
     axes.set_xlim(0.0, 1.0)
 
 
