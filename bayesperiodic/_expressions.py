@@ -228,13 +228,11 @@ class _Parser:
             self.refuse(f"which has {len(text)} characters, more than {MAX_LENGTH}")
 
     def refuse(self, reason: str) -> NoReturn:
-        """Raise the ValueError."""
         raise ValueError(
             f"{self.argument}: must consist of {ALLOWED_EXPRESSION}, got {self.shown}, {reason}."
         ) from None
 
     def tree(self) -> ast.expr:
-        """Return the root of Python's syntax tree."""
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

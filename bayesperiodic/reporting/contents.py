@@ -182,8 +182,8 @@ def channels(given: ReportInputs) -> Rows:
     for e in given.problem.experiments:
         at = e.measured_points
         measured = "output" if at.all() else f"output, at {np.sum(at)} points"
-        outputs = {channel: values[at] for channel, values in e.outputs.items()}
-        every = [("input", *item) for item in e.inputs.items()] + [(measured, *item) for item in outputs.items()]
+        every = [("input", *item) for item in e.inputs.items()]
+        every += [(measured, channel, values[at]) for channel, values in e.outputs.items()]
         rows += [
             {
                 "Channel": code(channel),
@@ -237,17 +237,16 @@ def summary(given: ReportInputs) -> Rows:
     """Return the summary table of the free parameters."""
     robust = given.fit.interval(PROBABILITY, robust=True) if given.robust_ratios else {}
     laplace = {} if given.comparison is None else dict(given.comparison.table["verdict"])
-    rows = []
-    for full, (name, rounding) in zip(estimates(given), _roundings(given.fit).items(), strict=True):
-        row = {
+    return [
+        {
             **{title: full[title] for title in ("Parameter", "Unit", "MAP")},
             "90 % interval": full.get("MCMC: 90 % interval", full["Laplace: 90 % interval"]),
+            **({"Robust 90 % interval": rounding.interval(*robust[name])} if robust else {}),
+            "Identifiability": badge(given.identifiability.verdicts[name]),
+            **({"Laplace approximation": badge(laplace[name])} if laplace else {}),
         }
-        row |= {"Robust 90 % interval": rounding.interval(*robust[name])} if robust else {}
-        row |= {"Identifiability": badge(given.identifiability.verdicts[name])}
-        row |= {"Laplace approximation": badge(laplace[name])} if laplace else {}
-        rows.append(row)
-    return rows
+        for full, (name, rounding) in zip(estimates(given), _roundings(given.fit).items(), strict=True)
+    ]
 
 
 def _roundings(fit: MapEstimate) -> dict[str, html.Rounding]:
