@@ -25,14 +25,13 @@ def discrete_flows(system: System, generators: Sequence[Generator], determined: 
     Exact substitution confirms each, see `invariants.verified`.
     """
     images = [*_sign_changes(system, generators), *_exchanges(system, list(determined))]
-    flows = (Flow(Generator({}, {}, {}), IDENTITY, image) for image in images)
-    return [flow for candidate in flows if (flow := verified(system, candidate)) is not None]
+    flows = [verified(system, Flow(Generator({}), IDENTITY, image)) for image in images]
+    return [flow for flow in flows if flow]
 
 
 def _sign_changes(system: System, generators: Sequence[Generator]) -> list[dict[sp.Symbol, sp.Expr]]:
     """Return the images of changed symbols by sign changes of parameters and states that are no scalings by −1."""
-    jets = {s: [system.symbols["d" * k + s] for k in range(3)] for s in system.orders}
-    members = [[symbol] for symbol in system.parameters.values()] + list(jets.values())
+    members = [[symbol] for symbol in system.parameters.values()] + [system.jet(state) for state in system.orders]
     bits = {symbol: 1 << i for i, symbols in enumerate(members) for symbol in symbols}
     constraints: list[int] = []
     for expression in system.equations:
@@ -40,17 +39,13 @@ def _sign_changes(system: System, generators: Sequence[Generator]) -> list[dict[
     constraints += [_parity(sp.expand(y), bits, constraints) for y in system.outputs.values()]
     basis = _null_space(constraints, len(members))
     parameter_bits = (1 << len(system.parameters)) - 1
-    symbols = set(system.parameters.values())
-    taken = [
-        sum(bits[s] for s, move in g.field.items() if s in symbols and sp.cancel(move / s) % 2)
-        for g in generators
-        if g.scaling
-    ]
-    every = range(1, 1 << len(basis)) if len(basis) <= MOST_COMBINED else (1 << i for i in range(len(basis)))
-    combinations = [reduce(int.__xor__, (b for i, b in enumerate(basis) if chosen >> i & 1), 0) for chosen in every]
+    scalings = [{s: sp.cancel(move / s) % 2 for s, move in g.field.items()} for g in generators if g.scaling]
+    taken = [sum({bits[s] for s, odd in scaling.items() if odd}) & parameter_bits for scaling in scalings]
+    several = range(1, 1 << len(basis)) if len(basis) <= MOST_COMBINED else [1 << i for i in range(len(basis))]
+    changes = [reduce(int.__xor__, (b for i, b in enumerate(basis) if chosen >> i & 1)) for chosen in several]
     result = []
-    for change in sorted(combinations, key=lambda f: ((f & parameter_bits).bit_count(), f.bit_count(), f)):
-        if change & parameter_bits and _is_independent(change & parameter_bits, taken):
+    for change in sorted(changes, key=lambda f: ((f & parameter_bits).bit_count(), f.bit_count(), f)):
+        if _is_independent(change & parameter_bits, taken):
             taken.append(change & parameter_bits)
             result.append({s: -s for i, symbols in enumerate(members) if change >> i & 1 for s in symbols})
     return result
@@ -91,25 +86,24 @@ def _null_space(rows: Iterable[int], size: int) -> list[int]:
 def _is_independent(vector: int, others: Iterable[int]) -> bool:
     """Return whether a set of bits is no sum of others modulo 2."""
     reduced: list[int] = []
-    for other in others:
+    for candidate in (*others, vector):
         for row in reduced:
-            other = min(other, other ^ row)
-        if other:
-            reduced.append(other)
-    for row in reduced:
-        vector = min(vector, vector ^ row)
-    return bool(vector)
+            candidate = min(candidate, candidate ^ row)
+        reduced.append(candidate)
+    return bool(reduced[-1])
 
 
 def _exchanges(system: System, determined: Sequence[str]) -> list[dict[sp.Symbol, sp.Expr]]:
     """Return the images of exchanges of two parameters, alone or with two states, that hold at random points."""
     symbols = sorted(system.used, key=str)
-    highest = system.highest
-    equations = sp.Matrix(system.equations)
+    highest, equations = system.highest, sp.Matrix(system.equations)
     slopes = equations.jacobian(highest) if highest and system.equations else sp.zeros(0, 0)
-    jets = {s: [system.symbols["d" * k + s] for k in range(3)] for s in system.orders}
-    pairs = [(a, b) for a, b in combinations(jets, 2) if system.orders[a] == system.orders[b]]
-    states = [dict(zip(jets[a] + jets[b], jets[b] + jets[a], strict=True)) for a, b in pairs]
+    pairs = [
+        (system.jet(a), system.jet(b))
+        for a, b in combinations(system.orders, 2)
+        if system.orders[a] == system.orders[b]
+    ]
+    states = [dict(zip(a + b, b + a, strict=True)) for a, b in pairs]
     try:
         evaluated = sp.lambdify(symbols, [equations, slopes, sp.Matrix(list(system.outputs.values()))], "numpy")
         exchanges = []

@@ -10,7 +10,14 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result, Storable
 from bayesperiodic.models.model import Model
 from bayesperiodic.symmetry import invariants
-from bayesperiodic.symmetry.determining import Generator, System, determining_equations, generators_of, system_of
+from bayesperiodic.symmetry.determining import (
+    Generator,
+    System,
+    VectorField,
+    determining_equations,
+    generators_of,
+    system_of,
+)
 from bayesperiodic.symmetry.discrete import discrete_flows
 from bayesperiodic.symmetry.invariants import Directions, Flow
 
@@ -291,9 +298,8 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
     system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if s in used})
     names = {s: n for n, s in (whole.parameters | whole.known).items()}
     symmetries = generators_of(determining_equations(system)) if system.parameters else []
-    flows = [
-        invariants.verified(system, flow) if (flow := invariants.flow_of(symmetry)) else None for symmetry in symmetries
-    ]
+    found_flows = [invariants.flow_of(system, symmetry) for symmetry in symmetries]
+    flows = [flow and invariants.verified(system, flow) for flow in found_flows]
     generators = [flow.generator if flow else symmetry for symmetry, flow in zip(symmetries, flows, strict=True)]
     directions = invariants.directions_of(system, generators)
     coefficients = invariants.coefficients_of(system)
@@ -308,10 +314,10 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
         table=_table(whole, system, generators, directions, coefficients, combinations, names),
         combinations=tuple(combinations.values()),
         symmetries=tuple(
-            _symmetry(system, _kind(symmetry), generator, flow, combinations, names)
+            _symmetry(system, _kind(symmetry), generator.field, flow, names, combinations)
             for symmetry, generator, flow in zip(symmetries, generators, flows, strict=True)
         ),
-        discrete=tuple(_discrete(system, flow, names) for flow in discrete),
+        discrete=tuple(_symmetry(system, _discrete_kind(flow), {}, flow, names) for flow in discrete),
         to_fix=directions.smallest_set(),
         rank=len(system.parameters) - len(directions.rows) if directions.points or not system.parameters else None,
         points=directions.points,
@@ -322,8 +328,11 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
 def _kind(generator: Generator) -> str:
     if generator.scaling:
         return "scaling"
-    constant = any(move.is_number for move in (*generator.parameters.values(), *generator.states.values()))
-    return "shift" if constant else "other"
+    return "shift" if any(move.is_number for move in generator.field.values()) else "other"
+
+
+def _discrete_kind(flow: Flow) -> str:
+    return "sign change" if all(image == -symbol for symbol, image in flow.images.items()) else "exchange"
 
 
 def _table(
@@ -354,7 +363,7 @@ def _table(
         rows[parameter] = {
             "verdict": verdict,
             "enters": "; ".join(enters),
-            "fix": ", ".join(str(i) for i, g in enumerate(generators, 1) if parameter in g.parameters),
+            "fix": ", ".join(str(i) for i, g in enumerate(generators, 1) if symbol in g.field),
             "partners": ", ".join(partners),
         }
     return pd.DataFrame.from_dict(rows, orient="index", columns=["verdict", "enters", "fix", "partners"])
@@ -363,44 +372,28 @@ def _table(
 def _symmetry(
     system: System,
     kind: str,
-    generator: Generator,
+    field: VectorField,
     flow: Flow | None,
-    combinations: Mapping[sp.Expr, str],
     names: Mapping[sp.Symbol, str],
+    combinations: Iterable[sp.Expr] = (),
 ) -> Symmetry:
-    symbols = system.parameters | {s: system.symbols[s] for s in generator.states}
-    moves = generator.parameters | generator.states
-    shared = [c.free_symbols for c in combinations if c.free_symbols & {symbols[n] for n in generator.parameters}]
-    others = {n: s for n, s in system.parameters.items() if n not in generator.parameters}
+    states = {state: system.symbols[state] for state in system.orders}
+    images = flow.images if flow else {}
+    moved = {n: s for n, s in (system.parameters | states).items() if s in field or s in images}
+    shared = [c.free_symbols for c in combinations if c.free_symbols & set(field)]
     texts = {**names, **{symbol: name for name, symbol in system.symbols.items()}}
     amount = ""
-    rows: list[list[sp.Expr]] = []
-    if flow is not None:
+    if flow and field:
         wanted = ("t", "scale", "scale_factor") if flow.amount.is_positive else ("delta", "shift_by", "amount")
         amount = next(n for n in wanted if n not in texts.values())
         texts[flow.amount] = amount
-        rows = flow.factor.tolist() if flow.factor else []
+    rows = flow.factor.tolist() if flow and flow.factor else []
     return Symmetry(
         kind=kind,
-        parameters=tuple(generator.parameters),
-        generator={n: written(move, texts) for n, move in moves.items()},
-        transformation={n: written(flow.images[symbols[n]], texts) for n in moves} if flow else {},
+        parameters=tuple(n for n in moved if n in system.parameters),
+        generator={n: written(field[s], texts) for n, s in moved.items() if s in field},
+        transformation={n: written(images[s], texts) for n, s in moved.items() if s in images},
         amount=amount,
         factor=tuple(tuple(written(e, texts) for e in row) for row in rows),
-        no_help=tuple(n for n, s in others.items() if any(s in c for c in shared)),
-    )
-
-
-def _discrete(system: System, flow: Flow, names: Mapping[sp.Symbol, str]) -> Symmetry:
-    texts = {**names, **{symbol: name for name, symbol in system.symbols.items()}}
-    states = {n: system.symbols[n] for n in system.orders}
-    moved = {n: written(flow.images[s], texts) for n, s in (system.parameters | states).items() if s in flow.images}
-    return Symmetry(
-        kind="sign change" if all(image == f"-{n}" for n, image in moved.items()) else "exchange",
-        parameters=tuple(n for n in moved if n in system.parameters),
-        generator={},
-        transformation=moved,
-        amount="",
-        factor=tuple(tuple(written(e, texts) for e in row) for row in flow.factor.tolist()) if flow.factor else (),
-        no_help=(),
+        no_help=tuple(n for n, s in system.parameters.items() if n not in moved and any(s in c for c in shared)),
     )
