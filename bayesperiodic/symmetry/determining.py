@@ -88,7 +88,8 @@ def system_of(model: Model, outputs: Iterable[str]) -> System:
 
 def _observed(system: System) -> System:
     """Return the system without the states and equations that no measured output depends on; update the orders."""
-    used, equations, count = system.used, [], -1
+    used, count = system.used, -1
+    equations: list[sp.Expr] = []
     orders = {s: max((k for k, symbol in enumerate(system.jet(s)) if symbol in used), default=0) for s in system.orders}
     while len(equations) > count:
         count = len(equations)
