@@ -109,10 +109,10 @@ def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool
     return any(np.abs(wrap(np.concatenate([points[d:], points[:d]]) - points)).max() < tolerance for d in divisors)
 
 
-def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) -> list[MapCycle]:
-    """Return the cycles of a prime period to which close returns in the section (n, 2) lead."""
-    starts, members = _close_returns(maps, section, period)
-    chains = section[starts[:, None] + np.arange(period)]
+def candidates(maps: ReturnMap, atlas: Atlas, period: int) -> list[MapCycle]:
+    """Return the cycles of a prime period to which close returns lead."""
+    starts, members = _close_returns(maps, period)
+    chains = maps.points[starts[:, None] + np.arange(period)]
     step = np.empty(0)
     # The maps of the atlas are discontinuous between centres, so the last steps fit about the points themselves.
     for images, steps, longest in ((atlas.at, CORRECTIONS, np.inf), (atlas.exactly, EXACT_STEPS, NEARLY)):
@@ -120,7 +120,7 @@ def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) 
         kept = np.array([k for k in np.unique(heir) if step[k] < NEARLY], dtype=int)
         members = [np.concatenate([members[i] for i in np.flatnonzero(heir == k)]) for k in kept]
         chains, step = chains[kept], step[kept]
-    return _distinct(maps, section, chains, step, members)
+    return _distinct(maps, chains, step, members)
 
 
 def _converge(
@@ -165,9 +165,9 @@ def _cells(maps: ReturnMap, chains: np.ndarray, size: float) -> np.ndarray:
     return np.floor(inside / size).astype(np.int64)
 
 
-def _close_returns(maps: ReturnMap, section: np.ndarray, period: int) -> tuple[np.ndarray, list[np.ndarray]]:
+def _close_returns(maps: ReturnMap, period: int) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the first point of the closest return in each cell of chains, and the first points of all in that cell."""
-    noise = float(maps.noise.max())
+    section, noise = maps.points, float(maps.noise.max())
     distance = maps.distance(section[period:], section[:-period])
     close = np.flatnonzero(distance < CLOSE + 2.0 * noise)
     close = close[np.argsort(distance[close], kind="stable")]
@@ -177,9 +177,7 @@ def _close_returns(maps: ReturnMap, section: np.ndarray, period: int) -> tuple[n
     return close[first], np.split(close[order], np.cumsum(counts)[:-1])
 
 
-def _distinct(
-    maps: ReturnMap, section: np.ndarray, chains: np.ndarray, step: np.ndarray, members: list[np.ndarray]
-) -> list[MapCycle]:
+def _distinct(maps: ReturnMap, chains: np.ndarray, step: np.ndarray, members: list[np.ndarray]) -> list[MapCycle]:
     noise = float(maps.noise.max())
     tolerance = max(SAME_CYCLE, 3.0 * noise)
     # Each cycle with the first points and the shift of each of its close returns, (returns, 2).
@@ -201,7 +199,7 @@ def _distinct(
         steps = np.arange(len(cycle) + 1)
         starts, shifts = np.concatenate(group, axis=1)
         expected = cycle[(steps + shifts[:, None]) % len(cycle)]
-        closest = int(np.argmin(np.abs(maps.wrap(section[starts[:, None] + steps] - expected)).max((1, 2))))
+        closest = int(np.argmin(np.abs(maps.wrap(maps.points[starts[:, None] + steps] - expected)).max((1, 2))))
         result.append(MapCycle(cycle, len(starts), int(starts[closest]), int(shifts[closest])))
     return result
 
@@ -317,9 +315,7 @@ def _joint_covariance(fit: LocalFit) -> np.ndarray:
     return errors.T @ errors
 
 
-def box_orbits(
-    maps: ReturnMap, section: np.ndarray, period: int, neighbours: int, box: float
-) -> list[tuple[MapCycle, Estimate]]:
+def box_orbits(maps: ReturnMap, period: int, neighbours: int, box: float) -> list[tuple[MapCycle, Estimate]]:
     """Return the orbits of one period by the method "boxes" of `find_orbits`.
 
     A point that is in its own or an adjacent box again after `period` steps is recurrent; adjacent boxes with several
@@ -327,9 +323,9 @@ def box_orbits(
     fixed point and eigenvalues are the orbit's.
     """
     count = int(2.25 * neighbours)
-    iterates = [_iterated(maps, section, k) for k in range(1, period + 1)]
+    iterates = [_iterated(maps, k) for k in range(1, period + 1)]
     orbits: list[tuple[MapCycle, Estimate]] = []
-    for centre, members in _recurrent_boxes(maps, section, period, box):
+    for centre, members in _recurrent_boxes(maps, period, box):
         fit = iterates[-1].fit(centre[None], count, 1)
         step = newton_step(maps.wrap(fit.value - centre)[None], fit.jacobian[None])[0, 0]
         if not np.abs(step).max() < FARTHEST * box:
@@ -351,20 +347,19 @@ def box_orbits(
         )
         if any(shift_between(points, other.points, maps.wrap)[0] < 2.0 * box for _, other in orbits):
             continue
-        away = maps.distance(section[members], points[0])
+        away = maps.distance(maps.points[members], points[0])
         orbits.append((MapCycle(points, len(members), int(members[np.argmin(away)]), 0), estimate))
     return orbits
 
 
-def _iterated(maps: ReturnMap, section: np.ndarray, steps: int) -> ReturnMap:
+def _iterated(maps: ReturnMap, steps: int) -> ReturnMap:
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(maps.increments, axis=0)])
-    return ReturnMap(section[:-steps], sums[steps:] - sums[:-steps], maps.turn, maps.winds, np.zeros(2))
+    return ReturnMap(maps.points, sums[steps:] - sums[:-steps], maps.turn, maps.winds, np.zeros(2))
 
 
-def _recurrent_boxes(
-    maps: ReturnMap, section: np.ndarray, period: int, box: float
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def _recurrent_boxes(maps: ReturnMap, period: int, box: float) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return centres and members of groups of adjacent boxes with recurrent points, those with most returns first."""
+    section = maps.points
     cell = np.floor(maps.wrap_points(section) / box).astype(np.int64)
     cell -= cell.min(axis=0)
     cells_per_turn = np.ceil(maps.turn / box)

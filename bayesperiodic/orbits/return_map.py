@@ -57,14 +57,15 @@ class ReturnMap:
     the normal equations unbiased and so remove the attenuation of the slopes.
     """
 
-    def __init__(self, arguments: np.ndarray, increments: np.ndarray, turn: np.ndarray, winds: bool, noise: np.ndarray):
-        self.arguments = arguments  # points with a known image, (n, 2)
+    def __init__(self, points: np.ndarray, increments: np.ndarray, turn: np.ndarray, winds: bool, noise: np.ndarray):
+        self.points = points  # in the order of time; images of the last ones may be unknown, (count, 2)
+        self.arguments = points[: len(increments)]  # points with a known image, (n, 2)
         self.increments = increments  # image minus argument, (n, 2)
         self.turn = turn  # one turn in these units; infinite for coordinates that are not angles, (2,)
         self.winds = winds  # whether the increments of angles include whole turns
         self.noise = noise  # standard deviation of the arguments, (2,)
         self.angle = np.isfinite(turn)
-        self._tree = self.tree(arguments)
+        self._tree = self.tree(self.arguments)
 
     def tree(self, points: np.ndarray) -> cKDTree:
         """Return a search tree of points, periodic in the angles."""
@@ -274,9 +275,9 @@ DIVERGING_PROBES = 400
 NEIGHBOUR = 8
 
 
-def check_chaos(maps: ReturnMap, section: np.ndarray) -> None:
-    """Raise a ValueError, which names the kind of motion, unless the section (n, 2) shows a chaotic return map."""
-    generator = np.random.default_rng(0)
+def check_chaos(maps: ReturnMap) -> None:
+    """Raise a ValueError, which names the kind of motion, unless the points show a chaotic return map."""
+    section, generator = maps.points, np.random.default_rng(0)
     one, other = generator.integers(len(section), size=(2, 4 * DIVERGING_PROBES))
     random = np.median(maps.distance(section[one], section[other]))
     for period in range(1, min(LONGEST_PERIOD, len(section) // 10) + 1):

@@ -131,9 +131,9 @@ def _weight(condition: Any) -> sp.Expr:
     return (1 + sp.sign(condition.gts - condition.lts)) / 2
 
 
-def _reduced(matrix: np.ndarray) -> tuple[np.ndarray, list[int]]:
-    """Return the reduced row echelon form of an integer matrix modulo the prime, and its pivot columns."""
-    rows = np.array(matrix, dtype=np.int64) % PRIME
+def _reduced(matrix: np.ndarray, modulus: int) -> tuple[np.ndarray, list[int]]:
+    """Return the reduced row echelon form of an integer matrix modulo a prime, and its pivot columns."""
+    rows = np.array(matrix, dtype=np.int64) % modulus
     pivots: list[int] = []
     for column in range(rows.shape[1]):
         top = len(pivots)
@@ -141,27 +141,25 @@ def _reduced(matrix: np.ndarray) -> tuple[np.ndarray, list[int]]:
         if not below.size:
             continue
         rows[[top, top + below[0]]] = rows[[top + below[0], top]]
-        rows[top] = rows[top] * pow(int(rows[top, column]), -1, PRIME) % PRIME
+        rows[top] = rows[top] * pow(int(rows[top, column]), -1, modulus) % modulus
         others = np.flatnonzero(rows[:, column])
         others = others[others != top]
-        rows[others] = (rows[others] - rows[others, column, None] * rows[top] % PRIME) % PRIME
+        rows[others] = (rows[others] - rows[others, column, None] * rows[top] % modulus) % modulus
         pivots.append(column)
     return rows[: len(pivots)], pivots
 
 
-def _rank(matrix: np.ndarray) -> int:
-    return len(_reduced(matrix)[1])
+def independent(rows: Sequence, columns: int, modulus: int = PRIME) -> list[int]:
+    """Return the positions of the rows that are no combination of those before, modulo a prime."""
+    return _reduced(np.array(rows, dtype=np.int64).reshape(len(rows), columns).T, modulus)[1]
 
 
-def nullspace(matrix: np.ndarray) -> np.ndarray:
-    """Return vectors (nullity, columns) that span the null space modulo the prime."""
-    rows, pivots = _reduced(matrix)
-    columns = matrix.shape[1]
-    free = [c for c in range(columns) if c not in pivots]
-    vectors = np.zeros((len(free), columns), dtype=np.int64)
-    for vector, column in zip(vectors, free, strict=True):
-        vector[column] = 1
-        vector[pivots] = -rows[:, column] % PRIME
+def nullspace(matrix: np.ndarray, modulus: int = PRIME) -> np.ndarray:
+    """Return vectors (nullity, columns) that span the null space modulo a prime."""
+    rows, pivots = _reduced(matrix, modulus)
+    free = [c for c in range(matrix.shape[1]) if c not in pivots]
+    vectors = np.eye(matrix.shape[1], dtype=np.int64)[free]
+    vectors[:, pivots] = -rows[:, free].T % modulus
     return vectors
 
 
@@ -176,7 +174,7 @@ def _circuits(vectors: np.ndarray, weights: np.ndarray, tries: int = 200) -> lis
     for trial in range(tries if len(vectors) > 1 else 1):
         # Heavy columns are the first pivots, so that each appears in one row only.
         order = np.lexsort((random.permutation(columns), -weights)) if trial % 2 else random.permutation(columns)
-        for row in _reduced(vectors[:, order])[0]:
+        for row in _reduced(vectors[:, order], PRIME)[0]:
             supports.add(tuple(sorted(int(c) for c in order[np.flatnonzero(row)])))
     return sorted(supports, key=lambda support: (weights[list(support)].sum(), support))
 
@@ -369,8 +367,7 @@ class Determining:
         """
         places = sorted(support)
         columns = [*places, *range(len(self.terms), self.matrix.shape[1])]
-        part = self.matrix[:, columns]
-        chosen = _reduced(part.T)[1]
+        chosen = independent(self.matrix[:, columns], len(columns))
         domain = sp.QQ[tuple(self.unknowns)]
         entries = [[domain.ring.from_dict(dict(self.rows[i].get(c, {}))) for c in columns] for i in chosen]
         matrix = DomainMatrix(entries, (len(chosen), len(columns)), domain)
@@ -446,13 +443,14 @@ def generators_of(equations: Determining) -> list[Generator]:
     values = dict(zip(equations.unknowns, equations.point, strict=True))
     rows = [[weights.get(k, 0) * values[symbols[k]] % PRIME for k in parameters] for weights in scalings]
     vectors = nullspace(equations.matrix)[:, : len(symbols)]
-    supports = _circuits(vectors, equations.weights) if len(rows) < _rank(vectors[:, parameters]) else []
+    wanted = len(independent(vectors[:, parameters], len(parameters)))
+    supports = _circuits(vectors, equations.weights) if len(rows) < wanted else []
     for support in supports:
         rest = [k for k in range(len(symbols)) if k not in support]
         (move,) = nullspace(vectors[:, rest].T)
         rows.append(list((move[:, None] * vectors[:, parameters] % PRIME).sum(axis=0) % PRIME))
     generators = []
-    for i in _independent(rows, len(parameters)):
+    for i in independent(rows, len(parameters)):
         if i < len(scalings):
             moves = {k: w * symbols[k] if k in parameters else sp.Integer(w) for k, w in scalings[i].items()}
         else:
@@ -463,11 +461,6 @@ def generators_of(equations: Determining) -> list[Generator]:
                 field[symbol] = field.get(symbol, sp.S.Zero) + move * rate
         generators.append(Generator({s: move for s, move in field.items() if move != 0}, i < len(scalings)))
     return generators
-
-
-def _independent(rows: list, columns: int) -> list[int]:
-    """Return the positions of the rows that are independent of those before, modulo the prime."""
-    return _reduced(np.array(rows, dtype=np.int64).reshape(len(rows), columns).T)[1]
 
 
 def _scalings(equations: Determining) -> list[dict[int, int]]:
@@ -488,5 +481,5 @@ def _scalings(equations: Determining) -> list[dict[int, int]]:
     exact = DomainMatrix([[sp.QQ(row.get(c, 0)) for c in range(size)] for row in table], (len(table), size), sp.QQ)
     whole = integer_rows(exact.to_sparse().nullspace())
     circuits = integer_circuits(whole, np.append(equations.weights[columns], np.zeros(len(diagonal), dtype=int)))
-    chosen = _independent([vector[: len(parameters)] for vector in circuits], len(parameters))
+    chosen = independent([vector[: len(parameters)] for vector in circuits], len(parameters))
     return [{k: int(w) for k, w in zip(columns, circuits[i], strict=False) if w} for i in chosen]
