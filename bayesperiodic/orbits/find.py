@@ -162,7 +162,7 @@ def _orbit(
     # The orbit starts at the point that belongs to the start of the measured cycle.
     order = (np.arange(period) + candidate.shift) % period
     index = np.concatenate([(2 * order[:, None] + np.arange(2)).ravel(), 2 * period + np.arange(2)])
-    points = estimate.points[order] * size
+    points = wrapped(estimate.points[order] * size, maps.angle)
     units = np.concatenate([np.tile(size, period), np.ones(2)])
     bias = estimate.bias[index] * units
     covariance = estimate.covariance[np.ix_(index, index)] * np.outer(units, units)
@@ -172,11 +172,9 @@ def _orbit(
         if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
-    for column in np.flatnonzero(maps.angle):
-        points[:, column] = wrapped(points[:, column])
-        if cycle is not None:
-            values = cycle[section.coordinates[column]]
-            values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
+    for column in np.flatnonzero(maps.angle) if cycle else ():
+        values = cycle[section.coordinates[column]]
+        values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
     return Orbit(
         name="", coordinates=section.coordinates, angles=section.angles, frequency=section.frequency, period=period,
         winding=round(estimate.turns) if section.winds else None, points=points, joint_covariance=covariance,

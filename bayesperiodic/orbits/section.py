@@ -211,9 +211,9 @@ class PoincareSection(Result):
                     "be in degrees: convert it with numpy.radians."
                 )
         _check_count(len(values))
-        increments = np.diff(values, axis=0)
-        values[:, turning], increments[:, turning] = wrapped(values[:, turning]), wrapped(increments[:, turning])
-        return cls(values, names, angle_names, frequency, increments, not angle_names, values=values.size)
+        increments = wrapped(np.diff(values, axis=0), turning)
+        points = wrapped(values, turning)
+        return cls(points, names, angle_names, frequency, increments, not angle_names, values=values.size)
 
     @classmethod
     def _of(
@@ -229,9 +229,8 @@ class PoincareSection(Result):
         _check_count(instants.size)
         frequency = frequency or float((instants.size - 1) / (instants[-1] - instants[0]))
         time = recording.time
-        points, noise = _estimate(time, signals, np.clip(instants, time[0], time[-1]))
-        increments, turning = np.diff(points, axis=0), np.isin(names, angles)
-        points[:, turning] = wrapped(points[:, turning])
+        values, noise = _estimate(time, signals, np.clip(instants, time[0], time[-1]))
+        points, increments = wrapped(values, np.isin(names, angles)), np.diff(values, axis=0)
         measured = (instants, time, signals, signals.size, recording.synthetic)
         return cls(points, names, angles, frequency, increments, True, noise, *measured)
 
@@ -257,8 +256,8 @@ class PoincareSection(Result):
         at = np.interp(np.arange(samples * period) / samples, knots, self.instants[index : index + period + 1])
         values = _fit(self.time, self.signals, at)[0]
         shift = self.points[index] - _fit(self.time, self.signals, self.instants[index : index + 1])[0][0]
-        turning = np.isin(self.coordinates, self.angles)
-        values[:, turning] += 2.0 * np.pi * np.round(shift[turning] / (2.0 * np.pi))
+        turns = np.where(np.isin(self.coordinates, self.angles), np.round(shift / (2.0 * np.pi)), 0.0)
+        values += 2.0 * np.pi * turns
         return dict(zip(self.coordinates, values.T, strict=True))
 
     def __repr__(self) -> str:
@@ -267,9 +266,9 @@ class PoincareSection(Result):
         return f"PoincareSection({len(self.points)} points of {names} at {self.frequency:.6g} Hz from {source})"
 
 
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Return angles in (−π, π]."""
-    return np.pi - (np.pi - angle) % (2.0 * np.pi)
+def wrapped(values: np.ndarray, turning: np.ndarray | bool = True) -> np.ndarray:
+    """Return values (…, coordinates), with those that are turning angles in (−π, π]."""
+    return np.where(turning, np.pi - (np.pi - values) % (2.0 * np.pi), values)
 
 
 def _names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple[tuple[str, str], tuple[str, ...]]:
