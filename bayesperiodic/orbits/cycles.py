@@ -106,7 +106,7 @@ def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool
     """Return whether the points (p, 2) repeat after a divisor of p."""
     p = len(points)
     divisors = [d for d in range(1, p) if p % d == 0]
-    return any(np.abs(wrap(np.concatenate([points[d:], points[:d]]) - points)).max() < tolerance for d in divisors)
+    return any(np.abs(wrap(np.roll(points, -d, axis=0) - points)).max() < tolerance for d in divisors)
 
 
 def candidates(maps: ReturnMap, atlas: Atlas, period: int) -> list[MapCycle]:
@@ -133,9 +133,10 @@ def _converge(
         if active.size == 0:
             break
         moved = chains[active]
-        size, bandwidth = _newton(maps, moved, images)
-        chains[active] = moved
-        lost = (bandwidth > max(WIDEST_BANDWIDTH, 2.0 * noise)) | ~(size < longest)
+        image, jacobian, bandwidth = images(moved.reshape(-1, 2))
+        chains[active], size = _moved(maps, moved, image.reshape(moved.shape), jacobian.reshape(*moved.shape, 2))
+        widest = bandwidth.reshape(moved.shape[:2]).max(1)
+        lost = (widest > max(WIDEST_BANDWIDTH, 2.0 * noise)) | ~(size < longest)
         step[active] = np.where(lost, np.inf, size)
         active = active[(size > max(0.01 * CONVERGED_CORRECTION, 0.05 * noise)) & ~lost]
         cells = _cells(maps, chains[active], max(MERGED, noise))
@@ -147,17 +148,13 @@ def _converge(
     return step, heir
 
 
-def _newton(maps: ReturnMap, chains: np.ndarray, images: Images) -> tuple[np.ndarray, np.ndarray]:
-    """Move chains (m, period, 2) by one step; return the step sizes and the largest bandwidths, (m,) each."""
-    if not len(chains):
-        return np.empty(0), np.empty(0)
-    shape = chains.shape[:2]
-    image, jacobian, bandwidth = images(chains.reshape(-1, 2))
-    defect = maps.wrap(image.reshape(*shape, 2) - np.roll(chains, -1, axis=1))
-    correction = newton_step(defect, jacobian.reshape(*shape, 2, 2))
+def _moved(
+    maps: ReturnMap, chains: np.ndarray, images: np.ndarray, jacobian: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return chains (m, period, 2) after a Newton step of limited length, and the sizes (m,) of the whole steps."""
+    correction = newton_step(maps.wrap(images - np.roll(chains, -1, axis=1)), jacobian)
     size = np.abs(correction).max((1, 2))
-    chains += correction * np.minimum(1.0, LONGEST_CORRECTION / np.maximum(size, 1e-300))[:, None, None]
-    return size, bandwidth.reshape(shape).max(1)
+    return chains + correction * np.minimum(1.0, LONGEST_CORRECTION / np.maximum(size, 1e-300))[:, None, None], size
 
 
 def _cells(maps: ReturnMap, chains: np.ndarray, size: float) -> np.ndarray:
@@ -187,13 +184,11 @@ def _distinct(maps: ReturnMap, chains: np.ndarray, step: np.ndarray, members: li
             break
         if has_shorter_period(chains[k], maps.wrap, tolerance):
             continue
-        for cycle, group in groups:
-            distance, shift = shift_between(chains[k], cycle, maps.wrap)
-            if distance < tolerance:
-                group.append(np.stack([members[k], np.full(len(members[k]), shift)]))
-                break
-        else:
-            groups.append((maps.wrap(chains[k]), [np.stack([members[k], np.zeros_like(members[k])])]))
+        shifts = ((group, *shift_between(chains[k], cycle, maps.wrap)) for cycle, group in groups)
+        group, shift = next(((group, shift) for group, distance, shift in shifts if distance < tolerance), ([], 0))
+        if not group:
+            groups.append((maps.wrap(chains[k]), group))
+        group.append(np.stack([members[k], np.full(len(members[k]), shift)]))
     result = []
     for cycle, group in groups:
         steps = np.arange(len(cycle) + 1)
@@ -220,13 +215,12 @@ def refine(maps: ReturnMap, points: np.ndarray, neighbours: int) -> Estimate | N
     values, wide_values = eigenvalues(fit.jacobian), eigenvalues(wide[1].jacobian)
     slope_bias = (np.log(np.abs(wide_values)) - np.log(np.abs(values))) / SLOPE_GROWTH
     point_bias = maps.wrap(wide[0] - cycle).ravel() / VALUE_GROWTH
-    bias = np.concatenate([point_bias, slope_bias])
-    run = np.sum(fit.value - cycle, axis=0)
-    return Estimate(maps.wrap(cycle), values, _joint_covariance(fit), bias, _turns(maps, run))
+    turns = _turns(maps, np.sum(fit.value - cycle, axis=0))
+    return Estimate(maps.wrap(cycle), values, _joint_covariance(fit), np.append(point_bias, slope_bias), turns)
 
 
 def _turns(maps: ReturnMap, run: np.ndarray) -> float:
-    return float(np.sum(run[maps.angle] / maps.turn[maps.angle]))
+    return float(np.sum(run / maps.turn))
 
 
 def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple[np.ndarray, LocalFit] | None:
@@ -235,15 +229,13 @@ def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple
     for step in range(REFINING_STEPS):
         final = last < refined or step == REFINING_STEPS - 1
         fit = maps.fit_within(cycle, bandwidths, REFINING_DEGREE, influence=final)
-        defect = maps.wrap(fit.value - np.roll(cycle, -1, axis=0))
-        correction = newton_step(defect[None], fit.jacobian[None])[0]
-        size = float(np.abs(correction).max())
+        (moved,), (size,) = _moved(maps, cycle[None], fit.value[None], fit.jacobian[None])
         if not np.isfinite(size) or np.abs(maps.wrap(cycle - points)).max() > 0.1:
             return None
         if final:
             # Neighbours change as the centre moves, which leaves steps far below the errors.
             return (cycle, fit) if size < 1e-3 else None
-        cycle, last = cycle + correction * min(1.0, LONGEST_CORRECTION / max(size, 1e-300)), size
+        cycle, last = moved, size
     return None
 
 

@@ -73,19 +73,14 @@ class ReturnMap:
 
     def wrap_points(self, points: np.ndarray) -> np.ndarray:
         """Return points with angles in [0, turn)."""
-        result, turn = np.array(points), self.turn[self.angle]
-        inside = result[:, self.angle] % turn
+        inside = points % self.turn
         # The remainder of a tiny negative number is the turn itself, which the tree does not accept.
-        result[:, self.angle] = np.where(inside >= turn, 0.0, inside)
-        return result
+        return np.where(self.angle, np.where(inside >= self.turn, 0.0, inside), points)
 
     def wrap(self, difference: np.ndarray) -> np.ndarray:
         """Return differences (…, 2) with angles in half a turn either way."""
-        result = np.array(difference)
-        for column in np.flatnonzero(self.angle):
-            turn = self.turn[column]
-            result[..., column] -= turn * np.round(result[..., column] / turn)
-        return result
+        turn = np.where(self.angle, self.turn, 1.0)
+        return np.where(self.angle, difference - turn * np.round(difference / turn), difference)
 
     def distance(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
         """Return the largest coordinate differences (n,) of points (n, 2)."""
