@@ -60,10 +60,7 @@ class Estimate(NamedTuple):
 
 
 def newton_step(defect: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-    """Return the corrections (m, p, 2) that close m chains of p linearised maps.
-
-    The defects (m, p, 2) are the images minus the next points; the derivatives of the maps are (m, p, 2, 2).
-    """
+    """Return corrections (m, p, 2) that close chains of linearised maps; defects are images minus the next points."""
     m, p = defect.shape[:2]
     system = _closing_matrix(jacobian) + 1e-14 * np.eye(2 * p)
     return -np.linalg.solve(system, defect.reshape(m, 2 * p, 1)).reshape(m, p, 2)
@@ -244,7 +241,7 @@ def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndar
     nearest = maps.nearest(points, int(2.25 * neighbours))[0][:, -1] / KERNEL_REACH
     ladder = np.maximum(nearest, SMALLEST_REFINING * maps.noise.max()) * WIDENED ** np.arange(WIDTHS_TRIED)[:, None]
     fit = maps.fit_within(points, ladder[0], REFINING_DEGREE)
-    right, left = _eigenvectors(fit.jacobian, 0)
+    (right, _), (left, _) = _eigenvectors(fit.jacobian)
     targets, sds = np.empty((2, WIDTHS_TRIED, len(points), 3))
     active, accepted = np.arange(len(points)), np.zeros(len(points), dtype=int)
     for size, bandwidths in enumerate(ladder):
@@ -268,18 +265,18 @@ def _along(fit: LocalFit, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarr
     return np.concatenate([slope[:, None], fit.value], axis=1), sd
 
 
-def _eigenvectors(jacobian: np.ndarray, which: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return right eigenvectors (p, 2) of the monodromy matrix at each point, and left ones at each image.
+def _eigenvectors(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return right eigenvectors (2, p, 2) of the monodromy matrix at each point, largest modulus first, and left ones.
 
-    They belong to the eigenvalue of largest modulus (`which` = 0) or to the other one.
+    The left ones are those at each image.
     """
     monodromy = np.stack([_monodromy(np.roll(jacobian, -j, axis=0)) for j in range(len(jacobian))])
     vectors = []
     for matrices in (monodromy, monodromy.transpose(0, 2, 1)):
         values, columns = np.linalg.eig(matrices)
-        chosen = np.argsort(-np.abs(values), axis=1, kind="stable")[:, which]
-        vectors.append(columns[np.arange(len(columns)), :, chosen])
-    return vectors[0], np.roll(vectors[1], -1, axis=0)
+        order = np.argsort(-np.abs(values), axis=1, kind="stable")
+        vectors.append(np.take_along_axis(columns, order[:, None], axis=2).transpose(2, 0, 1))
+    return vectors[0], np.roll(vectors[1], -1, axis=1)
 
 
 def _joint_covariance(fit: LocalFit) -> np.ndarray:
@@ -287,14 +284,12 @@ def _joint_covariance(fit: LocalFit) -> np.ndarray:
 
     Consecutive pairs of points share the noise of a point, so errors are summed over runs of consecutive pairs.
     """
-    jacobian, hessian, p = fit.jacobian, fit.hessian, len(fit.value)
+    jacobian, p = fit.jacobian, len(fit.value)
     by_value = -np.linalg.inv(_closing_matrix(jacobian[None])[0])
-    by_slope, by_point = np.zeros((2, p, 2, 2)), np.zeros((2, p, 2))
-    for k in range(2):
-        right, left = _eigenvectors(jacobian, k)
-        slope = np.einsum("pi,pij,pj->p", left, jacobian, right)
-        by_slope[k] = (np.einsum("pi,pj->pij", left, right) / slope[:, None, None]).real
-        by_point[k] = (np.einsum("pi,pijl,pj->pl", left, hessian, right) / slope[:, None]).real
+    right, left = _eigenvectors(jacobian)
+    slope = np.einsum("kpi,pij,kpj->kp", left, jacobian, right)
+    by_slope = (np.einsum("kpi,kpj->kpij", left, right) / slope[..., None, None]).real
+    by_point = (np.einsum("kpi,pijl,kpj->kpl", left, fit.hessian, right) / slope[..., None]).real
     rows = []
     for j, influence in enumerate(fit.influence):
         points = influence[:, 0] @ by_value[:, 2 * j : 2 * j + 2].T

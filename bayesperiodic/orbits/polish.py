@@ -262,10 +262,7 @@ class _Polisher:
         )
 
     def _starts(self, orbit: Orbit) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield winding numbers and states (points, states), whole turns included, from which to solve.
-
-        The measured cycle comes first, then segments that are integrated from the section points.
-        """
+        """Yield winding numbers and states (points, states), whole turns included: the cycle, then integrated ones."""
         winding = counted_turns(orbit)
         equations = self._equations(orbit, 0)
         if orbit.cycle is not None:

@@ -240,25 +240,21 @@ def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
     noise, count = np.zeros(2), int(2.25 * neighbours)
     for _ in range(3):
         width = maps.nearest(centres, count)[0][:, -1]
-        noise = _noise_at(maps, centres[width <= np.median(width)], count)
+        dense = centres[width <= np.median(width)]
+        fit = maps.fit(dense, count, 2, influence=False)
+        rows = (np.eye(2) + fit.jacobian**2).reshape(-1, 2)
+        target = maps.residual_variance(dense, fit).reshape(-1)
+        weight = 1.0 / np.maximum(target, 1e-30)
+        for _ in range(NOISE_ROUNDS):
+            variance, _ = nnls(rows * weight[:, None], target * weight)
+            predicted = rows @ variance
+            # Residuals far above the prediction are curvature, not noise.
+            weight = np.where(target < 4.0 * predicted, 1.0, 0.0) / np.maximum(predicted, 1e-30)
+        noise = np.sqrt(variance)
         if np.median(width) / KERNEL_REACH > SMALLEST_BANDWIDTH * noise.max() or count * 2 > len(maps.arguments) // 8:
             break
         count *= 2
     return noise
-
-
-def _noise_at(maps: ReturnMap, centres: np.ndarray, count: int) -> np.ndarray:
-    fit = maps.fit(centres, count, 2, influence=False)
-    rows = (np.eye(2) + fit.jacobian**2).reshape(-1, 2)
-    target = maps.residual_variance(centres, fit).reshape(-1)
-    weight = 1.0 / np.maximum(target, 1e-30)
-    solution = np.zeros(2)
-    for _ in range(NOISE_ROUNDS):
-        solution, _ = nnls(rows * weight[:, None], target * weight)
-        predicted = rows @ solution
-        # Residuals far above the prediction are curvature, not noise.
-        weight = np.where(target < 4.0 * predicted, 1.0, 0.0) / np.maximum(predicted, 1e-30)
-    return np.sqrt(solution)
 
 
 LONGEST_PERIOD = 32

@@ -52,6 +52,11 @@ class System:
         """The highest derivative of each state."""
         return [self.jet(state, order)[-1] for state, order in self.orders.items()]
 
+    @property
+    def names(self) -> dict[sp.Symbol, str]:
+        """The names of the parameters, the unknown ones first."""
+        return {symbol: name for name, symbol in (self.parameters | self.known).items()}
+
     def jet(self, name: str, order: int = 2) -> list[sp.Symbol]:
         """Return the symbols of a state or an input and of its derivatives up to an order."""
         return [self.symbols["d" * k + name] for k in range(order + 1)]

@@ -1,7 +1,7 @@
 """Discrete symmetries: changes of signs and exchanges of two parameters that leave the measured outputs unchanged."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import combinations, product
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations, islice, product
 
 import numpy as np
 import sympy as sp
@@ -19,10 +19,7 @@ IDENTITY = sp.Symbol("none")
 
 
 def discrete_flows(system: System, generators: Sequence[Generator], determined: Iterable[str]) -> list[Flow]:
-    """Return independent sign changes that are no scalings, and exchanges of two determined parameters.
-
-    Exact substitution confirms each, see `invariants.verified`.
-    """
+    """Return independent sign changes that are no scalings, and exchanges of determined parameters; all verified."""
     images = [*_sign_changes(system, generators), *_exchanges(system, list(determined))]
     flows = [verified(system, Flow(Generator({}), IDENTITY, image)) for image in images]
     return [flow for flow in flows if flow]
@@ -80,37 +77,26 @@ def _exchanges(system: System, determined: Sequence[str]) -> list[dict[sp.Symbol
         if system.orders[a] == system.orders[b]
     ]
     states = [dict(zip(a + b, b + a, strict=True)) for a, b in pairs]
+    points = np.random.default_rng(11).uniform(0.5, 1.5, (TRIAL_POINTS, len(symbols)))
     try:
         evaluated = sp.lambdify(symbols, [equations, slopes, sp.Matrix(list(system.outputs.values()))], "numpy")
+        trials = [(dict(zip(symbols, point, strict=True)), *evaluated(*point)) for point in points]
+
+        def holds(image: Mapping[sp.Symbol, sp.Symbol]) -> bool:
+            columns = [highest.index(image.get(h, h)) for h in highest]
+            for values, residual, slope, outputs in trials:
+                moved = evaluated(*(values.get(image.get(s, s), 1.0) for s in symbols))
+                if not np.allclose(moved[2], outputs, rtol=ERROR, atol=ERROR):
+                    return False
+                expected = moved[1][:, columns] @ np.linalg.solve(slope, residual) if slope.size else moved[0]
+                if not np.allclose(moved[0], expected, rtol=ERROR, atol=ERROR):
+                    return False
+            return True
+
         exchanges = []
         for a, b in combinations([system.parameters[n] for n in determined], 2):
-            for moved in ({}, *states):
-                image = {a: b, b: a} | moved
-                columns = [highest.index(image.get(h, h)) for h in highest]
-                if _holds(evaluated, symbols, image, columns):
-                    exchanges.append(image)
-                    break
+            images = ({a: b, b: a} | moved for moved in ({}, *states))
+            exchanges += islice(filter(holds, images), 1)
     except (TypeError, NameError, AttributeError, np.linalg.LinAlgError):
         return []
     return exchanges
-
-
-def _holds(
-    evaluated: Callable[..., list[np.ndarray]],
-    symbols: Sequence[sp.Symbol],
-    image: Mapping[sp.Symbol, sp.Symbol],
-    columns: list[int],
-) -> bool:
-    """Return whether equations and outputs do not change at random points, up to a factor of the equations."""
-    random = np.random.default_rng(11)
-    for _ in range(TRIAL_POINTS):
-        values = dict(zip(symbols, random.uniform(0.5, 1.5, len(symbols)), strict=True))
-        before = evaluated(*values.values())
-        after = evaluated(*(values.get(image.get(s, s), 1.0) for s in symbols))
-        if not np.allclose(after[2], before[2], rtol=ERROR, atol=ERROR):
-            return False
-        if before[1].size:
-            factor = after[1][:, columns] @ np.linalg.inv(before[1])
-            if not np.allclose(after[0], factor @ before[0], rtol=ERROR, atol=ERROR):
-                return False
-    return True

@@ -162,9 +162,6 @@ def _motions(
         return result
 
     values = {s: fixed(v) for s, v in zip(system.known.values(), known, strict=True)}
-    for i, (symbol, value) in enumerate(zip(system.parameters.values(), theta, strict=True)):
-        values[symbol] = fixed(value)
-        values[symbol][0, :, i] += COMPLEX_STEP * 1j
     frequency = random.uniform(0.3, 1.0, (points, 1))
     values[system.symbols["frequency"]] = fixed(frequency)
     values[system.symbols["tau"]] = fixed(random.uniform(0.0, 1.0, (points, 1)))
@@ -174,9 +171,10 @@ def _motions(
         for symbol in system.jet(name):
             values[symbol] = signal
             signal = differentiated(signal)
-    for i, symbol in enumerate(starts):
-        values[symbol] = fixed(random.uniform(-1.5, 1.5, (points, 1)))
-        values[symbol][0, :, len(theta) + i] += COMPLEX_STEP * 1j
+    varied = [*theta, *random.uniform(-1.5, 1.5, (len(starts), points, 1))]
+    for i, (symbol, value) in enumerate(zip([*system.parameters.values(), *starts], varied, strict=True)):
+        values[symbol] = fixed(value)
+        values[symbol][0, :, i] += COMPLEX_STEP * 1j
     with np.errstate(all="ignore"):
         _follow(system, values, order)
         shortened = {symbol: v[: order + 1] for symbol, v in values.items()}
@@ -353,11 +351,8 @@ def verified(system: System, flow: Flow) -> Flow | None:
 
 def _image(generator: Generator, symbol: sp.Symbol, amount: sp.Symbol) -> sp.Expr | None:
     for power in SYMBOL_POWERS:
-        image = _series(generator, symbol**power, amount)
-        if image is not None and power == 2:
-            return sp.sqrt(_shortest(image))
-        if image is not None:
-            return _shortest(image**power)
+        if (image := _series(generator, symbol**power, amount)) is not None:
+            return sp.sqrt(_shortest(image)) if power == 2 else _shortest(image**power)
     return None
 
 

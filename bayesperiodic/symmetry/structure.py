@@ -296,7 +296,7 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
     """Return the structure of a symbolic system, whose parameters may have been replaced by expressions."""
     used = whole.used
     system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if s in used})
-    names = {s: n for n, s in (whole.parameters | whole.known).items()}
+    names = whole.names
     symmetries = generators_of(determining_equations(system)) if system.parameters else []
     found_flows = [invariants.flow_of(system, symmetry) for symmetry in symmetries]
     flows = [flow and invariants.verified(system, flow) for flow in found_flows]
@@ -311,13 +311,13 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
         model=name,
         outputs=tuple(system.outputs),
         known=known,
-        table=_table(whole, system, generators, directions, coefficients, combinations, names),
+        table=_table(whole, generators, directions, coefficients, combinations),
         combinations=tuple(combinations.values()),
         symmetries=tuple(
-            _symmetry(system, _kind(symmetry), generator.field, flow, names, combinations)
+            _symmetry(whole, _kind(symmetry), generator.field, flow, combinations)
             for symmetry, generator, flow in zip(symmetries, generators, flows, strict=True)
         ),
-        discrete=tuple(_symmetry(system, _discrete_kind(flow), {}, flow, names) for flow in discrete),
+        discrete=tuple(_symmetry(whole, _discrete_kind(flow), {}, flow) for flow in discrete),
         to_fix=directions.smallest_set(),
         rank=len(system.parameters) - len(directions.rows) if directions.points or not system.parameters else None,
         points=directions.points,
@@ -337,19 +337,17 @@ def _discrete_kind(flow: Flow) -> str:
 
 def _table(
     whole: System,
-    system: System,
     generators: Sequence[Generator],
     directions: Directions,
     coefficients: Mapping[sp.Expr, bool],
     combinations: Mapping[sp.Expr, str],
-    names: Mapping[sp.Symbol, str],
 ) -> pd.DataFrame:
     moved = directions.moved
-    unsure = {system.parameters[n] for n in moved}
+    unsure = {whole.parameters[n] for n in moved}
     rows = {}
     for parameter, symbol in whole.parameters.items():
         verdict, enters, partners = "determined", [t for c, t in combinations.items() if symbol in c.free_symbols], []
-        if parameter not in system.parameters:
+        if parameter not in directions.names:
             verdict = "does not appear"
         elif parameter in moved:
             alone = directions.alone(parameter)
@@ -359,7 +357,7 @@ def _table(
             shown = [c for c in coefficients if symbol in c.free_symbols and not c.free_symbols & unsure]
             shown = [] if any(c.free_symbols == {symbol} for c in shown) else shown
             shown.sort(key=lambda c: not coefficients[c])
-            enters = [written(c, names).removeprefix("-") + " (in the drive)" * coefficients[c] for c in shown]
+            enters = [written(c, whole.names).removeprefix("-") + " (in the drive)" * coefficients[c] for c in shown]
         rows[parameter] = {
             "verdict": verdict,
             "enters": "; ".join(enters),
@@ -374,14 +372,13 @@ def _symmetry(
     kind: str,
     field: VectorField,
     flow: Flow | None,
-    names: Mapping[sp.Symbol, str],
     combinations: Iterable[sp.Expr] = (),
 ) -> Symmetry:
     states = {state: system.symbols[state] for state in system.orders}
     images = flow.images if flow else {}
     moved = {n: s for n, s in (system.parameters | states).items() if s in field or s in images}
     shared = [c.free_symbols for c in combinations if c.free_symbols & set(field)]
-    texts = {**names, **{symbol: name for name, symbol in system.symbols.items()}}
+    texts = {**system.names, **{symbol: name for name, symbol in system.symbols.items()}}
     amount = ""
     if flow and field:
         wanted = ("t", "scale", "scale_factor") if flow.amount.is_positive else ("delta", "shift_by", "amount")
