@@ -250,19 +250,15 @@ def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndar
             if not active.size:
                 break
             fit = maps.fit_within(points[active], bandwidths[active], REFINING_DEGREE)
-        targets[size, active], sds[size, active] = _along(fit, left[active], right[active])
+        # The slope along the unstable direction, and the two values of each fit.
+        slope = np.einsum("pi,pij,pj->p", left[active], fit.jacobian, right[active]).real
+        slopes = np.einsum("pi,pnji,pj->pn", left[active], fit.influence[:, :, 1:3], right[active]).real
+        targets[size, active] = np.column_stack([slope, fit.value])
+        sds[size, active] = np.sqrt(np.column_stack([(slopes**2).sum(1), (fit.influence[:, :, 0] ** 2).sum(1)]))
         away = np.abs(targets[size, active] - targets[:size, active])
         active = active[~np.any(away > AGREEMENT * sds[:size, active], axis=(0, 2))]
         accepted[active] += 1
     return ladder[np.maximum(accepted - 2, 0), np.arange(len(points))]
-
-
-def _along(fit: LocalFit, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slope along the unstable direction and the two values of each fit, and their standard deviations."""
-    slope = np.einsum("pi,pij,pj->p", left, fit.jacobian, right).real
-    slopes = np.einsum("pi,pnji,pj->pn", left, fit.influence[:, :, 1:3], right).real
-    sd = np.sqrt(np.concatenate([(slopes**2).sum(1)[:, None], (fit.influence[:, :, 0] ** 2).sum(1)], axis=1))
-    return np.concatenate([slope[:, None], fit.value], axis=1), sd
 
 
 def _eigenvectors(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -172,22 +172,21 @@ def _orbit(
         if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
-    for column in np.flatnonzero(maps.angle) if cycle else ():
-        values = cycle[section.coordinates[column]]
-        values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
+    still = False
+    if cycle is not None and section.signals is not None:
+        for column in np.flatnonzero(maps.angle):
+            values = cycle[section.coordinates[column]]
+            values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
+        # It moves no more than by noise and its distance to the orbit.
+        extent = np.ptp(section.signals, axis=0)
+        limit = (STILL_RANGE + STILL_NOISE * maps.noise) * np.where(maps.angle, np.minimum(extent, 2.0 * np.pi), extent)
+        still = bool(np.all(np.ptp(np.stack(list(cycle.values())), axis=1) < limit))
     return Orbit(
         name="", coordinates=section.coordinates, angles=section.angles, frequency=section.frequency, period=period,
         winding=round(estimate.turns) if section.winds else None, points=points, joint_covariance=covariance,
         eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[-2:], returns=candidate.returns, quality=quality,
-        cycle=cycle, equilibrium=cycle is not None and _at_rest(section, maps, cycle), synthetic=section.synthetic,
+        cycle=cycle, equilibrium=still, synthetic=section.synthetic,
     )  # fmt: skip
-
-
-def _at_rest(section: PoincareSection, maps: ReturnMap, cycle: dict[str, np.ndarray]) -> bool:
-    """Return whether a measured cycle moves no more than by noise and its distance to the orbit."""
-    extent = np.ptp(section.signals, axis=0)  # of the recorded motion, of an angle at most a turn
-    limit = (STILL_RANGE + STILL_NOISE * maps.noise) * np.where(maps.angle, np.minimum(extent, 2.0 * np.pi), extent)
-    return all(np.ptp(cycle[name]) < limit[k] for k, name in enumerate(section.coordinates))
 
 
 def _quality(maps: ReturnMap, candidate: MapCycle, estimate: Estimate, neighbours: int) -> float:

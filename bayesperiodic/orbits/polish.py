@@ -284,9 +284,9 @@ class _Polisher:
         half = _fourier.on_grid(_fourier.coefficients(equations.inputs[:samples].T), 2 * samples).T
         grid = {"samples": samples, "steps": samples + 1, "kept": samples + 1}
         paths = [integrate(self.model, s, half, self.theta, frequency=equations.frequency, **grid) for s in starts]
-        if any(path is None for path in paths):
+        segments = np.array([path[:, :count] for path in paths if path is not None])
+        if len(segments) < orbit.period:
             return
-        segments = np.stack(paths)[..., :count]
         missed = segments[:, -1] - np.roll(starts[:, :count], -1, axis=0)
         # The unit vector of the angle; zero without one.
         angle = np.eye(count)[[state in self.model.angles for state in self.model.states]][:1].sum(axis=0)

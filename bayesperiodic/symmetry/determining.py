@@ -154,7 +154,7 @@ def _reduced(matrix: np.ndarray, modulus: int) -> tuple[np.ndarray, list[int]]:
     return rows[: len(pivots)], pivots
 
 
-def independent(rows: Sequence, columns: int, modulus: int = PRIME) -> list[int]:
+def independent(rows: Sequence | np.ndarray, columns: int, modulus: int = PRIME) -> list[int]:
     """Return the positions of the rows that are no combination of those before, modulo a prime."""
     return _reduced(np.array(rows, dtype=np.int64).reshape(len(rows), columns).T, modulus)[1]
 
@@ -221,7 +221,10 @@ class Algebra:
         self._symbols: dict[sp.Expr, sp.Symbol] = {}
         self._relations: list[sp.Expr] = []
         replaced = [self._replaced(e) for e in expressions]
-        self._relate_circles()
+        for odd, even, sign in ((sp.sin, sp.cos, 1), (sp.sinh, sp.cosh, -1)):
+            for function, symbol in self._symbols.items():
+                if isinstance(function, odd) and (other := self._symbols.get(even(*function.args))):
+                    self._relations.append(other**2 + sign * symbol**2 - 1)
         used = set().union(*(e.free_symbols for e in (*replaced, *self._relations)))
         plain = sorted(used - set(self._symbols.values()), key=str)
         generators = [*reversed(self._symbols.values()), *plain]
@@ -293,12 +296,6 @@ class Algebra:
             if isinstance(function, sp.sign):
                 self._relations.append(symbol**2 - 1)
         return self._symbols[function]
-
-    def _relate_circles(self) -> None:
-        for odd, even, sign in ((sp.sin, sp.cos, 1), (sp.sinh, sp.cosh, -1)):
-            for function, symbol in list(self._symbols.items()):
-                if isinstance(function, odd) and (other := self._symbols.get(even(*function.args))):
-                    self._relations.append(other**2 + sign * symbol**2 - 1)
 
 
 def lie_derivative(field: VectorField, expression: sp.Expr) -> sp.Expr:

@@ -93,7 +93,7 @@ def _exchanges(system: System, determined: Sequence[str]) -> list[dict[sp.Symbol
                     return False
             return True
 
-        exchanges = []
+        exchanges: list[dict[sp.Symbol, sp.Expr]] = []
         for a, b in combinations([system.parameters[n] for n in determined], 2):
             images = ({a: b, b: a} | moved for moved in ({}, *states))
             exchanges += islice(filter(holds, images), 1)

@@ -313,18 +313,13 @@ def flow_of(system: System, generator: Generator) -> Flow | None:
                 break
             images[symbol] = image
         else:
-            return _with_factor(Flow(scaled, amount, images))
+            # In terms of t = exp(δ), if δ appears only in this form.
+            logarithm = sp.log(sp.Symbol("t", positive=True))
+            powers = {s: sp.powsimp(sp.expand_log(e.subs(amount, logarithm))) for s, e in images.items()}
+            powers = {s: _shortest(e) for s, e in powers.items()}
+            by_factor = not any(e.has(sp.log) for e in powers.values())
+            return Flow(scaled, *((logarithm.args[0], powers) if by_factor else (amount, images)))
     return None
-
-
-def _with_factor(flow: Flow) -> Flow:
-    """Return the flow in terms of t = exp(δ), if δ appears only in this form."""
-    factor = sp.Symbol("t", positive=True)
-    images = {s: e.subs(flow.amount, sp.log(factor)) for s, e in flow.images.items()}
-    images = {s: _shortest(sp.powsimp(sp.expand_log(e))) for s, e in images.items()}
-    if any(e.has(sp.log) for e in images.values()):
-        return flow
-    return Flow(flow.generator, factor, images)
 
 
 def verified(system: System, flow: Flow) -> Flow | None:

@@ -172,14 +172,13 @@ def _listed(names: Sequence[str], conjunction: str) -> str:
 
 def written(expression: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
     """Return an expression as text such as "k1/(m*l**2)", with factors and terms in the order of the names."""
-    order = {symbol: place for place, symbol in enumerate(names)}
     number, rest = sp.factor_terms(expression).as_coeff_Mul()
     negative = number.is_negative
     above = [(sp.Integer(abs(number.p)), sp.S.One)] if abs(number.p) != 1 else []
     below = [(sp.Integer(number.q), sp.S.One)] if number.q != 1 else []
-    for factor in sorted(sp.Mul.make_args(rest), key=lambda f: _place(f, order)):
+    for factor in sorted(sp.Mul.make_args(rest), key=lambda f: _place(f, names)):
         base, power = (factor, sp.S.One) if isinstance(factor, sp.exp) else factor.as_base_exp()
-        if base.is_Add and power.is_Integer and _terms(base, order)[0].as_coeff_Mul()[0] < 0:
+        if base.is_Add and power.is_Integer and _terms(base, names)[0].as_coeff_Mul()[0] < 0:
             base, negative = -base, negative ^ (power.is_odd)
         if base != 1:
             rational = power.is_Rational
@@ -191,34 +190,27 @@ def written(expression: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
     return f"-{fraction}" if negative else fraction
 
 
-def _terms(total: sp.Expr, order: Mapping[sp.Symbol, int]) -> list[sp.Expr]:
-    return sorted(total.args, key=lambda term: (len(term.free_symbols), _place(term, order)))
+def _terms(total: sp.Expr, names: Mapping[sp.Symbol, str]) -> list[sp.Expr]:
+    return sorted(total.args, key=lambda term: (len(term.free_symbols), _place(term, names)))
 
 
-def _place(factor: sp.Expr, order: Mapping[sp.Symbol, int]) -> tuple[bool, int, str]:
-    places = sorted(order.get(s, len(order)) for s in factor.free_symbols)
-    return not factor.as_base_exp()[0].is_Symbol, places[0] if places else -1, str(factor)
+def _place(factor: sp.Expr, names: Mapping[sp.Symbol, str]) -> tuple[bool, int, str]:
+    first = next((k for k, symbol in enumerate(names) if factor.has(symbol)), len(names) if factor.free_symbols else -1)
+    return not factor.as_base_exp()[0].is_Symbol, first, str(factor)
 
 
 def _power(base: sp.Expr, power: sp.Expr, names: Mapping[sp.Symbol, str], beside: bool) -> str:
-    text = _base(base, names)
-    simple = base.is_Atom or base.is_Function
+    if base.is_Add:
+        first, *others = [written(term, names) for term in _terms(base, names)]
+        text = first + "".join(f" - {t[1:]}" if t.startswith("-") else f" + {t}" for t in others)
+    elif base.is_Function:
+        text = f"{base.func.__name__.lower()}({', '.join(written(a, names) for a in base.args)})"
+    else:
+        text = str(base.xreplace({s: sp.Symbol(n) for s, n in names.items()}))
     if power == 1:
         return f"({text})" if base.is_Add and beside else text
     exponent = str(power) if power.is_Integer else f"({written(power, names)})"
-    return f"{text}**{exponent}" if simple else f"({text})**{exponent}"
-
-
-def _base(base: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
-    if base.is_Symbol:
-        return names.get(base, str(base))
-    if base.is_Add:
-        order = {symbol: place for place, symbol in enumerate(names)}
-        first, *others = [written(term, names) for term in _terms(base, order)]
-        return first + "".join(f" - {t[1:]}" if t.startswith("-") else f" + {t}" for t in others)
-    if base.is_Function:
-        return f"{base.func.__name__.lower()}({', '.join(written(a, names) for a in base.args)})"
-    return str(base.xreplace({s: sp.Symbol(n) for s, n in names.items()}))
+    return f"{text}**{exponent}" if base.is_Atom or base.is_Function else f"({text})**{exponent}"
 
 
 def structure(
