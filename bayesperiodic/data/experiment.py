@@ -344,7 +344,9 @@ class Experiment(Result):
         -------
         array (…, samples·periods)
         """
-        return _fourier.project(values, self.harmonics[channel]) if channel in self.harmonics else values
+        if channel not in self.harmonics:
+            return values
+        return _fourier.on_grid(_fourier.coefficients(values, self.harmonics[channel]), values.shape[-1])
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
