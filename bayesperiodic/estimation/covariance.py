@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import lu_factor, lu_solve
 
 from bayesperiodic import _fourier
 from bayesperiodic._linalg import TINY, covariance_eigh, hessian_scale, scaled
@@ -349,22 +348,19 @@ def _mixture(
     others = fit.hessian - (s * now) @ s.T + JITTER * np.eye(len(s))
     pull, names = -(s * now) @ r, fit.scale.size
     points, log_prior = _points(problem)
-    log_posterior, covariances = np.empty(len(points)), np.empty((len(points), names, names))
-    for i, shape in enumerate(_spectra(problem, blocks, np.column_stack([np.ones(len(points)), points]))):
-        precision = weight / shape
-        gram, along = (s * precision) @ s.T, s @ (precision * r)
-        variance = float(np.sum(precision * r**2)) / freedom
-        for _ in range(UPDATES):
-            factors = lu_factor(gram / variance + others, check_finite=False)
-            step = lu_solve(factors, along / variance + pull, check_finite=False)
-            left = r - step @ s
-            variance = max(float(np.sum(precision * left**2)) / freedom, TINY)
-        misfit = np.sum(precision * left**2) / variance + step @ others @ step - 2.0 * step @ pull
-        logarithms = float(np.sum(weight * np.log(variance * shape)) + np.sum(np.log(np.abs(np.diag(factors[0])))))
-        log_posterior[i] = log_prior[i] - 0.5 * (misfit + logarithms)
-        inverse = lu_solve(factors, np.eye(len(s), names), check_finite=False)
-        covariances[i] = inverse[:names] + np.outer(step[:names], step[:names])
-    return np.tensordot(_probabilities(log_posterior), covariances, 1)
+    shapes = _spectra(problem, blocks, np.column_stack([np.ones(len(points)), points]))
+    precision = weight / shapes
+    gram, along = np.array([(s * one) @ s.T for one in precision]), (precision * r) @ s.T
+    variance = np.sum(precision * r**2, axis=1) / freedom
+    for _ in range(UPDATES):
+        total = gram / variance[:, None, None] + others
+        step = np.linalg.solve(total, (along / variance[:, None] + pull)[..., None])[..., 0]
+        square = np.sum(precision * (r - step @ s) ** 2, axis=1)
+        variance = np.maximum(square / freedom, TINY)
+    misfit = square / variance + np.sum((step @ others - 2.0 * pull) * step, axis=1)
+    logarithms = np.sum(weight * np.log(variance[:, None] * shapes), axis=1) + np.linalg.slogdet(total)[1]
+    probabilities, mean = _probabilities(log_prior - 0.5 * (misfit + logarithms)), step[:, :names]
+    return np.tensordot(probabilities, np.linalg.inv(total)[:, :names, :names], 1) + (probabilities * mean.T) @ mean
 
 
 def _spectra(problem: Problem, blocks: list[Block], values: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import product
 from typing import Any
 
@@ -147,27 +147,18 @@ class Search(Storable):
     other_modes: tuple[Mode, ...]
 
 
-def _part(group: str, name: str, text: str) -> Any:
-    """Return a property that reads a field of a group."""
+def _part(group: str, name: str, text: str = "") -> Any:
+    """Return a property that reads a field of a group, and raises a ValueError if the estimate is without it."""
 
     def read(self: "MapEstimate") -> Any:
-        return getattr(getattr(self, group), name)
-
-    return property(read, doc=text)
-
-
-def _check(name: str) -> Any:
-    """Return a property that reads a field of the checks, and raises a ValueError if there are none."""
-
-    def read(self: "MapEstimate") -> Any:
-        if self.checks is None:
+        if (values := getattr(self, group)) is None:
             raise ValueError(
-                f"checks: must be made before {name!r} is used, got an estimate with checks=False; run "
-                "bp.check(problem, fit), or replace(fit, checks=bp.check(problem, fit))."
+                f"{group}: must be computed before {name!r} is used, got an estimate with checks=False; take "
+                "map_estimate(problem, start=fit.theta), or for the checks replace(fit, checks=bp.check(problem, fit))."
             )
-        return getattr(self.checks, name)
+        return getattr(values, name)
 
-    return property(read, doc=f"`FitCheck.{name}` of ``checks``; a ValueError without them.")
+    return property(read, doc=text or f"`FitCheck.{name}` of ``checks``; a ValueError without them.")
 
 
 @dataclass(frozen=True)
@@ -187,8 +178,9 @@ class MapEstimate(Result):
     degrees_of_freedom : dict of str to float
         Of Student's t of each parameter: the values that determine the variances its standard deviation rests on, less
         what the estimate takes up of them (Satterthwaite); infinite if that rests on known variances and the prior.
-    joint : JointLaplace
-        Normal approximation in sampling coordinates: `joint_mode` and `joint_covariance`.
+    joint : JointLaplace, optional
+        Normal approximation in sampling coordinates: `joint_mode` and `joint_covariance`; None with one optimum and
+        ``map_estimate(checks=False)``: `sample` and `compare` compute it where they need it.
     noise_estimate : NoiseEstimate
         `noise`, `noise_prior` and `independent`.
     solutions : dict of str to PeriodicSolution
@@ -224,7 +216,7 @@ class MapEstimate(Result):
     theta: dict[str, float]
     covariance: pd.DataFrame
     degrees_of_freedom: dict[str, float]
-    joint: JointLaplace
+    joint: JointLaplace | None
     noise_estimate: NoiseEstimate
     solutions: dict[str, PeriodicSolution]
     residuals: dict[str, dict[str, np.ndarray]]
@@ -272,10 +264,9 @@ class MapEstimate(Result):
     other_modes = _part(
         "search", "other_modes", "Separate optima whose objective is lower by less than 30, see `modes`."
     )
-    robust_sd, whiteness, noise_split = _check("robust_sd"), _check("whiteness"), _check("noise_split")
-    input_noise, input_nonlinearity = _check("input_noise"), _check("input_nonlinearity")
-    doubling_shift, prior_conflict = _check("doubling_shift"), _check("prior_conflict")
-    undetermined = _check("undetermined")
+    robust_sd, whiteness, noise_split, input_noise, input_nonlinearity, doubling_shift, prior_conflict, undetermined = (
+        _part("checks", field.name) for field in fields(FitCheck)
+    )
 
     @property
     def sd(self) -> dict[str, float]:
