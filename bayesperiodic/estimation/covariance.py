@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import softmax
 
 from bayesperiodic import _fourier
 from bayesperiodic._linalg import TINY, covariance_eigh, hessian_scale, scaled
@@ -45,19 +46,12 @@ def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarra
     """Return C (J + P) C, with C the inverse of H of eq. (8), P the prior's curvature and J the scores' variance.
 
     J takes the variance of each Fourier component from the residual: a first-order autoregressive spectrum, or white
-    noise, is fitted to it, the residual is divided by that spectrum (prewhitening, [1]_), and the remaining spectrum is
-    smoothed over neighbouring harmonics. Most outputs depend on the low harmonics, which the fit removes from the
-    residual. Therefore the spectrum is fitted by restricted likelihood [2]_, with the parameters integrated out, J is
-    averaged over the posterior of the correlation length, and raised for the few values behind each smoothed one. It is
-    at least what the known noise of the inputs causes. Components that are no Fourier components keep the variance of
-    the noise model.
-
-    References
-    ----------
-    .. [1] D. W. K. Andrews, J. C. Monahan, An improved heteroskedasticity and autocorrelation consistent covariance
-       matrix estimator, Econometrica 60 (1992) 953-966.
-    .. [2] D. A. Harville, Maximum likelihood approaches to variance component estimation and to related problems,
-       Journal of the American Statistical Association 72 (1977) 320-338.
+    noise, is fitted to it, the residual is divided by that spectrum (prewhitening, D. W. K. Andrews, J. C. Monahan,
+    Econometrica 60 (1992) 953-966), and the remaining spectrum is smoothed over neighbouring harmonics. Most outputs
+    depend on the low harmonics, which the fit removes from the residual. Therefore the spectrum is fitted by restricted
+    likelihood (see `bias_correction`), with the parameters integrated out, J is averaged over the posterior of the
+    correlation length, and raised for the few values behind each smoothed one. It is at least what the known noise of
+    the inputs causes. Components that are no Fourier components keep the variance of the noise model.
     """
     likelihood, prior = problem.likelihood, problem.joint_prior.curvature(estimate.theta)
     changes, residuals = (
@@ -135,12 +129,7 @@ def _residual_variance(
     misfit = square.sum(axis=1) / size + np.einsum("ga,ab,gb->g", step, others, step) + 2.0 * step @ score
     logarithms = block.weight * np.sum(np.log(size[:, None] * shape), axis=1) + np.linalg.slogdet(total)[1]
     ratios = [_smoothed(block, *one) for one in zip(square / size[:, None], left, strict=True)]
-    return _probabilities(log_prior - 0.5 * (misfit + logarithms)) @ (size[:, None] * shape * ratios)
-
-
-def _probabilities(log_weights: np.ndarray) -> np.ndarray:
-    weights = np.exp(log_weights - log_weights.max())
-    return weights / weights.sum()
+    return softmax(log_prior - 0.5 * (misfit + logarithms)) @ (size[:, None] * shape * ratios)
 
 
 def _shapes(block: Block, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -219,15 +208,11 @@ def uncertainty(problem: Problem, estimate: Iterate, log_variance_factor: float 
 
 
 def degrees_of_freedom(inverse: np.ndarray, parts: Mapping[str, VariancePart]) -> np.ndarray:
-    """Return the degrees of freedom of Student's t of each parameter (names,), by Satterthwaite's approximation [1]_.
+    """Return the degrees of freedom of Student's t of each parameter (names,), by Satterthwaite's approximation.
 
     The variance of θ_i, the diagonal of C, is the sum of the parts of all unknown variances, and of what known
-    variances and the prior are responsible for. An estimate from ν values has its relative uncertainty √(2/ν).
-
-    References
-    ----------
-    .. [1] F. E. Satterthwaite, An approximate distribution of estimates of variance components, Biometrics Bulletin 2
-       (1946) 110-114.
+    variances and the prior are responsible for. An estimate from ν values has its relative uncertainty √(2/ν) (F. E.
+    Satterthwaite, Biometrics Bulletin 2 (1946) 110-114).
     """
     uncertain = np.zeros(len(inverse))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -261,16 +246,11 @@ def with_uncertain_noise(
     """Return the covariance of θ (names, names) with uncertain noise parameters, `parts` those of the variances.
 
     Unknown variances make the weights of the channels and of the prior uncertain, which increases the covariance by
-    4 (C F C − C F C F C)/ν each [1]_, nothing where the values behind one variance determine θ alone; Student's t
-    accounts for the rest. For unknown shapes of the spectrum θ is estimated again by linear least squares for shapes
-    from the whole support of their prior. Their posterior is that of the restricted likelihood (Harville, see
-    `robust_covariance`), with θ integrated out; the covariance is that of the mixture about the estimate. The changes
-    of the covariance by several channels are added.
-
-    References
-    ----------
-    .. [1] M. G. Kenward, J. H. Roger, Small sample inference for fixed effects from restricted maximum likelihood,
-       Biometrics 53 (1997) 983-997.
+    4 (C F C − C F C F C)/ν each (M. G. Kenward, J. H. Roger, Biometrics 53 (1997) 983-997), nothing where the values
+    behind one variance determine θ alone; Student's t accounts for the rest. For unknown shapes of the spectrum θ is
+    estimated again by linear least squares for shapes from the whole support of their prior. Their posterior is that of
+    the restricted likelihood (see `bias_correction`), with θ integrated out; the covariance is that of the mixture
+    about the estimate. The changes of the covariance by several channels are added.
     """
     shaped = [group for group in problem.likelihood.groups() if _is_shaped(problem, *group)]
     if not np.all(np.diag(covariance) > 0.0):
@@ -359,7 +339,7 @@ def _mixture(
         variance = np.maximum(square / freedom, TINY)
     misfit = square / variance + np.sum((step @ others - 2.0 * pull) * step, axis=1)
     logarithms = np.sum(weight * np.log(variance[:, None] * shapes), axis=1) + np.linalg.slogdet(total)[1]
-    probabilities, mean = _probabilities(log_prior - 0.5 * (misfit + logarithms)), step[:, :names]
+    probabilities, mean = softmax(log_prior - 0.5 * (misfit + logarithms)), step[:, :names]
     return np.tensordot(probabilities, np.linalg.inv(total)[:, :names, :names], 1) + (probabilities * mean.T) @ mean
 
 

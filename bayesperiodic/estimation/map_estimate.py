@@ -157,7 +157,11 @@ def map_estimate(
     objective, settled = corrected(objective, best)
     ends = [settled if end is best else end and resumed(objective, end) for end in ends]
     modes = with_images(objective, [end for end in ends if end], partial(_climb, objective, progress=progress))
-    result = _describe(problem, objective, modes, tuple(_outcome(problem, end) for end in ends), checks)
+    lost = {"objective": -np.inf} | dict.fromkeys(problem.names, np.nan)
+    outcomes = [
+        {"objective": end.iterate.objective} | _by_name(problem, end.iterate.theta) if end else lost for end in ends
+    ]
+    result = _describe(problem, objective, modes, tuple(outcomes), checks)
     for text in estimation_warnings(problem, result):
         warnings.warn(text, UserWarning, stacklevel=3)
     return result
@@ -301,12 +305,6 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
         for initial in (measured, simultaneous_fit(guessed, measured.theta)):
             if initial is not None and initial.states:
                 yield _linearised(problem, initial.theta, initial)
-
-
-def _outcome(problem: Problem, end: End | None) -> dict[str, float]:
-    if end is None:
-        return {"objective": -np.inf} | dict.fromkeys(problem.names, np.nan)
-    return {"objective": end.iterate.objective} | _by_name(problem, end.iterate.theta)
 
 
 def _describe(
