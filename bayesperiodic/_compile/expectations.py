@@ -16,7 +16,7 @@ POINT = """def check(states, inputs, parameters, tau, frequency, out, sums, colu
 """
 CALLERS = """
 from bayesperiodic._compile.cache import load
-from bayesperiodic._compile.code_generation import GRID, grid_function_at
+from bayesperiodic._compile.code_generation import GRID_SIGNATURE_TYPE, grid_function_at
 from bayesperiodic._compile.expectations import verify
 from bayesperiodic._compile.intrinsics import as_vector, kernel
 
@@ -30,7 +30,7 @@ def check(address, states, inputs, parameters, tau, frequency, out):
     grid_function_at(address)(states, inputs, parameters, tau, frequency, out)
     return weighted(out)
 
-verify(check, load, GRID)
+verify(check, load, GRID_SIGNATURE_TYPE)
 """
 TYPE = "float64(int64, float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
 TOLERANCE = 1e-13
@@ -72,6 +72,8 @@ def _difference(load: Callable[..., Any], is_stored: Callable[..., bool]) -> str
         if not is_stored(CALLERS, constants, unusable=False):
             load(CALLERS, constants)
     except Exception as error:  # whatever Numba and LLVM raise when they are used in another way than they expect
+        if isinstance(error, ImportError) and str(error.name).startswith("bayesperiodic"):
+            raise  # an error of this package
         return f"{type(error).__name__}: {error}"
     return ""
 
