@@ -295,12 +295,8 @@ def _with_errors(problem: Problem, estimate: Iterate, covariance: np.ndarray) ->
     likelihood, scale = problem.likelihood, np.sqrt(np.diag(covariance))
     count, first = sum(one.parts[0].shape[1] for one in likelihood.shared), scale.size
     changes = [np.pad(s * scale[:, None], ((0, count), (0, 0))) for s in estimate.here.jacobian]
-    prior = problem.joint_prior.curvature(estimate.theta)
-    if not count:
-        hessian = scaled(information(problem, estimate)[0] + prior, scale)
-        return _Linear(scale, hessian, changes, list(estimate.here.residuals))
     hessian = np.eye(scale.size + count)
-    hessian[:first, :first] = scaled(prior, scale)
+    hessian[:first, :first] = scaled(problem.joint_prior.curvature(estimate.theta), scale)
     for one in likelihood.shared:
         last = first + one.parts[0].shape[1]
         for b, part in zip(one.members, one.parts, strict=True):
