@@ -35,6 +35,7 @@ from bayesperiodic.density.log_posterior import (
     collapsible,
 )
 from bayesperiodic.density.problem import Problem
+from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.problem.fingerprint import digest
 from bayesperiodic.sampling.checkpoint import Checkpoint
@@ -199,7 +200,7 @@ def sample(
     _checks.same_names("fit", fit.noise, problem.noise_names)
     runs = [e.name for e in problem.experiments]
     _checks.contains("fit", fit.solutions, runs, "give the estimate of this problem, map_estimate(problem)")
-    problem = problem.with_input_errors(fit.input_errors)
+    problem, fit = problem.with_input_errors(fit.input_errors), with_joint(problem, fit)
     executor = checked_executor(executor)
     if variances == COLLAPSED and not collapsible(problem):
         raise ValueError(
