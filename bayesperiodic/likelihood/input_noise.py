@@ -273,6 +273,10 @@ class Shared:
         # Lᵀ·L of all blocks together, a diagonal matrix.
         self._squares = values[large] ** 2
 
+    def mean(self, factors: np.ndarray) -> float:
+        """Return the mean of factors (all blocks,) over these blocks, weighted by their sizes."""
+        return float(np.average(factors[list(self.members)], weights=[len(part) for part in self.parts]))
+
     @property
     def covariances(self) -> list[np.ndarray]:
         """L·Lᵀ of each block."""
