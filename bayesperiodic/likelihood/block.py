@@ -48,7 +48,9 @@ class Block(ABC):
     averaged: float = 1.0  # measured samples behind the components
     measured: float = float("nan")  # variance of one value that the scatter of the cycles explains; NaN if unknown
     place: int = 0  # of the channel among the measured ones
+    log_scale: float = 0.0  # ln|∂ components/∂ data| of values that are divided by known standard deviations
 
+    words: ClassVar[str] = "{0.size} values of {0.channel}"  # what is compared, a format of the block
     counted: ClassVar[bool] = False  # whether the variance is unknown, so that eq. (7) counts the values
     timed: ClassVar[bool] = False  # whether the components are values of one channel along the period
     spectral: ClassVar[bool] = False  # whether they are Fourier components of one channel
@@ -74,9 +76,9 @@ class Block(ABC):
         Of blocks with a `layout` those of several experiments are added at once, without the prediction.
         """
 
-    def errors(self, values: np.ndarray) -> np.ndarray:
-        """Return the components (…, size) of errors of the measured outputs (…, points, channels)."""
-        return np.zeros((*values.shape[:-2], self.size))
+    def errors(self, signals: ComparedSignals) -> np.ndarray:
+        """Return the components (…, size) of errors of the outputs, zero if another instrument measured them."""
+        return np.zeros((*signals.values.shape[:-2], self.size))
 
     def simulate(self, components: np.ndarray, errors: np.ndarray) -> None:  # noqa: B027
         """Fill in the errors (draws, points, channels) of the outputs with these components (draws, size)."""
@@ -89,12 +91,7 @@ class Block(ABC):
     @property
     def description(self) -> str:
         """What is compared, in words."""
-        return f"{self.size} values of {self.channel}"
-
-    @property
-    def log_scale(self) -> float:
-        """ln|∂ components/∂ data| of values that are divided by known standard deviations."""
-        return 0.0
+        return self.words.format(self)
 
     @property
     def layout(self) -> Hashable:
@@ -165,17 +162,17 @@ class LinearBlock(Block):
         """Return the components of the derivatives."""
         return self.components(directions)
 
+    def errors(self, signals: ComparedSignals) -> np.ndarray:
+        """Return the components of errors."""
+        return self.components(signals)
+
 
 class Timed(LinearBlock):
     """Values of one output along the period, whose variance is a noise parameter."""
 
     counted: ClassVar[bool] = True
     timed: ClassVar[bool] = True
-
-    @property
-    def description(self) -> str:
-        """What is compared, in words."""
-        return self.channel
+    words: ClassVar[str] = "{0.channel}"
 
     def parameter_names(self, noise: Any) -> tuple[str, ...]:
         """Return the variance and the parameters of the spectrum's shape."""
@@ -192,10 +189,6 @@ class Timed(LinearBlock):
     def mean_variance(self, noise: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return those of the noise model."""
         return noise.mean_variance(self, values)
-
-    def errors(self, values: np.ndarray) -> np.ndarray:
-        """Return the components of errors of the measured outputs."""
-        return self.components(ComparedSignals(values, np.empty(0), np.empty(0)))
 
 
 def common(experiment: Experiment, channel: str, place: int = 0) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """The log-likelihood of residuals under a noise model, and its derivatives."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,10 +15,10 @@ from bayesperiodic.likelihood.section_points import SCALE
 
 
 class Residuals(Sequence[np.ndarray]):
-    """One array (…, size) of components a block, stored as stacks (members, …, size) with the place of each block."""
+    """One array (…, size) of components a block, stored as `stacks` (members, …, size) with the place of each block."""
 
     def __init__(self, stacks: Sequence[np.ndarray], places: Sequence[tuple[int, int]]):
-        self._stacks, self._places = tuple(stacks), tuple(places)
+        self.stacks, self._places = tuple(stacks), tuple(places)
 
     @classmethod
     def of(cls, blocks: Sequence[np.ndarray]) -> "Residuals":
@@ -32,39 +32,30 @@ class Residuals(Sequence[np.ndarray]):
 
     def __getitem__(self, block: Any) -> Any:
         stack, member = self._places[block]
-        return self._stacks[stack][member]
-
-    def __iter__(self) -> Iterator[np.ndarray]:
-        return (self._stacks[stack][member] for stack, member in self._places)
+        return self.stacks[stack][member]
 
     def at(self, index: int) -> "Residuals":
         """Return the components (size,) at one place of the middle axis (…,)."""
-        return Residuals([stack[:, index] for stack in self._stacks], self._places)
+        return Residuals([stack[:, index] for stack in self.stacks], self._places)
 
     def like(self, blocks: Sequence[np.ndarray]) -> "Residuals":
         """Return other arrays, one a block, side by side as these are."""
         if isinstance(blocks, Residuals) and blocks._places == self._places:
             return blocks
-        members: list[dict[int, np.ndarray]] = [{} for _ in self._stacks]
+        stacks = [np.empty((len(stack), stack.shape[-1])) for stack in self.stacks]
         for (stack, member), block in zip(self._places, blocks, strict=True):
-            members[stack][member] = block
-        return Residuals([np.stack([group[m] for m in range(len(group))]) for group in members], self._places)
+            stacks[stack][member] = block
+        return Residuals(stacks, self._places)
 
     def scaled(self, factors: np.ndarray) -> "Residuals":
         """Return the components (size,) of each block times its factor, factors (blocks,)."""
-        scales = [np.empty((len(stack), 1)) for stack in self._stacks]
-        for (stack, member), factor in zip(self._places, factors, strict=True):
-            scales[stack][member] = factor
-        return Residuals([stack * factor for stack, factor in zip(self._stacks, scales, strict=True)], self._places)
-
-    def stacks(self) -> tuple[np.ndarray, ...]:
-        """Return the arrays (members, …, size)."""
-        return self._stacks
+        scales = self.like(factors).stacks
+        return Residuals([scale * stack for scale, stack in zip(scales, self.stacks, strict=True)], self._places)
 
     @cached_property
     def squares(self) -> np.ndarray:
         """The sum of the squares of each block, (…, blocks)."""
-        sums = [_square(stack) for stack in self._stacks]
+        sums = [np.einsum("...i,...i->...", stack, stack) for stack in self.stacks]
         result = np.empty((*sums[0].shape[1:], len(self._places)))
         for block, (stack, member) in enumerate(self._places):
             result[..., block] = sums[stack][member]
@@ -138,12 +129,12 @@ class Likelihood:
             (even if self._checked_size(group) == 1 else uneven).append(group)
         self._groups, self._uneven = [*even, *uneven], uneven
         self._group_of = {b: g for g, group in enumerate(self._groups) for b in group.members}
-        # Of the blocks with one variance: index, group, size and weight of each, in the order of the groups.
+        # Of the blocks with one variance: index, group, weight and count of each, in the order of the groups.
         order = [b for group in even for b in group.members]
         self._even = np.array(order, dtype=int)
         self._even_groups = np.array([self._group_of[b] for b in order], dtype=int)
-        self._even_sizes = np.array([self.blocks[b].size for b in order], dtype=float)
         self._even_weights = np.array([self.blocks[b].weight for b in order])
+        self._even_counts = self._even_weights * np.array([self.blocks[b].size for b in order])
         # Of their groups: where each begins in that order, and group and column of each slope.
         self._starts = np.searchsorted(self._even_groups, range(len(even)))
         pairs = [(g, column) for g, group in enumerate(even) for column in range(len(self.names))[group.columns]]
@@ -368,14 +359,14 @@ class Likelihood:
         """Return the log-likelihood (…,) of all blocks but those whose components are correlated."""
         total = np.zeros(values.shape[:-1])
         if self._even.size:
-            variances = self._even_variances(spectra)
-            terms = factors[self._even] * self._even_sizes * np.log(variances)
+            precisions = self._even_precisions(spectra)
+            terms = factors[self._even] * self._even_counts * np.log(self._even_weights / precisions)
             if not self.shared:
-                terms += residuals.squares.take(self._even, axis=-1) / variances
+                terms += precisions * residuals.squares.take(self._even, axis=-1)
             elif self._alone.any():
-                terms += (residuals.squares * self._alone).take(self._even, axis=-1) / variances
+                terms += precisions * (residuals.squares * self._alone).take(self._even, axis=-1)
             # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
-            total = -0.5 * np.add.reduce(self._even_weights * terms, axis=-1)
+            total = -0.5 * np.add.reduce(terms, axis=-1)
         for group, (variances, _) in zip(self._uneven, spectra[len(self._starts) :], strict=True):
             terms = len(group.members) * factors[group.members[0]] * np.log(variances)
             if alone := [b for b in group.members if self._alone[b]]:
@@ -414,9 +405,10 @@ class Likelihood:
         """Return variances and slopes of all groups."""
         return [self._spectrum(group, values) for group in self._groups]
 
-    def _even_variances(self, spectra: Spectra) -> np.ndarray:
-        """Return the variances (…, blocks) of the blocks with one variance."""
-        return np.concatenate([v for v, _ in spectra[: len(self._starts)]], axis=-1).take(self._even_groups, axis=-1)
+    def _even_precisions(self, spectra: Spectra) -> np.ndarray:
+        """Return weights over variances (…, blocks) of the blocks with one variance."""
+        variances = np.concatenate([spectrum for spectrum, _ in spectra[: len(self._starts)]], axis=-1)
+        return self._even_weights / variances.take(self._even_groups, axis=-1)
 
     def _is_even(self, b: int) -> bool:
         """Return whether the components of a block all have the same variance."""
@@ -481,25 +473,22 @@ class Likelihood:
                     by_value[self._columns[b]] -= np.add.reduce(by_precision[:, None] * slopes, axis=0)
         return float(total) if np.isfinite(total) else -np.inf, by_residual, by_value
 
-    def _even_gradients(
-        self, residuals: Residuals, spectra: Spectra, factors: np.ndarray, by_value: np.ndarray
-    ) -> Any:
+    def _even_gradients(self, residuals: Residuals, spectra: Spectra, factors: np.ndarray, by_value: np.ndarray) -> Any:
         """Return the gradients by the residuals of blocks with one variance, and add those by ln φ to `by_value`."""
         by_square = np.zeros(len(self.blocks))
         if self._even.size:
-            inverse = self._even_weights / self._even_variances(spectra)
-            by_square[self._even] = -inverse
-            excess = inverse * residuals.squares[self._even] - self._even_weights * factors[self._even] * self._even_sizes
-            by_group = 0.5 * np.add.reduceat(excess, self._starts)
-            slopes = np.concatenate([slopes.ravel() for _, slopes in spectra[: len(self._starts)]])
-            weights = by_group[self._slope_groups] * slopes
-            by_value += np.bincount(self._slope_columns, weights, by_value.size)
+            precisions = self._even_precisions(spectra)
+            by_square[self._even] = -precisions
+            excess = precisions * residuals.squares[self._even] - factors[self._even] * self._even_counts
+            slopes = np.concatenate([slope.ravel() for _, slope in spectra[: len(self._starts)]])
+            each = 0.5 * np.add.reduceat(excess, self._starts)[self._slope_groups] * slopes
+            by_value += np.bincount(self._slope_columns, each, by_value.size)
         return residuals.scaled(by_square)
 
     def _dense_gradients(
         self, b: int, r: np.ndarray, values: np.ndarray, factor: float
     ) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return the log-likelihood of one residual (size,) of correlated components, and its gradients by r and ln φ."""
+        """Return the log-likelihood of correlated components r (size,), and its gradients by r and ln φ."""
         try:
             root, slopes = self._root(b, values)
         except np.linalg.LinAlgError:
@@ -552,8 +541,3 @@ class Likelihood:
                 values[i] = float(self.model.shape_priors[kind].quantile(np.array(0.5)))
             values[i] = self.fixed.get(name, values[i])
         return values
-
-
-def _square(r: np.ndarray) -> np.ndarray:
-    """Return the sum of squares (…,) of components (…, size)."""
-    return np.einsum("...i,...i->...", r, r)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.fft import dct
@@ -15,6 +15,8 @@ from bayesperiodic.models.model import Model
 @dataclass(frozen=True, eq=False)
 class Samples(Timed):
     """Values of one channel at some points of the period."""
+
+    words: ClassVar[str] = "{0.channel} at {0.size} points of a mask"
 
     @classmethod
     def of(cls, experiment: Experiment, model: Model) -> "list[Samples]":
@@ -31,11 +33,6 @@ class Samples(Timed):
             )
             for place, channel in enumerate(measured_channels(experiment, model))
         ]
-
-    @property
-    def description(self) -> str:
-        """What is compared, in words."""
-        return f"{self.channel} at {self.size} points of a mask"
 
     @cached_property
     def _at(self) -> np.ndarray:
