@@ -49,7 +49,7 @@ class Residuals(Sequence[np.ndarray]):
 
     def scaled(self, factors: np.ndarray) -> "Residuals":
         """Return the components (size,) of each block times its factor, factors (blocks,)."""
-        scales = self.like(factors).stacks
+        scales = self.like(list(factors)).stacks
         return Residuals([scale * stack for scale, stack in zip(scales, self.stacks, strict=True)], self._places)
 
     @cached_property
@@ -266,7 +266,7 @@ class Likelihood:
         return [
             (kind, columns, np.array([self.measured.get(self.names[i], np.nan) for i in columns]))
             for kind, columns in kinds.items()
-            if not self.model.has_constant_prior(kind)
+            if kind in self.model.shape_priors or not self.model.constant_prior
         ]
 
     def __call__(
@@ -373,24 +373,28 @@ class Likelihood:
                 terms = terms + sum(residuals[b] ** 2 for b in alone) / variances
             total = total - 0.5 * group.weight * np.add.reduce(terms, axis=-1)
         for one in self.shared:
-            parts, precisions = [residuals[b] for b in one.members], self._precisions(one.members, spectra)
-            total = total + one.log_likelihood(parts, precisions, one.mean(factors))
+            parts = [residuals[b] for b in one.members]
+            total = total + one.log_likelihood(parts, self._precisions(one.members, spectra), one.mean(factors))
         return total
 
     def _checked_size(self, group: _AlikeBlocks) -> int:
         """Return the number of variances that the spectrum of a group has, one or one each component."""
         block, count = group.block, len(self._parameters[group.members[0]])
-        sizes = (1, block.size)
+        sizes, without_harmonics = (1, block.size), block.timed and not block.harmonic.size
         try:
             variances, slopes = map(np.shape, self._spectrum(group, np.ones(len(self.names))))
         except (IndexError, ValueError):
-            if not block.refusal(self.model):
+            if not without_harmonics:
                 raise
             variances, slopes = (), ()
         if len(variances) == 1 and variances[0] in sizes and slopes in [(size, count) for size in sizes]:
             return variances[0]
-        if reason := block.refusal(self.model):
-            raise ValueError(reason)
+        if without_harmonics:
+            raise ValueError(
+                f"noise: must have a method `covariance` for the points of a mask, got {self.model.name!r}; experiment "
+                f"{block.experiment!r} has {block.size} points of {block.channel!r}, which have no harmonics, so that "
+                "`spectrum` gives no variances of them. Implement `covariance`, or compare whole periods."
+            )
         raise ValueError(
             f"noise: must have a spectrum of shapes (…, 1) or (…, {block.size}) and (…, 1, {count}) or (…, "
             f"{block.size}, {count}) for {block.channel!r} of {block.experiment!r}, got {variances} and {slopes} from "

@@ -17,7 +17,6 @@ MULTIPLIERS = "multipliers"
 class Multipliers(LinearBlock):
     """Logarithms of multipliers in units of their standard deviations, given the errors of the section points."""
 
-    at: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))  # (points,), on the grid
     slopes: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))  # (size, values), regression on the values
     whitening: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))  # (size, size)
 
@@ -29,24 +28,18 @@ class Multipliers(LinearBlock):
         e, count = experiment, experiment.measured_multipliers.size
         if not count:
             return []
-        at = np.empty(0, dtype=int)
-        slopes = np.zeros((count, 0))
+        position, slopes = np.empty(0), np.zeros((count, 0))
         if e.multiplier_sd is not None:
             root, scale = whitening(np.diag(e.multiplier_sd**2))
         else:
             assert e.covariance is not None
-            at = np.flatnonzero(e.measured_points)
-            size = at.size * len(measured_channels(e, model))
+            position = np.flatnonzero(e.measured_points) / e.measured_points.size
+            size = position.size * len(measured_channels(e, model))
             cross = e.covariance[size:, :size]
             slopes = np.linalg.solve(e.covariance[:size, :size], cross.T).T
             root, scale = whitening(e.covariance[size:, size:] - slopes @ cross.T)
-        given = {"at": at, "slopes": slopes, "whitening": root, "log_scale": scale}
-        return [cls(count=0.0, size=count, **given, **common(e, MULTIPLIERS))]
-
-    @property
-    def multipliers(self) -> int:  # type: ignore[override]
-        """Floquet multipliers that are compared."""
-        return self.size
+        given = common(e, MULTIPLIERS, count=0.0, size=count, position=position)
+        return [cls(slopes=slopes, whitening=root, log_scale=scale, **given)]
 
     def components(self, moved: ComparedSignals) -> np.ndarray:
         """Return the whitened logarithms, less what goes with the values."""

@@ -37,7 +37,7 @@ class GroupSolution(NamedTuple):
     z: np.ndarray  # (experiments, solves, points, states), periodic parts of the states
     status: np.ndarray  # int (experiments, solves), index into `compiled.STATUSES`
 
-    def response(self, members: Any, solves: Any = slice(None)) -> Response:
+    def response(self, members: Any, solves: Any = ...) -> Response:
         """Return the responses of one experiment (an index), θ on the leading axis; of several without multipliers."""
         at = members, solves
         multipliers = self.log_multipliers[members][solves] if isinstance(members, int) else np.empty(0)
@@ -98,6 +98,8 @@ class Observation:
         Their indices among the model's outputs, a slice, which does not copy, where they are consecutive.
     angles : list of bool
         Which of the channels are angles.
+    multipliers : int
+        The number of Floquet multipliers that are compared.
     data : array (points, channels)
     caused : list of array (size,), optional
         What the expected errors of the inputs cause in the components of each block, see `input_noise`.
@@ -117,16 +119,13 @@ class Observation:
         logarithms = np.log(np.abs(experiment.measured_multipliers))
         self._measured = ComparedSignals(self.data, logarithms, np.array(experiment.frequency))
         self._points = len(self.data)
+        self._ramp = np.arange(self._points)[:, None] / self._points
+        self.multipliers = logarithms.size
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
         """The data of the experiment, one entry a vector of components."""
         return blocks_of(self.experiment, self._model)
-
-    @cached_property
-    def multipliers(self) -> int:
-        """The number of Floquet multipliers that are compared."""
-        return max(block.multipliers for block in self.blocks)
 
     @property
     def whole(self) -> bool:
@@ -277,20 +276,20 @@ class Observation:
     def _phase_gradient(self, response: Response) -> np.ndarray:
         """Return the derivatives (points, channels) of the outputs' phase [turns] by their values."""
         agreement = np.sum(self._fundamentals(response.outputs) * self._reference)
-        wave = np.exp(-2j * np.pi * np.arange(self._points) / self._points) * 2.0 / self._points
+        wave = np.exp(-2j * np.pi * self._ramp[:, 0]) * 2.0 / self._points
         return np.imag(np.outer(wave, self._reference) / agreement) / (2 * np.pi)
 
     def _shift(self, signals: np.ndarray, fraction: np.ndarray, turning: bool = False) -> np.ndarray:
         """Return signals (…, points, channels) that come a fraction of the response period later."""
         phase = np.asarray(fraction)[..., None, None]
         trend = self._trend(signals) if turning else 0.0
-        spectrum = np.fft.rfft(signals - trend * np.arange(self._points)[:, None] / self._points, axis=-2)
+        spectrum = np.fft.rfft(signals - trend * self._ramp, axis=-2)
         harmonic = np.arange(spectrum.shape[-2])[:, None]
         turn = np.exp(-2j * np.pi * harmonic * phase)
         if self._points % 2 == 0:
             turn[..., -1, :] = turn[..., -1, :].real
         shifted = np.fft.irfft(spectrum * turn, n=self._points, axis=-2)
-        return shifted + trend * (np.arange(self._points)[:, None] / self._points - phase)
+        return shifted + trend * (self._ramp - phase)
 
     def _trend(self, signals: np.ndarray) -> np.ndarray:
         """Return what angles advance in a response period, (…, 1, channels), whole turns; zero for other channels."""
@@ -301,7 +300,7 @@ class Observation:
     def _rate(self, predicted: np.ndarray) -> np.ndarray:
         """Return the derivative (points, channels) of the predicted outputs by their phase [per response period]."""
         trend = self._trend(predicted)
-        spectrum = np.fft.rfft(predicted - trend * np.arange(self._points)[:, None] / self._points, axis=0)
+        spectrum = np.fft.rfft(predicted - trend * self._ramp, axis=0)
         spectrum *= 2j * np.pi * np.arange(len(spectrum))[:, None]
         if self._points % 2 == 0:
             spectrum[-1] = 0.0

@@ -27,8 +27,8 @@ class OrbitFrequency(LinearBlock):
         if not model.autonomous:
             return []
         error = experiment.frequency_se
-        given = {"standard_error": error, "log_scale": -math.log(error)}
-        return [cls(count=0.0, size=1, **given, **common(experiment, FREQUENCY))]
+        given = common(experiment, FREQUENCY, count=0.0, size=1, log_scale=-math.log(error))
+        return [cls(standard_error=error, **given)]
 
     def components(self, moved: ComparedSignals) -> np.ndarray:
         """Return the frequency over its standard error."""

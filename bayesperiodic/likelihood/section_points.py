@@ -1,6 +1,5 @@
 """Values of all channels with a given covariance, such as points of a Poincaré section."""
 
-from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -18,7 +17,6 @@ SCALE = "scale"
 class SectionPoints(LinearBlock):
     """Values that are whitened by their covariance, which is known up to one factor, the noise parameter "scale"."""
 
-    at: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))  # (points compared,), on the grid
     whitening: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))  # (size, size)
 
     counted: ClassVar[bool] = True
@@ -29,11 +27,11 @@ class SectionPoints(LinearBlock):
         """Return one block of experiments with a covariance."""
         if experiment.covariance is None:
             return []
-        at = np.flatnonzero(experiment.measured_points)
-        size = at.size * len(measured_channels(experiment, model))
+        position = np.flatnonzero(experiment.measured_points) / experiment.measured_points.size
+        size = position.size * len(measured_channels(experiment, model))
         root, scale = whitening(experiment.covariance[:size, :size])
-        given = {"at": at, "whitening": root, "log_scale": scale}
-        return [cls(count=float(size), size=size, **given, **common(experiment, SCALE))]
+        given = common(experiment, SCALE, count=float(size), size=size, position=position)
+        return [cls(whitening=root, log_scale=scale, **given)]
 
     def components(self, moved: ComparedSignals) -> np.ndarray:
         """Return the whitened values."""
@@ -55,10 +53,6 @@ class SectionPoints(LinearBlock):
     def spectrum(self, noise: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the scale."""
         return values, PROPORTIONAL
-
-    def alike(self, noise: Any) -> Hashable:
-        """Return nothing: all have the same variance."""
-        return SCALE
 
     def places(self, even: bool, dense: bool) -> tuple[str, np.ndarray, str]:
         """Return the whitened values."""
