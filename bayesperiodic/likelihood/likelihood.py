@@ -104,9 +104,9 @@ class Likelihood:
         self._sort_blocks()
         self.shared = []
         for experiment, matrix in self.loadings.items():
-            members = [b for b, block in enumerate(self.blocks) if block.experiment == experiment]
+            sizes = {b: block.size for b, block in enumerate(blocks) if block.experiment == experiment}
             if matrix.any():
-                self.shared.append(Shared(members, [self.blocks[b].size for b in members], matrix))
+                self.shared.append(Shared([*sizes], [*sizes.values()], matrix))
         # One for blocks that share no errors of inputs, zero for the others.
         self._alone = np.ones(len(blocks))
         self._alone[[b for one in self.shared for b in one.members]] = 0.0
@@ -179,9 +179,9 @@ class Likelihood:
         """
         units = np.array([self.fixed.get(name, 1.0) for name in self.names])
         units[[self.names.index(names[0]) for names in self._parameters if names]] = 1.0
-        squares = np.array(Residuals.of(residuals).squares)
+        squares, spectra = np.array(Residuals.of(residuals).squares), self._spectra(units)
         for b, g in self._group_of.items():
-            variances = self._spectrum(self._groups[g], units)[0]
+            variances = spectra[g][0]
             if variances.size == 1:
                 squares[..., b] /= variances[0]
             else:
@@ -382,7 +382,7 @@ class Likelihood:
         block, count = group.block, len(self._parameters[group.members[0]])
         sizes, without_harmonics = (1, block.size), block.timed and not block.harmonic.size
         try:
-            variances, slopes = map(np.shape, self._spectrum(group, np.ones(len(self.names))))
+            variances, slopes = map(np.shape, block.spectrum(self.model, np.ones(count)))
         except (IndexError, ValueError):
             if not without_harmonics:
                 raise
@@ -401,13 +401,9 @@ class Likelihood:
             f"{self.model.name!r}."
         )
 
-    def _spectrum(self, group: _AlikeBlocks, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the variances (…, size) or (…, 1) of a group's components, and their slopes by its parameters."""
-        return group.block.spectrum(self.model, values[..., group.columns])
-
     def _spectra(self, values: np.ndarray) -> Spectra:
-        """Return variances and slopes of all groups."""
-        return [self._spectrum(group, values) for group in self._groups]
+        """Return variances (…, size) or (…, 1) of the components of each group, and their slopes."""
+        return [group.block.spectrum(self.model, values[..., group.columns]) for group in self._groups]
 
     def _even_precisions(self, spectra: Spectra) -> np.ndarray:
         """Return weights over variances (…, blocks) of the blocks with one variance."""
@@ -420,11 +416,9 @@ class Likelihood:
 
     def precisions(self, members: Sequence[int], values: np.ndarray) -> list[np.ndarray]:
         """Return weights over variances of the components of some blocks, (…, size), or (…, 1) if they are the same."""
-        groups = [self._groups[self._group_of[b]] for b in members]
-        return [group.weight / self._spectrum(group, values)[0] for group in groups]
+        return self._precisions(members, self._spectra(values))
 
     def _precisions(self, members: Sequence[int], spectra: Spectra) -> list[np.ndarray]:
-        """Return the same, given the spectra of all groups."""
         return [self.blocks[b].weight / spectra[self._group_of[b]][0] for b in members]
 
     def _root(self, b: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -538,10 +532,6 @@ class Likelihood:
 
     def guess(self) -> np.ndarray:
         """Return where the noise parameters start, (names,): variances 1, shapes at the medians of their priors."""
-        values = np.ones(len(self.names))
-        for i, name in enumerate(self.names):
-            kind = name.partition("[")[0]
-            if kind in self.model.shape_priors:
-                values[i] = float(self.model.shape_priors[kind].quantile(np.array(0.5)))
-            values[i] = self.fixed.get(name, values[i])
-        return values
+        medians = {kind: float(prior.quantile(np.array(0.5))) for kind, prior in self.model.shape_priors.items()}
+        starts = {name: medians.get(name.partition("[")[0], 1.0) for name in self.names}
+        return np.array([self.fixed.get(name, start) for name, start in starts.items()])

@@ -9,7 +9,7 @@ import numpy as np
 from bayesperiodic import _fourier
 from bayesperiodic._parallel import available_cores, in_threads
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.block import Block, ComparedSignals, measured_channels, measured_variance
+from bayesperiodic.likelihood.block import ComparedSignals, measured_channels, measured_variance
 from bayesperiodic.likelihood.kinds import blocks_of
 from bayesperiodic.likelihood.likelihood import Residuals
 from bayesperiodic.models.model import Model
@@ -98,6 +98,8 @@ class Observation:
         Their indices among the model's outputs, a slice, which does not copy, where they are consecutive.
     angles : list of bool
         Which of the channels are angles.
+    blocks : tuple of Block
+        The data of the experiment, one entry a vector of components.
     multipliers : int
         The number of Floquet multipliers that are compared.
     data : array (points, channels)
@@ -107,7 +109,7 @@ class Observation:
 
     def __init__(self, experiment: Experiment, model: Model, delayed: bool, caused: Sequence[np.ndarray] | None = None):
         self.experiment, self.caused = experiment, caused
-        self.channels, self._model = measured_channels(experiment, model), model
+        self.channels, self.blocks = measured_channels(experiment, model), blocks_of(experiment, model)
         columns = [model.outputs.index(channel) for channel in self.channels]
         between = slice(columns[0], columns[-1] + 1)
         self.picked = between if len(columns) == between.stop - between.start else columns
@@ -121,11 +123,6 @@ class Observation:
         self._points = len(self.data)
         self._ramp = np.arange(self._points)[:, None] / self._points
         self.multipliers = logarithms.size
-
-    @cached_property
-    def blocks(self) -> tuple[Block, ...]:
-        """The data of the experiment, one entry a vector of components."""
-        return blocks_of(self.experiment, self._model)
 
     @property
     def whole(self) -> bool:
