@@ -305,7 +305,7 @@ class Likelihood:
         rows = []
         for b, _, order, starts in self._parts:
             block = self.blocks[b]
-            spectral = block.spectral and not self._is_even(b)
+            spectral = block.spectral and b not in self._even
             harmonic = block.harmonic[order][starts] if spectral else np.full(len(starts), np.nan)
             rows += [(block.experiment, block.channel, h, block.weight) for h in harmonic]
         columns = map(np.array, zip(*rows, strict=True))
@@ -316,7 +316,7 @@ class Likelihood:
         """Of each block its index, labels of its observations, values in their order, and where each begins."""
         parts = []
         for b, block in enumerate(self.blocks):
-            name, place, end = block.places(self._is_even(b), b in self._dense)
+            name, place, end = block.places(b in self._even, b in self._dense)
             order = np.argsort(place, kind="stable")
             numbers, starts = np.unique(place[order], return_index=True)
             labels = [f"{name} {i}{end}" for i in numbers]
@@ -332,7 +332,7 @@ class Likelihood:
                 terms.append(self._dense_values(b, residuals[b], values, 1.0)[..., None])
                 continue
             (precisions,) = self.precisions([b], values)
-            r = block.independent(residuals[b], self._is_even(b))
+            r = block.independent(residuals[b], b in self._even)
             squares = shared[b] if b in shared else precisions * r**2
             each = block.weight * np.log(block.weight / precisions) + squares
             terms.append(-0.5 * np.add.reduceat(each[..., order], starts, axis=-1))
@@ -409,10 +409,6 @@ class Likelihood:
         """Return weights over variances (…, blocks) of the blocks with one variance."""
         variances = np.concatenate([spectrum for spectrum, _ in spectra[: len(self._starts)]], axis=-1)
         return self._even_weights / variances.take(self._even_groups, axis=-1)
-
-    def _is_even(self, b: int) -> bool:
-        """Return whether the components of a block all have the same variance."""
-        return b in self._even
 
     def precisions(self, members: Sequence[int], values: np.ndarray) -> list[np.ndarray]:
         """Return weights over variances of the components of some blocks, (…, size), or (…, 1) if they are the same."""

@@ -129,11 +129,6 @@ class Observation:
         """Whether the outputs were measured along the whole period."""
         return bool(self.experiment.measured_points.all())
 
-    @property
-    def log_scale(self) -> float:
-        """ln|∂ components/∂ data| of values that are divided by known standard deviations or a given covariance."""
-        return sum(block.log_scale for block in self.blocks)
-
     def residuals(self, response: Response) -> list[np.ndarray]:
         """Return the residual components, one array (…, size) a block."""
         measured, predicted = self._measured, self._signals(response)
