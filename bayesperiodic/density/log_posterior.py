@@ -294,17 +294,16 @@ class LogPosterior(SamplingCoordinates):
         here = Linearisation(theta, self.simulator, self.comparisons, polish=forward)
         if not here.converged:
             return -np.inf, *zeros, here.status
-        value = prior + float(self.problem.likelihood(here.residuals, noise))
+        value, by_residual, by_noise = self.problem.likelihood.value_and_gradients(here.residuals, noise)
         if not np.isfinite(value):
             return -np.inf, *zeros, CONVERGED
-        by_residual, by_noise = self.problem.likelihood.gradients(here.residuals, noise)
         if forward or any(o.multipliers for o in self.problem.observations.values()):
             here = here.anchored()
         by_theta = np.add.reduce(list(here.vjp(by_residual, adjoint=not forward).values()))
         by_theta, _ = self.add_prior(theta, by_theta)
         if not (np.isfinite(by_theta).all() and np.isfinite(by_noise).all()):
             return -np.inf, *zeros, SINGULAR
-        return value, by_theta, by_noise, CONVERGED
+        return prior + value, by_theta, by_noise, CONVERGED
 
     def linearise(self, theta: np.ndarray) -> Linearisation:
         """Solve at one θ (names,) from the present anchors, and return residuals and Jacobian there."""

@@ -265,7 +265,7 @@ def _data(problem: Problem) -> dict[str, float]:
 
 def _constant(problem: Problem) -> float:
     """Return what the log-likelihood leaves out: −n/2 ln 2π, and the units of whitened values."""
-    scales = sum(observation.log_scale for observation in problem.observations.values())
+    scales = sum(block.log_scale for block in problem.likelihood.blocks)
     return scales - sum(_data(problem).values()) * LOG_ROOT_TWO_PI
 
 
