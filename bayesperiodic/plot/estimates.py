@@ -61,7 +61,8 @@ def fit(
         )
     drawn = [e for e in problem.experiments if e.name in runs]
     shown = [(e, channel) for e in drawn for channel in e.outputs]
-    noisy = [(e, name) for e in drawn for name, sd in estimate.input_sd.get(e.name, {}).items() if sd.any()]
+    inexact = [e for e in drawn if e.name in estimate.input_errors]
+    noisy = [(e, name) for e in inexact for name, sd in estimate.input_sd[e.name].items() if sd.any()]
     heights = [3, 1] * len(shown) + [1] * len(noisy)
     figure = figure or plt.figure(figsize=(7.0, 4.6 * len(shown) + 1.3 * len(noisy)), layout="constrained")
     grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)

@@ -128,9 +128,7 @@ def test_parameters_without_effect_and_directions_are_named():
     assert "a → a + 3·x; and 2 more, for any t." in text
 
 
-def test_outcome_of_a_failed_start_has_no_values():
-    found = map_estimate._outcome(problem(), None)
-    assert found["objective"] == -np.inf and np.isnan([found["a"], found["b"]]).all() and len(found) == 3
+def test_noise_parameters_are_named_in_short_without_the_word_variance():
     assert [map_estimate._short(name) for name in ("variance[y, run]", "scale", "floor[y]")] == [
         "y, run",
         "scale",
