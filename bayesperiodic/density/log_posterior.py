@@ -9,7 +9,7 @@ from scipy.special import gammaln
 
 from bayesperiodic.density.initial_orbits import simultaneous_fit
 from bayesperiodic.density.orbit_check import other_orbit
-from bayesperiodic.density.responses import Simulator
+from bayesperiodic.density.responses import ResponseSolver
 from bayesperiodic.likelihood.likelihood import Residuals
 from bayesperiodic.likelihood.noise import FLAT_PRIOR, JEFFREYS, Circulant, Independent
 from bayesperiodic.likelihood.observation import Comparisons, Response, Simulation
@@ -23,25 +23,25 @@ SAMPLED, COLLAPSED = "sampled", "collapsed"
 class Linearisation:
     """Residuals at one θ (names,) and their Jacobian (de Kraker et al. 1997, eq. 4-5).
 
-    The `jacobian` needs a simulator anchored at θ. With `polish` the solves are as accurate as possible;
+    The `jacobian` needs a solver anchored at θ. With `polish` the solves are as accurate as possible;
     without it the residuals are those of `LogPosterior.evaluate`.
     """
 
-    def __init__(self, theta: np.ndarray, simulator: Simulator, comparisons: Comparisons, polish: bool = True):
-        self.theta, self.simulator, self._comparisons, self._polish = theta, simulator, comparisons, polish
-        self._observations = simulator.problem.observations
+    def __init__(self, theta: np.ndarray, solver: ResponseSolver, comparisons: Comparisons, polish: bool = True):
+        self.theta, self.solver, self._comparisons, self._polish = theta, solver, comparisons, polish
+        self._observations = solver.problem.observations
 
     @cached_property
     def _simulation(self) -> Simulation:
-        return self.simulator.solve(self.theta[None], keep=True, polish=self._polish)
+        return self.solver.solve(self.theta[None], keep=True, polish=self._polish)
 
     def moved(self, theta: np.ndarray) -> "Linearisation":
         """Return the residuals at another θ (names,), solved from the same anchors."""
-        return Linearisation(theta, self.simulator, self._comparisons)
+        return Linearisation(theta, self.solver, self._comparisons)
 
     def anchored(self) -> "Linearisation":
         """Return the same with the anchors at its θ."""
-        return Linearisation(self.theta, self.simulator.anchored(self.theta), self._comparisons)
+        return Linearisation(self.theta, self.solver.anchored(self.theta), self._comparisons)
 
     @property
     def status(self) -> int:
@@ -74,7 +74,7 @@ class Linearisation:
         result = []
         for name, observation in self._observations.items():
             response = self._responses[name]
-            directions = self.simulator.jacobian(self.theta, name, response, self._simulation.z(name)[0])
+            directions = self.solver.jacobian(self.theta, name, response, self._simulation.z(name)[0])
             if directions is None:
                 result += [np.full((self.theta.size, block.size), np.nan) for block in observation.blocks]
             else:
@@ -99,7 +99,7 @@ class Linearisation:
         """
         if adjoint:
             by_response = self._comparisons.vjp(self._simulation, self.residuals.like(by_residual))
-            by_theta = self.simulator.vjp(self.theta, self._simulation, *by_response)
+            by_theta = self.solver.vjp(self.theta, self._simulation, *by_response)
             return {name: -gradient for name, gradient in by_theta.items()}
         products = (jacobian @ weights for jacobian, weights in zip(self.jacobian, by_residual, strict=True))
         return {name: -np.sum([next(products) for _ in o.blocks], axis=0) for name, o in self._observations.items()}
@@ -158,22 +158,22 @@ class SamplingCoordinates:
 class LogPosterior(SamplingCoordinates):
     """Log-posterior density over the sampling coordinates of a problem, the Jacobian determinant included.
 
-    Its value depends on the point alone: periodic solves start from the fixed anchors of the simulator.
+    Its value depends on the point alone: periodic solves start from the fixed anchors of the solver.
     """
 
     def __init__(
         self,
         problem: Description,
-        simulator: Simulator,
+        solver: ResponseSolver,
         *,
         coordinates: str = RIDGE_COORDINATES,
         variances: str = SAMPLED,
         comparisons: Comparisons | None = None,
     ):
         super().__init__(problem, coordinates=coordinates, variances=variances)
-        self.simulator = simulator
+        self.solver = solver
         self.comparisons = comparisons or Comparisons(
-            [[problem.observations[e.name] for e in group] for group in simulator.groups], problem.observations
+            [[problem.observations[e.name] for e in group] for group in solver.groups], problem.observations
         )
 
     @classmethod
@@ -184,20 +184,20 @@ class LogPosterior(SamplingCoordinates):
         fit together, see `simultaneous_fit`: at the medians other orbits may be nearer, or none may exist.
         """
         if problem.anchors:
-            return cls(problem, Simulator(problem, problem.anchors))
+            return cls(problem, ResponseSolver(problem, problem.anchors))
         median = problem.median()
         estimate = simultaneous_fit(problem, median)
         if estimate is not None and estimate.states:
-            return cls(problem, Simulator.start(problem, estimate.theta, estimate.states))
-        return cls(problem, Simulator.start(problem, median))
+            return cls(problem, ResponseSolver.start(problem, estimate.theta, estimate.states))
+        return cls(problem, ResponseSolver.start(problem, median))
 
     def with_settings(
-        self, *, simulator: Simulator | None = None, coordinates: str | None = None, variances: str | None = None
+        self, *, solver: ResponseSolver | None = None, coordinates: str | None = None, variances: str | None = None
     ) -> "LogPosterior":
         """Return the density with other anchors, coordinates or treatment of the variances."""
         return LogPosterior(
             self.problem,
-            simulator or self.simulator,
+            solver or self.solver,
             coordinates=coordinates or self.coordinates,
             variances=variances or (COLLAPSED if self.collapsed else SAMPLED),
             comparisons=self.comparisons,
@@ -232,7 +232,7 @@ class LogPosterior(SamplingCoordinates):
 
         The values do not depend on the number of threads, by default one per core.
         """
-        simulation = self.simulator.solve(theta, threads, whole=True)
+        simulation = self.solver.solve(theta, threads, whole=True)
         status, good = simulation.status, simulation.status == CONVERGED
         if not (count := np.count_nonzero(good)):
             return self._nothing(status)
@@ -291,7 +291,7 @@ class LogPosterior(SamplingCoordinates):
         if not np.isfinite(prior):
             return -np.inf, *zeros, CONVERGED
         forward = forward or self.problem.model.autonomous
-        here = Linearisation(theta, self.simulator, self.comparisons, polish=forward)
+        here = Linearisation(theta, self.solver, self.comparisons, polish=forward)
         if not here.converged:
             return -np.inf, *zeros, here.status
         value, by_residual, by_noise = self.problem.likelihood.value_and_gradients(here.residuals, noise)
@@ -307,7 +307,7 @@ class LogPosterior(SamplingCoordinates):
 
     def linearise(self, theta: np.ndarray) -> Linearisation:
         """Solve at one θ (names,) from the present anchors, and return residuals and Jacobian there."""
-        return Linearisation(theta, self.simulator.anchored(theta), self.comparisons)
+        return Linearisation(theta, self.solver.anchored(theta), self.comparisons)
 
     def objective(self, here: Linearisation, noise: np.ndarray, log_variance_factor: float | np.ndarray) -> float:
         """Return the log-density over the coordinates where all solves have converged.
@@ -320,7 +320,7 @@ class LogPosterior(SamplingCoordinates):
 
     def outputs(self, theta: np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
         """Return the predicted outputs at θ (draws, names) and whether the solves converged, see `Problem.outputs`."""
-        simulation = self.simulator.solve(theta)
+        simulation = self.solver.solve(theta)
         predicted = {name: o.predicted(simulation.response(name)) for name, o in self.problem.observations.items()}
         return predicted, simulation.status == CONVERGED
 

@@ -9,7 +9,7 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, SAMPLED, Evaluation, LogPosterior
-from bayesperiodic.density.responses import Guesses, Simulator
+from bayesperiodic.density.responses import Guesses, ResponseSolver
 from bayesperiodic.likelihood.input_noise import EXACT, InputErrors, same
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.problem.description import Description, written_out
@@ -142,10 +142,10 @@ class Problem(Description):
             For unknown or missing names, or arrays of another length.
         """
         values = self.vector(theta)
-        simulator = (
-            self.density().simulator.anchored(values) if guesses is None else Simulator.start(self, values, guesses)
+        solver = (
+            self.density().solver.anchored(values) if guesses is None else ResponseSolver.start(self, values, guesses)
         )
-        return self.replace(input_errors=self.input_errors, anchors=simulator.anchors)
+        return self.replace(input_errors=self.input_errors, anchors=solver.anchors)
 
     def with_input_errors(self, errors: Mapping[str, InputErrors]) -> "Problem":
         """Return the same problem with the errors of its inputs, linearised about an estimate.
@@ -320,4 +320,4 @@ class Problem(Description):
         dict of str to PeriodicSolution
             By experiment; a solve that fails has another status than "converged".
         """
-        return self.density().simulator.solutions(self.vector(theta))
+        return self.density().solver.solutions(self.vector(theta))

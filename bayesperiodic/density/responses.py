@@ -32,15 +32,15 @@ class InitialOrbit(NamedTuple):
     derivatives: Sensitivities | None  # of outputs and frequency by all parameters; None where they do not exist
 
 
-class Simulator:
+class ResponseSolver:
     """Periodic solutions of a problem's experiments at any θ, solved from anchors, and their derivatives at one θ."""
 
     def __init__(self, problem: Description, anchors: Mapping[str, InitialOrbit]):
         self.problem, self.anchors = problem, anchors
 
     @classmethod
-    def start(cls, problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> "Simulator":
-        """Return the simulator anchored at θ (names,), solved from guesses, the experiments' own or the equilibrium."""
+    def start(cls, problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> "ResponseSolver":
+        """Return the solver anchored at θ (names,), solved from guesses, the experiments' own or the equilibrium."""
         if guesses is None:
             chosen: dict[str, Any] = experiments_guesses(problem, theta)
         else:
@@ -52,14 +52,14 @@ class Simulator:
         # The factors at the anchors are computed again; the anchors are kept to the last bit.
         return {key: value for key, value in self.__dict__.items() if key != "_batches"}
 
-    def anchored(self, theta: np.ndarray) -> "Simulator":
-        """Return the simulator anchored at θ (names,), solved from the present anchors, else from the guesses."""
+    def anchored(self, theta: np.ndarray) -> "ResponseSolver":
+        """Return the solver anchored at θ (names,), solved from the present anchors, else from the guesses."""
         simulation, anchors = self.solve(theta[None], keep=True, polish=True), {}
         for name, orbit in self.anchors.items():
             converged = simulation.statuses(name)[0] == CONVERGED
             solved = self._solved(simulation, name) if converged else None
             anchors[name] = _initial_orbit(self.problem, name, theta, orbit.guess, solved)
-        return Simulator(self.problem, anchors)
+        return ResponseSolver(self.problem, anchors)
 
     def _solved(self, simulation: Simulation, experiment: str, i: int = 0) -> tuple[PeriodicEquations, np.ndarray]:
         """Return the equations at the frequency of one of the solves, and its z."""

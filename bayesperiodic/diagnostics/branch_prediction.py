@@ -185,11 +185,11 @@ def predict_branch(
     size = posterior.draws(problem.names[0]).size
     points, _ = draws_of(problem, posterior, np.linspace(0, size - 1, count).astype(int))
     guesses = posterior.guesses([*problem.observations], problem.model.states)
-    simulator = problem.anchored(np.median(points, axis=0), guesses).density().simulator
+    solver = problem.anchored(np.median(points, axis=0), guesses).density().solver
     ends = [float(end) for end in np.atleast_1d(np.asarray(until, dtype=float))]
     curves, failed, incomplete = [], 0, 0
     for draw, theta in enumerate(tqdm(points, desc=f"branches in {vary}", unit="draw", disable=not progress)):
-        start = simulator.solutions(theta)[name]
+        start = solver.solutions(theta)[name]
         if not start.converged:
             failed += 1
             continue

@@ -68,7 +68,7 @@ class Optimum:
     @cached_property
     def orbits(self) -> dict[str, dict[str, np.ndarray]]:
         """The states of the periodic solutions by experiment."""
-        solutions = self.iterate.here.simulator.solutions(self.iterate.theta)
+        solutions = self.iterate.here.solver.solutions(self.iterate.theta)
         return {name: solution.states for name, solution in solutions.items()}
 
     @property

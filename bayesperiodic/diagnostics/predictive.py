@@ -325,7 +325,7 @@ def predict(
     peak = draws_of(problem, posterior, [int(np.argmax(lp))])[0][0]
     guesses = posterior.guesses([*problem.observations], problem.model.states)
     anchored = problem.anchored(peak, guesses).density()
-    solved = anchored.simulator.solve(points)
+    solved = anchored.solver.solve(points)
     converged = solved.status == CONVERGED
     if not converged.any():
         raise RuntimeError("posterior: none of its draws has a periodic solution. Give draws of this problem.")
@@ -464,11 +464,11 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     count = _checks.integer("draws", draws, 20)
     theta = problem.joint_prior.sample(count, np.random.default_rng(_checks.integer("seed", seed, 0)))
     density, runs = problem.density(), [e.name for e in problem.experiments]
-    solved, causes = density.simulator.solve(theta), Counter[str]()
+    solved, causes = density.solver.solve(theta), Counter[str]()
     verdicts = {name: np.full(count, STATUSES[CONVERGED], dtype=object) for name in runs}
     failed = [(name, i) for name in runs for i in np.flatnonzero(solved.statuses(name) != CONVERGED)]
     for name, i in tqdm(failed, desc="failed solves", disable=not (progress and failed)):
-        verdicts[name][i], why = PATH_VERDICTS[density.simulator.path_outcome(theta[i], name)]
+        verdicts[name][i], why = PATH_VERDICTS[density.solver.path_outcome(theta[i], name)]
         causes[f"{verdicts[name][i]} ({STATUSES[solved.statuses(name)[i]]}): {why}"] += 1
     outputs, converged = density.outputs(theta)
     if not converged.any():

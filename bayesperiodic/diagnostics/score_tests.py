@@ -52,7 +52,7 @@ class ScoreTests:
 
     def __init__(self, problem: Problem, optimum: Iterate, terms: Sequence[Term]):
         likelihood, noise, here = problem.likelihood, optimum.noise, optimum.here
-        solutions = here.simulator.solutions(optimum.theta)
+        solutions = here.solver.solutions(optimum.theta)
         effects = _effects(problem, optimum.theta, solutions, terms)
         finite = np.isfinite(np.concatenate(effects, axis=1)).all(axis=1)
         effects = [np.where(finite[:, None], effect, 0.0) for effect in effects]

@@ -12,7 +12,7 @@ from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.density.responses import Simulator
+from bayesperiodic.density.responses import ResponseSolver
 from bayesperiodic.estimation.conflict import prior_conflict
 from bayesperiodic.estimation.covariance import (
     Uncertainty,
@@ -91,8 +91,8 @@ def at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate]
     problem = check_results(problem, fit=fit)
     theta, noise = problem.vector(fit.theta), np.array([fit.noise[name] for name in problem.noise_names])
     guesses = {name: s.states for name, s in fit.solutions.items()}
-    density = LogPosterior(problem, Simulator.start(problem, theta, guesses), coordinates=NATURAL)
-    here = Linearisation(theta, density.simulator, density.comparisons)
+    density = LogPosterior(problem, ResponseSolver.start(problem, theta, guesses), coordinates=NATURAL)
+    here = Linearisation(theta, density.solver, density.comparisons)
     factor = bias_correction(problem, Iterate(theta, here, noise, np.nan)) if here.converged else 1.0
     objective = Objective(density, factor)
     peak = objective.iterate(here, noise)

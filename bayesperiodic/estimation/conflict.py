@@ -149,7 +149,7 @@ def _almost_flat(problem: Problem, near: Iterate, factor: np.ndarray) -> Objecti
     """Return the objective with the priors widened by factors (names,)."""
     wide = Problem(**written_out(problem) | {"priors": _widened(problem, factor)})
     wide = wide.with_input_errors(problem.input_errors)
-    density = LogPosterior(wide, near.here.simulator, coordinates=RIDGE_COORDINATES)
+    density = LogPosterior(wide, near.here.solver, coordinates=RIDGE_COORDINATES)
     return Objective(density, bias_correction(wide, near))
 
 

@@ -14,7 +14,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.initial_orbits import InitialEstimate, measured_orbits, simultaneous_fit
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.density.responses import Simulator
+from bayesperiodic.density.responses import ResponseSolver
 from bayesperiodic.estimation.check import MOST_UNEXPLAINED, check_warnings, checked
 from bayesperiodic.estimation.covariance import (
     degrees_of_freedom,
@@ -175,7 +175,7 @@ def nearest_optimum(
 
     None if there is no orbit or no finite density.
     """
-    near = LogPosterior(problem, Simulator.start(problem, theta, guesses)).linearise(theta)
+    near = LogPosterior(problem, ResponseSolver.start(problem, theta, guesses)).linearise(theta)
     objective = _objective(problem, near)
     first = objective.iterate(near, problem.likelihood.guess())
     return None if first is None else (objective, climb(objective, first))
@@ -185,7 +185,7 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
     """Return problem and end of the climb with the errors of the inputs, linearised about the estimate."""
     for _ in range(MOST_LINEARISATIONS if problem.noisy_inputs else 0):
         now, before = end.iterate, problem.input_errors
-        loadings = input_loadings(problem, now.theta, now.here.simulator.solutions(now.theta), problem.input_noise)
+        loadings = input_loadings(problem, now.theta, now.here.solver.solutions(now.theta), problem.input_noise)
         errors = estimated_inputs(problem, now, loadings).errors
         problem = problem.with_input_errors(errors)
         objective, first = _of_problem(problem, now)
@@ -216,16 +216,16 @@ def _moved(problem: Problem, end: End | None) -> End | None:
 
 def _of_problem(problem: Problem, iterate: Iterate) -> tuple[Objective, Iterate | None]:
     """Return objective and iterate, solved from the same orbits, of a problem with other errors of the inputs."""
-    if iterate.here.simulator.problem is problem:
+    if iterate.here.solver.problem is problem:
         return _objective(problem, iterate.here), iterate
-    guesses = {name: solution.states for name, solution in iterate.here.simulator.solutions(iterate.theta).items()}
-    near = LogPosterior(problem, Simulator.start(problem, iterate.theta, guesses)).linearise(iterate.theta)
+    guesses = {name: solution.states for name, solution in iterate.here.solver.solutions(iterate.theta).items()}
+    near = LogPosterior(problem, ResponseSolver.start(problem, iterate.theta, guesses)).linearise(iterate.theta)
     objective = _objective(problem, near)
     return objective, objective.iterate(near, iterate.noise)
 
 
 def _objective(problem: Problem, near: Linearisation) -> Objective:
-    return Objective(LogPosterior(problem, near.simulator, coordinates=NATURAL))
+    return Objective(LogPosterior(problem, near.solver, coordinates=NATURAL))
 
 
 def _first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:
@@ -248,7 +248,7 @@ def _linearised(problem: Problem, theta: np.ndarray, initial: InitialEstimate | 
     """Return residuals and Jacobian where orbits and parameters fit together, or else at θ."""
     if initial is None or not initial.states:
         return problem.density().linearise(theta)
-    return LogPosterior(problem, Simulator.start(problem, initial.theta, initial.states)).linearise(initial.theta)
+    return LogPosterior(problem, ResponseSolver.start(problem, initial.theta, initial.states)).linearise(initial.theta)
 
 
 def _from_draw(objective: Objective, first: Iterate, theta: np.ndarray, progress: bool) -> End | None:
@@ -299,7 +299,7 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
     """
     if problem.model.autonomous:
         return
-    solutions = {name: solution.states for name, solution in end.here.simulator.solutions(end.theta).items()}
+    solutions = {name: solution.states for name, solution in end.here.solver.solutions(end.theta).items()}
     for theta in (start, end.theta):
         measured = measured_orbits(problem, theta, solutions)
         for initial in (measured, simultaneous_fit(problem, measured.theta, measured.states)):
@@ -332,7 +332,7 @@ def _describe(
             problem.noise.prior_text,
             {_short(name): count for name, count in noise_names.items()},
         ),
-        solutions=best.here.simulator.solutions(best.theta),
+        solutions=best.here.solver.solutions(best.theta),
         residuals=residuals,
         rms={c: _pooled(problem, c, residuals) for c in problem.channels},
         fvu=_fractions_left(problem, residuals),

@@ -117,7 +117,7 @@ def _credible_images(objective: Objective, mode: Iterate) -> np.ndarray:
     points = np.concatenate([mode.theta[None], images(problem, mode.theta)])
     prior = problem.joint_prior.log_prob(points)
     points = points[prior > prior[0] + np.log(CREDIBLE)]
-    density = objective.density.with_settings(simulator=mode.here.simulator)
+    density = objective.density.with_settings(solver=mode.here.solver)
     values = density.at(points, np.tile(mode.noise, (len(points), 1))).log_prob
     return points[1:][values[1:] > values[0] + np.log(CREDIBLE)]
 

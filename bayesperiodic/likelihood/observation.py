@@ -311,7 +311,7 @@ class _Part(NamedTuple):
 class Comparisons:
     """Residual components of all experiments, computed together where experiments have the same layout.
 
-    The groups are of experiments that are solved together, as in `Simulator.groups`, the order that of the blocks.
+    The groups are of experiments that are solved together, as in `ResponseSolver.groups`, the order that of the blocks.
     """
 
     def __init__(self, groups: Sequence[Sequence[Observation]], order: Iterable[str]):

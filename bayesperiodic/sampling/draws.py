@@ -372,14 +372,14 @@ def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, seed: int
     chosen, theta, noise = _some(problem, posterior, REPLICATES)
     shape = chosen.sizes[CHAIN], chosen.sizes[DRAW]
     components = problem.likelihood.simulate(noise, np.random.default_rng(seed))
-    simulation, variables, largest = density.simulator.solve(theta, keep=True, polish=True), {}, []
+    simulation, variables, largest = density.solver.solve(theta, keep=True, polish=True), {}, []
     for e in problem.experiments:
         observation, failed = problem.observations[e.name], simulation.statuses(e.name) != CONVERGED
         parts, components = components[: len(observation.blocks)], components[len(observation.blocks) :]
         for channel, values in observation.replicates(simulation.response(e.name), parts).items():
             values[failed] = np.nan
             variables[f"{e.name} {channel}"] = ((CHAIN, DRAW, _time(e.name)), values.reshape(*shape, -1))
-        largest.append(density.simulator.largest_multipliers(theta, e.name, simulation).reshape(shape))
+        largest.append(density.solver.largest_multipliers(theta, e.name, simulation).reshape(shape))
     variables["largest_multiplier"] = ((CHAIN, DRAW, EXPERIMENT), np.stack(largest, axis=-1))
     return xr.Dataset(variables, coords=chosen.coords)
 
@@ -462,7 +462,7 @@ def tree(
         "sample_stats": xr.Dataset(stats, coords=coords),
         "log_likelihood": log_likelihood_terms(density, posterior),
         "posterior_predictive": posterior_predictive(density, posterior, seed),
-        "orbits": _signals(problem, {run: s.states for run, s in density.simulator.solutions(best).items()}),
+        "orbits": _signals(problem, {run: s.states for run, s in density.solver.solutions(best).items()}),
         "observed_data": _signals(problem, {e.name: e.outputs for e in problem.experiments}),
         "constant_data": _signals(problem, {e.name: e.inputs for e in problem.experiments}),
     }
@@ -491,7 +491,7 @@ def log_likelihood_terms(density: LogPosterior, posterior: xr.Dataset) -> xr.Dat
     likelihood = density.problem.likelihood
     most = min(max(MOST_TERMS // len(likelihood.observations), TERM_DRAWS[0]), TERM_DRAWS[1])
     chosen, theta, noise = _some(density.problem, posterior, most)
-    simulation = density.simulator.solve(theta, whole=True)
+    simulation = density.solver.solve(theta, whole=True)
     terms = likelihood.terms(density.comparisons.residuals(simulation, None), noise)
     terms[simulation.status != CONVERGED] = np.nan
     shaped = terms.reshape(chosen.sizes[CHAIN], chosen.sizes[DRAW], -1)

@@ -167,7 +167,7 @@ def _from_prior(density: LogPosterior, size: int, generator: np.random.Generator
     """Return coordinates of draws from the priors whose periodic solves converge, (at most size, dimension)."""
     problem = density.problem
     theta = problem.joint_prior.sample(size, generator)
-    simulation = density.simulator.solve(theta, whole=True)
+    simulation = density.solver.solve(theta, whole=True)
     good = simulation.status == CONVERGED
     residuals = density.comparisons.residuals(simulation.at(good), threads=None)
     likelihood, noise = problem.likelihood, []

@@ -156,7 +156,7 @@ def _stages(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> dict[str,
     density, points = warm.density(), [one[None] for one in theta]
 
     def compared(one: np.ndarray) -> Any:
-        return density.comparisons.residuals(density.simulator.solve(one, 1))
+        return density.comparisons.residuals(density.solver.solve(one, 1))
 
     residuals = [compared(one) for one in points]
     runs: tuple[Callable[[], Any], ...] = (

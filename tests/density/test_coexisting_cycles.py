@@ -43,8 +43,8 @@ def test_stable_and_unstable_cycles_are_never_confused():
     """Draws with an sd of 12 %, half with the fold above 15 m/s; checked by continuation and by multipliers."""
     stated, generator = problem(), np.random.default_rng(1)
     theta = np.array([RIG[name] for name in stated.names]) * np.exp(0.12 * generator.standard_normal((600, len(FREE))))
-    simulator = stated.density().simulator
-    solved = simulator.solve(theta)
+    solver = stated.density().solver
+    solved = solver.solve(theta)
     statuses = np.array([solved.statuses(name) for name in KINDS])
     stable, unstable = (np.ptp(solved.response(name).outputs[..., 1], axis=1) for name in KINDS)
     assert set(np.unique(statuses)) == {CONVERGED, OTHER_ORBIT}
@@ -52,11 +52,11 @@ def test_stable_and_unstable_cycles_are_never_confused():
     assert 200 < both.sum() < 400 and np.all(unstable[both] < 0.99 * stable[both])
     for i in (*np.flatnonzero(both)[:5], *np.flatnonzero(~both)[:15]):
         for name, kind in KINDS.items():
-            ending = simulator.path_outcome(theta[i], name)
+            ending = solver.path_outcome(theta[i], name)
             assert (ending == ARRIVED) == (solved.statuses(name)[i] == CONVERGED), ending
             if ending == ARRIVED:
-                alone = simulator.solve(theta[i : i + 1], keep=True)
-                assert (simulator.largest_multipliers(theta[i : i + 1], name, alone)[0] < 1.0) == kind
+                alone = solver.solve(theta[i : i + 1], keep=True)
+                assert (solver.largest_multipliers(theta[i : i + 1], name, alone)[0] < 1.0) == kind
 
 
 def test_determinant_changes_sign_between_cycles_on_both_sides_of_a_fold():

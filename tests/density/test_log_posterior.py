@@ -60,7 +60,7 @@ def test_a_collapsed_density_is_the_integral_over_the_variance(prior):
     sampled = problem.density()
     collapsed = sampled.with_settings(variances="collapsed")
     assert (collapsed.collapsed, collapsed.free, collapsed.dimension) == (("variance[force]",), (), 3)
-    assert collapsed.with_settings(simulator=collapsed.simulator).collapsed == collapsed.collapsed
+    assert collapsed.with_settings(solver=collapsed.solver).collapsed == collapsed.collapsed
     assert sampled.with_settings(coordinates="natural").collapsed == ()
     for k in (880.0, 905.0):
         theta = np.array([np.log(k), 41.0, 24.0])

@@ -60,7 +60,7 @@ def test_residuals_whose_squares_overflow_are_refused():
         LINEAR, [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)], noise="circulant",
         priors={"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)},
     )  # fmt: skip
-    objective = Objective(LogPosterior(problem, problem.density().linearise(problem.median()).simulator))
+    objective = Objective(LogPosterior(problem, problem.density().linearise(problem.median()).solver))
     size = problem.density().linearise(problem.median()).residuals[0].size
     far = SimpleNamespace(converged=True, residuals=[np.full(size, 1e200)], theta=problem.median())
     assert objective.iterate(far, problem.likelihood.guess()) is None

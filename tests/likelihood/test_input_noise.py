@@ -492,7 +492,7 @@ def test_replicates_are_of_what_was_measured_with_the_noisy_input():
     frozen = problem.with_input_errors(fit.input_errors)
     here = frozen.anchored(fit.theta).density().linearise(frozen.vector(fit.theta))
     seen, (residual,) = frozen.observations["run"], here.residuals
-    response = here.simulator.solve(here.theta[None]).response("run")
+    response = here.solver.solve(here.theta[None]).response("run")
     (replicate,) = seen.replicates(response, [np.zeros((1, residual.size))])["y"]
     assert np.abs(seen.caused[0]).max() > 0.05
     assert replicate + _fourier.from_components(residual, 21) == pytest.approx(run.outputs["y"], abs=1e-9)

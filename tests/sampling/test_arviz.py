@@ -118,7 +118,7 @@ def test_observations_have_names_in_words():
 def test_terms_sum_to_the_log_likelihood_in_every_case(case):
     problem, theta = CASES[case]()
     density = problem.density()
-    residuals = density.comparisons.residuals(density.simulator.solve(np.tile(theta, (3, 1))))
+    residuals = density.comparisons.residuals(density.solver.solve(np.tile(theta, (3, 1))))
     noise = problem.likelihood.guess() * np.array([[0.5], [1.0], [3.0]])
     terms, names = problem.likelihood.terms(residuals, noise), problem.likelihood.observations
     assert terms.shape == (3, len(names)) and len(set(names)) == len(names)
@@ -131,7 +131,7 @@ def test_terms_count_the_independent_values():
     problem = bp.Problem(LINEAR, [run], priors={n: bp.Normal(0.0, 1e3) for n in ("k", "c", "coulomb")})
     residual = run.outputs["force"] - linear_regressors(0.05, 2.0, grid(40)) @ TRUTH
     density = problem.density()
-    residuals = density.comparisons.residuals(density.simulator.solve(TRUTH[None]))
+    residuals = density.comparisons.residuals(density.solver.solve(TRUTH[None]))
     found = problem.likelihood.terms(residuals, np.array([[4.0]]))[0]
     assert found == pytest.approx(-0.25 * (np.log(4.0) + residual**2 / 4.0), abs=1e-6)
 
@@ -157,7 +157,7 @@ def test_observations_are_independent_values_of_the_data():
                 fixed={"m": 1.0, "c": 0.2, "k3": 0.5}, noise=noise,
             )  # fmt: skip
             density = problem.density()
-            residuals = density.comparisons.residuals(density.simulator.solve(np.array([[1.0]])))
+            residuals = density.comparisons.residuals(density.solver.solve(np.array([[1.0]])))
             found.append(problem.likelihood.terms(residuals, problem.likelihood.guess()[None])[0])
         moved = np.abs(found[1] - found[0]) > 1e-9
         assert [name for name, one in zip(problem.likelihood.observations, moved, strict=True) if one] == expected

@@ -30,7 +30,7 @@ def test_residual_of_a_replicate_equals_its_simulated_noise(case):
     problem, theta = CASES[case]()
     values = problem.likelihood.complete(np.full((1, len(problem.free_noise)), 1e-4))
     components = problem.likelihood.simulate(values, np.random.default_rng(3))
-    solved, left = problem.density().simulator.solve(np.array([theta])), list(components)
+    solved, left = problem.density().solver.solve(np.array([theta])), list(components)
     for e in problem.experiments:
         observation = problem.observations[e.name]
         own, left = left[: len(observation.blocks)], left[len(observation.blocks) :]
