@@ -1,0 +1,210 @@
+"""The steady part of a recording: without ramps, without the rest of a transient that matters, and what remains."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from bayesperiodic.data.harmonics import MINIMUM_CYCLES, resolved_harmonics
+
+# Parts of a cycle in which ramps begin or end, in recordings of so many cycles; most windows of long recordings.
+FINE, FEW_CYCLES, MOST_WINDOWS = 8, 64, 256
+HARMONICS = 5
+# Range of an amplitude in a steady part, relative to the amplitude and in standard deviations of a cycle's noise.
+SMALL_RANGE, NOISE_RANGE = 0.08, 10.0
+# Least level of a steady part relative to the largest amplitudes: a part at rest is steady too.
+LEAST_LEVEL = 0.5
+# Largest change per cycle inside the steady part relative to outside.
+CALMER = 0.25
+# Largest distance of a window from the middle of the steady part, relative to usual ones, in harmonics and mean value.
+DISTANT, DISTANT_MEAN = 3.0, 12.0
+# Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
+FEWEST_FOR_MEDIAN = 9
+# Shares of a channel's standard deviation below which distances and noise do not count.
+SMALLEST_DISTANCE, SMALLEST_NOISE = 1e-9, 1e-6
+# Bias of the mean amplitudes by a transient that is allowed, in standard errors of all together.
+ALLOWED_BIAS = 0.3
+# Decay times of transients, in cycles and relative to the recording, their number, and the number of frequencies.
+SHORTEST_DECAY, LONGEST_DECAY, DECAYS, FREQUENCIES = 0.3, 1.0 / 6.0, 12, 13
+# Decay times in which a transient is compared with noise, and most places of the recording with which it is compared.
+LENGTH, CONTROLS = 6.0, 8
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Amplitudes of all channels in windows of whole cycles, which may overlap."""
+
+    first: np.ndarray  # first sample of each window
+    last: np.ndarray  # its last sample + 1
+    overlap: int  # windows from one to the next that does not overlap it
+    cycles: int  # in a window
+    amplitudes: np.ndarray  # complex (windows, channels, harmonics + 1), relative to each channel's standard deviation
+
+    def part(self, first: int, last: int) -> "Windows":
+        """Return the windows first … last − 1."""
+        used = slice(first, last)
+        return Windows(self.first[used], self.last[used], self.overlap, self.cycles, self.amplitudes[used])
+
+    def apart(self) -> "Windows":
+        """Return windows that do not overlap, the last one among them."""
+        used = slice((len(self.first) - 1) % self.overlap, None, self.overlap)
+        return Windows(self.first[used], self.last[used], 1, self.cycles, self.amplitudes[used])
+
+    @cached_property
+    def sizes(self) -> np.ndarray:
+        """Amplitudes of the strongest harmonic of each channel, (windows, channels)."""
+        every = np.abs(self.amplitudes[:, :, 1:])
+        strongest = every.mean(axis=0).argmax(axis=1)
+        return np.take_along_axis(every, strongest[None, :, None], axis=2)[:, :, 0]
+
+
+def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows:
+    """Return the amplitudes of signals (channels, samples) in windows along a recording."""
+    duration = np.ptp(time) * time.size / (time.size - 1) * (1 + 1e-9)
+    total = int(duration * fundamental)
+    fine = FINE if total <= FEW_CYCLES else 1
+    cycles = max(1, total // MOST_WINDOWS)
+    # Blocks of a fraction of a cycle, or of some cycles; the last one ends with the recording.
+    length = cycles / fine / fundamental
+    count = int(duration / length)
+    back = ((time[-1] - time) / length + 1e-9).astype(int)
+    edges = np.searchsorted(-back, np.arange(1 - count, 1))
+    order = np.arange(2 * min(HARMONICS, resolved_harmonics(time, fundamental, time.size)) + 1)
+    harmonics = order[: order.size // 2 + 1]
+    used = slice(edges[0], None)
+    wave, power = np.exp(-2j * np.pi * (fundamental * time[used] % 1.0)), np.ones(time[used].size, dtype=complex)
+    scaled = values[:, used] / values.std(axis=1)[:, None]
+    sums = np.empty((order.size, len(values) + 1, count), dtype=complex)
+    for h in order:
+        for row, signal in zip(sums[h], [1.0, *(scaled if h < harmonics.size else ())], strict=False):
+            row[:] = np.add.reduceat(signal * power, edges - edges[0])
+        power *= wave
+    blocks = fine  # in a window
+    sums = np.lib.stride_tricks.sliding_window_view(sums, blocks, axis=2).sum(axis=3)
+    # Normal equations of each window, as in `fit_harmonics`.
+    moments = np.concatenate([np.conj(sums[:0:-1, 0]), sums[:, 0]])
+    place = order[:, None] - order[None, :] + order.size - 1
+    right = np.concatenate([np.conj(sums[harmonics[:0:-1], 1:]), sums[harmonics, 1:]])
+    amplitudes = np.linalg.solve(np.moveaxis(moments[place], -1, 0), np.moveaxis(right, -1, 0))[:, harmonics[-1] :]
+    amplitudes[:, 1:] *= 2.0
+    stops = np.concatenate([edges[1:], [time.size]])
+    shown = count - blocks + 1
+    return Windows(edges[:shown], stops[blocks - 1 :], blocks, cycles, np.moveaxis(amplitudes, 1, 2))
+
+
+@dataclass(frozen=True)
+class Steady:
+    """The part of a recording that is used, and how steady it is."""
+
+    samples: slice
+    cycles: int  # whole ones in it
+    total: int  # whole ones in the recording
+    transient: float  # bias of all mean amplitudes together by a rest of the transient, in standard errors
+    bias: np.ndarray  # mean squares of this bias by channel and harmonic, relative to the channel's variance
+    calm: bool  # the amplitudes change less than outside
+    plateau: tuple[int, int]
+
+
+def plateau(part: Windows) -> tuple[int, int]:
+    """Return the longest part in which the range of every channel's amplitude is small, as windows first … last − 1."""
+    size = part.sizes
+    level = np.quantile(size, 0.9, axis=0)
+    noise = np.quantile(np.abs(size[part.overlap :] - size[: -part.overlap]), 0.15, axis=0) / 0.267
+    limit = np.maximum(SMALL_RANGE * level, NOISE_RANGE * noise)
+    best = (0, 0)
+    for first in range(len(size)):
+        if len(size) - first < best[1] - best[0]:
+            break
+        rest = size[first:]
+        spread = np.maximum.accumulate(rest) - np.minimum.accumulate(rest)
+        inside = (spread <= limit).all(axis=1)
+        count = int(np.argmin(inside)) if not inside.all() else inside.size
+        if count >= best[1] - best[0] and (np.median(rest[:count], axis=0) >= LEAST_LEVEL * level).any():
+            best = (first, first + count)
+    return best
+
+
+def _trimmed(part: Windows) -> tuple[int, int]:
+    """Return windows first … last − 1 without those at the ends that are far from the middle half."""
+    shape, reach = part.amplitudes, part.overlap
+    count = len(shape)
+    inner = slice(count // 4, count - count // 4)
+    middle = np.median(shape[inner].real, axis=0) + 1j * np.median(shape[inner].imag, axis=0)
+    away, near = np.abs(shape - middle) ** 2, np.ones(count, dtype=bool)
+    # The median of few windows is one of them in every component, and the median distance from it is no scale.
+    usual = np.max if count // 2 < FEWEST_FOR_MEDIAN * reach else np.median
+    for squares, factor in ((away[:, :, 1:].sum(axis=2), DISTANT), (away[:, :, 0], DISTANT_MEAN)):
+        distance = np.sqrt(squares.max(axis=1))
+        near &= distance <= factor * usual(distance[inner]) + SMALLEST_DISTANCE
+    first, last, least = 0, count, (MINIMUM_CYCLES - 1) * reach + 1
+    span = min(2 * reach + 1, least)
+    while last - first > least and not near[first : first + span].all():
+        first += 1
+    while last - first > least and not near[last - span : last].all():
+        last -= 1
+    return first, last
+
+
+def transient_bias(shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean squares of the bias of means over cycles k, k + 1, … by a transient, and variances of the means.
+
+    Both are (cycles, components) for the components (cycles, components) of the amplitudes. A transient of linear
+    decay is exp(−t/T) times a cosine and a sine, with unknown T and frequency, in all components; its sizes have a
+    normal prior of that variance which makes the data most probable. What noise does at the other end of the recording
+    is no transient. The mean squares are averages over all T and frequencies by their probabilities, and over no
+    transient, whose probability before the data is one half.
+    """
+    count = len(shape)
+    step = np.diff(shape, axis=0)
+    noise = np.median(np.abs(step - np.median(step, axis=0)), axis=0) / 0.954
+    noise = np.maximum(noise, SMALLEST_NOISE)
+    scaled = (shape - shape.mean(axis=0)) / noise
+    share = _independent(step / noise) / shape.shape[1]
+    cycle, remaining = np.arange(count, dtype=float), np.arange(count, 0, -1.0)
+    gains, biases = [], []
+    for decay in np.geomspace(SHORTEST_DECAY, max(LONGEST_DECAY * count, 2.0 * SHORTEST_DECAY), DECAYS):
+        length = min(int(np.ceil(LENGTH * decay)) + 2, count)
+        ends = np.unique(np.linspace(0, max(count - length - int(LENGTH * decay / 2), 0), CONTROLS).astype(int))
+        starts = ends[ends > 0] + int(LENGTH * decay / 2)
+        elsewhere = [scaled[::-1][k : k + length] for k in ends] + [scaled[k : k + length] for k in starts]
+        others = np.concatenate([part for part in elsewhere if len(part) == length], axis=1)
+        for angle in np.linspace(0.0, np.pi, FREQUENCIES):
+            course = np.exp(-cycle[:, None] / decay + 1j * angle * cycle[:, None])
+            course = np.hstack([course.real, course.imag][: 1 if angle in (0.0, np.pi) else 2])
+            basis, root = np.linalg.qr(course[:length] - course[:length].mean(axis=0))
+            ahead, behind = basis.T @ scaled[:length], basis.T @ others
+            usual = max(float(np.mean(behind**2)), 1.0)
+            ratio = max(float(np.mean(ahead**2)) / usual, 1.0)
+            free, known = ahead.size * share, behind.size * share
+            gains.append(0.5 * ((free + known) * np.log((free * ratio + known) / (free + known)) - free * np.log(ratio)))
+            # The transient ends at zero, so that its mean is the bias.
+            later = np.cumsum(course[::-1], axis=0)[::-1] / remaining[:, None] @ np.linalg.pinv(root)
+            kept = 1.0 - 1.0 / ratio
+            biases.append((kept * later @ ahead) ** 2 + kept * usual * np.sum(later**2, axis=1)[:, None])
+    weight = np.exp(np.array(gains) - max(gains))
+    weight /= weight.sum() + len(gains) * np.exp(-max(gains))
+    return np.einsum("m,mkd->kd", weight, np.array(biases)) * noise**2, noise**2 / remaining[:, None]
+
+
+def _independent(steps: np.ndarray) -> float:
+    """Return the effective number of independent components of noise, by the products of different cycles' steps."""
+    products = steps @ steps.T
+    number = np.arange(len(steps))
+    apart = np.abs(number[:, None] - number) > 1
+    square = float(np.mean(products[apart] ** 2)) if apart.any() else 0.0
+    if not square > 0.0:
+        return 1.0
+    return float(np.clip(np.median(np.diag(products)) ** 2 / square, 1.0, steps.shape[1]))
+
+
+def kept_after_transient(part: Windows) -> tuple[int, float, np.ndarray]:
+    """Return the first of windows that do not overlap to use, the bias [standard errors] then, and its mean squares."""
+    shape = part.amplitudes.reshape(len(part.amplitudes), -1)
+    components = np.concatenate([shape.real, shape.imag[:, np.ptp(shape.imag, axis=0) > 0.0]], axis=1)
+    squares, variances = transient_bias(components)
+    total = np.sqrt(np.sum(squares / variances, axis=1))
+    most = len(shape) - max(len(shape) // 2, MINIMUM_CYCLES)
+    total = total[: max(most, 0) + 1]
+    allowed = np.flatnonzero(total <= ALLOWED_BIAS)
+    first = int(allowed[0]) if allowed.size else int(np.argmin(total))
+    return first, float(total[first]), squares[first]
