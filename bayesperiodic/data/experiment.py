@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import covariance_cholesky
+from bayesperiodic.data.recording_check import Finding
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -67,6 +68,8 @@ class Experiment(Result):
         used, ``explained`` fraction of the variance (smallest of the channels), share of the variance ``between`` the
         lines (largest, of ``channel``; 0 if white), ``p`` of the lines that divisors lack, and ``verdict``: "chosen",
         "not periodic", "adds no lines" or "lacks lines".
+    findings : tuple of Finding
+        What the check of the recording found, see `Recording.check`.
     synthetic : bool
         True if the data were simulated.
     mask : bool array (samples·periods,), optional
@@ -124,6 +127,7 @@ class Experiment(Result):
     period_drift: float = field(default=0.0, kw_only=True)
     origin: float = field(default=0.0, kw_only=True)
     period_test: "pd.DataFrame | None" = field(default=None, kw_only=True)
+    findings: tuple[Finding, ...] = field(default=(), kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
     covariance: np.ndarray | None = field(default=None, kw_only=True)
@@ -357,7 +361,7 @@ class Experiment(Result):
         return (
             f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples per "
             f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
-            f"{text})"
+            f"{text}{''.join(f'; {finding}' for finding in self.findings)})"
         )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, softmax
 
 from bayesperiodic import _checks, _fourier
+from bayesperiodic.data.faults import ChannelFaults, outliers_of
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
     NEGLIGIBLE_PHASE,
@@ -21,7 +22,20 @@ from bayesperiodic.data.harmonics import (
     track_frequency,
 )
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
+from bayesperiodic.data.recording_check import (
+    SEVERITIES,
+    WRAPS,
+    Finding,
+    RecordingCheck,
+    bounded,
+    clock_findings,
+    cycle_findings,
+    refuse,
+    sample_findings,
+    signal_faults,
+)
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, FINENESS, aperiodic, response_period
+from bayesperiodic.data.steadiness import Steady, Windows, steady_part, windows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,10 +54,10 @@ MINIMUM_PERIODICITY = 0.5
 CLEARLY = 4.0
 # Difference of two phases [cycles] at the ends of a recording that selects other cycles.
 OTHER_CYCLES = 0.05
-# Largest distance of a cycle from the steady ones, relative to their own, in harmonics and in the mean value.
-STEADY, STEADY_MEAN = 3.0, 12.0
-# Cycles from which the median of their distances is taken, the largest one of fewer.
-FEWEST_FOR_MEDIAN = 9
+# Largest relative change of an amplitude within half of a steady part.
+LARGEST_CHANGE = 0.1
+# Harmonics of the first mean period, from which outliers are left out.
+ROUGH_HARMONICS = 40
 # Response cycles of the later half of a recording that show a period which the whole has not.
 LATER_CYCLES = 6
 CROSSING, AUTO = "crossing", "auto"
@@ -101,23 +115,24 @@ def fold_signals(
     if isinstance(origin, str) and origin != CROSSING:
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
-    signals = replace(signals, time=signals.time - start)
-    fundamental = _first_guess(signals, frequency, periods)
-    _refuse_gaps(signals, fundamental)
-    tracked = _tracked(signals, fundamental, frequency is not None)
-    cycle, shape = _cycles_apart(signals, tracked)
-    drift = dict(zip(signals.channels, _drift(shape[::-1]), strict=True))
-    _refuse_drift(signals.name, drift, largest_drift)
-    steady = signals.part(_steady_part(cycle, shape))
-    limit = resolved_harmonics(steady.time, tracked, points)
-    fit, pace = refine_frequency(steady.time, steady.values, tracked, limit)
+    seen = inspect(replace(signals, time=signals.time - start), periods, frequency, points)
+    if seen.steady is None or seen.fit is None:
+        raise ValueError(seen.reason)
+    refuse(signals.name, seen.findings)
+    fit, pace, limit = seen.fit, seen.pace, seen.limit
+    steady = seen.signals.part(seen.steady.samples)
     if frequency is not None:
-        estimated, fit = fit, fit_harmonics(steady.time, steady.values, fundamental, limit)
+        estimated, fit = fit, fit_harmonics(steady.time, steady.values, frequency / periods, limit)
         _refuse_frequency(estimated, fit, pace, float(np.ptp(steady.time)), periods)
+    drift = dict(zip(signals.channels, _drift(seen.steady.part.sizes), strict=True))
+    _refuse_drift(signals.name, drift, largest_drift)
     periodicity = _periodicity(steady, fit)
     cycles = round(np.ptp(steady.time) * fit.frequency)
-    _warn(signals.name, pace, cycles, len(shape))
+    _warn(signals.name, pace, cycles, seen.total)
     one_cycle, noise = zip(*(_noise(steady, fit, row, cycles) for row in range(len(steady.values))), strict=True)
+    for row, squares in enumerate(seen.steady.squares):
+        order = min(squares.size, noise[row].variance.size)
+        noise[row].variance[:order] += (squares * np.var(seen.signals.values[row]))[:order]
     significant = [_last_significant(a, part) for a, part in zip(fit.amplitudes, noise, strict=True)]
     kept = dict(zip(signals.channels, significant, strict=True)) | _chosen(harmonics, signals.channels, limit)
     amplitudes = fit.amplitudes
@@ -152,7 +167,148 @@ def fold_signals(
         "periodicity": periodicity,
         "drift": drift,
         "origin": start,
+        "findings": seen.findings,
     }
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """Faults, steady part and mean period of signals."""
+
+    signals: Signals
+    faults: list[ChannelFaults]
+    findings: tuple[Finding, ...]
+    total: int = 0  # whole cycles
+    steady: Steady | None = None
+    fit: HarmonicFit | None = None  # of the steady part, at the estimated frequency
+    pace: Pace = Pace(0.0, 0, 0.0, False)
+    limit: int = 0  # of the harmonics
+    reason: str = ""  # why there is no steady part or no mean period
+
+
+def inspect(signals: Signals, periods: int, frequency: float | None, points: int) -> Inspection:
+    """Return what signals are like; without a steady part or a mean period, the reason."""
+    faults = [signal_faults(values) for values in signals.values]
+
+    def found(rate: float | None, limit: int = 0) -> list[Finding]:
+        rows = zip(signals.channels, signals.values, faults, strict=True)
+        every = [f for c, v, fault in rows for f in sample_findings(c, signals.time, v, fault, rate, limit)]
+        return every + [*clock_findings(signals.time, rate)]
+
+    def sorted_(findings: list[Finding]) -> tuple[Finding, ...]:
+        return tuple(sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity)))
+
+    if any(fault.wrap for fault in faults):
+        return Inspection(signals, faults, sorted_(found(None)), reason=_wrapped(signals.name, found(None)))
+    moving = np.ones(signals.time.size, dtype=bool)
+    for fault in faults:
+        for part in fault.stuck:
+            moving[part] = False
+    calm = replace(signals, values=bounded(signals.values)).part(np.flatnonzero(moving))
+    try:
+        fundamental = _first_guess(calm, frequency, periods)
+        _refuse_gaps(signals, fundamental)
+        tracked = _tracked(calm, fundamental, frequency is not None)
+    except ValueError as error:
+        return Inspection(signals, faults, sorted_(found(None)), reason=str(error))
+    total = int(_cycles(signals.time, tracked))
+    sound = _sound(signals, calm, faults, np.flatnonzero(moving), tracked, points)
+    every = windows(signals.time[sound], signals.values[:, sound], tracked)
+    steady = steady_part(every)
+    if steady is not None and frequency is None and steady.part.first[0] + sound.size - steady.part.last[-1] > 0:
+        # The frequency of a part that ramps is not that of the steady one.
+        part = sound[steady.samples]
+        few = min(ROUGH_HARMONICS, resolved_harmonics(signals.time[part], tracked, points))
+        tracked = refine_frequency(signals.time[part], signals.values[:, part], tracked, few)[0].frequency
+        every = windows(signals.time[sound], signals.values[:, sound], tracked)
+        steady = steady_part(every)
+    if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
+        return Inspection(signals, faults, sorted_(found(tracked)), total, reason=_unsteady(signals, every))
+    steady = steady.among(sound)
+    used = signals.part(steady.samples)
+    limit = resolved_harmonics(used.time, tracked, points)
+    fit, pace = refine_frequency(used.time, used.values, tracked, limit)
+    residuals = fit.residuals
+    here = sound[(sound >= steady.samples.start) & (sound < steady.samples.stop)]
+    if here.size < used.time.size:
+        near = fit_harmonics(signals.time[here], signals.values[:, here], tracked, limit).amplitudes
+        residuals = used.values - _fourier.at_times(near, tracked * used.time)
+    for fault, rest, values in zip(faults, residuals, used.values, strict=True):
+        place = outliers_of(rest, used.time * fit.frequency, values, fault.step)
+        fault.outliers = place + steady.samples.start
+    findings = found(fit.frequency, limit)
+    findings += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
+    return Inspection(signals, faults, sorted_(findings), total, steady, fit, pace, limit)
+
+
+def _wrapped(name: str, findings: list[Finding]) -> str:
+    return f"recording: must be without wraps, got {name!r}: {'. '.join(str(f) for f in findings if f.kind == WRAPS)}."
+
+
+def _sound(
+    signals: Signals, calm: Signals, faults: list[ChannelFaults], moving: np.ndarray, fundamental: float, points: int
+) -> np.ndarray:
+    """Return the numbers of the samples without outliers from a first mean period, of those that are not stuck."""
+    limit = min(resolved_harmonics(calm.time, fundamental, points), ROUGH_HARMONICS)
+    fit = fit_harmonics(calm.time, calm.values, fundamental, limit)
+    bad = np.zeros(moving.size, dtype=bool)
+    for fault, values, near, rest in zip(faults, signals.values[:, moving], calm.values, fit.residuals, strict=True):
+        bad[outliers_of(values - near + rest, calm.time * fundamental, values, fault.step)] = True
+    return moving[~bad]
+
+
+def _unsteady(signals: Signals, every: Windows) -> str:
+    size = every.sizes
+    worst = int(np.argmax(np.ptp(size, axis=0) / size.mean(axis=0)))
+    low, high = size[:, worst].min(), size[:, worst].max()
+    return (
+        f"recording: must have a steady part of {MINIMUM_CYCLES} cycles, got {signals.name!r}, in which the amplitude of "
+        f"{signals.channels[worst]!r} changes between {low / high:.0%} and 100 % of its largest value throughout; record "
+        "at a constant amplitude, or select a part by `between`."
+    )
+
+
+def summary(name: str, seen: Inspection) -> RecordingCheck:
+    """Return what was seen as the result of `Recording.check`."""
+    import pandas as pd
+
+    time, part = seen.signals.time, seen.steady
+    bad = {
+        channel: {
+            "outliers": fault.outliers,
+            "stuck": np.concatenate([np.arange(s.start, s.stop) for s in fault.stuck] or [np.zeros(0, dtype=int)]),
+            "clipped": np.concatenate([fault.low, fault.high]),
+        }
+        for channel, fault in zip(seen.signals.channels, seen.faults, strict=True)
+    }
+    named = {(finding.channel, finding.kind) for finding in seen.findings}
+    bad = {c: {kind: v if (c, kind) in named else v[:0] for kind, v in each.items()} for c, each in bad.items()}
+    rows = [
+        {
+            "lowest": values.min(),
+            "highest": values.max(),
+            "resolution": fault.step,
+            "bits": np.log2(np.ptp(values) / fault.step + 1.0) if fault.step else np.nan,
+            **{kind: places.size for kind, places in bad[channel].items()},
+            "wraps": fault.wraps.size,
+        }
+        for channel, values, fault in zip(seen.signals.channels, seen.signals.values, seen.faults, strict=True)
+    ]
+    step = np.diff(time)
+    step = step[step <= USUAL_STEPS * np.median(step)]
+    return RecordingCheck(
+        name,
+        pd.DataFrame(rows, index=[*seen.signals.channels]),
+        seen.findings,
+        seen.fit.frequency if seen.fit else np.nan,
+        round(np.ptp(time[part.samples]) * seen.fit.frequency) if part and seen.fit else 0,
+        seen.total,
+        float(time[part.samples.start]) if part else float(time[0]),
+        float(time[part.samples.stop - 1]) if part else float(time[-1]),
+        float(step.std() / np.median(step)),
+        bad,
+        seen.reason,
+    )
 
 
 def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, pd.DataFrame]":
@@ -293,42 +449,10 @@ def _warn(name: str, pace: Pace, cycles: int, total: int) -> None:
         )
 
 
-def _cycles_apart(signals: Signals, fundamental: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cycle of each sample, counted back from the end, and the amplitudes of the whole cycles, last first.
-
-    The amplitudes (cycles, channels, harmonics + 1) are relative to each channel's standard deviation.
-    """
-    time, values = signals.time, signals.values
-    period = 1.0 / fundamental
-    total = int(_cycles(time, fundamental))
-    back = np.minimum(((time[-1] - time) / period + 1e-9).astype(int), total)
-    order = np.arange(2 * min(5, resolved_harmonics(time, fundamental, time.size)) + 1)
-    harmonics = order[: order.size // 2 + 1]
-    first = np.searchsorted(-back, np.arange(1 - total, 1))
-    used = slice(first[0], None)
-    wave, power = np.exp(-2j * np.pi * (fundamental * time[used] % 1.0)), np.ones(time[used].size, dtype=complex)
-    scaled = values[:, used] / values.std(axis=1)[:, None]
-    sums = np.empty((order.size, len(values) + 1, total), dtype=complex)
-    for h in order:
-        for row, signal in zip(sums[h], [1.0, *(scaled if h < harmonics.size else ())], strict=False):
-            row[:] = np.add.reduceat(signal * power, first - first[0])
-        power *= wave
-    # Normal equations of each cycle, as in `fit_harmonics`.
-    moments = np.concatenate([np.conj(sums[:0:-1, 0]), sums[:, 0]])
-    place = order[:, None] - order[None, :] + order.size - 1
-    right = np.concatenate([np.conj(sums[harmonics[:0:-1], 1:]), sums[harmonics, 1:]])
-    amplitudes = np.linalg.solve(np.moveaxis(moments[place], -1, 0), np.moveaxis(right, -1, 0))[:, harmonics[-1] :]
-    amplitudes[:, 1:] *= 2.0
-    return back, np.moveaxis(amplitudes, 1, 2)[::-1]
-
-
-def _drift(shape: np.ndarray) -> list[float]:
-    """Return the relative growth of each channel's strongest harmonic from the first cycle to the last."""
-    every = np.abs(shape[:, :, 1:])
-    strongest = every.mean(axis=0).argmax(axis=1)
-    size = np.take_along_axis(every, strongest[None, :, None], axis=2)[:, :, 0]
-    number = np.arange(len(size)) - 0.5 * (len(size) - 1)
-    return (number @ size / (number @ number) * len(size) / size.mean(axis=0)).tolist()
+def _drift(sizes: np.ndarray) -> list[float]:
+    """Return the relative growth of amplitudes (windows, channels) over the part used."""
+    number = np.arange(len(sizes)) - 0.5 * (len(sizes) - 1)
+    return (number @ sizes / max(float(number @ number), 1.0) * len(sizes) / sizes.mean(axis=0)).tolist()
 
 
 def _refuse_drift(name: str, drift: Mapping[str, float], largest: float | None) -> None:
@@ -341,26 +465,6 @@ def _refuse_drift(name: str, drift: Mapping[str, float], largest: float | None) 
             f"{drift[worst]:+.1%}, more than largest_drift = {largest:.1%}; leave it out, or select a steady part with "
             "`between`."
         )
-
-
-def _steady_part(cycle: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Return a mask of the last whole cycles, without the first ones if they differ from the later half.
-
-    Mean values differ under noise slower than a cycle too, and are allowed a larger difference.
-    """
-    total = len(shape)
-    half = max(total // 2, MINIMUM_CYCLES)
-    middle = np.median(shape[:half].real, axis=0) + 1j * np.median(shape[:half].imag, axis=0)
-    away, settled = np.abs(shape - middle) ** 2, np.ones(total, dtype=bool)
-    # The median of few cycles is one of them in every component, and the median distance from it is no scale.
-    usual = np.median if half >= FEWEST_FOR_MEDIAN else np.max
-    for squares, factor in ((away[:, :, 1:].sum(axis=2), STEADY), (away[:, :, 0], STEADY_MEAN)):
-        distance = np.sqrt(squares.max(axis=1))
-        settled &= distance <= factor * usual(distance[:half]) + 1e-9
-    used = total
-    while used > MINIMUM_CYCLES and not settled[used - 1 - min(2, used - 1) : used].all():
-        used -= 1
-    return cycle < used
 
 
 def _periodicity(signals: Signals, fit: HarmonicFit) -> float:

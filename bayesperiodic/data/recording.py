@@ -6,13 +6,15 @@ from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import one_thread
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.files import CSV, MAT, NPZ, Format, Units, convert
-from bayesperiodic.data.folding import AUTO, Signals, automatic_periods, fold_signals, parts
+from bayesperiodic.data.folding import AUTO, Signals, automatic_periods, fold_signals, inspect, parts, summary
+from bayesperiodic.data.recording_check import RecordingCheck
 
 DROP, INTERPOLATE = "drop", "interpolate"
 # Successive samples that may be interpolated.
@@ -355,6 +357,155 @@ class Recording(Result):
             )
         return self._part(keep, self.name)
 
+    def check(self, frequency: float | None = None, *, periods: int = 1) -> RecordingCheck:
+        """Look for faults of the sensors and the clock, and for the steady part.
+
+        Samples: values that wrap at the range of a sensor (2π, 360, 1, or a power of two of its steps), stuck and clipped
+        stretches, outliers (more than eight standard deviations from the mean period, with jumps before and after, not
+        in every cycle), gaps. Cycles: ramps, the rest of a transient, steps of amplitude and phase, slow changes,
+        beating. `fold` makes the same check, leaves ramps and transients out, warns of serious findings and refuses
+        ruinous ones.
+
+        The rest of a transient is exp(−t/T) times a cosine with unknown T and frequency in all channels; cycles are left
+        out until its expected bias of all amplitudes together is below 0.3 standard errors, at most half of them, and
+        what remains is added to ``amplitude_variance``.
+
+        Parameters
+        ----------
+        frequency : float, optional
+            Forcing frequency [Hz]; by default it is estimated.
+        periods : int
+            Forcing periods per response period.
+
+        Returns
+        -------
+        RecordingCheck
+
+        Raises
+        ------
+        ValueError
+            For a frequency or periods ≤ 0.
+
+        Examples
+        --------
+        >>> t = np.arange(0, 60, 0.01)
+        >>> angle = 0.3 + 0.1 * np.cos(2 * np.pi * t)
+        >>> angle[1000:1003] = 6.283
+        >>> check = bp.Recording.from_arrays(t, {"angle": angle}).check()
+        >>> check.findings[0].kind, check.findings[0].count
+        ('outliers', 3)
+        """
+        if frequency is not None:
+            _checks.positive("frequency", frequency)
+        signals = self._signals()
+        with one_thread():
+            seen = inspect(signals, _checks.integer("periods", periods, 1), frequency, self.time.size)
+        return summary(self.name, seen)
+
+    def steady(self, frequency: float | None = None, *, periods: int = 1) -> "Recording":
+        """Return the steady part that `fold` uses, as `check` finds it.
+
+        Parameters
+        ----------
+        frequency, periods
+            As for `check`.
+
+        Returns
+        -------
+        Recording
+
+        Raises
+        ------
+        ValueError
+            If there is none.
+        """
+        found = self.check(frequency, periods=periods)
+        if found.reason:
+            raise ValueError(found.reason)
+        return self.between(found.start, found.stop)
+
+    def without(
+        self,
+        *,
+        outliers: bool | ArrayLike = False,
+        stuck: bool | ArrayLike = False,
+        clipped: bool | ArrayLike = False,
+        channel: str | None = None,
+        frequency: float | None = None,
+    ) -> "Recording":
+        """Return the recording without faulty samples, which are left out of all channels and not filled.
+
+        Parameters
+        ----------
+        outliers, stuck, clipped : bool or bool array (samples,)
+            True for those that `check` finds, or a mask of the samples to leave out.
+        channel : str, optional
+            The channel whose faults count; by default all.
+        frequency : float, optional
+            As for `check`.
+
+        Returns
+        -------
+        Recording
+
+        Raises
+        ------
+        ValueError
+            For an unknown channel, a mask of another shape, or if fewer than two samples remain.
+        """
+        channels = self.inputs | self.outputs
+        if channel is not None:
+            _checks.one_of("channel", channel, channels)
+        wanted = {"outliers": outliers, "stuck": stuck, "clipped": clipped}
+        bad = np.zeros(self.time.size, dtype=bool)
+        found = self.check(frequency).bad if any(value is True for value in wanted.values()) else {}
+        for kind, value in wanted.items():
+            if isinstance(value, bool):
+                for name, places in found.items():
+                    if value and channel in (None, name):
+                        bad[places[kind]] = True
+                continue
+            mask = np.asarray(value)
+            if mask.dtype != bool or mask.shape != bad.shape:
+                raise ValueError(
+                    f"{kind}: must be True, False or a bool array of shape {bad.shape}, got {mask.dtype} of shape "
+                    f"{mask.shape}."
+                )
+            bad |= mask
+        if self.time.size - np.count_nonzero(bad) < 2:
+            raise ValueError(f"recording: must have at least two sound samples, got none or one in {self.name!r}.")
+        return self._part(~bad, self.name)
+
+    def unwrapped(self, channel: str, period: float = 2.0 * np.pi) -> "Recording":
+        """Return the recording with a channel whose jumps by multiples of a range are removed.
+
+        Parameters
+        ----------
+        channel : str
+        period : float
+            The range at which the sensor wraps, in the channel's unit.
+
+        Returns
+        -------
+        Recording
+
+        Raises
+        ------
+        ValueError
+            For an unknown channel or a range ≤ 0.
+        """
+        _checks.one_of("channel", channel, self.inputs | self.outputs)
+        period = _checks.positive("period", period)
+
+        def cured(kind: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+            return {name: np.unwrap(v, period=period) if name == channel else v for name, v in kind.items()}
+
+        return replace(self, outputs=cured(self.outputs), inputs=cured(self.inputs))
+
+    def _signals(self) -> Signals:
+        channels = self.inputs | self.outputs
+        return Signals(self.name, self.time, tuple(channels), np.stack([*channels.values()]), len(self.inputs))
+
     def split(self) -> "list[Recording]":
         """Divide the recording at gaps and at steps of the frequency of the first input (or output, without inputs).
 
@@ -482,9 +633,7 @@ class Recording(Result):
         (2, ['not periodic', 'chosen'])
         """
         samples = _checks.integer("samples", samples, 4)
-        channels = self.inputs | self.outputs
-        signals = Signals(self.name, self.time, tuple(channels), np.stack([*channels.values()]), len(self.inputs))
-        evidence = None
+        signals, evidence = self._signals(), None
         try:
             if periods == AUTO:
                 periods, evidence = automatic_periods(signals, frequency)

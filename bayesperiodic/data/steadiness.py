@@ -1,6 +1,6 @@
 """The steady part of a recording: without ramps, without the rest of a transient that matters, and what remains."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,16 +10,22 @@ from bayesperiodic.data.harmonics import MINIMUM_CYCLES, resolved_harmonics
 # Parts of a cycle in which ramps begin or end, in recordings of so many cycles; most windows of long recordings.
 FINE, FEW_CYCLES, MOST_WINDOWS = 8, 64, 256
 HARMONICS = 5
+# Least share of the usual samples of a window, and largest condition number of its amplitudes.
+ENOUGH, LARGEST_CONDITION = 0.5, 30.0
 # Range of an amplitude in a steady part, relative to the amplitude and in standard deviations of a cycle's noise.
-SMALL_RANGE, NOISE_RANGE = 0.08, 10.0
+SMALL_RANGE, NOISE_RANGE = 0.08, 14.0
 # Least level of a steady part relative to the largest amplitudes: a part at rest is steady too.
 LEAST_LEVEL = 0.5
 # Largest change per cycle inside the steady part relative to outside.
 CALMER = 0.25
 # Largest distance of a window from the middle of the steady part, relative to usual ones, in harmonics and mean value.
 DISTANT, DISTANT_MEAN = 3.0, 12.0
+# Times that the ends are compared with the middle of what is left.
+TRIMMINGS = 3
 # Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
 FEWEST_FOR_MEDIAN = 9
+# Windows from which a transient is searched for, and standard errors of a significant slope.
+FEWEST_FOR_TRANSIENT, SIGNIFICANT_SLOPE = 5, 4.0
 # Shares of a channel's standard deviation below which distances and noise do not count.
 SMALLEST_DISTANCE, SMALLEST_NOISE = 1e-9, 1e-6
 # Bias of the mean amplitudes by a transient that is allowed, in standard errors of all together.
@@ -36,19 +42,23 @@ class Windows:
 
     first: np.ndarray  # first sample of each window
     last: np.ndarray  # its last sample + 1
-    overlap: int  # windows from one to the next that does not overlap it
+    place: np.ndarray  # its number; those with too few samples are missing
+    overlap: int  # numbers from one window to the next that does not overlap it
     cycles: int  # in a window
     amplitudes: np.ndarray  # complex (windows, channels, harmonics + 1), relative to each channel's standard deviation
 
-    def part(self, first: int, last: int) -> "Windows":
-        """Return the windows first … last − 1."""
-        used = slice(first, last)
-        return Windows(self.first[used], self.last[used], self.overlap, self.cycles, self.amplitudes[used])
+    def chosen(self, used: "slice | list[int]") -> "Windows":
+        """Return the windows with these indices."""
+        every = (v[used] for v in (self.first, self.last, self.place))
+        return Windows(*every, self.overlap, self.cycles, self.amplitudes[used])
 
     def apart(self) -> "Windows":
         """Return windows that do not overlap, the last one among them."""
-        used = slice((len(self.first) - 1) % self.overlap, None, self.overlap)
-        return Windows(self.first[used], self.last[used], 1, self.cycles, self.amplitudes[used])
+        used = [len(self.place) - 1]
+        for k in range(len(self.place) - 2, -1, -1):
+            if self.place[used[-1]] - self.place[k] >= self.overlap:
+                used.append(k)
+        return self.chosen(used[::-1])
 
     @cached_property
     def sizes(self) -> np.ndarray:
@@ -69,6 +79,8 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     count = int(duration / length)
     back = ((time[-1] - time) / length + 1e-9).astype(int)
     edges = np.searchsorted(-back, np.arange(1 - count, 1))
+    stops = np.concatenate([edges[1:], [time.size]])
+    empty, edges = edges == stops, np.minimum(edges, time.size - 1)
     order = np.arange(2 * min(HARMONICS, resolved_harmonics(time, fundamental, time.size)) + 1)
     harmonics = order[: order.size // 2 + 1]
     used = slice(edges[0], None)
@@ -78,31 +90,70 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     for h in order:
         for row, signal in zip(sums[h], [1.0, *(scaled if h < harmonics.size else ())], strict=False):
             row[:] = np.add.reduceat(signal * power, edges - edges[0])
+            row[empty] = 0.0
         power *= wave
-    blocks = fine  # in a window
-    sums = np.lib.stride_tricks.sliding_window_view(sums, blocks, axis=2).sum(axis=3)
-    # Normal equations of each window, as in `fit_harmonics`.
+    sums = np.lib.stride_tricks.sliding_window_view(sums, fine, axis=2).sum(axis=3)
+    # Normal equations of each window, as in `fit_harmonics`; they are well conditioned where the samples are enough.
     moments = np.concatenate([np.conj(sums[:0:-1, 0]), sums[:, 0]])
     place = order[:, None] - order[None, :] + order.size - 1
-    right = np.concatenate([np.conj(sums[harmonics[:0:-1], 1:]), sums[harmonics, 1:]])
-    amplitudes = np.linalg.solve(np.moveaxis(moments[place], -1, 0), np.moveaxis(right, -1, 0))[:, harmonics[-1] :]
+    matrices = np.moveaxis(moments[place], -1, 0)
+    right = np.moveaxis(np.concatenate([np.conj(sums[harmonics[:0:-1], 1:]), sums[harmonics, 1:]]), -1, 0)
+    few = sums[0, 0].real < ENOUGH * np.median(sums[0, 0].real)
+    size = np.linalg.eigvalsh(matrices)
+    enough = np.flatnonzero(~few & (size[:, 0] * LARGEST_CONDITION > size[:, -1]))
+    amplitudes = np.linalg.solve(matrices[enough], right[enough])[:, harmonics[-1] :]
     amplitudes[:, 1:] *= 2.0
-    stops = np.concatenate([edges[1:], [time.size]])
-    shown = count - blocks + 1
-    return Windows(edges[:shown], stops[blocks - 1 :], blocks, cycles, np.moveaxis(amplitudes, 1, 2))
+    first, last = edges[: count - fine + 1], stops[fine - 1 :]
+    return Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2))
 
 
 @dataclass(frozen=True)
 class Steady:
-    """The part of a recording that is used, and how steady it is."""
+    """The steady part of a recording."""
 
+    part: Windows  # that do not overlap
     samples: slice
-    cycles: int  # whole ones in it
-    total: int  # whole ones in the recording
-    transient: float  # bias of all mean amplitudes together by a rest of the transient, in standard errors
-    bias: np.ndarray  # mean squares of this bias by channel and harmonic, relative to the channel's variance
-    calm: bool  # the amplitudes change less than outside
-    plateau: tuple[int, int]
+    level: tuple[int, int]  # samples of the part of one level, before the rest of the transient is left out
+    bias: float  # of all mean amplitudes together by the rest of the transient, in standard errors
+    squares: np.ndarray  # expected squares of this bias (channels, harmonics + 1), relative to the channel's variance
+    change: np.ndarray  # relative changes of the amplitudes within each half, where they are significant (2, channels)
+
+    def among(self, numbers: np.ndarray) -> "Steady":
+        """Return the same part of all samples, of which it was found by those with these numbers."""
+        part = replace(self.part, first=numbers[self.part.first], last=numbers[self.part.last - 1] + 1)
+        level = (int(numbers[self.level[0]]), int(numbers[self.level[1] - 1]) + 1)
+        return replace(self, part=part, samples=slice(int(part.first[0]), int(part.last[-1])), level=level)
+
+
+def steady_part(every: Windows) -> Steady | None:
+    """Return the steady part of a recording; None if less than three cycles have one level."""
+    first, last = plateau(every) if len(every.first) > every.overlap else (0, 0)
+    if last - first <= (MINIMUM_CYCLES - 1) * every.overlap // every.cycles:
+        return None
+    part = every.chosen(slice(first, last))
+    for _ in range(TRIMMINGS):
+        part = part.chosen(slice(*_trimmed(part)))
+    part = part.apart()
+    level = (int(part.first[0]), int(part.last[-1]))
+    first, bias, squares = 0, 0.0, np.zeros(part.amplitudes.shape[1:])
+    if len(part.first) >= FEWEST_FOR_TRANSIENT:
+        first, bias, squares = _after_transient(part)
+    part = part.chosen(slice(first, None))
+    change = np.array([_change(half) for half in np.array_split(part.sizes, 2)])
+    return Steady(part, slice(int(part.first[0]), int(part.last[-1])), level, bias, squares, change)
+
+
+def _change(sizes: np.ndarray) -> np.ndarray:
+    """Return the relative change of amplitudes (windows, channels) by linear regression, 0 where insignificant."""
+    count = len(sizes)
+    if count < 3:
+        return np.zeros(sizes.shape[1])
+    place = np.arange(count) - 0.5 * (count - 1)
+    slope = place @ sizes / (place @ place)
+    rest = sizes - sizes.mean(axis=0) - place[:, None] * slope
+    error = np.sqrt(np.sum(rest**2, axis=0) / max(count - 2, 1) / (place @ place))
+    change = slope * count / np.abs(sizes.mean(axis=0))
+    return np.where(np.abs(slope) > SIGNIFICANT_SLOPE * error, change, 0.0)
 
 
 def plateau(part: Windows) -> tuple[int, int]:
@@ -134,8 +185,8 @@ def _trimmed(part: Windows) -> tuple[int, int]:
     # The median of few windows is one of them in every component, and the median distance from it is no scale.
     usual = np.max if count // 2 < FEWEST_FOR_MEDIAN * reach else np.median
     for squares, factor in ((away[:, :, 1:].sum(axis=2), DISTANT), (away[:, :, 0], DISTANT_MEAN)):
-        distance = np.sqrt(squares.max(axis=1))
-        near &= distance <= factor * usual(distance[inner]) + SMALLEST_DISTANCE
+        distance = np.sqrt(squares)
+        near &= (distance <= factor * usual(distance[inner], axis=0) + SMALLEST_DISTANCE).all(axis=1)
     first, last, least = 0, count, (MINIMUM_CYCLES - 1) * reach + 1
     span = min(2 * reach + 1, least)
     while last - first > least and not near[first : first + span].all():
@@ -197,14 +248,16 @@ def _independent(steps: np.ndarray) -> float:
     return float(np.clip(np.median(np.diag(products)) ** 2 / square, 1.0, steps.shape[1]))
 
 
-def kept_after_transient(part: Windows) -> tuple[int, float, np.ndarray]:
-    """Return the first of windows that do not overlap to use, the bias [standard errors] then, and its mean squares."""
-    shape = part.amplitudes.reshape(len(part.amplitudes), -1)
-    components = np.concatenate([shape.real, shape.imag[:, np.ptp(shape.imag, axis=0) > 0.0]], axis=1)
-    squares, variances = transient_bias(components)
-    total = np.sqrt(np.sum(squares / variances, axis=1))
-    most = len(shape) - max(len(shape) // 2, MINIMUM_CYCLES)
-    total = total[: max(most, 0) + 1]
+def _after_transient(part: Windows) -> tuple[int, float, np.ndarray]:
+    """Return the first window to use, the bias [standard errors] then, and its expected squares by amplitude."""
+    shape = part.amplitudes
+    count, channels, harmonics = shape.shape
+    components = np.concatenate([shape.real, shape.imag[:, :, 1:]], axis=2)
+    squares, variances = transient_bias(components.reshape(count, -1))
+    total = np.sqrt(np.sum(squares / variances, axis=1))[: max(count - max(count // 2, MINIMUM_CYCLES), 0) + 1]
     allowed = np.flatnonzero(total <= ALLOWED_BIAS)
     first = int(allowed[0]) if allowed.size else int(np.argmin(total))
-    return first, float(total[first]), squares[first]
+    by_part = squares[first].reshape(channels, -1)
+    by_harmonic = by_part[:, :harmonics].copy()
+    by_harmonic[:, 1:] += by_part[:, harmonics:]
+    return first, float(total[first]), by_harmonic
