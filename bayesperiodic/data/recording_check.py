@@ -14,7 +14,7 @@ from bayesperiodic._verdicts import BAD, CAUTION, GOOD, with_tone
 from bayesperiodic.data import faults
 from bayesperiodic.data.faults import ChannelFaults
 from bayesperiodic.data.harmonics import fit_harmonics
-from bayesperiodic.data.steadiness import Steady, Windows
+from bayesperiodic.data.steadiness import ALLOWED_BIAS, Steady, Windows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -244,6 +244,12 @@ def cycle_findings(
         yield Finding(
             kind, "", HARMLESS, np.array([[a, b]]), count, count / total, np.nan,
             f"{what} {place:.6g} s; {start:.6g} to {stop:.6g} s are used ({cycles} of {total} cycles)",
+        )  # fmt: skip
+    if steady.bias > ALLOWED_BIAS:
+        yield Finding(
+            "transient", "", SERIOUS if steady.bias > SERIOUS_BIAS else HARMLESS, np.array([[start, stop]]), cycles, 1.0,
+            steady.bias, f"a rest of the transient is in the part used, {start:.6g} to {stop:.6g} s, and biases the "
+            f"amplitudes by {steady.bias:.2g} standard errors", "record longer, or begin later with recording.between",
         )  # fmt: skip
     changes = steady.change[np.argmax(np.abs(steady.change), axis=0), np.arange(len(channels))]
     for channel, change in zip(channels, changes, strict=True):

@@ -1,7 +1,9 @@
 """The steady part of a recording: without ramps, without the rest of a transient that matters, and what remains."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -20,12 +22,10 @@ LEAST_LEVEL = 0.5
 CALMER = 0.25
 # Largest distance of a window from the middle of the steady part, relative to usual ones, in harmonics and mean value.
 DISTANT, DISTANT_MEAN = 3.0, 12.0
-# Times that the ends are compared with the middle of what is left.
-TRIMMINGS = 3
 # Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
 FEWEST_FOR_MEDIAN = 9
 # Windows from which a transient is searched for, and standard errors of a significant slope.
-FEWEST_FOR_TRANSIENT, SIGNIFICANT_SLOPE = 5, 4.0
+FEWEST_FOR_TRANSIENT, SIGNIFICANT_SLOPE = 6, 4.0
 # Shares of a channel's standard deviation below which distances and noise do not count.
 SMALLEST_DISTANCE, SMALLEST_NOISE = 1e-9, 1e-6
 # Bias of the mean amplitudes by a transient that is allowed, in standard errors of all together.
@@ -131,8 +131,8 @@ def steady_part(every: Windows) -> Steady | None:
     if last - first <= (MINIMUM_CYCLES - 1) * every.overlap // every.cycles:
         return None
     part = every.chosen(slice(first, last))
-    for _ in range(TRIMMINGS):
-        part = part.chosen(slice(*_trimmed(part)))
+    for usual in (None, np.max, np.max):
+        part = part.chosen(slice(*_trimmed(part, usual)))
     part = part.apart()
     level = (int(part.first[0]), int(part.last[-1]))
     first, bias, squares = 0, 0.0, np.zeros(part.amplitudes.shape[1:])
@@ -175,7 +175,7 @@ def plateau(part: Windows) -> tuple[int, int]:
     return best
 
 
-def _trimmed(part: Windows) -> tuple[int, int]:
+def _trimmed(part: Windows, usual: Callable[..., Any] | None = None) -> tuple[int, int]:
     """Return windows first … last − 1 without those at the ends that are far from the middle half."""
     shape, reach = part.amplitudes, part.overlap
     count = len(shape)
@@ -183,7 +183,7 @@ def _trimmed(part: Windows) -> tuple[int, int]:
     middle = np.median(shape[inner].real, axis=0) + 1j * np.median(shape[inner].imag, axis=0)
     away, near = np.abs(shape - middle) ** 2, np.ones(count, dtype=bool)
     # The median of few windows is one of them in every component, and the median distance from it is no scale.
-    usual = np.max if count // 2 < FEWEST_FOR_MEDIAN * reach else np.median
+    usual = usual or (np.max if count // 2 < FEWEST_FOR_MEDIAN * reach else np.median)
     for squares, factor in ((away[:, :, 1:].sum(axis=2), DISTANT), (away[:, :, 0], DISTANT_MEAN)):
         distance = np.sqrt(squares)
         near &= (distance <= factor * usual(distance[inner], axis=0) + SMALLEST_DISTANCE).all(axis=1)
@@ -207,8 +207,7 @@ def transient_bias(shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     count = len(shape)
     step = np.diff(shape, axis=0)
-    noise = np.median(np.abs(step - np.median(step, axis=0)), axis=0) / 0.954
-    noise = np.maximum(noise, SMALLEST_NOISE)
+    noise = np.maximum(np.sqrt(np.mean(step[count // 3 :] ** 2, axis=0) / 2.0), SMALLEST_NOISE)
     scaled = (shape - shape.mean(axis=0)) / noise
     share = _independent(step / noise) / shape.shape[1]
     cycle, remaining = np.arange(count, dtype=float), np.arange(count, 0, -1.0)
@@ -254,10 +253,11 @@ def _after_transient(part: Windows) -> tuple[int, float, np.ndarray]:
     count, channels, harmonics = shape.shape
     components = np.concatenate([shape.real, shape.imag[:, :, 1:]], axis=2)
     squares, variances = transient_bias(components.reshape(count, -1))
-    total = np.sqrt(np.sum(squares / variances, axis=1))[: max(count - max(count // 2, MINIMUM_CYCLES), 0) + 1]
-    allowed = np.flatnonzero(total <= ALLOWED_BIAS)
-    first = int(allowed[0]) if allowed.size else int(np.argmin(total))
+    total = np.sum(squares / variances, axis=1)[: count - MINIMUM_CYCLES + 1]
+    allowed = np.flatnonzero(total[: count // 2 + 1] <= ALLOWED_BIAS**2)
+    # If half of the cycles has more bias, the mean square error of what is biased is least.
+    first = int(allowed[0]) if allowed.size else int(np.argmin((1.0 + total) / np.arange(count, MINIMUM_CYCLES - 1, -1)))
     by_part = squares[first].reshape(channels, -1)
     by_harmonic = by_part[:, :harmonics].copy()
     by_harmonic[:, 1:] += by_part[:, harmonics:]
-    return first, float(total[first]), by_harmonic
+    return first, float(np.sqrt(total[first])), by_harmonic
