@@ -18,6 +18,8 @@ FEWEST_CLIPPED, CLIPPED_RUN, PILED = 6, 3, 6.0
 # Distance of outliers from the mean period in standard deviations of the others, and how often they may return.
 FAR, RETURNING = 8.0, 0.5
 MEDIAN_TO_SD = 1.4826
+# Largest step between samples relative to 99 % of them, of so many, without outliers.
+JUMP, SCREENED = 3.0, 100_000
 
 
 @dataclass
@@ -67,7 +69,7 @@ def runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def stuck_of(values: np.ndarray) -> list[slice]:
     """Return runs of one value that are much longer than usual ones."""
     first, length = runs(values)
-    if length.size < 2:
+    if length.size < 2 or length.max() < FEWEST_STUCK:
         return []
     # The usual length is that in which most samples are, without the longest runs.
     order = np.sort(length)
@@ -106,6 +108,13 @@ def _piles_up(values: np.ndarray, top: np.ndarray, place: np.ndarray) -> bool:
         return False
     below = counts[-6:-1]
     return bool(top.size > PILED * max(float(below.max()), 1.0))
+
+
+def jumps(values: np.ndarray) -> bool:
+    """Return whether some steps between samples (channels, samples) are larger than smooth signals with noise have."""
+    steps = np.abs(np.diff(values, axis=1))
+    usual = np.quantile(steps[:, :: 1 + steps.shape[1] // SCREENED], 0.99, axis=1)
+    return bool((steps.max(axis=1) > JUMP * usual).any())
 
 
 def outliers_of(residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, softmax
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic.data.faults import ChannelFaults, outliers_of
+from bayesperiodic.data.faults import ChannelFaults, jumps, outliers_of
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
     NEGLIGIBLE_PHASE,
@@ -94,7 +94,7 @@ class Signals:
                     f"{kind}[{channel!r}]: must vary, got the constant {values[0]:g}; leave the channel out{remedy}."
                 )
 
-    def part(self, samples: np.ndarray) -> "Signals":
+    def part(self, samples: np.ndarray | slice) -> "Signals":
         """Return the signals at the selected samples."""
         return replace(self, time=self.time[samples], values=self.values[:, samples])
 
@@ -190,9 +190,9 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     """Return what signals are like; without a steady part or a mean period, the reason."""
     faults = [signal_faults(values) for values in signals.values]
 
-    def found(rate: float | None, limit: int = 0) -> list[Finding]:
+    def found(rate: float | None, limit: int = 0, used: slice = slice(0, signals.time.size)) -> list[Finding]:
         rows = zip(signals.channels, signals.values, faults, strict=True)
-        every = [f for c, v, fault in rows for f in sample_findings(c, signals.time, v, fault, rate, limit)]
+        every = [f for c, v, fault in rows for f in sample_findings(c, signals.time, v, fault, rate, limit, used)]
         return every + [*clock_findings(signals.time, rate)]
 
     def sorted_(findings: list[Finding]) -> tuple[Finding, ...]:
@@ -204,7 +204,8 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     for fault in faults:
         for part in fault.stuck:
             moving[part] = False
-    calm = replace(signals, values=bounded(signals.values)).part(np.flatnonzero(moving))
+    calm = replace(signals, values=bounded(signals.values))
+    calm = calm if moving.all() else calm.part(np.flatnonzero(moving))
     try:
         fundamental = _first_guess(calm, frequency, periods)
         _refuse_gaps(signals, fundamental)
@@ -213,14 +214,15 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
         return Inspection(signals, faults, sorted_(found(None)), reason=str(error))
     total = int(_cycles(signals.time, tracked))
     sound = _sound(signals, calm, faults, np.flatnonzero(moving), tracked, points)
-    every = windows(signals.time[sound], signals.values[:, sound], tracked)
+    some = signals if sound.size == signals.time.size else signals.part(sound)
+    every = windows(some.time, some.values, tracked)
     steady = steady_part(every)
-    if steady is not None and frequency is None and steady.part.first[0] + sound.size - steady.part.last[-1] > 0:
+    if steady is not None and frequency is None and steady.level != (0, sound.size):
         # The frequency of a part that ramps is not that of the steady one.
-        part = sound[steady.samples]
-        few = min(ROUGH_HARMONICS, resolved_harmonics(signals.time[part], tracked, points))
-        tracked = refine_frequency(signals.time[part], signals.values[:, part], tracked, few)[0].frequency
-        every = windows(signals.time[sound], signals.values[:, sound], tracked)
+        part = some.part(steady.samples)
+        few = min(ROUGH_HARMONICS, resolved_harmonics(part.time, tracked, points))
+        tracked = refine_frequency(part.time, part.values, tracked, few)[0].frequency
+        every = windows(some.time, some.values, tracked)
         steady = steady_part(every)
     if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
         return Inspection(signals, faults, sorted_(found(tracked)), total, reason=_unsteady(signals, every))
@@ -236,7 +238,7 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     for fault, rest, values in zip(faults, residuals, used.values, strict=True):
         place = outliers_of(rest, used.time * fit.frequency, values, fault.step)
         fault.outliers = place + steady.samples.start
-    findings = found(fit.frequency, limit)
+    findings = found(fit.frequency, limit, steady.samples)
     findings += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
     return Inspection(signals, faults, sorted_(findings), total, steady, fit, pace, limit)
 
@@ -249,6 +251,8 @@ def _sound(
     signals: Signals, calm: Signals, faults: list[ChannelFaults], moving: np.ndarray, fundamental: float, points: int
 ) -> np.ndarray:
     """Return the numbers of the samples without outliers from a first mean period, of those that are not stuck."""
+    if not jumps(signals.values):
+        return moving
     limit = min(resolved_harmonics(calm.time, fundamental, points), ROUGH_HARMONICS)
     fit = fit_harmonics(calm.time, calm.values, fundamental, limit)
     bad = np.zeros(moving.size, dtype=bool)

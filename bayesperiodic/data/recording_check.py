@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -90,7 +90,8 @@ def signal_faults(values: np.ndarray) -> ChannelFaults:
 
 def bounded(values: np.ndarray) -> np.ndarray:
     """Return values (channels, samples) without rare extremes, for a first estimate of the frequency."""
-    low, high = np.quantile(values, [0.005, 0.995], axis=1, keepdims=True)
+    some = values[:, :: 1 + values.shape[1] // faults.SCREENED]
+    low, high = np.quantile(some, [0.005, 0.995], axis=1, keepdims=True)
     return np.where(high > low, np.clip(values, low - 0.5 * (high - low), high + 0.5 * (high - low)), values)
 
 
@@ -154,9 +155,18 @@ def _when(times: np.ndarray) -> str:
 
 
 def sample_findings(
-    channel: str, time: np.ndarray, values: np.ndarray, fault: ChannelFaults, frequency: float | None, harmonics: int
+    channel: str,
+    time: np.ndarray,
+    values: np.ndarray,
+    fault: ChannelFaults,
+    frequency: float | None,
+    harmonics: int,
+    used: slice,
 ) -> Iterator[Finding]:
-    """Return the findings of one channel; stuck and clipped samples count if the mean period of the others differs."""
+    """Return the findings of one channel; stuck and clipped samples count if the mean period of the others differs.
+
+    Those outside of the part used are harmless.
+    """
     total = values.size
     if fault.wrap:
         yield Finding(
@@ -171,7 +181,11 @@ def sample_findings(
         bad[samples] = True
     if not bad.any():
         return
-    every = effect_of(time, values, bad, frequency, harmonics) if frequency else UNKNOWN
+    every = effect_of(time[used], values[used], bad[used], frequency, harmonics) if frequency else UNKNOWN
+    if every.predicted.size:  # at the other samples too
+        predicted = values.astype(float)
+        predicted[used] = every.predicted
+        every = replace(every, predicted=predicted)
 
     def finding(kind: str, samples: np.ndarray, what: str) -> Finding:
         only = np.zeros(total, dtype=bool)
@@ -179,17 +193,19 @@ def sample_findings(
         own = every
         if every.predicted.size:
             kept = np.where(bad & ~only, every.predicted, values)
-            own = effect_of(time, kept, only, frequency or 1.0, harmonics)
-        severity = own.severity if frequency else SERIOUS
+            own = effect_of(time[used], kept[used], only[used], frequency or 1.0, harmonics)
+        inside = bool(only[used].any())
+        severity = (own.severity if frequency else SERIOUS) if inside else HARMLESS
         times, share = times_of(time, samples), samples.size / total
         size = f", a bias of {own.bias:.3g} standard errors" if own.bias == own.bias else ""
+        size = size if inside else ", not used"
         return Finding(
             kind, channel, severity, times, samples.size, share, own.bias,
             f"{channel} {what} {_when(times)} ({samples.size} samples, {share:.2g} of all{size})",
             f"recording.without({kind}=True, channel={channel!r}) leaves them out",
         )  # fmt: skip
 
-    stuck = [part for part in fault.stuck if _moves(every, part, fault.step)]
+    stuck = [part for part in fault.stuck if _moves(every, part, fault.step, used)]
     if stuck:
         samples = np.concatenate([np.arange(part.start, part.stop) for part in stuck])
         level = ", ".join(f"{values[part.start]:.6g}" for part in stuck[:3])
@@ -207,9 +223,9 @@ def sample_findings(
         yield finding("outliers", fault.outliers, which)
 
 
-def _moves(effect: Effect, part: slice, step: float) -> bool:
-    """Return whether the mean period changes where the values do not."""
-    if not effect.predicted.size:
+def _moves(effect: Effect, part: slice, step: float, used: slice) -> bool:
+    """Return whether the mean period changes where the values do not; unknown outside of the part used."""
+    if not effect.predicted.size or part.start < used.start or part.stop > used.stop:
         return True
     return bool(np.ptp(effect.predicted[part]) > max(4.0 * effect.noise, 3.0 * step, 1e-9))
 

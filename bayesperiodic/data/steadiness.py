@@ -103,7 +103,9 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     enough = np.flatnonzero(~few & (size[:, 0] * LARGEST_CONDITION > size[:, -1]))
     amplitudes = np.linalg.solve(matrices[enough], right[enough])[:, harmonics[-1] :]
     amplitudes[:, 1:] *= 2.0
-    first, last = edges[: count - fine + 1], stops[fine - 1 :]
+    first, last = edges[: count - fine + 1].copy(), stops[fine - 1 :]
+    # Whole cycles before the first of many windows of several cycles are in it; its amplitudes are without them.
+    first[0] -= np.count_nonzero(((time[-1] - time[: first[0]]) * fundamental + 1e-9).astype(int) < int(duration * fundamental))
     return Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2))
 
 
