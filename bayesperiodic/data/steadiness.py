@@ -30,6 +30,8 @@ FEWEST_FOR_TRANSIENT, SIGNIFICANT_SLOPE = 6, 4.0
 SMALLEST_DISTANCE, SMALLEST_NOISE = 1e-9, 1e-6
 # Bias of the mean amplitudes by a transient that is allowed, in standard errors of all together.
 ALLOWED_BIAS = 0.3
+# Probability of a transient that the ends do not show, before the data.
+PROBABLE = 0.1
 # Decay times of transients, in cycles and relative to the recording, their number, and the number of frequencies.
 SHORTEST_DECAY, LONGEST_DECAY, DECAYS, FREQUENCIES = 0.3, 1.0 / 6.0, 12, 13
 # Decay times in which a transient is compared with noise, and most places of the recording with which it is compared.
@@ -199,13 +201,13 @@ def _trimmed(part: Windows, usual: Callable[..., Any] | None = None) -> tuple[in
 
 
 def transient_bias(shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean squares of the bias of means over cycles k, k + 1, … by a transient, and variances of the means.
+    """Return the bias of means over cycles k, k + 1, … by a transient, in standard errors, and its expected squares.
 
-    Both are (cycles, components) for the components (cycles, components) of the amplitudes. A transient of linear
+    They are (cycles,) and (cycles, components), for the components (cycles, components) of the amplitudes. A transient of linear
     decay is exp(−t/T) times a cosine and a sine, with unknown T and frequency, in all components; its sizes have a
     normal prior of that variance which makes the data most probable. What noise does at the other end of the recording
     is no transient. The mean squares are averages over all T and frequencies by their probabilities, and over no
-    transient, whose probability before the data is one half.
+    transient, whose probability before the data is 1 − PROBABLE.
     """
     count = len(shape)
     step = np.diff(shape, axis=0)
@@ -213,7 +215,7 @@ def transient_bias(shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     scaled = (shape - shape.mean(axis=0)) / noise
     share = _independent(step / noise) / shape.shape[1]
     cycle, remaining = np.arange(count, dtype=float), np.arange(count, 0, -1.0)
-    gains, biases = [], []
+    gains, means, variances = [], [], []
     for decay in np.geomspace(SHORTEST_DECAY, max(LONGEST_DECAY * count, 2.0 * SHORTEST_DECAY), DECAYS):
         length = min(int(np.ceil(LENGTH * decay)) + 2, count)
         ends = np.unique(np.linspace(0, max(count - length - int(LENGTH * decay / 2), 0), CONTROLS).astype(int))
@@ -232,10 +234,15 @@ def transient_bias(shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             # The transient ends at zero, so that its mean is the bias.
             later = np.cumsum(course[::-1], axis=0)[::-1] / remaining[:, None] @ np.linalg.pinv(root)
             kept = 1.0 - 1.0 / ratio
-            biases.append((kept * later @ ahead) ** 2 + kept * usual * np.sum(later**2, axis=1)[:, None])
+            means.append(kept * later @ ahead)
+            variances.append(kept * usual * np.sum(later**2, axis=1))
     weight = np.exp(np.array(gains) - max(gains))
-    weight /= weight.sum() + len(gains) * np.exp(-max(gains))
-    return np.einsum("m,mkd->kd", weight, np.array(biases)) * noise**2, noise**2 / remaining[:, None]
+    weight /= weight.sum() + (1.0 / PROBABLE - 1.0) * len(gains) * np.exp(-max(gains))
+    mean = np.einsum("m,mkd->kd", weight, np.array(means))
+    spread = np.einsum("m,mkd->kd", weight, np.array(means) ** 2) - mean**2 + (weight @ np.array(variances))[:, None]
+    # The mean in the worst direction of all components, and its uncertainty in any one of them.
+    total = (np.sum(mean**2, axis=1) + np.mean(spread, axis=1)) * remaining
+    return np.sqrt(total), (mean**2 + spread) * noise**2
 
 
 def _independent(steps: np.ndarray) -> float:
@@ -254,12 +261,12 @@ def _after_transient(part: Windows) -> tuple[int, float, np.ndarray]:
     shape = part.amplitudes
     count, channels, harmonics = shape.shape
     components = np.concatenate([shape.real, shape.imag[:, :, 1:]], axis=2)
-    squares, variances = transient_bias(components.reshape(count, -1))
-    total = np.sum(squares / variances, axis=1)[: count - MINIMUM_CYCLES + 1]
-    allowed = np.flatnonzero(total[: count // 2 + 1] <= ALLOWED_BIAS**2)
+    bias, squares = transient_bias(components.reshape(count, -1))
+    bias = bias[: count - MINIMUM_CYCLES + 1]
+    allowed = np.flatnonzero(bias[: count // 2 + 1] <= ALLOWED_BIAS)
     # If half of the cycles has more bias, the mean square error of what is biased is least.
-    first = int(allowed[0]) if allowed.size else int(np.argmin((1.0 + total) / np.arange(count, MINIMUM_CYCLES - 1, -1)))
+    first = int(allowed[0]) if allowed.size else int(np.argmin((1.0 + bias**2) / np.arange(count, MINIMUM_CYCLES - 1, -1)))
     by_part = squares[first].reshape(channels, -1)
     by_harmonic = by_part[:, :harmonics].copy()
     by_harmonic[:, 1:] += by_part[:, harmonics:]
-    return first, float(np.sqrt(total[first])), by_harmonic
+    return first, float(bias[first]), by_harmonic
