@@ -31,9 +31,9 @@ from .estimation.result import FitCheck as FitCheck
 from .estimation.result import MapEstimate as MapEstimate
 from .likelihood import noise as noise
 from .models import elements as elements
+from .models.elements import smooth_abs as smooth_abs
+from .models.elements import smooth_sign as smooth_sign
 from .models.model import Model as Model
-from .models.model import smooth_abs as smooth_abs
-from .models.model import smooth_sign as smooth_sign
 from .orbits.find import find_orbits as find_orbits
 from .orbits.orbit import Orbit as Orbit
 from .orbits.orbit import Orbits as Orbits

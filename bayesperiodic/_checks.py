@@ -4,7 +4,7 @@ import difflib
 import reprlib
 import unicodedata
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -174,6 +174,28 @@ def measured_vector(argument: str, values: Any, length: int | None = None, meani
             "another unit."
         )
     return array
+
+
+class ReadOnly(dict[Any, Any]):
+    """A dictionary that refuses changes; unlike `types.MappingProxyType` it can be pickled, copied and stored."""
+
+    def _refuse(self, *_: Any, **__: Any) -> NoReturn:
+        raise TypeError("This mapping is read-only. Change a copy, dict(…), and make another object with it.")
+
+    __setitem__ = __delitem__ = __ior__ = clear = pop = popitem = setdefault = update = _refuse
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return read_only, (dict(self),)
+
+
+def read_only(value: Any) -> Any:
+    """Return arrays and mappings, also those in mappings, as copies that refuse changes; other values as they are."""
+    if isinstance(value, Mapping):
+        return ReadOnly({key: read_only(item) for key, item in value.items()})
+    if isinstance(value, np.ndarray) and (value.flags.writeable or value.base is not None):
+        value = value.copy()
+        value.flags.writeable = False
+    return value
 
 
 def _code_points(name: str) -> str:

@@ -4,6 +4,7 @@ import ast
 import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import chain
@@ -151,15 +152,8 @@ class Expression:
                 else:
                     stack.append((step, {}))
         value, partials = stack[0]
-        shapes = {array.shape for array in given.values()}
-        shape = shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
-
-        def filled(number: Any) -> np.ndarray:
-            result = np.empty(shape)
-            result[...] = number
-            return result
-
-        return filled(value), {name: filled(partials.get(name, 0.0)) for name in wanted}
+        shape = np.broadcast_shapes(*{array.shape for array in given.values()})
+        return np.full(shape, value, float), {name: np.full(shape, partials.get(name, 0.0), float) for name in wanted}
 
 
 def _popped(stack: list[Any], count: int) -> list[Any]:
@@ -223,26 +217,22 @@ class _Parser:
     def __init__(self, argument: str, text: Any, names: Iterable[str], note: str):
         if not isinstance(text, str):
             raise ValueError(f"{argument}: must be a text of {ALLOWED_EXPRESSION}, got {text!r}.")
-        self.text = text.strip()
-        self.argument, self.shown = argument, repr(text if len(text) <= SHOWN_LETTERS else f"{text[:SHOWN_LETTERS]}…")
+        self.text, self.argument, self.note = text.strip(), argument, note
+        self.shown = repr(text if len(text) <= SHOWN_LETTERS else f"{text[:SHOWN_LETTERS]}…")
         # Python's parser normalises names, for example µ (micro) to μ (mu).
-        known = tuple(dict.fromkeys(names))
-        self.names = {unicodedata.normalize("NFKC", name): name for name in known}
-        self.note = note
-        if len(self.names) < len(known):
-            same = [name for name in known if self.names[unicodedata.normalize("NFKC", name)] != name]
+        normal = {name: unicodedata.normalize("NFKC", name) for name in names}
+        self.names = {after: name for name, after in normal.items()}
+        if same := [name for name, after in normal.items() if self.names[after] != name]:
             self.refuse(f"where {same[0]!r} is the same name as another one to Python; rename it")
         if len(text) > MAX_LENGTH:
             self.refuse(f"which has {len(text)} characters, more than {MAX_LENGTH}")
 
     def refuse(self, reason: str) -> NoReturn:
-        """Raise the ValueError."""
         raise ValueError(
             f"{self.argument}: must consist of {ALLOWED_EXPRESSION}, got {self.shown}, {reason}."
         ) from None
 
     def tree(self) -> ast.expr:
-        """Return the root of Python's syntax tree."""
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -300,10 +290,7 @@ class _Parser:
     def _number(self, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
             self.refuse(f"which contains {value!r}")
-        try:
-            number = float(value)
-        except OverflowError:
-            number = np.inf
-        if not np.isfinite(number):
-            self.refuse("which contains a number beyond the largest float")
-        return number
+        with suppress(OverflowError):
+            if np.isfinite(number := float(value)):
+                return number
+        self.refuse("which contains a number beyond the largest float")

@@ -119,11 +119,6 @@ def derivative(amplitudes: np.ndarray, frequency: float, order: int = 1) -> np.n
     return amplitudes * (2j * np.pi * frequency * harmonic) ** order
 
 
-def project(values: np.ndarray, harmonics: int) -> np.ndarray:
-    """Return signals (…, points) without the harmonics above the given one."""
-    return on_grid(coefficients(values, harmonics), values.shape[-1])
-
-
 def highest_harmonic(points: int) -> int:
     """Return the highest harmonic below the Nyquist harmonic of a grid."""
     return (points - 1) // 2

@@ -209,7 +209,12 @@ def _decode(value: Any, arrays: dict[str, Any], whole: io.BytesIO) -> Any:
 
         return pd.DataFrame(value["table"], index=value["index"])
     if "tree" in value:
-        return _read_tree(whole)
+        import xarray as xr
+
+        with xr.open_datatree(whole, engine="h5netcdf") as tree:
+            draws = tree.load().drop_nodes(ARRAYS, errors="ignore")
+        del draws.attrs[HEADER]
+        return draws
     name = str(value["result"])
     kind = _class(str(value.get("module")), name)
     if kind is None:
@@ -229,14 +234,3 @@ def _class(module: str, name: str) -> Any:
     kind = vars(import_module(f"{__package__}.{module}")).get(name)
     defined = isinstance(kind, type) and issubclass(kind, Storable) and kind.__module__ == f"{__package__}.{module}"
     return kind if defined and is_dataclass(kind) else None
-
-
-def _read_tree(content: io.BytesIO) -> Any:
-    import xarray as xr
-
-    with xr.open_datatree(content, engine="h5netcdf") as tree:
-        loaded = tree.load()
-    groups = {name: group.to_dataset() for name, group in loaded.children.items() if name != ARRAYS}
-    result = xr.DataTree.from_dict(groups)
-    result.attrs = {key: value for key, value in loaded.attrs.items() if key != HEADER}
-    return result

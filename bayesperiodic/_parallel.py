@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import pickle
 import signal
 import threading
 import warnings
@@ -167,8 +168,7 @@ class TaskPool:
         self._hint = MAIN_GUARD if isinstance(self._executor, int) else ""
         self._running: dict[int, tuple[Any, Any]] = {}
         self._key: Key | None = None
-        self._content, self._unsent, self._at_once = shared, 0, None
-        self._always_sent = True
+        self._content, self._always_sent, self._unsent, self._at_once = shared, True, 0, None
         self._stack = ExitStack()
 
     def __enter__(self) -> "TaskPool":
@@ -177,8 +177,7 @@ class TaskPool:
             if executor is None:
                 executor = stack.enter_context(ThreadPoolExecutor(available_cores()))
             elif isinstance(executor, int):
-                pool = ProcessPoolExecutor(executor, get_context("spawn"), _start_worker)
-                executor = stack.enter_context(pool)
+                executor = stack.enter_context(ProcessPoolExecutor(executor, get_context("spawn"), _start_worker))
             stack.callback(self._cancel)
             self._connect(executor)
             self._stack = stack.pop_all()
@@ -198,7 +197,7 @@ class TaskPool:
             self._submit = partial(executor.submit, pure=False)
             with warnings.catch_warnings(), _losses(RuntimeError, OSError):
                 warnings.simplefilter("ignore")  # about the size of the task graph
-                self._content = self._submit(_identity, payload)
+                self._content = self._submit(bytes, payload)
             return
         workers = getattr(executor, "num_workers", None) or getattr(executor, "_max_workers", None)
         self._unsent, self._at_once = workers or 1, workers and QUEUED_PER_WORKER * workers
@@ -306,17 +305,11 @@ def _unpickled(key: Key, content: bytes | None) -> Any:
         if key not in _UNPICKLED:
             if content is None:
                 return _Missing()
-            import cloudpickle
-
-            _UNPICKLED[key] = cloudpickle.loads(content)
-            while len(_UNPICKLED) > KEPT:
+            _UNPICKLED[key] = pickle.loads(content)
+            if len(_UNPICKLED) > KEPT:
                 _UNPICKLED.popitem(last=False)
         _UNPICKLED.move_to_end(key)
         return _UNPICKLED[key]
-
-
-def _identity(content: bytes) -> bytes:
-    return content
 
 
 Line = dict[str, Any]

@@ -4,12 +4,11 @@ from collections.abc import Callable, Mapping
 from functools import cache
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from scipy.integrate import DOP853, solve_ivp
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic._compile.code_generation import as_columns
 from bayesperiodic.data.recording import Recording
-from bayesperiodic.models.model import Model, integration_kernels
+from bayesperiodic.models.model import Model, integration_kernels, parameter_vector
 
 RELATIVE_TOLERANCE = 1e-10
 SIXTH_ORDER = {
@@ -100,9 +99,8 @@ class _FirstOrder:
     """A model as ẏ = f(t, y), where y contains the states and the first derivatives of the second-order states."""
 
     def __init__(self, model: Model, parameters: Mapping[str, float], inputs: Mapping[str, Signal], frequency: float):
-        _checks.same_names("parameters", parameters, model.parameters)
         self.model, self.frequency, self.count = model, frequency, len(model.states)
-        self.theta = np.array([_checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
+        self.theta = parameter_vector(model, parameters)
         _checks.same_names("inputs", inputs, model.inputs)
         self.signals = [_with_derivatives(name, inputs[name], frequency) for name in model.inputs]
         self.orders = np.array([model.orders[state] for state in model.states])
@@ -127,8 +125,10 @@ class _FirstOrder:
         return table[: 1 + np.flatnonzero(present).max(initial=0)]
 
     def _evaluate(self, function: str, states: np.ndarray, time: np.ndarray) -> np.ndarray:
-        derivatives = [signal(time) for signal in self.signals]
-        inputs = as_columns((d[order] for order in range(3) for d in derivatives), time.size)
+        signals = np.empty((len(self.signals), 3, time.size))
+        for i, signal in enumerate(self.signals):
+            signals[i] = signal(time)
+        inputs = np.ascontiguousarray(np.swapaxes(signals, 0, 1).reshape(-1, time.size).T)
         tau = time * self.frequency
         return self.model.kernels.evaluate(function, states, inputs, self.theta, tau, self.frequency)
 
@@ -156,16 +156,8 @@ def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.n
     step = LONGEST_STEP / system.frequency
     short = (time[0], min(time[-1], TRIAL / system.frequency))
     size = np.abs(solve_ivp(system, short, start, rtol=1e-3, max_step=step).y).max(axis=1)
-    result = solve_ivp(
-        system,
-        (time[0], time[-1]),
-        start,
-        method="DOP853",
-        t_eval=time,
-        rtol=RELATIVE_TOLERANCE,
-        atol=RELATIVE_TOLERANCE * (size + np.finfo(float).tiny),
-        max_step=step,
-    )
+    tolerances = {"rtol": RELATIVE_TOLERANCE, "atol": RELATIVE_TOLERANCE * (size + np.finfo(float).tiny)}
+    result = solve_ivp(system, (time[0], time[-1]), start, "DOP853", time, max_step=step, **tolerances)
     if not result.success or not np.isfinite(result.y).all():
         raise RuntimeError(f"The time integration of {system.model.name!r} failed: {result.message} {UNBOUNDED}")
     return result.y.T
@@ -174,8 +166,6 @@ def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.n
 @cache
 def _tableau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return stages, nodes and error weights of the method of order 8, with the step's end as the last stage."""
-    from scipy.integrate import DOP853  # an import of half a second
-
     a = np.vstack([DOP853.A, DOP853.B])
     return a, np.append(DOP853.C, 1.0), np.stack([DOP853.E5, DOP853.E3])
 
@@ -183,7 +173,7 @@ def _tableau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _integrate_periodic(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Return the same as `_integrate` for inputs that are Fourier series, by compiled code."""
     amplitudes, tau, ones = system.amplitudes(), time * system.frequency, np.ones(start.size)
-    function, dormand_prince = system.model.kernels.residual_jacobian, integration_kernels().dormand_prince
+    function, dormand_prince = system.model.kernels.residual_jacobian.address, integration_kernels().dormand_prince
 
     def path(tau: np.ndarray, absolute: np.ndarray, relative: np.ndarray) -> np.ndarray:
         states = np.empty((tau.size, start.size))

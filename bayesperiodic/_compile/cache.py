@@ -21,15 +21,13 @@ import types
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import llvmlite.binding
 import numba
 import platformdirs
-
-from bayesperiodic._compile import expectations
 
 try:
     from numba.core.compiler_lock import global_compiler_lock
@@ -61,16 +59,17 @@ def load(
     Its functions have Numba signatures and the option ``cache=CACHE``. The constants, values with a unique `repr`, and
     the names of the `shared` module, which this function returned, are defined in the module before its text is
     executed. An entry is compiled again when the text, the constants or the shared module change. A function
-    ``run(source, names, path, module, cache=…)`` may define the functions of other texts in the module and keep their
-    machine code beside the path, in files `*.nbc` in `__pycache__`.
+    ``run(source, path, module)`` may define the functions of other texts in the module and, if its constant `CACHE` is
+    true, keep their machine code beside the path, in files `*.nbc` in `__pycache__`.
     """
     configuration: Any = numba.config
     if configuration.DISABLE_JIT:
         raise RuntimeError("NUMBA_DISABLE_JIT: must not be set, because the kernels need compiled code; unset it.")
     source, names = _definitions(body, constants, shared)
+    execute = partial(_execute, source, names, run or _run)
     try:
         entry = _private_folder() / _digest(source)
-        return _stored(source, names, entry, run or _run) or _build(source, names, entry, run or _run)
+        return _stored(source, entry, execute) or _build(source, entry, execute)
     except (CacheProblem, OSError) as problem:
         reason = str(problem)
     warnings.warn(
@@ -79,20 +78,15 @@ def load(
         RuntimeWarning,
         stacklevel=2,
     )
-    return _execute(source, names, Path("<kernels compiled in memory>"), run or _run, cache=False)
+    return execute(Path("<kernels compiled in memory>"), cache=False)
 
 
-def is_stored(body: str, constants: Mapping[str, Any] | None = None, unusable: bool = True) -> bool:
-    """Return whether the cache has an entry of a text without a shared module; `unusable` if it cannot have one."""
+def is_stored(body: str, constants: Mapping[str, Any]) -> bool:
+    """Return whether the cache has an entry of a text without a shared module, or cannot be used."""
     try:
         return (_private_folder() / _digest(_definitions(body, constants, None)[0])).exists()
     except (CacheProblem, OSError):
-        return unusable
-
-
-def internals_expected() -> bool:
-    """Return whether Numba's internals are those expected, see `expectations`."""
-    return expectations.met(load, is_stored)
+        return True
 
 
 def declare(body: str, constants: Mapping[str, Any] | None = None) -> types.ModuleType:
@@ -101,29 +95,30 @@ def declare(body: str, constants: Mapping[str, Any] | None = None) -> types.Modu
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / SOURCE
         path.write_text(source, encoding="utf-8")
-        return _execute(source, {**names, "DECLARED": True}, path, _run, cache=True)
+        return _execute(source, {**names, "DECLARED": True}, _run, path, cache=True)
 
 
 def _definitions(
     body: str, constants: Mapping[str, Any] | None, shared: types.ModuleType | None
 ) -> tuple[str, dict[str, Any]]:
     """Return the text of an entry, and the names that are defined before it is executed."""
-    constants = dict(constants or {})
+    constants, before = dict(constants or {}), vars(shared) if shared else {}
     source = f"{_header()}# {constants!r}, {shared.__name__ if shared else None}\n{body}"
-    return source, {**(vars(shared) if shared else {}), **constants, "DECLARED": False}
+    shown = {name: value for name, value in before.items() if not name.startswith("__")}
+    return source, {**shown, **constants, "DECLARED": False}
 
 
 def _digest(source: str) -> str:
     return hashlib.sha256(source.encode()).hexdigest()[:32]
 
 
-def _stored(source: str, names: Mapping[str, Any], entry: Path, run: Callable[..., None]) -> types.ModuleType | None:
+def _stored(source: str, entry: Path, execute: Callable[..., types.ModuleType]) -> types.ModuleType | None:
     """Return the module of an entry; None if there is none, or if it was damaged and has been removed."""
     if not os.path.lexists(entry):
         return None
     try:
         _check(entry, source)
-        return _execute(source, names, entry / SOURCE, run, cache=True)
+        return execute(entry / SOURCE, cache=True)
     except CacheProblem as problem:
         reason = str(problem)
     except Exception as problem:  # any error that a damaged compiled file causes in the loader
@@ -144,8 +139,7 @@ def _header() -> str:
     settings: Any = numba.config
     name = settings.CPU_NAME or llvmlite.binding.get_host_cpu_name()
     features = settings.CPU_FEATURES or llvmlite.binding.get_host_cpu_features().flatten()
-    route = "machine code" if internals_expected() else "njit"
-    machine = f"{platform.machine()} {llvmlite.binding.get_process_triple()} {name} {features}, {route}"
+    machine = f"{platform.machine()} {llvmlite.binding.get_process_triple()} {name} {features}"
     versions = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, python {platform.python_version()}"
     return f"# {versions}, {machine}\n"
 
@@ -165,7 +159,7 @@ def _announce() -> None:
     print("compiling kernels (once per machine) …", file=sys.stderr, flush=True)
 
 
-def _build(source: str, names: Mapping[str, Any], entry: Path, run: Callable[..., None]) -> types.ModuleType:
+def _build(source: str, entry: Path, execute: Callable[..., types.ModuleType]) -> types.ModuleType:
     for other in entry.parent.glob(f"{BUILDING}*"):
         with suppress(OSError):
             if other.stat().st_mtime < time.time() - ABANDONED:
@@ -174,7 +168,7 @@ def _build(source: str, names: Mapping[str, Any], entry: Path, run: Callable[...
     workshop = Path(tempfile.mkdtemp(prefix=BUILDING, dir=entry.parent))
     try:
         (workshop / SOURCE).write_text(source, encoding="utf-8")
-        module = _execute(source, names, workshop / SOURCE, run, cache=True)
+        module = execute(workshop / SOURCE, cache=True)
         (workshop / MANIFEST).write_text(json.dumps(_digests(workshop)), encoding="utf-8")
         try:
             workshop.rename(entry)
@@ -201,17 +195,15 @@ def _digests(entry: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def _run(source: str, names: Mapping[str, Any], path: Path, module: types.ModuleType, *, cache: bool) -> None:
-    module.__dict__.update(names, CACHE=cache)
+def _run(source: str, path: Path, module: types.ModuleType) -> None:
     exec(compile(source, str(path), "exec"), module.__dict__)
 
 
 def _execute(
-    source: str, names: Mapping[str, Any], path: Path, run: Callable[..., None], cache: bool
+    source: str, names: Mapping[str, Any], run: Callable[..., None], path: Path, *, cache: bool
 ) -> types.ModuleType:
     module = types.ModuleType(f"bayesperiodic_kernels_{_digest(source)}")
-    defined = {name: value for name, value in names.items() if not name.startswith("__")}
-    module.__file__ = str(path)
+    module.__dict__.update(names, __file__=str(path), CACHE=cache)
     sys.modules[module.__name__] = module
     settings: Any = numba.config
     with global_compiler_lock:
@@ -219,7 +211,7 @@ def _execute(
         settings.CACHE_DIR = ""  # beside the source, where its digests are kept
         gc.set_threshold(0)  # looking for garbage takes a fifth of the compiler's time
         try:
-            run(source, defined, path, module, cache=cache)
+            run(source, path, module)
         finally:
             settings.CACHE_DIR = elsewhere
             gc.set_threshold(*thresholds)

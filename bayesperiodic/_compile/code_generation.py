@@ -8,72 +8,19 @@ Every generated function has the signature ``(states, inputs, parameters, tau, f
 - out (points, size): the result, one row per grid point.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, partial
 from types import ModuleType
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import sympy as sp
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympy.printing.pycode import PythonCodePrinter
 
-from bayesperiodic._compile import plain
-from bayesperiodic._compile.cache import internals_expected, load
+from bayesperiodic._compile.grid_function import GridFunction
 
-GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
 FUNCTIONS = ("residual", "residual_jacobian", "outputs", "derivatives", "transitions")
-_ROWS, _VECTOR = types.float64[:, ::1], types.float64[::1]
-GRID_SIGNATURE_TYPE = types.void(_ROWS, _ROWS, _VECTOR, _VECTOR, types.float64, _ROWS)
-GRID_FUNCTION = types.FunctionType(GRID_SIGNATURE_TYPE)
-CALL = f"""
-from numba import njit
-from bayesperiodic._compile.code_generation import grid_function_at
-
-@njit("{GRID_SIGNATURE.replace("(", "(int64, ", 1)}", cache=CACHE, nogil=True)
-def call(address, states, inputs, parameters, tau, frequency, out):
-    grid_function_at(address)(states, inputs, parameters, tau, frequency, out)
-"""
-
-
-class GridFunction(types.WrapperAddressProtocol):
-    """The machine code of a grid function, which Python and compiled functions can call.
-
-    The type and the address are at hand: Numba would look them up at every call that takes a compiled function as an
-    argument, which takes longer than a periodic solve. In short calls even the conversion of this argument counts;
-    these take the `address`, see `grid_function_at`.
-    """
-
-    def __init__(self, address: int):
-        self._numba_type_ = GRID_FUNCTION
-        self.address = address
-
-    def __wrapper_address__(self) -> int:
-        return self.address
-
-    def signature(self) -> Any:
-        """Return the Numba signature."""
-        return GRID_FUNCTION.signature
-
-    def __call__(self, *arguments: Any) -> None:
-        """Run the compiled function."""
-        _call()(self.address, *arguments)
-
-
-@intrinsic
-def grid_function_at(typing_context: Any, address: Any) -> Any:
-    """Return the grid function at an address; for use in compiled code."""
-
-    def structure(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        function = ir.Constant(context.get_value_type(GRID_FUNCTION), None)
-        address = builder.inttoptr(values[0], context.get_value_type(types.voidptr))
-        return builder.insert_value(function, address, 0)
-
-    return GRID_FUNCTION(types.int64), structure
 
 
 @dataclass(frozen=True)
@@ -123,8 +70,7 @@ class Kernels:
         return [(g, theta), (g, u), (g, 1), (f, 3 * g), (f, theta), (f, u), (f, 1)]
 
 
-@dataclass(frozen=True)
-class VjpKernels:
+class VjpKernels(NamedTuple):
     """Compiled vector-Jacobian products, with respect to some of a model's parameters θ.
 
     Usually either the outputs or the equations of a model are expensive; therefore these are two functions.
@@ -232,20 +178,9 @@ def grid_functions(source: str, names: Sequence[str]) -> list[GridFunction]:
 
 def compiled(source: str) -> ModuleType:
     """Return the addresses of the functions of a generated text, by their names, compiled or from the cache."""
-    if not internals_expected():
-        return load(source, run=partial(plain.compile_functions, signature=GRID_SIGNATURE_TYPE))
-    from bayesperiodic._compile import machine_code
+    from bayesperiodic._compile import functions  # which checks Numba's internals
 
-    return load(
-        f"# {machine_code.digest()}\n{source}",
-        run=partial(machine_code.compile_functions, signature=GRID_SIGNATURE_TYPE),
-    )
-
-
-@cache
-def _call() -> Callable[..., None]:
-    """Return the compiled function that calls the grid function at an address."""
-    return load(CALL).call
+    return functions.compiled(source)
 
 
 def _jacobian(rows: Sequence[sp.Expr], columns: Sequence[sp.Symbol]) -> list[sp.Expr]:
@@ -272,13 +207,15 @@ def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, 
 
 
 class _PythonPrinter(PythonCodePrinter):
-    """SymPy's Python printer, with the functions of `machine_code` for conditions and generalised functions."""
+    """SymPy's Python printer, with the function `where` for conditions and generalised functions."""
 
     def _print_sign(self, expression: sp.Expr) -> str:
-        return f"sign({self._print(expression.args[0])})"
+        x = self._print(expression.args[0])
+        return f"(where({x} > 0.0, 1.0, 0.0) - where({x} < 0.0, 1.0, 0.0))"
 
     def _print_Heaviside(self, expression: sp.Expr) -> str:
-        return f"step({self._print(expression.args[0])})"
+        x = self._print(expression.args[0])
+        return f"(0.5*(where({x} > 0.0, 1.0, 0.0) + where({x} >= 0.0, 1.0, 0.0)))"
 
     def _print_DiracDelta(self, expression: sp.Expr) -> str:
         return "0.0"
@@ -313,9 +250,3 @@ def _code(expression: sp.Expr) -> str:
             f"{expression}, which cannot be compiled."
         )
     return text
-
-
-def as_columns(values: Iterable[np.ndarray], points: int) -> np.ndarray:
-    """Return signals as the columns of a C-contiguous array (points, signals)."""
-    stacked = [np.asarray(v, dtype=float) for v in values]
-    return np.ascontiguousarray(np.stack(stacked, axis=-1)) if stacked else np.empty((points, 0))

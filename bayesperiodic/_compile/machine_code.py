@@ -9,8 +9,7 @@ optimise the code, would compile the same loop from Python in five times the tim
 import hashlib
 import math
 import pickle
-from collections.abc import Callable, Mapping
-from functools import cache
+from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
@@ -20,6 +19,9 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.registry import cpu_target
+
+from bayesperiodic._compile.cache import load
+from bayesperiodic._compile.grid_function import GRID_SIGNATURE
 
 NO_GATHER, FIRST_LLVM = "+prefer-no-gather", 17  # and the first version of LLVM that has this feature
 LLVM_NUMBER, LLVM_TRUTH, INTEGER = ir.DoubleType(), ir.IntType(1), ir.IntType(64)
@@ -134,16 +136,6 @@ def maximum(first: Any, *others: Any) -> Any:
     return first
 
 
-def sign(x: Any) -> Any:
-    """Return the sign, 0 at 0."""
-    return where(x > 0.0, 1.0, 0.0) - where(x < 0.0, 1.0, 0.0)
-
-
-def step(x: Any) -> Any:
-    """Return Heaviside's function, ½ at 0."""
-    return 0.5 * (where(x > 0.0, 1.0, 0.0) + where(x >= 0.0, 1.0, 0.0))
-
-
 def called(name: str, *arguments: Any) -> Any:
     """Return a function of the module `math`."""
     value = next((argument for argument in arguments if isinstance(argument, Value)), None)
@@ -225,7 +217,7 @@ class _Functions:
         return constant if isinstance(constant, float) else lambda *arguments: called(name, *arguments)
 
 
-SCOPE = {"math": _Functions(), "where": where, "min": minimum, "max": maximum, "sign": sign, "step": step}
+SCOPE = {"math": _Functions(), "where": where, "min": minimum, "max": maximum}
 
 
 class _Row:
@@ -261,26 +253,30 @@ def _number(value: Any) -> ir.Value:
     return value.value if isinstance(value, Value) else ir.Constant(LLVM_NUMBER, float(value))
 
 
-def compile_functions(
-    source: str, _: Mapping[str, Any], path: Path, module: ModuleType, *, signature: Any, cache: bool
-) -> None:
+def compiled(source: str) -> ModuleType:
+    """Return the addresses of the functions of a text, by their names, compiled or from the cache."""
+    digest = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
+    return load(f"# {digest}\n{source}", run=_compile)
+
+
+def _compile(source: str, path: Path, module: ModuleType) -> None:
     """Define the addresses of a text's functions in a module, from the machine code beside `path` or compiled."""
     scope = dict(SCOPE)
     exec(compile(source, str(path), "exec"), scope)
     functions = {name: f for name, f in scope.items() if isinstance(f, FunctionType) and name not in SCOPE}
     stored, codegen = path.parent / "__pycache__" / "functions.nbc", cpu_target.target_context.codegen()
-    if cache and stored.exists():
+    if module.CACHE and stored.exists():
         library = codegen.unserialize_library(pickle.loads(stored.read_bytes()))
     else:
         library = codegen.create_library(module.__name__)
         llvm = library.create_ir_module(module.__name__)
         for name, function in functions.items():
-            _append(llvm, f"{module.__name__}.{name}", function, signature)
-        if cache:
+            _append(llvm, f"{module.__name__}.{name}", function)
+        if module.CACHE:
             library.enable_object_caching()
         library.add_ir_module(llvm)
         library.finalize()
-        if cache:
+        if module.CACHE:
             stored.parent.mkdir(exist_ok=True)
             stored.write_bytes(pickle.dumps(library.serialize_using_object_code()))
     module.__dict__["library"] = library
@@ -288,9 +284,9 @@ def compile_functions(
         module.__dict__[name] = library.get_pointer_to_function(f"{module.__name__}.{name}")
 
 
-def _append(module: ir.Module, symbol: str, function: FunctionType, signature: Any) -> None:
+def _append(module: ir.Module, symbol: str, function: FunctionType) -> None:
     """Append the loop over the grid of a function, with the calling convention of `types.FunctionType`."""
-    context, kinds = cpu_target.target_context, signature.args
+    context, kinds = cpu_target.target_context, GRID_SIGNATURE.args
     result = context.get_value_type(types.none)
     code = ir.Function(module, ir.FunctionType(result, [context.get_value_type(kind) for kind in kinds]), symbol)
     _forbid_gathers(code)
@@ -331,9 +327,3 @@ def _forbid_gathers(code: ir.Function) -> None:
     features = cpu_target.target_context.codegen().magic_tuple()[2]
     if "+avx2" in features.split(",") and llvmlite.binding.llvm_version_info[0] >= FIRST_LLVM:
         set.add(code.attributes, f'"target-features"="{features},{NO_GATHER}"')  # `add` accepts only a few names.
-
-
-@cache
-def digest() -> str:
-    """Return a digest of this file, on which the machine code depends."""
-    return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +22,7 @@ MEANING, DATA = "samples·periods", "data"
 class Experiment(Result):
     """One response period of measured outputs and inputs.
 
-    Its arrays are read-only copies of those given.
+    Its arrays and mappings are read-only copies of those given.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class Experiment(Result):
         self._check_multipliers()
         self._check_covariance(measured * len(self.outputs))
         for member in fields(self):
-            object.__setattr__(self, member.name, _read_only(getattr(self, member.name)))
+            object.__setattr__(self, member.name, _checks.read_only(getattr(self, member.name)))
 
     def _measured(self, kind: str, values: ArrayLike) -> ArrayLike:
         """Return the values of a channel, with zeros at points of an output that the mask excludes."""
@@ -348,7 +348,9 @@ class Experiment(Result):
         -------
         array (…, samples·periods)
         """
-        return _fourier.project(values, self.harmonics[channel]) if channel in self.harmonics else values
+        if channel not in self.harmonics:
+            return values
+        return _fourier.on_grid(_fourier.coefficients(values, self.harmonics[channel]), values.shape[-1])
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
@@ -363,16 +365,6 @@ class Experiment(Result):
             f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
             f"{text}{''.join(f'; {finding}' for finding in self.findings)})"
         )
-
-
-def _read_only(value: Any) -> Any:
-    """Return arrays, also those in mappings, as copies that cannot be changed in place; other values as they are."""
-    if isinstance(value, Mapping):
-        return {key: _read_only(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray) and (value.flags.writeable or value.base is not None):
-        value = value.copy()
-        value.flags.writeable = False
-    return value
 
 
 def _checked_mask(given: ArrayLike, points: int) -> np.ndarray:

@@ -14,13 +14,14 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesperiodic._linalg import hessian_eigh, in_one_thread, scaled
-from bayesperiodic.data.experiment import DATA, Experiment
+from bayesperiodic.data.experiment import DATA
 from bayesperiodic.likelihood.likelihood import Likelihood
 from bayesperiodic.likelihood.noise_estimate import estimate_noise
 from bayesperiodic.likelihood.observation import Observation, Response
@@ -35,6 +36,7 @@ ON_ORBIT, SMALL_TURN = 1e-6, 1e-2
 SEEN, EQUATIONS, SEEN_ROUNDS, TURNS, FEW_TURNS = 8, 0.03, 5, 100, 5
 # Means of a state that are tried, in standard deviations from the one found.
 MEANS = (1.0, -1.0, 2.0, -2.0)
+Guesses = Mapping[str, Mapping[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -56,79 +58,75 @@ class InitialEstimate(NamedTuple):
     blocked: str  # the experiment whose orbit could not be followed; empty otherwise
 
 
-def simultaneous_fit(problem: Description, theta: np.ndarray) -> InitialEstimate | None:
+def simultaneous_fit(problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> InitialEstimate | None:
     """Return θ and orbits near the MAP point; None if the model is autonomous or an experiment has no guess.
 
-    The fit starts at θ (names,) and at the experiments' guesses, ignores multipliers, and moves positive parameters in
-    their logarithms.
+    The fit starts at θ (names,) and at guesses, by default the experiments' own, ignores multipliers, and moves
+    positive parameters in their logarithms.
     """
-    if problem.model.autonomous or not all(e.guess for e in problem.experiments):
+    if problem.model.autonomous or not (guesses or all(e.guess for e in problem.experiments)):
         return None
-    fit = _SimultaneousFit(with_guesses(problem, theta))
+    fit = _SimultaneousFit(problem, guesses or experiments_guesses(problem, theta))
     return fit.iterate(fit.parameters_along_guesses(theta))
 
 
 @in_one_thread
-def with_guesses(problem: Description, theta: np.ndarray) -> Description:
-    """Return the problem with states in place of ``guess="data"``, found from a θ (names,); see `measured_orbits`."""
-    if all(e.guess != DATA for e in problem.experiments):
-        return problem
-    near: dict[str, dict[str, np.ndarray]] = {}
-    for e in problem.experiments:
-        equations = problem.equations[e.name]
-        z = equations.static_guess(problem.parameters(theta[None], e.name)[0])
-        states = z + equations.drift * equations.grid.tau[:, None]
-        near[e.name] = dict(zip(problem.model.states, states.T.copy(), strict=True))
-    fit = _SimultaneousFit(problem.replace(experiments=[replace(e, guess=near[e.name]) for e in problem.experiments]))
-    for e in problem.experiments:
-        if e.guess == DATA:
-            near[e.name] = fit._states(e.name, fit.orbit_of_any_mean(e.name, theta))
-    _, estimate = measured_orbits(problem, theta, near, FEW_TURNS)
-    for name, states in estimate.states.items():
+def experiments_guesses(problem: Description, theta: np.ndarray) -> dict[str, Any]:
+    """Return the experiments' guesses; in place of "data" states found from a θ (names,), see `measured_orbits`."""
+    guesses: dict[str, Any] = {e.name: e.guess for e in problem.experiments}
+    wanted = [name for name, guess in guesses.items() if guess == DATA]
+    if not wanted:
+        return guesses
+    fit = _SimultaneousFit(problem, {})
+    near = {
+        name: fit.states(name, equations.static_guess(problem.parameters(theta[None], name)[0]))
+        for name, equations in problem.equations.items()
+    }
+    fit = _SimultaneousFit(problem, near)
+    near |= {name: fit.states(name, fit.orbit_of_any_mean(name, theta)) for name in wanted}
+    measured = measured_orbits(problem, theta, near, FEW_TURNS).states
+    for name, states in measured.items():
         if lost := [state for state, values in states.items() if not np.isfinite(values).all()]:
             raise ValueError(
                 f"guess of experiment {name!r}: must be finite, got nan for {lost[0]!r} from the data; give the states "
                 "as a mapping, or start nearer to the truth."
             )
-    orbits = estimate.states
-    return problem.replace(
-        experiments=[replace(e, guess=orbits[e.name]) if e.guess == DATA else e for e in problem.experiments]
-    )
+    return guesses | {name: measured[name] for name in wanted}
 
 
-def measured_orbits(
-    problem: Description, theta: np.ndarray, near: dict[str, dict[str, np.ndarray]], most: int = TURNS
-) -> tuple[Description, InitialEstimate]:
+def measured_orbits(problem: Description, theta: np.ndarray, near: Guesses, most: int = TURNS) -> InitialEstimate:
     """Return orbits of a driven model that give the measured outputs, and the θ that fits them, in turns from a θ.
 
     The orbits solve the equations only as far as the outputs leave them free; `near` are the states of other orbits
-    from which they start. Returned with them is the problem whose experiments have these orbits as their guesses.
+    from which they start.
     """
-    fit = _SimultaneousFit(problem.replace(experiments=[replace(e, guess=near[e.name]) for e in problem.experiments]))
+    fit = _SimultaneousFit(problem, near)
     misfit, before, turns = np.inf, np.inf, 0
     while turns < most and not before - misfit < SMALL_TURN:
         fit.guess = {name: fit.measured_orbit(name, theta) for name in fit.guess}
         theta = fit.parameters_along_guesses(theta)
         misfit, before, turns = fit._misfit(theta), misfit, turns + 1
-    states = {name: fit._states(name, z) for name, z in fit.guess.items()}
-    guessed = problem.replace(experiments=[replace(e, guess=states[e.name]) for e in problem.experiments])
-    return guessed, InitialEstimate(theta, states, "")
+    return InitialEstimate(theta, {name: fit.states(name, z) for name, z in fit.guess.items()}, "")
 
 
 class _SimultaneousFit:
-    def __init__(self, problem: Description):
-        self.problem, self.maps = problem, problem.parameter_maps
+    def __init__(self, problem: Description, guesses: Guesses):
+        self.problem, self.maps, self.equations = problem, problem.parameter_maps, problem.equations
         experiments = [e.without_multipliers() for e in problem.experiments]
         self.observations = {e.name: Observation(e, problem.model, self.maps[e.name].delayed) for e in experiments}
         blocks = [block for observation in self.observations.values() for block in observation.blocks]
         self.likelihood = Likelihood(problem.noise, blocks, problem.likelihood.fixed)
-        self.equations: dict[str, PeriodicEquations] = problem.equations
-        self.guess = {e.name: self._periodic_part(e) for e in experiments}
+        self.guess = {}
+        for name, states in guesses.items():
+            turning = np.stack([states[state] for state in problem.model.states], axis=-1)
+            self.guess[name] = turning - self._turns(name)
 
-    def _periodic_part(self, e: Experiment) -> np.ndarray:
-        equations, guess = self.equations[e.name], {} if isinstance(e.guess, str) else e.guess
-        states = np.stack([guess[name] for name in self.problem.model.states], axis=-1)
-        return states - equations.drift * equations.grid.tau[:, None]
+    def states(self, name: str, z: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the states (points,), turns included, of the periodic part (points, states) of an orbit."""
+        return dict(zip(self.problem.model.states, (z + self._turns(name)).T.copy(), strict=True))
+
+    def _turns(self, name: str) -> np.ndarray:
+        return self.equations[name].drift * self.equations[name].grid.tau[:, None]
 
     def parameters_along_guesses(self, theta: np.ndarray) -> np.ndarray:
         """Return the θ near which the equations hold best along the experiments' guesses, by damped Gauss-Newton."""
@@ -137,10 +135,9 @@ class _SimultaneousFit:
             total, count = 0.0, 0
             hessian, gradient = np.zeros((theta.size, theta.size)), np.zeros(theta.size)
             for name, z in self.guess.items():
-                mapped, equations = self.maps[name], self.equations[name]
-                at = np.ascontiguousarray(mapped.values(theta[None])[0, :-1])
+                at, equations = self.problem.parameters(theta[None], name)[0], self.equations[name]
                 g = _weighed(equations, equations.residual_jacobian(z, at)[:, : equations.count, None]).ravel()
-                by = _weighed(equations, equations.derivatives(z, at).g_theta @ mapped.slopes(theta)[:-1])
+                by = _weighed(equations, equations.derivatives(z, at).g_theta @ self.maps[name].slopes(theta)[:-1])
                 by = by.reshape(g.size, theta.size)
                 hessian, gradient = hessian + by.T @ by, gradient - by.T @ g
                 total, count = total + g @ g, count + g.size
@@ -211,7 +208,7 @@ class _SimultaneousFit:
         return best
 
     def _equation_error(self, name: str, z: np.ndarray, theta: np.ndarray) -> float:
-        at, equations = np.ascontiguousarray(self.maps[name].values(theta[None])[0, :-1]), self.equations[name]
+        at, equations = self.problem.parameters(theta[None], name)[0], self.equations[name]
         return float(np.sum(_weighed(equations, equations.residual_jacobian(z, at)[:, : equations.count, None]) ** 2))
 
     def _misfit(self, theta: np.ndarray) -> float:
@@ -240,13 +237,13 @@ class _SimultaneousFit:
             off = {name: _size(one.correction, orbits[name]) for name, one in linear.items()}
             worst = max(off, key=lambda name: off[name])
             if off[worst] < ON_ORBIT and size < SMALL_TURN:
-                return InitialEstimate(theta, {name: self._states(name, z) for name, z in orbits.items()}, "")
+                break
             theta, orbits, blocked = self._moved(linear, orbits, theta, step)
             if blocked:
                 return InitialEstimate(theta, {}, blocked)
         # Where the data leave a direction open, θ moves on along it while the orbits solve the equations.
         if off[worst] < SMALL_TURN:
-            return InitialEstimate(theta, {name: self._states(name, z) for name, z in orbits.items()}, "")
+            return InitialEstimate(theta, {name: self.states(name, z) for name, z in orbits.items()}, "")
         return InitialEstimate(theta, {}, worst)
 
     def _linearise(self, name: str, z: np.ndarray, theta: np.ndarray) -> LinearisedOrbit | None:
@@ -319,7 +316,7 @@ class _SimultaneousFit:
         """Return an orbit a step further, with one chord correction; None where the step is not nearly linear."""
         equations = self.equations[name]
         step = share * linear.correction + np.tensordot(change, linear.response, (0, 0))
-        at = np.ascontiguousarray(self.maps[name].values(there[None])[0, :-1])
+        at = self.problem.parameters(there[None], name)[0]
         columns = equations.residual_jacobian(z + step, at)
         if not np.isfinite(columns).all():
             return None
@@ -328,11 +325,6 @@ class _SimultaneousFit:
         if curved > NONLINEAR * _size(step, z) and curved > ON_ORBIT:
             return None
         return z + step + (again if share == 1.0 else 0.0)
-
-    def _states(self, name: str, z: np.ndarray) -> dict[str, np.ndarray]:
-        equations = self.equations[name]
-        states = z + equations.drift * equations.grid.tau[:, None]
-        return dict(zip(self.problem.model.states, states.T.copy(), strict=True))
 
 
 def _weighed(equations: PeriodicEquations, values: np.ndarray) -> np.ndarray:

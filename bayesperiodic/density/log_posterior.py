@@ -9,12 +9,11 @@ from scipy.special import gammaln
 
 from bayesperiodic.density.initial_orbits import simultaneous_fit
 from bayesperiodic.density.orbit_check import other_orbit
-from bayesperiodic.density.responses import Guesses, Simulator
+from bayesperiodic.density.responses import Simulator
 from bayesperiodic.likelihood.likelihood import Residuals
 from bayesperiodic.likelihood.noise import FLAT_PRIOR, JEFFREYS, Circulant, Independent
 from bayesperiodic.likelihood.observation import Comparisons, Response, Simulation
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
-from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.problem.description import Description
 
 RIDGE_COORDINATES, NATURAL = "ridge", "natural"
@@ -102,13 +101,8 @@ class Linearisation:
             by_response = self._comparisons.vjp(self._simulation, self.residuals.like(by_residual))
             by_theta = self.simulator.vjp(self.theta, self._simulation, *by_response)
             return {name: -gradient for name, gradient in by_theta.items()}
-        result, start, blocks = {}, 0, list(by_residual)
-        for name, observation in self._observations.items():
-            stop = start + len(observation.blocks)
-            pairs = zip(self.jacobian[start:stop], blocks[start:stop], strict=True)
-            result[name] = -np.sum([s @ w for s, w in pairs], axis=0)
-            start = stop
-        return result
+        products = (jacobian @ weights for jacobian, weights in zip(self.jacobian, by_residual, strict=True))
+        return {name: -np.sum([next(products) for _ in o.blocks], axis=0) for name, o in self._observations.items()}
 
 
 class Evaluation(NamedTuple):
@@ -124,16 +118,9 @@ class SamplingCoordinates:
 
     A parameter whose prior's support is (0, ∞) is replaced by its logarithm, any other is its own coordinate; the
     logarithms of the free noise parameters follow. `coordinates` "natural" takes no logarithms of parameters,
-    `variances` "collapsed" leaves out the variances that can be integrated out in closed form.
-
-    Attributes
-    ----------
-    labels : tuple of str
-        Parameters and noise parameters, in the order of the coordinates.
-    collapsed : tuple of str
-        Variances that are integrated out.
-    free : tuple of str
-        Noise parameters that have a coordinate.
+    `variances` "collapsed" leaves out the variances that can be integrated out in closed form. `labels` are the names
+    of the coordinates, those of parameters first, `free` the noise parameters among them, `collapsed` the variances
+    that are integrated out.
     """
 
     def __init__(self, problem: Description, *, coordinates: str = RIDGE_COORDINATES, variances: str = SAMPLED):
@@ -190,22 +177,19 @@ class LogPosterior(SamplingCoordinates):
         )
 
     @classmethod
-    def start(cls, problem: Description, theta: np.ndarray | None = None) -> "LogPosterior":
-        """Return the density anchored near θ, by default the medians of the priors.
+    def start(cls, problem: Description) -> "LogPosterior":
+        """Return the density with the problem's anchors, by default near the medians of the priors.
 
         Where every experiment of a forced model has a guess of its orbit, the anchors are where orbits and parameters
         fit together, see `simultaneous_fit`: at the medians other orbits may be nearer, or none may exist.
         """
-        theta = problem.median() if theta is None else theta
-        estimate = simultaneous_fit(problem, theta)
+        if problem.anchors:
+            return cls(problem, Simulator(problem, problem.anchors))
+        median = problem.median()
+        estimate = simultaneous_fit(problem, median)
         if estimate is not None and estimate.states:
             return cls(problem, Simulator.start(problem, estimate.theta, estimate.states))
-        return cls(problem, Simulator.start(problem, theta))
-
-    def anchored(self, theta: np.ndarray, guesses: Guesses | None = None) -> "LogPosterior":
-        """Return the density anchored at another θ (names,), solved from guesses or the present anchors."""
-        moved = self.simulator.anchored(theta) if guesses is None else Simulator.start(self.problem, theta, guesses)
-        return self.with_settings(simulator=moved)
+        return cls(problem, Simulator.start(problem, median))
 
     def with_settings(
         self, *, simulator: Simulator | None = None, coordinates: str | None = None, variances: str | None = None
@@ -249,45 +233,35 @@ class LogPosterior(SamplingCoordinates):
         The values do not depend on the number of threads, by default one per core.
         """
         simulation = self.simulator.solve(theta, threads, whole=True)
-        good = simulation.status == CONVERGED
-        count = np.count_nonzero(good)
-        if count == good.size:
-            return Evaluation(*self._log_likelihood(simulation, noise, threads), simulation.status)
-        log_prob, moments = self._nothing(len(theta))
-        if count:
-            log_prob[good], moments[good] = self._log_likelihood(simulation.at(good), noise[good], threads)
-        return Evaluation(log_prob, moments, simulation.status)
-
-    def _log_likelihood(
-        self, simulation: Simulation, noise: np.ndarray, threads: int | None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return log-likelihoods and moments of converged solutions."""
+        status, good = simulation.status, simulation.status == CONVERGED
+        if not (count := np.count_nonzero(good)):
+            return self._nothing(status)
+        if count < good.size:
+            simulation, noise = simulation.at(good), noise[good]
         residuals = self.comparisons.residuals(simulation, threads)
-        values = self.problem.likelihood(residuals, noise)
-        if not self.collapsed:
-            return values, np.empty((len(values), 0))
-        by_name = self.problem.likelihood.moments(residuals)
-        moments = np.stack([by_name[name] for name in self.collapsed], axis=-1)
-        values = values + np.sum(0.5 * moments + self._integrals(moments), axis=-1)
-        return np.where(np.isfinite(values), values, -np.inf), moments
+        values, moments = self.problem.likelihood(residuals, noise), np.empty((count, 0))
+        if self.collapsed:
+            by_name = self.problem.likelihood.moments(residuals)
+            moments = np.stack([by_name[name] for name in self.collapsed], axis=-1)
+            values = values + np.sum(0.5 * moments + self._integrals(moments), axis=-1)
+            values = np.where(np.isfinite(values), values, -np.inf)
+        return Evaluation(_placed(values, good, -np.inf), _placed(moments, good, np.nan), status)
 
-    def _nothing(self, points: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return log-densities and moments of points without a solution."""
-        return np.full(points, -np.inf), np.full((points, len(self.collapsed)), np.nan)
+    def _nothing(self, status: np.ndarray) -> Evaluation:
+        """Return the evaluation of points that all have the density zero."""
+        return Evaluation(np.full(len(status), -np.inf), np.full((len(status), len(self.collapsed)), np.nan), status)
 
     def at(self, theta: np.ndarray, noise: np.ndarray, threads: int | None = None) -> Evaluation:
         """Return the log-density over the coordinates at natural values; arguments as in `log_likelihood`."""
         prior = self.log_prior(theta, noise)
         inside = np.isfinite(prior)
-        count = np.count_nonzero(inside)
-        if count == inside.size:
-            likelihood, moments, status = self.log_likelihood(theta, noise, threads)
-            return Evaluation(prior + likelihood, moments, status)
-        (log_prob, moments), status = self._nothing(len(theta)), np.full(len(theta), CONVERGED)
-        if count:
-            likelihood, moments[inside], status[inside] = self.log_likelihood(theta[inside], noise[inside], threads)
-            log_prob[inside] = prior[inside] + likelihood
-        return Evaluation(log_prob, moments, status)
+        if not (count := np.count_nonzero(inside)):
+            return self._nothing(np.full(len(theta), CONVERGED))
+        if count < inside.size:
+            theta, noise, prior = theta[inside], noise[inside], prior[inside]
+        likelihood, moments, status = self.log_likelihood(theta, noise, threads)
+        parts = (prior + likelihood, -np.inf), (moments, np.nan), (status, CONVERGED)
+        return Evaluation(*(_placed(part, inside, outside) for part, outside in parts))
 
     def evaluate(self, points: np.ndarray, threads: int | None = 1) -> Evaluation:
         """Return the log-density at points (points, dimension), by default in one thread."""
@@ -320,17 +294,16 @@ class LogPosterior(SamplingCoordinates):
         here = Linearisation(theta, self.simulator, self.comparisons, polish=forward)
         if not here.converged:
             return -np.inf, *zeros, here.status
-        value = prior + float(self.problem.likelihood(here.residuals, noise))
+        value, by_residual, by_noise = self.problem.likelihood.value_and_gradients(here.residuals, noise)
         if not np.isfinite(value):
             return -np.inf, *zeros, CONVERGED
-        by_residual, by_noise = self.problem.likelihood.gradients(here.residuals, noise)
         if forward or any(o.multipliers for o in self.problem.observations.values()):
             here = here.anchored()
         by_theta = np.add.reduce(list(here.vjp(by_residual, adjoint=not forward).values()))
         by_theta, _ = self.add_prior(theta, by_theta)
         if not (np.isfinite(by_theta).all() and np.isfinite(by_noise).all()):
             return -np.inf, *zeros, SINGULAR
-        return value, by_theta, by_noise, CONVERGED
+        return prior + value, by_theta, by_noise, CONVERGED
 
     def linearise(self, theta: np.ndarray) -> Linearisation:
         """Solve at one θ (names,) from the present anchors, and return residuals and Jacobian there."""
@@ -344,10 +317,6 @@ class LogPosterior(SamplingCoordinates):
         prior = self.problem.joint_prior.log_prob(here.theta) + np.sum(np.log(here.theta[self.logarithmic]))
         likelihood = self.problem.likelihood
         return float((likelihood(here.residuals, noise, log_variance_factor) + likelihood.log_prior(noise)) + prior)
-
-    def solve(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
-        """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""
-        return self.simulator.solutions(theta)
 
     def outputs(self, theta: np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
         """Return the predicted outputs at θ (draws, names) and whether the solves converged, see `Problem.outputs`."""
@@ -382,6 +351,15 @@ class LogPosterior(SamplingCoordinates):
         columns |= {name: np.log(variances[..., i]) for i, name in enumerate(self.collapsed)}
         noise = np.stack([columns[name] for name in self.problem.free_noise], axis=-1)
         return np.concatenate([points[..., :count], noise], axis=-1), log_prob
+
+
+def _placed(values: np.ndarray, where: np.ndarray, outside: float) -> np.ndarray:
+    """Return values (count, …) at the true places of a mask (points,), and another value elsewhere."""
+    if len(values) == where.size:
+        return values
+    result = np.full((where.size, *values.shape[1:]), outside, dtype=values.dtype)
+    result[where] = values
+    return result
 
 
 def collapsible(problem: Description) -> tuple[str, ...]:

@@ -63,6 +63,11 @@ class Problem(Description):
         harmonics kept, as many amplitudes as these. The true inputs, with a flat prior, are integrated out, linearised
         about the estimate; see `MapEstimate.input_errors`. "joint": as "measured", but the amplitudes of the errors are
         parameters of each experiment, ``force_mean``, ``force_cos1``, ``force_sin1``, …, in the unit of the input.
+    input_errors : mapping of str to InputErrors, optional
+        Errors of the inputs by experiment, linearised about an estimate, see `with_input_errors`.
+    anchors : mapping of str to InitialOrbit, optional
+        Orbits from which the periodic solves of each experiment start, see `anchored`; by default near the medians of
+        the priors.
 
     Raises
     ------
@@ -90,22 +95,10 @@ class Problem(Description):
     ((3,), 'converged')
     """
 
-    _anchors: Simulator | None = None
-
-    def _with(self, input_errors: Mapping[str, InputErrors], anchors: Simulator | None) -> "Problem":
-        """Return the problem that the constructor has validated, with a density of other errors of inputs or anchors.
-
-        All that depends on them is computed anew.
-        """
-        other = object.__new__(type(self))
-        given = {n: v for n, v in vars(self).items() if not isinstance(getattr(type(self), n, None), cached_property)}
-        vars(other).update(given, input_errors=dict(input_errors), _anchors=anchors)
-        return other
-
     @cached_property
     def _densities(self) -> dict[tuple[str, str], LogPosterior]:
         """The densities that were asked for, by coordinates and variances."""
-        return {}
+        return {(RIDGE_COORDINATES, SAMPLED): LogPosterior.start(self)}
 
     def density(self, *, coordinates: str = RIDGE_COORDINATES, variances: str = SAMPLED) -> LogPosterior:
         """Return the log-posterior over the sampling coordinates.
@@ -126,9 +119,7 @@ class Problem(Description):
         """
         settings = coordinates, variances
         if settings not in self._densities:
-            first = next(iter(self._densities.values()), None)
-            if first is None:
-                first = LogPosterior(self, self._anchors) if self._anchors else LogPosterior.start(self)
+            first = next(iter(self._densities.values()))
             self._densities[settings] = first.with_settings(coordinates=coordinates, variances=variances)
         return self._densities[settings]
 
@@ -151,9 +142,10 @@ class Problem(Description):
             For unknown or missing names, or arrays of another length.
         """
         values = self.vector(theta)
-        if guesses is None:
-            return self._with(self.input_errors, self.density().simulator.anchored(values))
-        return self._with(self.input_errors, Simulator.start(self, values, guesses))
+        simulator = (
+            self.density().simulator.anchored(values) if guesses is None else Simulator.start(self, values, guesses)
+        )
+        return self.replace(input_errors=self.input_errors, anchors=simulator.anchors)
 
     def with_input_errors(self, errors: Mapping[str, InputErrors]) -> "Problem":
         """Return the same problem with the errors of its inputs, linearised about an estimate.
@@ -172,20 +164,9 @@ class Problem(Description):
         Raises
         ------
         ValueError
-            For an unknown experiment.
+            For an unknown experiment, or errors of other data.
         """
-        if same(self.input_errors, errors):
-            return self
-        for name in errors:
-            _checks.one_of("errors", name, [e.name for e in self.experiments])
-        if not (self._last and same(self._last[0].input_errors, errors)):
-            self._last[:] = [self._with(errors, None)]
-        return self._last[0]
-
-    @cached_property
-    def _last(self) -> list["Problem"]:
-        """The last problem of `with_input_errors`, whose anchors are kept."""
-        return []
+        return self if same(self.input_errors, errors) else self.replace(input_errors=errors)
 
     def planned(self, experiment: Experiment, noise: Mapping[str, float]) -> "Problem":
         """Return the problem of an experiment that may be made, alone, with exact inputs.
@@ -208,6 +189,7 @@ class Problem(Description):
         changes = {
             "experiments": [experiment], "priors": {name: self.joint_prior.marginals[name] for name in acting},
             "fixed": {name: {run: v[run]} for name, v in self.fixed.items() if run in v} | known, "input_noise": EXACT,
+            "input_errors": None, "anchors": None,
         }  # fmt: skip
         return Problem(**written_out(self) | changes)
 
@@ -338,4 +320,4 @@ class Problem(Description):
         dict of str to PeriodicSolution
             By experiment; a solve that fails has another status than "converged".
         """
-        return self.density().solve(self.vector(theta))
+        return self.density().simulator.solutions(self.vector(theta))

@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.density.initial_orbits import with_guesses
+from bayesperiodic.density.initial_orbits import Guesses, experiments_guesses
 from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
 from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
@@ -21,35 +21,32 @@ from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.parameters import ParameterMaps
 
-Guesses = Mapping[str, Mapping[str, np.ndarray]]
+NO_HISTORY = np.empty((0, 3))
+
+
+class InitialOrbit(NamedTuple):
+    """Orbit from which the periodic solves of an experiment start."""
+
+    guess: Any  # states (points,) by name, or "static", from which to solve where the anchor fails
+    anchor: Anchor
+    derivatives: Sensitivities | None  # of outputs and frequency by all parameters; None where they do not exist
 
 
 class Simulator:
-    """Periodic solutions of a problem's experiments at any θ, solved from anchors, and their derivatives at one θ.
+    """Periodic solutions of a problem's experiments at any θ, solved from anchors, and their derivatives at one θ."""
 
-    By experiment: the guesses are states (points,), or "static", to solve from where the anchors fail; the derivatives
-    are those of outputs and frequency at the anchors by all parameters, None where they do not exist.
-    """
-
-    def __init__(
-        self,
-        problem: Description,
-        guesses: Mapping[str, Any],
-        anchors: Mapping[str, Anchor],
-        derivatives: Mapping[str, Sensitivities | None],
-    ):
-        self.problem, self._guesses, self._anchors, self._derivatives = problem, guesses, anchors, derivatives
+    def __init__(self, problem: Description, anchors: Mapping[str, InitialOrbit]):
+        self.problem, self.anchors = problem, anchors
 
     @classmethod
     def start(cls, problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> "Simulator":
         """Return the simulator anchored at θ (names,), solved from guesses, the experiments' own or the equilibrium."""
-        if guesses is not None:
+        if guesses is None:
+            chosen: dict[str, Any] = experiments_guesses(problem, theta)
+        else:
             _checks.same_names("guesses", guesses, [e.name for e in problem.experiments])
-        experiments = with_guesses(problem, theta).experiments if guesses is None else problem.experiments
-        chosen = {
-            e.name: (e if guesses is None else replace(e, guess=guesses[e.name])).guess or "static" for e in experiments
-        }
-        return cls(problem, chosen, {}, {}).anchored(theta)
+            chosen = {e.name: replace(e, guess=guesses[e.name]).guess for e in problem.experiments}
+        return cls(problem, {name: _initial_orbit(problem, name, theta, g or "static") for name, g in chosen.items()})
 
     def __getstate__(self) -> dict[str, Any]:
         # The factors at the anchors are computed again; the anchors are kept to the last bit.
@@ -57,35 +54,17 @@ class Simulator:
 
     def anchored(self, theta: np.ndarray) -> "Simulator":
         """Return the simulator anchored at θ (names,), solved from the present anchors, else from the guesses."""
-        simulation = self.solve(theta[None], keep=True, polish=True) if self._anchors else None
-        anchors: dict[str, Anchor] = {}
-        derivatives: dict[str, Sensitivities | None] = {}
-        for name, equations in self.problem.equations.items():
-            parameters = self.problem.parameters(theta[None], name)[0]
-            if simulation is not None and simulation.statuses(name)[0] == CONVERGED:
-                here = equations.at_frequency(float(simulation.response(name).frequency[0]))
-                z = simulation.z(name)[0]
-            else:
-                here, (z, code, *_) = self._from_guess(name, parameters)
-                if code != CONVERGED:
-                    anchors[name], derivatives[name] = Anchor(parameters, z, equations.frequency), None
-                    continue
-            moving = np.flatnonzero(self.problem.parameter_maps[name].slopes(theta)[:-1].any(axis=1))
-            directions = np.eye(parameters.size)[moving]
-            derivative = directional_sensitivities(here, z, parameters, directions)
-            anchors[name] = Anchor.of(here, parameters, z, derivative, moving)
-            derivatives[name] = derivative and derivative._replace(
-                outputs=np.tensordot(directions, derivative.outputs, (0, 0)),
-                frequency=directions.T @ derivative.frequency,
-            )
-        return Simulator(self.problem, self._guesses, anchors, derivatives)
+        simulation, anchors = self.solve(theta[None], keep=True, polish=True), {}
+        for name, orbit in self.anchors.items():
+            converged = simulation.statuses(name)[0] == CONVERGED
+            solved = self._solved(simulation, name) if converged else None
+            anchors[name] = _initial_orbit(self.problem, name, theta, orbit.guess, solved)
+        return Simulator(self.problem, anchors)
 
-    def _from_guess(self, experiment: str, parameters: np.ndarray) -> tuple[PeriodicEquations, Solved]:
-        """Solve from the experiment's guess, with all fallbacks."""
-        equations, guess = self.problem.equations[experiment], self._guesses[experiment]
-        if self.problem.model.autonomous:
-            return solve_free(equations, parameters, guess)[:2]
-        return equations, solve_driven(equations, parameters, guess)[0]
+    def _solved(self, simulation: Simulation, experiment: str, i: int = 0) -> tuple[PeriodicEquations, np.ndarray]:
+        """Return the equations at the frequency of one of the solves, and its z."""
+        frequency = float(simulation.response(experiment).frequency[i])
+        return self.problem.equations[experiment].at_frequency(frequency), simulation.z(experiment)[i]
 
     @cached_property
     def groups(self) -> list[tuple[Experiment, ...]]:
@@ -108,7 +87,7 @@ class Simulator:
             (
                 group,
                 ParameterMaps([self.problem.parameter_maps[e.name] for e in group]),
-                kind([self.problem.equations[e.name] for e in group], [self._anchors[e.name] for e in group]),
+                kind([self.problem.equations[e.name] for e in group], [self.anchors[e.name].anchor for e in group]),
                 any(self.problem.observations[e.name].multipliers for e in group),
             )
             for group in self.groups
@@ -149,12 +128,11 @@ class Simulator:
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
         """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""
-        anchor, parameters = self._anchors[experiment], self.problem.parameters(theta[None], experiment)[0]
-        return (
-            PATH_LOST
-            if anchor.sensitivities is None
-            else path_outcome(self.problem.equations[experiment], anchor, parameters)
-        )
+        anchor = self.anchors[experiment].anchor
+        if anchor.sensitivities is None:
+            return PATH_LOST
+        parameters = self.problem.parameters(theta[None], experiment)[0]
+        return path_outcome(self.problem.equations[experiment], anchor, parameters)
 
     def _log_multipliers(
         self, experiment: Experiment, z: np.ndarray, frequency: np.ndarray, parameters: np.ndarray, status: np.ndarray
@@ -178,24 +156,22 @@ class Simulator:
     def largest_multipliers(self, theta: np.ndarray, experiment: str, simulation: Simulation) -> np.ndarray:
         """Return the modulus (solves,) of the largest multiplier at θ (solves, names); NaN where the solve failed."""
         parameters, result = self.problem.parameters(theta, experiment), np.full(len(theta), np.nan)
-        frequency, z = simulation.response(experiment).frequency, simulation.z(experiment)
-        for i in np.flatnonzero(simulation.statuses(experiment) == CONVERGED):
-            equations = self.problem.equations[experiment].at_frequency(float(frequency[i]))
-            result[i] = np.abs(orbit_multipliers(equations, parameters[i], z[i], 1)).max(initial=0.0)
+        for i in np.flatnonzero(simulation.statuses(experiment) == CONVERGED).tolist():
+            equations, z = self._solved(simulation, experiment, i)
+            result[i] = np.abs(orbit_multipliers(equations, parameters[i], z, 1)).max(initial=0.0)
         return result
 
     def solutions(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
         """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""
         simulation, solutions = self.solve(theta[None], keep=True, polish=True), {}
-        for name, equations in self.problem.equations.items():
-            here = equations.at_frequency(float(simulation.response(name).frequency[0]))
-            parameters, code = self.problem.parameters(theta[None], name)[0], int(simulation.statuses(name)[0])
-            solutions[name] = describe(here, parameters, Solved(simulation.z(name)[0], code, np.empty((0, 3))))
+        for name in self.anchors:
+            (here, z), code = self._solved(simulation, name), int(simulation.statuses(name)[0])
+            solutions[name] = describe(here, self.problem.parameters(theta[None], name)[0], Solved(z, code, NO_HISTORY))
         return solutions
 
     def jacobian(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:
         """Return the derivatives of a response at the anchor by θ, (names, …); None where they do not exist."""
-        slopes, derivative = self.problem.parameter_maps[experiment].slopes(theta), self._derivatives[experiment]
+        slopes, derivative = self.problem.parameter_maps[experiment].slopes(theta), self.anchors[experiment].derivatives
         if derivative is None:
             return None
         outputs = np.tensordot(slopes[:-1], derivative.outputs, (0, 0))
@@ -206,7 +182,8 @@ class Simulator:
 
     def _multiplier_jacobian(self, theta: np.ndarray, experiment: str, z: np.ndarray, response: Response) -> np.ndarray:
         """Return ∂ log|μ|/∂θ at the anchor, (names, multipliers)."""
-        anchor, directions = self._anchors[experiment], self.problem.parameter_maps[experiment].slopes(theta)[:-1].T
+        anchor = self.anchors[experiment].anchor
+        directions = self.problem.parameter_maps[experiment].slopes(theta)[:-1].T
         assert anchor.sensitivities is not None and anchor.frequency_sensitivities is not None
         equations = self.problem.equations[experiment].at_frequency(float(response.frequency))
         parameters, count = self.problem.parameters(theta[None], experiment)[0], response.log_multipliers.size
@@ -253,6 +230,33 @@ class Simulator:
         return result
 
 
+def _initial_orbit(
+    problem: Description,
+    experiment: str,
+    theta: np.ndarray,
+    guess: Any,
+    solved: tuple[PeriodicEquations, np.ndarray] | None = None,
+) -> InitialOrbit:
+    """Return the orbit at θ (names,): one that is solved, or solved from the guess with all fallbacks."""
+    equations, parameters = problem.equations[experiment], problem.parameters(theta[None], experiment)[0]
+    if solved is None:
+        if problem.model.autonomous:
+            here, (z, code, *_), *_ = solve_free(equations, parameters, guess)
+        else:
+            here, (z, code, *_) = equations, solve_driven(equations, parameters, guess)[0]
+        if code != CONVERGED:
+            return InitialOrbit(guess, Anchor(parameters, z, equations.frequency), None)
+        solved = here, z
+    here, z = solved
+    moving = np.flatnonzero(problem.parameter_maps[experiment].slopes(theta)[:-1].any(axis=1))
+    directions = np.eye(parameters.size)[moving]
+    derivative = directional_sensitivities(here, z, parameters, directions)
+    by_all = derivative and derivative._replace(
+        outputs=np.tensordot(directions, derivative.outputs, (0, 0)), frequency=directions.T @ derivative.frequency
+    )
+    return InitialOrbit(guess, Anchor.of(here, parameters, z, derivative, moving), by_all)
+
+
 def orbit_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int) -> np.ndarray:
     """Return the `count` largest multipliers of a solution z, or fewer, without an autonomous orbit's trivial 1."""
     if not count:
@@ -282,7 +286,7 @@ def _leading_multipliers_directly(
 
 
 def _described(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> PeriodicSolution:
-    return describe(equations, parameters, Solved(z, CONVERGED, np.empty((0, 3))), sensitivities=False)
+    return describe(equations, parameters, Solved(z, CONVERGED, NO_HISTORY), sensitivities=False)
 
 
 def _without_trivial(solution: PeriodicSolution, values: np.ndarray) -> np.ndarray:

@@ -178,12 +178,8 @@ def adequacy(
             "spectrum": ASSUMED_SPECTRUM if white[0].spectrum(i) is None else MEASURED_SPECTRUM,
             "amplitude": _amplitude(problem, block, replicates),
         }
-    rows[ALL] = {
-        "experiment": ALL,
-        "channel": ALL,
-        "spectrum": "",
-        "consistency": np.mean([w.consistency() for w in white]),
-    }
+    consistent = np.mean([w.consistency() for w in white])
+    rows[ALL] = {"experiment": ALL, "channel": ALL, "spectrum": "", "consistency": consistent}
     columns = ["experiment", "channel", *ADEQUACY_TESTS, "harmonic", "model_error_share", "spectrum"]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
     adjusted = adjusted_p(table)
@@ -348,9 +344,8 @@ def used(block: Block, *parts: np.ndarray) -> list[np.ndarray]:
 def _size(problem: Problem, here: Linearisation, index: int, white: Whitened) -> tuple[float, float]:
     """Return p of a residual larger than the measured or known noise, and the fraction of model error."""
     block = white.blocks[index]
-    if not _testable(here.residuals[index], here.jacobian[index]):
-        return NOT_TESTED, NOT_TESTED
-    if not (block.measured > 0.0 or white.groups[index] in white.known):
+    known = block.measured > 0.0 or white.groups[index] in white.known
+    if not (known and _testable(here.residuals[index], here.jacobian[index])):
         return NOT_TESTED, NOT_TESTED
     if block.measured > 0.0:
         unexplained = white.in_measured_sd(index)
@@ -384,9 +379,9 @@ def measured_spectrum(experiment: Experiment, block: Block) -> tuple[np.ndarray,
     """
     variance = experiment.amplitude_variance.get(block.channel)
     freedom = experiment.amplitude_freedom.get(block.channel)
-    if not block.spectral or variance is None or freedom is None or block.size != 2 * variance.size - 1:
+    if not block.spectral or variance is None or freedom is None:
         return None
-    if not np.all(variance > 0.0):
+    if block.size != 2 * variance.size - 1 or not np.all(variance > 0.0):
         return None
     return block.size * variance * np.where(np.arange(variance.size) == 0, 1.0, 0.25), freedom
 

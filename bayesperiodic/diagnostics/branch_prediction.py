@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -112,20 +111,10 @@ class BranchPrediction(Result):
                 stable[i] = np.where(np.isnan(every[i]), np.nan, np.interp(grid, value, 1.0 * ordered["stable"]))
             fraction = np.mean(~np.isnan(every), axis=0)
             kept = fraction >= LEAST_FRACTION
-            median, low, high = np.nanquantile(every[:, kept], BAND_QUANTILES, axis=0)
-            rows.append(
-                pd.DataFrame(
-                    {
-                        "part": part,
-                        "value": grid[kept],
-                        "median": median,
-                        "low": low,
-                        "high": high,
-                        "stable": np.nanmean(stable[:, kept], axis=0) > LEAST_FRACTION,
-                        "fraction": fraction[kept],
-                    }
-                )
-            )
+            band = pd.DataFrame({"part": part, "value": grid[kept]})
+            band[["median", "low", "high"]] = np.nanquantile(every[:, kept], BAND_QUANTILES, axis=0).T
+            band["stable"] = np.nanmean(stable[:, kept], axis=0) > LEAST_FRACTION
+            rows.append(band.assign(fraction=fraction[kept]))
         return pd.concat(rows, ignore_index=True)
 
     def __repr__(self) -> str:
@@ -232,16 +221,7 @@ def _curve(draw: int, branches: Sequence[Branch]) -> pd.DataFrame:
     folds = (table["kind"] == FOLD).to_numpy()
     table.insert(0, "draw", draw)
     table.insert(1, "part", np.cumsum(folds) - folds)
-    # A fold is the end of one part and the start of the next.
-    return _with_shared_folds(table)
-
-
-def _with_shared_folds(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a curve in which every fold is also the first row of the part after it, without its kind."""
-    ends = [0, *(np.flatnonzero(table["kind"] == FOLD) + 1), len(table)]
-    pieces = []
-    for i, (begin, end) in enumerate(pairwise(ends)):
-        if i:
-            pieces.append(table.iloc[[begin - 1]].assign(part=i, kind=""))
-        pieces.append(table.iloc[begin:end])
-    return pd.concat(pieces, ignore_index=True)
+    # A fold is the end of one part and, without its kind, the start of the next.
+    starts = table[folds].assign(kind="")
+    starts["part"] += 1
+    return pd.concat([starts, table]).sort_values("part", kind="stable", ignore_index=True)

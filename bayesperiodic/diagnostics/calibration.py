@@ -25,6 +25,7 @@ from bayesperiodic.data.recording import Recording
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import holm
 from bayesperiodic.diagnostics.verdicts import NARROW, WIDE
+from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import FROM_CYCLES, JOINT, error_waves, noisy_inputs
@@ -429,7 +430,7 @@ def _ranks(
     """Return the ranks of the truth in the Laplace approximation and among the draws."""
     problem = campaign.problem.with_experiments(experiments)
     try:
-        fit = map_estimate(problem, checks=False, progress=False)
+        fit = with_joint(problem, map_estimate(problem, checks=False, progress=False))
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
         return {"status": "no estimate", "error": str(error)}
     result: dict[str, Any] = {"map": fit.status, "stop_rule": False}

@@ -1,6 +1,7 @@
 """Candidate terms that a model may lack: products, absolute values, signs and lags of what it contains."""
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass
@@ -11,7 +12,8 @@ import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic.models.model import DERIVATIVES, Model, Names, smooth_abs, smooth_sign, with_derivatives
+from bayesperiodic.models.elements import smooth_abs, smooth_sign
+from bayesperiodic.models.model import DERIVATIVES, Model, Names, with_derivatives
 from bayesperiodic.models.units import Unit, parsed, product, unit_of, written
 
 HIGHEST_DEGREE, HIGHEST_POWER = 3, 5
@@ -180,10 +182,7 @@ def _written(model: Model, expression: sp.Expr) -> str:
 
 
 def _product(names: Iterable[str]) -> str:
-    powers: dict[str, int] = {}
-    for name in names:
-        powers[name] = powers.get(name, 0) + 1
-    return "*".join(name if power == 1 else f"{name}**{power}" for name, power in powers.items())
+    return "*".join(name if power == 1 else f"{name}**{power}" for name, power in Counter(names).items())
 
 
 def values(

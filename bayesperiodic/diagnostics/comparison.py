@@ -28,6 +28,7 @@ from bayesperiodic.diagnostics.verdicts import (
     WRONG_SHAPE,
     Sample,
 )
+from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.modes import notable
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.problem.fingerprint import check_results
@@ -187,7 +188,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     """
     _checks.instance("problem", problem, Problem)
     _checks.one_of("coordinates", coordinates, COORDINATES)
-    problem = check_results(problem, fit=fit, posterior=posterior)
+    problem, fit = check_results(problem, fit=fit, posterior=posterior), with_joint(problem, fit)
     scored = _scores(problem, fit, posterior, coordinates)
     if scored is None:
         raise ValueError(

@@ -17,8 +17,9 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import misfit
 from bayesperiodic.diagnostics.design import FurtherExperiment, Information, default_candidates, rank_candidates
 from bayesperiodic.diagnostics.predictive import draws_of
+from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
-from bayesperiodic.estimation.modes import NOTABLE, Mode, notable
+from bayesperiodic.estimation.modes import NOTABLE, notable
 from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
@@ -271,7 +272,7 @@ def identifiability(
     {'c': 'determined', 'k': 'determined'}
     """
     problem = check_results(problem, fit=fit, **({} if posterior is None else {"posterior": posterior}))
-    information, structure = Information.of(problem, fit), structure_of(problem)
+    fit, information, structure = with_joint(problem, fit), Information.of(problem, fit), structure_of(problem)
     shapes = profile_of(problem, fit).shape if profile is True else profile.shape if profile else {}
     options = default_candidates(problem) if candidates is None else [FurtherExperiment(*c) for c in candidates]
     experiments, directions = rank_candidates(problem, fit, information, options), _directions(information)
@@ -368,7 +369,7 @@ def _widths(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ratio of posterior to prior sd of each coordinate, and the Monte Carlo error of the contraction."""
     if posterior is None:
-        names, modes, masses = list(problem.names), _optima(fit), fit.modes["mass"].to_numpy()
+        names, modes, masses = list(problem.names), [fit, *fit.other_modes], fit.modes["mass"].to_numpy()
         variances = np.array([np.diag(mode.joint_covariance.loc[names, names]) for mode in modes])
         means = information.coordinates(np.array([list(mode.theta.values()) for mode in modes]))
         variances += (means - masses @ means) ** 2
@@ -379,10 +380,6 @@ def _widths(
     # The standard error of half the central 68 % interval of a normal sample is 1.1 times that of its sd.
     size = np.array([posterior.ess[name] for name in problem.names])
     return widths, 2.0 * widths**2 * 1.1 / np.sqrt(2.0 * size)
-
-
-def _optima(fit: MapEstimate) -> list[MapEstimate | Mode]:
-    return [fit, *fit.other_modes]
 
 
 def _half_width(values: np.ndarray) -> np.ndarray:
@@ -401,7 +398,7 @@ def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, n
         return np.nan, np.nan
     if posterior is None:
         freedom = min(fit.degrees_of_freedom[name], 1e9)
-        fractions = [float(stdtr(freedom, -mode.theta[name] / mode.sd[name])) for mode in _optima(fit)]
+        fractions = [float(stdtr(freedom, -mode.theta[name] / mode.sd[name])) for mode in [fit, *fit.other_modes]]
         return float(fit.modes["mass"].to_numpy() @ fractions), 0.0
     share = float(np.mean(posterior.draws(name) < 0.0))
     size = posterior.ess[name]
@@ -414,7 +411,7 @@ def _size_known(problem: Problem, fit: MapEstimate, posterior: Posterior | None,
     column = problem.names.index(name)
     prior = np.abs(problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))[:, column])
     if posterior is None:
-        generator, modes = np.random.default_rng(1), _optima(fit)
+        generator, modes = np.random.default_rng(1), [fit, *fit.other_modes]
         chosen = generator.choice(len(modes), PRIOR_DRAWS, p=fit.modes["mass"])
         centres, widths = np.array([(mode.theta[name], mode.sd[name]) for mode in modes]).T
         values = centres[chosen] + widths[chosen] * generator.standard_normal(PRIOR_DRAWS)

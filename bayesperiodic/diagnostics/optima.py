@@ -13,7 +13,6 @@ from bayesperiodic.estimation.gauss_newton import NO_CURVATURE, Iterate, Objecti
 from bayesperiodic.estimation.map_estimate import nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.priors.single import LogNormal, Normal
 from bayesperiodic.problem.parameters import local_names
 
@@ -67,14 +66,10 @@ class Optimum:
     names: tuple[str, ...]  # of the terms' coefficients
 
     @cached_property
-    def solutions(self) -> dict[str, PeriodicSolution]:
-        """The periodic solutions by experiment."""
-        return self.iterate.here.simulator.solutions(self.iterate.theta)
-
-    @cached_property
     def orbits(self) -> dict[str, dict[str, np.ndarray]]:
         """The states of the periodic solutions by experiment."""
-        return {name: solution.states for name, solution in self.solutions.items()}
+        solutions = self.iterate.here.simulator.solutions(self.iterate.theta)
+        return {name: solution.states for name, solution in solutions.items()}
 
     @property
     def curved(self) -> bool:

@@ -56,7 +56,11 @@ class ScoreTests:
         effects = _effects(problem, optimum.theta, solutions, terms)
         finite = np.isfinite(np.concatenate(effects, axis=1)).all(axis=1)
         effects = [np.where(finite[:, None], effect, 0.0) for effect in effects]
-        self.widths = _widths(likelihood.whitened(_deviations(problem), noise), likelihood.whitened(effects, noise))
+        data: list[np.ndarray] = []  # components of the measured outputs less their means, one array (size,) a block
+        for e in problem.experiments:
+            seen = problem.observations[e.name]
+            data += seen.errors(np.stack([e.outputs[c] - e.outputs[c].mean() for c in seen.channels], axis=-1))
+        self.widths = _widths(likelihood.whitened(data, noise), likelihood.whitened(effects, noise))
         joined = [np.concatenate([s, c]) for s, c in zip(here.jacobian, effects, strict=True)]
         white, parameters = Whitened(problem, Compared(list(here.residuals), joined), noise), len(problem.names)
         plain = _projected(white.parts, parameters)
@@ -191,15 +195,6 @@ def _effects(
             caused[finite] = predicted_changes(problem, e, equations, theta, z, moved)[finite]
         effects += np.split(caused, np.cumsum(sizes)[:-1], axis=1)
     return effects
-
-
-def _deviations(problem: Problem) -> list[np.ndarray]:
-    """Return the components of the measured outputs less their means, one array (size,) a block."""
-    deviations: list[np.ndarray] = []
-    for e in problem.experiments:
-        seen = problem.observations[e.name]
-        deviations += seen.errors(np.stack([e.outputs[c] - e.outputs[c].mean() for c in seen.channels], axis=-1))
-    return deviations
 
 
 def _widths(data: Sequence[np.ndarray], effects: Sequence[np.ndarray]) -> np.ndarray:

@@ -10,7 +10,7 @@ import pandas as pd
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic.density.log_posterior import NATURAL, Linearisation, LogPosterior
+from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import Simulator
 from bayesperiodic.estimation.conflict import prior_conflict
@@ -25,7 +25,7 @@ from bayesperiodic.estimation.covariance import (
     uncertainty,
 )
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, bias_correction
-from bayesperiodic.estimation.laplace import IN_COMBINATION, SILENT, undetermined
+from bayesperiodic.estimation.laplace import IN_COMBINATION, SILENT, joint_laplace, undetermined
 from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit, Whiteness, sds, written
 from bayesperiodic.estimation.units import unit_error
 from bayesperiodic.likelihood.input_noise import EXACT, FEWEST_CYCLES, ROUGH
@@ -102,6 +102,15 @@ def at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate]
             "this problem."
         )
     return objective, objective.anchored(peak)
+
+
+def with_joint(problem: Problem, fit: MapEstimate) -> MapEstimate:
+    """Return the estimate with its joint Laplace approximation, which is computed if there is none yet."""
+    if fit.joint is not None:
+        return fit
+    objective, peak = at_estimate(problem, fit)
+    sampled = objective.density.with_settings(coordinates=RIDGE_COORDINATES)
+    return replace(fit, joint=joint_laplace(sampled, peak))
 
 
 def checked(

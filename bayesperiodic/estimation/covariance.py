@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import lu_factor, lu_solve
+from scipy.special import softmax
 
 from bayesperiodic import _fourier
 from bayesperiodic._linalg import TINY, covariance_eigh, hessian_scale, scaled
@@ -46,19 +46,12 @@ def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarra
     """Return C (J + P) C, with C the inverse of H of eq. (8), P the prior's curvature and J the scores' variance.
 
     J takes the variance of each Fourier component from the residual: a first-order autoregressive spectrum, or white
-    noise, is fitted to it, the residual is divided by that spectrum (prewhitening, [1]_), and the remaining spectrum is
-    smoothed over neighbouring harmonics. Most outputs depend on the low harmonics, which the fit removes from the
-    residual. Therefore the spectrum is fitted by restricted likelihood [2]_, with the parameters integrated out, J is
-    averaged over the posterior of the correlation length, and raised for the few values behind each smoothed one. It is
-    at least what the known noise of the inputs causes. Components that are no Fourier components keep the variance of
-    the noise model.
-
-    References
-    ----------
-    .. [1] D. W. K. Andrews, J. C. Monahan, An improved heteroskedasticity and autocorrelation consistent covariance
-       matrix estimator, Econometrica 60 (1992) 953-966.
-    .. [2] D. A. Harville, Maximum likelihood approaches to variance component estimation and to related problems,
-       Journal of the American Statistical Association 72 (1977) 320-338.
+    noise, is fitted to it, the residual is divided by that spectrum (prewhitening, D. W. K. Andrews, J. C. Monahan,
+    Econometrica 60 (1992) 953-966), and the remaining spectrum is smoothed over neighbouring harmonics. Most outputs
+    depend on the low harmonics, which the fit removes from the residual. Therefore the spectrum is fitted by restricted
+    likelihood (see `bias_correction`), with the parameters integrated out, J is averaged over the posterior of the
+    correlation length, and raised for the few values behind each smoothed one. It is at least what the known noise of
+    the inputs causes. Components that are no Fourier components keep the variance of the noise model.
     """
     likelihood, prior = problem.likelihood, problem.joint_prior.curvature(estimate.theta)
     changes, residuals = (
@@ -136,12 +129,7 @@ def _residual_variance(
     misfit = square.sum(axis=1) / size + np.einsum("ga,ab,gb->g", step, others, step) + 2.0 * step @ score
     logarithms = block.weight * np.sum(np.log(size[:, None] * shape), axis=1) + np.linalg.slogdet(total)[1]
     ratios = [_smoothed(block, *one) for one in zip(square / size[:, None], left, strict=True)]
-    return _probabilities(log_prior - 0.5 * (misfit + logarithms)) @ (size[:, None] * shape * ratios)
-
-
-def _probabilities(log_weights: np.ndarray) -> np.ndarray:
-    weights = np.exp(log_weights - log_weights.max())
-    return weights / weights.sum()
+    return softmax(log_prior - 0.5 * (misfit + logarithms)) @ (size[:, None] * shape * ratios)
 
 
 def _shapes(block: Block, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -220,15 +208,11 @@ def uncertainty(problem: Problem, estimate: Iterate, log_variance_factor: float 
 
 
 def degrees_of_freedom(inverse: np.ndarray, parts: Mapping[str, VariancePart]) -> np.ndarray:
-    """Return the degrees of freedom of Student's t of each parameter (names,), by Satterthwaite's approximation [1]_.
+    """Return the degrees of freedom of Student's t of each parameter (names,), by Satterthwaite's approximation.
 
     The variance of θ_i, the diagonal of C, is the sum of the parts of all unknown variances, and of what known
-    variances and the prior are responsible for. An estimate from ν values has its relative uncertainty √(2/ν).
-
-    References
-    ----------
-    .. [1] F. E. Satterthwaite, An approximate distribution of estimates of variance components, Biometrics Bulletin 2
-       (1946) 110-114.
+    variances and the prior are responsible for. An estimate from ν values has its relative uncertainty √(2/ν) (F. E.
+    Satterthwaite, Biometrics Bulletin 2 (1946) 110-114).
     """
     uncertain = np.zeros(len(inverse))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -262,16 +246,11 @@ def with_uncertain_noise(
     """Return the covariance of θ (names, names) with uncertain noise parameters, `parts` those of the variances.
 
     Unknown variances make the weights of the channels and of the prior uncertain, which increases the covariance by
-    4 (C F C − C F C F C)/ν each [1]_, nothing where the values behind one variance determine θ alone; Student's t
-    accounts for the rest. For unknown shapes of the spectrum θ is estimated again by linear least squares for shapes
-    from the whole support of their prior. Their posterior is that of the restricted likelihood (Harville, see
-    `robust_covariance`), with θ integrated out; the covariance is that of the mixture about the estimate. The changes
-    of the covariance by several channels are added.
-
-    References
-    ----------
-    .. [1] M. G. Kenward, J. H. Roger, Small sample inference for fixed effects from restricted maximum likelihood,
-       Biometrics 53 (1997) 983-997.
+    4 (C F C − C F C F C)/ν each (M. G. Kenward, J. H. Roger, Biometrics 53 (1997) 983-997), nothing where the values
+    behind one variance determine θ alone; Student's t accounts for the rest. For unknown shapes of the spectrum θ is
+    estimated again by linear least squares for shapes from the whole support of their prior. Their posterior is that of
+    the restricted likelihood (see `bias_correction`), with θ integrated out; the covariance is that of the mixture
+    about the estimate. The changes of the covariance by several channels are added.
     """
     shaped = [group for group in problem.likelihood.groups() if _is_shaped(problem, *group)]
     if not np.all(np.diag(covariance) > 0.0):
@@ -316,12 +295,8 @@ def _with_errors(problem: Problem, estimate: Iterate, covariance: np.ndarray) ->
     likelihood, scale = problem.likelihood, np.sqrt(np.diag(covariance))
     count, first = sum(one.parts[0].shape[1] for one in likelihood.shared), scale.size
     changes = [np.pad(s * scale[:, None], ((0, count), (0, 0))) for s in estimate.here.jacobian]
-    prior = problem.joint_prior.curvature(estimate.theta)
-    if not count:
-        hessian = scaled(information(problem, estimate)[0] + prior, scale)
-        return _Linear(scale, hessian, changes, list(estimate.here.residuals))
     hessian = np.eye(scale.size + count)
-    hessian[:first, :first] = scaled(prior, scale)
+    hessian[:first, :first] = scaled(problem.joint_prior.curvature(estimate.theta), scale)
     for one in likelihood.shared:
         last = first + one.parts[0].shape[1]
         for b, part in zip(one.members, one.parts, strict=True):
@@ -349,22 +324,19 @@ def _mixture(
     others = fit.hessian - (s * now) @ s.T + JITTER * np.eye(len(s))
     pull, names = -(s * now) @ r, fit.scale.size
     points, log_prior = _points(problem)
-    log_posterior, covariances = np.empty(len(points)), np.empty((len(points), names, names))
-    for i, shape in enumerate(_spectra(problem, blocks, np.column_stack([np.ones(len(points)), points]))):
-        precision = weight / shape
-        gram, along = (s * precision) @ s.T, s @ (precision * r)
-        variance = float(np.sum(precision * r**2)) / freedom
-        for _ in range(UPDATES):
-            factors = lu_factor(gram / variance + others, check_finite=False)
-            step = lu_solve(factors, along / variance + pull, check_finite=False)
-            left = r - step @ s
-            variance = max(float(np.sum(precision * left**2)) / freedom, TINY)
-        misfit = np.sum(precision * left**2) / variance + step @ others @ step - 2.0 * step @ pull
-        logarithms = float(np.sum(weight * np.log(variance * shape)) + np.sum(np.log(np.abs(np.diag(factors[0])))))
-        log_posterior[i] = log_prior[i] - 0.5 * (misfit + logarithms)
-        inverse = lu_solve(factors, np.eye(len(s), names), check_finite=False)
-        covariances[i] = inverse[:names] + np.outer(step[:names], step[:names])
-    return np.tensordot(_probabilities(log_posterior), covariances, 1)
+    shapes = _spectra(problem, blocks, np.column_stack([np.ones(len(points)), points]))
+    precision = weight / shapes
+    gram, along = np.array([(s * one) @ s.T for one in precision]), (precision * r) @ s.T
+    variance = np.sum(precision * r**2, axis=1) / freedom
+    for _ in range(UPDATES):
+        total = gram / variance[:, None, None] + others
+        step = np.linalg.solve(total, (along / variance[:, None] + pull)[..., None])[..., 0]
+        square = np.sum(precision * (r - step @ s) ** 2, axis=1)
+        variance = np.maximum(square / freedom, TINY)
+    misfit = square / variance + np.sum((step @ others - 2.0 * pull) * step, axis=1)
+    logarithms = np.sum(weight * np.log(variance[:, None] * shapes), axis=1) + np.linalg.slogdet(total)[1]
+    probabilities, mean = softmax(log_prior - 0.5 * (misfit + logarithms)), step[:, :names]
+    return np.tensordot(probabilities, np.linalg.inv(total)[:, :names, :names], 1) + (probabilities * mean.T) @ mean
 
 
 def _spectra(problem: Problem, blocks: list[Block], values: np.ndarray) -> np.ndarray:

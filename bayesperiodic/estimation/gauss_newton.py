@@ -130,12 +130,7 @@ def bias_correction(problem: Description, iterate: Iterate) -> np.ndarray:
     Of the n values behind a variance the estimate of θ takes up p = tr(F C), with F their part of the information and
     C the inverse of H of eq. (8). Without priors the p of all variances sum to the number of parameters l; they are
     l/s each, as in eq. (7), where all s channels tell the same. The maximum over the variances is then that of the
-    density with θ integrated out [1]_.
-
-    References
-    ----------
-    .. [1] D. A. Harville, Maximum likelihood approaches to variance component estimation and to related problems,
-       Journal of the American Statistical Association 72 (1977) 320-338.
+    density with θ integrated out (D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320-338).
     """
     likelihood = problem.likelihood
     result = np.ones(len(likelihood.blocks))

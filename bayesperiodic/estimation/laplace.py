@@ -54,7 +54,7 @@ def _hessian(objective: Objective, mode: Iterate, free: list[int]) -> np.ndarray
     problem, logs = objective.density.problem, objective.density.logarithmic
     count = len(problem.names)
     by_theta = -_second_derivatives(objective, mode) + problem.joint_prior.curvature(mode.theta)
-    by_residual, _ = problem.likelihood.gradients(mode.here.residuals, mode.noise)
+    _, by_residual, _ = problem.likelihood.value_and_gradients(mode.here.residuals, mode.noise)
     gradient = sum(mode.here.vjp(by_residual, adjoint=False).values()) + problem.joint_prior.gradient(mode.theta)
     slopes = np.where(logs, mode.theta, 1.0)
     hessian = np.zeros((count + len(free), count + len(free)))
@@ -64,7 +64,7 @@ def _hessian(objective: Objective, mode: Iterate, free: list[int]) -> np.ndarray
         for sign in (1.0, -1.0):
             noise = mode.noise.copy()
             noise[column] *= np.exp(sign * NOISE_STEP)
-            by_residual, by_noise = problem.likelihood.gradients(mode.here.residuals, noise)
+            _, by_residual, by_noise = problem.likelihood.value_and_gradients(mode.here.residuals, noise)
             total = sum(mode.here.vjp(by_residual, adjoint=False).values())
             changes.append(np.concatenate([total * slopes, by_noise[free]]))
         hessian[count + row] = -(changes[0] - changes[1]) / (2.0 * NOISE_STEP)
@@ -104,7 +104,7 @@ def _gradients(problem: Description, theta: np.ndarray, mode: Iterate) -> dict[s
         there = there.anchored()
     if not there.converged:
         return dict.fromkeys(problem.observations, np.full(theta.size, np.nan))
-    by_residual = problem.likelihood.gradients(there.residuals, mode.noise)[0]
+    _, by_residual, _ = problem.likelihood.value_and_gradients(there.residuals, mode.noise)
     return there.vjp(by_residual, adjoint=not problem.model.autonomous)
 
 

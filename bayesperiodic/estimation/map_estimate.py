@@ -99,8 +99,9 @@ def map_estimate(
     seed : int
         Of these draws.
     checks : bool
-        Make the checks of `check`, which take about as long as the iteration from a good start; without them
-        ``fit.checks`` is None, for repeated fits.
+        Make the checks of `check` and the joint Laplace approximation, which take about as long as the iteration from
+        a good start. Without them ``fit.checks`` is None, and ``fit.joint`` unless there are several optima; for
+        repeated fits.
     progress : bool
         Show the iterations, with the objective and the step in standard deviations.
 
@@ -156,7 +157,11 @@ def map_estimate(
     objective, settled = corrected(objective, best)
     ends = [settled if end is best else end and resumed(objective, end) for end in ends]
     modes = with_images(objective, [end for end in ends if end], partial(_climb, objective, progress=progress))
-    result = _describe(problem, objective, modes, tuple(_outcome(problem, end) for end in ends), checks)
+    lost = {"objective": -np.inf} | dict.fromkeys(problem.names, np.nan)
+    outcomes = [
+        {"objective": end.iterate.objective} | _by_name(problem, end.iterate.theta) if end else lost for end in ends
+    ]
+    result = _describe(problem, objective, modes, tuple(outcomes), checks)
     for text in estimation_warnings(problem, result):
         warnings.warn(text, UserWarning, stacklevel=3)
     return result
@@ -296,16 +301,10 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
         return
     solutions = {name: solution.states for name, solution in end.here.simulator.solutions(end.theta).items()}
     for theta in (start, end.theta):
-        guessed, measured = measured_orbits(problem, theta, solutions)
-        for initial in (measured, simultaneous_fit(guessed, measured.theta)):
+        measured = measured_orbits(problem, theta, solutions)
+        for initial in (measured, simultaneous_fit(problem, measured.theta, measured.states)):
             if initial is not None and initial.states:
                 yield _linearised(problem, initial.theta, initial)
-
-
-def _outcome(problem: Problem, end: End | None) -> dict[str, float]:
-    if end is None:
-        return {"objective": -np.inf} | dict.fromkeys(problem.names, np.nan)
-    return {"objective": end.iterate.objective} | _by_name(problem, end.iterate.theta)
 
 
 def _describe(
@@ -320,14 +319,14 @@ def _describe(
     covariance[lost, lost] = np.inf
     acting = np.diag(uncertain.information) * problem.joint_prior.widths**2 > INFORMED
     sampled = objective.density.with_settings(coordinates=RIDGE_COORDINATES)
-    joints = [joint_laplace(sampled, end.iterate) for end in modes]
+    joints = [joint_laplace(sampled, end.iterate) for end in modes] if checks or len(modes) > 1 else []
     residuals = best.here.compared()
     fit = MapEstimate(
         status=STATUSES[OTHER_ORBIT] if best.here.other_orbits else status,
         theta=_by_name(problem, best.theta),
         covariance=pd.DataFrame(covariance, index=list(names), columns=list(names)),
         degrees_of_freedom=_by_name(problem, degrees_of_freedom(uncertain.inverse, uncertain.parts)),
-        joint=joints[0],
+        joint=joints[0] if joints else None,
         noise_estimate=NoiseEstimate(
             dict(zip(problem.noise_names, best.noise.tolist(), strict=True)),
             problem.noise.prior_text,

@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.special import softmax
 
 from bayesperiodic._io import Storable
-from bayesperiodic._linalg import covariance_eigh, hessian_eigh
+from bayesperiodic._linalg import hessian_eigh
 from bayesperiodic.estimation.gauss_newton import NO_CURVATURE, End, Iterate, Objective, preference
 from bayesperiodic.estimation.laplace import JointLaplace
 from bayesperiodic.periodic.schemes import FourierScheme, find_scheme
@@ -151,7 +151,7 @@ def weighed(problem: Description, ends: Sequence[End], laplaces: Sequence[JointL
     labels = [*problem.names]
     heights = np.array([one.log_density for one in laplaces])
     if all(one.covariance.notna().all(axis=None) for one in laplaces):
-        heights = heights + [_half_log_determinant(one.covariance.to_numpy()) for one in laplaces]
+        heights = heights + [0.5 * np.linalg.slogdet(one.covariance)[1] for one in laplaces]
     masses = softmax(heights) if np.isfinite(heights).all() else np.full(len(ends), np.nan)
     modes = []
     for end, laplace, mass in zip(ends[1:], laplaces[1:], masses[1:], strict=True):
@@ -169,11 +169,6 @@ def weighed(problem: Description, ends: Sequence[End], laplaces: Sequence[JointL
             )
         )
     return tuple(modes)
-
-
-def _half_log_determinant(covariance: np.ndarray) -> float:
-    values, _, sd = covariance_eigh(covariance)
-    return float(0.5 * np.sum(np.log(np.maximum(values, np.finfo(float).tiny))) + np.sum(np.log(sd)))
 
 
 def notable(modes: Sequence[Mode]) -> list[Mode]:

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import product
 from typing import Any
 
@@ -120,7 +120,7 @@ class FitCheck(Result):
 
 @dataclass(frozen=True)
 class NoiseEstimate(Storable):
-    """Noise parameters of an estimate by their full names, their prior in words, and the values behind variances."""
+    """Noise parameters of an estimate, see `MapEstimate`."""
 
     values: dict[str, float]
     prior: str
@@ -129,7 +129,7 @@ class NoiseEstimate(Storable):
 
 @dataclass(frozen=True)
 class TrueInputs(Storable):
-    """True inputs by experiment and input, their standard deviations, and the errors of the measured ones."""
+    """Estimated true inputs, see `MapEstimate`."""
 
     values: dict[str, dict[str, np.ndarray]]
     sd: dict[str, dict[str, np.ndarray]]
@@ -138,7 +138,7 @@ class TrueInputs(Storable):
 
 @dataclass(frozen=True)
 class Search(Storable):
-    """How an estimate was found: objective at each step, all starts, and what the iteration ended at."""
+    """How an estimate was found, see `MapEstimate`."""
 
     history: np.ndarray
     starts: tuple[dict[str, float], ...]
@@ -147,27 +147,18 @@ class Search(Storable):
     other_modes: tuple[Mode, ...]
 
 
-def _part(group: str, name: str, text: str) -> Any:
-    """Return a property that reads a field of a group."""
+def _part(group: str, name: str) -> Any:
+    """Return a property that reads a field of a group, and raises a ValueError if the estimate is without it."""
 
     def read(self: "MapEstimate") -> Any:
-        return getattr(getattr(self, group), name)
-
-    return property(read, doc=text)
-
-
-def _check(name: str) -> Any:
-    """Return a property that reads a field of the checks, and raises a ValueError if there are none."""
-
-    def read(self: "MapEstimate") -> Any:
-        if self.checks is None:
+        if (values := getattr(self, group)) is None:
             raise ValueError(
-                f"checks: must be made before {name!r} is used, got an estimate with checks=False; run "
-                "bp.check(problem, fit), or replace(fit, checks=bp.check(problem, fit))."
+                f"{group}: must be computed before {name!r} is used, got an estimate with checks=False; take "
+                "map_estimate(problem, start=fit.theta), or for the checks replace(fit, checks=bp.check(problem, fit))."
             )
-        return getattr(self.checks, name)
+        return getattr(values, name)
 
-    return property(read, doc=f"`FitCheck.{name}` of ``checks``; a ValueError without them.")
+    return property(read, doc=f"``{group}.{name}``, see the attribute ``{group}``.")
 
 
 @dataclass(frozen=True)
@@ -187,10 +178,14 @@ class MapEstimate(Result):
     degrees_of_freedom : dict of str to float
         Of Student's t of each parameter: the values that determine the variances its standard deviation rests on, less
         what the estimate takes up of them (Satterthwaite); infinite if that rests on known variances and the prior.
-    joint : JointLaplace
-        Normal approximation in sampling coordinates: `joint_mode` and `joint_covariance`.
+    joint : JointLaplace, optional
+        `joint_mode`, the mode in sampling coordinates, in natural values of parameters and free noise parameters, and
+        `joint_covariance`, the inverse of the exact Hessian there; NaN if it is no maximum. Sampling coordinates are
+        the logarithms of noise parameters and of parameters whose prior's support is (0, ∞), and the other parameters.
+        None with one optimum and ``map_estimate(checks=False)``; `sample` and `compare` compute it then.
     noise_estimate : NoiseEstimate
-        `noise`, `noise_prior` and `independent`.
+        `noise`, all noise parameters by their full names; `noise_prior`, the prior of the variances, in words; and
+        `independent`, the independent values behind each variance.
     solutions : dict of str to PeriodicSolution
         By experiment.
     residuals : dict of str to dict of str to array (points,)
@@ -198,9 +193,17 @@ class MapEstimate(Result):
     rms, fvu : dict of str to float
         Root mean square of each channel's residuals, and the fraction of the measured variance that they are.
     true_inputs : TrueInputs
-        `inputs`, `input_sd` and `input_errors`.
+        `inputs` (points,) by experiment and input, in their units: the measured ones where ``Problem(input_noise=…)``
+        takes them as exact; `input_sd` (points,) given the estimate, zero if exact; and by experiment with noisy inputs
+        `input_errors`: independent standard normal errors, `expected` (errors,), what they cause in the predicted
+        components, `caused` (components,), and the derivatives of the residual by them, `loadings` L (components,
+        errors), at the estimate; L·Lᵀ is what they add to the covariance of the residual.
     search : Search
-        `history`, `starts`, `at_ends`, `other_orbits` and `other_modes`.
+        `history` (iterations,), the objective before each step and at the end; `starts`, of every start the "objective"
+        reached (−inf: none) and the estimates; `at_ends`, parameters that the data act upon and whose estimate lies at
+        the end of their support; `other_orbits`, experiments whose fitted orbit is not the measured one (prime period,
+        turns of angles, or order of the forcing periods), with the reason in words; and `other_modes`, separate optima
+        whose objective is lower by less than 30, see `modes`.
     tied : dict of str to dict of str to float
         Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
     fingerprint : str
@@ -224,7 +227,7 @@ class MapEstimate(Result):
     theta: dict[str, float]
     covariance: pd.DataFrame
     degrees_of_freedom: dict[str, float]
-    joint: JointLaplace
+    joint: JointLaplace | None
     noise_estimate: NoiseEstimate
     solutions: dict[str, PeriodicSolution]
     residuals: dict[str, dict[str, np.ndarray]]
@@ -236,46 +239,15 @@ class MapEstimate(Result):
     fingerprint: str
     checks: FitCheck | None = None
 
-    joint_mode = _part(
-        "joint", "mode", "Mode in sampling coordinates: natural values of parameters and free noise parameters."
+    joint_mode, joint_covariance = _part("joint", "mode"), _part("joint", "covariance")
+    noise, noise_prior = _part("noise_estimate", "values"), _part("noise_estimate", "prior")
+    independent = _part("noise_estimate", "independent")
+    inputs, input_sd = _part("true_inputs", "values"), _part("true_inputs", "sd")
+    input_errors = _part("true_inputs", "errors")
+    history, starts, at_ends, other_orbits, other_modes = (_part("search", field.name) for field in fields(Search))
+    robust_sd, whiteness, noise_split, input_noise, input_nonlinearity, doubling_shift, prior_conflict, undetermined = (
+        _part("checks", field.name) for field in fields(FitCheck)
     )
-    joint_covariance = _part(
-        "joint", "covariance",
-        "Inverse of the exact Hessian there; NaN if it is no maximum. Sampling coordinates are the logarithms of noise "
-        "parameters and of parameters whose prior's support is (0, ∞), and the other parameters.",
-    )  # fmt: skip
-    noise = _part("noise_estimate", "values", "All noise parameters by their full names.")
-    noise_prior = _part("noise_estimate", "prior", "Prior of the variances, in words.")
-    independent = _part("noise_estimate", "independent", "Independent values behind each variance.")
-    inputs = _part(
-        "true_inputs", "values",
-        "Estimated true inputs (points,) by experiment and input, in their units; the measured ones where "
-        "``Problem(input_noise=…)`` takes them as exact.",
-    )  # fmt: skip
-    input_sd = _part("true_inputs", "sd", "Their standard deviations (points,) given the estimate; zero if exact.")
-    input_errors = _part(
-        "true_inputs", "errors",
-        "By experiment with noisy inputs: independent standard normal errors, `expected` (errors,), what they cause in "
-        "the predicted components, `caused` (components,), and the derivatives of the residual by them, `loadings` L "
-        "(components, errors), at the estimate; L·Lᵀ is what they add to the covariance of the residual.",
-    )  # fmt: skip
-    history = _part("search", "history", "The objective before each step and at the end, (iterations,).")
-    starts = _part("search", "starts", 'Of every start the "objective" reached (−inf: none), and the estimates.')
-    at_ends = _part(
-        "search", "at_ends", "Parameters that the data act upon and whose estimate lies at the end of their support."
-    )
-    other_orbits = _part(
-        "search", "other_orbits",
-        "Experiments whose fitted orbit is not the measured one (prime period, turns of angles, or order of the "
-        "forcing periods), with the reason in words.",
-    )  # fmt: skip
-    other_modes = _part(
-        "search", "other_modes", "Separate optima whose objective is lower by less than 30, see `modes`."
-    )
-    robust_sd, whiteness, noise_split = _check("robust_sd"), _check("whiteness"), _check("noise_split")
-    input_noise, input_nonlinearity = _check("input_noise"), _check("input_nonlinearity")
-    doubling_shift, prior_conflict = _check("doubling_shift"), _check("prior_conflict")
-    undetermined = _check("undetermined")
 
     @property
     def sd(self) -> dict[str, float]:

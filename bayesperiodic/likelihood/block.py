@@ -7,6 +7,7 @@ compared with the data of an experiment, and what the noise model must know of t
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -43,16 +44,17 @@ class Block(ABC):
     count: float  # independent values behind the components
     size: int  # number of components
     harmonic: np.ndarray = field(default_factory=_nothing)  # (size,), of the response period, of Fourier components
-    position: np.ndarray = field(default_factory=_nothing)  # (size,), of each point, in response periods
+    position: np.ndarray = field(default_factory=_nothing)  # (points compared,), in response periods
     points: int = 0  # grid points of the response period
     averaged: float = 1.0  # measured samples behind the components
     measured: float = float("nan")  # variance of one value that the scatter of the cycles explains; NaN if unknown
     place: int = 0  # of the channel among the measured ones
+    log_scale: float = 0.0  # ln|∂ components/∂ data| of values that are divided by known standard deviations
 
+    words: ClassVar[str] = "{0.size} values of {0.channel}"  # what is compared, a format of the block
     counted: ClassVar[bool] = False  # whether the variance is unknown, so that eq. (7) counts the values
     timed: ClassVar[bool] = False  # whether the components are values of one channel along the period
     spectral: ClassVar[bool] = False  # whether they are Fourier components of one channel
-    multipliers: ClassVar[int] = 0  # Floquet multipliers that are compared
 
     @classmethod
     @abstractmethod
@@ -74,12 +76,17 @@ class Block(ABC):
         Of blocks with a `layout` those of several experiments are added at once, without the prediction.
         """
 
-    def errors(self, values: np.ndarray) -> np.ndarray:
-        """Return the components (…, size) of errors of the measured outputs (…, points, channels)."""
-        return np.zeros((*values.shape[:-2], self.size))
+    def errors(self, signals: ComparedSignals) -> np.ndarray:
+        """Return the components (…, size) of errors of the outputs, zero if another instrument measured them."""
+        return np.zeros((*signals.values.shape[:-2], self.size))
 
     def simulate(self, components: np.ndarray, errors: np.ndarray) -> None:  # noqa: B027
         """Fill in the errors (draws, points, channels) of the outputs with these components (draws, size)."""
+
+    @cached_property
+    def at(self) -> np.ndarray:
+        """Indices on the grid of the points in `position`, (points compared,)."""
+        return np.rint(self.position * self.points).astype(int)
 
     @property
     def weight(self) -> float:
@@ -89,12 +96,7 @@ class Block(ABC):
     @property
     def description(self) -> str:
         """What is compared, in words."""
-        return f"{self.size} values of {self.channel}"
-
-    @property
-    def log_scale(self) -> float:
-        """ln|∂ components/∂ data| of values that are divided by known standard deviations."""
-        return 0.0
+        return self.words.format(self)
 
     @property
     def layout(self) -> Hashable:
@@ -106,8 +108,8 @@ class Block(ABC):
         return ()
 
     def alike(self, noise: Any) -> Hashable:
-        """Return what `spectrum` depends on besides the values."""
-        return self.experiment, self.channel
+        """Return what `spectrum` depends on besides the values and the number of components."""
+        return None
 
     def spectrum(self, noise: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return variances and slopes at values (…, parameters), see `Noise.spectrum`."""
@@ -145,10 +147,6 @@ class Block(ABC):
         """The waves along the period, (size,), in half-periods of cosines where there are no harmonics."""
         return (np.arange(self.size) + 1) // 2
 
-    def refusal(self, noise: Any) -> str:
-        """Return why a spectrum whose shapes do not fit cannot be used; empty for the general reason."""
-        return ""
-
 
 class LinearBlock(Block):
     """A kind of data whose components are a linear function of what is predicted."""
@@ -165,21 +163,22 @@ class LinearBlock(Block):
         """Return the components of the derivatives."""
         return self.components(directions)
 
+    def errors(self, signals: ComparedSignals) -> np.ndarray:
+        """Return the components of errors."""
+        return self.components(signals)
+
 
 class Timed(LinearBlock):
     """Values of one output along the period, whose variance is a noise parameter."""
 
     counted: ClassVar[bool] = True
     timed: ClassVar[bool] = True
-
-    @property
-    def description(self) -> str:
-        """What is compared, in words."""
-        return self.channel
+    words: ClassVar[str] = "{0.channel}"
 
     def parameter_names(self, noise: Any) -> tuple[str, ...]:
         """Return the variance and the parameters of the spectrum's shape."""
-        return tuple(f"{kind}[{noise.label(self)}]" for kind in noise.kinds)
+        label = f"{self.channel}, {self.experiment}" if noise.separate else self.channel
+        return tuple(f"{kind}[{label}]" for kind in ("variance", *noise.shape_priors))
 
     def alike(self, noise: Any) -> Hashable:
         """Return what the noise model's spectrum depends on."""
@@ -191,15 +190,11 @@ class Timed(LinearBlock):
 
     def mean_variance(self, noise: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return those of the noise model."""
-        return noise.mean_variance(self, values)
-
-    def errors(self, values: np.ndarray) -> np.ndarray:
-        """Return the components of errors of the measured outputs."""
-        return self.components(ComparedSignals(values, np.empty(0), np.empty(0)))
+        return noise._mean_variance(self, values)
 
 
-def common(experiment: Experiment, channel: str, place: int = 0) -> dict[str, Any]:
-    """Return what blocks of outputs have in common: names, grid, averaged samples and measured variance."""
+def common(experiment: Experiment, channel: str, place: int = 0, **more: Any) -> dict[str, Any]:
+    """Return what blocks of outputs have in common: names, grid, averaged samples and measured variance; and `more`."""
     e = experiment
     averaged = e.averaged or e.cycles * int(e.measured_points.sum())
     return {
@@ -209,6 +204,7 @@ def common(experiment: Experiment, channel: str, place: int = 0) -> dict[str, An
         "averaged": float(averaged),
         "measured": measured_variance(e, channel),
         "place": place,
+        **more,
     }
 
 

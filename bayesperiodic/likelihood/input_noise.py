@@ -54,8 +54,7 @@ class InputErrors(Storable):
 def same(one: Mapping[str, InputErrors], other: Mapping[str, InputErrors]) -> bool:
     """Return whether two linearisations are equal."""
     return one.keys() == other.keys() and all(
-        all(np.array_equal(a, b) for a, b in zip(astuple(wave), astuple(other[name]), strict=True))
-        for name, wave in one.items()
+        np.array_equal(a, b) for name in one for a, b in zip(astuple(one[name]), astuple(other[name]), strict=True)
     )
 
 
@@ -273,6 +272,10 @@ class Shared:
         # Lᵀ·L of all blocks together, a diagonal matrix.
         self._squares = values[large] ** 2
 
+    def mean(self, factors: np.ndarray) -> float:
+        """Return the mean of factors (all blocks,) over these blocks, weighted by their sizes."""
+        return float(np.average(factors[list(self.members)], weights=[len(part) for part in self.parts]))
+
     @property
     def covariances(self) -> list[np.ndarray]:
         """L·Lᵀ of each block."""
@@ -310,15 +313,11 @@ class Shared:
                 total = total + p[0][..., 0] * np.add.reduce(left * left, axis=-1)
             return -0.5 * total
         matrix, vector = self._system(r, p)
-        wrong = ~(np.isfinite(matrix).all(axis=(-2, -1)) & np.isfinite(vector).all(axis=-1))
-        if np.any(wrong):
-            matrix = np.where(wrong[..., None, None], np.eye(matrix.shape[-1]), matrix)
-        logarithms = np.log(np.diagonal(np.linalg.cholesky(matrix), axis1=-2, axis2=-1)).sum(axis=-1)
-        errors = np.linalg.solve(matrix, vector[..., None])
+        logarithms, errors = np.linalg.slogdet(matrix)[1], np.linalg.solve(matrix, vector[..., None])
         square = np.sum(errors[..., 0] ** 2, axis=-1)
         for part, block, precision in zip(self.parts, r, p, strict=True):
             square = square + np.sum(precision * (block - (part @ errors)[..., 0]) ** 2, axis=-1)
-        return np.where(wrong, np.nan, -0.5 * square - factor * logarithms)
+        return -0.5 * (square + factor * logarithms)
 
     def gradients(
         self, r: Sequence[np.ndarray], p: Sequence[np.ndarray], factor: float

@@ -1,6 +1,6 @@
 """The log-likelihood of residuals under a noise model, and its derivatives."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,10 +15,10 @@ from bayesperiodic.likelihood.section_points import SCALE
 
 
 class Residuals(Sequence[np.ndarray]):
-    """One array (…, size) of components a block, stored as stacks (members, …, size) with the place of each block."""
+    """One array (…, size) of components a block, stored as `stacks` (members, …, size) with the place of each block."""
 
     def __init__(self, stacks: Sequence[np.ndarray], places: Sequence[tuple[int, int]]):
-        self._stacks, self._places = tuple(stacks), tuple(places)
+        self.stacks, self._places = tuple(stacks), tuple(places)
 
     @classmethod
     def of(cls, blocks: Sequence[np.ndarray]) -> "Residuals":
@@ -32,39 +32,30 @@ class Residuals(Sequence[np.ndarray]):
 
     def __getitem__(self, block: Any) -> Any:
         stack, member = self._places[block]
-        return self._stacks[stack][member]
-
-    def __iter__(self) -> Iterator[np.ndarray]:
-        return (self._stacks[stack][member] for stack, member in self._places)
+        return self.stacks[stack][member]
 
     def at(self, index: int) -> "Residuals":
         """Return the components (size,) at one place of the middle axis (…,)."""
-        return Residuals([stack[:, index] for stack in self._stacks], self._places)
+        return Residuals([stack[:, index] for stack in self.stacks], self._places)
 
     def like(self, blocks: Sequence[np.ndarray]) -> "Residuals":
         """Return other arrays, one a block, side by side as these are."""
         if isinstance(blocks, Residuals) and blocks._places == self._places:
             return blocks
-        members: list[dict[int, np.ndarray]] = [{} for _ in self._stacks]
+        stacks = [np.empty((len(stack), stack.shape[-1])) for stack in self.stacks]
         for (stack, member), block in zip(self._places, blocks, strict=True):
-            members[stack][member] = block
-        return Residuals([np.stack([group[m] for m in range(len(group))]) for group in members], self._places)
+            stacks[stack][member] = block
+        return Residuals(stacks, self._places)
 
     def scaled(self, factors: np.ndarray) -> "Residuals":
         """Return the components (size,) of each block times its factor, factors (blocks,)."""
-        scales = [np.empty((len(stack), 1)) for stack in self._stacks]
-        for (stack, member), factor in zip(self._places, factors, strict=True):
-            scales[stack][member] = factor
-        return Residuals([stack * factor for stack, factor in zip(self._stacks, scales, strict=True)], self._places)
-
-    def stacks(self) -> tuple[np.ndarray, ...]:
-        """Return the arrays (members, …, size)."""
-        return self._stacks
+        scales = self.like(list(factors)).stacks
+        return Residuals([scale * stack for scale, stack in zip(scales, self.stacks, strict=True)], self._places)
 
     @cached_property
     def squares(self) -> np.ndarray:
         """The sum of the squares of each block, (…, blocks)."""
-        sums = [_square(stack) for stack in self._stacks]
+        sums = [np.einsum("...i,...i->...", stack, stack) for stack in self.stacks]
         result = np.empty((*sums[0].shape[1:], len(self._places)))
         for block, (stack, member) in enumerate(self._places):
             result[..., block] = sums[stack][member]
@@ -78,6 +69,9 @@ class _AlikeBlocks(NamedTuple):
     block: Block  # the first of them
     columns: slice  # noise parameters among all
     weight: float  # independent values per component, one for values in units of their standard deviation
+
+
+Spectra = list[tuple[np.ndarray, np.ndarray]]  # variances and slopes of each group of alike blocks
 
 
 class Likelihood:
@@ -96,37 +90,68 @@ class Likelihood:
     ):
         self.loadings = dict(loadings or {})
         self.model, self.blocks = model, tuple(blocks)
-        model.check([b for b in blocks if not set(model.parameter_names(b)) <= set(fixed)])
-        self.names = tuple(dict.fromkeys(name for block in blocks for name in model.parameter_names(block)))
+        self._parameters = [model.parameter_names(block) for block in blocks]
+        model.check([b for b, names in zip(blocks, self._parameters, strict=True) if not set(names) <= set(fixed)])
+        self.names = tuple(dict.fromkeys(name for names in self._parameters for name in names))
         for name, value in fixed.items():
             _checks.one_of("fixed", name, self.names)
             _checks.positive(f"fixed[{name!r}]", value)
         self.fixed = {name: float(fixed[name]) for name in self.names if name in fixed}
         self.free = tuple(name for name in self.names if name not in fixed)
-        self._columns = [[self.names.index(name) for name in model.parameter_names(block)] for block in blocks]
         self._free = [self.names.index(name) for name in self.free]
-        self._even, self._uneven, self._dense_groups = self._sorted_groups()
+        starts = [self.names.index(names[0]) if names else 0 for names in self._parameters]
+        self._columns = [slice(i, i + len(names)) for i, names in zip(starts, self._parameters, strict=True)]
+        self._sort_blocks()
         self.shared = []
         for experiment, matrix in self.loadings.items():
-            members = [b for b, block in enumerate(self.blocks) if block.experiment == experiment]
+            sizes = {b: block.size for b, block in enumerate(blocks) if block.experiment == experiment}
             if matrix.any():
-                self.shared.append(Shared(members, [self.blocks[b].size for b in members], matrix))
+                self.shared.append(Shared([*sizes], [*sizes.values()], matrix))
+        # One for blocks that share no errors of inputs, zero for the others.
+        self._alone = np.ones(len(blocks))
+        self._alone[[b for one in self.shared for b in one.members]] = 0.0
+
+    def _sort_blocks(self) -> None:
+        """Sort the blocks: groups with one variance first, then other groups, and those with correlated components."""
+        alike: dict[Any, list[int]] = {}
+        for b, block in enumerate(self.blocks):
+            key = type(block), block.alike(self.model), self._parameters[b], block.size, block.weight
+            alike.setdefault(key, []).append(b)
+        even: list[_AlikeBlocks] = []
+        uneven: list[_AlikeBlocks] = []
+        self._dense: list[int] = []
+        for members in alike.values():
+            block = self.blocks[members[0]]
+            if block.is_dense(self.model):
+                self._dense += members
+                continue
+            group = _AlikeBlocks(members, block, self._columns[members[0]], block.weight)
+            (even if self._checked_size(group) == 1 else uneven).append(group)
+        self._groups, self._uneven = [*even, *uneven], uneven
+        self._group_of = {b: g for g, group in enumerate(self._groups) for b in group.members}
+        # Of the blocks with one variance: index, group, weight and count of each, in the order of the groups.
+        order = [b for group in even for b in group.members]
+        self._even = np.array(order, dtype=int)
+        self._even_groups = np.array([self._group_of[b] for b in order], dtype=int)
+        self._even_weights = np.array([self.blocks[b].weight for b in order])
+        self._even_counts = self._even_weights * np.array([self.blocks[b].size for b in order])
+        # Of their groups: where each begins in that order, and group and column of each slope.
+        self._starts = np.searchsorted(self._even_groups, range(len(even)))
+        pairs = [(g, column) for g, group in enumerate(even) for column in range(len(self.names))[group.columns]]
+        self._slope_groups, self._slope_columns = np.array(pairs, dtype=int).reshape(-1, 2).T
 
     @property
     def white(self) -> bool:
         """Whether the components of every block are independent and have the same variance."""
-        return not self._uneven and not self._dense_groups
+        return not self._uneven and not self._dense
 
     def groups(self) -> list[tuple[tuple[str, ...], list[int]]]:
         """Return the noise parameters that belong together, by name, and the indices of their blocks."""
-        together = dict.fromkeys(tuple(columns) for columns in self._columns if columns)
-        return [
-            (
-                tuple(self.names[i] for i in group),
-                [b for b, places in enumerate(self._columns) if tuple(places) == group],
-            )
-            for group in together
-        ]
+        together: dict[tuple[str, ...], list[int]] = {}
+        for b, names in enumerate(self._parameters):
+            if names:
+                together.setdefault(names, []).append(b)
+        return list(together.items())
 
     @cached_property
     def counts(self) -> dict[str, float]:
@@ -136,10 +161,9 @@ class Likelihood:
     def _summed(self, values: Iterable[Any]) -> dict[str, Any]:
         """Return the sum of values, one a block, behind each variance."""
         result: dict[str, Any] = {}
-        for block, columns, value in zip(self.blocks, self._columns, values, strict=True):
+        for block, names, value in zip(self.blocks, self._parameters, values, strict=True):
             if block.counted:
-                name = self.names[columns[0]]
-                result[name] = result.get(name, 0.0) + value
+                result[names[0]] = result.get(names[0], 0.0) + value
         return result
 
     @cached_property
@@ -154,13 +178,13 @@ class Likelihood:
         S is the spectrum for a variance of 1; all its other parameters have to be known.
         """
         units = np.array([self.fixed.get(name, 1.0) for name in self.names])
-        units[[columns[0] for columns in self._columns if columns]] = 1.0
-        squares = np.array(Residuals.of(residuals).squares)
-        if self._even:
-            squares[..., self._even_blocks] /= self._even_variances(units)
-        for group in self._uneven:
-            variances = self._spectrum(group, units)[0]
-            for b in group.members:
+        units[[self.names.index(names[0]) for names in self._parameters if names]] = 1.0
+        squares, spectra = np.array(Residuals.of(residuals).squares), self._spectra(units)
+        for b, g in self._group_of.items():
+            variances = spectra[g][0]
+            if variances.size == 1:
+                squares[..., b] /= variances[0]
+            else:
                 squares[..., b] = np.add.reduce(residuals[b] ** 2 / variances, axis=-1)
         return self._summed(block.weight * squares[..., b] for b, block in enumerate(self.blocks))
 
@@ -184,8 +208,8 @@ class Likelihood:
     def complete(self, free: np.ndarray) -> np.ndarray:
         """Return the values of all noise parameters (…, names) from those of the free ones (…, free)."""
         values = np.empty((*free.shape[:-1], len(self.names)))
-        for i, name in enumerate(self.names):
-            values[..., i] = self.fixed[name] if name in self.fixed else free[..., self.free.index(name)]
+        values[...] = [self.fixed.get(name, np.nan) for name in self.names]
+        values[..., self._free] = free
         return values
 
     def log_prior(self, values: np.ndarray) -> np.ndarray:
@@ -220,18 +244,16 @@ class Likelihood:
     @cached_property
     def _spectra_of_errors(self) -> list[tuple[int, int, np.ndarray]]:
         """Column and a block of each free variance with Jeffreys' prior, and eigenvalues of L·Lᵀ of all its blocks."""
-        spectra: dict[int, list[tuple[int, np.ndarray]]] = {}
-        if self.model.prior == JEFFREYS:
-            for one in self.shared:
-                for b, matrix in zip(one.members, one.covariances, strict=True):
-                    if self._columns[b] and self._columns[b][0] in self._free:
-                        spectra.setdefault(self._columns[b][0], []).append((b, np.linalg.eigvalsh(matrix)))
+        spectra: dict[str, dict[int, np.ndarray]] = {}
+        for one in self.shared if self.model.prior == JEFFREYS else ():
+            for b, matrix in zip(one.members, one.covariances, strict=True):
+                for name in set(self._parameters[b][:1]) & set(self.free):
+                    spectra.setdefault(name, {})[b] = np.linalg.eigvalsh(matrix)
         result = []
-        for column, pairs in spectra.items():
-            with_errors = {b for b, _ in pairs}
-            others = [b for b, columns in enumerate(self._columns) if columns[:1] == [column] and b not in with_errors]
-            rest = [np.zeros(self.blocks[b].size) for b in others]
-            result.append((column, pairs[0][0], np.maximum(np.concatenate([v for _, v in pairs] + rest), 0.0)))
+        for name, by_block in spectra.items():
+            others = [b for b, names in enumerate(self._parameters) if names[:1] == (name,) and b not in by_block]
+            values = [*by_block.values(), *(np.zeros(self.blocks[b].size) for b in others)]
+            result.append((self.names.index(name), next(iter(by_block)), np.maximum(np.concatenate(values), 0.0)))
         return result
 
     @cached_property
@@ -244,7 +266,7 @@ class Likelihood:
         return [
             (kind, columns, np.array([self.measured.get(self.names[i], np.nan) for i in columns]))
             for kind, columns in kinds.items()
-            if not self.model.has_constant_prior(kind)
+            if kind in self.model.shape_priors or not self.model.constant_prior
         ]
 
     def __call__(
@@ -255,11 +277,11 @@ class Likelihood:
         The logarithms of the variances are multiplied by `log_variance_factor`, one for all blocks or one each: the
         bias correction of eq. (7), see `gauss_newton.bias_correction`.
         """
+        factors, residuals = np.full(len(self.blocks), log_variance_factor), Residuals.of(residuals)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            total = self._without_inputs(residuals, values, log_variance_factor)
-            for one in self.shared:
-                parts, precisions = [residuals[b] for b in one.members], self.precisions(one.members, values)
-                total = total + one.log_likelihood(parts, precisions, _mean(log_variance_factor, one))
+            total = self._independent(residuals, values, self._spectra(values), factors)
+            for b in self._dense:
+                total = total + self._dense_values(b, residuals[b], values, factors[b])
         return np.where(np.isfinite(total), total, -np.inf)
 
     @cached_property
@@ -283,20 +305,18 @@ class Likelihood:
         rows = []
         for b, _, order, starts in self._parts:
             block = self.blocks[b]
-            spectral = block.spectral and not self._is_even[b]
+            spectral = block.spectral and b not in self._even
             harmonic = block.harmonic[order][starts] if spectral else np.full(len(starts), np.nan)
             rows += [(block.experiment, block.channel, h, block.weight) for h in harmonic]
-        columns = zip(*rows, strict=True)
-        return {
-            name: np.array(c) for name, c in zip(("experiment", "channel", "harmonic", "weight"), columns, strict=True)
-        }
+        columns = map(np.array, zip(*rows, strict=True))
+        return dict(zip(("experiment", "channel", "harmonic", "weight"), columns, strict=True))
 
     @cached_property
     def _parts(self) -> list[tuple[int, list[str], np.ndarray, np.ndarray]]:
         """Of each block its index, labels of its observations, values in their order, and where each begins."""
         parts = []
         for b, block in enumerate(self.blocks):
-            name, place, end = block.places(self._is_even[b], b in self._dense_groups)
+            name, place, end = block.places(b in self._even, b in self._dense)
             order = np.argsort(place, kind="stable")
             numbers, starts = np.unique(place[order], return_index=True)
             labels = [f"{name} {i}{end}" for i in numbers]
@@ -307,15 +327,14 @@ class Likelihood:
         """Return the log-likelihoods (…, observations) of the `observations`, which sum to that of `__call__`."""
         terms, shared = [], self._shared_terms(residuals, values)
         for b, _, order, starts in self._parts:
-            r = residuals[b]
-            if b not in self._group_of:
-                terms.append(self._dense_values(b, r, values, 1.0)[..., None])
+            block = self.blocks[b]
+            if b in self._dense:
+                terms.append(self._dense_values(b, residuals[b], values, 1.0)[..., None])
                 continue
-            group = self._group_of[b]
-            variances = self._spectrum(group, values)[0]
-            r = self.blocks[b].independent(r, self._is_even[b])
-            squares = shared[b] if b in shared else group.weight * r**2 / variances
-            each = group.weight * np.log(variances) + squares
+            (precisions,) = self.precisions([b], values)
+            r = block.independent(residuals[b], b in self._even)
+            squares = shared[b] if b in shared else precisions * r**2
+            each = block.weight * np.log(block.weight / precisions) + squares
             terms.append(-0.5 * np.add.reduceat(each[..., order], starts, axis=-1))
         return np.concatenate(terms, axis=-1)
 
@@ -334,240 +353,172 @@ class Likelihood:
             terms |= zip(one.members, parts, strict=True)
         return terms
 
-    def _without_inputs(
-        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
+    def _independent(
+        self, residuals: Residuals, values: np.ndarray, spectra: Spectra, factors: np.ndarray
     ) -> np.ndarray:
-        """Return the log-likelihood (…,) without the squares of blocks that share errors of inputs."""
+        """Return the log-likelihood (…,) of all blocks but those whose components are correlated."""
         total = np.zeros(values.shape[:-1])
-        if self._even:
-            total = self._even_total(residuals, values, log_variance_factor)
-        for group in self._uneven:
-            variances = self._spectrum(group, values)[0]
-            factor = len(group.members) * self._factor(log_variance_factor, group)
-            terms = factor * np.log(variances)
+        if self._even.size:
+            precisions = self._even_precisions(spectra)
+            terms = factors[self._even] * self._even_counts * np.log(self._even_weights / precisions)
+            if not self.shared:
+                terms += precisions * residuals.squares.take(self._even, axis=-1)
+            elif self._alone.any():
+                terms += precisions * (residuals.squares * self._alone).take(self._even, axis=-1)
+            # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
+            total = -0.5 * np.add.reduce(terms, axis=-1)
+        for group, (variances, _) in zip(self._uneven, spectra[len(self._starts) :], strict=True):
+            terms = len(group.members) * factors[group.members[0]] * np.log(variances)
             if alone := [b for b in group.members if self._alone[b]]:
                 terms = terms + sum(residuals[b] ** 2 for b in alone) / variances
             total = total - 0.5 * group.weight * np.add.reduce(terms, axis=-1)
-        for b in self._dense_groups:
-            total = total + self._dense_values(b, residuals[b], values, self._factor(log_variance_factor, b))
+        for one in self.shared:
+            parts = [residuals[b] for b in one.members]
+            total = total + one.log_likelihood(parts, self._precisions(one.members, spectra), one.mean(factors))
         return total
-
-    def _even_total(
-        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
-    ) -> np.ndarray:
-        """Return the log-likelihood (…,) of blocks whose components all have the same variance."""
-        at, sizes, weights = self._even_blocks, self._even_sizes, self._even_weights
-        variances = self._even_variances(values)
-        factor = log_variance_factor if isinstance(log_variance_factor, float) else log_variance_factor[at]
-        terms = factor * sizes * np.log(variances)
-        if np.any(self._alone):
-            squares = Residuals.of(residuals).squares
-            squares = squares * self._alone if self.shared else squares
-            terms = terms + squares[..., at] / variances
-        # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
-        return -0.5 * np.add.reduce(np.ascontiguousarray(weights * terms), axis=-1)
-
-    def _factor(self, log_variance_factor: float | np.ndarray, group: "_AlikeBlocks | int") -> float:
-        """Return the factor of the logarithms of one group or block."""
-        b = group if isinstance(group, int) else group.members[0]
-        return log_variance_factor if isinstance(log_variance_factor, float) else float(log_variance_factor[b])
-
-    @cached_property
-    def _alone(self) -> np.ndarray:
-        """Zero for blocks that share errors of inputs, one for the others, (blocks,)."""
-        with_errors = {b for one in self.shared for b in one.members}
-        return np.array([0.0 if b in with_errors else 1.0 for b in range(len(self.blocks))])
-
-    def _sorted_groups(self) -> tuple[list[_AlikeBlocks], list[_AlikeBlocks], list[int]]:
-        """Return groups whose components have one variance, others, and the blocks whose components are correlated."""
-        groups: dict[Any, list[int]] = {}
-        for b, (block, columns) in enumerate(zip(self.blocks, self._columns, strict=True)):
-            key = type(block), block.alike(self.model), tuple(columns), block.size, block.weight
-            groups.setdefault(key, []).append(b)
-        even: list[_AlikeBlocks] = []
-        uneven: list[_AlikeBlocks] = []
-        dense: list[int] = []
-        for members in groups.values():
-            block, columns = self.blocks[members[0]], self._columns[members[0]]
-            if block.is_dense(self.model):
-                dense += members
-                continue
-            group = _AlikeBlocks(
-                members, block, slice(columns[0], columns[-1] + 1) if columns else slice(0), block.weight
-            )
-            (even if self._checked_size(group) == 1 else uneven).append(group)
-        return even, uneven, dense
 
     def _checked_size(self, group: _AlikeBlocks) -> int:
         """Return the number of variances that the spectrum of a group has, one or one each component."""
-        block, count = group.block, len(self._columns[group.members[0]])
-        sizes = (1, block.size)
+        block, count = group.block, len(self._parameters[group.members[0]])
+        sizes, without_harmonics = (1, block.size), block.timed and not block.harmonic.size
         try:
-            variances, slopes = map(np.shape, self._spectrum(group, np.ones(len(self.names))))
+            variances, slopes = map(np.shape, block.spectrum(self.model, np.ones(count)))
         except (IndexError, ValueError):
-            if not block.refusal(self.model):
+            if not without_harmonics:
                 raise
             variances, slopes = (), ()
         if len(variances) == 1 and variances[0] in sizes and slopes in [(size, count) for size in sizes]:
             return variances[0]
-        if reason := block.refusal(self.model):
-            raise ValueError(reason)
+        if without_harmonics:
+            raise ValueError(
+                f"noise: must have a method `covariance` for the points of a mask, got {self.model.name!r}; experiment "
+                f"{block.experiment!r} has {block.size} points of {block.channel!r}, which have no harmonics, so that "
+                "`spectrum` gives no variances of them. Implement `covariance`, or compare whole periods."
+            )
         raise ValueError(
             f"noise: must have a spectrum of shapes (…, 1) or (…, {block.size}) and (…, 1, {count}) or (…, "
             f"{block.size}, {count}) for {block.channel!r} of {block.experiment!r}, got {variances} and {slopes} from "
             f"{self.model.name!r}."
         )
 
-    def _spectrum(self, group: _AlikeBlocks, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the variances (…, size) or (…, 1) of a group's components, and their slopes by its parameters."""
-        return group.block.spectrum(self.model, values[..., group.columns])
+    def _spectra(self, values: np.ndarray) -> Spectra:
+        """Return variances (…, size) or (…, 1) of the components of each group, and their slopes."""
+        return [group.block.spectrum(self.model, values[..., group.columns]) for group in self._groups]
 
-    def _even_variances(self, values: np.ndarray) -> np.ndarray:
-        """Return the variances (…, blocks) of the blocks of `_even_blocks`."""
-        each = [self._spectrum(group, values)[0] for group in self._even]
-        joined = each[0] if len(each) == 1 else np.concatenate(each, axis=-1)
-        return joined[..., self._even_places]
-
-    @cached_property
-    def _even_blocks(self) -> Any:
-        """Indices of the blocks of `_even`; a slice where they are all."""
-        order = [b for group in self._even for b in group.members]
-        return slice(None) if order == list(range(len(self.blocks))) else np.array(order, dtype=int)
-
-    @cached_property
-    def _even_places(self) -> Any:
-        """The group of each of `_even_blocks`."""
-        places = [g for g, group in enumerate(self._even) for _ in group.members]
-        return slice(None) if len(places) == len(self._even) else np.array(places, dtype=int)
-
-    @cached_property
-    def _even_sizes(self) -> np.ndarray:
-        return np.array([group.block.size for group in self._even for _ in group.members], dtype=float)
-
-    @cached_property
-    def _even_weights(self) -> np.ndarray:
-        return np.array([group.weight for group in self._even for _ in group.members])
-
-    @cached_property
-    def _is_even(self) -> list[bool]:
-        """Whether the components of each block all have the same variance."""
-        even = {b for group in self._even for b in group.members}
-        return [b in even for b in range(len(self.blocks))]
-
-    @cached_property
-    def _group_of(self) -> dict[int, _AlikeBlocks]:
-        """The group of each block whose components are independent."""
-        return {b: group for group in (*self._even, *self._uneven) for b in group.members}
+    def _even_precisions(self, spectra: Spectra) -> np.ndarray:
+        """Return weights over variances (…, blocks) of the blocks with one variance."""
+        variances = np.concatenate([spectrum for spectrum, _ in spectra[: len(self._starts)]], axis=-1)
+        return self._even_weights / variances.take(self._even_groups, axis=-1)
 
     def precisions(self, members: Sequence[int], values: np.ndarray) -> list[np.ndarray]:
         """Return weights over variances of the components of some blocks, (…, size), or (…, 1) if they are the same."""
-        groups = [self._group_of[b] for b in members]
-        return [group.weight / self._spectrum(group, values)[0] for group in groups]
+        return self._precisions(members, self._spectra(values))
 
-    def _dense_values(self, b: int, r: np.ndarray, values: np.ndarray, log_variance_factor: float) -> np.ndarray:
-        """Return the log-likelihoods (…,) of a block whose components are correlated."""
-        rows, parameters = r.reshape(-1, r.shape[-1]), values[..., self._columns[b]].reshape(-1, len(self._columns[b]))
-        pairs = zip(rows, parameters, strict=True)
-        each = [self._dense(self.blocks[b], row, phi, log_variance_factor)[0] for row, phi in pairs]
-        return np.array(each).reshape(values.shape[:-1])
+    def _precisions(self, members: Sequence[int], spectra: Spectra) -> list[np.ndarray]:
+        return [self.blocks[b].weight / spectra[self._group_of[b]][0] for b in members]
 
-    def _dense(
-        self, block: Block, r: np.ndarray, values: np.ndarray, log_variance_factor: float
-    ) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return the log-likelihood of one residual with a dense covariance, and its gradients by r and ln φ."""
-        covariance, slopes = self.model.covariance(block, values)
-        try:
-            factor = np.linalg.cholesky(covariance)
-        except np.linalg.LinAlgError:
-            return -np.inf, np.zeros_like(r), np.zeros(len(slopes))
-        half = solve_triangular(factor, r, lower=True)
-        solved = solve_triangular(factor, half, lower=True, trans=1)
-        inverse = solve_triangular(factor, np.eye(block.size), lower=True)
-        traces = np.einsum("ki,kj,pij->p", inverse, inverse, slopes)
-        value = -0.5 * block.weight * (2 * log_variance_factor * np.sum(np.log(np.diag(factor))) + half @ half)
-        return (
-            value,
-            -block.weight * solved,
-            0.5 * block.weight * (solved @ slopes @ solved - log_variance_factor * traces),
-        )
+    def _root(self, b: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lower Cholesky factor of the covariance of correlated components, and the covariance's slopes."""
+        covariance, slopes = self.model.covariance(self.blocks[b], values[self._columns[b]])
+        return np.linalg.cholesky(covariance), slopes
 
-    def gradients(
+    def _dense_values(self, b: int, r: np.ndarray, values: np.ndarray, factor: float) -> np.ndarray:
+        """Return the log-likelihoods (…,) of a block whose components are correlated; −inf if not positive definite."""
+        result = np.full(values.shape[:-1], -np.inf)
+        for at in np.ndindex(result.shape):
+            try:
+                root, _ = self._root(b, values[at])
+            except np.linalg.LinAlgError:
+                continue
+            half = solve_triangular(root, r[at], lower=True)
+            result[at] = -0.5 * self.blocks[b].weight * (2 * factor * np.sum(np.log(np.diag(root))) + half @ half)
+        return result
+
+    def value_and_gradients(
         self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray = 1.0
-    ) -> tuple[Sequence[np.ndarray], np.ndarray]:
-        """Return the gradients of log-likelihood plus log-prior of φ, by each block's residual and by ln φ (names,)."""
-        residuals, by_value = Residuals.of(residuals), self._prior_slopes(values)
-        by_residual: Any = [np.empty(0)] * len(self.blocks)
-        if self._even:
-            by_residual = self._even_gradients(residuals, values, log_variance_factor, by_value)
-            by_residual = list(by_residual) if self._uneven or self._dense_groups else by_residual
-        for group in self._uneven:
-            variances, slopes = self._spectrum(group, values)
-            stack, factor = np.stack([residuals[b] for b in group.members]), self._factor(log_variance_factor, group)
-            for b, r in zip(group.members, stack, strict=True):
-                by_residual[b] = -group.weight * r / variances
-            by_logarithm = 0.5 * group.weight * np.add.reduce(stack**2 / variances - factor, axis=0)
-            by_value[group.columns] += np.add.reduce(by_logarithm[:, None] * slopes, axis=0)
-        for b in self._dense_groups:
-            columns, factor = self._columns[b], self._factor(log_variance_factor, b)
-            _, by_residual[b], by_phi = self._dense(self.blocks[b], residuals[b], values[columns], factor)
-            by_value[columns] += by_phi
-        if not self.shared:
-            return by_residual, by_value
-        total = list(by_residual)
-        for one in self.shared:
-            parts, precisions = [residuals[b] for b in one.members], self.precisions(one.members, values)
-            gradients = one.gradients(parts, precisions, _mean(log_variance_factor, one))
-            for b, more, by_precision in zip(one.members, *gradients, strict=True):
-                total[b] = total[b] + more
-                group = self._group_of[b]
-                slopes = self._spectrum(group, values)[1]
-                by_value[group.columns] -= np.add.reduce(by_precision[:, None] * slopes, axis=0)
-        return total, by_value
+    ) -> tuple[float, Sequence[np.ndarray], np.ndarray]:
+        """Return the log-likelihood of residuals (size,) at values (names,), and gradients.
 
-    def _even_gradients(
-        self, residuals: Residuals, values: np.ndarray, log_variance_factor: float | np.ndarray, by_value: np.ndarray
-    ) -> Residuals:
+        The gradients are those of log-likelihood plus log-prior of φ by each block's residual and by ln φ (names,).
+        """
+        factors, residuals = np.full(len(self.blocks), log_variance_factor), Residuals.of(residuals)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            spectra, by_value = self._spectra(values), self._prior_slopes(values)
+            total = self._independent(residuals, values, spectra, factors)
+            by_residual = self._even_gradients(residuals, spectra, factors, by_value)
+            if self._uneven or self._dense or self.shared:
+                by_residual = list(by_residual)
+            for group, (variances, slopes) in zip(self._uneven, spectra[len(self._starts) :], strict=True):
+                stack, factor = np.stack([residuals[b] for b in group.members]), factors[group.members[0]]
+                for b, r in zip(group.members, stack, strict=True):
+                    by_residual[b] = -group.weight * r / variances
+                by_logarithm = 0.5 * group.weight * np.add.reduce(stack**2 / variances - factor, axis=0)
+                by_value[group.columns] += np.add.reduce(by_logarithm[:, None] * slopes, axis=0)
+            for b in self._dense:
+                value, by_residual[b], by_phi = self._dense_gradients(b, residuals[b], values, factors[b])
+                total = total + value
+                by_value[self._columns[b]] += by_phi
+            for one in self.shared:
+                parts, precisions = [residuals[b] for b in one.members], self._precisions(one.members, spectra)
+                gradients = one.gradients(parts, precisions, one.mean(factors))
+                for b, more, by_precision in zip(one.members, *gradients, strict=True):
+                    by_residual[b] = by_residual[b] + more
+                    slopes = spectra[self._group_of[b]][1]
+                    by_value[self._columns[b]] -= np.add.reduce(by_precision[:, None] * slopes, axis=0)
+        return float(total) if np.isfinite(total) else -np.inf, by_residual, by_value
+
+    def _even_gradients(self, residuals: Residuals, spectra: Spectra, factors: np.ndarray, by_value: np.ndarray) -> Any:
         """Return the gradients by the residuals of blocks with one variance, and add those by ln φ to `by_value`."""
-        at, weights, spectra = self._even_blocks, self._even_weights, [self._spectrum(g, values) for g in self._even]
-        variances = np.concatenate([spectrum for spectrum, _ in spectra])[self._even_places]
-        factor = log_variance_factor if isinstance(log_variance_factor, float) else log_variance_factor[at]
-        by_logarithm = 0.5 * weights * (residuals.squares[at] / variances - factor * self._even_sizes)
-        by_square, start = np.zeros(len(self.blocks)), 0
-        by_square[at] = -0.5 * weights / variances
-        for group, (_, slopes) in zip(self._even, spectra, strict=True):
-            stop = start + len(group.members)
-            by_value[group.columns] += np.add.reduce(by_logarithm[start:stop]) * slopes[0]
-            start = stop
-        return residuals.scaled(2.0 * by_square)
+        by_square = np.zeros(len(self.blocks))
+        if self._even.size:
+            precisions = self._even_precisions(spectra)
+            by_square[self._even] = -precisions
+            excess = precisions * residuals.squares[self._even] - factors[self._even] * self._even_counts
+            slopes = np.concatenate([slope.ravel() for _, slope in spectra[: len(self._starts)]])
+            each = 0.5 * np.add.reduceat(excess, self._starts)[self._slope_groups] * slopes
+            by_value += np.bincount(self._slope_columns, each, by_value.size)
+        return residuals.scaled(by_square)
+
+    def _dense_gradients(
+        self, b: int, r: np.ndarray, values: np.ndarray, factor: float
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the log-likelihood of correlated components r (size,), and its gradients by r and ln φ."""
+        try:
+            root, slopes = self._root(b, values)
+        except np.linalg.LinAlgError:
+            return -np.inf, np.zeros_like(r), np.zeros(len(self._parameters[b]))
+        weight, inverse = self.blocks[b].weight, solve_triangular(root, np.eye(r.size), lower=True)
+        half = solve_triangular(root, r, lower=True)
+        solved = inverse.T @ half
+        value = -0.5 * weight * (2 * factor * np.sum(np.log(np.diag(root))) + half @ half)
+        traces = np.einsum("ij,pij->p", inverse.T @ inverse, slopes)
+        return value, -weight * solved, 0.5 * weight * (solved @ slopes @ solved - factor * traces)
 
     def whitened(self, vectors: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
         """Return vectors (…, size), one a block, in units of the noise: their squares sum to −2 log-likelihood."""
-        result = list(vectors)
-        for group in (*self._even, *self._uneven):
-            scale = np.sqrt(group.weight / self._spectrum(group, values)[0])
-            for b in group.members:
-                result[b] = vectors[b] * scale
-        for b in self._dense_groups:
-            block = self.blocks[b]
-            covariance, _ = self.model.covariance(block, values[self._columns[b]])
-            white = solve_triangular(np.linalg.cholesky(covariance), vectors[b].reshape(-1, block.size).T, lower=True)
+        result, spectra = list(vectors), self._spectra(values)
+        for b in self._group_of:
+            (precisions,) = self._precisions([b], spectra)
+            result[b] = vectors[b] * np.sqrt(precisions)
+        for b in self._dense:
+            block, (root, _) = self.blocks[b], self._root(b, values)
+            white = solve_triangular(root, vectors[b].reshape(-1, block.size).T, lower=True)
             result[b] = np.sqrt(block.weight) * white.T.reshape(vectors[b].shape)
         for one in self.shared:
-            joint = one.whitened([result[b] for b in one.members], self.precisions(one.members, values))
+            joint = one.whitened([result[b] for b in one.members], self._precisions(one.members, spectra))
             for b, part in zip(one.members, joint, strict=True):
                 result[b] = part
         return result
 
     def simulate(self, values: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:
         """Return noise at values (draws, names): components (draws, size), one array a block."""
-        result = []
-        for b, (block, columns) in enumerate(zip(self.blocks, self._columns, strict=True)):
+        result, spectra = [], self._spectra(values)
+        for b, block in enumerate(self.blocks):
             white = generator.standard_normal((len(values), block.size))
-            if b in self._dense_groups:
-                factors = np.linalg.cholesky([self.model.covariance(block, row)[0] for row in values[:, columns]])
-                white = np.einsum("dij,dj->di", factors, white)
+            if b in self._dense:
+                white = np.einsum("dij,dj->di", [self._root(b, row)[0] for row in values], white)
             else:
-                white *= np.sqrt(self._spectrum(self._group_of[b], values)[0])
+                white *= np.sqrt(spectra[self._group_of[b]][0])
             result.append(white)
         for one in self.shared:
             errors = generator.standard_normal((len(values), one.parts[0].shape[1]))
@@ -577,22 +528,6 @@ class Likelihood:
 
     def guess(self) -> np.ndarray:
         """Return where the noise parameters start, (names,): variances 1, shapes at the medians of their priors."""
-        values = np.ones(len(self.names))
-        for i, name in enumerate(self.names):
-            kind = name.partition("[")[0]
-            if kind in self.model.shape_priors:
-                values[i] = float(self.model.shape_priors[kind].quantile(np.array(0.5)))
-            values[i] = self.fixed.get(name, values[i])
-        return values
-
-
-def _mean(log_variance_factor: float | np.ndarray, one: Shared) -> float:
-    """Return the factor of errors that blocks share: the mean of theirs, weighted by their sizes."""
-    if isinstance(log_variance_factor, float):
-        return log_variance_factor
-    return float(np.average(log_variance_factor[list(one.members)], weights=[len(part) for part in one.parts]))
-
-
-def _square(r: np.ndarray) -> np.ndarray:
-    """Return the sum of squares (…,) of components (…, size)."""
-    return np.einsum("...i,...i->...", r, r)
+        medians = {kind: float(prior.quantile(np.array(0.5))) for kind, prior in self.model.shape_priors.items()}
+        starts = {name: medians.get(name.partition("[")[0], 1.0) for name in self.names}
+        return np.array([self.fixed.get(name, start) for name, start in starts.items()])

@@ -41,7 +41,8 @@ class MeanPeriod(Timed):
             nyquist = [points // 2] if kept is None and points % 2 == 0 else []
             harmonic = np.array([0, *harmonics, *harmonics, *nyquist])
             count = float(experiment.independent[channel])
-            blocks.append(cls(count=count, size=harmonic.size, harmonic=harmonic, **common(experiment, channel, place)))
+            given = common(experiment, channel, place, count=count, size=harmonic.size, harmonic=harmonic)
+            blocks.append(cls(**given))
         return blocks
 
     @property
@@ -82,7 +83,7 @@ class MeanPeriod(Timed):
 
     def spread(self, weights: np.ndarray) -> np.ndarray:
         """Return the transpose of `transform` applied to weights (…, size), its inverse but for a factor."""
-        return _fourier.from_components(weights, self.points) * self.size / self.points
+        return _fourier.from_components(weights * (self.size / self.points), self.points)
 
     def add_vjp(self, predicted: Any, weights: np.ndarray, total: ComparedSignals) -> None:
         """Add the transposed transform."""

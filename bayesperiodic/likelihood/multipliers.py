@@ -1,7 +1,7 @@
 """Measured Floquet multipliers, compared as log|μ|."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,9 +17,10 @@ MULTIPLIERS = "multipliers"
 class Multipliers(LinearBlock):
     """Logarithms of multipliers in units of their standard deviations, given the errors of the section points."""
 
-    at: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))  # (points,), on the grid
     slopes: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))  # (size, values), regression on the values
     whitening: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))  # (size, size)
+
+    words: ClassVar[str] = "{0.size} Floquet multipliers"
 
     @classmethod
     def of(cls, experiment: Experiment, model: Model) -> "list[Multipliers]":
@@ -27,33 +28,18 @@ class Multipliers(LinearBlock):
         e, count = experiment, experiment.measured_multipliers.size
         if not count:
             return []
-        at = np.empty(0, dtype=int)
-        slopes = np.zeros((count, 0))
+        position, slopes = np.empty(0), np.zeros((count, 0))
         if e.multiplier_sd is not None:
-            root = np.diag(1.0 / e.multiplier_sd)
+            root, scale = whitening(np.diag(e.multiplier_sd**2))
         else:
             assert e.covariance is not None
-            at = np.flatnonzero(e.measured_points)
-            size = at.size * len(measured_channels(e, model))
+            position = np.flatnonzero(e.measured_points) / e.measured_points.size
+            size = position.size * len(measured_channels(e, model))
             cross = e.covariance[size:, :size]
             slopes = np.linalg.solve(e.covariance[:size, :size], cross.T).T
-            root = whitening(e.covariance[size:, size:] - slopes @ cross.T)
-        return [cls(count=0.0, size=count, at=at, slopes=slopes, whitening=root, **common(e, MULTIPLIERS))]
-
-    @property
-    def multipliers(self) -> int:  # type: ignore[override]
-        """Floquet multipliers that are compared."""
-        return self.size
-
-    @property
-    def description(self) -> str:
-        """What is compared, in words."""
-        return f"{self.size} Floquet multipliers"
-
-    @property
-    def log_scale(self) -> float:
-        """The logarithm of the determinant of what whitens the logarithms."""
-        return float(np.log(np.diag(self.whitening)).sum())
+            root, scale = whitening(e.covariance[size:, size:] - slopes @ cross.T)
+        given = common(e, MULTIPLIERS, count=0.0, size=count, position=position)
+        return [cls(slopes=slopes, whitening=root, log_scale=scale, **given)]
 
     def components(self, moved: ComparedSignals) -> np.ndarray:
         """Return the whitened logarithms, less what goes with the values."""
@@ -61,10 +47,6 @@ class Multipliers(LinearBlock):
         if self.at.size:
             logarithms = logarithms - times(self.slopes, values_at(moved.values, self.at))
         return times(self.whitening, logarithms)
-
-    def errors(self, values: np.ndarray) -> np.ndarray:
-        """Return what errors of the measured outputs change."""
-        return self.components(ComparedSignals(values, np.zeros((*values.shape[:-2], self.size)), np.empty(0)))
 
     def add_vjp(self, predicted: Any, weights: np.ndarray, total: ComparedSignals) -> None:
         """Add the transposed whitening and regression."""

@@ -69,11 +69,6 @@ class Noise(ABC):
         return {}
 
     @property
-    def kinds(self) -> tuple[str, ...]:
-        """The kinds of noise parameters of a channel, the variance first."""
-        return VARIANCE, *self.shape_priors
-
-    @property
     def separate(self) -> bool:
         """Whether each experiment has its own noise parameters."""
         return self.per == PER_EXPERIMENT
@@ -122,25 +117,6 @@ class Noise(ABC):
                     f"{block.experiment!r} has no scatter of {block.channel!r}. Give scatter and cycles."
                 )
 
-    @property
-    def correlates_points(self) -> bool:
-        """Whether the values at the points of a mask have a covariance of their own instead of equal variances."""
-        return type(self).covariance is not Noise.covariance
-
-    def label(self, block: Block) -> str:
-        """Return the text in brackets of the names of a block's noise parameters.
-
-        Parameters
-        ----------
-        block : Block
-
-        Returns
-        -------
-        str
-            The channel, followed by the experiment where each has its own.
-        """
-        return block.channel if self.per == PER_CHANNEL else f"{block.channel}, {block.experiment}"
-
     def parameter_names(self, block: Block) -> tuple[str, ...]:
         """Return the names of the noise parameters of a block.
 
@@ -151,7 +127,8 @@ class Noise(ABC):
         Returns
         -------
         tuple of str
-            The variance first; none where the errors are known.
+            The variance first, each with the channel in brackets, followed by the experiment where each has its own
+            noise; none where the errors are known.
         """
         return block.parameter_names(self)
 
@@ -209,19 +186,10 @@ class Noise(ABC):
         every = np.broadcast_to(variances, block.size)
         return np.diag(every), np.stack([np.diag(every * slope) for slope in slopes.T])
 
-    def has_constant_prior(self, kind: str) -> bool:
-        """Return whether `log_prior` of a kind of noise parameters is zero wherever they are.
-
-        Parameters
-        ----------
-        kind : str
-            "variance", "lengthscale" or "floor".
-
-        Returns
-        -------
-        bool
-        """
-        return kind not in self.shape_priors and self.prior == JEFFREYS
+    @property
+    def constant_prior(self) -> bool:
+        """Whether `log_prior` of a variance is zero wherever it is."""
+        return self.prior == JEFFREYS
 
     def log_prior(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the log-density of noise parameters over their logarithms, and its derivative.
@@ -243,25 +211,14 @@ class Noise(ABC):
         """
         if kind in self.shape_priors:
             return _over_logarithm(self.shape_priors[kind], value)
-        if self.has_constant_prior(kind):
+        if self.constant_prior:
             return np.zeros_like(value), np.zeros_like(value)
         if self.prior == FLAT_PRIOR:
             return np.log(value), np.ones_like(value)
         return _over_logarithm(self._proper_prior, value)
 
-    def mean_variance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean variance of a block's components, and the part of it that is proportional to the variance.
-
-        Parameters
-        ----------
-        block : Block
-        values : array (…, parameters)
-            Of the block's noise parameters, the variance first.
-
-        Returns
-        -------
-        mean, proportional : array (…)
-        """
+    def _mean_variance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean variance (…,) of a block's components, and the part that is proportional to the parameter."""
         variances, slopes = self.spectrum(block, values)
         return variances.mean(axis=-1), (variances * slopes[..., 0]).mean(axis=-1)
 
@@ -349,8 +306,9 @@ class Measured(Noise):
         """Return scatter²/cycles."""
         return block.measured
 
-    def has_constant_prior(self, kind: str) -> bool:
-        """Return False: Jeffreys' prior is not constant over ln v here."""
+    @property
+    def constant_prior(self) -> bool:
+        """False: Jeffreys' prior is not constant over ln v here."""
         return False
 
     def log_prior(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -418,14 +376,14 @@ class Circulant(Noise):
         super().check(blocks)
         points: dict[str, int] = {}
         for block in (b for b in blocks if b.timed):
-            if points.setdefault(self.label(block), block.points) != block.points:
+            if (other := points.setdefault(self.parameter_names(block)[0], block.points)) != block.points:
                 raise ValueError(
                     f"noise: must have per='experiment' for grids that differ, got {self.name!r}; experiments with "
-                    f"{points[self.label(block)]} and {block.points} points in the response period share the "
-                    f"correlation of {block.channel!r}. Or give all the same samples and periods."
+                    f"{other} and {block.points} points in the response period share the correlation of "
+                    f"{block.channel!r}. Or give all the same samples and periods."
                 )
 
-    def mean_variance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _mean_variance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return v·N/n twice, the mean over all harmonics of the grid."""
         variance = values[..., 0] * (block.size / block.points)
         return variance, variance
@@ -436,26 +394,24 @@ class Circulant(Noise):
 
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return V = v·S_h·N/n, S with mean 1 over the harmonics of the grid."""
-        variances, slopes = self._spectrum(block.harmonic, block.points, values)
+        variances, slopes = self._spectrum(block.points, values, block.harmonic)
         return variances * (block.size / block.points), slopes
 
     def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return v·Σ_h S_h cos(2πh(t_i − t_j))/n at the points of a mask."""
         harmonic = np.minimum(np.arange(block.points), block.points - np.arange(block.points))
-        variances, slopes = self._spectrum(harmonic, block.points, values)
-        point = np.rint(block.position * block.points).astype(int)
+        variances, slopes = self._spectrum(block.points, values, harmonic)
         by_lag = np.fft.ifft(np.vstack([variances, slopes.T * variances])).real
-        matrix = by_lag[:, np.abs(point[:, None] - point[None, :])]
+        matrix = by_lag[:, np.abs(block.at[:, None] - block.at)]
         return matrix[0], matrix[1:]
 
-    def _spectrum(self, harmonic: np.ndarray, points: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _spectrum(self, points: int, values: np.ndarray, harmonic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return v·S at harmonics and its logarithmic slopes, S with mean 1 over a grid of points."""
         on_grid, repeated = _harmonics_of_grid(points)
         power, slope = self._kernel_spectrum(on_grid, values)
         mean = np.sum(repeated * power, axis=-1, keepdims=True)
         mean_slope = np.sum(repeated * power * slope, axis=-1, keepdims=True) / mean
-        power, slope = self._kernel_spectrum(harmonic, values)
-        power, slope = power / mean, slope - mean_slope
+        power, slope = (power / mean).take(harmonic, axis=-1), (slope - mean_slope).take(harmonic, axis=-1)
         if self.kernel == "exponential":
             return values[..., :1] * power, np.stack([np.ones_like(slope), slope], axis=-1)
         floor = values[..., 2:3]

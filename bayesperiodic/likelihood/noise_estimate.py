@@ -69,10 +69,9 @@ def _maximise(
 
     def negative(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
         values = complete(logarithms)
-        value = float(part(residuals, values, log_variance_factor) + part.log_prior(values))
-        if not np.isfinite(value):
-            return 1e300, np.zeros(len(free))
-        return -value, -part.gradients(residuals, values, log_variance_factor)[1][free]
+        value, _, slopes = part.value_and_gradients(residuals, values, log_variance_factor)
+        value += float(part.log_prior(values))
+        return (-value, -slopes[free]) if np.isfinite(value) else (1e300, np.zeros(len(free)))
 
     middle = np.log(centre[free])
     bounds = [(c - LOWEST_LOG_SCALE, c + HIGHEST_LOG_SCALE) for c in middle]

@@ -9,7 +9,7 @@ import numpy as np
 from bayesperiodic import _fourier
 from bayesperiodic._parallel import available_cores, in_threads
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.block import Block, ComparedSignals, measured_channels, measured_variance
+from bayesperiodic.likelihood.block import ComparedSignals, measured_channels, measured_variance
 from bayesperiodic.likelihood.kinds import blocks_of
 from bayesperiodic.likelihood.likelihood import Residuals
 from bayesperiodic.models.model import Model
@@ -37,10 +37,11 @@ class GroupSolution(NamedTuple):
     z: np.ndarray  # (experiments, solves, points, states), periodic parts of the states
     status: np.ndarray  # int (experiments, solves), index into `compiled.STATUSES`
 
-    def response(self, member: int) -> Response:
-        """Return the responses of one experiment, θ on the leading axis."""
-        delay = self.values[member][..., -1]
-        return Response(self.outputs[member], self.frequency[member], self.log_multipliers[member], delay)
+    def response(self, members: Any, solves: Any = ...) -> Response:
+        """Return the responses of one experiment (an index), θ on the leading axis; of several without multipliers."""
+        at = members, solves
+        multipliers = self.log_multipliers[members][solves] if isinstance(members, int) else np.empty(0)
+        return Response(self.outputs[at], self.frequency[at], multipliers, self.values[at][..., -1])
 
     def at(self, solves: Any) -> "GroupSolution":
         """Return the solutions at some of the θ."""
@@ -93,12 +94,14 @@ class Observation:
     ----------
     channels : tuple of str
         Those measured, in the order of the model's outputs.
-    columns : list of int
-        Their indices among the model's outputs.
     picked : slice or list of int
-        The same, a slice where they are consecutive.
+        Their indices among the model's outputs, a slice, which does not copy, where they are consecutive.
     angles : list of bool
         Which of the channels are angles.
+    blocks : tuple of Block
+        The data of the experiment, one entry a vector of components.
+    multipliers : int
+        The number of Floquet multipliers that are compared.
     data : array (points, channels)
     caused : list of array (size,), optional
         What the expected errors of the inputs cause in the components of each block, see `input_noise`.
@@ -106,59 +109,49 @@ class Observation:
 
     def __init__(self, experiment: Experiment, model: Model, delayed: bool, caused: Sequence[np.ndarray] | None = None):
         self.experiment, self.caused = experiment, caused
-        self.channels, self._model = measured_channels(experiment, model), model
-        self.columns = [model.outputs.index(channel) for channel in self.channels]
+        self.channels, self.blocks = measured_channels(experiment, model), blocks_of(experiment, model)
+        columns = [model.outputs.index(channel) for channel in self.channels]
+        between = slice(columns[0], columns[-1] + 1)
+        self.picked = between if len(columns) == between.stop - between.start else columns
         self.angles = [channel in model.angles for channel in self.channels]
-        first, count = self.columns[0], len(self.columns)
-        consecutive = self.columns == list(range(first, first + count))
-        # A slice does not copy the outputs.
-        self.picked = slice(first, first + count) if consecutive else self.columns
+        self._angle_places = np.flatnonzero(self.angles)
         self._free_phase = model.autonomous
         self._shifted = delayed or model.autonomous
         self.data = np.stack([experiment.outputs[channel] for channel in self.channels], axis=-1)
         logarithms = np.log(np.abs(experiment.measured_multipliers))
         self._measured = ComparedSignals(self.data, logarithms, np.array(experiment.frequency))
         self._points = len(self.data)
-
-    @cached_property
-    def blocks(self) -> tuple[Block, ...]:
-        """The data of the experiment, one entry a vector of components."""
-        return blocks_of(self.experiment, self._model)
-
-    @cached_property
-    def multipliers(self) -> int:
-        """The number of Floquet multipliers that are compared."""
-        return max(block.multipliers for block in self.blocks)
+        self._ramp = np.arange(self._points)[:, None] / self._points
+        self.multipliers = logarithms.size
 
     @property
     def whole(self) -> bool:
         """Whether the outputs were measured along the whole period."""
         return bool(self.experiment.measured_points.all())
 
-    @property
-    def log_scale(self) -> float:
-        """ln|∂ components/∂ data| of values that are divided by known standard deviations or a given covariance."""
-        return sum(block.log_scale for block in self.blocks)
-
-    def data_components(self) -> list[np.ndarray]:
-        """Return the components (size,) of the measured values, without what errors of the inputs caused."""
-        components = [block.errors(self.data) for block in self.blocks]
-        return components if self.caused is None else [a - b for a, b in zip(components, self.caused, strict=True)]
-
     def residuals(self, response: Response) -> list[np.ndarray]:
         """Return the residual components, one array (…, size) a block."""
         measured, predicted = self._measured, self._signals(response)
         difference = ComparedSignals(
-            self._difference(response),
+            self._difference(predicted.values),
             measured.log_multipliers - predicted.log_multipliers,
             measured.frequency - predicted.frequency,
         )
-        components = [block.compare(predicted, difference) for block in self.blocks]
+        return self._less_caused([block.compare(predicted, difference) for block in self.blocks])
+
+    def _less_caused(self, components: list[np.ndarray]) -> list[np.ndarray]:
+        """Return the components without what the expected errors of the inputs caused."""
         return components if self.caused is None else [a - b for a, b in zip(components, self.caused, strict=True)]
+
+    def data_components(self) -> list[np.ndarray]:
+        """Return the components (size,) of the measured values, without what errors of the inputs caused."""
+        return self._less_caused(self.errors(self.data))
 
     def errors(self, values: np.ndarray) -> list[np.ndarray]:
         """Return the components (…, size) of errors of the measured values (…, points, channels), an array a block."""
-        return [block.errors(values) for block in self.blocks]
+        shape = values.shape[:-2]
+        signals = ComparedSignals(values, np.zeros((*shape, self.multipliers)), np.zeros(shape))
+        return [block.errors(signals) for block in self.blocks]
 
     @cached_property
     def layout(self) -> tuple[Hashable, ...] | None:
@@ -168,34 +161,33 @@ class Observation:
 
     def changes(self, response: Response, directions: Response) -> list[np.ndarray]:
         """Return the derivatives of the predicted components along directions, one array (directions, size) a block."""
-        moved = directions.outputs[..., self.columns]
+        predicted, moved = self._signals(response), directions.outputs[..., self.picked]
         if self._shifted:
-            moved = self._shift(moved, self._fraction(response))
-            moved = moved - self._rate(response) * self._fraction_changes(response, directions)[:, None, None]
-        along, predicted = (
-            ComparedSignals(moved, directions.log_multipliers, directions.frequency),
-            self._signals(response),
-        )
+            turned = self._fraction_changes(response, directions)[:, None, None]
+            moved = self._shift(moved, self._fraction(response)) - self._rate(predicted.values) * turned
+        along = ComparedSignals(moved, directions.log_multipliers, directions.frequency)
         return [block.changes(predicted, along) for block in self.blocks]
 
     def vjp(self, response: Response, weights: list[np.ndarray]) -> Response:
-        """Return the derivatives of Σ weights · predicted components by everything in a forced model's response."""
-        predicted = self._signals(response)
-        by = ComparedSignals(np.zeros_like(self.data), np.zeros(self.multipliers), np.zeros(()))
+        """Return the derivatives of Σ weights · predicted components by everything in a forced model's response.
+
+        Where there is a `layout`, response and weights may be of several experiments, on the leading axis.
+        """
+        predicted, outputs, by_delay = self._signals(response), np.zeros(response.outputs.shape), 0.0
+        by = ComparedSignals(outputs[..., self.picked], np.zeros(self.multipliers), np.zeros(()))
         for block, weight in zip(self.blocks, weights, strict=True):
             block.add_vjp(predicted, weight, by)
-        total, by_delay = by.values, 0.0
+        values = by.values
         if self._shifted:
             fraction = float(response.frequency) / self.experiment.periods
-            by_delay = -float(np.sum(total * self._rate(response))) * fraction
-            total = self._shift(total, -self._fraction(response))
-        outputs = np.zeros_like(response.outputs)
-        outputs[:, self.columns] = total
+            by_delay = -float(np.sum(values * self._rate(predicted.values))) * fraction
+            values = self._shift(values, -self._fraction(response))
+        outputs[..., self.picked] = values
         return Response(outputs, by.frequency, by.log_multipliers, np.array(by_delay))
 
     def predicted(self, response: Response) -> dict[str, np.ndarray]:
         """Return ŷ (…, points) of each measured channel, turned and delayed."""
-        return dict(zip(self.channels, np.moveaxis(self._predicted(response), -1, 0), strict=True))
+        return dict(zip(self.channels, np.moveaxis(self._signals(response).values, -1, 0), strict=True))
 
     def replicates(self, response: Response, components: list[np.ndarray]) -> dict[str, np.ndarray]:
         """Return possible measurements, ŷ plus noise (draws, points), by channel; NaN outside the mask.
@@ -208,7 +200,7 @@ class Observation:
             components = [a + b for a, b in zip(components, self.caused, strict=True)]
         for block, component in zip(self.blocks, components, strict=True):
             block.simulate(component, noise)
-        values = self._predicted(response) + noise
+        values = self._signals(response).values + noise
         turned = self.data - _fourier.within_half_turn(self.data - values)
         return {n: (turned if self.angles[c] else values)[..., c] for c, n in enumerate(self.channels)}
 
@@ -217,27 +209,23 @@ class Observation:
 
         ŷ is taken a number of forcing periods `ahead`.
         """
-        pairs = zip(self.channels, np.moveaxis(self._difference(response, ahead), -1, 0), strict=True)
+        predicted = np.roll(self._signals(response).values, -ahead * self.experiment.samples, axis=-2)
+        pairs = zip(self.channels, np.moveaxis(self._difference(predicted), -1, 0), strict=True)
         return {channel: self.experiment.compared(channel, e) for channel, e in pairs}
 
     def _signals(self, response: Response) -> ComparedSignals:
-        """Return the prediction of what was measured."""
-        return ComparedSignals(self._predicted(response), response.log_multipliers, response.frequency)
+        """Return the prediction of what was measured, the outputs turned and delayed."""
+        values = response.outputs[..., self.picked]
+        if self._shifted:
+            values = self._shift(values, self._fraction(response), turning=True)
+        return ComparedSignals(values, response.log_multipliers, response.frequency)
 
-    def _difference(self, response: Response, ahead: int = 0) -> np.ndarray:
-        """Return y − ŷ (…, points, channels), ŷ some forcing periods ahead, angles within half a turn."""
-        predicted = self._predicted(response)
-        if ahead:
-            predicted = np.roll(predicted, -ahead * self.experiment.samples, axis=-2)
+    def _difference(self, predicted: np.ndarray) -> np.ndarray:
+        """Return y − ŷ (…, points, channels), angles within half a turn."""
         values = self.data - predicted
-        for c in np.flatnonzero(self.angles):
+        for c in self._angle_places:
             values[..., c] = _fourier.within_half_turn(values[..., c])
         return values
-
-    def _predicted(self, response: Response) -> np.ndarray:
-        """Return the model's outputs (…, points, channels), turned and delayed."""
-        outputs = response.outputs[..., self.columns]
-        return self._shift(outputs, self._fraction(response), turning=True) if self._shifted else outputs
 
     def _fraction(self, response: Response) -> np.ndarray:
         """Return by what fraction of the response period the outputs are shifted, (…,)."""
@@ -252,7 +240,7 @@ class Observation:
 
     def _fundamentals(self, outputs: np.ndarray) -> np.ndarray:
         """Return the complex amplitude of the first harmonic of each channel, (…, channels)."""
-        return _fourier.coefficients(np.moveaxis(outputs[..., self.columns], -1, -2), 1)[..., 1]
+        return _fourier.coefficients(np.moveaxis(outputs[..., self.picked], -1, -2), 1)[..., 1]
 
     @cached_property
     def _reference(self) -> np.ndarray:
@@ -273,27 +261,27 @@ class Observation:
         delays = directions.delay * response.frequency + response.delay * directions.frequency
         changes = delays / self.experiment.periods
         if self._free_phase:
-            moved = directions.outputs[..., self.columns]
+            moved = directions.outputs[..., self.picked]
             changes = changes + np.einsum("...pc,pc->...", moved, self._phase_gradient(response))
         return changes
 
     def _phase_gradient(self, response: Response) -> np.ndarray:
         """Return the derivatives (points, channels) of the outputs' phase [turns] by their values."""
         agreement = np.sum(self._fundamentals(response.outputs) * self._reference)
-        wave = np.exp(-2j * np.pi * np.arange(self._points) / self._points) * 2.0 / self._points
+        wave = np.exp(-2j * np.pi * self._ramp[:, 0]) * 2.0 / self._points
         return np.imag(np.outer(wave, self._reference) / agreement) / (2 * np.pi)
 
     def _shift(self, signals: np.ndarray, fraction: np.ndarray, turning: bool = False) -> np.ndarray:
         """Return signals (…, points, channels) that come a fraction of the response period later."""
         phase = np.asarray(fraction)[..., None, None]
         trend = self._trend(signals) if turning else 0.0
-        spectrum = np.fft.rfft(signals - trend * np.arange(self._points)[:, None] / self._points, axis=-2)
+        spectrum = np.fft.rfft(signals - trend * self._ramp, axis=-2)
         harmonic = np.arange(spectrum.shape[-2])[:, None]
         turn = np.exp(-2j * np.pi * harmonic * phase)
         if self._points % 2 == 0:
             turn[..., -1, :] = turn[..., -1, :].real
         shifted = np.fft.irfft(spectrum * turn, n=self._points, axis=-2)
-        return shifted + trend * (np.arange(self._points)[:, None] / self._points - phase)
+        return shifted + trend * (self._ramp - phase)
 
     def _trend(self, signals: np.ndarray) -> np.ndarray:
         """Return what angles advance in a response period, (…, 1, channels), whole turns; zero for other channels."""
@@ -301,11 +289,10 @@ class Observation:
         turns = np.rint((ahead - signals[..., :1, :]) / (2 * np.pi))
         return 2 * np.pi * np.where(self.angles, turns, 0.0)
 
-    def _rate(self, response: Response) -> np.ndarray:
+    def _rate(self, predicted: np.ndarray) -> np.ndarray:
         """Return the derivative (points, channels) of the predicted outputs by their phase [per response period]."""
-        predicted = self._predicted(response)
         trend = self._trend(predicted)
-        spectrum = np.fft.rfft(predicted - trend * np.arange(self._points)[:, None] / self._points, axis=0)
+        spectrum = np.fft.rfft(predicted - trend * self._ramp, axis=0)
         spectrum *= 2j * np.pi * np.arange(len(spectrum))[:, None]
         if self._points % 2 == 0:
             spectrum[-1] = 0.0
@@ -316,8 +303,8 @@ class _Part(NamedTuple):
     """Experiments whose residuals are computed together."""
 
     group: int  # index of the group of experiments that are solved together
-    members: Any  # slice or list of int, their places in the group
-    observations: list[Observation]
+    members: Any  # place in the group of an experiment that is compared alone; slice or list of int of others
+    first: Observation
     data: list[np.ndarray]  # Fourier components (experiments, 1, size) a channel; empty if more than these is compared
 
 
@@ -336,14 +323,14 @@ class Comparisons:
             for m, observation in enumerate(group):
                 layouts.setdefault(observation.layout or observation.experiment.name, []).append(m)
             for members in layouts.values():
-                members_of = [group[m] for m in members]
-                each = zip(*(o.data_components() for o in members_of), strict=True) if members_of[0].layout else ()
-                data = [np.stack(components)[:, None] for components in each]
-                self._parts.append(
-                    _Part(g, slice(None) if len(members_of) == len(group) else members, members_of, data)
-                )
-                blocks = range(stacks, stacks + len(members_of[0].blocks))
-                places |= {o.experiment.name: [(b, m) for b in blocks] for m, o in enumerate(members_of)}
+                together, first, data = [group[m] for m in members], group[members[0]], []
+                at: Any = slice(None) if len(members) == len(group) else members
+                if first.layout:
+                    parts = zip(*(o.data_components() for o in together), strict=True)
+                    data = [np.stack(components)[:, None] for components in parts]
+                self._parts.append(_Part(g, at if data else members[0], first, data))
+                blocks = range(stacks, stacks + len(first.blocks))
+                places |= {o.experiment.name: [(b, m) for b in blocks] for m, o in enumerate(together)}
                 stacks = blocks.stop
         self._places = [place for name in order for place in places[name]]
 
@@ -362,16 +349,13 @@ class Comparisons:
     def _stacks(self, simulation: Simulation) -> list[np.ndarray]:
         """Return the residual components of all parts, an array (experiments, solves, size) a block."""
         result = []
-        for group, members, observations, data in self._parts:
-            solved, first = simulation.groups[group], observations[0]
+        for group, members, first, data in self._parts:
+            solved = simulation.groups[group]
             if data:
-                values = solved.outputs[members][..., first.picked]
-                result += [
-                    predicted - block.errors(values) for predicted, block in zip(data, first.blocks, strict=True)
-                ]
+                signals = ComparedSignals(solved.outputs[members][..., first.picked], np.empty(0), np.empty(0))
+                result += [part - block.errors(signals) for part, block in zip(data, first.blocks, strict=True)]
             else:
-                (member,) = range(len(solved.outputs))[members] if isinstance(members, slice) else members
-                result += [block[None] for block in first.residuals(solved.response(member))]
+                result += [part[None] for part in first.residuals(solved.response(members))]
         return result
 
     def vjp(
@@ -382,20 +366,12 @@ class Comparisons:
         They are by the outputs (experiments, points, channels) and the delays (experiments,) of each group, and by
         log|μ| of the experiments whose multipliers were measured. The weights are arranged as the residuals at this θ.
         """
-        by_outputs = [np.zeros((len(group.outputs), *group.outputs.shape[2:])) for group in simulation.groups]
-        by_delay, by_multipliers = [np.zeros(len(group.outputs)) for group in simulation.groups], {}
-        stacks = iter(weights.stacks())
-        for group, members, observations, data in self._parts:
-            first, pulls = observations[0], [next(stacks) for _ in observations[0].blocks]
-            if data:
-                by = ComparedSignals(np.zeros((len(observations), *first.data.shape)), np.empty(0), np.empty(0))
-                for block, weight in zip(first.blocks, pulls, strict=True):
-                    block.add_vjp(None, weight, by)
-                for c, column in enumerate(first.columns):
-                    by_outputs[group][members, :, column] = by.values[..., c]
-            else:
-                response = simulation.at(0).response(first.experiment.name)
-                pulled = first.vjp(response, [stack[0] for stack in pulls])
-                by_outputs[group][members], by_delay[group][members] = pulled.outputs, pulled.delay
-                by_multipliers[first.experiment.name] = pulled.log_multipliers
+        by_outputs = [np.empty((len(group.outputs), *group.outputs.shape[2:])) for group in simulation.groups]
+        by_delay, by_multipliers = [np.empty(len(group.outputs)) for group in simulation.groups], {}
+        stacks = iter(weights.stacks)
+        for group, members, first, data in self._parts:
+            pulls = [next(stacks) if data else next(stacks)[0] for _ in first.blocks]
+            pulled = first.vjp(simulation.groups[group].response(members, 0), pulls)
+            by_outputs[group][members], by_delay[group][members] = pulled.outputs, pulled.delay
+            by_multipliers[first.experiment.name] = pulled.log_multipliers
         return by_outputs, by_delay, by_multipliers

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -19,22 +19,16 @@ class OrbitFrequency(LinearBlock):
 
     standard_error: float = 1.0  # [Hz]
 
+    words: ClassVar[str] = FREQUENCY
+
     @classmethod
     def of(cls, experiment: Experiment, model: Model) -> "list[OrbitFrequency]":
         """Return one block of every experiment of an autonomous model."""
         if not model.autonomous:
             return []
-        return [cls(count=0.0, size=1, standard_error=experiment.frequency_se, **common(experiment, FREQUENCY))]
-
-    @property
-    def description(self) -> str:
-        """What is compared, in words."""
-        return FREQUENCY
-
-    @property
-    def log_scale(self) -> float:
-        """Minus the logarithm of the standard error."""
-        return -math.log(self.standard_error)
+        error = experiment.frequency_se
+        given = common(experiment, FREQUENCY, count=0.0, size=1, log_scale=-math.log(error))
+        return [cls(standard_error=error, **given)]
 
     def components(self, moved: ComparedSignals) -> np.ndarray:
         """Return the frequency over its standard error."""

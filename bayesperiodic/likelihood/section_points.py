@@ -1,6 +1,5 @@
 """Values of all channels with a given covariance, such as points of a Poincaré section."""
 
-from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -18,30 +17,21 @@ SCALE = "scale"
 class SectionPoints(LinearBlock):
     """Values that are whitened by their covariance, which is known up to one factor, the noise parameter "scale"."""
 
-    at: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))  # (points compared,), on the grid
     whitening: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))  # (size, size)
 
     counted: ClassVar[bool] = True
+    words: ClassVar[str] = "{0.size} values with a given covariance"
 
     @classmethod
     def of(cls, experiment: Experiment, model: Model) -> "list[SectionPoints]":
         """Return one block of experiments with a covariance."""
         if experiment.covariance is None:
             return []
-        at = np.flatnonzero(experiment.measured_points)
-        size = at.size * len(measured_channels(experiment, model))
-        root = whitening(experiment.covariance[:size, :size])
-        return [cls(count=float(size), size=size, at=at, whitening=root, **common(experiment, SCALE))]
-
-    @property
-    def description(self) -> str:
-        """What is compared, in words."""
-        return f"{self.size} values with a given covariance"
-
-    @property
-    def log_scale(self) -> float:
-        """The logarithm of the determinant of what whitens the values."""
-        return float(np.log(np.diag(self.whitening)).sum())
+        position = np.flatnonzero(experiment.measured_points) / experiment.measured_points.size
+        size = position.size * len(measured_channels(experiment, model))
+        root, scale = whitening(experiment.covariance[:size, :size])
+        given = common(experiment, SCALE, count=float(size), size=size, position=position)
+        return [cls(whitening=root, log_scale=scale, **given)]
 
     def components(self, moved: ComparedSignals) -> np.ndarray:
         """Return the whitened values."""
@@ -50,10 +40,6 @@ class SectionPoints(LinearBlock):
     def add_vjp(self, predicted: Any, weights: np.ndarray, total: ComparedSignals) -> None:
         """Add the transposed whitening."""
         total.values[self.at] += (weights @ self.whitening).reshape(self.at.size, -1)
-
-    def errors(self, values: np.ndarray) -> np.ndarray:
-        """Return the components of errors of the measured outputs."""
-        return times(self.whitening, values_at(values, self.at))
 
     def simulate(self, components: np.ndarray, errors: np.ndarray) -> None:
         """Fill in the errors at the points."""
@@ -68,10 +54,6 @@ class SectionPoints(LinearBlock):
         """Return the scale."""
         return values, PROPORTIONAL
 
-    def alike(self, noise: Any) -> Hashable:
-        """Return nothing: all have the same variance."""
-        return SCALE
-
     def places(self, even: bool, dense: bool) -> tuple[str, np.ndarray, str]:
         """Return the whitened values."""
         return "value", np.arange(self.size), ""
@@ -83,6 +65,7 @@ def values_at(values: np.ndarray, at: np.ndarray) -> np.ndarray:
     return picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
 
 
-def whitening(covariance: np.ndarray) -> np.ndarray:
-    """Return the inverse of the lower Cholesky factor."""
-    return solve_triangular(np.linalg.cholesky(covariance), np.eye(len(covariance)), lower=True)
+def whitening(covariance: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the inverse of the lower Cholesky factor, and the logarithm of its determinant."""
+    root = solve_triangular(np.linalg.cholesky(covariance), np.eye(len(covariance)), lower=True)
+    return root, float(np.log(np.diag(root)).sum())

@@ -7,7 +7,8 @@ from typing import Any
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic.models.model import Model, smooth_sign
+from bayesperiodic.models.elements import smooth_sign
+from bayesperiodic.models.model import Model
 
 duffing = Model(
     "duffing",
@@ -65,20 +66,15 @@ def _pendulum(s: Any, p: Any, u: Any) -> list[sp.Expr]:
     return [s.ddphi + friction / inertia + (p.g + p.a * omega**2 * sp.cos(2 * sp.pi * s.tau)) / p.l * sp.sin(s.phi)]
 
 
+_PENDULUM_UNITS = {
+    "m": "kg", "l": "m", "k1": "N m", "k2": "N m s", "k3": "N m s^2", "a": "m", "g": "m/s^2", "v0": "rad/s",
+}  # fmt: skip
+
 pendulum = Model(
     "pendulum",
     states=["phi"],
     angles=["phi", "angle"],
-    parameters={
-        "m": "kg",
-        "l": "m",
-        "k1": "N m",
-        "k2": "N m s",
-        "k3": "N m s^2",
-        "a": "m",
-        "g": "m/s^2",
-        "v0": "rad/s",
-    },
+    parameters=_PENDULUM_UNITS,
     units={"phi": "rad", "angle": "rad", "rate": "rad/s"},
     equations=_pendulum,
     outputs=lambda s, p, u: {"angle": s.phi, "rate": s.dphi},
@@ -284,19 +280,14 @@ def _landing_gear(drive: str) -> Model:
 
     def outputs(s: Any, p: Any, u: Any) -> dict[str, sp.Expr]:
         pressure, force, _ = terms(s, p, u)
-        return (
-            {"displacement": s.q + p.theta12, "pressure": pressure}
-            if forced
-            else {"force": force, "pressure": pressure}
-        )
+        return ({"displacement": s.q + p.theta12} if forced else {"force": force}) | {"pressure": pressure}
 
-    names = ["q", "T", "force", "displacement", "pressure"] if forced else ["T", "displacement", "force", "pressure"]
     return Model(
         f"landing_gear_{drive}",
         states=["q", "T"] if forced else ["T"],
         inputs=[drive],
         parameters=_GEAR_UNITS,
-        units={name: _GEAR_CHANNELS[name] for name in names},
+        units={name: unit for name, unit in _GEAR_CHANNELS.items() if forced or name != "q"},
         equations=equations,
         outputs=outputs,
         description=f"""A landing gear damper with a gas spring and oil damping, its {drive} prescribed.

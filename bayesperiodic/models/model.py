@@ -14,7 +14,8 @@ import sympy as sp
 
 from bayesperiodic import _checks
 from bayesperiodic._compile.cache import load
-from bayesperiodic._compile.code_generation import GridFunction, Kernels, SymbolicModel, VjpKernels, grid_functions
+from bayesperiodic._compile.code_generation import Kernels, SymbolicModel, VjpKernels, grid_functions
+from bayesperiodic._compile.grid_function import GridFunction
 from bayesperiodic._expressions import parse
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
@@ -35,10 +36,9 @@ class Names:
         if name.startswith("_"):
             raise AttributeError(name)
         try:
-            _checks.one_of(self._kind, name, self._symbols)
+            return self[name]
         except ValueError as error:
             raise AttributeError(str(error)) from None
-        return self._symbols[name]
 
     def __getitem__(self, name: str) -> sp.Symbol:
         _checks.one_of(self._kind, name, self._symbols)
@@ -359,99 +359,19 @@ def with_derivatives(space: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]
     return {d + n: sp.Symbol(f"{space}_{d}_{n}", real=True) for d in DERIVATIVES for n in names}
 
 
+def parameter_vector(model: Model, parameters: Mapping[str, float]) -> np.ndarray:
+    """Return the value of every parameter, (parameters,); raise a ValueError for other names and values."""
+    _checks.same_names("parameters", parameters, model.parameters)
+    return np.array([_checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
+
+
 @cache
+def dense_kernels(path: Path | None = None) -> ModuleType:
+    """Return the compiled solution of small dense systems, or the compiled functions of a source that uses it."""
+    text = (path or Path(__file__).with_name("_kernels") / "dense.py").read_text(encoding="utf-8")
+    return load(text, shared=dense_kernels() if path else None)
+
+
 def integration_kernels() -> ModuleType:
     """Return the compiled functions of time integration."""
-    return load(Path(__file__).with_name("_kernels").joinpath("integrate.py").read_text(encoding="utf-8"))
-
-
-def integrate(
-    model: Model,
-    start: np.ndarray,
-    inputs: np.ndarray,
-    parameters: np.ndarray,
-    *,
-    frequency: float,
-    samples: int,
-    steps: int,
-    kept: int,
-) -> np.ndarray | None:
-    """Integrate by the classical fourth-order Runge-Kutta method; None if the states overflow.
-
-    `start` (size,) contains the states and then the rates of the second-order ones at tau = 0; `inputs`
-    (2·samples·periods, 3·inputs) u, u̇, ü at half steps over one response period, which is repeated. There are `samples`
-    steps per forcing period. The result (kept, size) contains `start`'s variables before each of the last steps.
-    """
-    orders = np.array(list(model.orders.values()))
-    path = np.empty((kept, orders.sum()))
-    start, inputs = np.array(start, dtype=float), np.ascontiguousarray(inputs)
-    function = model.kernels.residual_jacobian
-    runge_kutta = integration_kernels().runge_kutta
-    return path if runge_kutta(function, start, inputs, samples, parameters, frequency, orders, steps, path) else None
-
-
-def smooth_sign(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
-    """Return tanh(x / width), a smooth sign.
-
-    Parameters
-    ----------
-    x : sympy expression
-    width : number > 0 or sympy expression, in the units of `x`
-        The value is 0.76 at ``|x|`` = width and 0.995 at 3 width. Difference schemes do not resolve a transition within
-        a few grid steps.
-
-    Returns
-    -------
-    sympy expression, dimensionless
-
-    Raises
-    ------
-    ValueError
-        If a numeric width is not positive and finite.
-
-    Examples
-    --------
-    Coulomb friction of 20 N with a transition within about ±1 mm/s:
-
-    >>> import sympy as sp
-    >>> v = sp.Symbol("v")
-    >>> friction = 20 * bp.smooth_sign(v, 1e-3)
-    >>> [round(float(friction.subs(v, speed)), 2) for speed in (-1e-3, 0, 1e-3, 1e-2)]
-    [-15.23, 0.0, 15.23, 20.0]
-    """
-    return sp.tanh(x / _width(width))
-
-
-def smooth_abs(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
-    """Return sqrt(x² + width²) − width, a smooth absolute value that is zero at zero.
-
-    Parameters
-    ----------
-    x, width : sympy expression, and number > 0 or sympy expression in the same unit
-        The value tends to ``|x|`` − width for large ``|x|``; the curvature at zero is 1 / width. So
-        (x + smooth_abs)/2 is no ramp: it tends to −width/2 for large negative x; see `elements.ramp`.
-
-    Returns
-    -------
-    sympy expression, in the unit of `x`
-
-    Raises
-    ------
-    ValueError
-        If a numeric width is not positive and finite.
-
-    Examples
-    --------
-    >>> import sympy as sp
-    >>> v = sp.Symbol("v")
-    >>> [round(float(bp.smooth_abs(v, 0.1).subs(v, speed)), 3) for speed in (0, 0.1, 1, -10)]
-    [0.0, 0.041, 0.905, 9.9]
-    """
-    w = _width(width)
-    return sp.sqrt(x**2 + w**2) - w
-
-
-def _width(width: float | sp.Expr) -> sp.Expr:
-    if isinstance(width, sp.Expr) and not width.is_number:
-        return width
-    return sp.Float(_checks.positive("width", width))
+    return dense_kernels(Path(__file__).with_name("_kernels") / "integrate.py")

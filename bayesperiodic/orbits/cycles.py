@@ -60,10 +60,7 @@ class Estimate(NamedTuple):
 
 
 def newton_step(defect: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-    """Return the corrections (m, p, 2) that close m chains of p linearised maps.
-
-    The defects (m, p, 2) are the images minus the next points; the derivatives of the maps are (m, p, 2, 2).
-    """
+    """Return corrections (m, p, 2) that close chains of linearised maps; defects are images minus the next points."""
     m, p = defect.shape[:2]
     system = _closing_matrix(jacobian) + 1e-14 * np.eye(2 * p)
     return -np.linalg.solve(system, defect.reshape(m, 2 * p, 1)).reshape(m, p, 2)
@@ -106,13 +103,13 @@ def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool
     """Return whether the points (p, 2) repeat after a divisor of p."""
     p = len(points)
     divisors = [d for d in range(1, p) if p % d == 0]
-    return any(np.abs(wrap(np.concatenate([points[d:], points[:d]]) - points)).max() < tolerance for d in divisors)
+    return any(np.abs(wrap(np.roll(points, -d, axis=0) - points)).max() < tolerance for d in divisors)
 
 
-def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) -> list[MapCycle]:
-    """Return the cycles of a prime period to which close returns in the section (n, 2) lead."""
-    starts, members = _close_returns(maps, section, period)
-    chains = section[starts[:, None] + np.arange(period)]
+def candidates(maps: ReturnMap, atlas: Atlas, period: int) -> list[MapCycle]:
+    """Return the cycles of a prime period to which close returns lead."""
+    starts, members = _close_returns(maps, period)
+    chains = maps.points[starts[:, None] + np.arange(period)]
     step = np.empty(0)
     # The maps of the atlas are discontinuous between centres, so the last steps fit about the points themselves.
     for images, steps, longest in ((atlas.at, CORRECTIONS, np.inf), (atlas.exactly, EXACT_STEPS, NEARLY)):
@@ -120,7 +117,7 @@ def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) 
         kept = np.array([k for k in np.unique(heir) if step[k] < NEARLY], dtype=int)
         members = [np.concatenate([members[i] for i in np.flatnonzero(heir == k)]) for k in kept]
         chains, step = chains[kept], step[kept]
-    return _distinct(maps, section, chains, step, members)
+    return _distinct(maps, chains, step, members)
 
 
 def _converge(
@@ -133,9 +130,10 @@ def _converge(
         if active.size == 0:
             break
         moved = chains[active]
-        size, bandwidth = _newton(maps, moved, images)
-        chains[active] = moved
-        lost = (bandwidth > max(WIDEST_BANDWIDTH, 2.0 * noise)) | ~(size < longest)
+        image, jacobian, bandwidth = images(moved.reshape(-1, 2))
+        chains[active], size = _moved(maps, moved, image.reshape(moved.shape), jacobian.reshape(*moved.shape, 2))
+        widest = bandwidth.reshape(moved.shape[:2]).max(1)
+        lost = (widest > max(WIDEST_BANDWIDTH, 2.0 * noise)) | ~(size < longest)
         step[active] = np.where(lost, np.inf, size)
         active = active[(size > max(0.01 * CONVERGED_CORRECTION, 0.05 * noise)) & ~lost]
         cells = _cells(maps, chains[active], max(MERGED, noise))
@@ -147,17 +145,13 @@ def _converge(
     return step, heir
 
 
-def _newton(maps: ReturnMap, chains: np.ndarray, images: Images) -> tuple[np.ndarray, np.ndarray]:
-    """Move chains (m, period, 2) by one step; return the step sizes and the largest bandwidths, (m,) each."""
-    if not len(chains):
-        return np.empty(0), np.empty(0)
-    shape = chains.shape[:2]
-    image, jacobian, bandwidth = images(chains.reshape(-1, 2))
-    defect = maps.wrap(image.reshape(*shape, 2) - np.roll(chains, -1, axis=1))
-    correction = newton_step(defect, jacobian.reshape(*shape, 2, 2))
+def _moved(
+    maps: ReturnMap, chains: np.ndarray, images: np.ndarray, jacobian: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return chains (m, period, 2) after a Newton step of limited length, and the sizes (m,) of the whole steps."""
+    correction = newton_step(maps.wrap(images - np.roll(chains, -1, axis=1)), jacobian)
     size = np.abs(correction).max((1, 2))
-    chains += correction * np.minimum(1.0, LONGEST_CORRECTION / np.maximum(size, 1e-300))[:, None, None]
-    return size, bandwidth.reshape(shape).max(1)
+    return chains + correction * np.minimum(1.0, LONGEST_CORRECTION / np.maximum(size, 1e-300))[:, None, None], size
 
 
 def _cells(maps: ReturnMap, chains: np.ndarray, size: float) -> np.ndarray:
@@ -165,9 +159,9 @@ def _cells(maps: ReturnMap, chains: np.ndarray, size: float) -> np.ndarray:
     return np.floor(inside / size).astype(np.int64)
 
 
-def _close_returns(maps: ReturnMap, section: np.ndarray, period: int) -> tuple[np.ndarray, list[np.ndarray]]:
+def _close_returns(maps: ReturnMap, period: int) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the first point of the closest return in each cell of chains, and the first points of all in that cell."""
-    noise = float(maps.noise.max())
+    section, noise = maps.points, float(maps.noise.max())
     distance = maps.distance(section[period:], section[:-period])
     close = np.flatnonzero(distance < CLOSE + 2.0 * noise)
     close = close[np.argsort(distance[close], kind="stable")]
@@ -177,9 +171,7 @@ def _close_returns(maps: ReturnMap, section: np.ndarray, period: int) -> tuple[n
     return close[first], np.split(close[order], np.cumsum(counts)[:-1])
 
 
-def _distinct(
-    maps: ReturnMap, section: np.ndarray, chains: np.ndarray, step: np.ndarray, members: list[np.ndarray]
-) -> list[MapCycle]:
+def _distinct(maps: ReturnMap, chains: np.ndarray, step: np.ndarray, members: list[np.ndarray]) -> list[MapCycle]:
     noise = float(maps.noise.max())
     tolerance = max(SAME_CYCLE, 3.0 * noise)
     # Each cycle with the first points and the shift of each of its close returns, (returns, 2).
@@ -189,19 +181,17 @@ def _distinct(
             break
         if has_shorter_period(chains[k], maps.wrap, tolerance):
             continue
-        for cycle, group in groups:
-            distance, shift = shift_between(chains[k], cycle, maps.wrap)
-            if distance < tolerance:
-                group.append(np.stack([members[k], np.full(len(members[k]), shift)]))
-                break
-        else:
-            groups.append((maps.wrap(chains[k]), [np.stack([members[k], np.zeros_like(members[k])])]))
+        shifts = ((group, *shift_between(chains[k], cycle, maps.wrap)) for cycle, group in groups)
+        group, shift = next(((group, shift) for group, distance, shift in shifts if distance < tolerance), ([], 0))
+        if not group:
+            groups.append((maps.wrap(chains[k]), group))
+        group.append(np.stack([members[k], np.full(len(members[k]), shift)]))
     result = []
     for cycle, group in groups:
         steps = np.arange(len(cycle) + 1)
         starts, shifts = np.concatenate(group, axis=1)
         expected = cycle[(steps + shifts[:, None]) % len(cycle)]
-        closest = int(np.argmin(np.abs(maps.wrap(section[starts[:, None] + steps] - expected)).max((1, 2))))
+        closest = int(np.argmin(np.abs(maps.wrap(maps.points[starts[:, None] + steps] - expected)).max((1, 2))))
         result.append(MapCycle(cycle, len(starts), int(starts[closest]), int(shifts[closest])))
     return result
 
@@ -222,13 +212,12 @@ def refine(maps: ReturnMap, points: np.ndarray, neighbours: int) -> Estimate | N
     values, wide_values = eigenvalues(fit.jacobian), eigenvalues(wide[1].jacobian)
     slope_bias = (np.log(np.abs(wide_values)) - np.log(np.abs(values))) / SLOPE_GROWTH
     point_bias = maps.wrap(wide[0] - cycle).ravel() / VALUE_GROWTH
-    bias = np.concatenate([point_bias, slope_bias])
-    run = np.sum(fit.value - cycle, axis=0)
-    return Estimate(maps.wrap(cycle), values, _joint_covariance(fit), bias, _turns(maps, run))
+    turns = _turns(maps, np.sum(fit.value - cycle, axis=0))
+    return Estimate(maps.wrap(cycle), values, _joint_covariance(fit), np.append(point_bias, slope_bias), turns)
 
 
 def _turns(maps: ReturnMap, run: np.ndarray) -> float:
-    return float(np.sum(run[maps.angle] / maps.turn[maps.angle]))
+    return float(np.sum(run / maps.turn))
 
 
 def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple[np.ndarray, LocalFit] | None:
@@ -237,15 +226,13 @@ def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple
     for step in range(REFINING_STEPS):
         final = last < refined or step == REFINING_STEPS - 1
         fit = maps.fit_within(cycle, bandwidths, REFINING_DEGREE, influence=final)
-        defect = maps.wrap(fit.value - np.roll(cycle, -1, axis=0))
-        correction = newton_step(defect[None], fit.jacobian[None])[0]
-        size = float(np.abs(correction).max())
+        (moved,), (size,) = _moved(maps, cycle[None], fit.value[None], fit.jacobian[None])
         if not np.isfinite(size) or np.abs(maps.wrap(cycle - points)).max() > 0.1:
             return None
         if final:
             # Neighbours change as the centre moves, which leaves steps far below the errors.
             return (cycle, fit) if size < 1e-3 else None
-        cycle, last = cycle + correction * min(1.0, LONGEST_CORRECTION / max(size, 1e-300)), size
+        cycle, last = moved, size
     return None
 
 
@@ -254,7 +241,7 @@ def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndar
     nearest = maps.nearest(points, int(2.25 * neighbours))[0][:, -1] / KERNEL_REACH
     ladder = np.maximum(nearest, SMALLEST_REFINING * maps.noise.max()) * WIDENED ** np.arange(WIDTHS_TRIED)[:, None]
     fit = maps.fit_within(points, ladder[0], REFINING_DEGREE)
-    right, left = _eigenvectors(fit.jacobian, 0)
+    (right, _), (left, _) = _eigenvectors(fit.jacobian)
     targets, sds = np.empty((2, WIDTHS_TRIED, len(points), 3))
     active, accepted = np.arange(len(points)), np.zeros(len(points), dtype=int)
     for size, bandwidths in enumerate(ladder):
@@ -263,33 +250,29 @@ def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndar
             if not active.size:
                 break
             fit = maps.fit_within(points[active], bandwidths[active], REFINING_DEGREE)
-        targets[size, active], sds[size, active] = _along(fit, left[active], right[active])
+        # The slope along the unstable direction, and the two values of each fit.
+        slope = np.einsum("pi,pij,pj->p", left[active], fit.jacobian, right[active]).real
+        slopes = np.einsum("pi,pnji,pj->pn", left[active], fit.influence[:, :, 1:3], right[active]).real
+        targets[size, active] = np.column_stack([slope, fit.value])
+        sds[size, active] = np.sqrt(np.column_stack([(slopes**2).sum(1), (fit.influence[:, :, 0] ** 2).sum(1)]))
         away = np.abs(targets[size, active] - targets[:size, active])
         active = active[~np.any(away > AGREEMENT * sds[:size, active], axis=(0, 2))]
         accepted[active] += 1
     return ladder[np.maximum(accepted - 2, 0), np.arange(len(points))]
 
 
-def _along(fit: LocalFit, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slope along the unstable direction and the two values of each fit, and their standard deviations."""
-    slope = np.einsum("pi,pij,pj->p", left, fit.jacobian, right).real
-    slopes = np.einsum("pi,pnji,pj->pn", left, fit.influence[:, :, 1:3], right).real
-    sd = np.sqrt(np.concatenate([(slopes**2).sum(1)[:, None], (fit.influence[:, :, 0] ** 2).sum(1)], axis=1))
-    return np.concatenate([slope[:, None], fit.value], axis=1), sd
+def _eigenvectors(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return right eigenvectors (2, p, 2) of the monodromy matrix at each point, largest modulus first, and left ones.
 
-
-def _eigenvectors(jacobian: np.ndarray, which: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return right eigenvectors (p, 2) of the monodromy matrix at each point, and left ones at each image.
-
-    They belong to the eigenvalue of largest modulus (`which` = 0) or to the other one.
+    The left ones are those at each image.
     """
     monodromy = np.stack([_monodromy(np.roll(jacobian, -j, axis=0)) for j in range(len(jacobian))])
     vectors = []
     for matrices in (monodromy, monodromy.transpose(0, 2, 1)):
         values, columns = np.linalg.eig(matrices)
-        chosen = np.argsort(-np.abs(values), axis=1, kind="stable")[:, which]
-        vectors.append(columns[np.arange(len(columns)), :, chosen])
-    return vectors[0], np.roll(vectors[1], -1, axis=0)
+        order = np.argsort(-np.abs(values), axis=1, kind="stable")
+        vectors.append(np.take_along_axis(columns, order[:, None], axis=2).transpose(2, 0, 1))
+    return vectors[0], np.roll(vectors[1], -1, axis=1)
 
 
 def _joint_covariance(fit: LocalFit) -> np.ndarray:
@@ -297,14 +280,12 @@ def _joint_covariance(fit: LocalFit) -> np.ndarray:
 
     Consecutive pairs of points share the noise of a point, so errors are summed over runs of consecutive pairs.
     """
-    jacobian, hessian, p = fit.jacobian, fit.hessian, len(fit.value)
+    jacobian, p = fit.jacobian, len(fit.value)
     by_value = -np.linalg.inv(_closing_matrix(jacobian[None])[0])
-    by_slope, by_point = np.zeros((2, p, 2, 2)), np.zeros((2, p, 2))
-    for k in range(2):
-        right, left = _eigenvectors(jacobian, k)
-        slope = np.einsum("pi,pij,pj->p", left, jacobian, right)
-        by_slope[k] = (np.einsum("pi,pj->pij", left, right) / slope[:, None, None]).real
-        by_point[k] = (np.einsum("pi,pijl,pj->pl", left, hessian, right) / slope[:, None]).real
+    right, left = _eigenvectors(jacobian)
+    slope = np.einsum("kpi,pij,kpj->kp", left, jacobian, right)
+    by_slope = (np.einsum("kpi,kpj->kpij", left, right) / slope[..., None, None]).real
+    by_point = (np.einsum("kpi,pijl,kpj->kpl", left, fit.hessian, right) / slope[..., None]).real
     rows = []
     for j, influence in enumerate(fit.influence):
         points = influence[:, 0] @ by_value[:, 2 * j : 2 * j + 2].T
@@ -317,9 +298,7 @@ def _joint_covariance(fit: LocalFit) -> np.ndarray:
     return errors.T @ errors
 
 
-def box_orbits(
-    maps: ReturnMap, section: np.ndarray, period: int, neighbours: int, box: float
-) -> list[tuple[MapCycle, Estimate]]:
+def box_orbits(maps: ReturnMap, period: int, neighbours: int, box: float) -> list[tuple[MapCycle, Estimate]]:
     """Return the orbits of one period by the method "boxes" of `find_orbits`.
 
     A point that is in its own or an adjacent box again after `period` steps is recurrent; adjacent boxes with several
@@ -327,9 +306,9 @@ def box_orbits(
     fixed point and eigenvalues are the orbit's.
     """
     count = int(2.25 * neighbours)
-    iterates = [_iterated(maps, section, k) for k in range(1, period + 1)]
+    iterates = [_iterated(maps, k) for k in range(1, period + 1)]
     orbits: list[tuple[MapCycle, Estimate]] = []
-    for centre, members in _recurrent_boxes(maps, section, period, box):
+    for centre, members in _recurrent_boxes(maps, period, box):
         fit = iterates[-1].fit(centre[None], count, 1)
         step = newton_step(maps.wrap(fit.value - centre)[None], fit.jacobian[None])[0, 0]
         if not np.abs(step).max() < FARTHEST * box:
@@ -351,20 +330,19 @@ def box_orbits(
         )
         if any(shift_between(points, other.points, maps.wrap)[0] < 2.0 * box for _, other in orbits):
             continue
-        away = maps.distance(section[members], points[0])
+        away = maps.distance(maps.points[members], points[0])
         orbits.append((MapCycle(points, len(members), int(members[np.argmin(away)]), 0), estimate))
     return orbits
 
 
-def _iterated(maps: ReturnMap, section: np.ndarray, steps: int) -> ReturnMap:
+def _iterated(maps: ReturnMap, steps: int) -> ReturnMap:
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(maps.increments, axis=0)])
-    return ReturnMap(section[:-steps], sums[steps:] - sums[:-steps], maps.turn, maps.winds, np.zeros(2))
+    return ReturnMap(maps.points, sums[steps:] - sums[:-steps], maps.turn, maps.winds, np.zeros(2))
 
 
-def _recurrent_boxes(
-    maps: ReturnMap, section: np.ndarray, period: int, box: float
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def _recurrent_boxes(maps: ReturnMap, period: int, box: float) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return centres and members of groups of adjacent boxes with recurrent points, those with most returns first."""
+    section = maps.points
     cell = np.floor(maps.wrap_points(section) / box).astype(np.int64)
     cell -= cell.min(axis=0)
     cells_per_turn = np.ceil(maps.turn / box)

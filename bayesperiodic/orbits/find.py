@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -26,15 +25,6 @@ LARGEST_SD = 0.02
 LARGEST_LOGARITHM_SD = 0.5
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
 STILL_RANGE, STILL_NOISE = 0.02, 20.0
-
-
-class _ScaledSection(NamedTuple):
-    """A section in units of the attractor's size."""
-
-    points: np.ndarray  # (count, 2)
-    size: np.ndarray  # the unit, (2,)
-    maps: ReturnMap
-    extent: np.ndarray  # range of the recorded motion, of an angle at most a turn, (2,)
 
 
 @in_one_thread
@@ -94,15 +84,15 @@ def find_orbits(
     wanted = _periods(periods, len(section))
     _checks.one_of("method", method, SEARCHES)
     neighbours, box = _checks.integer("neighbours", neighbours, 16), _checks.positive("box", box)
-    scaled = _scaled(section, neighbours)
+    maps, size = _scaled(section, neighbours)
     if method == "boxes":
-        pairs = [pair for p in wanted for pair in cycles.box_orbits(scaled.maps, scaled.points, p, neighbours, box)]
+        pairs = [pair for p in wanted for pair in cycles.box_orbits(maps, p, neighbours, box)]
     else:
-        atlas = Atlas(scaled.maps, _search_count(scaled.maps, neighbours))
-        pairs = [pair for p in wanted for pair in _chained(scaled, atlas, p, neighbours)]
-    quality_count = _search_count(scaled.maps, FEWEST_NEIGHBOURS)
-    orbits = [_orbit(section, scaled, *pair, _quality(scaled, *pair, quality_count)) for pair in pairs]
-    return Orbits(_finished(orbits, scaled), values=section.values, method=method)
+        atlas = Atlas(maps, _search_count(maps, neighbours))
+        pairs = [pair for p in wanted for pair in _chained(maps, atlas, p, neighbours)]
+    quality_count = _search_count(maps, FEWEST_NEIGHBOURS)
+    orbits = [_orbit(section, maps, size, *pair, _quality(maps, *pair, quality_count)) for pair in pairs]
+    return Orbits(_finished(orbits, maps, size), values=section.values, method=method)
 
 
 def _periods(periods: Iterable[int], count: int) -> list[int]:
@@ -117,22 +107,20 @@ def _periods(periods: Iterable[int], count: int) -> list[int]:
     return wanted
 
 
-def _scaled(section: PoincareSection, neighbours: int) -> _ScaledSection:
+def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.ndarray]:
+    """Return the return map in units of the attractor's size, and that size (2,)."""
     size = np.ptp(section.points, axis=0)
     if not np.all(size > 0.0):
         raise ValueError(
             "section: must be of a chaotic motion, got one of period 1: a coordinate is equal at all points."
         )
     turn = np.array([2.0 * np.pi if name in section.angles else np.inf for name in section.coordinates]) / size
-    points = section.points / size
     noise = np.zeros(2) if section.noise is None else section.noise / size
-    maps = ReturnMap(points[:-1], section.increments / size, turn, section.winds, noise)
-    check_chaos(maps, points)
+    maps = ReturnMap(section.points / size, section.increments / size, turn, section.winds, noise)
+    check_chaos(maps)
     if section.noise is None:
         maps.noise = estimate_noise(maps, neighbours)
-    motion = section.points if section.signals is None else section.signals
-    extent = np.array([np.ptp(column) for column in motion.T])
-    return _ScaledSection(points, size, maps, np.where(maps.angle, np.minimum(extent, 2.0 * np.pi), extent))
+    return maps, size
 
 
 def _search_count(maps: ReturnMap, neighbours: int) -> int:
@@ -146,15 +134,14 @@ def _search_count(maps: ReturnMap, neighbours: int) -> int:
     return count
 
 
-def _chained(scaled: _ScaledSection, atlas: Atlas, period: int, neighbours: int) -> list[tuple[MapCycle, Estimate]]:
-    maps = scaled.maps
+def _chained(maps: ReturnMap, atlas: Atlas, period: int, neighbours: int) -> list[tuple[MapCycle, Estimate]]:
     pairs: list[tuple[MapCycle, Estimate]] = []
 
     def same(one: Estimate, other: Estimate) -> bool:
         distance, _ = cycles.shift_between(one.points, other.points, maps.wrap)
         return distance < max(1e-3, 2.0 * max(_largest_sd(one), _largest_sd(other)))
 
-    for candidate in cycles.candidates(maps, atlas, scaled.points, period):
+    for candidate in cycles.candidates(maps, atlas, period):
         estimate = cycles.refine(maps, candidate.points, neighbours)
         if estimate is None or not (sd := _largest_sd(estimate)) < LARGEST_SD:
             continue
@@ -169,47 +156,44 @@ def _largest_sd(estimate: Estimate) -> float:
 
 
 def _orbit(
-    section: PoincareSection, scaled: _ScaledSection, candidate: MapCycle, estimate: Estimate, quality: float
+    section: PoincareSection, maps: ReturnMap, size: np.ndarray, candidate: MapCycle, estimate: Estimate, quality: float
 ) -> Orbit:
     period = len(estimate.points)
-    size = 2 * period
     # The orbit starts at the point that belongs to the start of the measured cycle.
     order = (np.arange(period) + candidate.shift) % period
-    index = np.concatenate([(2 * order[:, None] + np.arange(2)).ravel(), [size, size + 1]])
-    points = estimate.points[order] * scaled.size
-    units = np.concatenate([np.tile(scaled.size, period), np.ones(2)])
+    index = np.concatenate([(2 * order[:, None] + np.arange(2)).ravel(), 2 * period + np.arange(2)])
+    points = wrapped(estimate.points[order] * size, maps.angle)
+    units = np.concatenate([np.tile(size, period), np.ones(2)])
     bias = estimate.bias[index] * units
     covariance = estimate.covariance[np.ix_(index, index)] * np.outer(units, units)
     sd = np.sqrt(np.diag(covariance))
     covariance += np.outer(bias, bias)
-    for k in (size, size + 1):
+    for k in (-2, -1):
         if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
-    for column in np.flatnonzero(scaled.maps.angle):
-        points[:, column] = wrapped(points[:, column])
-        if cycle is not None:
+    still = False
+    if cycle is not None and section.signals is not None:
+        for column in np.flatnonzero(maps.angle):
             values = cycle[section.coordinates[column]]
             values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
+        # It moves no more than by noise and its distance to the orbit.
+        extent = np.ptp(section.signals, axis=0)
+        limit = (STILL_RANGE + STILL_NOISE * maps.noise) * np.where(maps.angle, np.minimum(extent, 2.0 * np.pi), extent)
+        still = bool(np.all(np.ptp(np.stack(list(cycle.values())), axis=1) < limit))
     return Orbit(
         name="", coordinates=section.coordinates, angles=section.angles, frequency=section.frequency, period=period,
         winding=round(estimate.turns) if section.winds else None, points=points, joint_covariance=covariance,
-        eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[size:], returns=candidate.returns, quality=quality,
-        cycle=cycle, equilibrium=cycle is not None and _at_rest(section, scaled, cycle), synthetic=section.synthetic,
+        eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[-2:], returns=candidate.returns, quality=quality,
+        cycle=cycle, equilibrium=still, synthetic=section.synthetic,
     )  # fmt: skip
 
 
-def _at_rest(section: PoincareSection, scaled: _ScaledSection, cycle: dict[str, np.ndarray]) -> bool:
-    """Return whether a measured cycle moves no more than by noise and its distance to the orbit."""
-    limit = (STILL_RANGE + STILL_NOISE * scaled.maps.noise) * scaled.extent
-    return all(np.ptp(cycle[name]) < limit[k] for k, name in enumerate(section.coordinates))
-
-
-def _quality(scaled: _ScaledSection, candidate: MapCycle, estimate: Estimate, neighbours: int) -> float:
+def _quality(maps: ReturnMap, candidate: MapCycle, estimate: Estimate, neighbours: int) -> float:
     """Return the p-value of the closest return under the maps along the orbit."""
-    maps, period = scaled.maps, len(estimate.points)
+    period = len(estimate.points)
     steps = np.arange(period + 1)
-    away = maps.wrap(scaled.points[candidate.closest + steps] - estimate.points[(steps + candidate.shift) % period])
+    away = maps.wrap(maps.points[candidate.closest + steps] - estimate.points[(steps + candidate.shift) % period])
     statistic = 0.0
     for point, here, there in zip(np.roll(estimate.points, -candidate.shift, 0), away[:-1], away[1:], strict=True):
         count = neighbours
@@ -221,20 +205,20 @@ def _quality(scaled: _ScaledSection, candidate: MapCycle, estimate: Estimate, ne
     return float(chi2.sf(statistic, 2 * period))
 
 
-def _finished(orbits: list[Orbit], scaled: _ScaledSection) -> tuple[Orbit, ...]:
+def _finished(orbits: list[Orbit], maps: ReturnMap, size: np.ndarray) -> tuple[Orbit, ...]:
     """Return the orbits with names, and with the positions of their mirror images under the change of all signs."""
     result: list[Orbit] = []
     counts: Counter[tuple[int, int | None]] = Counter()
-    points = [orbit.points / scaled.size for orbit in orbits]
-    sds = [np.sqrt(np.diag(o.covariance).reshape(-1, 2).max(0) / scaled.size**2).max() for o in orbits]
+    points = [orbit.points / size for orbit in orbits]
+    sds = [np.sqrt(np.diag(o.covariance).reshape(-1, 2).max(0) / size**2).max() for o in orbits]
     for number, orbit in enumerate(orbits):
-        partner, closest = None, np.inf
-        for k, other in enumerate(orbits):
-            if other.period != orbit.period:
-                continue
-            distance, _ = cycles.shift_between(points[number], -points[k], scaled.maps.wrap)
-            if distance < max(2e-3, 4.0 * sds[number], 4.0 * sds[k]) and distance < closest:
-                partner, closest = k, distance
+        away = {
+            k: cycles.shift_between(points[number], -points[k], maps.wrap)[0]
+            for k, other in enumerate(orbits)
+            if other.period == orbit.period
+        }
+        near = [k for k, distance in away.items() if distance < max(2e-3, 4.0 * sds[number], 4.0 * sds[k])]
+        partner = min(near, key=away.__getitem__, default=None)
         # Without a measured cycle, a symmetric fixed point is taken for a state of rest.
         rest = orbit.equilibrium or (orbit.cycle is None and orbit.period == 1 and partner == number)
         counts[orbit.period, orbit.winding] += 1

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic.models.model import Model, integrate
+from bayesperiodic.models.model import Model
 from bayesperiodic.orbits.cycles import shift_between
 from bayesperiodic.orbits.orbit import TURN, Orbit, Orbits, counted_turns, resampled_cycle
 from bayesperiodic.orbits.section import wrapped
@@ -16,7 +16,7 @@ from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import PeriodicSolution, describe, multiplier_sensitivities
-from bayesperiodic.periodic.solve import solve_driven
+from bayesperiodic.periodic.solve import integrate, solve_driven
 
 # In units of the attractor's size: solutions that coincide, the largest range of a state of rest.
 SAME_SOLUTION, SMALLEST_MOTION = 1e-5, 1e-6
@@ -136,15 +136,12 @@ class _Polisher:
     ):
         if model.autonomous:
             raise ValueError(f"model: must be a forced one, got {model.name!r}, which is autonomous.")
-        _checks.integer("samples", samples, 4)
         _checks.positive("tolerance", tolerance)
         _checks.same_names("parameters", parameters, model.parameters)
         for name, sd in parameter_sd.items():
             _checks.one_of("parameter_sd", name, model.parameters)
             _checks.positive(f"parameter_sd[{name!r}]", sd)
-        _checks.same_names("inputs", inputs, model.inputs)
-        for name, values in inputs.items():
-            _checks.finite_vector(f"inputs[{name!r}]", values, samples, "samples")
+        PeriodicEquations.build(model, inputs, frequency=1.0, samples=samples, scheme=scheme)
         for orbit in orbits:
             for name in orbit.coordinates:
                 _checks.one_of("coordinates", name, model.outputs)
@@ -177,19 +174,13 @@ class _Polisher:
         if one.period != other.period or one.winding is None or one.winding * sign != other.winding:
             return None
         points, others = sign * self._section_points(one), self._section_points(other)
-        distance, shift = shift_between(points, others, lambda away: self._wrap(away) / self.scales)
+        distance, shift = shift_between(points, others, lambda away: wrapped(away, self.angles) / self.scales)
         return shift if distance <= SAME_SOLUTION else None
-
-    def _wrap(self, points: np.ndarray) -> np.ndarray:
-        """Return points or differences (…, coordinates) with angles in (−π, π]."""
-        result = np.array(points)
-        result[..., self.angles] = wrapped(result[..., self.angles])
-        return result
 
     def _section_points(self, orbit: Orbit) -> np.ndarray:
         assert orbit.solution is not None
         outputs = np.stack([orbit.solution.outputs[name] for name in orbit.coordinates], axis=-1)
-        return self._wrap(outputs[:: self.samples])
+        return wrapped(outputs[:: self.samples], self.angles)
 
     def _equations(self, orbit: Orbit, winding: int) -> PeriodicEquations:
         return PeriodicEquations.build(
@@ -233,7 +224,7 @@ class _Polisher:
         """
         period, coordinates = orbit.period // times, orbit.points.shape[1]
         repeats = orbit.points.reshape(times, period, coordinates)
-        mean = repeats[0] + self._wrap(repeats - repeats[0]).mean(axis=0)
+        mean = repeats[0] + wrapped(repeats - repeats[0], self.angles).mean(axis=0)
         size = orbit.points.size
         average = np.zeros((mean.size + 2, size + 2))
         average[: mean.size, :size] = np.tile(np.eye(mean.size), times) / times
@@ -246,12 +237,10 @@ class _Polisher:
             orbit,
             name=f"{orbit.name}, reduced to period {period}",
             period=period,
-            winding=None if orbit.winding is None else orbit.winding // times,
-            points=self._wrap(mean),
+            points=wrapped(mean, self.angles),
             joint_covariance=np.where(average @ unknown @ average.T > 0, np.nan, covariance),
             eigenvalues=np.sign(orbit.eigenvalues) * moduli if signed else moduli,
             eigenvalue_bias=orbit.eigenvalue_bias / times,
-            partner=None,
             cycle=orbit.cycle and {name: values[: len(values) // times] for name, values in orbit.cycle.items()},
         )
 
@@ -262,7 +251,7 @@ class _Polisher:
         variance = np.diag(orbit.covariance).reshape(orbit.points.shape) + (self.tolerance * self.scales) ** 2
         for name, sd in self.parameter_sd.items():
             variance = variance + (sd * _slopes(orbit, solution, name)) ** 2
-        off = np.abs(self._wrap(self._section_points(orbit) - orbit.points)) / np.sqrt(variance)
+        off = np.abs(wrapped(self._section_points(orbit) - orbit.points, self.angles)) / np.sqrt(variance)
         at, coordinate = np.unravel_index(int(np.argmax(off)), off.shape)
         if off.max() <= MOST_ERRORS:
             return ""
@@ -273,10 +262,7 @@ class _Polisher:
         )
 
     def _starts(self, orbit: Orbit) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield winding numbers and states (points, states), whole turns included, from which to solve.
-
-        The measured cycle comes first, then segments that are integrated from the section points.
-        """
+        """Yield winding numbers and states (points, states), whole turns included: the cycle, then integrated ones."""
         winding = counted_turns(orbit)
         equations = self._equations(orbit, 0)
         if orbit.cycle is not None:
@@ -293,26 +279,26 @@ class _Polisher:
         The model is integrated over one forcing period from each point, and the segments are corrected so that they
         meet. Several winding numbers are possible; they follow in the order of the corrections they need.
         """
-        samples, periods, count = self.samples, orbit.period, equations.count
+        samples, count = self.samples, equations.count
         starts = self._phases(orbit, equations, orbit.points, rates=True)
         half = _fourier.on_grid(_fourier.coefficients(equations.inputs[:samples].T), 2 * samples).T
-        grid = {"samples": samples, "steps": samples + 1, "kept": samples + 1}
-        paths = [integrate(self.model, s, half, self.theta, frequency=equations.frequency, **grid) for s in starts]
-        segments = [path[:, :count] for path in paths if path is not None]
-        if len(segments) < periods:
+        paths = [integrate(equations, self.theta, start, half, samples + 1, samples + 1) for start in starts]
+        segments = np.array([path[:, :count] for path in paths if path is not None])
+        if len(segments) < orbit.period:
             return
-        missed = np.stack([segment[-1] for segment in segments]) - np.roll(starts[:, :count], -1, axis=0)
-        angle = next((i for i, state in enumerate(self.model.states) if state in self.model.angles), None)
-        if angle is None:
-            yield 0, _connected(np.stack(segments), missed, np.zeros((periods, count)))
-            return
-        exact = missed[:, angle] / TURN
-        choices = [(np.floor(turns), np.ceil(turns)) for turns in exact]
-        ranked = sorted(product(*choices), key=lambda turns: float(np.sum((exact - np.array(turns)) ** 2)))
-        for turns in ranked[:MOST_TRIED]:
-            whole = np.zeros((periods, count))
-            whole[:, angle] = TURN * np.array(turns)
-            yield int(sum(turns)), _connected(np.stack(segments), missed, whole)
+        missed = segments[:, -1] - np.roll(starts[:, :count], -1, axis=0)
+        # The unit vector of the angle; zero without one.
+        angle = np.eye(count)[[state in self.model.angles for state in self.model.states]][:1].sum(axis=0)
+        exact = missed @ angle / TURN
+        choices = product(*(sorted({np.floor(turns), np.ceil(turns)}) for turns in exact))
+        ranked = sorted(choices, key=lambda turns: float(np.sum((exact - np.array(turns)) ** 2)))
+        # Errors grow along an unstable orbit, so most of the correction belongs to the end of a segment.
+        fraction = (np.arange(samples) / samples)[:, None] ** 2
+        for chosen in ranked[:MOST_TRIED]:
+            turns = TURN * np.outer(chosen, angle)[:, None]
+            before = np.cumsum(turns, axis=0) - turns
+            corrected = segments[:, :-1] - fraction * (missed[:, None] - turns) + before
+            yield int(sum(chosen)), corrected.reshape(-1, count)
 
     def _phases(
         self, orbit: Orbit, equations: PeriodicEquations, values: np.ndarray, rates: bool = False
@@ -345,19 +331,6 @@ class _Polisher:
                 f"got {orbit.coordinates}. Make the section of outputs such as a state and its rate."
             )
         return phases
-
-
-def _connected(segments: np.ndarray, missed: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Return the segments (periods, samples + 1, states), corrected so that each ends where the next one starts.
-
-    `missed` and `turns`, (periods, states), are the distances to the next start and the whole turns in them.
-    """
-    periods, length, count = segments.shape
-    before = np.concatenate([np.zeros((1, count)), np.cumsum(turns, axis=0)[:-1]])
-    # Errors grow along an unstable orbit, so most of the correction belongs to the end of a segment.
-    fraction = (np.arange(length - 1) / (length - 1)) ** 2
-    corrected = segments[:, :-1] - fraction[:, None] * (missed - turns)[:, None] + before[:, None]
-    return corrected.reshape(-1, count)
 
 
 def _sign_mismatch(orbit: Orbit) -> str:

@@ -57,14 +57,15 @@ class ReturnMap:
     the normal equations unbiased and so remove the attenuation of the slopes.
     """
 
-    def __init__(self, arguments: np.ndarray, increments: np.ndarray, turn: np.ndarray, winds: bool, noise: np.ndarray):
-        self.arguments = arguments  # points with a known image, (n, 2)
+    def __init__(self, points: np.ndarray, increments: np.ndarray, turn: np.ndarray, winds: bool, noise: np.ndarray):
+        self.points = points  # in the order of time; images of the last ones may be unknown, (count, 2)
+        self.arguments = points[: len(increments)]  # points with a known image, (n, 2)
         self.increments = increments  # image minus argument, (n, 2)
         self.turn = turn  # one turn in these units; infinite for coordinates that are not angles, (2,)
         self.winds = winds  # whether the increments of angles include whole turns
         self.noise = noise  # standard deviation of the arguments, (2,)
         self.angle = np.isfinite(turn)
-        self._tree = self.tree(arguments)
+        self._tree = self.tree(self.arguments)
 
     def tree(self, points: np.ndarray) -> cKDTree:
         """Return a search tree of points, periodic in the angles."""
@@ -72,19 +73,14 @@ class ReturnMap:
 
     def wrap_points(self, points: np.ndarray) -> np.ndarray:
         """Return points with angles in [0, turn)."""
-        result, turn = np.array(points), self.turn[self.angle]
-        inside = result[:, self.angle] % turn
+        inside = points % self.turn
         # The remainder of a tiny negative number is the turn itself, which the tree does not accept.
-        result[:, self.angle] = np.where(inside >= turn, 0.0, inside)
-        return result
+        return np.where(self.angle, np.where(inside >= self.turn, 0.0, inside), points)
 
     def wrap(self, difference: np.ndarray) -> np.ndarray:
         """Return differences (…, 2) with angles in half a turn either way."""
-        result = np.array(difference)
-        for column in np.flatnonzero(self.angle):
-            turn = self.turn[column]
-            result[..., column] -= turn * np.round(result[..., column] / turn)
-        return result
+        turn = np.where(self.angle, self.turn, 1.0)
+        return np.where(self.angle, difference - turn * np.round(difference / turn), difference)
 
     def distance(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
         """Return the largest coordinate differences (n,) of points (n, 2)."""
@@ -244,25 +240,21 @@ def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
     noise, count = np.zeros(2), int(2.25 * neighbours)
     for _ in range(3):
         width = maps.nearest(centres, count)[0][:, -1]
-        noise = _noise_at(maps, centres[width <= np.median(width)], count)
+        dense = centres[width <= np.median(width)]
+        fit = maps.fit(dense, count, 2, influence=False)
+        rows = (np.eye(2) + fit.jacobian**2).reshape(-1, 2)
+        target = maps.residual_variance(dense, fit).reshape(-1)
+        weight = 1.0 / np.maximum(target, 1e-30)
+        for _ in range(NOISE_ROUNDS):
+            variance, _ = nnls(rows * weight[:, None], target * weight)
+            predicted = rows @ variance
+            # Residuals far above the prediction are curvature, not noise.
+            weight = np.where(target < 4.0 * predicted, 1.0, 0.0) / np.maximum(predicted, 1e-30)
+        noise = np.sqrt(variance)
         if np.median(width) / KERNEL_REACH > SMALLEST_BANDWIDTH * noise.max() or count * 2 > len(maps.arguments) // 8:
             break
         count *= 2
     return noise
-
-
-def _noise_at(maps: ReturnMap, centres: np.ndarray, count: int) -> np.ndarray:
-    fit = maps.fit(centres, count, 2, influence=False)
-    rows = (np.eye(2) + fit.jacobian**2).reshape(-1, 2)
-    target = maps.residual_variance(centres, fit).reshape(-1)
-    weight = 1.0 / np.maximum(target, 1e-30)
-    solution = np.zeros(2)
-    for _ in range(NOISE_ROUNDS):
-        solution, _ = nnls(rows * weight[:, None], target * weight)
-        predicted = rows @ solution
-        # Residuals far above the prediction are curvature, not noise.
-        weight = np.where(target < 4.0 * predicted, 1.0, 0.0) / np.maximum(predicted, 1e-30)
-    return np.sqrt(solution)
 
 
 LONGEST_PERIOD = 32
@@ -274,9 +266,9 @@ DIVERGING_PROBES = 400
 NEIGHBOUR = 8
 
 
-def check_chaos(maps: ReturnMap, section: np.ndarray) -> None:
-    """Raise a ValueError, which names the kind of motion, unless the section (n, 2) shows a chaotic return map."""
-    generator = np.random.default_rng(0)
+def check_chaos(maps: ReturnMap) -> None:
+    """Raise a ValueError, which names the kind of motion, unless the points show a chaotic return map."""
+    section, generator = maps.points, np.random.default_rng(0)
     one, other = generator.integers(len(section), size=(2, 4 * DIVERGING_PROBES))
     random = np.median(maps.distance(section[one], section[other]))
     for period in range(1, min(LONGEST_PERIOD, len(section) // 10) + 1):

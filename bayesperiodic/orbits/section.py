@@ -115,8 +115,7 @@ class PoincareSection(Result):
         """
         frequency = _checks.positive("frequency", frequency)
         origin = _checks.finite_number("origin", origin)
-        names, angle_names = _names(coordinates, angles)
-        signals = _signals(recording, names, angle_names)
+        names, angle_names, signals = _signals(recording, coordinates, angles)
         time = recording.time
         if recording.sampling_rate < FEWEST_SAMPLES * frequency:
             rate = f"{recording.sampling_rate / frequency:.3g}"
@@ -127,14 +126,13 @@ class PoincareSection(Result):
         first = int(np.ceil((time[0] - origin) * frequency - 1e-9))
         last = int(np.floor((time[-1] - origin) * frequency + 1e-9))
         instants = origin + np.arange(first, last + 1) / frequency
-        _check_count(instants.size)
-        values, noise = _estimate(time, signals, np.clip(instants, time[0], time[-1]))
-        if np.all(np.ptp(values, axis=0) < 1e-2 * np.ptp(signals, axis=0)):
+        section = cls._of(recording, names, angle_names, signals, instants, frequency)
+        if np.all(np.ptp(np.cumsum(section.increments, axis=0), axis=0) < 1e-2 * np.ptp(signals, axis=0)):
             raise ValueError(
                 "recording: must be chaotic, got a motion of period 1, whose section points coincide. Use "
                 "recording.fold instead."
             )
-        return cls._of(recording, names, angle_names, frequency, instants, signals, values, noise)
+        return section
 
     @classmethod
     def from_crossings(
@@ -169,17 +167,13 @@ class PoincareSection(Result):
         ValueError
             For an unknown channel, too few crossings, and as for `from_recording`.
         """
-        names, angle_names = _names(coordinates, angles)
+        names, angle_names, signals = _signals(recording, coordinates, angles)
         _checks.one_of("channel", channel, [name for name in recording.outputs if name not in names])
         level = _checks.finite_number("level", level)
         if direction not in (1, -1):
             raise ValueError(f"direction: must be 1 (upwards) or -1 (downwards), got {direction!r}.")
-        signals = _signals(recording, names, angle_names)
         instants = _upward_crossings(recording.time, direction * (recording.outputs[channel] - level))
-        _check_count(instants.size)
-        frequency = float((instants.size - 1) / (instants[-1] - instants[0]))
-        values, noise = _estimate(recording.time, signals, instants)
-        return cls._of(recording, names, angle_names, frequency, instants, signals, values, noise)
+        return cls._of(recording, names, angle_names, signals, instants)
 
     @classmethod
     def from_points(
@@ -205,10 +199,7 @@ class PoincareSection(Result):
         """
         frequency = _checks.positive("frequency", frequency)
         names, angle_names = _names(coordinates, angles)
-        try:
-            values = np.array(points, dtype=float)
-        except (TypeError, ValueError):
-            raise ValueError(f"points: must be an array of real numbers, got {points!r}.") from None
+        values = _checks.real_array("points", points)
         if values.ndim != 2 or values.shape[1] != 2:
             raise ValueError(f"points: must have the shape (count, 2), got {values.shape}.")
         turning = np.isin(names, angle_names)
@@ -220,10 +211,9 @@ class PoincareSection(Result):
                     "be in degrees: convert it with numpy.radians."
                 )
         _check_count(len(values))
-        increments = np.diff(values, axis=0)
-        values[:, turning], increments[:, turning] = wrapped(values[:, turning]), wrapped(increments[:, turning])
-        winds = not angle_names
-        return cls(values, names, angle_names, frequency, increments, winds, values=values.size)
+        increments = wrapped(np.diff(values, axis=0), turning)
+        points = wrapped(values, turning)
+        return cls(points, names, angle_names, frequency, increments, not angle_names, values=values.size)
 
     @classmethod
     def _of(
@@ -231,15 +221,17 @@ class PoincareSection(Result):
         recording: Recording,
         names: tuple[str, str],
         angles: tuple[str, ...],
-        frequency: float,
-        instants: np.ndarray,
         signals: np.ndarray,
-        values: np.ndarray,
-        noise: np.ndarray,
+        instants: np.ndarray,
+        frequency: float | None = None,
     ) -> "PoincareSection":
-        points, increments, turning = values.copy(), np.diff(values, axis=0), np.isin(names, angles)
-        points[:, turning] = wrapped(points[:, turning])
-        measured = (instants, recording.time, signals, signals.size, recording.synthetic)
+        """Return the section of signals at given instants; the frequency is by default that of the instants."""
+        _check_count(instants.size)
+        frequency = frequency or float((instants.size - 1) / (instants[-1] - instants[0]))
+        time = recording.time
+        values, noise = _estimate(time, signals, np.clip(instants, time[0], time[-1]))
+        points, increments = wrapped(values, np.isin(names, angles)), np.diff(values, axis=0)
+        measured = (instants, time, signals, signals.size, recording.synthetic)
         return cls(points, names, angles, frequency, increments, True, noise, *measured)
 
     def __len__(self) -> int:
@@ -264,8 +256,8 @@ class PoincareSection(Result):
         at = np.interp(np.arange(samples * period) / samples, knots, self.instants[index : index + period + 1])
         values = _fit(self.time, self.signals, at)[0]
         shift = self.points[index] - _fit(self.time, self.signals, self.instants[index : index + 1])[0][0]
-        turning = np.isin(self.coordinates, self.angles)
-        values[:, turning] += 2.0 * np.pi * np.round(shift[turning] / (2.0 * np.pi))
+        turns = np.where(np.isin(self.coordinates, self.angles), np.round(shift / (2.0 * np.pi)), 0.0)
+        values += 2.0 * np.pi * turns
         return dict(zip(self.coordinates, values.T, strict=True))
 
     def __repr__(self) -> str:
@@ -274,9 +266,9 @@ class PoincareSection(Result):
         return f"PoincareSection({len(self.points)} points of {names} at {self.frequency:.6g} Hz from {source})"
 
 
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Return angles in (−π, π]."""
-    return np.pi - (np.pi - angle) % (2.0 * np.pi)
+def wrapped(values: np.ndarray, turning: np.ndarray | bool = True) -> np.ndarray:
+    """Return values (…, coordinates), with those that are turning angles in (−π, π]."""
+    return np.where(turning, np.pi - (np.pi - values) % (2.0 * np.pi), values)
 
 
 def _names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple[tuple[str, str], tuple[str, ...]]:
@@ -291,16 +283,20 @@ def _names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple[tuple[str
     return (names[0], names[1]), angle_names
 
 
-def _signals(recording: Recording, names: tuple[str, str], angles: tuple[str, ...]) -> np.ndarray:
+def _signals(
+    recording: Recording, coordinates: Sequence[str], angles: Iterable[str]
+) -> tuple[tuple[str, str], tuple[str, ...], np.ndarray]:
+    """Return the names of the coordinates and of their angles, and their values (samples, 2), angles unwrapped."""
+    names, angle_names = _names(coordinates, angles)
     for name in names:
         _checks.one_of("coordinates", name, recording.outputs)
     signals = np.stack([recording.outputs[name] for name in names], -1)
-    for name in angles:
+    for name in angle_names:
         k = names.index(name)
         _check_angle(name, signals[:, k])
         signals[:, k] = np.unwrap(signals[:, k])
         _check_rate(name, names[1 - k], recording.time, signals[:, k], signals[:, 1 - k])
-    return signals
+    return names, angle_names, signals
 
 
 def _check_count(count: int) -> None:
@@ -337,10 +333,10 @@ def _check_rate(name: str, other: str, time: np.ndarray, angle: np.ndarray, rate
     """Raise a ValueError if the other coordinate is the rate of the unwrapped angle in another unit."""
     measured = np.diff(angle)
     expected = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)
-    scale = np.sqrt(np.sum(measured**2) * np.sum(expected**2))
-    if scale == 0.0 or np.sum(measured * expected) < 0.98 * scale:
+    scale, product = np.sqrt(np.sum(measured**2) * np.sum(expected**2)), np.sum(measured * expected)
+    if scale == 0.0 or product < 0.98 * scale:
         return
-    ratio = np.sum(measured * expected) / np.sum(expected**2)
+    ratio = product / np.sum(expected**2)
     for factor, quantity in ((DEGREES, "angle"), (1.0 / DEGREES, "rate")):
         if abs(ratio / factor - 1.0) < 0.1:
             raise ValueError(

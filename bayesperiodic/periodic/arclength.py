@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from bayesperiodic.periodic.compiled import CONVERGED, Border, Unknowns
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
 
 INPUTS, PARAMETERS = "all inputs", "all parameters"  # no model's parameter has a name with a space
+Change = tuple[np.ndarray, np.ndarray]  # parts for z (…, points, states) and for the unknowns' values (…, unknowns)
 
 
 @dataclass(frozen=True)
@@ -51,48 +51,38 @@ class ParametrisedEquations:
         """Return equations and parameters at values of the unknowns."""
         equations, unknowns = self.equations, self._unknowns(values, values, values)
         inputs, parameters = np.empty_like(equations.inputs), np.empty_like(self.parameters)
-        frequency = equations.bordered_kernels.fill_setting(
-            equations.setting(self._base), unknowns, values, inputs, parameters
-        )
+        fill, setting = equations.bordered_kernels.fill_setting, equations.setting(self._base)
+        frequency = fill(setting, unknowns, values, inputs, parameters)
         return replace(equations, frequency=frequency, inputs=inputs), parameters
 
     def slopes(self, values: np.ndarray, z: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Return ∂g/∂(unknowns), (unknowns, points, states)."""
         equations, parameters = self.at(values)
-        unknowns, states = self._unknowns(values, values, values), equations.states(z)
+        unknowns, folded = self._unknowns(values, values, values), np.empty((len(self.free), z.size))
+        given = equations.functions, equations.grid.packed, equations.setting(parameters), unknowns, equations.states(z)
         table = np.empty((len(z), equations.model.kernels.columns("derivatives")))
-        folded, setting = np.empty((len(self.free), z.size)), equations.setting(parameters)
-        equations.bordered_kernels.fill_slopes(
-            equations.functions, equations.grid.packed, setting, unknowns, states, columns, table, folded
-        )
-        return np.ascontiguousarray(folded.reshape(-1, *z.shape)[:, equations.grid.place])
+        equations.bordered_kernels.fill_slopes(*given, columns, table, folded)
+        return np.ascontiguousarray(folded.reshape(-1, *z.shape)[:, equations.grid.packed.place])
 
     def solve(
-        self,
-        z: np.ndarray,
-        values: np.ndarray,
-        rows: np.ndarray,
-        corner: np.ndarray,
-        targets: np.ndarray,
-        scales: np.ndarray,
+        self, z: np.ndarray, values: np.ndarray, conditions: Change, targets: np.ndarray, scales: np.ndarray
     ) -> Solved:
         """Solve g(z, values) = 0 and rows·z + corner·values = targets from a guess of z and values.
 
-        `rows` is (unknowns, points, states), `corner` (unknowns, unknowns); for the scales see `compiled.Unknowns`.
+        The conditions are rows (unknowns, points, states) and corner (unknowns, unknowns); for the scales see
+        `compiled.Unknowns`.
         """
-        border = Border.empty(len(values), z.size)
-        border.rows.reshape(rows.shape)[:, self.equations.grid.place] = rows
+        (rows, corner), border = conditions, Border.empty(len(values), z.size)
+        border.rows.reshape(rows.shape)[:, self.equations.grid.packed.place] = rows
         border.corner[:] = corner
         return self.equations.solve(self._base, z, self._unknowns(values, targets, scales), border)
 
 
 def solve_autonomous(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, frequency: float) -> Solved:
     """Solve for an orbit of unknown frequency with the phase condition ∫ q_guess'·(q − q_guess) dτ = 0."""
+    free, start = ParametrisedEquations(equations, parameters, (FREQUENCY,)), np.array([frequency])
     row = equations.phase_row(z)
-    target = np.array([np.sum(row * z)])
-    start = np.array([frequency])
-    free = ParametrisedEquations(equations, parameters, (FREQUENCY,))
-    return free.solve(z, start, row[None], np.zeros((1, 1)), target, start)
+    return free.solve(z, start, (row[None], np.zeros((1, 1))), np.array([np.sum(row * z)]), start)
 
 
 MAX_POINTS = 2000
@@ -102,10 +92,8 @@ FEW_ITERATIONS, MANY_ITERATIONS = 3, 6
 STEP_GROWTH = 1.5
 
 
-Change = tuple[np.ndarray, np.ndarray]  # of z (points, states) and of the unknowns' values (unknowns,)
-
-
-class BranchPoint(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class BranchPoint:
     """A point of a branch: z, the unknowns' values, the unit tangent, the arclength, the kind."""
 
     z: np.ndarray
@@ -140,19 +128,15 @@ class Tracer:
         """Return the unit tangent at a point that continues an earlier one; None if it is not unique."""
         equations, parameters = self.parametrised.at(values)
         columns = equations.residual_jacobian(z, parameters)
-        factors = equations.bordered(
-            columns, self.parametrised.slopes(values, z, columns), *self._conditions(z, before)
-        )
+        slopes = self.parametrised.slopes(values, z, columns)
+        factors = equations.bordered(columns, slopes, *self._conditions(z, before))
         solved = factors.solve_bordered(np.zeros((1, *z.shape)), np.eye(1, len(values)))
-        if solved is None:
-            return None
-        return self.unit((solved[0][0], solved[1][0]))
+        return solved and self.unit((solved[0][0], solved[1][0]))
 
     def correct(self, start: BranchPoint, step: float) -> tuple[BranchPoint, int] | None:
         """Return the point of the branch a step along the tangent from another, and the iterations it took."""
         z, values = start.z + step * start.tangent[0], start.values + step * start.tangent[1]
-        rows, corner = self._conditions(z, start.tangent)
-        return self._solve(start, z, values, rows, corner, step)
+        return self._solve(start, z, values, self._conditions(z, start.tangent), step)
 
     def stop_at(self, start: BranchPoint, end: BranchPoint, value: float) -> BranchPoint | None:
         """Return the point between two others where the first unknown has a value."""
@@ -161,12 +145,8 @@ class Tracer:
         rows, corner = self._conditions(z, start.tangent)
         rows[0], corner[0] = 0.0, 0.0
         corner[0, 0] = 1.0 / self._value_scales[0]
-        solved = self._solve(start, z, values, rows, corner, share * (end.distance - start.distance))
-        if solved is None:
-            return None
-        exact = solved[0].values.copy()
-        exact[0] = value
-        return solved[0]._replace(values=exact)
+        solved = self._solve(start, z, values, (rows, corner), share * (end.distance - start.distance))
+        return solved and replace(solved[0], values=np.concatenate([[value], solved[0].values[1:]]))
 
     def length(self, change: Change) -> float:
         """Return the length of a change of z and the values."""
@@ -179,18 +159,14 @@ class Tracer:
         return largest * min(grown, 1.0 / max(share, 1e-12))
 
     def _solve(
-        self, start: BranchPoint, z: np.ndarray, values: np.ndarray, rows: np.ndarray, corner: np.ndarray, step: float
+        self, start: BranchPoint, z: np.ndarray, values: np.ndarray, conditions: Change, step: float
     ) -> tuple[BranchPoint, int] | None:
-        targets = np.einsum("rps,ps->r", rows, z) + corner @ values
-        solved = self.parametrised.solve(z, values, rows, corner, targets, self._value_scales)
-        if solved.code != CONVERGED:
-            return None
-        tangent = self.tangent(solved.z, solved.values, start.tangent)
-        if tangent is None:
-            return None
-        return BranchPoint(solved.z, solved.values, tangent, start.distance + step), len(solved.history)
+        targets = np.einsum("rps,ps->r", conditions[0], z) + conditions[1] @ values
+        solved = self.parametrised.solve(z, values, conditions, targets, self._value_scales)
+        tangent = self.tangent(solved.z, solved.values, start.tangent) if solved.code == CONVERGED else None
+        return tangent and (BranchPoint(solved.z, solved.values, tangent, start.distance + step), len(solved.history))
 
-    def _conditions(self, z: np.ndarray, tangent: Change) -> tuple[np.ndarray, np.ndarray]:
+    def _conditions(self, z: np.ndarray, tangent: Change) -> Change:
         """Return rows and corner of: distance along a tangent; for an autonomous model, the phase against z."""
         unknowns = len(tangent[1])
         rows, corner = np.zeros((unknowns, *z.shape)), np.zeros((unknowns, unknowns))
@@ -231,8 +207,7 @@ def trace(
     """
     tracer = Tracer(equations, np.ptp(z, axis=0) if size is None else size, values, until)
     origin = float(values[0])
-    direction = 1.0 if until > origin else -1.0
-    tangent = tracer.first_tangent(z, values, direction)
+    tangent = tracer.first_tangent(z, values, np.sign(until - origin))
     here = BranchPoint(z, values, tangent or (np.zeros_like(z), np.zeros_like(values)), 0.0)
     yield here
     if tangent is None:
@@ -267,10 +242,9 @@ def trace(
 
 def _passed(value: float, origin: float, until: float) -> float | None:
     """Return the end of the range that a value has passed, if any."""
-    direction = 1.0 if until > origin else -1.0
-    if direction * (value - until) >= 0.0:
+    if (until - origin) * (value - until) >= 0.0:
         return until
-    return origin if direction * (value - origin) < 0.0 else None
+    return origin if (until - origin) * (value - origin) < 0.0 else None
 
 
 ARRIVED, ROUND_FOLDS, FOLDED = "arrived", "round folds", "fold"
@@ -296,7 +270,8 @@ def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.nd
     before = anchor.z
     with np.errstate(all="ignore"):
         for point in islice(trace(parametrised, anchor.z, values, until=1.0, step=PATH_STEP), MOST_PATH_POINTS):
-            if autonomous and _is_reversed(point.z, before):
+            # Beyond a Hopf point the cycle is the same one half a period later.
+            if autonomous and np.sum((point.z - point.z.mean(axis=0)) * (before - before.mean(axis=0))) <= 0.0:
                 return EQUILIBRIUM
             if equations.kernels.repetitions(point.z, equations.grid.periods) > once:
                 return SHORTER
@@ -305,8 +280,3 @@ def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.nd
             folded |= bool(point.tangent[1][0] < 0.0)
             before = point.z
     return FOLDED if folded else PATH_LOST
-
-
-def _is_reversed(z: np.ndarray, before: np.ndarray) -> bool:
-    """Return whether a cycle has passed through zero: beyond a Hopf point it is the same one half a period later."""
-    return bool(np.sum((z - z.mean(axis=0)) * (before - before.mean(axis=0))) <= 0.0)

@@ -102,17 +102,9 @@ class Batch:
             right[e] = change[:, : first.count]
         ranges = np.stack([np.ptp(a.z, axis=0) for a in anchors])
         ratios = np.divide(ranges, amplitude, out=np.full(ranges.shape, np.inf), where=amplitude > 0.0)
-        self._anchors = Anchors(
-            np.stack([a.parameters for a in anchors]),
-            np.stack([a.z for a in anchors]),
-            sensitivities,
-            amplitude,
-            gradient,
-            first.kernels.OFF_ANCHOR * ratios.min(axis=1),
-            factors,
-            left,
-            right,
-        )
+        parameters, z = np.stack([a.parameters for a in anchors]), np.stack([a.z for a in anchors])
+        near = first.kernels.OFF_ANCHOR * ratios.min(axis=1)
+        self._anchors = Anchors(parameters, z, sensitivities, amplitude, gradient, near, factors, left, right)
 
     @cached_property
     def _compiled(self) -> tuple[Callable[..., None], Functions]:
@@ -142,14 +134,7 @@ class Batch:
         _in_blocks(lambda block: solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads)
         return solution
 
-    def vjp(
-        self,
-        parameters: np.ndarray,
-        z: np.ndarray,
-        weights: np.ndarray,
-        moving: tuple[int, ...],
-        threads: int | None = None,
-    ) -> np.ndarray:
+    def vjp(self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, moving: tuple[int, ...]) -> np.ndarray:
         """Return Σ weights · ∂ŷ/∂θ (sets, moving) at one solution of every input set; NaN where it is singular.
 
         `weights` is (sets, points, channels); `moving` are the indices of the parameters θ.
@@ -165,7 +150,7 @@ class Batch:
             factors = empty_factors(grid, self._first.count)
             compiled.vjp_many(addresses, grid.packed, self._sets, *points, factors, *block, gradients)
 
-        _in_blocks(part, self._size, SMALLEST_BLOCK, threads, each=1)
+        _in_blocks(part, self._size, SMALLEST_BLOCK, None, each=1)
         return gradients
 
 
@@ -193,21 +178,13 @@ class AutonomousBatch:
         z, parameters = np.stack([a.z for a in anchors]), np.stack([a.parameters for a in anchors])
         known = [a.sensitivities is not None for a in anchors]
         sensitivities, slopes = np.zeros((*parameters.shape, *z.shape[1:])), np.zeros(parameters.shape)
-        for e, anchor in enumerate(anchors):
-            if anchor.sensitivities is not None and anchor.frequency_sensitivities is not None:
-                sensitivities[e], slopes[e] = anchor.sensitivities, anchor.frequency_sensitivities
-        self._orbits = CycleAnchors(
-            parameters,
-            z,
-            frequency,
-            sensitivities,
-            slopes,
-            np.stack([f.band for f in factors]),
-            np.stack([f.pivots for f in factors]),
-            Border(*(np.stack(parts) for parts in zip(*(f.border for f in factors), strict=True))),
-            np.array([np.sum(e.phase_row(a.z) * a.z) for e, a in zip(here, anchors, strict=True)]),
-            np.where(known, [f.orientation for f in factors], 0.0),
-        )
+        for e in np.flatnonzero(known).tolist():
+            sensitivities[e], slopes[e] = anchors[e].sensitivities, anchors[e].frequency_sensitivities
+        band, pivots = np.stack([f.band for f in factors]), np.stack([f.pivots for f in factors])
+        border = Border(*(np.stack(parts) for parts in zip(*(f.border for f in factors), strict=True)))
+        target = np.array([np.sum(e.phase_row(a.z) * a.z) for e, a in zip(here, anchors, strict=True)])
+        bordered = band, pivots, border, target, np.where(known, [f.orientation for f in factors], 0.0)
+        self._orbits = CycleAnchors(parameters, z, frequency, sensitivities, slopes, *bordered)
 
     def solve(
         self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False, whole: bool = False

@@ -20,6 +20,7 @@ import numpy as np
 from numba import types
 
 from bayesperiodic._compile.cache import declare, is_stored, load
+from bayesperiodic._compile.expectations import internals_expected
 from bayesperiodic._parallel import available_cores
 
 STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit", "not resolved")
@@ -54,16 +55,16 @@ class Functions(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """A `schemes.CyclicGrid`, whose attributes these are."""
+    """The arrays of a `schemes.CyclicGrid`."""
 
-    first: np.ndarray
-    second: np.ndarray
-    neighbours: np.ndarray
-    shift: np.ndarray
-    place: np.ndarray
-    tau: np.ndarray
-    half_width: int
-    lead: int
+    first: np.ndarray  # (offsets,), weights of the first derivative with respect to tau
+    second: np.ndarray  # (offsets,), of the second derivative
+    neighbours: np.ndarray  # (points, offsets), index of the point at each offset
+    shift: np.ndarray  # (points, offsets), distance to it in the folded order
+    place: np.ndarray  # (points,), of each point in the folded order
+    tau: np.ndarray  # (points,), in forcing periods
+    half_width: int  # of the folded band, in points
+    lead: int  # offset of the newest point of a march, −1 where the scheme cannot be marched
 
 
 class Setting(NamedTuple):
@@ -180,26 +181,26 @@ class BatchSolution(NamedTuple):
     iterations: np.ndarray  # (sets, solves), steps with the anchor's factors and Newton iterations
 
 
-def named(kind: type, *fields: types.Type) -> types.NamedTuple:
-    """Return Numba's type of a named tuple."""
-    return types.NamedTuple(fields, kind)
-
-
 ADDRESSES = types.NamedUniTuple(COUNT, len(Functions._fields), Functions)
-GRID = named(Grid, VECTOR, VECTOR, INDICES, INDICES, PLACES, VECTOR, COUNT, COUNT)
-SETTING = named(Setting, MATRIX, VECTOR, NUMBER, VECTOR)
-FACTORS = named(Factors, MATRIX, PLACES, CUBE, GAINS, CUBE, PLACES, VECTOR, PLACES)
-BORDER = named(Border, MATRIX, MATRIX, MATRIX, MATRIX, PLACES)
-UNKNOWNS = named(Unknowns, VECTOR, VECTOR, VECTOR, MATRIX, CUBE, COUNT)
-WORKSPACE = named(Workspace, MATRIX, MATRIX, MATRIX, FACTORS)
-SETS = named(Sets, CUBE, VECTOR, MATRIX)
-ALL_FACTORS = named(Factors, CUBE, INDICES, GAINS, types.Array(NUMBER, 5, "C"), GAINS, INDICES, MATRIX, INDICES)
-ANCHORS = named(Anchors, MATRIX, CUBE, GAINS, MATRIX, MATRIX, VECTOR, ALL_FACTORS, CUBE, CUBE)
-ALL_BORDERS = named(Border, CUBE, CUBE, CUBE, CUBE, INDICES)
-CYCLE_ANCHORS = named(CycleAnchors, MATRIX, CUBE, VECTOR, GAINS, MATRIX, CUBE, INDICES, ALL_BORDERS, VECTOR, VECTOR)
-SOLUTION = named(BatchSolution, GAINS, GAINS, MATRIX, INDICES, INDICES)
+GRID = types.NamedTuple([VECTOR, VECTOR, INDICES, INDICES, PLACES, VECTOR, COUNT, COUNT], Grid)
+SETTING = types.NamedTuple([MATRIX, VECTOR, NUMBER, VECTOR], Setting)
+FACTORS = types.NamedTuple([MATRIX, PLACES, CUBE, GAINS, CUBE, PLACES, VECTOR, PLACES], Factors)
+BORDER = types.NamedTuple([MATRIX, MATRIX, MATRIX, MATRIX, PLACES], Border)
+UNKNOWNS = types.NamedTuple([VECTOR, VECTOR, VECTOR, MATRIX, CUBE, COUNT], Unknowns)
+WORKSPACE = types.NamedTuple([MATRIX, MATRIX, MATRIX, FACTORS], Workspace)
+SETS = types.NamedTuple([CUBE, VECTOR, MATRIX], Sets)
+ALL_FACTORS = types.NamedTuple(
+    [CUBE, INDICES, GAINS, types.Array(NUMBER, 5, "C"), GAINS, INDICES, MATRIX, INDICES], Factors
+)
+ANCHORS = types.NamedTuple([MATRIX, CUBE, GAINS, MATRIX, MATRIX, VECTOR, ALL_FACTORS, CUBE, CUBE], Anchors)
+ALL_BORDERS = types.NamedTuple([CUBE, CUBE, CUBE, CUBE, INDICES], Border)
+CYCLE_ANCHORS = types.NamedTuple(
+    [MATRIX, CUBE, VECTOR, GAINS, MATRIX, CUBE, INDICES, ALL_BORDERS, VECTOR, VECTOR], CycleAnchors
+)
+SOLUTION = types.NamedTuple([GAINS, GAINS, MATRIX, INDICES, INDICES], BatchSolution)
 
 
+DIGEST = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()  # of the definitions above, which sources import
 # What each module of compiled functions is compiled from: the source, and the module whose names are defined in it.
 SOURCES = {
     "linear": ("linear", None),
@@ -229,7 +230,8 @@ def _kernels(name: str, sizes: tuple[int, ...]) -> ModuleType:
 
 
 def _constants(name: str, sizes: tuple[int, ...]) -> dict[str, Any]:
-    return {"SIZES": sizes, "BORDERED": SOURCES[name][1] == "border", "DEFINITIONS": _digest()}
+    route = "internals" if internals_expected() else "njit"
+    return {"SIZES": sizes, "BORDERED": SOURCES[name][1] == "border", "DEFINITIONS": DIGEST, "COMPILED_BY": route}
 
 
 @contextmanager
@@ -266,9 +268,3 @@ def compile_alone(name: str, sizes: tuple[int, ...]) -> None:
 def source(name: str) -> str:
     """Return the text of a source in `_kernels`."""
     return Path(__file__).with_name("_kernels").joinpath(f"{name}.py").read_text(encoding="utf-8")
-
-
-@cache
-def _digest() -> str:
-    """Return a digest of the definitions in this file, which the sources import."""
-    return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, overload
 
@@ -19,7 +19,7 @@ from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.arclength import INPUTS, BranchPoint, ParametrisedEquations, Tracer, trace
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved, null_vector
-from bayesperiodic.periodic.solution import PeriodicSolution, describe, equations_of
+from bayesperiodic.periodic.solution import PeriodicSolution, describe, equations_of, settings_of
 from bayesperiodic.periodic.solve import solve_periodic
 
 if TYPE_CHECKING:
@@ -31,8 +31,7 @@ BRANCH_STEPS = 50
 LOCATED = 1e-9
 FOUND_BY = "continuation"
 DOUBLED = 0.005
-# Points whose solutions are kept: both ends of a step, and those located between them.
-REMEMBERED = 4
+REMEMBERED = 4  # points whose solutions are kept: both ends of a step, and those located between them
 
 
 @dataclass(frozen=True)
@@ -184,7 +183,6 @@ def continue_periodic(
     (True, 2, 0)
     """
     _checks.instance("model", model, Model)
-    _checks.instance("solution", solution, PeriodicSolution)
     points = []
     with tqdm(desc=f"{model.name}: {vary} to {until:g}", unit=" points", disable=not progress, leave=False) as bar:
         for point in iterate_periodic(model, solution, vary, until=until, step=step):
@@ -227,8 +225,6 @@ def iterate_periodic(
     >>> round(frequency, 3)
     0.303
     """
-    _checks.instance("model", model, Model)
-    _checks.instance("solution", solution, PeriodicSolution)
     equations, parameters, z = equations_of(model, solution)
     parametrised, values = _parametrised(equations, parameters, vary)
     until = _checks.finite_number("until", until)
@@ -237,7 +233,7 @@ def iterate_periodic(
     if until == values[0]:
         raise ValueError(f"until: must differ from the start value of {vary}, got {until!r}.")
     step = abs(until - values[0]) / BRANCH_STEPS if step is None else _checks.positive("step", step)
-    solved = _remembered(parametrised)
+    solved = lru_cache(REMEMBERED)(partial(_solution, parametrised))
     for point in trace(parametrised, z, values, until=until, step=step, refine=partial(_special_points, solved)):
         yield float(point.values[0]), solved(point), point.kind
 
@@ -274,22 +270,18 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
     >>> doubled.periods, doubled.winding, doubled.stable
     (2, {'phi': 2}, True)
     """
-    _checks.instance("model", model, Model)
-    _checks.instance("solution", solution, PeriodicSolution)
     equations, parameters, z = equations_of(model, solution)
     if np.min(abs(solution.multipliers + 1.0)) > 0.1:
         raise ValueError(
             f"solution: must have a multiplier near -1, got {solution.multipliers}. Take a period doubling of a branch."
         )
-    twice = PeriodicEquations.build(
-        model,
-        {name: np.tile(values, 2) for name, values in solution.inputs.items()},
-        frequency=solution.frequency / 2 if model.autonomous else solution.frequency,
-        samples=2 * solution.samples if model.autonomous else solution.samples,
-        scheme=solution.scheme,
-        periods=solution.periods if model.autonomous else 2 * solution.periods,
-        winding={name: 2 * turns for name, turns in solution.winding.items()},
-    )
+    settings = settings_of(solution) | {"winding": {name: 2 * turns for name, turns in solution.winding.items()}}
+    if model.autonomous:
+        settings |= {"frequency": solution.frequency / 2, "samples": 2 * solution.samples}
+    else:
+        settings |= {"periods": 2 * solution.periods}
+    inputs = {name: np.tile(values, 2) for name, values in solution.inputs.items()}
+    twice = PeriodicEquations.build(model, inputs, **settings)
     parametrised, values = _parametrised(twice, parameters, vary)
     start = np.tile(z, (2, 1))
     columns = twice.residual_jacobian(start, parameters)
@@ -310,15 +302,15 @@ def _parametrised(
     model = equations.model
     allowed = [*model.parameters, *model.inputs, *([] if model.autonomous else [FREQUENCY])]
     _checks.one_of("vary", vary, allowed)
-    free, own_values = ((FREQUENCY,), [equations.frequency]) if model.autonomous else ((), [])
+    free, frequency = ((FREQUENCY,), [equations.frequency]) if model.autonomous else ((), [])
     if vary in model.inputs:
         column, width = model.inputs.index(vary), len(model.inputs)
         change = np.zeros_like(equations.inputs)
         change[:, column::width] = equations.inputs[:, column::width]
         base = replace(equations, inputs=equations.inputs - change)
-        return ParametrisedEquations(base, parameters, (INPUTS, *free), change), np.array([1.0, *own_values])
+        return ParametrisedEquations(base, parameters, (INPUTS, *free), change), np.array([1.0, *frequency])
     value = equations.frequency if vary == FREQUENCY else parameters[model.parameters.index(vary)]
-    return ParametrisedEquations(equations, parameters, (vary, *free)), np.array([value, *own_values])
+    return ParametrisedEquations(equations, parameters, (vary, *free)), np.array([value, *frequency])
 
 
 def _solution(parametrised: ParametrisedEquations, point: BranchPoint, sensitivities: bool = False) -> PeriodicSolution:
@@ -327,27 +319,16 @@ def _solution(parametrised: ParametrisedEquations, point: BranchPoint, sensitivi
     return describe(equations, parameters, solved, FOUND_BY, sensitivities)
 
 
-def _remembered(parametrised: ParametrisedEquations) -> Callable[[BranchPoint], PeriodicSolution]:
-    """Return a function that returns the solution at a point; those of the last points are kept."""
-    recent: dict[int, tuple[BranchPoint, PeriodicSolution]] = {}
-
-    def solution(point: BranchPoint) -> PeriodicSolution:
-        key = id(point.z)
-        if key not in recent:
-            if len(recent) == REMEMBERED:
-                del recent[next(iter(recent))]
-            recent[key] = point, _solution(parametrised, point)
-        return recent[key][1]
-
-    return solution
-
-
 def _special_points(
     solved: Callable[[BranchPoint], PeriodicSolution], tracer: Tracer, before: BranchPoint, after: BranchPoint
 ) -> list[BranchPoint]:
     """Return the folds and period doublings between two neighbouring points, in order."""
     points: list[BranchPoint] = []
-    for kind, test in ((FOLD, _fold_test), (PERIOD_DOUBLING, lambda point: _doubling_test(solved(point)))):
+    tests: dict[str, Callable[[BranchPoint], float]] = {
+        FOLD: lambda point: float(point.tangent[1][0]),  # slope of the varied quantity along the branch
+        PERIOD_DOUBLING: lambda point: _doubling_test(solved(point)),
+    }
+    for kind, test in tests.items():
         if test(before) * test(after) < 0.0:
             points += _locate(tracer, before, after, kind, test)
     return sorted(points, key=lambda point: point.distance)
@@ -373,16 +354,11 @@ def _locate(
         at(root)
     except _Lost:
         return []
-    return [known[root]._replace(kind=kind)]
+    return [replace(known[root], kind=kind)]
 
 
 class _Lost(Exception):
     """A correction failed."""
-
-
-def _fold_test(point: BranchPoint) -> float:
-    """Return the slope of the varied quantity along the branch."""
-    return float(point.tangent[1][0])
 
 
 def _doubling_test(solution: PeriodicSolution) -> float:
@@ -444,17 +420,9 @@ def _between(
 ) -> PeriodicSolution:
     free = (1.0 - share) * before.frequency + share * after.frequency
     guess = {n: (1.0 - share) * before.states[n] + share * after.states[n] for n in before.states}
-    return solve_periodic(
-        model,
-        before.parameters | ({vary: value} if vary != FREQUENCY else {}),
-        before.inputs,
-        frequency=value if vary == FREQUENCY else free,
-        samples=before.samples,
-        scheme=before.scheme,
-        periods=before.periods,
-        winding=before.winding,
-        guess=guess,
-    )
+    parameters = before.parameters | ({vary: value} if vary != FREQUENCY else {})
+    settings = settings_of(before) | {"frequency": value if vary == FREQUENCY else free}
+    return solve_periodic(model, parameters, before.inputs, guess=guess, **settings)
 
 
 def _absent(branch: Branch, value: float) -> str:

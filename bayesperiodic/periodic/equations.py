@@ -4,12 +4,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic._compile.code_generation import as_columns
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.compiled import (
     CONVERGED,
@@ -36,17 +35,17 @@ class CyclicFactors:
     `columns` (points, states·(1 + 3·states)) are g and ∂g/∂(q, q̇, q̈), as `residual_jacobian` returns them.
     """
 
-    def __init__(self, grid: CyclicGrid, columns: np.ndarray, states: int, frequency: float):
+    def __init__(self, grid: CyclicGrid, columns: np.ndarray, states: int, frequency: float, *border: Any):
         self._grid, self._states = grid, states
         self._compiled = kernels("linear", states, grid.stencil)
-        self._lower = grid.half_width * states + states - 1
+        self._lower = grid.packed.half_width * states + states - 1
         size = grid.points * states
         self.band = np.empty((size, 3 * self._lower + 1))
         self.pivots = np.empty(size, dtype=np.int64)
         self._compiled.assemble(columns, grid.packed, states, frequency, self.band)
-        self.regular = self._factor()
+        self.regular = self._factor(*border)
 
-    def _factor(self) -> bool:
+    def _factor(self, *border: Any) -> bool:
         return bool(self._compiled.factor(self.band, self._lower, self._lower, self.pivots))
 
     def solve(self, right: np.ndarray) -> np.ndarray:
@@ -67,39 +66,28 @@ class CyclicFactors:
     def _fold(self, natural: np.ndarray) -> np.ndarray:
         """Return arrays (…, points, states) in the folded order, (arrays, size)."""
         folded = np.empty((natural.size // len(self.band), self._grid.points, self._states))
-        folded[:, self._grid.place] = natural.reshape(folded.shape)
+        folded[:, self._grid.packed.place] = natural.reshape(folded.shape)
         return folded.reshape(-1, len(self.band))
 
     def _unfold(self, folded: np.ndarray) -> np.ndarray:
         shaped = folded.reshape(-1, self._grid.points, self._states)
-        return np.ascontiguousarray(shaped[:, self._grid.place])
+        return np.ascontiguousarray(shaped[:, self._grid.packed.place])
 
 
 class BorderedFactors(CyclicFactors):
     """Factors of [∂g/∂z, B; C, D], also where ∂g/∂z is singular.
 
-    B and C are `sides` and `rows` (borders, points, states), D is `corner` (borders, borders). The `orientation` is the
+    B and C are `sides` and `rows` (borders, points, states), D is `corner` (borders, borders), the last arguments after
+    those of `CyclicFactors`. The `orientation` is the
     sign of the determinant, which changes along a branch only at folds; 0 if the matrix is singular.
     """
 
-    def __init__(
-        self,
-        grid: CyclicGrid,
-        columns: np.ndarray,
-        states: int,
-        frequency: float,
-        sides: np.ndarray,
-        rows: np.ndarray,
-        corner: np.ndarray | float = 0.0,
-    ):
-        self._sides, self._rows, self._corner = sides, rows, corner
-        super().__init__(grid, columns, states, frequency)
-
-    def _factor(self) -> bool:
-        self.border = Border.empty(len(self._rows), len(self.band))
-        self.border.columns[:-1] = self._fold(self._sides)
-        self.border.rows[:] = self._fold(self._rows)
-        self.border.corner[:] = self._corner
+    def _factor(self, *border: Any) -> bool:
+        sides, rows, corner = border
+        self.border = Border.empty(len(rows), len(self.band))
+        self.border.columns[:-1] = self._fold(sides)
+        self.border.rows[:] = self._fold(rows)
+        self.border.corner[:] = corner
         self._compiled = kernels("border", self._states, self._grid.stencil)
         self.orientation = self._compiled.factor_bordered(self.band, self.pivots, self.border)
         return self.orientation != 0.0
@@ -119,7 +107,7 @@ class BorderedFactors(CyclicFactors):
 def null_vector(grid: CyclicGrid, columns: np.ndarray, states: int, frequency: float) -> np.ndarray:
     """Return the unit vector (points, states) that a nearly singular ∂g/∂z makes smallest."""
     nothing = np.empty((0, grid.points, states))
-    factors = BorderedFactors(grid, columns, states, frequency, nothing, nothing)
+    factors = BorderedFactors(grid, columns, states, frequency, nothing, nothing, 0.0)
     vector = factors._unfold(factors.border.columns)[0]
     return vector / np.linalg.norm(vector)
 
@@ -179,15 +167,14 @@ class PeriodicEquations:
                 "the frequency of the whole orbit."
             )
         _checks.same_names("inputs", inputs or {}, model.inputs)
-        columns: list[list[np.ndarray]] = [[], [], []]
-        for name in model.inputs:
+        signals = np.empty((3, len(model.inputs), grid.points))
+        for i, name in enumerate(model.inputs):
             values = _checks.finite_vector(f"inputs[{name!r}]", (inputs or {})[name], grid.points, "samples·periods")
-            amplitudes = _fourier.coefficients(values)
-            columns[0].append(values)
+            amplitudes, signals[0, i] = _fourier.coefficients(values), values
             for order in (1, 2):
                 rate = _fourier.derivative(amplitudes, frequency / grid.periods, order)
-                columns[order].append(_fourier.on_grid(rate, grid.points))
-        stacked = as_columns([column for order in columns for column in order], grid.points)
+                signals[order, i] = _fourier.on_grid(rate, grid.points)
+        stacked = np.ascontiguousarray(signals.reshape(-1, grid.points).T)
         turns = _winding_numbers(model, winding)
         drift = np.array([2.0 * np.pi * turns.get(state, 0) / grid.periods for state in model.states])
         return cls(model, grid, frequency, stacked, drift)
@@ -260,7 +247,7 @@ class PeriodicEquations:
     @cached_property
     def separated(self) -> bool:
         """True if even and odd points of an autonomous model are separate solutions, each of free phase."""
-        used = self.grid.offsets[self.grid.first != 0.0]
+        used = self.grid.offsets[self.grid.packed.first != 0.0]
         alone = self.model.autonomous and set(self.model.orders.values()) == {1} and self.grid.points % 2 == 0
         return alone and bool(np.all(used % 2))
 
@@ -312,11 +299,9 @@ class PeriodicEquations:
 
     def sizes(self, z: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Return the size of each equation's terms."""
-        size, rounding = np.empty((2, self.count))
-        amplitude, weight = np.abs(z).max(axis=0), np.empty((self.count, self.count))
-        self.kernels.scales(
-            columns, self.states(z), self.grid.packed, amplitude, self.frequency, size, rounding, weight
-        )
+        (size, rounding), weight = np.empty((2, self.count)), np.empty((self.count, self.count))
+        given = columns, self.states(z), self.grid.packed, np.abs(z).max(axis=0), self.frequency
+        self.kernels.scales(*given, size, rounding, weight)
         return size
 
     def scaled_residual(self, z: np.ndarray, parameters: np.ndarray) -> float:
@@ -350,7 +335,7 @@ def phase_row(grid: CyclicGrid, z: np.ndarray, states: np.ndarray) -> np.ndarray
     """Return the row (points, states) of the phase condition against z, given q, q̇, q̈ side by side."""
     folded = np.empty(z.size)
     kernels("border", z.shape[1], grid.stencil).phase_row(np.ascontiguousarray(z), states, grid.packed, folded)
-    return np.ascontiguousarray(folded.reshape(z.shape)[grid.place])
+    return np.ascontiguousarray(folded.reshape(z.shape)[grid.packed.place])
 
 
 def workspace(equations: PeriodicEquations, *, bordered: bool) -> Workspace:
@@ -367,7 +352,7 @@ def workspace(equations: PeriodicEquations, *, bordered: bool) -> Workspace:
 def empty_factors(grid: CyclicGrid, states: int, sets: tuple[int, ...] = ()) -> Factors:
     """Return arrays for the factors of the compiled functions, one for each of `sets`."""
     points, reach = grid.points, max(grid.reach, 1)
-    lower = grid.half_width * states + states - 1
+    lower = grid.packed.half_width * states + states - 1
     coupled = MAX_SEGMENTS * reach * states if grid.reach else 1
     return Factors(
         np.empty((*sets, points * states, 3 * lower + 1)),
@@ -391,9 +376,9 @@ def _winding_numbers(model: Model, winding: int | Mapping[str, int]) -> dict[str
                 f"winding: must be 0, got {winding!r}; no state of {model.name!r} is an angle, see Model(angles=…)."
             )
         if turns and len(angles) > 1:
+            example = {angles[0]: turns}
             raise ValueError(
-                f"winding: must name the angles {angles} of {model.name!r}, as {{{angles[0]!r}: {turns}}}, got "
-                f"{winding!r}."
+                f"winding: must name the angles {angles} of {model.name!r}, as {example}, got {winding!r}."
             )
         return dict.fromkeys(angles, turns)
     for name, turns in winding.items():

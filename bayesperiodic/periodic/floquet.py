@@ -14,12 +14,12 @@ References
 
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
-from bayesperiodic._compile.cache import load
-from bayesperiodic.periodic.compiled import source
+from bayesperiodic.models.model import dense_kernels
 
 STENCIL = 8
 GAUSS_NODES = np.array([0.5 - np.sqrt(15) / 10, 0.5, 0.5 + np.sqrt(15) / 10])
@@ -39,7 +39,7 @@ STIFF, MOST_PARTS = 3.0, 32
 
 @cache
 def _kernels() -> ModuleType:
-    return load(source("floquet"))
+    return dense_kernels(Path(__file__).with_name("_kernels") / "floquet.py")
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,14 @@ def first_order_matrix(linearisation: np.ndarray, orders: tuple[int, ...]) -> np
     equations cannot be solved for the highest derivatives.
     """
     highest, lower = _split(linearisation, orders)
-    return _companion(-np.linalg.solve(highest, lower), orders)
+    solved, second = -np.linalg.solve(highest, lower), [i for i, order in enumerate(orders) if order == 2]
+    matrix = np.zeros((len(solved), solved.shape[2], solved.shape[2]))
+    matrix[:, : len(orders)] = solved
+    for row, state in enumerate(second, len(orders)):
+        matrix[:, row] = solved[:, state]
+        matrix[:, state] = 0.0
+        matrix[:, state, row] = 1.0
+    return matrix
 
 
 def derivative_factors(
@@ -92,19 +99,6 @@ def derivative_factors(
     seen[..., [order * count + i for i, order in enumerate(orders)]] = highest
     transposed = np.swapaxes(_split(linearisation, orders)[0], 1, 2)
     return -np.linalg.solve(transposed[None], w[..., rows, None])[..., 0], seen
-
-
-def _companion(solved: np.ndarray, orders: tuple[int, ...]) -> np.ndarray:
-    """Return the matrix whose rows for the highest derivatives are given, (points, states, size)."""
-    points, count, size = solved.shape
-    second = [i for i, order in enumerate(orders) if order == 2]
-    matrix = np.zeros((points, size, size))
-    matrix[:, :count] = solved
-    for row, state in enumerate(second):
-        matrix[:, count + row] = solved[:, state]
-        matrix[:, state] = 0.0
-        matrix[:, state, count + row] = 1.0
-    return matrix
 
 
 def _split(linearisation: np.ndarray, orders: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -171,12 +165,12 @@ def _transfer_matrices(matrix: np.ndarray, step: float) -> np.ndarray:
 @cache
 def _interpolation(width: int, first: int, parts: int) -> np.ndarray:
     """Return the weights (parts, Gauss points, width) of grid points from `first` on, for each part of a step."""
-    offsets = np.arange(width) + first
-    return np.array([[_lagrange(offsets, node) for node in (part + GAUSS_NODES) / parts] for part in range(parts)])
+    nodes = np.arange(width) + first
 
+    def lagrange(at: float) -> list[np.floating]:
+        return [np.prod([(at - m) / (k - m) for m in nodes if m != k]) for k in nodes]
 
-def _lagrange(nodes: np.ndarray, at: float) -> np.ndarray:
-    return np.array([np.prod([(at - m) / (k - m) for m in nodes if m != k]) for k in nodes])
+    return np.array([[lagrange(node) for node in (part + GAUSS_NODES) / parts] for part in range(parts)])
 
 
 def _harmless_products(steps: np.ndarray) -> tuple[np.ndarray, int]:
@@ -194,8 +188,6 @@ def _harmless_products(steps: np.ndarray) -> tuple[np.ndarray, int]:
 def _spread(matrices: np.ndarray) -> np.ndarray:
     """Return condition numbers, in Frobenius norms; infinite where the matrices are far from 1 in size."""
     with np.errstate(all="ignore"):
-        if not np.isfinite(matrices).all():
-            return np.full(len(matrices), np.inf)
         try:
             back = np.linalg.norm(np.linalg.inv(matrices), axis=(1, 2))
         except np.linalg.LinAlgError:

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
-from bayesperiodic.models.model import Model
+from bayesperiodic.models.model import Model, parameter_vector
 from bayesperiodic.periodic.arclength import ParametrisedEquations
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations
 from bayesperiodic.periodic.floquet import first_order_matrix
@@ -98,9 +98,7 @@ def hopf_points(
     low, high = (_checks.finite_number(f"between[{i}]", value) for i, value in enumerate(between))
     if not low < high:
         raise ValueError(f"between: must be in ascending order, got {between!r}.")
-    given = dict(parameters) | {vary: low}
-    _checks.same_names("parameters", given, model.parameters)
-    theta = np.array([_checks.finite_number(f"parameters[{n!r}]", given[n]) for n in model.parameters])
+    theta = parameter_vector(model, dict(parameters) | {vary: low})
     equations = PeriodicEquations.build(model, None, frequency=1.0, samples=EQUILIBRIUM_SAMPLES, scheme="fourier")
 
     def at(value: float) -> np.ndarray:
@@ -109,10 +107,9 @@ def hopf_points(
     def growth(value: float) -> float:
         return _leading(equations, at(value))[0].real
 
-    grid = np.linspace(low, high, INTERVALS + 1)
-    rates = [growth(value) for value in grid]
     points = []
-    for (a, b), (before, after) in zip(pairwise(grid), pairwise(rates), strict=True):
+    rates = [(value, growth(value)) for value in np.linspace(low, high, INTERVALS + 1)]
+    for (a, before), (b, after) in pairwise(rates):
         if before * after < 0.0 or (after == 0.0 and before != 0.0):
             value = float(brentq(growth, a, b, xtol=1e-13 * max(abs(a), abs(b)), rtol=1e-14))
             points.append(_describe(equations, at(value), vary, value))
@@ -159,9 +156,8 @@ def emerging_cycle(
     if point.model != model.name:
         raise ValueError(f"model: must be {point.model!r}, as of the point, got {model.name!r}.")
     if len(amplitude) != 1:
-        raise ValueError(
-            f"amplitude: must be that of one state, such as {{{model.states[0]!r}: 0.01}}, got {dict(amplitude)!r}."
-        )
+        example = f"{{{model.states[0]!r}: 0.01}}"
+        raise ValueError(f"amplitude: must be that of one state, such as {example}, got {dict(amplitude)!r}.")
     ((state, size),) = amplitude.items()
     _checks.one_of("amplitude", state, model.states)
     size = _checks.positive(f"amplitude[{state!r}]", size)
@@ -179,7 +175,7 @@ def emerging_cycle(
     values = np.array([point.value, point.frequency])
     parametrised = ParametrisedEquations(equations, theta, (point.vary, FREQUENCY))
     scales = np.maximum(np.abs(values), 1.0)
-    solved = parametrised.solve(z, values, rows, np.zeros((2, 2)), np.array([size, 0.0]), scales)
+    solved = parametrised.solve(z, values, (rows, np.zeros((2, 2))), np.array([size, 0.0]), scales)
     equations, theta = parametrised.at(solved.values)
     return describe(equations, theta, solved, "Hopf point", sensitivities=False)
 

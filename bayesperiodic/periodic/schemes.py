@@ -139,9 +139,9 @@ def find_scheme(scheme: str | Scheme) -> Scheme:
 
 @dataclass(frozen=True)
 class CyclicGrid:
-    """A scheme on the grid of one response period: the neighbours of every point, and its place in the folded band.
+    """A scheme on the grid of one response period.
 
-    The points are taken in the order 0, n−1, 1, n−2, …, which turns the cyclic band into an ordinary one.
+    In the folded order 0, n−1, 1, n−2, … of the points, the cyclic band of the equations is an ordinary one.
     """
 
     scheme: Scheme
@@ -163,74 +163,46 @@ class CyclicGrid:
         return np.arange(self.points) / self.samples
 
     @cached_property
-    def _weights(self) -> tuple[Mapping[int, float], Mapping[int, float]]:
-        return self.scheme.weights(self.points)
-
-    @cached_property
     def offsets(self) -> np.ndarray:
         """Offsets of the points that a point uses, ascending, (offsets,)."""
-        return np.array(sorted({0, *self._weights[0], *self._weights[1]}))
+        first, second = self.scheme.weights(self.points)
+        return np.array(sorted({0, *first, *second}))
 
     @cached_property
-    def first(self) -> np.ndarray:
-        """Weights of the first derivative with respect to tau, one an offset."""
-        return np.array([self._weights[0].get(o, 0.0) for o in self.offsets.tolist()]) * self.samples
+    def packed(self) -> Grid:
+        """The grid as the compiled functions take it."""
+        i, first, second = np.arange(self.points), *self.scheme.weights(self.points)
+        rates = np.array([first.get(o, 0.0) for o in self.offsets.tolist()]) * self.samples
+        accelerations = np.array([second.get(o, 0.0) for o in self.offsets.tolist()]) * self.samples**2
+        neighbours = (i[:, None] + self.offsets) % self.points
+        place = np.where(i < (self.points + 1) // 2, 2 * i, 2 * (self.points - 1 - i) + 1)
+        shift = place[neighbours] - place[:, None]
+        half_width, lead = int(np.max(np.abs(shift))), self._lead(rates, accelerations)
+        return Grid(rates, accelerations, neighbours, shift, place, self.tau, half_width, lead)
 
-    @cached_property
-    def second(self) -> np.ndarray:
-        """Weights of the second derivative with respect to tau, one an offset."""
-        return np.array([self._weights[1].get(o, 0.0) for o in self.offsets.tolist()]) * self.samples**2
-
-    @cached_property
-    def neighbours(self) -> np.ndarray:
-        """Index of the point at each offset, (points, offsets)."""
-        return (np.arange(self.points)[:, None] + self.offsets) % self.points
-
-    @cached_property
-    def place(self) -> np.ndarray:
-        """Place of each point in the folded order, (points,)."""
-        i = np.arange(self.points)
-        return np.where(i < (self.points + 1) // 2, 2 * i, 2 * (self.points - 1 - i) + 1)
-
-    @cached_property
-    def shift(self) -> np.ndarray:
-        """Distance in the folded order to the point at each offset, (points, offsets)."""
-        return self.place[self.neighbours] - self.place[:, None]
-
-    @cached_property
-    def half_width(self) -> int:
-        """Half-width, in points, of the folded band."""
-        return int(np.max(np.abs(self.shift)))
-
-    @cached_property
-    def lead(self) -> int:
-        """The largest offset if the scheme can be marched forward from point to point without growing, else −1.
+    def _lead(self, first: np.ndarray, second: np.ndarray) -> int:
+        """Return the largest offset if the scheme can be marched forward from point to point without growing, else −1.
 
         It can if the recurrences of both derivatives, solved for the value at that offset, have no root outside the
         unit circle.
         """
         if len(self.offsets) > self.points // 2:
             return -1
-        roots = np.concatenate([np.roots(self.first[::-1]), np.roots(self.second[::-1])])
+        roots = np.concatenate([np.roots(first[::-1]), np.roots(second[::-1])])
         marches = self._in_a_row and self.offsets[-1] >= 0 and np.all(abs(roots) < 1.001)
         return int(self.offsets[-1]) if marches else -1
 
-    @cached_property
+    @property
     def reach(self) -> int:
         """Number of start points of a march, 0 where the scheme cannot be marched."""
-        return len(self.offsets) - 1 if self.lead >= 0 else 0
+        return len(self.offsets) - 1 if self.packed.lead >= 0 else 0
 
     @cached_property
     def stencil(self) -> tuple[int, int, int]:
         """Reach, number of offsets and half-width, or zeros if the offsets have gaps or are many."""
         few = len(self.offsets) <= UNROLLED_OFFSETS < self.points
-        return (self.reach, len(self.offsets), self.half_width) if few and self._in_a_row else (0, 0, 0)
+        return (self.reach, len(self.offsets), self.packed.half_width) if few and self._in_a_row else (0, 0, 0)
 
     @property
     def _in_a_row(self) -> bool:
         return bool(np.all(np.diff(self.offsets) == 1))
-
-    @cached_property
-    def packed(self) -> Grid:
-        """The grid as the compiled functions take it."""
-        return Grid(*(getattr(self, name) for name in Grid._fields))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from scipy.linalg import circulant
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
@@ -28,19 +28,35 @@ from bayesperiodic.periodic.schemes import CyclicGrid, Scheme
 
 def estimate_error(solution: PeriodicSolution, z: np.ndarray) -> dict[str, float]:
     """Return `PeriodicSolution.error_estimate` of a converged solution with the periodic part z (points, states)."""
-    if np.isinf(solution.scheme.order):
-        return dict(zip([*solution.states, FREQUENCY], _step_on_twice_the_points(solution, z), strict=False))
-    grid, frequency = CyclicGrid(solution.scheme, solution.samples, solution.periods), solution.frequency
-    defect, slope, derivatives = np.zeros_like(z), np.zeros_like(z), {}
-    for order, weights in ((1, grid.first), (2, grid.second)):
-        fine, coarse = _derivative(z, grid, weights, 1), _derivative(z, grid, weights, 2) / 2**order
-        change = (fine - coarse) / (2.0**solution.scheme.order - 1.0)
-        block = solution.linearisation[:, :, order * z.shape[1] : (order + 1) * z.shape[1]]
-        defect -= frequency**order * np.einsum("nes,ns->ne", block, change)
-        slope += order * frequency ** (order - 1) * np.einsum("nes,ns->ne", block, fine)
-        derivatives[order] = fine
-    error = _respond(solution, grid, z, defect, slope, derivatives[1])
-    return dict(zip([*solution.states, FREQUENCY], error, strict=False))
+    spectral, frequency, count = np.isinf(solution.scheme.order), solution.frequency, z.shape[1]
+    grid = CyclicGrid(solution.scheme, solution.samples * (2 if spectral else 1), solution.periods)
+    fine, g, jacobian = z, np.zeros_like(z), solution.linearisation.reshape(len(z), -1)
+    if spectral:
+        fine = _fourier.on_grid(_fourier.coefficients(z.T), grid.points).T
+        g, jacobian = np.split(solution.twice_the_points, [count], axis=1)
+    defect, slope, rates = -g, np.zeros_like(fine), []
+    for order, weights in ((1, grid.packed.first), (2, grid.packed.second)):
+        block = jacobian.reshape(len(fine), count, -1)[:, :, order * count : (order + 1) * count]
+        rates.append(_derivative(fine, grid, weights, 1))
+        slope += order * frequency ** (order - 1) * np.einsum("nes,ns->ne", block, rates[-1])
+        if not spectral:
+            change = rates[-1] - _derivative(z, grid, weights, 2) / 2**order
+            change /= 2.0**solution.scheme.order - 1.0
+            defect -= frequency**order * np.einsum("nes,ns->ne", block, change)
+    matrix = grid, np.concatenate([g, jacobian], axis=1), count, frequency
+    step, error = np.full_like(fine, np.nan), [np.nan] * solution.autonomous
+    if solution.autonomous:
+        row = phase_row(grid, fine, np.concatenate([fine, *rates], axis=1))
+        solved = BorderedFactors(*matrix, slope[None], row[None], 0.0).solve_bordered(defect[None], np.zeros((1, 1)))
+        if solved is not None:
+            step, error = solved[0][0], [abs(float(solved[1][0, 0]))]
+    else:
+        factors = CyclicFactors(*matrix)
+        step = factors.solve(defect) if factors.regular else step
+    # The interpolation lacks the highest harmonic of an even grid.
+    every = len(fine) // len(z)
+    largest = np.abs(step[::every] + (fine[::every] - z)).max(axis=0)
+    return dict(zip([*solution.states, FREQUENCY], [*largest.tolist(), *error], strict=False))
 
 
 def _derivative(z: np.ndarray, grid: CyclicGrid, weights: np.ndarray, stride: int) -> np.ndarray:
@@ -49,60 +65,12 @@ def _derivative(z: np.ndarray, grid: CyclicGrid, weights: np.ndarray, stride: in
     return np.sum(rolled, axis=0)
 
 
-def _respond(
-    solution: PeriodicSolution, grid: CyclicGrid, z: np.ndarray, defect: np.ndarray, slope: np.ndarray, rate: np.ndarray
-) -> list[float]:
-    """Return the largest change of each state, and of an autonomous model's frequency, by a defect of the equations."""
-    points, count = z.shape
-    columns = np.concatenate([np.zeros((points, count)), solution.linearisation.reshape(points, -1)], axis=1)
-    matrix = grid, np.ascontiguousarray(columns), count, solution.frequency
-    if not solution.autonomous:
-        return np.abs(CyclicFactors(*matrix).solve(defect)).max(axis=0).tolist()
-    row = phase_row(grid, z, np.concatenate([z, rate, rate], axis=1))
-    solved = BorderedFactors(*matrix, slope[None], row[None]).solve_bordered(defect[None], np.zeros((1, 1)))
-    if solved is None:
-        return [np.nan] * (count + 1)
-    return [*np.abs(solved[0][0]).max(axis=0).tolist(), abs(float(solved[1][0, 0]))]
-
-
 def _twice_the_points(equations: PeriodicEquations, z: np.ndarray, theta: np.ndarray) -> np.ndarray:
     """Return g and ∂g/∂(q, q̇, q̈) of the trigonometric interpolation, (2·points, states·(1 + 3·states))."""
-    grid, frequency, points = equations.grid, equations.frequency, 2 * equations.grid.points
-    amplitudes, tau = _fourier.coefficients(z.T), np.arange(points) / (2 * grid.samples)
-    rates = [_fourier.derivative(amplitudes, frequency / grid.periods, order) for order in range(3)]
-    states = [_fourier.on_grid(rate, points).T for rate in rates]
-    states[0] += equations.drift * tau[:, None]
-    states[1] += equations.drift * frequency
-    inputs = _fourier.on_grid(_fourier.coefficients(equations.inputs.T), points).T
-    q, u = np.ascontiguousarray(np.concatenate(states, axis=1)), np.ascontiguousarray(inputs)
-    return equations.model.kernels.evaluate("residual_jacobian", q, u, theta, tau, frequency)
-
-
-def _step_on_twice_the_points(solution: PeriodicSolution, z: np.ndarray) -> list[float]:
-    """Return the largest change of each state, and of an autonomous model's frequency, by a Newton step there."""
-    (points, count), frequency, autonomous = (2 * len(z), z.shape[1]), solution.frequency, int(solution.autonomous)
-    size = points * count
-    defect, blocks = np.split(solution.twice_the_points, [count], axis=1)
-    fine = _fourier.on_grid(_fourier.coefficients(z.T), points).T
-    harmonics = 2j * np.pi * np.fft.rfftfreq(points, 1.0 / points) / solution.periods
-    square, matrix = np.zeros((points, count, points, count)), np.zeros((size + autonomous, size + autonomous))
-    for order, block in enumerate(np.split(blocks.reshape(points, count, -1), 3, axis=2)):
-        multiplier = harmonics**order * np.where(order == 1, np.arange(points // 2 + 1) < points // 2, 1.0)
-        weights = circulant(np.fft.irfft(multiplier, n=points))
-        square += frequency**order * block[:, :, None] * weights[:, None, :, None]
-        if autonomous and order:
-            rate = weights @ fine
-            matrix[:size, -1] += (order * frequency ** (order - 1) * np.einsum("nes,ns->ne", block, rate)).ravel()
-            matrix[-1, :size] = (rate / np.ptp(fine, axis=0) ** 2).ravel() if order == 1 else matrix[-1, :size]
-    matrix[:size, :size], right = square.reshape(size, size), np.append(-defect, np.zeros(autonomous))
-    largest = np.abs(matrix).max(axis=1)
-    try:
-        step = np.linalg.solve(matrix / largest[:, None], right / largest)
-    except np.linalg.LinAlgError:
-        return [np.nan] * (count + 1)
-    # The interpolation lacks the highest harmonic of an even grid.
-    on_grid = np.abs((fine + step[:size].reshape(points, count))[::2] - z).max(axis=0).tolist()
-    return [*on_grid, abs(float(step[-1]))] if autonomous else on_grid
+    grid = CyclicGrid(equations.grid.scheme, 2 * equations.grid.samples, equations.grid.periods)
+    fine, inputs = (_fourier.on_grid(_fourier.coefficients(v.T), grid.points).T for v in (z, equations.inputs))
+    twice = replace(equations, grid=grid, inputs=np.ascontiguousarray(inputs))
+    return twice.residual_jacobian(np.ascontiguousarray(fine), theta)
 
 
 NEWTON = "newton"
@@ -343,23 +311,22 @@ def describe(
     )
 
 
+def settings_of(solution: PeriodicSolution) -> dict[str, Any]:
+    """Return the keyword arguments of `solve_periodic` for the same frequency, grid and winding numbers."""
+    return {name: getattr(solution, name) for name in ("frequency", "samples", "scheme", "periods", "winding")}
+
+
 def equations_of(model: Model, solution: PeriodicSolution) -> tuple[PeriodicEquations, np.ndarray, np.ndarray]:
     """Return equations, parameters and z; raise a ValueError for a solution unconverged or of another model."""
+    _checks.instance("model", model, Model)
+    _checks.instance("solution", solution, PeriodicSolution)
     if solution.model != model.name:
         raise ValueError(f"model: must be {solution.model!r}, as of the solution, got {model.name!r}.")
     if not solution.converged:
         raise ValueError(
             f"solution: must have converged, got status {solution.status!r}. Solve again from another guess."
         )
-    equations = PeriodicEquations.build(
-        model,
-        solution.inputs,
-        frequency=solution.frequency,
-        samples=solution.samples,
-        scheme=solution.scheme,
-        periods=solution.periods,
-        winding=solution.winding,
-    )
+    equations = PeriodicEquations.build(model, solution.inputs, **settings_of(solution))
     parameters = np.array([solution.parameters[name] for name in model.parameters])
     return equations, parameters, periodic_part(equations, solution.states)
 
@@ -431,8 +398,6 @@ def multiplier_sensitivities(model: Model, solution: PeriodicSolution) -> dict[s
     >>> bool(np.isclose(sum(by_parameter["c"] / solution.multipliers), -10.0))
     True
     """
-    _checks.instance("model", model, Model)
-    _checks.instance("solution", solution, PeriodicSolution)
     equations, theta, z = equations_of(model, solution)
     derivative = parameter_sensitivities(equations, z, theta)
     if solution.floquet is None or derivative is None:

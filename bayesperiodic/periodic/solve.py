@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic.models.model import Model, integrate
+from bayesperiodic.models.model import Model, integration_kernels, parameter_vector
 from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
@@ -19,39 +19,32 @@ SHARPENING = 2.0
 SMALLEST_SHARPENING = 1.02
 
 
-def raise_amplitude(equations: PeriodicEquations, parameters: np.ndarray, static: np.ndarray) -> Solved | None:
+def raise_amplitude(equations: PeriodicEquations, parameters: np.ndarray, static: np.ndarray) -> np.ndarray | None:
     """Continue the solution while the variation of the inputs about their means grows from zero; None if that fails."""
     if not equations.model.inputs:
         return None
-    mean = np.zeros_like(equations.inputs)
-    width = len(equations.model.inputs)
+    mean, width = np.zeros_like(equations.inputs), len(equations.model.inputs)
     mean[:, :width] = equations.inputs[:, :width].mean(axis=0)
     start = replace(equations, inputs=mean)
     scaled = ParametrisedEquations(start, parameters, (INPUTS,), equations.inputs - mean)
     beginning = start.solve(parameters, static)
-    if beginning.code != CONVERGED:
-        return None
     columns = start.residual_jacobian(beginning.z, parameters)
-    factors = start.factors(columns)
-    if not factors.regular:
+    if beginning.code != CONVERGED or not (factors := start.factors(columns)).regular:
         return None
     linear = factors.solve(scaled.slopes(np.zeros(1), beginning.z, columns)[0])
-    points = list(trace(scaled, beginning.z, np.zeros(1), until=1.0, step=0.1, size=np.ptp(linear, axis=0)))
-    if not points or points[-1].values[0] != 1.0:
-        return None
-    return equations.solve(parameters, points[-1].z)
+    *_, last = trace(scaled, beginning.z, np.zeros(1), until=1.0, step=0.1, size=np.ptp(linear, axis=0))
+    return last.z if last.values[0] == 1.0 else None
 
 
-def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndarray) -> Solved | None:
+def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndarray) -> np.ndarray | None:
     """Solve with softened signs first and sharpen them step by step; None if that fails or there are none."""
     if not equations.model.smooth_signs:
         return None
     soft = replace(equations, model=equations.model.softened)
-    sharpness, factor, z = SOFTEST, SHARPENING, guess
-    solved = soft.solve(np.append(parameters, sharpness), z)
+    solved = soft.solve(np.append(parameters, SOFTEST), guess)
     if solved.code != CONVERGED:
         return None
-    z = solved.z
+    sharpness, factor, z = SOFTEST, SHARPENING, solved.z
     while sharpness < 1.0:
         next_sharpness = min(1.0, sharpness * factor)
         solved = soft.solve(np.append(parameters, next_sharpness), z)
@@ -61,12 +54,31 @@ def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndar
             factor = np.sqrt(factor)
             if factor < SMALLEST_SHARPENING:
                 return None
-    return equations.solve(parameters, z)
+    return z
 
 
 PERIODS = 40
 SETTLING_CYCLES = 120
 NUDGE = 0.1
+
+
+def integrate(
+    equations: PeriodicEquations, parameters: np.ndarray, start: np.ndarray, inputs: np.ndarray, steps: int, kept: int
+) -> np.ndarray | None:
+    """Integrate by the classical fourth-order Runge-Kutta method on the grid; None if the states overflow.
+
+    `start` (size,) contains the states and then the rates of the second-order ones at tau = 0; `inputs`
+    (2·samples·periods, 3·inputs) u, u̇, ü at half steps over one response period, which is repeated. The result (kept,
+    size) contains `start`'s variables before each of the last steps.
+    """
+    orders, function = (
+        np.array(list(equations.model.orders.values())),
+        equations.model.kernels.residual_jacobian.address,
+    )
+    path = np.empty((kept, orders.sum()))
+    given = np.array(start, dtype=float), np.ascontiguousarray(inputs), equations.grid.samples, parameters
+    solved = integration_kernels().runge_kutta(function, *given, equations.frequency, orders, steps, path)
+    return path if solved else None
 
 
 def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: np.ndarray) -> np.ndarray | None:
@@ -77,16 +89,8 @@ def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: 
     grid, count = equations.grid, equations.count
     second = [i for i, state in enumerate(equations.model.states) if equations.model.orders[state] == 2]
     half = _fourier.on_grid(_fourier.coefficients(equations.inputs.T), 2 * grid.points).T
-    path = integrate(
-        equations.model,
-        np.concatenate([start[0], equations.drift[second] * equations.frequency]),
-        half,
-        parameters,
-        frequency=equations.frequency,
-        samples=grid.samples,
-        steps=PERIODS * grid.points,
-        kept=grid.points,
-    )
+    state, steps = np.concatenate([start[0], equations.drift[second] * equations.frequency]), PERIODS * grid.points
+    path = integrate(equations, parameters, state, half, steps, grid.points)
     if path is None:
         return None
     z = path[:, :count] - equations.drift * (grid.tau[:, None] + (PERIODS - 1) * grid.periods)
@@ -95,12 +99,6 @@ def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: 
     z[:, turns] -= 2 * np.pi * np.round(z[0, turns] / (2 * np.pi))
     slip = np.abs(z[-1] - z[0])[angles]
     return None if np.any(slip > np.pi) else z
-
-
-def settle(equations: PeriodicEquations, parameters: np.ndarray, start: np.ndarray) -> Solved | None:
-    """Solve from the end of a time integration from rest at start[0]; None if that fails."""
-    settled = settled_period(equations, parameters, start)
-    return None if settled is None else equations.solve(parameters, settled)
 
 
 def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tuple[np.ndarray, float] | None:
@@ -113,16 +111,8 @@ def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tupl
     equilibrium = equations.static_guess(parameters)[0]
     rates = sum(model.orders.values()) - count
     start = np.concatenate([equilibrium + NUDGE * np.maximum(np.abs(equilibrium), 1.0), np.zeros(rates)])
-    path = integrate(
-        model,
-        start,
-        np.empty((2, 0)),
-        parameters,
-        frequency=equations.frequency,
-        samples=grid.samples,
-        steps=SETTLING_CYCLES * grid.samples,
-        kept=SETTLING_CYCLES * grid.samples // 4,
-    )
+    steps = SETTLING_CYCLES * grid.samples
+    path = integrate(equations, parameters, start, np.empty((2, 0)), steps, steps // 4)
     if path is None:
         return None
     state = path[:, int(np.argmax(np.ptp(path[:, :count], axis=0) / (1.0 + np.abs(path[:, :count]).max(axis=0))))]
@@ -231,8 +221,7 @@ def solve_periodic(
     equations = PeriodicEquations.build(
         model, inputs, frequency=frequency, samples=samples, scheme=scheme, periods=periods, winding=winding
     )
-    _checks.same_names("parameters", parameters, model.parameters)
-    theta = np.array([_checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
+    theta = parameter_vector(model, parameters)
     if model.autonomous:
         equations, solved, found_by = solve_free(equations, theta, guess)
     else:
@@ -278,11 +267,17 @@ def _solution_warnings(
 def solve_driven(
     equations: PeriodicEquations, theta: np.ndarray, guess: str | Mapping[str, np.ndarray] | PeriodicSolution
 ) -> tuple[Solved, str]:
-    """Solve a driven problem from any guess; return the solve and how it was found (`PeriodicSolution.found_by`)."""
+    """Solve a driven problem from any guess; return the solve and how it was found (`PeriodicSolution.found_by`).
+
+    The status is "other orbit" if the solution repeats more often within the response period than the guess.
+    """
     if not isinstance(guess, str):
         start = as_guess(equations, guess)
         solved, found_by = solve_from(equations, theta, start)
-        return _same_orbit(equations, solved, start), found_by
+        times, periods = equations.kernels.repetitions, equations.grid.periods
+        if solved.code == CONVERGED and times(solved.z, periods) > times(start, periods):
+            solved = solved._replace(code=OTHER_ORBIT)
+        return solved, found_by
     _checks.one_of("guess", guess, GUESSES)
     if guess == "integration":
         settled = settled_period(equations, theta, equations.static_guess(theta))
@@ -298,30 +293,22 @@ def solve_from(
 
     The first solve is returned if none converges.
     """
-    routes: dict[str, Callable[[], Solved | None]] = {
-        NEWTON: lambda: equations.solve(theta, start),
+    routes: dict[str, Callable[[], np.ndarray | None]] = {
+        NEWTON: lambda: start,
         "sharpness": lambda: sharpen(equations, theta, start),
     }
     if at_rest:
         routes["input amplitude"] = lambda: raise_amplitude(equations, theta, start)
-        routes["time integration"] = lambda: settle(equations, theta, start)
+        routes["time integration"] = lambda: settled_period(equations, theta, start)
     first = None
     for name, route in routes.items():
-        solved = route()
-        solved = solved and equations.checked(solved)
-        if solved is not None and solved.code == CONVERGED:
-            return solved, name
-        first = first or solved
+        if (guess := route()) is not None:
+            solved = equations.checked(equations.solve(theta, guess))
+            if solved.code == CONVERGED:
+                return solved, name
+            first = first or solved
     assert first is not None
     return first, NEWTON
-
-
-def _same_orbit(equations: PeriodicEquations, solved: Solved, guess: np.ndarray) -> Solved:
-    """Return the solve, marked "other orbit" if it repeats more often within the response period than its guess."""
-    times, periods = equations.kernels.repetitions, equations.grid.periods
-    if solved.code == CONVERGED and times(solved.z, periods) > times(guess, periods):
-        return solved._replace(code=OTHER_ORBIT)
-    return solved
 
 
 def solve_free(

@@ -6,7 +6,6 @@ from typing import Any, cast
 
 import matplotlib.pyplot as plt
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -19,7 +18,13 @@ from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, styled
 
 BRANCH_MEASURES = ("amplitude", "maximum", "section", "period")
-MARKERS = {FOLD: "o", PERIOD_DOUBLING: "D"}
+STABILITIES = {True: "stable", False: "unstable"}
+BRANCH_STYLES: dict[str, dict[str, Any]] = {
+    "stable": {"lw": 1.6, "ls": "-"},
+    "unstable": {"lw": 1.6, "ls": "--"},
+    FOLD: {"marker": "o", "mfc": "white", "mew": 1.4, "ls": ""},
+    PERIOD_DOUBLING: {"marker": "D", "mfc": "white", "mew": 1.4, "ls": ""},
+}
 
 
 @styled
@@ -55,13 +60,8 @@ def branch(
         One per branch, for the legend.
     angular : bool
         Show frequencies as angular frequencies in rad/s.
-    figure : Figure, optional
     ax : Axes, optional
         To draw into, instead of a figure.
-
-    Returns
-    -------
-    Figure
 
     Raises
     ------
@@ -90,41 +90,47 @@ def branch(
         _checks.one_of("measure", measure, BRANCH_MEASURES)
     if ax is None:
         ax = (figure or plt.figure(figsize=(7.0, 4.6), layout="constrained")).add_subplot()
-    factor = 2 * np.pi if angular and branch.vary == "frequency" else 1.0
+    factor, drawn = 2 * np.pi if angular and branch.vary == "frequency" else 1.0, set[str]()
     for b, colour in zip(branches, cycle(ENSEMBLES), strict=False):
-        if isinstance(b, BranchPrediction):
-            _draw_prediction(ax, b, b.band(output, str(measure)), f"{measure}[{output}]", factor, colour)
-            continue
-        across, up = factor * b.values, _measures(b, measure, output)
-        for stable, part in _runs(b):
-            ax.plot(across[part], up[part], color=colour, lw=1.6, ls="-" if stable else "--", zorder=2 + stable)
-        for kind, marker in MARKERS.items():
-            at = np.array([k == kind for k in b.kinds])
-            every = np.repeat(across[at], up.shape[1])
-            ax.plot(every, up[at].ravel(), marker, color=colour, mfc="white", ms=6, mew=1.4, ls="none", zorder=4)
+        draw: Any = _draw_prediction if isinstance(b, BranchPrediction) else _draw_branch
+        drawn |= draw(ax, b, measure, output, factor, colour)
     varied = axis_label(branch.vary, branch.units.get(branch.vary, ""))
     ax.set_xlabel("angular frequency [rad/s]" if factor != 1.0 else varied)
     ax.set_ylabel(_measure_label(measure, output, branch.units.get(output, "") if unit is None else unit))
-    ax.legend(handles=_branch_handles(branches, labels), frameon=False)
+    looks: list[dict[str, Any]] = [{"color": c, "lw": 1.6, "label": t} for c, t in zip(cycle(ENSEMBLES), labels or [])]
+    looks += [{"color": "black", "label": name} | look for name, look in BRANCH_STYLES.items() if name in drawn]
+    ax.legend(handles=[plt.Line2D([], [], **look) for look in looks], frameon=False)
     return cast(Figure, ax.figure)
 
 
+def _draw_branch(ax: Axes, branch: Branch, measure: Any, output: str, factor: float, colour: str) -> set[str]:
+    """Draw the parts of a branch and its marked points, and return the styles that appear."""
+    across, up = factor * branch.values, _measures(branch, measure, output)
+    runs = _runs(branch)
+    for stable, part in runs:
+        ax.plot(across[part], up[part], color=colour, zorder=2 + stable, **BRANCH_STYLES[STABILITIES[stable]])
+    for kind in (FOLD, PERIOD_DOUBLING):
+        at = np.array([k == kind for k in branch.kinds])
+        ax.plot(np.repeat(across[at], up.shape[1]), up[at].ravel(), color=colour, ms=6, zorder=4, **BRANCH_STYLES[kind])
+    return {STABILITIES[stable] for stable, _ in runs} | {*branch.kinds}
+
+
 def _draw_prediction(
-    ax: Axes, prediction: BranchPrediction, band: pd.DataFrame, column: str, factor: float, colour: str
-) -> None:
-    for _, part in band.groupby("part"):
+    ax: Axes, prediction: BranchPrediction, measure: Any, output: str, factor: float, colour: str
+) -> set[str]:
+    """Draw the band of a prediction and its folds, and return the styles that appear."""
+    for _, part in prediction.band(output, str(measure)).groupby("part"):
         value = factor * part["value"].to_numpy()
         ax.fill_between(value, part["low"], part["high"], color=colour, alpha=0.3, lw=0, zorder=2)
-        stable = part["stable"].to_numpy()
-        starts = [0, *(np.flatnonzero(np.diff(stable)) + 1), len(stable)]
-        for begin, end in pairwise(starts):
-            style = "-" if stable[begin] else "--"
-            ax.plot(value[begin:end], part["median"].iloc[begin:end], color=colour, lw=1.6, ls=style, zorder=3)
-    at = prediction.curves[prediction.curves["kind"] == FOLD].groupby("part")[column].median()
-    folds = factor * prediction.folds[["median", "low", "high"]].to_numpy()
-    for (middle, low, high), height in zip(folds, at, strict=True):
-        reach = [[middle - low], [high - middle]]
-        ax.errorbar([middle], [height], xerr=reach, fmt="o", color=colour, mfc="white", ms=6, mew=1.4, zorder=4)
+        for stable, at in _stretches(part["stable"].to_numpy()):
+            ax.plot(value[at], part["median"].iloc[at], color=colour, zorder=3, **BRANCH_STYLES[STABILITIES[stable]])
+    curves = prediction.curves
+    heights = curves[curves["kind"] == FOLD].groupby("part")[f"{measure}[{output}]"].median()
+    middle, low, high = factor * prediction.folds[["median", "low", "high"]].to_numpy().T
+    look = BRANCH_STYLES[FOLD] | {"color": colour, "ms": 6, "zorder": 4}
+    if len(middle):
+        ax.errorbar(middle, heights, xerr=[middle - low, high - middle], **look)
+    return {STABILITIES[stable] for stable in curves["stable"]} | {*curves["kind"]}
 
 
 def _measures(branch: Branch, measure: str | Callable, output: str) -> np.ndarray:
@@ -149,8 +155,13 @@ def _runs(branch: Branch) -> list[tuple[bool, slice]]:
     """Return the stable and unstable parts of the branch; folds and period doublings belong to both neighbours."""
     plain = [None if kind else solution.stable for solution, kind in zip(branch, branch.kinds, strict=True)]
     between = [True in pair and False not in pair for pair in pairwise(plain)]
-    starts = [0, *(np.flatnonzero(np.diff(between)) + 1), len(between)]
-    return [(between[first], slice(first, last + 1)) for first, last in pairwise(starts) if first < last]
+    return [(stable, slice(part.start, part.stop + 1)) for stable, part in _stretches(between) if between]
+
+
+def _stretches(flags: Sequence[bool] | np.ndarray) -> list[tuple[bool, slice]]:
+    """Return the stretches of equal flags, with the flag."""
+    starts = [0, *(np.flatnonzero(np.diff(flags)) + 1), len(flags)]
+    return [(bool(flags[begin]), slice(begin, end)) for begin, end in pairwise(starts)]
 
 
 def _measure_label(measure: str | Callable, output: str, unit: str) -> str:
@@ -159,26 +170,6 @@ def _measure_label(measure: str | Callable, output: str, unit: str) -> str:
     if measure == "period":
         return "period [s]"
     return axis_label(f"{output} at tau = 0, 1, …" if measure == "section" else f"{measure} of {output}", unit)
-
-
-def _branch_handles(branches: Sequence[Branch | BranchPrediction], labels: Sequence[str] | None) -> list[plt.Line2D]:
-    looks: list[dict[str, Any]] = [
-        {"color": colour, "lw": 1.6, "label": label}
-        for colour, label in zip(cycle(ENSEMBLES), labels or [], strict=False)
-    ]
-    for stable, style, name in ((True, "-", "stable"), (False, "--", "unstable")):
-        if any(stable in _stabilities(b) for b in branches):
-            looks.append({"color": "black", "lw": 1.6, "ls": style, "label": name})
-    for kind, marker in MARKERS.items():
-        if any(kind in (b.curves["kind"].to_numpy() if isinstance(b, BranchPrediction) else b.kinds) for b in branches):
-            looks.append({"color": "black", "marker": marker, "mfc": "white", "mew": 1.4, "ls": "", "label": kind})
-    return [plt.Line2D([], [], **look) for look in looks]
-
-
-def _stabilities(branch: Branch | BranchPrediction) -> set[bool]:
-    if isinstance(branch, BranchPrediction):
-        return set(branch.curves["stable"])
-    return {stable for stable, _ in _runs(branch)}
 
 
 MOST_POINTS_DRAWN = 20_000
@@ -210,18 +201,8 @@ def section(
     orbits : Orbits or sequence of Orbit
     units : mapping of str to str, optional
         Units of the coordinates; angles are in rad.
-    figure : Figure, optional
     ax : Axes, optional
         To draw into, instead of a figure.
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For another object than a `PoincareSection`.
 
     Examples
     --------
@@ -264,11 +245,6 @@ def orbits(
         At least one.
     units : mapping of str to str, optional
         See `section`.
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
 
     Raises
     ------

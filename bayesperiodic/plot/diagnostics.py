@@ -5,7 +5,6 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import ndtri
@@ -24,11 +23,7 @@ BAND_LEVEL = 0.99
 # Factor on the height of the histogram axes, for the legend.
 HEADROOM = 1.45
 RANK_TITLES = "count per bin / expected", "distribution function − diagonal", "coverage − probability"
-RANK_AXES = (
-    "position of the truth in the posterior",
-    "position of the truth in the posterior",
-    "probability of the interval",
-)
+RANK_AXES = *["position of the truth in the posterior"] * 2, "probability of the interval"
 METHOD_LABELS = {"mcmc": "MCMC", "laplace": "Laplace"}
 METHOD_LINES = {"mcmc": "-", "laplace": "--"}
 BAND_STYLE: dict[str, Any] = {"color": "grey", "alpha": 0.25, "lw": 0}
@@ -45,17 +40,6 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
     Parameters
     ----------
     calibration : Calibration
-    figure : Figure, optional
-        With a constrained layout.
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For another object than a `Calibration`.
 
     Examples
     --------
@@ -72,11 +56,8 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
             values = calibration.positions[method][name]
             values = np.sort(values[np.isfinite(values)])
             _histogram(row[0], values, method, f"{METHOD_LABELS[method]}: {verdicts[method, name]}")
-            points, size, banded = (
-                uniformity.evaluation_points(),
-                values.size,
-                method == CALIBRATED_METHODS[0] and values.size,
-            )
+            points, size = uniformity.evaluation_points(), values.size
+            banded = method == CALIBRATED_METHODS[0] and size
             steps = np.searchsorted(values, points, side="right") / max(size, 1)
             _deviation(row[1], steps, uniformity.ecdf_band(size, BAND_LEVEL) if banded else None, method)
             covered = np.array([uniformity.coverage(values, level) for level in points])
@@ -129,17 +110,6 @@ def comparison(comparison: Comparison, *, names: Sequence[str] | None = None, fi
     comparison : Comparison
     names : sequence of str, optional
         By default all.
-    figure : Figure, optional
-        With a constrained layout.
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For an unknown name.
 
     Examples
     --------
@@ -193,7 +163,7 @@ def _quantiles(axes: Axes, comparison: Comparison, names: Sequence[str]) -> None
             axes.plot(across, (comparison.quantiles[name] - line["map"]) / line["sd"], **looks.get(name, plain))
     labels = {"xlabel": "Laplace quantile − MAP [posterior sd]", "ylabel": "MCMC quantile − MAP [posterior sd]"}
     axes.set(xlim=(-LIMIT, LIMIT), ylim=(-LIMIT, LIMIT), aspect="equal", **labels)
-    handles = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    handles = style.legend_entries(axes)
     axes.legend(handles.values(), handles.keys(), frameon=False, fontsize="small", loc="upper left")
 
 
@@ -227,16 +197,6 @@ def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Fig
     profile : Profile
     names : sequence of str, optional
         By default all.
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For a name without a profile.
 
     Examples
     --------
@@ -252,7 +212,7 @@ def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Fig
         _profile_panel(axes, profile, shown[number])
         if number % columns == 0:
             axes.set_ylabel("relative log-density")
-    drawn = {label: line for axes in figure.axes for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    drawn = style.legend_entries(*figure.axes)
     legend = {label: drawn[label] for label in PROFILE_LEGEND if label in drawn}
     figure.legend(legend.values(), legend.keys(), loc="outside upper center", ncols=len(legend), frameon=False)
     return figure
@@ -286,15 +246,11 @@ def _profile_panel(axes: Axes, profile: Profile, name: str) -> None:
 
 def _laplace_range(profile: Profile, name: str) -> np.ndarray:
     """Return values within three standard deviations, limited by the support and half the drawn range beyond it."""
-    values, at, reach, (low, high) = (
-        profile.values[name],
-        profile.map[name],
-        3.0 * profile.sd[name],
-        profile.limits[name],
-    )
-    margin = 0.5 * np.ptp(values)
-    start = min(values[0], max(low, values[0] - margin, at - reach))
-    return np.linspace(start, max(values[-1], min(high, values[-1] + margin, at + reach)), 400)
+    at, reach, (low, high) = profile.map[name], 3.0 * profile.sd[name], profile.limits[name]
+    first, last = profile.values[name][[0, -1]]
+    margin = 0.5 * (last - first)
+    start = min(first, max(low, first - margin, at - reach))
+    return np.linspace(start, max(last, min(high, last + margin, at + reach)), 400)
 
 
 @styled
@@ -308,16 +264,6 @@ def models(comparison: ModelComparison, *, figure: Figure | None = None) -> Figu
     Parameters
     ----------
     comparison : ModelComparison
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For another object than a `ModelComparison`.
 
     Examples
     --------
@@ -329,10 +275,11 @@ def models(comparison: ModelComparison, *, figure: Figure | None = None) -> Figu
     figure = figure or plt.figure(figsize=(10.5, 0.55 * len(table) + 1.8), layout="constrained")
     change = table["log_evidence"] - table["log_evidence"].iloc[0]
     error = np.hypot(table["log_evidence_error"], table["log_evidence_error"].iloc[0]) * (change != 0.0)
+    one, several = ((table[f"{name}_difference"], table[f"{name}_difference_se"]) for name in ("elpd", "held_out"))
     panels = (
         ("evidence", "log evidence − that of the first", change, error, DECISIVE),
-        ("one value left out", "ELPD − that of the first", *_difference(table, "elpd"), SMALLEST_GAIN),
-        ("one experiment left out", "sum of ELPD − that of the first", *_difference(table, "held_out"), SMALLEST_GAIN),
+        ("one value left out", "ELPD − that of the first", *one, SMALLEST_GAIN),
+        ("one experiment left out", "sum of ELPD − that of the first", *several, SMALLEST_GAIN),
     )
     rows = np.arange(len(table))
     for axes, (title, label, values, errors, band) in zip(figure.subplots(1, 3, sharey=True), panels, strict=True):
@@ -352,7 +299,3 @@ def models(comparison: ModelComparison, *, figure: Figure | None = None) -> Figu
     subject = wrapped_label(f"verdict on {table.index[0]}: {table['verdict'].iloc[0]}", "").replace("\n", " ")
     figure.suptitle(f"{subject}{', synthetic data' * comparison.synthetic}", fontsize="medium")
     return figure
-
-
-def _difference(table: pd.DataFrame, name: str) -> tuple[pd.Series, pd.Series]:
-    return table[f"{name}_difference"], table[f"{name}_difference_se"]

@@ -46,16 +46,6 @@ def fit(
     prediction : Prediction, optional
     experiments : sequence of str, optional
         By default all.
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For an unknown name.
 
     Examples
     --------
@@ -69,14 +59,9 @@ def fit(
         _checks.contains(
             "prediction", prediction.median, runs, "give the one of this problem, predict(problem, posterior)"
         )
-    shown = [(e, channel) for e in problem.experiments if e.name in runs for channel in e.outputs]
-    noisy = [
-        (e, name)
-        for e in problem.experiments
-        if e.name in runs and e.name in estimate.input_errors
-        for name, sd in estimate.input_sd[e.name].items()
-        if sd.any()
-    ]
+    drawn = [e for e in problem.experiments if e.name in runs]
+    shown = [(e, channel) for e in drawn for channel in e.outputs]
+    noisy = [(e, name) for e in drawn for name, sd in estimate.input_sd.get(e.name, {}).items() if sd.any()]
     heights = [3, 1] * len(shown) + [1] * len(noisy)
     figure = figure or plt.figure(figsize=(7.0, 4.6 * len(shown) + 1.3 * len(noisy)), layout="constrained")
     grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
@@ -92,9 +77,8 @@ def fit(
         axes.axhline(0.0, lw=1.0, color=COLOURS["measured"])
         if row == 2 * len(shown):
             axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 0.95), borderpad=0.0)
-        axes.set(
-            ylabel=axis_label(f"error of\n{name}", problem.model.units.get(name, "")), xlabel="time in the period [s]"
-        )
+        label = axis_label(f"error of\n{name}", problem.model.units.get(name, ""))
+        axes.set(ylabel=label, xlabel="time in the period [s]")
     return figure
 
 
@@ -160,11 +144,6 @@ def loops(
     estimate : MapEstimate
     output, input : str, optional
         By default the first of each.
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
 
     Raises
     ------
@@ -214,11 +193,6 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
     posterior : Posterior
     walkers : int
         Number of walkers per ensemble.
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
 
     Raises
     ------
@@ -243,8 +217,7 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
             axes.plot(shown, paths[:, :walkers], color=ENSEMBLES[e % len(ENSEMBLES)], lw=0.4, alpha=0.6)
         axes.set_ylabel(draws_label(posterior, name), fontsize=8)
         text = f"tau {posterior.tau[name]:.0f} steps, R-hat {posterior.rhat[name]:.3f}"
-        place: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top"}
-        axes.annotate(text, (0.995, 0.97), fontsize=7, bbox=BOX, **place)
+        axes.annotate(text, (0.995, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize=7, bbox=BOX)
     rows[-1].set_xlabel("step after burn-in (one colour per ensemble)")
     if text := caveats_of(posterior):
         figure.suptitle(text)

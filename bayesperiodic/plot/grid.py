@@ -21,9 +21,8 @@ PLAIN_POWERS = (-5, 10)
 def write_labels(grid: np.ndarray, labels: Sequence[str]) -> None:
     """Write the names and the ticks at the left and the lower edge."""
     last, small = len(grid) - 1, {"size": SMALL_LABEL_SIZE} if len(grid) > MANY_NAMES else {}
-    for (i, j), axes in np.ndenumerate(grid):
-        if j > i:
-            continue
+    for i, j in np.argwhere(np.tri(len(grid))).tolist():
+        axes = grid[i, j]
         for axis in (axes.xaxis, axes.yaxis) if j < i else (axes.xaxis,):
             _set_ticks(axis)
         axes.tick_params(axis="x", labelbottom=i == last, labelrotation=45)
@@ -47,18 +46,16 @@ def write_legend(grid: np.ndarray, handles: list[Any], title: str) -> float:
 
 def arrange(grid: np.ndarray, above: float) -> None:
     """Put panels of one size as closely as their labels allow; `above` is the height of the legend [pixels]."""
-    figure, last = grid[0, 0].figure, len(grid) - 1
-    boxes = {place: (axes.get_tightbbox(), axes.bbox) for place, axes in np.ndenumerate(grid)}
-    column, row = [boxes[i, 0] for i in range(last + 1)], [boxes[last, j] for j in range(last + 1)]
-    left, bottom = (max(inner.p0[k] - outer.p0[k] for outer, inner in line) for k, line in enumerate((column, row)))
-    outer, inner = boxes[0, 0]
-    title, gap, (width, height) = outer.y1 - inner.y1, PANEL_GAP * figure.dpi, figure.bbox.size
-    x, y = (left + 2.0 * gap) / width, (bottom + 2.0 * gap) / height
-    top = 1.0 - (title + above + 2.0 * gap) / height
-    each = [(1.0 - x - gap / width + gap / width) / (last + 1), (top - y + (title + gap) / height) / (last + 1)]
+    figure, count, gap = grid[0, 0].figure, len(grid), PANEL_GAP * grid[0, 0].figure.dpi
+    left = 2.0 * gap + max(axes.bbox.x0 - axes.get_tightbbox().x0 for axes in grid[:, 0])
+    bottom = 2.0 * gap + max(axes.bbox.y0 - axes.get_tightbbox().y0 for axes in grid[-1])
+    title = grid[0, 0].get_tightbbox().y1 - grid[0, 0].bbox.y1
+    size = figure.bbox.size
+    start, between = np.array([left, bottom]), np.array([gap, title + gap])
+    each = (size - start - [0.0, above + gap]) / count
     for (i, j), axes in np.ndenumerate(grid):
-        size = each[0] - gap / width, each[1] - (title + gap) / height
-        axes.set_position((x + j * each[0], y + (last - i) * each[1], *size))
+        corner = start + each * [j, count - 1 - i]
+        axes.set_position((*corner / size, *(each - between) / size))
 
 
 def interval_title(draws: np.ndarray) -> str:

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from bayesperiodic.plot.grid import TITLE_QUANTILES, arrange, interval_title, write_labels, write_legend
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, caveats_of
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, caveats_of, legend_entries
 from bayesperiodic.sampling.convergence import arviz
 from bayesperiodic.sampling.draws import Posterior
 
@@ -53,8 +53,7 @@ def draw_histograms(
     if not any(name in options for name in TITLE_OPTIONS):
         defaults |= {"titles": [interval_title(values) for values in draws.T], "title_fmt": None}
     histogram = {"label": f"MCMC {len(before) + 1}" if before else "MCMC", "lw": 1.4}
-    if options.get("smooth1d") is None:  # a line otherwise
-        histogram["density"] = True
+    histogram |= {"density": True} if options.get("smooth1d") is None else {}  # a line otherwise
     settings = defaults | options | {"hist_kwargs": histogram | dict(options.get("hist_kwargs") or {})}
     marks = [truths.get(name) for name in names]
     several = len(names) > 1
@@ -85,16 +84,12 @@ def _contain(grid: np.ndarray, k: int, value: float) -> None:
 def _legend(grid: np.ndarray, caveats: str) -> float:
     """Write one legend of all posteriors, with the caveats on each; return its height as `write_legend` does."""
     figure, titles = grid[0, 0].figure, [caveats]
-    entries: dict[str, Any] = {}
-    for axes in np.diag(grid):
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
     for legend in figure.legends[:]:
         titles.insert(0, legend.get_title().get_text())
         legend.remove()
     handles = [
         Line2D([], [], color=_colour(handle), lw=1.4 if label == TRUTH_LABEL else 4.0, label=label)
-        for label, handle in sorted(entries.items(), key=lambda entry: entry[0] == TRUTH_LABEL)
+        for label, handle in sorted(legend_entries(*np.diag(grid)).items(), key=lambda entry: entry[0] == TRUTH_LABEL)
     ]
     every = dict.fromkeys(part for title in titles for part in title.split(", ") if part)
     return write_legend(grid, handles, ", ".join(every))

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 import matplotlib.pyplot as plt
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.comparison import Comparison, compare
@@ -36,15 +36,7 @@ def summary(problem: Problem, fit: MapEstimate, posterior: Posterior, *, figure:
     fit : MapEstimate
     posterior : Posterior
     figure : Figure, optional
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For results of another problem.
+        To draw into: empty.
 
     Examples
     --------
@@ -61,21 +53,15 @@ def summary(problem: Problem, fit: MapEstimate, posterior: Posterior, *, figure:
     channel = max(fit.fvu, key=lambda name: fit.fvu[name])
     having = [e for e in problem.experiments if channel in e.outputs]
     worst = max(having, key=lambda e: float((fit.residuals[e.name][channel] ** 2).sum()))
-    top, bottom = _fit_and_residual(left)
+    room = {"left": 0.15, "right": 0.97, "bottom": 0.1, "top": 0.93, "hspace": 0.08, "height_ratios": [2.2, 1.0]}
+    top, bottom = left.subplots(2, 1, sharex=True, gridspec_kw=room)
     draw_period(top, bottom, problem, fit, worst, channel)
     names = _worst(problem, posterior, identified, compared)
     corner(posterior, laplace=fit, problem=problem, names=names, figure=cast(Figure, above))
-    text = "\n".join(
-        textwrap.fill(line, LINE_LENGTH, subsequent_indent="   ")
-        for line in _words(fit, posterior, identified, compared)
-    )
+    words = _words(fit, posterior, identified, compared)
+    text = "\n".join(textwrap.fill(line, LINE_LENGTH, subsequent_indent="   ") for line in words)
     below.text(0.02, 0.97, axis_label(text), va="top", linespacing=1.35)
     return figure
-
-
-def _fit_and_residual(figure: SubFigure) -> Any:
-    grid = {"left": 0.15, "right": 0.97, "bottom": 0.1, "top": 0.93, "hspace": 0.08, "height_ratios": [2.2, 1.0]}
-    return figure.subplots(2, 1, sharex=True, gridspec_kw=grid)
 
 
 def _worst(problem: Problem, posterior: Posterior, identified: Identifiability, compared: Comparison) -> list[str]:

@@ -107,10 +107,6 @@ def corner(
         plot_contours, plot_datapoints, plot_density, range, scale_hist, smooth, smooth1d, title_fmt, title_kwargs,
         title_quantiles, titles, truth_color. The label in `hist_kwargs` is that of the legend.
 
-    Returns
-    -------
-    Figure
-
     Raises
     ------
     ValueError
@@ -221,8 +217,7 @@ class _Panels:
                 axes.set_ylim(*limits[i])
             elif j > i:
                 axes.set_axis_off()
-        group = posterior.tree["posterior"].to_dataset()
-        supports = [support(group, name) for name in names]
+        supports = [support(posterior.tree["posterior"].to_dataset(), name) for name in names]
         return cls(grid, names, draws, supports, limits, truths, _groups(posterior))
 
     def pairs(self) -> Iterator[tuple[Axes, list[int]]]:
@@ -329,12 +324,10 @@ def draw_ellipses(axes: Axes, mean: np.ndarray, covariance: np.ndarray) -> None:
     sds = np.sqrt(np.diag(covariance))
     correlation = covariance[0, 1] / np.prod(sds)
     turn = np.linspace(0.0, 2 * np.pi, 200)
-    across = np.cos(turn)
-    up = correlation * across + np.sqrt(max(1.0 - correlation**2, 0.0)) * np.sin(turn)
+    up = correlation * np.cos(turn) + np.sqrt(max(1.0 - correlation**2, 0.0)) * np.sin(turn)
+    circle = sds * np.column_stack([np.cos(turn), up])
     for level in REGION_LEVELS:
-        radius = np.sqrt(-2.0 * np.log(1.0 - level))
-        x, y = (m + radius * sd * wave for m, sd, wave in zip(mean, sds, (across, up), strict=True))
-        axes.plot(x, y, zorder=5, **LAPLACE_STYLE | {"lw": 1.2})
+        axes.plot(*(mean + np.sqrt(-2.0 * np.log(1.0 - level)) * circle).T, zorder=5, **LAPLACE_STYLE | {"lw": 1.2})
 
 
 def normal_approximation(
@@ -368,16 +361,6 @@ def marginals(
         For noise parameters see `corner`.
     names : sequence of str, optional
         See `corner`.
-    figure : Figure, optional
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For an unknown name, or an estimate of another problem.
 
     Examples
     --------

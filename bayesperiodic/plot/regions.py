@@ -9,8 +9,7 @@ support. The density at the level is exceeded by the density at exactly the frac
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from functools import cached_property, reduce
 
 import numpy as np
 from scipy.fft import dctn, idctn
@@ -103,7 +102,6 @@ class Chart:
             best = int(np.argmin([rest for _, rest in trends]))
             order, (trend, rest) = choices[best], trends[best]
             scale[order[1]] *= rest
-            trend = _divided(trend, rest)
         return cls(supports, logarithmic, order, centre[order], scale[order], trend, [edges[k] for k in order])
 
     def inward(self, x: np.ndarray) -> np.ndarray:
@@ -156,9 +154,9 @@ def _edges(v: np.ndarray, support: Sequence[float]) -> Support:
 
 
 def _trend(x: np.ndarray, y: np.ndarray) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
-    """Return the mean of y given x, a line unless a curve explains much more, and the sd of the rest."""
+    """Return the mean of y given x over the sd of the rest, and that sd: a line unless a curve explains much more."""
     slope = float(x @ y / max(x @ x, SMALLEST_DENSITY))
-    line, straight = (lambda t: slope * t), float((y - slope * x).std())
+    straight = float((y - slope * x).std())
     members = np.array_split(np.argsort(x), min(KNOTS, max(1, len(x) // 50)))
     knots = np.array([[x[m].mean(), y[m].mean()] for m in members]).T
     knots = knots[:, np.flatnonzero(np.diff(knots[0], prepend=-np.inf) > 1e-6)]
@@ -168,12 +166,9 @@ def _trend(x: np.ndarray, y: np.ndarray) -> tuple[Callable[[np.ndarray], np.ndar
         curve = PchipInterpolator(*np.column_stack([far[0], knots, far[1]]))
         curved = float((y - curve(x)).std())
         if 0.0 < curved < CURVED_RATIO * straight:
-            return curve, curved
-    return line, straight if straight > 0.0 else 1.0
-
-
-def _divided(function: Callable[[np.ndarray], np.ndarray], divisor: float) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda t: function(t) / divisor
+            return (lambda t: curve(t) / curved), curved
+    rest = straight if straight > 0.0 else 1.0
+    return (lambda t: slope * t / rest), rest
 
 
 @dataclass(frozen=True)
@@ -194,28 +189,23 @@ class KernelEstimate:
         steps = (ends[:, 1] - ends[:, 0]) / nodes
         places = np.floor((points - ends[:, 0]) / steps).astype(int)
         inside = np.all((places >= 0) & (places < nodes), axis=1)
-        counter = _Counter(nodes, points.shape[1], ends[:, 1] - ends[:, 0])
-        halves = [counter.spectrum(part[keep]) for part, keep in zip(_halves(places), _halves(inside), strict=True)]
+        counter, middle = _Counter(nodes, ends[:, 1] - ends[:, 0]), len(points) // 2
+        halves = [counter.spectrum(places[part][inside[part]]) for part in (slice(middle), slice(middle, None))]
         widths = np.geomspace(NARROWEST_KERNEL * steps.max(), WIDEST_KERNEL, KERNEL_WIDTHS)
         scores = np.array([counter.score(halves, width) for width in widths])
         tolerance = max(SCORE_TOLERANCE[0], SCORE_TOLERANCE[1] * len(points) ** SCORE_TOLERANCE[2])
         width = float(widths[scores >= scores.max() - tolerance * abs(scores.max())].max())
-        pilot = counter.smooth(0.5 * (halves[0] + halves[1]), width)
+        pilot = counter.counts(0.5 * (halves[0] + halves[1]) * counter.kernel(width))
         places = places[inside]
         at = np.maximum(pilot[tuple(places.T)], 1e-9 * pilot.max())
         factor = np.minimum(np.sqrt(at.mean() / at), max(IN_TAILS / width, 1.0))
-        group = np.clip(
-            np.log(factor / KERNEL_FACTORS[0]) / np.log(KERNEL_FACTORS[1] / KERNEL_FACTORS[0]),
-            0.0,
-            len(KERNEL_FACTORS) - 1.0,
-        )
-        whole: Any = 0.0
+        group = np.interp(np.log(factor), np.log(KERNEL_FACTORS), np.arange(KERNEL_FACTORS.size))
+        whole = np.zeros(pilot.shape)
         for number, multiple in enumerate(KERNEL_FACTORS):
             weight = np.maximum(1.0 - np.abs(group - number), 0.0) / len(points)
             if weight.any():
-                whole = whole + counter.spectrum(places, weight) * counter.kernel(width * multiple)
-        values = np.maximum(idctn(whole, norm="ortho"), 0.0) / np.prod(steps)
-        return cls(ends[:, 0], steps, values, float(width * KERNEL_FACTORS[0] / steps.max()))
+                whole += counter.spectrum(places, weight) * counter.kernel(width * multiple)
+        return cls(ends[:, 0], steps, counter.counts(whole) / np.prod(steps), width * KERNEL_FACTORS[0] / steps.max())
 
     @cached_property
     def padded(self) -> np.ndarray:
@@ -240,16 +230,11 @@ class KernelEstimate:
         return np.where(inside, map_coordinates(self.padded, place.T, order=1, mode="nearest"), 0.0)
 
 
-def _halves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    half = len(values) // 2
-    return values[:half], values[half:]
-
-
 class _Counter:
     """Histograms on a mesh, as coefficients of cosines, and their smoothing."""
 
-    def __init__(self, nodes: int, axes: int, lengths: np.ndarray):
-        self._shape = (nodes,) * axes
+    def __init__(self, nodes: int, lengths: np.ndarray):
+        self._shape = (nodes,) * len(lengths)
         self._frequencies = [np.pi * np.arange(nodes) / length for length in lengths]
 
     def spectrum(self, places: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
@@ -260,12 +245,11 @@ class _Counter:
 
     def kernel(self, width: float) -> np.ndarray:
         """Return the transform of a normal kernel."""
-        each = [np.exp(-0.5 * (width * k) ** 2) for k in self._frequencies]
-        return each[0] if len(each) == 1 else np.multiply.outer(*each)
+        return reduce(np.multiply.outer, [np.exp(-0.5 * (width * k) ** 2) for k in self._frequencies])
 
-    def smooth(self, spectrum: np.ndarray, width: float) -> np.ndarray:
-        """Return smoothed fractions per cell."""
-        return np.maximum(idctn(spectrum * self.kernel(width), norm="ortho"), 0.0)
+    def counts(self, spectrum: np.ndarray) -> np.ndarray:
+        """Return the fractions per cell of a smoothed histogram."""
+        return np.maximum(idctn(spectrum, norm="ortho"), 0.0)
 
     def score(self, halves: Sequence[np.ndarray], width: float) -> float:
         """Return minus the squared error of both halves' estimates for the density of the other, but for a constant."""

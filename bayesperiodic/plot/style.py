@@ -1,6 +1,7 @@
 """Colours, labels and panels of all figures; each colour has one meaning everywhere."""
 
 import functools
+import inspect
 import re
 import textwrap
 from collections.abc import Callable, Sequence
@@ -24,10 +25,22 @@ LAPLACE_STYLE: dict[str, Any] = {"color": COLOURS["laplace"], "lw": 1.6, "ls": "
 LABEL_LENGTH, PANELS_ACROSS = 24, 4
 SHEET = "bayesperiodic.plot.figures"
 Arguments = ParamSpec("Arguments")
+# Entries of the docstrings of all figures, in their order, each with its first line.
+SHARED_ENTRIES = {
+    "figure : Figure": "figure : Figure, optional\n    To draw into: empty, with a constrained layout.",
+    "Returns\n": "\nReturns\n-------\nFigure",
+    "Raises\n": "\nRaises\n------\nValueError\n"
+    "    For an object of another class, an unknown name or results of another problem.",
+}
 
 
 def styled(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
-    """Return a function that draws in the style of the package, without a change of matplotlib's settings."""
+    """Return a function that draws in the style of the package, without a change of matplotlib's settings.
+
+    The entries of its docstring that are the same for all figures are added.
+    """
+    described, *rest = re.split(r"\n(?=\nRaises\n|\nWarns\n|\nExamples\n)", inspect.cleandoc(draw.__doc__ or ""))
+    missing = [text for start, text in SHARED_ENTRIES.items() if start not in "\n".join([described, *rest])]
 
     @functools.wraps(draw)
     def wrapped(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Figure:
@@ -36,6 +49,7 @@ def styled(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
         with plt.style.context(SHEET):
             return draw(*args, **kwargs)
 
+    wrapped.__doc__ = "\n".join([described, *missing, *rest])
     return wrapped
 
 
@@ -97,6 +111,11 @@ def panels(figure: FigureBase, count: int, across: int = PANELS_ACROSS, sharey: 
     for axes in grid[count:]:
         axes.remove()
     return list(grid[:count])
+
+
+def legend_entries(*panels: Axes) -> dict[str, Any]:
+    """Return the last artist of each label in the panels."""
+    return {label: artist for axes in panels for artist, label in zip(*axes.get_legend_handles_labels(), strict=True)}
 
 
 def draw_marginal(axes: Axes, edges: np.ndarray, density: np.ndarray, mean: float, sd: float) -> None:

@@ -42,17 +42,6 @@ def missing_terms(problem: Problem, fit: MapEstimate, found: MissingTerms, *, fi
     problem : Problem
     fit : MapEstimate
     found : MissingTerms
-    figure : Figure, optional
-        With a constrained layout.
-
-    Returns
-    -------
-    Figure
-
-    Raises
-    ------
-    ValueError
-        For a fit or terms of another problem.
 
     Examples
     --------
@@ -85,9 +74,7 @@ def _steps(axes: Axes, search: MissingTerms) -> None:
     held_out = np.array([step.held_out for step in models])
     if np.isfinite(held_out).any():
         axes.plot(held_out, rows, label="experiments left out", **HELD_OUT_STYLE)
-    values = {
-        channel: np.array([step.unexplained[channel] for step in models]) for channel in search.before.unexplained
-    }
+    values = {name: np.array([step.unexplained[name] for step in models]) for name in search.before.unexplained}
     for number, (channel, left) in enumerate(values.items()):
         axes.plot(left, rows, "o-", color=CHANNELS[number % len(CHANNELS)], lw=1.6, ms=5, label=axis_label(channel))
         for row, value in zip(rows, left, strict=True):
@@ -159,10 +146,8 @@ def _variables(problem: Problem, fit: MapEstimate, search: MissingTerms, e: Expe
 
 def _label(problem: Problem, name: str) -> str:
     """Return the label of a variable of the model by its name there, of a derivative as that of the variable."""
-    model, order = problem.model, 0
-    while name[order:] not in (*model.states, *model.inputs):
-        order += 1
-    plain, rate = name[order:], ("", "/s", "/s²")[order]
-    unit = model.units.get(plain, "")
+    model = problem.model
+    order = next(k for k in range(3) if name[k:] in (*model.states, *model.inputs))
+    plain, unit = name[order:], model.units.get(name[order:], "")
     text = ("", "rate of ", "second derivative of ")[order] + plain
-    return axis_label(text, f"{unit or '1'}{rate}" if order else unit)
+    return axis_label(text, f"{unit or '1'}{('', '/s', '/s²')[order]}" if order else unit)

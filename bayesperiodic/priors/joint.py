@@ -46,11 +46,9 @@ class MultivariateNormal(LogDensity):
     covariance: np.ndarray
 
     def __post_init__(self) -> None:
-        mean = _checks.finite_vector("mean", self.mean).copy()
-        covariance = _covariance("covariance", self.covariance, mean.size)
-        for name, array in (("mean", mean), ("covariance", covariance)):
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+        mean = _checks.finite_vector("mean", self.mean)
+        object.__setattr__(self, "mean", _checks.read_only(mean))
+        object.__setattr__(self, "covariance", _checks.read_only(_covariance("covariance", self.covariance, mean.size)))
 
     @property
     def dimension(self) -> int:
@@ -279,7 +277,7 @@ class JointPrior:
             blocks[key] = _joint(key, value) if isinstance(key, tuple) else as_prior(f"priors[{key!r}]", value)
         names = tuple(name for name in known if name in keys)
         ordered = dict.fromkeys(keys[name] for name in names)
-        return cls(names, {key: blocks[key] for key in ordered})
+        return cls(names, _checks.read_only({key: blocks[key] for key in ordered}))
 
     @cached_property
     def _columns(self) -> dict[str | tuple[str, ...], Any]:

@@ -139,10 +139,7 @@ def _bound(argument: str, value: Any) -> float:
 
 
 class _Positive(Univariate):
-    @property
-    def support(self) -> tuple[float, float]:
-        """The positive half-line."""
-        return 0.0, math.inf
+    support = (0.0, math.inf)
 
 
 class _Interval(Univariate):

@@ -17,6 +17,7 @@ from bayesperiodic.likelihood.input_noise import (
     InputErrors,
     InputNoise,
     checked,
+    error_waves,
     noisy_inputs,
     true_inputs,
     with_errors_as_parameters,
@@ -51,6 +52,8 @@ class Description:
         noise: str | Noise = "independent",
         scheme: str | Scheme | None = None,
         input_noise: InputNoise = FROM_CYCLES,
+        input_errors: Mapping[str, InputErrors] | None = None,
+        anchors: Mapping[str, Any] | None = None,
     ):
         if not isinstance(model, Model):
             raise ValueError(f"model: must be a Model, got {_checks.shortened(model)}.")
@@ -63,6 +66,7 @@ class Description:
             "model": model, "experiments": self.experiments, "priors": dict(priors), "fixed": dict(fixed or {}),
             "tied": dict(tied or {}), "local": local, "noise": noise, "scheme": scheme,
             "input_noise": input_noise if isinstance(input_noise, str) else self.input_noise,
+            "input_errors": dict(input_errors or {}), "anchors": dict(anchors or {}),
         }  # fmt: skip
         if self.input_noise == JOINT:
             model, errors, none = with_errors_as_parameters(model, self.experiments)
@@ -96,7 +100,10 @@ class Description:
             for run in runs
         }
         self.ties = self._ties()
-        self.input_errors: dict[str, InputErrors] = {}
+        self.input_errors = self._checked_input_errors(input_errors or {})
+        self.anchors = dict(anchors or {})
+        if anchors:
+            _checks.same_names("anchors", anchors, runs)
         self._noise_values = self._checked_noise_values(fixed)
         self._check_counts()
         self._complete = True
@@ -108,7 +115,7 @@ class Description:
                 f"{name}: must not be assigned or deleted, because a problem is immutable; problem.{changed} returns "
                 f"another one. The arguments of replace are {', '.join(self._settings)}."
             )
-        super().__setattr__(name, value)
+        super().__setattr__(name, _checks.read_only(value))
 
     def __delattr__(self, name: str) -> None:
         self.__setattr__(name, None)
@@ -123,16 +130,28 @@ class Description:
             if f"{SHIFT}[{e.name}]" not in priors
         }
 
+    def _checked_input_errors(self, errors: Mapping[str, InputErrors]) -> dict[str, InputErrors]:
+        """Return the errors of the inputs; raise a ValueError unless they are those of these experiments."""
+        for name, one in errors.items():
+            _checks.one_of("input_errors", name, self.parameter_maps)
+            experiment = next(e for e in self.experiments if e.name == name)
+            size = sum(block.size for block in blocks_of(experiment, self.model))
+            count = len(error_waves(experiment, self.input_noise)[0])
+            if one.caused.shape != (size,) or one.loadings.shape[:1] != (size,) or one.expected.shape != (count,):
+                raise ValueError(
+                    f"input_errors[{name!r}]: must be {count} errors and {size} components, got {one.expected.size} "
+                    f"and {one.caused.size}; give those of an estimate of this problem."
+                )
+        return dict(errors)
+
     @cached_property
     def observations(self) -> dict[str, Observation]:
         """Comparison of outputs with the data of every experiment, less what the errors of the inputs caused."""
         result = {}
         for e in self.experiments:
             delayed, errors = self.parameter_maps[e.name].delayed, self.input_errors.get(e.name)
-            result[e.name] = Observation(e, self.model, delayed)
-            if errors is not None:
-                caused = errors.parts([block.size for block in result[e.name].blocks])
-                result[e.name] = Observation(e, self.model, delayed, caused)
+            caused = None if errors is None else errors.parts([block.size for block in blocks_of(e, self.model)])
+            result[e.name] = Observation(e, self.model, delayed, caused)
         return result
 
     @cached_property
@@ -220,14 +239,13 @@ class Description:
     def replace(self, **changes: Any) -> Self:
         """Return the problem with other arguments of the constructor.
 
-        They are validated as the constructor does. Periodic solves start at the medians of the priors again, and the
-        errors of inputs are those of no estimate.
+        They are validated as the constructor does. Anchors and errors of inputs are kept only if they are given.
 
         Parameters
         ----------
         **changes
-            Arguments of the constructor: model, experiments, priors, fixed, tied, local, noise, scheme, input_noise.
-            For experiments without those that have local parameters see `with_experiments`.
+            Arguments of the constructor. For experiments without those that have local parameters see
+            `with_experiments`.
 
         Returns
         -------
@@ -246,7 +264,7 @@ class Description:
         """
         for name in changes:
             _checks.one_of("replace", name, self._settings)
-        return type(self)(**self._settings | changes)
+        return type(self)(**self._settings | {"input_errors": None, "anchors": None} | changes)
 
     def with_experiments(self, experiments: Iterable[Experiment]) -> Self:
         """Return the same problem with other data, or with some of its experiments.
@@ -404,7 +422,7 @@ class Description:
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled functions cannot be pickled; they are loaded again where they are needed.
-        return {key: value for key, value in self.__dict__.items() if key not in ("equations", "_last")}
+        return {key: value for key, value in self.__dict__.items() if key != "equations"}
 
     def parameters(self, theta: np.ndarray, experiment: str) -> np.ndarray:
         """Return every parameter of the model in an experiment, free, fixed and tied.
@@ -477,14 +495,13 @@ def _checked_local(
         _checks.one_of("local", name, every)
         if name in tied:
             raise ValueError(f"local: {name!r} is tied; it follows what it is tied to, so leave it out.")
-    if isinstance(priors, Mapping):
-        for key in priors:
-            for name in key if isinstance(key, tuple) else ():
-                if name in names:
-                    raise ValueError(
-                        f"priors[{key!r}]: {name!r} is local; a joint prior needs the names of single experiments, "
-                        f"such as '{name}[run]'."
-                    )
+    for key in priors:
+        for name in key if isinstance(key, tuple) else ():
+            if name in names:
+                raise ValueError(
+                    f"priors[{key!r}]: {name!r} is local; a joint prior needs the names of single experiments, such as "
+                    f"'{name}[run]'."
+                )
     return names if SHIFT in names else (*names, SHIFT)
 
 

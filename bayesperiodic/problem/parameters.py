@@ -75,11 +75,7 @@ class ParameterMap:
     ) -> "ParameterMap":
         """Return the checked map of an experiment; `names` are those of θ."""
         every = (*parameters, SHIFT)
-        columns = {}
-        for name in every:
-            for candidate in (name, local_name(name, experiment)):
-                if candidate in names:
-                    columns[name] = names.index(candidate)
+        columns = {name: names.index(n) for name in every for n in (name, local_name(name, experiment)) if n in names}
         for name in tied:
             _checks.one_of("tied", name, every)
             for argument, others in (("priors", columns), ("fixed", fixed)):
@@ -122,12 +118,10 @@ class ParameterMap:
 
 
 class ParameterMaps:
-    """Maps of several experiments with the same free parameters; `moving` are the indices of free and tied ones."""
+    """Maps of several experiments with the same free and tied parameters, whose indices are `moving`."""
 
     def __init__(self, maps: Sequence[ParameterMap]):
         first = maps[0]
-        if any(m.columns.keys() != first.columns.keys() or m.tied.keys() != first.tied.keys() for m in maps):
-            raise ValueError("maps: the same parameters must be free, and the same tied.")
         self._tied, self._size = first.tied, first.size
         self._fixed = np.array([[m.fixed.get(name, np.nan) for name in first.parameters] for m in maps])
         self._places = np.array([first.parameters.index(name) for name in first.columns], dtype=int)
@@ -241,11 +235,6 @@ def support(group: xr.Dataset, name: str) -> tuple[float, float]:
 def squared(unit: str) -> str:
     """Return the unit of a variance: N², (m/s)², or 1."""
     return unit if unit == "1" else f"{unit}²" if unit.isalpha() else f"({unit})²"
-
-
-def is_noise(group: xr.Dataset, variable: str) -> bool:
-    """Return whether a variable is one of the noise model's."""
-    return NOISE in group[variable].attrs
 
 
 def in_experiment(names: Iterable[str], experiment: str | None) -> dict[str, str]:

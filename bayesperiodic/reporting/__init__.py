@@ -78,7 +78,7 @@ def report(
     target = in_folder(path)
     text = html.page(
         title=title or problem.model.name,
-        given=contents.ReportInputs.of(problem, fit, posterior, identifiability, comparison, prediction, missing),
+        given=contents.ReportInputs(problem, fit, posterior, identifiability, comparison, prediction, missing),
         content=contents,
         plot=plot,
         level=ADEQUACY_LEVEL,

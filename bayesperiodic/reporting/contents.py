@@ -19,7 +19,7 @@ from bayesperiodic._verdicts import CAUTION, TONES
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.adequacy import ADEQUACY_TESTS
 from bayesperiodic.diagnostics.comparison import Comparison, compare
-from bayesperiodic.diagnostics.identifiability import Identifiability, identifiability
+from bayesperiodic.diagnostics.identifiability import identifiability
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction, predict
 from bayesperiodic.estimation.map_estimate import estimation_warnings
@@ -38,54 +38,43 @@ LONGEST_PRIOR, MOST_PANELS = 120, 7
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "xarray", "matplotlib")
 
 
-@dataclass(frozen=True)
+@dataclass
 class ReportInputs:
-    """A problem, its estimate, and the draws and diagnostics that the report shows; those that are missing are None.
+    """A problem, its estimate, the draws or None, and the diagnostics that the report shows.
 
-    `no_prediction` is the reason why there is no prediction although there are draws, "" otherwise.
+    Diagnostics that are None are computed, those that need draws only with draws. `no_prediction` is the reason
+    why there is no prediction although there are draws, "" otherwise.
     """
 
     problem: Problem
     fit: MapEstimate
     posterior: Posterior | None
-    identifiability: Identifiability
+    identifiability: Any
     comparison: Comparison | None
     prediction: Prediction | None
     missing: MissingTerms | None
-    no_prediction: str
+    no_prediction: str = ""
 
-    @classmethod
-    def of(
-        cls,
-        problem: Problem,
-        fit: MapEstimate,
-        posterior: Posterior | None,
-        identified: Identifiability | None,
-        comparison: Comparison | None,
-        prediction: Prediction | None,
-        missing: MissingTerms | None,
-    ) -> "ReportInputs":
-        """Check that all inputs belong to one problem, and compute the diagnostics that are not given."""
-        runs, no_prediction = [e.name for e in problem.experiments], ""
-        problem = check_results(problem, fit=fit, **({} if posterior is None else {"posterior": posterior}))
-        if posterior is not None:
-            comparison = compare(problem, fit, posterior) if comparison is None else comparison
+    def __post_init__(self) -> None:
+        given = {"fit": self.fit} | ({} if self.posterior is None else {"posterior": self.posterior})
+        problem = self.problem = check_results(self.problem, **given)
+        if self.posterior is not None:
+            self.comparison = self.comparison or compare(problem, self.fit, self.posterior)
             try:
-                prediction = predict(problem, posterior) if prediction is None else prediction
+                self.prediction = self.prediction or predict(problem, self.posterior)
             except RuntimeError as error:
-                no_prediction = str(error)
-        identified = identifiability(problem, fit, posterior, profile=False) if identified is None else identified
-        _checks.same_names("identifiability", dict.fromkeys(identified.table.index), problem.names)
-        if comparison is not None:
+                self.no_prediction = str(error)
+        self.identifiability = self.identifiability or identifiability(problem, self.fit, self.posterior, profile=False)
+        _checks.same_names("identifiability", dict.fromkeys(self.identifiability.table.index), problem.names)
+        if self.comparison is not None:
             remedy = "give the one of this problem, compare(problem, fit, posterior)"
-            _checks.contains("comparison", comparison.table.index, problem.names, remedy)
-        if prediction is not None:
-            _checks.same_names("prediction", prediction.median, runs)
-        if missing is not None:
-            _checks.instance("missing", missing, MissingTerms)
-            if missing.fit(0).fingerprint != fingerprint(problem):
+            _checks.contains("comparison", self.comparison.table.index, problem.names, remedy)
+        if self.prediction is not None:
+            _checks.same_names("prediction", self.prediction.median, [e.name for e in problem.experiments])
+        if self.missing is not None:
+            _checks.instance("missing", self.missing, MissingTerms)
+            if self.missing.fit(0).fingerprint != fingerprint(problem):
                 raise ValueError("missing: must be missing_terms(problem, fit) of this problem, got that of another.")
-        return cls(problem, fit, posterior, identified, comparison, prediction, missing, no_prediction)
 
     @property
     def synthetic(self) -> bool:
@@ -193,8 +182,8 @@ def channels(given: ReportInputs) -> Rows:
     for e in given.problem.experiments:
         at = e.measured_points
         measured = "output" if at.all() else f"output, at {np.sum(at)} points"
-        outputs = {channel: values[at] for channel, values in e.outputs.items()}
-        every = [("input", *item) for item in e.inputs.items()] + [(measured, *item) for item in outputs.items()]
+        every = [("input", *item) for item in e.inputs.items()]
+        every += [(measured, channel, values[at]) for channel, values in e.outputs.items()]
         rows += [
             {
                 "Channel": code(channel),
@@ -248,17 +237,16 @@ def summary(given: ReportInputs) -> Rows:
     """Return the summary table of the free parameters."""
     robust = given.fit.interval(PROBABILITY, robust=True) if given.robust_ratios else {}
     laplace = {} if given.comparison is None else dict(given.comparison.table["verdict"])
-    rows = []
-    for full, (name, rounding) in zip(estimates(given), _roundings(given.fit).items(), strict=True):
-        row = {
+    return [
+        {
             **{title: full[title] for title in ("Parameter", "Unit", "MAP")},
             "90 % interval": full.get("MCMC: 90 % interval", full["Laplace: 90 % interval"]),
+            **({"Robust 90 % interval": rounding.interval(*robust[name])} if robust else {}),
+            "Identifiability": badge(given.identifiability.verdicts[name]),
+            **({"Laplace approximation": badge(laplace[name])} if laplace else {}),
         }
-        row |= {"Robust 90 % interval": rounding.interval(*robust[name])} if robust else {}
-        row |= {"Identifiability": badge(given.identifiability.verdicts[name])}
-        row |= {"Laplace approximation": badge(laplace[name])} if laplace else {}
-        rows.append(row)
-    return rows
+        for full, (name, rounding) in zip(estimates(given), _roundings(given.fit).items(), strict=True)
+    ]
 
 
 def _roundings(fit: MapEstimate) -> dict[str, html.Rounding]:
@@ -286,10 +274,9 @@ def estimates(given: ReportInputs) -> Rows:
 def noise(given: ReportInputs) -> Rows:
     """Return the table of the estimates of the noise parameters."""
     fit, rows = given.fit, []
-    variances = dict(zip(fit.joint_covariance.index, np.diag(fit.joint_covariance), strict=True))
     for name, value in fit.noise.items():
         free = name in given.problem.free_noise
-        relative = np.sqrt(float(variances[name])) if free else np.nan
+        relative = np.sqrt(float(fit.joint_covariance.loc[name, name])) if free else np.nan
         rounding = html.Rounding.of(value, value * relative)
         channel = name.removeprefix("variance[").removesuffix("]")
         independent = fit.independent.get(channel, fit.independent.get(name, np.nan))

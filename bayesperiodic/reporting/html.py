@@ -7,10 +7,11 @@ from functools import cache
 from itertools import groupby
 from math import floor, isfinite, isinf, isnan, log10
 from typing import Any
+from xml.dom.minidom import parseString
 
 import sympy as sp
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from sympy.printing.mathml import MathMLPresentationPrinter
 from sympy.printing.pretty.pretty_symbology import greek_unicode
 
@@ -193,45 +194,36 @@ class _MathPrinter(MathMLPresentationPrinter):
             text = text.replace(printed, wanted)
         return text
 
-    def node(self, tag: str, *children: Any) -> Any:
-        """Create an element with text or elements in it."""
-        made = self.dom.createElement(tag)
-        for child in children:
-            made.appendChild(self.dom.createTextNode(child) if isinstance(child, str) else child)
-        return made
-
     def mathml_tag(self, e: Any) -> str:
         """Return the tag or name of a function, or the sign of a relation."""
         return TAGS.get(type(e).__name__) or super().mathml_tag(e)
 
     def _print_Symbol(self, sym: sp.Symbol, style: str = "plain") -> Any:
         name, order = self._names.get(sym, (sym.name, 0))
-        pieces = re.findall(r"\d+|[^\d_]+", name)
-        base, *below = (greek_unicode.get(piece, piece) for piece in pieces)
-        line = self.node("mi", base)
+        pieces = [greek_unicode.get(piece, piece) for piece in re.findall(r"\d+|[^\d_]+", name)]
+        base, *below = (f"<mn>{piece}</mn>" if piece.isdigit() else f"<mi>{escape(piece)}</mi>" for piece in pieces)
         if order:
-            line = self.node("mover", line, self.node("mo", DOTS[order]))
-            line.setAttribute("accent", "true")
-        if not below:
-            return line
-        marks = [self.node("mn" if piece.isdigit() else "mi", piece) for piece in below]
-        return self.node("msub", line, marks[0] if len(marks) == 1 else self.node("mrow", *marks))
+            base = f'<mover accent="true">{base}<mo>{DOTS[order]}</mo></mover>'
+        if below:
+            marks = below[0] if len(below) == 1 else f"<mrow>{''.join(below)}</mrow>"
+            base = f"<msub>{base}{marks}</msub>"
+        return parseString(base).documentElement
 
     def _print_Float(self, expr: sp.Float) -> Any:
         mantissa, _, exponent = f"{float(expr):.12g}".partition("e")
-        if not exponent:
-            return self.node("mn", mantissa)
-        power = self.node("msup", self.node("mn", "10"), self.node("mn", str(int(exponent)).replace("-", "−")))
-        return self.node("mrow", self.node("mn", mantissa), self.node("mo", "×"), power)
+        markup = f"<mn>{mantissa}</mn>"
+        if exponent:
+            power = str(int(exponent)).replace("-", "−")
+            markup = f"<mrow>{markup}<mo>×</mo><msup><mn>10</mn><mn>{power}</mn></msup></mrow>"
+        return parseString(markup).documentElement
 
     def _print_Piecewise(self, expr: sp.Piecewise) -> Any:
-        rows = []
+        rows = ""
         for value, condition in expr.args:
-            when = [self.node("mtext", "if\u00a0"), self._print(condition)]
-            if condition is sp.true:
-                when = [self.node("mtext", "otherwise")]
-            rows.append(self.node("mtr", self.node("mtd", self._print(value)), self.node("mtd", *when)))
-        return self.node("mrow", self.node("mo", "{"), self.node("mtable", *rows))
+            when = f"<mtext>if\u00a0</mtext>{self.text(condition)}"
+            when = "<mtext>otherwise</mtext>" if condition is sp.true else when
+            rows += f"<mtr><mtd>{self.text(value)}</mtd><mtd>{when}</mtd></mtr>"
+        return parseString(f"<mrow><mo>{{</mo><mtable>{rows}</mtable></mrow>").documentElement
 
     def _as_ordered_terms(self, expr: sp.Expr, order: Any = None) -> list[sp.Expr]:
         """Sort terms by their highest derivative, negative ones last."""

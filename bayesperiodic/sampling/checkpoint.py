@@ -86,10 +86,8 @@ class Checkpoint:
             return MemoryBackend(), {}
         try:
             backend = MemoryBackend(read_sealed(self._path))
-            mark, state = (
-                str(backend.file.attrs.get(MARK, "no run of this package")),
-                json.loads(backend.file[RUN][()]),
-            )
+            mark = str(backend.file.attrs.get(MARK, "no run of this package"))
+            state = json.loads(backend.file[RUN][()])
             backend.get_last_sample()
         except Exception as error:  # whatever HDF5, JSON and emcee raise for damaged files
             raise ValueError(

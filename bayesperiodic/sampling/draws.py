@@ -32,7 +32,6 @@ from bayesperiodic.problem.parameters import (
     column,
     full_name,
     in_experiment,
-    is_noise,
     local_hint,
     local_names,
     pack,
@@ -219,7 +218,7 @@ class Posterior(Result):
     @property
     def _noise(self) -> list[str]:
         """Full names of the noise parameters."""
-        return [n for n, (variable, _) in places(self._group).items() if is_noise(self._group, variable)]
+        return [n for n, (variable, _) in places(self._group).items() if NOISE in self._group[variable].attrs]
 
     def summary(self, *, mode: int | None = None) -> pd.DataFrame:
         """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, one row per parameter.
@@ -245,13 +244,8 @@ class Posterior(Result):
             _checks.one_of("mode", mode, self.modes.index.tolist())
             inside = self.tree["sample_stats"][MODE].to_numpy().ravel() == mode
             return _table({name: _moments(self.draws(name)[inside]) for name in self.names})
-        table = _table(
-            {
-                name: _described(column(self._group, name), self.ess[name])
-                | {"tau": self.tau[name], "rhat": self.rhat[name]}
-                for name in self.names
-            }
-        )
+        rows = {name: _described(column(self._group, name), self.ess[name]) for name in self.names}
+        table = _table(rows).assign(tau=pd.Series(self.tau), rhat=pd.Series(self.rhat))
         table.attrs |= {"converged": self.converged, "reason": self.reason, "failures": dict(self.failures)}
         return table
 
@@ -368,7 +362,7 @@ REPLICATES = 100
 TERM_DRAWS, MOST_TERMS = (500, 2000), 10_000_000
 
 
-def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, time: dict[str, str], seed: int) -> xr.Dataset:
+def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, seed: int) -> xr.Dataset:
     """Return replicates of the measured mean periods, noise included, for some draws.
 
     Variables are ``<experiment> <channel>`` with dims (chain, draw, time axis), and ``largest_multiplier``, the modulus
@@ -384,20 +378,10 @@ def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, time: dic
         parts, components = components[: len(observation.blocks)], components[len(observation.blocks) :]
         for channel, values in observation.replicates(simulation.response(e.name), parts).items():
             values[failed] = np.nan
-            variables[f"{e.name} {channel}"] = ((CHAIN, DRAW, time[e.name]), values.reshape(*shape, -1))
+            variables[f"{e.name} {channel}"] = ((CHAIN, DRAW, _time(e.name)), values.reshape(*shape, -1))
         largest.append(density.simulator.largest_multipliers(theta, e.name, simulation).reshape(shape))
     variables["largest_multiplier"] = ((CHAIN, DRAW, EXPERIMENT), np.stack(largest, axis=-1))
     return xr.Dataset(variables, coords=chosen.coords)
-
-
-def orbits(density: LogPosterior, theta: np.ndarray, time: dict[str, str]) -> xr.Dataset:
-    """Return the states, turns included, of every experiment at one θ (names,): ``<experiment> <state>`` over time."""
-    states = {
-        f"{name} {state}": ((time[name],), values)
-        for name, solution in density.solve(theta).items()
-        for state, values in solution.states.items()
-    }
-    return xr.Dataset(states, coords={time[e.name]: e.time for e in density.problem.experiments})
 
 
 def _some(problem: Description, posterior: xr.Dataset, most: int) -> tuple[xr.Dataset, np.ndarray, np.ndarray]:
@@ -465,12 +449,10 @@ def tree(
     coords = {
         CHAIN: np.arange(len(lp)), DRAW: np.arange(lp.shape[1]), STEP: (DRAW, step), WALKER: (DRAW, walker)
     }  # fmt: skip
-    posterior, time = _variables(problem, theta, noise).assign_coords(coords), _time_axes(problem)
+    posterior = _variables(problem, theta, noise).assign_coords(coords)
     status = np.where(np.isfinite(lp), CONVERGED, NOT_FINITE).astype(np.int8)
-    meanings = {
-        "flag_values": list(range(len(STATUSES))),
-        "flag_meanings": " ".join(s.replace(" ", "_") for s in STATUSES),
-    }
+    flags = " ".join(s.replace(" ", "_") for s in STATUSES)
+    meanings = {"flag_values": list(range(len(STATUSES))), "flag_meanings": flags}
     stats = {"lp": ((CHAIN, DRAW), lp), "status": ((CHAIN, DRAW), status, meanings)}
     stats |= {"acceptance_rate": ((CHAIN, DRAW), convergence.as_chains(moved))}
     if modes is not None:
@@ -479,10 +461,10 @@ def tree(
         "posterior": posterior,
         "sample_stats": xr.Dataset(stats, coords=coords),
         "log_likelihood": log_likelihood_terms(density, posterior),
-        "posterior_predictive": posterior_predictive(density, posterior, time, seed),
-        "orbits": orbits(density, best, time),
-        "observed_data": _signals(problem, "outputs", time),
-        "constant_data": _signals(problem, "inputs", time),
+        "posterior_predictive": posterior_predictive(density, posterior, seed),
+        "orbits": _signals(problem, {run: s.states for run, s in density.simulator.solutions(best).items()}),
+        "observed_data": _signals(problem, {e.name: e.outputs for e in problem.experiments}),
+        "constant_data": _signals(problem, {e.name: e.inputs for e in problem.experiments}),
     }
     if problem.input_errors:
         variables: dict[str, Any] = {}
@@ -565,15 +547,12 @@ def _noise_attributes(problem: Description, variable: str) -> dict[str, str]:
     return {NOISE: problem.noise.name} | each
 
 
-def _signals(problem: Description, kind: str, time: dict[str, str]) -> xr.Dataset:
-    signals = {
-        f"{e.name} {channel}": ((time[e.name],), values)
-        for e in problem.experiments
-        for channel, values in getattr(e, kind).items()
-    }
-    return xr.Dataset(signals, coords={time[e.name]: e.time for e in problem.experiments})
+def _signals(problem: Description, by_run: Mapping[str, Mapping[str, np.ndarray]]) -> xr.Dataset:
+    """Return signals (points,) by experiment and name as variables ``<experiment> <name>`` over time."""
+    signals = {f"{run} {name}": (_time(run), x) for run, signals in by_run.items() for name, x in signals.items()}
+    return xr.Dataset(signals, coords={_time(e.name): e.time for e in problem.experiments})
 
 
-def _time_axes(problem: Description) -> dict[str, str]:
-    """Return the name of each experiment's time axis, which no channel can have."""
-    return {e.name: f"{e.name} time [s]" for e in problem.experiments}
+def _time(experiment: str) -> str:
+    """Return the name of an experiment's time axis, which no channel can have."""
+    return f"{experiment} time [s]"

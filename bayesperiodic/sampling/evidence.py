@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -154,23 +154,23 @@ def evidence(problem: Problem, posterior: Posterior) -> Evidence:
     first, second = (
         _bridge(density, points[fitted::2], points[1 - fitted :: 2], constant, generator) for fitted in (0, 1)
     )
-    halves = first.log, second.log
     improper = _improper(problem)
-    alarms = _alarms(posterior, first, second)
-    for alarm in alarms:
-        warnings.warn(f"The evidence is unreliable: {alarm}", stacklevel=3)
-    return Evidence(
-        log=float(np.mean(halves)),
+    result = Evidence(
+        log=float(np.mean([first.log, second.log])),
         log_error=float(0.5 * np.hypot(first.error, second.error)),
-        halves=halves,
+        halves=(first.log, second.log),
         overlap=min(first.overlap, second.overlap),
         missed=max(first.missed, second.missed),
         failed=max(first.failed, second.failed),
         data=_data(problem),
         improper=improper,
-        notes=(*(f"Unreliable: {alarm}" for alarm in alarms), *_notes(problem, improper)),
+        notes=tuple(_notes(problem, improper)),
         fingerprint=posterior.fingerprint,
     )
+    alarms = _alarms(posterior, result, (first.error, second.error))
+    for alarm in alarms:
+        warnings.warn(f"The evidence is unreliable: {alarm}", stacklevel=3)
+    return replace(result, notes=(*(f"Unreliable: {alarm}" for alarm in alarms), *result.notes))
 
 
 def _anchored(problem: Problem, posterior: Posterior) -> tuple[LogPosterior, np.ndarray]:
@@ -265,7 +265,7 @@ def _data(problem: Problem) -> dict[str, float]:
 
 def _constant(problem: Problem) -> float:
     """Return what the log-likelihood leaves out: −n/2 ln 2π, and the units of whitened values."""
-    scales = sum(observation.log_scale for observation in problem.observations.values())
+    scales = sum(block.log_scale for block in problem.likelihood.blocks)
     return scales - sum(_data(problem).values()) * LOG_ROOT_TWO_PI
 
 
@@ -326,22 +326,22 @@ def _notes(problem: Problem, improper: dict[str, str]) -> Iterator[str]:
         yield "Correlated values are counted as fewer independent ones, as in the likelihood."
 
 
-def _alarms(posterior: Posterior, first: _Bridge, second: _Bridge) -> list[str]:
-    """Return the reasons not to rely on the evidence, in words."""
-    alarms = []
-    overlap, missed = min(first.overlap, second.overlap), max(first.missed, second.missed)
-    failed = max(first.failed, second.failed)
+def _alarms(posterior: Posterior, result: Evidence, errors: tuple[float, float]) -> list[str]:
+    """Return the reasons not to rely on the evidence, in words; `errors` are those of the halves."""
+    alarms, (first, second) = [], result.halves
     if not posterior.converged:
         alarms.append(f"the draws have not converged ({posterior.reason}). Sample longer, see max_steps.")
-    if overlap < OVERLAP:
-        alarms.append(f"posterior and mixture overlap by {overlap:.2g} alone (should be at least {OVERLAP}).")
-    if missed > FRACTION:
-        alarms.append(f"the mixture fitted to one half of the draws misses {missed:.1%} of the other half.")
-    if abs(first.log - second.log) > DIFFERENT_ESTIMATES * np.hypot(first.error, second.error):
+    if result.overlap < OVERLAP:
+        alarms.append(f"posterior and mixture overlap by {result.overlap:.2g} alone (should be at least {OVERLAP}).")
+    if result.missed > FRACTION:
+        alarms.append(f"the mixture fitted to one half of the draws misses {result.missed:.1%} of the other half.")
+    if abs(first - second) > DIFFERENT_ESTIMATES * np.hypot(*errors):
         alarms.append(
-            f"the two halves of the ensembles give {first.log:.2f} ± {first.error:.2g} and {second.log:.2f} ± "
-            f"{second.error:.2g}. Sample longer, see max_steps."
+            f"the two halves of the ensembles give {first:.2f} ± {errors[0]:.2g} and {second:.2f} ± {errors[1]:.2g}. "
+            "Sample longer, see max_steps."
         )
-    if failed > FRACTION:
-        alarms.append(f"{failed:.1%} of the points of the mixture have no periodic solution, and count as impossible.")
+    if result.failed > FRACTION:
+        alarms.append(
+            f"{result.failed:.1%} of the points of the mixture have no periodic solution, and count as impossible."
+        )
     return alarms

@@ -219,9 +219,7 @@ class _Chains:
             acceptance=float(stats["acceptance_rate"].mean()),
             seed=seed,
         )
-        described = result.tree["sample_stats"].to_dataset()
-        result.tree["sample_stats"] = xr.DataTree(
-            described.assign({name: ((CHAIN, DRAW), values) for name, values in stats.items()})
-        )
+        described = {name: ((CHAIN, DRAW), values) for name, values in stats.items()}
+        result.tree["sample_stats"] = xr.DataTree(result.tree["sample_stats"].to_dataset().assign(described))
         result.tree.attrs["nutpie"] = version
         return result

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import astuple
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from bayesperiodic.density.log_posterior import (
     collapsible,
 )
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.density.responses import Simulator
+from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.problem.fingerprint import digest
 from bayesperiodic.sampling.checkpoint import Checkpoint
@@ -199,7 +200,7 @@ def sample(
     _checks.same_names("fit", fit.noise, problem.noise_names)
     runs = [e.name for e in problem.experiments]
     _checks.contains("fit", fit.solutions, runs, "give the estimate of this problem, map_estimate(problem)")
-    problem = problem.with_input_errors(fit.input_errors)
+    problem, fit = problem.with_input_errors(fit.input_errors), with_joint(problem, fit)
     executor = checked_executor(executor)
     if variances == COLLAPSED and not collapsible(problem):
         raise ValueError(
@@ -217,8 +218,7 @@ def sample(
         backend, saved = (emcee.backends.Backend(), {}) if store is None else store.load()
         anchor = np.array(saved["anchor"]) if saved else problem.vector(fit.theta)
         guesses = saved["guesses"] if saved else {name: s.states for name, s in fit.solutions.items()}
-        anchored = Simulator.start(problem, anchor, guesses)
-        density = LogPosterior(problem, anchored, coordinates=coordinates, variances=variances)
+        density = problem.anchored(anchor, guesses).density(coordinates=coordinates, variances=variances)
         if sampler == NUTS:
             return sample_nuts(density, fit, seed, ensembles, max_steps, start, progress)
         lists = {run: {state: [*map(float, x)] for state, x in states.items()} for run, states in guesses.items()}
@@ -492,10 +492,5 @@ class _EnsembleRun:
 def _evaluate_pieces(pool: TaskPool, points: np.ndarray) -> Evaluation:
     """Return the evaluation of points (points, dimension), computed by the workers piece by piece."""
     pieces = [points[k : k + PIECE] for k in range(0, len(points), PIECE)]
-    evaluations = dict(pool.run(_evaluate, pieces))
-    parts = [evaluations[number] for number in range(len(pieces))]
+    _, parts = zip(*sorted(pool.run(LogPosterior.evaluate, pieces), key=itemgetter(0)), strict=True)
     return Evaluation(*(np.concatenate(values) for values in zip(*parts, strict=True)))
-
-
-def _evaluate(density: LogPosterior, points: np.ndarray) -> Evaluation:
-    return density.evaluate(points)

@@ -1,6 +1,7 @@
 """Symbolic equations of a model, and their Lie symmetries by determining equations, solved by exact linear algebra."""
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
@@ -49,7 +50,16 @@ class System:
     @property
     def highest(self) -> list[sp.Symbol]:
         """The highest derivative of each state."""
-        return [self.symbols["d" * order + state] for state, order in self.orders.items()]
+        return [self.jet(state, order)[-1] for state, order in self.orders.items()]
+
+    @property
+    def names(self) -> dict[sp.Symbol, str]:
+        """The names of the parameters, the unknown ones first."""
+        return {symbol: name for name, symbol in (self.parameters | self.known).items()}
+
+    def jet(self, name: str, order: int = 2) -> list[sp.Symbol]:
+        """Return the symbols of a state or an input and of its derivatives up to an order."""
+        return [self.symbols["d" * k + name] for k in range(order + 1)]
 
     def given(self, known: Iterable[str], values: Mapping[sp.Symbol, sp.Expr]) -> "System":
         """Return the system with known parameters, and with parameters replaced by expressions."""
@@ -83,26 +93,16 @@ def system_of(model: Model, outputs: Iterable[str]) -> System:
 
 def _observed(system: System) -> System:
     """Return the system without the states and equations that no measured output depends on; update the orders."""
-    used = system.used
-    left = {s: max((k for k in range(3) if system.symbols["d" * k + s] in used), default=0) for s in system.orders}
-    system = replace(system, orders=left)
-    pending = list(system.outputs.values())
-    states: set[str] = set()
-    rows: set[int] = set()
-    while pending:
-        used = pending.pop().free_symbols
-        for state in set(system.orders) - states:
-            if used & {system.symbols[d + state] for d in ("", "d", "dd")}:
-                states.add(state)
-                highest = system.symbols["d" * system.orders[state] + state]
-                new = {i for i, g in enumerate(system.equations) if highest in g.free_symbols} - rows
-                rows |= new
-                pending += [system.equations[i] for i in new]
-    return replace(
-        system,
-        orders={s: order for s, order in system.orders.items() if s in states},
-        equations=tuple(g for i, g in enumerate(system.equations) if i in rows),
-    )
+    used, count = system.used, -1
+    equations: list[sp.Expr] = []
+    orders = {s: max((k for k, symbol in enumerate(system.jet(s)) if symbol in used), default=0) for s in system.orders}
+    while len(equations) > count:
+        count = len(equations)
+        symbols = set().union(*(e.free_symbols for e in (*system.outputs.values(), *equations)))
+        states = {s: order for s, order in orders.items() if symbols & set(system.jet(s))}
+        highest = {system.jet(s, order)[-1] for s, order in states.items()}
+        equations = [g for g in system.equations if g.free_symbols & highest]
+    return replace(system, orders=states, equations=tuple(equations))
 
 
 def with_signs(expression: sp.Expr) -> sp.Expr:
@@ -136,9 +136,9 @@ def _weight(condition: Any) -> sp.Expr:
     return (1 + sp.sign(condition.gts - condition.lts)) / 2
 
 
-def _reduced(matrix: np.ndarray) -> tuple[np.ndarray, list[int]]:
-    """Return the reduced row echelon form of an integer matrix modulo the prime, and its pivot columns."""
-    rows = np.array(matrix, dtype=np.int64) % PRIME
+def _reduced(matrix: np.ndarray, modulus: int) -> tuple[np.ndarray, list[int]]:
+    """Return the reduced row echelon form of an integer matrix modulo a prime, and its pivot columns."""
+    rows = np.array(matrix, dtype=np.int64) % modulus
     pivots: list[int] = []
     for column in range(rows.shape[1]):
         top = len(pivots)
@@ -146,27 +146,25 @@ def _reduced(matrix: np.ndarray) -> tuple[np.ndarray, list[int]]:
         if not below.size:
             continue
         rows[[top, top + below[0]]] = rows[[top + below[0], top]]
-        rows[top] = rows[top] * pow(int(rows[top, column]), -1, PRIME) % PRIME
+        rows[top] = rows[top] * pow(int(rows[top, column]), -1, modulus) % modulus
         others = np.flatnonzero(rows[:, column])
         others = others[others != top]
-        rows[others] = (rows[others] - rows[others, column, None] * rows[top] % PRIME) % PRIME
+        rows[others] = (rows[others] - rows[others, column, None] * rows[top] % modulus) % modulus
         pivots.append(column)
     return rows[: len(pivots)], pivots
 
 
-def _rank(matrix: np.ndarray) -> int:
-    return len(_reduced(matrix)[1])
+def independent(rows: Sequence | np.ndarray, columns: int, modulus: int = PRIME) -> list[int]:
+    """Return the positions of the rows that are no combination of those before, modulo a prime."""
+    return _reduced(np.array(rows, dtype=np.int64).reshape(len(rows), columns).T, modulus)[1]
 
 
-def nullspace(matrix: np.ndarray) -> np.ndarray:
-    """Return vectors (nullity, columns) that span the null space modulo the prime."""
-    rows, pivots = _reduced(matrix)
-    columns = matrix.shape[1]
-    free = [c for c in range(columns) if c not in pivots]
-    vectors = np.zeros((len(free), columns), dtype=np.int64)
-    for vector, column in zip(vectors, free, strict=True):
-        vector[column] = 1
-        vector[pivots] = -rows[:, column] % PRIME
+def nullspace(matrix: np.ndarray, modulus: int = PRIME) -> np.ndarray:
+    """Return vectors (nullity, columns) that span the null space modulo a prime."""
+    rows, pivots = _reduced(matrix, modulus)
+    free = [c for c in range(matrix.shape[1]) if c not in pivots]
+    vectors = np.eye(matrix.shape[1], dtype=np.int64)[free]
+    vectors[:, pivots] = -rows[:, free].T % modulus
     return vectors
 
 
@@ -181,7 +179,7 @@ def _circuits(vectors: np.ndarray, weights: np.ndarray, tries: int = 200) -> lis
     for trial in range(tries if len(vectors) > 1 else 1):
         # Heavy columns are the first pivots, so that each appears in one row only.
         order = np.lexsort((random.permutation(columns), -weights)) if trial % 2 else random.permutation(columns)
-        for row in _reduced(vectors[:, order])[0]:
+        for row in _reduced(vectors[:, order], PRIME)[0]:
             supports.add(tuple(sorted(int(c) for c in order[np.flatnonzero(row)])))
     return sorted(supports, key=lambda support: (weights[list(support)].sum(), support))
 
@@ -201,15 +199,12 @@ def integer_circuits(vectors: np.ndarray, weights: np.ndarray) -> list[np.ndarra
 
 def integer_rows(matrix: DomainMatrix) -> np.ndarray:
     """Return the rows of a rational matrix, scaled to integers without common factor."""
-    result = np.zeros(matrix.shape, dtype=np.int64)
-    for i, row in enumerate(matrix.to_Matrix().tolist()):
-        common = math.lcm(*(int(v.q) for v in row))
-        result[i] = [int(v * common) for v in row]
-        result[i] //= np.gcd.reduce(result[i])
-    return result
+    result = np.array(matrix.clear_denoms_rowwise()[1].to_Matrix().tolist(), dtype=np.int64).reshape(matrix.shape)
+    return result // np.gcd.reduce(result, axis=1, keepdims=True)
 
 
-Polynomial = dict[tuple[int, ...], Any]
+Polynomial = Mapping[tuple[int, ...], Any]  # coefficients by the powers of the symbols
+VectorField = dict[sp.Symbol, sp.Expr]  # changes of symbols, including the derivatives of states
 
 
 class Algebra:
@@ -226,7 +221,10 @@ class Algebra:
         self._symbols: dict[sp.Expr, sp.Symbol] = {}
         self._relations: list[sp.Expr] = []
         replaced = [self._replaced(e) for e in expressions]
-        self._relate_circles()
+        for odd, even, sign in ((sp.sin, sp.cos, 1), (sp.sinh, sp.cosh, -1)):
+            for function, symbol in self._symbols.items():
+                if isinstance(function, odd) and (other := self._symbols.get(even(*function.args))):
+                    self._relations.append(other**2 + sign * symbol**2 - 1)
         used = set().union(*(e.free_symbols for e in (*replaced, *self._relations)))
         plain = sorted(used - set(self._symbols.values()), key=str)
         generators = [*reversed(self._symbols.values()), *plain]
@@ -246,13 +244,6 @@ class Algebra:
     def is_zero(self, expression: sp.Expr) -> bool:
         """Return whether an expression vanishes identically."""
         return not self.numerators([expression])[0]
-
-    def split(self, polynomial: Any) -> dict[tuple[int, ...], Polynomial]:
-        """Return {powers of the varying symbols: {powers of the other generators: coefficient}}."""
-        parts: dict[tuple[int, ...], Polynomial] = {}
-        for powers, coefficient in polynomial.terms():
-            parts.setdefault(powers[: self.size], {})[powers[self.size :]] = coefficient
-        return parts
 
     def original(self, expression: sp.Expr) -> sp.Expr:
         """Return an expression with the variables replaced by the functions that they represent."""
@@ -306,45 +297,25 @@ class Algebra:
                 self._relations.append(symbol**2 - 1)
         return self._symbols[function]
 
-    def _relate_circles(self) -> None:
-        for odd, even, sign in ((sp.sin, sp.cos, 1), (sp.sinh, sp.cosh, -1)):
-            for function, symbol in list(self._symbols.items()):
-                if isinstance(function, odd) and (other := self._symbols.get(even(*function.args))):
-                    self._relations.append(other**2 + sign * symbol**2 - 1)
 
-
-@dataclass(frozen=True)
-class BasisField:
-    """Basis element of the infinitesimal transformations of one parameter or state."""
-
-    name: str
-    moves: sp.Expr  # factor of the unknown coefficient: 1 for a parameter; 1, a state, or an input for a state
-    field: dict[sp.Symbol, sp.Expr]  # change of each symbol, including the derivatives of the state
-    is_parameter: bool
-
-    @property
-    def symbol(self) -> sp.Symbol:
-        """The symbol of the parameter or state."""
-        return next(iter(self.field))
-
-
-def lie_derivative(field: Mapping[sp.Symbol, sp.Expr], expression: sp.Expr) -> sp.Expr:
+def lie_derivative(field: VectorField, expression: sp.Expr) -> sp.Expr:
     """Return the derivative of an expression along a vector field, away from kinks."""
     slopes = {s: sp.diff(expression, s).replace(sp.DiracDelta, lambda *_: sp.S.Zero) for s in field}
     return sp.Add(*(move * slopes[symbol] for symbol, move in field.items()))
 
 
-def _terms(system: System) -> list[BasisField]:
-    """Return the basis: every parameter, and every state with terms affine in the states and inputs."""
-    basis = [BasisField(n, sp.S.One, {s: sp.S.One}, True) for n, s in system.parameters.items()]
-    signals = [(n, order) for n, order in system.orders.items()] + [(n, 2) for n in system.inputs]
+def _terms(system: System) -> list[VectorField]:
+    """Return the basis: a change of every parameter, and changes of every state that are affine in states and inputs.
+
+    The parameter or state is the first symbol of each.
+    """
+    basis = [{symbol: sp.S.One} for symbol in system.parameters.values()]
+    signals = [*system.orders.items(), *((name, 2) for name in system.inputs)]
     for state, order in system.orders.items():
-        targets = [system.symbols["d" * k + state] for k in range(order + 1)]
         chains = [[sp.S.One, *[sp.S.Zero] * order]]
         for name, highest in signals:
-            jets = [system.symbols["d" * k + name] for k in range(highest + 1)]
-            chains += [jets[k : k + order + 1] for k in range(highest - order + 1)]
-        basis += [BasisField(state, c[0], dict(zip(targets, c, strict=True)), False) for c in chains]
+            chains += [system.jet(name, highest)[k : k + order + 1] for k in range(highest - order + 1)]
+        basis += [dict(zip(system.jet(state, order), chain, strict=True)) for chain in chains]
     return basis
 
 
@@ -356,20 +327,21 @@ class Determining:
     powers of the varying symbols must vanish separately.
     """
 
-    terms: tuple[BasisField, ...]  # the first columns
+    terms: list[VectorField]  # the first columns
+    parameters: range  # the terms of parameters, which come first
     algebra: Algebra
-    rows: tuple[dict[int, Polynomial], ...]  # by column
-    multipliers: tuple[bool, ...]  # the other columns: whether the element of Λ is on its diagonal
+    rows: list[Mapping[int, Polynomial]]  # by column
+    multipliers: list[bool]  # the other columns: whether the element of Λ is on its diagonal
 
     @property
-    def parameters(self) -> list[int]:
-        """The terms of parameters."""
-        return [k for k, term in enumerate(self.terms) if term.is_parameter]
+    def symbols(self) -> list[sp.Symbol]:
+        """The parameter or state that each term changes."""
+        return [next(iter(term)) for term in self.terms]
 
     @property
     def weights(self) -> np.ndarray:
         """Weights of the terms, by which transformations of few parameters are preferred, (terms,)."""
-        return np.array([PARAMETER_WEIGHT if term.is_parameter else 1 for term in self.terms])
+        return np.where(np.arange(len(self.terms)) < len(self.parameters), PARAMETER_WEIGHT, 1)
 
     @property
     def unknowns(self) -> list[sp.Symbol]:
@@ -397,8 +369,7 @@ class Determining:
         """
         places = sorted(support)
         columns = [*places, *range(len(self.terms), self.matrix.shape[1])]
-        part = self.matrix[:, columns]
-        chosen = _reduced(part.T)[1]
+        chosen = independent(self.matrix[:, columns], len(columns))
         domain = sp.QQ[tuple(self.unknowns)]
         entries = [[domain.ring.from_dict(dict(self.rows[i].get(c, {}))) for c in columns] for i in chosen]
         matrix = DomainMatrix(entries, (len(chosen), len(columns)), domain)
@@ -417,31 +388,29 @@ def determining_equations(system: System) -> Determining:
         for i, expression in enumerate(group):
             first = len(terms) + len(multipliers)
             multiplied = {first + j: -other for j, other in enumerate(group)}
-            table.append({k: lie_derivative(t.field, expression) for k, t in enumerate(terms)} | multiplied)
+            table.append({k: lie_derivative(term, expression) for k, term in enumerate(terms)} | multiplied)
             multipliers += [i == j for j in range(len(group))]
-    table += [{k: lie_derivative(t.field, y) for k, t in enumerate(terms)} for y in system.outputs.values()]
+    table += [{k: lie_derivative(term, y) for k, term in enumerate(terms)} for y in system.outputs.values()]
     expressions = [e for row in table for e in row.values()]
     algebra = Algebra([*expressions, *system.parameters.values()], system.symbols.values())
     rows = [part for row in table for part in _coefficients(row, algebra)]
-    return Determining(tuple(terms), algebra, tuple(rows), tuple(multipliers))
+    return Determining(terms, range(len(system.parameters)), algebra, rows, multipliers)
 
 
-def _coefficients(row: dict[int, sp.Expr], algebra: Algebra) -> list[dict[int, Polynomial]]:
-    """Return the coefficients of each power of the varying symbols in a row."""
-    parts: dict[tuple[int, ...], dict[int, Polynomial]] = {}
+def _coefficients(row: Mapping[int, sp.Expr], algebra: Algebra) -> list[Mapping[int, Polynomial]]:
+    """Return, for each power of the varying symbols, the coefficients in the columns of a row."""
+    parts: Any = defaultdict(lambda: defaultdict(dict))
     for column, polynomial in zip(row, algebra.numerators(list(row.values())), strict=True):
-        for powers, coefficients in algebra.split(polynomial).items():
-            parts.setdefault(powers, {})[column] = coefficients
+        for powers, coefficient in polynomial.terms():
+            parts[powers[: algebra.size]][column][powers[algebra.size :]] = coefficient
     return list(parts.values())
 
 
 def _modulo(polynomial: Polynomial, point: list[int]) -> int:
     total = 0
     for powers, coefficient in polynomial.items():
-        value = int(coefficient.numerator) * pow(int(coefficient.denominator), -1, PRIME)
-        for base, power in zip(point, powers, strict=True):
-            value = value * pow(base, power, PRIME) % PRIME
-        total += value
+        monomial = math.prod(pow(base, power, PRIME) for base, power in zip(point, powers, strict=True))
+        total += int(coefficient.numerator) * pow(int(coefficient.denominator), -1, PRIME) * monomial
     return total % PRIME
 
 
@@ -455,91 +424,64 @@ def _primitive(vector: list[sp.Expr]) -> list[sp.Expr]:
 
 @dataclass(frozen=True, eq=False)
 class Generator:
-    """An infinitesimal symmetry: the changes of the parameters and states that change."""
+    """An infinitesimal symmetry."""
 
-    parameters: dict[str, sp.Expr]
-    states: dict[str, sp.Expr]
-    field: dict[sp.Symbol, sp.Expr]  # by symbol, including derivatives of the states
+    field: VectorField  # without zeros, parameters first
     scaling: bool = False
-
-    @property
-    def _parts(self) -> tuple[dict, dict, dict]:
-        return self.parameters, self.states, self.field
 
     def times(self, factor: sp.Expr) -> "Generator":
         """Return the generator multiplied by a function of the parameters."""
-        parameters, states, moves = ({k: sp.factor(v * factor) for k, v in part.items()} for part in self._parts)
-        return Generator(parameters, states, moves)
+        return Generator({s: sp.factor(move * factor) for s, move in self.field.items()})
 
     def minus(self, other: "Generator", factor: sp.Expr) -> "Generator":
         """Return self − factor · other."""
-
-        def difference(these: dict, its: dict) -> dict:
-            moves = {k: sp.factor(these.get(k, 0) - factor * its.get(k, 0)) for k in dict.fromkeys((*these, *its))}
-            return {k: v for k, v in moves.items() if v != 0}
-
-        parameters, states, moves = map(difference, self._parts, other._parts)
-        return Generator(parameters, states, moves)
+        moves = {s: self.field.get(s, 0) - factor * other.field.get(s, 0) for s in self.field | other.field}
+        return Generator({s: reduced for s, move in moves.items() if (reduced := sp.factor(move)) != 0})
 
 
 def generators_of(equations: Determining) -> list[Generator]:
     """Return a maximal set of symmetries of the parameters that are independent at generic values."""
-    terms, parameters, scalings = equations.terms, equations.parameters, _scalings(equations)
+    parameters, symbols, scalings = equations.parameters, equations.symbols, _scalings(equations)
     values = dict(zip(equations.unknowns, equations.point, strict=True))
-    rows = [[scaling.get(k, 0) * values[terms[k].symbol] % PRIME for k in parameters] for scaling in scalings]
-    moves = np.array(rows, dtype=np.int64).reshape(len(scalings), len(parameters))
-    vectors = nullspace(equations.matrix)[:, : len(terms)]
-    wanted = _rank(vectors[:, parameters])
-    chosen = [_generator(equations, {k: terms[k].symbol * w for k, w in s.items()}, s) for s in scalings]
-    for support in _circuits(vectors, equations.weights) if len(chosen) < wanted else []:
-        rest = [k for k in range(len(terms)) if k not in support]
-        (move,) = nullspace(vectors[:, rest].T) if rest else np.ones((1, len(vectors)), dtype=np.int64)
-        row = (move[:, None] * vectors[:, parameters] % PRIME).sum(axis=0) % PRIME
-        if _rank(np.vstack([moves, row])) > len(moves):
-            moves = np.vstack([moves, row])
-            chosen.append(_generator(equations, equations.solution(support)))
-        if len(chosen) == wanted:
-            break
-    return chosen
+    rows = [[weights.get(k, 0) * values[symbols[k]] % PRIME for k in parameters] for weights in scalings]
+    vectors = nullspace(equations.matrix)[:, : len(symbols)]
+    wanted = len(independent(vectors[:, parameters], len(parameters)))
+    supports = _circuits(vectors, equations.weights) if len(rows) < wanted else []
+    for support in supports:
+        rest = [k for k in range(len(symbols)) if k not in support]
+        (move,) = nullspace(vectors[:, rest].T)
+        rows.append(list((move[:, None] * vectors[:, parameters] % PRIME).sum(axis=0) % PRIME))
+    generators = []
+    for i in independent(rows, len(parameters)):
+        if i < len(scalings):
+            moves = {k: w * symbols[k] if k in parameters else sp.Integer(w) for k, w in scalings[i].items()}
+        else:
+            moves = equations.solution(supports[i - len(scalings)])
+        field: VectorField = {}
+        for k, move in moves.items():
+            for symbol, rate in equations.terms[k].items():
+                field[symbol] = field.get(symbol, sp.S.Zero) + move * rate
+        generators.append(Generator({s: move for s, move in field.items() if move != 0}, i < len(scalings)))
+    return generators
 
 
 def _scalings(equations: Determining) -> list[dict[int, int]]:
     """Return {term: weight} of independent scalings of parameters and states."""
-    terms = equations.terms
-    columns = [k for k, t in enumerate(terms) if t.is_parameter or t.moves == t.symbol]
-    diagonal = [len(terms) + j for j, on in enumerate(equations.multipliers) if on]
-    index = {k: equations.unknowns.index(terms[k].symbol) for k in equations.parameters}
+    parameters, symbols = equations.parameters, equations.symbols
+    columns = [k for k, s in enumerate(symbols) if k in parameters or equations.terms[k][s] == s]
+    diagonal = [len(symbols) + j for j, on in enumerate(equations.multipliers) if on]
+    index = {k: equations.unknowns.index(symbols[k]) for k in parameters}
     table: list[dict[int, sp.Rational]] = []
     for row in equations.rows:
-        parts: dict[tuple[int, ...], dict[int, sp.Rational]] = {}
+        parts: dict[tuple[int, ...], dict[int, sp.Rational]] = defaultdict(dict)
         for place, column in enumerate([*columns, *diagonal]):
             for powers, coefficient in row.get(column, {}).items():
                 raised = tuple(p + (i == index.get(column)) for i, p in enumerate(powers))
-                parts.setdefault(raised, {})[place] = coefficient
+                parts[raised][place] = coefficient
         table += parts.values()
     size = len(columns) + len(diagonal)
     exact = DomainMatrix([[sp.QQ(row.get(c, 0)) for c in range(size)] for row in table], (len(table), size), sp.QQ)
     whole = integer_rows(exact.to_sparse().nullspace())
-    parameters = [place for place, k in enumerate(columns) if terms[k].is_parameter]
-    scalings: list[dict[int, int]] = []
-    taken = np.empty((0, len(parameters)), dtype=np.int64)
-    for vector in integer_circuits(whole, np.append(equations.weights[columns], np.zeros(len(diagonal), dtype=int))):
-        if _rank(np.vstack([taken, vector[parameters]])) > len(taken):
-            taken = np.vstack([taken, vector[parameters]])
-            scalings.append({k: int(w) for k, w in zip(columns, vector, strict=False) if w})
-    return scalings
-
-
-def _generator(
-    equations: Determining, moves: Mapping[int, sp.Expr], weights: Mapping[int, int] | None = None
-) -> Generator:
-    parameters: dict[str, sp.Expr] = {}
-    states: dict[str, sp.Expr] = {}
-    field: dict[sp.Symbol, sp.Expr] = {}
-    for k, move in moves.items():
-        term = equations.terms[k]
-        part = parameters if term.is_parameter else states
-        part[term.name] = part.get(term.name, sp.S.Zero) + move * (1 if weights else term.moves)
-        for symbol, rate in term.field.items():
-            field[symbol] = field.get(symbol, sp.S.Zero) + (weights[k] * symbol if weights else move * rate)
-    return Generator(parameters, states, field, bool(weights))
+    circuits = integer_circuits(whole, np.append(equations.weights[columns], np.zeros(len(diagonal), dtype=int)))
+    chosen = independent([vector[: len(parameters)] for vector in circuits], len(parameters))
+    return [{k: int(w) for k, w in zip(columns, circuits[i], strict=False) if w} for i in chosen]

@@ -1,13 +1,12 @@
 """Discrete symmetries: changes of signs and exchanges of two parameters that leave the measured outputs unchanged."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import reduce
-from itertools import combinations
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations, islice, product
 
 import numpy as np
 import sympy as sp
 
-from bayesperiodic.symmetry.determining import Generator, System
+from bayesperiodic.symmetry.determining import Generator, System, independent, nullspace
 from bayesperiodic.symmetry.invariants import Flow, verified
 
 ODD = (sp.sin, sp.tan, sp.asin, sp.atan, sp.sinh, sp.tanh, sp.asinh, sp.atanh, sp.sign)
@@ -20,127 +19,84 @@ IDENTITY = sp.Symbol("none")
 
 
 def discrete_flows(system: System, generators: Sequence[Generator], determined: Iterable[str]) -> list[Flow]:
-    """Return independent sign changes that are no scalings, and exchanges of two determined parameters.
-
-    Exact substitution confirms each, see `invariants.verified`.
-    """
+    """Return independent sign changes that are no scalings, and exchanges of determined parameters; all verified."""
     images = [*_sign_changes(system, generators), *_exchanges(system, list(determined))]
-    flows = (Flow(Generator({}, {}, {}), IDENTITY, image) for image in images)
-    return [flow for candidate in flows if (flow := verified(system, candidate)) is not None]
+    flows = [verified(system, Flow(Generator({}), IDENTITY, image)) for image in images]
+    return [flow for flow in flows if flow]
 
 
 def _sign_changes(system: System, generators: Sequence[Generator]) -> list[dict[sp.Symbol, sp.Expr]]:
     """Return the images of changed symbols by sign changes of parameters and states that are no scalings by −1."""
-    jets = {s: [system.symbols["d" * k + s] for k in range(3)] for s in system.orders}
-    members = [[symbol] for symbol in system.parameters.values()] + list(jets.values())
-    bits = {symbol: 1 << i for i, symbols in enumerate(members) for symbol in symbols}
-    constraints: list[int] = []
+    members = [[symbol] for symbol in system.parameters.values()] + [system.jet(state) for state in system.orders]
+    units = np.eye(len(members), dtype=int)
+    places = {symbol: unit for symbols, unit in zip(members, units, strict=True) for symbol in symbols}
+    constraints: list[np.ndarray] = []
     for expression in system.equations:
-        _parity(sp.expand(expression), bits, constraints)
-    constraints += [_parity(sp.expand(y), bits, constraints) for y in system.outputs.values()]
-    basis = _null_space(constraints, len(members))
-    parameter_bits = (1 << len(system.parameters)) - 1
-    symbols = set(system.parameters.values())
-    taken = [
-        sum(bits[s] for s, move in g.field.items() if s in symbols and sp.cancel(move / s) % 2)
-        for g in generators
-        if g.scaling
-    ]
-    every = range(1, 1 << len(basis)) if len(basis) <= MOST_COMBINED else (1 << i for i in range(len(basis)))
-    combinations = [reduce(int.__xor__, (b for i, b in enumerate(basis) if chosen >> i & 1), 0) for chosen in every]
-    result = []
-    for change in sorted(combinations, key=lambda f: ((f & parameter_bits).bit_count(), f.bit_count(), f)):
-        if change & parameter_bits and _is_independent(change & parameter_bits, taken):
-            taken.append(change & parameter_bits)
-            result.append({s: -s for i, symbols in enumerate(members) if change >> i & 1 for s in symbols})
-    return result
+        _parity(sp.expand(expression), places, constraints)
+    constraints += [_parity(sp.expand(y), places, constraints) for y in system.outputs.values()]
+    basis = nullspace(np.array(constraints).reshape(-1, len(members)), 2)
+    several = np.array(list(product((0, 1), repeat=len(basis)))) if len(basis) <= MOST_COMBINED else np.eye(len(basis))
+    changes = (several @ basis).astype(int) % 2
+    parameters = system.parameters.values()
+    changes = changes[np.lexsort((*changes.T, changes.sum(1), changes[:, : len(parameters)].sum(1)))]
+    scalings = [[sp.cancel(g.field.get(s, 0) / s) % 2 for s in parameters] for g in generators if g.scaling]
+    rows = [*scalings, *changes[:, : len(parameters)]]
+    chosen = [k - len(scalings) for k in independent(rows, len(parameters), 2)]
+    return [{s: -s for i in np.flatnonzero(changes[k]) for s in members[i]} for k in chosen if k >= 0]
 
 
-def _parity(e: sp.Expr, bits: Mapping[sp.Symbol, int], constraints: list[int]) -> int:
-    """Return the symbols whose sign changes change the sign of an expression, as a sum of bits.
+def _parity(e: sp.Expr, places: Mapping[sp.Symbol, np.ndarray], constraints: list[np.ndarray]) -> np.ndarray:
+    """Return where the places (members,) are 1 of symbols whose sign changes change the sign of an expression.
 
-    Sign changes under which it is neither even nor odd have an odd number of bits in common with a constraint.
+    Sign changes under which it is neither even nor odd have an odd number of places in common with a constraint.
     """
+    even = np.zeros_like(next(iter(places.values())))
     if e.is_Symbol or e.is_number:
-        return bits.get(e, 0)
-    parities = [_parity(argument, bits, constraints) for argument in e.args]
+        return places.get(e, even)
+    parities = [_parity(argument, places, constraints) for argument in e.args]
     if e.is_Add:
         constraints += [parities[0] ^ other for other in parities[1:]]
         return parities[0]
     if e.is_Mul:
-        return reduce(int.__xor__, parities)
-    if e.is_Pow and e.exp.is_Integer:
-        return parities[0] if e.exp % 2 else 0
-    if isinstance(e, ODD):
+        return np.bitwise_xor.reduce(parities)
+    if isinstance(e, ODD) or (e.is_Pow and e.exp.is_Integer and e.exp % 2):
         return parities[0]
-    if not isinstance(e, EVEN_FUNCTIONS):
+    if not isinstance(e, EVEN_FUNCTIONS) and not (e.is_Pow and e.exp.is_Integer):
         constraints += parities
-    return 0
-
-
-def _null_space(rows: Iterable[int], size: int) -> list[int]:
-    """Return independent sets of bits that have an even number in common with every row."""
-    vectors = [1 << i for i in range(size)]
-    for row in rows:
-        odd = [v for v in vectors if (v & row).bit_count() % 2]
-        if odd:
-            vectors = [v ^ odd[0] if (v & row).bit_count() % 2 else v for v in vectors if v != odd[0]]
-    return vectors
-
-
-def _is_independent(vector: int, others: Iterable[int]) -> bool:
-    """Return whether a set of bits is no sum of others modulo 2."""
-    reduced: list[int] = []
-    for other in others:
-        for row in reduced:
-            other = min(other, other ^ row)
-        if other:
-            reduced.append(other)
-    for row in reduced:
-        vector = min(vector, vector ^ row)
-    return bool(vector)
+    return even
 
 
 def _exchanges(system: System, determined: Sequence[str]) -> list[dict[sp.Symbol, sp.Expr]]:
     """Return the images of exchanges of two parameters, alone or with two states, that hold at random points."""
     symbols = sorted(system.used, key=str)
-    highest = system.highest
-    equations = sp.Matrix(system.equations)
+    highest, equations = system.highest, sp.Matrix(system.equations)
     slopes = equations.jacobian(highest) if highest and system.equations else sp.zeros(0, 0)
-    jets = {s: [system.symbols["d" * k + s] for k in range(3)] for s in system.orders}
-    pairs = [(a, b) for a, b in combinations(jets, 2) if system.orders[a] == system.orders[b]]
-    states = [dict(zip(jets[a] + jets[b], jets[b] + jets[a], strict=True)) for a, b in pairs]
+    pairs = [
+        (system.jet(a), system.jet(b))
+        for a, b in combinations(system.orders, 2)
+        if system.orders[a] == system.orders[b]
+    ]
+    states = [dict(zip(a + b, b + a, strict=True)) for a, b in pairs]
+    points = np.random.default_rng(11).uniform(0.5, 1.5, (TRIAL_POINTS, len(symbols)))
     try:
         evaluated = sp.lambdify(symbols, [equations, slopes, sp.Matrix(list(system.outputs.values()))], "numpy")
-        exchanges = []
+        trials = [(dict(zip(symbols, point, strict=True)), *evaluated(*point)) for point in points]
+
+        def holds(image: Mapping[sp.Symbol, sp.Symbol]) -> bool:
+            columns = [highest.index(image.get(h, h)) for h in highest]
+            for values, residual, slope, outputs in trials:
+                moved = evaluated(*(values.get(image.get(s, s), 1.0) for s in symbols))
+                if not np.allclose(moved[2], outputs, rtol=ERROR, atol=ERROR):
+                    return False
+                expected = moved[1][:, columns] @ np.linalg.solve(slope, residual) if slope.size else moved[0]
+                if not np.allclose(moved[0], expected, rtol=ERROR, atol=ERROR):
+                    return False
+            return True
+
+        exchanges: list[dict[sp.Symbol, sp.Expr]] = []
         for a, b in combinations([system.parameters[n] for n in determined], 2):
-            for moved in ({}, *states):
-                image = {a: b, b: a} | moved
-                columns = [highest.index(image.get(h, h)) for h in highest]
-                if _holds(evaluated, symbols, image, columns):
-                    exchanges.append(image)
-                    break
+            images = ({a: b, b: a} | moved for moved in ({}, *states))
+            exchanges += islice(filter(holds, images), 1)
     except (TypeError, NameError, AttributeError, np.linalg.LinAlgError):
         return []
     return exchanges
-
-
-def _holds(
-    evaluated: Callable[..., list[np.ndarray]],
-    symbols: Sequence[sp.Symbol],
-    image: Mapping[sp.Symbol, sp.Symbol],
-    columns: list[int],
-) -> bool:
-    """Return whether equations and outputs do not change at random points, up to a factor of the equations."""
-    random = np.random.default_rng(11)
-    for _ in range(TRIAL_POINTS):
-        values = dict(zip(symbols, random.uniform(0.5, 1.5, len(symbols)), strict=True))
-        before = evaluated(*values.values())
-        after = evaluated(*(values.get(image.get(s, s), 1.0) for s in symbols))
-        if not np.allclose(after[2], before[2], rtol=ERROR, atol=ERROR):
-            return False
-        if before[1].size:
-            factor = after[1][:, columns] @ np.linalg.inv(before[1])
-            if not np.allclose(after[0], factor @ before[0], rtol=ERROR, atol=ERROR):
-                return False
-    return True

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ SMALL_SLOPE = 1e-7
 LONGEST_SERIES, SYMBOL_POWERS = 5, (1, -1, 2)
 # Operations that a sum in a denominator counts for.
 AWKWARD = 5
+X = sp.Symbol("x")
 
 
 def series(expression: sp.Expr, values: Mapping[sp.Symbol, np.ndarray]) -> np.ndarray:
@@ -52,15 +54,14 @@ def series(expression: sp.Expr, values: Mapping[sp.Symbol, np.ndarray]) -> np.nd
                 result = _product(result, value(factor))
             return result
         if e.is_Pow and e.exp.is_number:
-            return _composed(lambda x: x**e.exp, e.exp, value(e.base))
+            return _composed(X**e.exp, value(e.base))
         if e.is_Pow:
             return value(sp.exp(e.exp * sp.log(e.base), evaluate=False))
         if isinstance(e, sp.sign):
-            leading = np.sign(value(e.args[0])[0].real)
-            return constant(1.0) * leading
+            return constant(1.0) * np.sign(value(e.args[0])[0].real)
         if len(e.args) != 1:
             raise TypeError(f"expression: must consist of functions of one argument, got {e.func}.")
-        return _composed(e.func, e.func, value(e.args[0]))
+        return _composed(e.func(X), value(e.args[0]))
 
     return value(expression)
 
@@ -70,28 +71,25 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.stack([sum((a[i] * b[k - i] for i in range(1, k + 1)), a[0] * b[k]) for k in range(len(a))])
 
 
-def _composed(function: Callable[[Any], Any], key: Any, inner: np.ndarray) -> np.ndarray:
+def _composed(function: sp.Expr, inner: np.ndarray) -> np.ndarray:
     """Return a function of a power series, by Horner's rule with its derivatives of all orders."""
-    rest, x = inner.copy(), sp.Symbol("x")
+    rest = inner.copy()
     rest[0] = 0.0
     result = np.zeros_like(inner)
     for order in range(len(inner) - 1, -1, -1):
         result = _product(result, rest)
-        result[0] += _compiled(key, order, function(x), x)(inner[0]) / math.factorial(order)
-    return result
-
-
-def differentiated(a: np.ndarray) -> np.ndarray:
-    """Return the time derivative; its last coefficient is unknown and set to zero."""
-    result = np.zeros_like(a)
-    for k in range(1, len(a)):
-        result[k - 1] = k * a[k]
+        result[0] += _compiled_derivative(function, order)(inner[0]) / math.factorial(order)
     return result
 
 
 @cache
-def _compiled(key: Any, order: int, written: sp.Expr, x: sp.Symbol) -> Callable[[np.ndarray], np.ndarray]:
-    return sp.lambdify(x, sp.diff(written, x, order), "numpy")
+def _compiled_derivative(function: sp.Expr, order: int) -> Callable[[np.ndarray], np.ndarray]:
+    return sp.lambdify(X, sp.diff(function, X, order), "numpy")
+
+
+def differentiated(a: np.ndarray) -> np.ndarray:
+    """Return the time derivative; its last coefficient is unknown and set to zero."""
+    return np.concatenate([np.polynomial.polynomial.polyder(a), np.zeros_like(a[:1])])
 
 
 def null_directions(system: System) -> list[tuple[dict[sp.Symbol, float], np.ndarray]]:
@@ -154,7 +152,7 @@ def _motions(
     system: System, theta: np.ndarray, known: np.ndarray, order: int, points: int, random: np.random.Generator
 ) -> np.ndarray:
     """Return Taylor coefficients of the outputs (order + 1, points, directions, outputs), with complex steps."""
-    starts = [system.symbols["d" * k + s] for s, highest in system.orders.items() for k in range(highest)]
+    starts = [symbol for state, highest in system.orders.items() for symbol in system.jet(state, highest)[:-1]]
     directions = len(theta) + len(starts)
     shape = (order + 3, points, directions)
 
@@ -164,21 +162,19 @@ def _motions(
         return result
 
     values = {s: fixed(v) for s, v in zip(system.known.values(), known, strict=True)}
-    for i, (symbol, value) in enumerate(zip(system.parameters.values(), theta, strict=True)):
-        values[symbol] = fixed(value)
-        values[symbol][0, :, i] += COMPLEX_STEP * 1j
     frequency = random.uniform(0.3, 1.0, (points, 1))
     values[system.symbols["frequency"]] = fixed(frequency)
     values[system.symbols["tau"]] = fixed(random.uniform(0.0, 1.0, (points, 1)))
     values[system.symbols["tau"]][1] = frequency
     for name in system.inputs:
         signal = fixed(0.0) + random.uniform(-1.0, 1.0, (order + 3, points, 1))
-        for prefix in ("", "d", "dd"):
-            values[system.symbols[prefix + name]] = signal
+        for symbol in system.jet(name):
+            values[symbol] = signal
             signal = differentiated(signal)
-    for i, symbol in enumerate(starts):
-        values[symbol] = fixed(random.uniform(-1.5, 1.5, (points, 1)))
-        values[symbol][0, :, len(theta) + i] += COMPLEX_STEP * 1j
+    varied = [*theta, *random.uniform(-1.5, 1.5, (len(starts), points, 1))]
+    for i, (symbol, value) in enumerate(zip([*system.parameters.values(), *starts], varied, strict=True)):
+        values[symbol] = fixed(value)
+        values[symbol][0, :, i] += COMPLEX_STEP * 1j
     with np.errstate(all="ignore"):
         _follow(system, values, order)
         shortened = {symbol: v[: order + 1] for symbol, v in values.items()}
@@ -205,8 +201,8 @@ def _follow(system: System, values: dict[sp.Symbol, np.ndarray], order: int) -> 
             if not np.any(np.abs(change.real) > 1e-13 * (1.0 + np.abs(values[highest[0]][k].real)[..., None])):
                 break
         for state, n in system.orders.items():
-            chain = [values[system.symbols["d" * j + state]] for j in range(n, -1, -1)]
-            for rate, integral in zip(chain, chain[1:], strict=False):
+            chain = [values[symbol] for symbol in reversed(system.jet(state, n))]
+            for rate, integral in pairwise(chain):
                 for j in range(k + 2):
                     integral[j + 1 : j + 2] = rate[j] / (j + 1)
 
@@ -276,7 +272,7 @@ def directions_of(system: System, generators: Sequence[Generator]) -> Directions
 
 
 def _explained(system: System, generators: Sequence[Generator], values: dict[sp.Symbol, float]) -> np.ndarray:
-    moves = [[g.parameters.get(n, sp.S.Zero) / s for n, s in system.parameters.items()] for g in generators]
+    moves = [[g.field.get(s, sp.S.Zero) / s for s in system.parameters.values()] for g in generators]
     slopes = np.array([[float(move.subs(values)) for move in row] for row in moves])
     return np.linalg.qr(slopes.reshape(len(generators), len(system.parameters)).T)[0].T
 
@@ -294,12 +290,8 @@ class Flow:
     images: dict[sp.Symbol, sp.Expr]  # of the parameters, states and derivatives of states that change
     factor: sp.Matrix | None = None  # of the transformed equations; None until the flow is verified
 
-    def of(self, expression: sp.Expr) -> sp.Expr:
-        """Return the image of an expression."""
-        return expression.subs(self.images, simultaneous=True)
 
-
-def flow_of(generator: Generator) -> Flow | None:
+def flow_of(system: System, generator: Generator) -> Flow | None:
     """Return the finite transformation of a symmetry, if one of several normalisations has a closed form.
 
     The form of scalings is known. For others, the Lie series exp(δ X) of every symbol, its reciprocal or its square
@@ -307,32 +299,27 @@ def flow_of(generator: Generator) -> Flow | None:
     """
     if generator.scaling:
         factor = sp.Symbol("t", positive=True)
-        images = {s: s * factor ** int(sp.cancel(move / s)) for s, move in generator.field.items() if move != 0}
+        images = {s: s * factor ** int(sp.cancel(move / s)) for s, move in generator.field.items()}
         return Flow(generator, factor, images)
     amount = sp.Symbol("delta", real=True)
-    moves = [*generator.parameters.values(), *generator.states.values()]
-    constant = [move for move in moves if move.is_number]
-    for unit in dict.fromkeys([*constant, sp.S.One, *sorted(generator.parameters.values(), key=sp.count_ops)]):
+    constant = [move for move in generator.field.values() if move.is_number]
+    rates = [generator.field[s] for s in system.parameters.values() if s in generator.field]
+    for unit in dict.fromkeys([*constant, sp.S.One, *sorted(rates, key=sp.count_ops)]):
         scaled = generator.times(1 / unit)
         images = {}
-        for symbol in (s for s, move in scaled.field.items() if move != 0):
+        for symbol in scaled.field:
             image = _image(scaled, symbol, amount)
             if image is None:
                 break
             images[symbol] = image
         else:
-            return _with_factor(Flow(scaled, amount, images))
+            # In terms of t = exp(δ), if δ appears only in this form.
+            logarithm = sp.log(sp.Symbol("t", positive=True))
+            powers = {s: sp.powsimp(sp.expand_log(e.subs(amount, logarithm))) for s, e in images.items()}
+            powers = {s: _shortest(e) for s, e in powers.items()}
+            by_factor = not any(e.has(sp.log) for e in powers.values())
+            return Flow(scaled, *((logarithm.args[0], powers) if by_factor else (amount, images)))
     return None
-
-
-def _with_factor(flow: Flow) -> Flow:
-    """Return the flow in terms of t = exp(δ), if δ appears only in this form."""
-    factor = sp.Symbol("t", positive=True)
-    images = {s: e.subs(flow.amount, sp.log(factor)) for s, e in flow.images.items()}
-    images = {s: _shortest(sp.powsimp(sp.expand_log(e))) for s, e in images.items()}
-    if any(e.has(sp.log) for e in images.values()):
-        return flow
-    return Flow(flow.generator, factor, images)
 
 
 def verified(system: System, flow: Flow) -> Flow | None:
@@ -340,10 +327,9 @@ def verified(system: System, flow: Flow) -> Flow | None:
 
     The outputs must be identical, and the transformed equations the old ones times an invertible matrix.
     """
-    images = [flow.of(g) for g in system.equations]
-    changes = [flow.of(y) - y for y in system.outputs.values()]
-    highest = system.highest
-    before, after = sp.Matrix(system.equations), sp.Matrix(images)
+    changes = [y.subs(flow.images, simultaneous=True) - y for y in system.outputs.values()]
+    before = sp.Matrix(system.equations)
+    after, highest = before.subs(flow.images, simultaneous=True), system.highest
     algebra = Algebra([*before, *after, *changes, *flow.images.values()], system.symbols.values())
     if not all(algebra.is_zero(change) for change in changes):
         return None
@@ -360,11 +346,8 @@ def verified(system: System, flow: Flow) -> Flow | None:
 
 def _image(generator: Generator, symbol: sp.Symbol, amount: sp.Symbol) -> sp.Expr | None:
     for power in SYMBOL_POWERS:
-        image = _series(generator, symbol**power, amount)
-        if image is not None and power == 2:
-            return sp.sqrt(_shortest(image))
-        if image is not None:
-            return _shortest(image**power)
+        if (image := _series(generator, symbol**power, amount)) is not None:
+            return sp.sqrt(_shortest(image)) if power == 2 else _shortest(image**power)
     return None
 
 
@@ -397,7 +380,7 @@ def coefficients_of(system: System) -> dict[sp.Expr, bool]:
     An equation is first divided by the coefficient of its highest derivative. Arguments of functions are included.
     """
     parameters = (*system.parameters.values(), *system.known.values())
-    drive = {system.symbols["tau"], *(system.symbols[d + n] for d in ("", "d", "dd") for n in system.inputs)}
+    drive = {system.symbols["tau"], *(symbol for name in system.inputs for symbol in system.jet(name))}
     moving = set(system.symbols.values())
     coefficients: dict[sp.Expr, bool] = {}
 
@@ -458,35 +441,33 @@ def _others(
     system: System, moving: Sequence[sp.Symbol], generators: Sequence[Generator], flows: Sequence[Flow]
 ) -> list[sp.Expr]:
     """Return scaling-invariant monomials of the parameters, after the other symmetries set some to zero."""
-    rates = {g: _weights_of_parameters(system, g) for g in generators}
-    curved = [f.generator for f in flows if len(rates[f.generator]) < len(f.generator.parameters)]
-    moved, zero = _with_zeros(system, curved)
-    scalings = [row for g, row in rates.items() if g not in zero.values()]
-    bent = {n for g, row in rates.items() if g not in zero.values() for n in g.parameters if n not in row}
-    left = [n for n, s in system.parameters.items() if s in moving and s not in zero and n not in bent]
-    weights = sp.Matrix(len(scalings), len(left), lambda i, j: scalings[i].get(left[j], 0))
+    parameters = system.parameters.values()
+    rates = {g: _weights(g, [s for s in parameters if s in g.field]) for g in generators}
+    bent = {g: {s for s in parameters if s in g.field and s not in row} for g, row in rates.items()}
+    moved, zero = _with_zeros(system, [f.generator for f in flows if bent[f.generator]])
+    scalings = [g for g in generators if g not in zero.values()]
+    left = [s for s in moving if s not in zero and not any(s in bent[g] for g in scalings)]
+    weights = sp.Matrix(len(scalings), len(left), lambda i, j: rates[scalings[i]].get(left[j], 0))
     null = [list(v) for v in weights.nullspace()] if scalings else sp.eye(len(left)).tolist()
     if not null:
         return []
     vectors = determining.integer_rows(DomainMatrix.from_Matrix(sp.Matrix(null)).convert_to(sp.QQ))
-    symbols = [system.parameters[n] for n in left]
     products = [
-        sp.Mul(*(moved.get(s, s) ** int(power) for s, power in zip(symbols, vector, strict=True)))
+        sp.Mul(*(moved[s] ** int(power) for s, power in zip(left, vector, strict=True)))
         for vector in determining.integer_circuits(vectors, np.ones(len(left), dtype=np.int64))
     ]
     return [sp.factor(sp.cancel(p)) for p in products]
 
 
-def _weights_of_parameters(system: System, generator: Generator) -> dict[str, int]:
+def _weights(generator: Generator, parameters: Sequence[sp.Symbol]) -> dict[sp.Symbol, int]:
     """Return integer weights of the parameters that a symmetry scales, regardless of the others."""
-    rates = {n: sp.cancel(move / system.parameters[n]) for n, move in generator.parameters.items()}
-    best: dict[str, sp.Expr] = {}
+    rates = {s: sp.cancel(generator.field[s] / s) for s in parameters}
+    best: dict[sp.Symbol, sp.Expr] = {}
     for unit in rates.values():
-        ratios = {n: sp.cancel(rate / unit) for n, rate in rates.items()}
-        rational = {n: ratio for n, ratio in ratios.items() if ratio.is_Rational}
-        best = max(best, rational, key=len)
+        ratios = {s: sp.cancel(rate / unit) for s, rate in rates.items()}
+        best = max(best, {s: ratio for s, ratio in ratios.items() if ratio.is_Rational}, key=len)
     common = math.lcm(*(int(ratio.q) for ratio in best.values()))
-    return {n: int(ratio * common) for n, ratio in best.items()}
+    return {s: int(ratio * common) for s, ratio in best.items()}
 
 
 def _with_zeros(
@@ -500,7 +481,7 @@ def _with_zeros(
         generator = given
         for symbol, earlier in straight.items():
             generator = generator.minus(earlier, generator.field.get(symbol, sp.S.Zero))
-        flow = flow_of(generator)
+        flow = flow_of(system, generator)
         unit = [] if flow is None else [s for s in moved if flow.generator.field.get(s) == 1 and s not in zero]
         if flow is None or not unit:
             continue

@@ -10,7 +10,14 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result, Storable
 from bayesperiodic.models.model import Model
 from bayesperiodic.symmetry import invariants
-from bayesperiodic.symmetry.determining import Generator, System, determining_equations, generators_of, system_of
+from bayesperiodic.symmetry.determining import (
+    Generator,
+    System,
+    VectorField,
+    determining_equations,
+    generators_of,
+    system_of,
+)
 from bayesperiodic.symmetry.discrete import discrete_flows
 from bayesperiodic.symmetry.invariants import Directions, Flow
 
@@ -165,14 +172,13 @@ def _listed(names: Sequence[str], conjunction: str) -> str:
 
 def written(expression: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
     """Return an expression as text such as "k1/(m*l**2)", with factors and terms in the order of the names."""
-    order = {symbol: place for place, symbol in enumerate(names)}
     number, rest = sp.factor_terms(expression).as_coeff_Mul()
     negative = number.is_negative
     above = [(sp.Integer(abs(number.p)), sp.S.One)] if abs(number.p) != 1 else []
     below = [(sp.Integer(number.q), sp.S.One)] if number.q != 1 else []
-    for factor in sorted(sp.Mul.make_args(rest), key=lambda f: _place(f, order)):
+    for factor in sorted(sp.Mul.make_args(rest), key=lambda f: _place(f, names)):
         base, power = (factor, sp.S.One) if isinstance(factor, sp.exp) else factor.as_base_exp()
-        if base.is_Add and power.is_Integer and _terms(base, order)[0].as_coeff_Mul()[0] < 0:
+        if base.is_Add and power.is_Integer and _terms(base, names)[0].as_coeff_Mul()[0] < 0:
             base, negative = -base, negative ^ (power.is_odd)
         if base != 1:
             rational = power.is_Rational
@@ -184,34 +190,27 @@ def written(expression: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
     return f"-{fraction}" if negative else fraction
 
 
-def _terms(total: sp.Expr, order: Mapping[sp.Symbol, int]) -> list[sp.Expr]:
-    return sorted(total.args, key=lambda term: (len(term.free_symbols), _place(term, order)))
+def _terms(total: sp.Expr, names: Mapping[sp.Symbol, str]) -> list[sp.Expr]:
+    return sorted(total.args, key=lambda term: (len(term.free_symbols), _place(term, names)))
 
 
-def _place(factor: sp.Expr, order: Mapping[sp.Symbol, int]) -> tuple[bool, int, str]:
-    places = sorted(order.get(s, len(order)) for s in factor.free_symbols)
-    return not factor.as_base_exp()[0].is_Symbol, places[0] if places else -1, str(factor)
+def _place(factor: sp.Expr, names: Mapping[sp.Symbol, str]) -> tuple[bool, int, str]:
+    first = next((k for k, symbol in enumerate(names) if factor.has(symbol)), len(names) if factor.free_symbols else -1)
+    return not factor.as_base_exp()[0].is_Symbol, first, str(factor)
 
 
 def _power(base: sp.Expr, power: sp.Expr, names: Mapping[sp.Symbol, str], beside: bool) -> str:
-    text = _base(base, names)
-    simple = base.is_Atom or base.is_Function
+    if base.is_Add:
+        first, *others = [written(term, names) for term in _terms(base, names)]
+        text = first + "".join(f" - {t[1:]}" if t.startswith("-") else f" + {t}" for t in others)
+    elif base.is_Function:
+        text = f"{base.func.__name__.lower()}({', '.join(written(a, names) for a in base.args)})"
+    else:
+        text = str(base.xreplace({s: sp.Symbol(n) for s, n in names.items()}))
     if power == 1:
         return f"({text})" if base.is_Add and beside else text
     exponent = str(power) if power.is_Integer else f"({written(power, names)})"
-    return f"{text}**{exponent}" if simple else f"({text})**{exponent}"
-
-
-def _base(base: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
-    if base.is_Symbol:
-        return names.get(base, str(base))
-    if base.is_Add:
-        order = {symbol: place for place, symbol in enumerate(names)}
-        first, *others = [written(term, names) for term in _terms(base, order)]
-        return first + "".join(f" - {t[1:]}" if t.startswith("-") else f" + {t}" for t in others)
-    if base.is_Function:
-        return f"{base.func.__name__.lower()}({', '.join(written(a, names) for a in base.args)})"
-    return str(base.xreplace({s: sp.Symbol(n) for s, n in names.items()}))
+    return f"{text}**{exponent}" if base.is_Atom or base.is_Function else f"({text})**{exponent}"
 
 
 def structure(
@@ -289,11 +288,10 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
     """Return the structure of a symbolic system, whose parameters may have been replaced by expressions."""
     used = whole.used
     system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if s in used})
-    names = {s: n for n, s in (whole.parameters | whole.known).items()}
+    names = whole.names
     symmetries = generators_of(determining_equations(system)) if system.parameters else []
-    flows = [
-        invariants.verified(system, flow) if (flow := invariants.flow_of(symmetry)) else None for symmetry in symmetries
-    ]
+    found_flows = [invariants.flow_of(system, symmetry) for symmetry in symmetries]
+    flows = [flow and invariants.verified(system, flow) for flow in found_flows]
     generators = [flow.generator if flow else symmetry for symmetry, flow in zip(symmetries, flows, strict=True)]
     directions = invariants.directions_of(system, generators)
     coefficients = invariants.coefficients_of(system)
@@ -305,13 +303,13 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
         model=name,
         outputs=tuple(system.outputs),
         known=known,
-        table=_table(whole, system, generators, directions, coefficients, combinations, names),
+        table=_table(whole, generators, directions, coefficients, combinations),
         combinations=tuple(combinations.values()),
         symmetries=tuple(
-            _symmetry(system, _kind(symmetry), generator, flow, combinations, names)
+            _symmetry(whole, _kind(symmetry), generator.field, flow, combinations)
             for symmetry, generator, flow in zip(symmetries, generators, flows, strict=True)
         ),
-        discrete=tuple(_discrete(system, flow, names) for flow in discrete),
+        discrete=tuple(_symmetry(whole, _discrete_kind(flow), {}, flow) for flow in discrete),
         to_fix=directions.smallest_set(),
         rank=len(system.parameters) - len(directions.rows) if directions.points or not system.parameters else None,
         points=directions.points,
@@ -322,25 +320,26 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
 def _kind(generator: Generator) -> str:
     if generator.scaling:
         return "scaling"
-    constant = any(move.is_number for move in (*generator.parameters.values(), *generator.states.values()))
-    return "shift" if constant else "other"
+    return "shift" if any(move.is_number for move in generator.field.values()) else "other"
+
+
+def _discrete_kind(flow: Flow) -> str:
+    return "sign change" if all(image == -symbol for symbol, image in flow.images.items()) else "exchange"
 
 
 def _table(
     whole: System,
-    system: System,
     generators: Sequence[Generator],
     directions: Directions,
     coefficients: Mapping[sp.Expr, bool],
     combinations: Mapping[sp.Expr, str],
-    names: Mapping[sp.Symbol, str],
 ) -> pd.DataFrame:
     moved = directions.moved
-    unsure = {system.parameters[n] for n in moved}
+    unsure = {whole.parameters[n] for n in moved}
     rows = {}
     for parameter, symbol in whole.parameters.items():
         verdict, enters, partners = "determined", [t for c, t in combinations.items() if symbol in c.free_symbols], []
-        if parameter not in system.parameters:
+        if parameter not in directions.names:
             verdict = "does not appear"
         elif parameter in moved:
             alone = directions.alone(parameter)
@@ -350,11 +349,11 @@ def _table(
             shown = [c for c in coefficients if symbol in c.free_symbols and not c.free_symbols & unsure]
             shown = [] if any(c.free_symbols == {symbol} for c in shown) else shown
             shown.sort(key=lambda c: not coefficients[c])
-            enters = [written(c, names).removeprefix("-") + " (in the drive)" * coefficients[c] for c in shown]
+            enters = [written(c, whole.names).removeprefix("-") + " (in the drive)" * coefficients[c] for c in shown]
         rows[parameter] = {
             "verdict": verdict,
             "enters": "; ".join(enters),
-            "fix": ", ".join(str(i) for i, g in enumerate(generators, 1) if parameter in g.parameters),
+            "fix": ", ".join(str(i) for i, g in enumerate(generators, 1) if symbol in g.field),
             "partners": ", ".join(partners),
         }
     return pd.DataFrame.from_dict(rows, orient="index", columns=["verdict", "enters", "fix", "partners"])
@@ -363,44 +362,27 @@ def _table(
 def _symmetry(
     system: System,
     kind: str,
-    generator: Generator,
+    field: VectorField,
     flow: Flow | None,
-    combinations: Mapping[sp.Expr, str],
-    names: Mapping[sp.Symbol, str],
+    combinations: Iterable[sp.Expr] = (),
 ) -> Symmetry:
-    symbols = system.parameters | {s: system.symbols[s] for s in generator.states}
-    moves = generator.parameters | generator.states
-    shared = [c.free_symbols for c in combinations if c.free_symbols & {symbols[n] for n in generator.parameters}]
-    others = {n: s for n, s in system.parameters.items() if n not in generator.parameters}
-    texts = {**names, **{symbol: name for name, symbol in system.symbols.items()}}
+    states = {state: system.symbols[state] for state in system.orders}
+    images = flow.images if flow else {}
+    moved = {n: s for n, s in (system.parameters | states).items() if s in field or s in images}
+    shared = [c.free_symbols for c in combinations if c.free_symbols & set(field)]
+    texts = {**system.names, **{symbol: name for name, symbol in system.symbols.items()}}
     amount = ""
-    rows: list[list[sp.Expr]] = []
-    if flow is not None:
+    if flow and field:
         wanted = ("t", "scale", "scale_factor") if flow.amount.is_positive else ("delta", "shift_by", "amount")
         amount = next(n for n in wanted if n not in texts.values())
         texts[flow.amount] = amount
-        rows = flow.factor.tolist() if flow.factor else []
+    rows = flow.factor.tolist() if flow and flow.factor else []
     return Symmetry(
         kind=kind,
-        parameters=tuple(generator.parameters),
-        generator={n: written(move, texts) for n, move in moves.items()},
-        transformation={n: written(flow.images[symbols[n]], texts) for n in moves} if flow else {},
+        parameters=tuple(n for n in moved if n in system.parameters),
+        generator={n: written(field[s], texts) for n, s in moved.items() if s in field},
+        transformation={n: written(images[s], texts) for n, s in moved.items() if s in images},
         amount=amount,
         factor=tuple(tuple(written(e, texts) for e in row) for row in rows),
-        no_help=tuple(n for n, s in others.items() if any(s in c for c in shared)),
-    )
-
-
-def _discrete(system: System, flow: Flow, names: Mapping[sp.Symbol, str]) -> Symmetry:
-    texts = {**names, **{symbol: name for name, symbol in system.symbols.items()}}
-    states = {n: system.symbols[n] for n in system.orders}
-    moved = {n: written(flow.images[s], texts) for n, s in (system.parameters | states).items() if s in flow.images}
-    return Symmetry(
-        kind="sign change" if all(image == f"-{n}" for n, image in moved.items()) else "exchange",
-        parameters=tuple(n for n in moved if n in system.parameters),
-        generator={},
-        transformation=moved,
-        amount="",
-        factor=tuple(tuple(written(e, texts) for e in row) for row in flow.factor.tolist()) if flow.factor else (),
-        no_help=(),
+        no_help=tuple(n for n, s in system.parameters.items() if n not in moved and any(s in c for c in shared)),
     )

@@ -49,7 +49,7 @@ def _estimate(problem: bp.Problem, start: dict[str, float], near: bp.MapEstimate
     guesses = {e.name: near.solutions[e.name].states for e in problem.experiments}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        return bp.map_estimate(problem.anchored(start, guesses), start=start, progress=False)
+        return bp.map_estimate(problem.anchored(start, guesses), start=start, checks=False, progress=False)
 
 
 def _errors(problem: bp.Problem, fit: bp.MapEstimate) -> dict[str, dict[str, float]]:

@@ -140,7 +140,8 @@ def estimate(
     measured = float(np.sqrt(np.mean([e.frequency_se**2 for e in guessed])))
     for number in range(ROUNDS + 1):
         stated = problem(guessed, speeds, frequency_error=error, known=known, noise=noise)
-        found = Fitted(stated, bp.map_estimate(stated, start=point, progress=False), error)
+        fit = bp.map_estimate(stated, start=point, checks=number == ROUNDS, progress=False)
+        found = Fitted(stated, fit, error)
         if number < ROUNDS:
             missed = [found.fit.solutions[e.name].frequency - e.frequency for e in guessed]
             error = math.sqrt(max(float(np.mean(np.square(missed))) - measured**2, 0.0))

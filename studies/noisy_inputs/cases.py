@@ -64,7 +64,7 @@ def replicate(task: Task) -> dict[str, Any]:
         for kind in KINDS:
             problem = bp.Problem(model, [experiment], priors=priors, fixed=fixed, input_noise=kind)
             try:
-                fit = bp.map_estimate(problem, start=start, progress=False)
+                fit = bp.map_estimate(problem, start=start, checks=False, progress=False)
             except (RuntimeError, ValueError) as error:
                 line[kind] = {"error": f"{type(error).__name__}: {error}"}
                 continue

@@ -222,7 +222,8 @@ def vectorised_gain(repeats: int = 15) -> dict[str, Any]:
     cores, result = available_cores(), {}
     for drive in ("force", "displacement"):
         problem = gear_problem(drive, 4, scheme="central2")
-        fit = bp.map_estimate(problem, start={name: GEAR[name] for name in problem.names}, progress=False)
+        start = {name: GEAR[name] for name in problem.names}
+        fit = bp.map_estimate(problem, start=start, checks=False, progress=False)
         mean, sd, noise = (np.array(list(values.values())) for values in (fit.theta, fit.sd, fit.noise))
         theta = mean + sd * np.random.default_rng(5).standard_normal((POINTS, mean.size))
         call = partial(problem.anchored(fit.theta).log_likelihood, theta, noise)

@@ -252,7 +252,7 @@ def _repeat(action: Callable[[], Any], calls: int) -> None:
 def lapack_band(equations: PeriodicEquations, columns: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the folded band of ∂g/∂z in LAPACK's storage, with room for pivoting, and its half-width."""
     grid, count = equations.grid, equations.count
-    lower = grid.half_width * count + count - 1
+    lower = grid.packed.half_width * count + count - 1
     size = grid.points * count
     rows = np.empty((size, 3 * lower + 1))
     equations.kernels.assemble(columns, grid.packed, count, equations.frequency, rows)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from bayesperiodic._compile import cache
+from bayesperiodic._compile import cache, expectations
 from bayesperiodic._compile.code_generation import FUNCTIONS
 from bayesperiodic._parallel import available_cores
 from tests.known import formula_model
@@ -56,7 +56,8 @@ def combined(x):
 """
 PROGRAM = f"""
 from bayesperiodic._compile import machine_code
-from bayesperiodic._compile.cache import internals_expected, load
+from bayesperiodic._compile.cache import load
+from bayesperiodic._compile.expectations import internals_expected
 from bayesperiodic.models.library import pendulum
 internals_expected()
 SMALL, NAMES = {SMALL!r}, {NAMES!r}
@@ -71,7 +72,7 @@ FIRST, SECOND = f"{len(FUNCTIONS)} 0\n", "0 2\n"
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    cache.internals_expected()  # which fills another folder
+    expectations.internals_expected()  # which fills another folder
     monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path))
     return tmp_path / "kernels"
 
@@ -107,9 +108,9 @@ def test_callers_of_declared_kernels_are_compiled_for_processes_that_have_the_ke
     cache.load(KERNELS)
     cache.load(CALLERS, shared=cache.declare(KERNELS))
     program = f"""
-from bayesperiodic._compile import cache
+from bayesperiodic._compile import cache, expectations
 cache._announce = lambda: None
-cache.internals_expected()
+expectations.internals_expected()
 cache._build = None
 print(cache.load({CALLERS!r}, shared=cache.load({KERNELS!r})).combined(2.0))
 """
@@ -127,7 +128,7 @@ def test_a_kernel_for_compiled_code_only_cannot_be_called_by_python(folder):
 def kernel_entries(folder: Path) -> set[str]:
     """Return the names of the entries in a cache, without those of the check of Numba's internals."""
     check = folder.with_name("check")
-    program = "from bayesperiodic._compile import cache; cache.internals_expected()"
+    program = "from bayesperiodic._compile.expectations import internals_expected as check; check()"
     subprocess.run([sys.executable, "-c", program], check=True, env=os.environ | {"BAYESPERIODIC_CACHE": str(check)})
     return {path.name for path in folder.iterdir()} - {path.name for path in (check / "kernels").iterdir()}
 
@@ -136,9 +137,9 @@ def kernel_entries(folder: Path) -> set[str]:
 @pytest.mark.skipif(available_cores() < 2, reason="two cores are needed")
 def test_two_processes_compile_half_of_the_solver_each(folder):
     program = """
-from bayesperiodic._compile import cache
+from bayesperiodic._compile import cache, expectations
 from bayesperiodic.periodic.compiled import kernels
-cache.internals_expected()
+expectations.internals_expected()
 built, build = [], cache._build
 cache._build = lambda source, *arguments: (built.append(source), build(source, *arguments))[1]
 kernels("newton", 1, (2, 3, 2))

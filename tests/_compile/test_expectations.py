@@ -26,8 +26,9 @@ VALUES = """
 import json, warnings
 import numpy as np
 import bayesperiodic as bp
-from bayesperiodic._compile.cache import internals_expected
-from bayesperiodic._compile.code_generation import GridFunction, compiled
+from bayesperiodic._compile.expectations import internals_expected
+from bayesperiodic._compile.code_generation import compiled
+from bayesperiodic._compile.grid_function import GridFunction
 from tests.known import formula_model
 import sympy as sp
 

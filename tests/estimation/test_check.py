@@ -8,6 +8,7 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.estimation import check as checks_of
+from bayesperiodic.estimation import map_estimate as estimates
 from bayesperiodic.estimation.result import FitCheck
 from tests.known import LINEAR, linear_experiment
 from tests.problems import DUFFING_PRIORS, duffing_run
@@ -60,7 +61,10 @@ def test_checks_made_afterwards_equal_those_of_the_estimate(name):
     problem = problems()[name]
     whole, quick = (bp.map_estimate(problem, checks=made, progress=False) for made in (True, False))
     assert quick.checks is None and quick.theta == whole.theta and quick.covariance.equals(whole.covariance)
-    assert quick.joint_covariance.equals(whole.joint_covariance)
+    assert quick.joint is None
+    joint = checks_of.with_joint(problem, quick)
+    assert joint.joint_mode == pytest.approx(whole.joint_mode, rel=1e-4)
+    assert joint.joint_covariance.to_numpy() == pytest.approx(whole.joint_covariance.to_numpy(), rel=1e-4, abs=1e-12)
     checks = bp.check(problem, quick)
     assert values(checks) == pytest.approx(values(whole.checks), rel=1e-4, abs=1e-8, nan_ok=True)
     assert checks.undetermined == whole.checks.undetermined
@@ -72,6 +76,7 @@ def test_without_checks_none_is_computed_and_no_warning_of_theirs_is_given(monke
     problem = problems()["conflict"]
     for name in ("prior_conflict", "robust_covariance", "doubling_shift", "input_nonlinearity", "undetermined"):
         monkeypatch.setattr(checks_of, name, None)
+    monkeypatch.setattr(estimates, "joint_laplace", None)
     quick = bp.map_estimate(problem, checks=False, progress=False)
     assert not recwarn.list and "Not checked" in str(quick) and "robust" not in str(quick)
     monkeypatch.undo()
@@ -79,11 +84,14 @@ def test_without_checks_none_is_computed_and_no_warning_of_theirs_is_given(monke
         bp.check(problem, quick)
 
 
-@pytest.mark.parametrize("name", [field.name for field in fields(FitCheck)])
-def test_reading_a_check_that_was_not_made_names_the_function(name):
+@pytest.mark.parametrize(
+    ("name", "group"),
+    [*((field.name, "checks") for field in fields(FitCheck)), ("mode", "joint"), ("covariance", "joint")],
+)
+def test_reading_what_was_not_computed_names_the_function(name, group):
     quick = bp.map_estimate(problems()["linear"], checks=False, progress=False)
-    with pytest.raises(ValueError, match=rf"checks: must be made before '{name}' is used.* bp\.check\(problem, fit\)"):
-        getattr(quick, name)
+    with pytest.raises(ValueError, match=rf"{group}: must be computed before '{name}' is used.* map_estimate\("):
+        getattr(quick, f"joint_{name}" if group == "joint" else name)
 
 
 def test_an_estimate_of_another_problem_is_not_checked():

@@ -97,7 +97,7 @@ def test_several_points_at_once_give_the_same_bits_as_single_ones(case):
 
 def test_gradients_are_those_of_differences(case):
     likelihood, residuals, values, _ = case
-    by_residual, by_value = likelihood.gradients(residuals, values)
+    _, by_residual, by_value = likelihood.value_and_gradients(residuals, values)
 
     def density(r: list[np.ndarray], phi: np.ndarray) -> float:
         return float(likelihood(r, phi) + likelihood.log_prior(phi))

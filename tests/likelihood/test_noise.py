@@ -339,7 +339,7 @@ def situation(model) -> tuple[Likelihood, list[np.ndarray], np.ndarray]:
 @pytest.mark.parametrize("model", MODELS, ids=repr)
 def test_noise_gradients_equal_high_order_differences(model, share):
     likelihood, residuals, values = situation(model)
-    by_residual, by_noise = likelihood.gradients(residuals, values, share)
+    _, by_residual, by_noise = likelihood.value_and_gradients(residuals, values, share)
 
     def total(moved, noise_values):
         return float(likelihood(moved, noise_values, share) + likelihood.log_prior(noise_values))

@@ -126,4 +126,4 @@ def test_the_estimated_variance_is_the_mean_of_the_squares_in_units_of_the_spect
     r[[0, 1, 8]] = np.sqrt(11 * np.array([4.0, 4.5, 8.0]))
     found = estimate_noise(likelihood, [r], np.ones(1), 1.0)
     assert found[0] == pytest.approx(4.0 + 2 * 4.5 + 4 * 8.0, rel=1e-7)
-    assert likelihood.gradients([r], found)[1] == pytest.approx([0.0], abs=1e-6)
+    assert likelihood.value_and_gradients([r], found)[2] == pytest.approx([0.0], abs=1e-6)

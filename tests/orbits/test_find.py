@@ -120,9 +120,9 @@ def test_intervals_hold_where_the_density_of_returns_varies():
         section = bp.PoincareSection.from_recording(
             chaos.recording(12_000, 40, 0.001, seed), ("angle", "rate"), frequency=chaos.FREQUENCY, angles=("angle",)
         )
-        scaled = find._scaled(section, 32)
+        maps, size = find._scaled(section, 32)
         for sign in (1, -1):
-            estimate = refine(scaled.maps, sign * np.array(known.section) / scaled.size, 32)
+            estimate = refine(maps, sign * np.array(known.section) / size, 32)
             error = np.log(abs(estimate.eigenvalues[0] / known.multipliers[0]))
             standardised.append(error / np.hypot(np.sqrt(estimate.covariance[2, 2]), estimate.bias[2]))
     assert np.sum(np.square(standardised)) < chi2.ppf(0.99, len(standardised))
@@ -212,7 +212,7 @@ def test_the_noise_is_estimated_from_the_points():
         section = bp.PoincareSection.from_points(
             chaos.points(9000, noise), ("angle", "rate"), frequency=1.0, angles=("angle",)
         )
-        np.testing.assert_allclose(find._scaled(section, 32).maps.noise, noise, rtol=0.35)
+        np.testing.assert_allclose(find._scaled(section, 32)[0].noise, noise, rtol=0.35)
 
 
 def test_sections_without_chaos_raise():

@@ -149,7 +149,7 @@ def test_transposed_solves_by_segments_and_by_the_band_match_dense_algebra(schem
 def test_bands_of_any_length_are_factored_with_row_exchanges(scheme, states):
     """Random bands without dominance, one with a column of zeros, against dense algebra."""
     shape, random = CyclicGrid(find_scheme(scheme), 800, 1), np.random.default_rng(2)
-    functions, lower = compiled.kernels("batch", states, shape.stencil), shape.half_width * states + states - 1
+    functions, lower = compiled.kernels("batch", states, shape.stencil), shape.packed.half_width * states + states - 1
     for size in (lower + 1, 3 * lower, 3 * lower + 1, 3 * lower + 2, 60):
         matrix = np.tril(np.triu(random.standard_normal((size, size)), -lower), lower)
         band, pivots = rows_of_band(matrix, lower), np.empty(size, dtype=np.int64)
@@ -250,29 +250,29 @@ def test_singular_and_not_finite_matrices_are_detected():
 def test_folded_band_is_accurate_for_stable_and_unstable_orbits(exponent):
     """W' = λ w + u on the cyclic grid of central2, multiplier e^λ over the period, against the discrete closed form."""
     shape = CyclicGrid(find_scheme("central2"), 800)
-    size, half, tau = shape.points, shape.half_width, shape.tau
+    size, half, tau = shape.points, shape.packed.half_width, shape.tau
     symbol = 1j * np.sin(2 * np.pi / size) * size - exponent
     forcing, expected = np.cos(2 * np.pi * tau), (np.exp(2j * np.pi * tau) / symbol).real
     matrix = np.zeros((size, 3 * half + 1))
     for i in range(size):
-        row = shape.place[i]
+        row = shape.packed.place[i]
         matrix[row, half] -= exponent
-        for neighbour, weight in zip(shape.neighbours[i], shape.first, strict=True):
-            matrix[row, shape.place[neighbour] - row + half] += weight
+        for neighbour, weight in zip(shape.packed.neighbours[i], shape.packed.first, strict=True):
+            matrix[row, shape.packed.place[neighbour] - row + half] += weight
     right = np.empty((1, size))
-    right[0, shape.place] = forcing
+    right[0, shape.packed.place] = forcing
     pivots = np.empty(size, dtype=np.int64)
     assert linear().factor(matrix, half, half, pivots)
     linear().solve(matrix, half, half, pivots, right)
-    assert right[0, shape.place] == pytest.approx(expected, abs=1e-12)
+    assert right[0, shape.packed.place] == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize(("scheme", "half_width"), [("central2", 2), ("backward2", 6)])
 @pytest.mark.parametrize("points", [20, 21])
 def test_folded_order_has_the_expected_half_width(scheme, half_width, points):
     shape = CyclicGrid(find_scheme(scheme), points)
-    assert sorted(shape.place) == list(range(points))
-    assert shape.half_width == half_width
+    assert sorted(shape.packed.place) == list(range(points))
+    assert shape.packed.half_width == half_width
 
 
 def test_changed_kernels_recompile_their_callers(monkeypatch, tmp_path):

@@ -98,6 +98,19 @@ def test_settings_build_the_problem_again(problem):
     assert problem.settings["priors"] == PRIORS
 
 
+@pytest.mark.parametrize("copied", [lambda e: e, copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))])
+def test_mappings_refuse_changes(problem, copied: Callable):
+    other = copied(problem)
+    run = other.experiments[0]
+    for mapping in (run.outputs, run.independent, other.fixed, other.priors, other.settings["priors"]):
+        for change in ("__setitem__", "x", 0.0), ("__delitem__", "x"), ("update", {"x": 0.0}), ("pop", "x"), ("clear",):
+            with pytest.raises(TypeError, match="read-only"):
+                getattr(mapping, change[0])(*change[1:])
+    assert not run.outputs["force"].flags.writeable
+    with pytest.raises(TypeError, match="read-only"):
+        problem.replace(priors={n: PRIORS[n] for n in ("k", "c")}, fixed={"coulomb": 22.0}).fixed["coulomb"].clear()
+
+
 def test_arrays_and_mappings_that_the_user_changes_do_not_change_the_problem():
     displacement = duffing_run()
     y, u = np.array(displacement.outputs["displacement"]), np.array(displacement.inputs["force"])
@@ -131,9 +144,12 @@ def test_anchors_and_errors_of_inputs_leave_the_problem_as_it_is():
     size = problem.observations[run.name].blocks[0].size
     errors = InputErrors(np.zeros(3), 0.05 * random.standard_normal((size, 3)), 0.01 * random.standard_normal(size))
     noisy = problem.with_input_errors({run.name: errors})
-    with pytest.raises(ValueError, match="errors: must be 'run 1', got 'run 7'"):
+    with pytest.raises(ValueError, match="input_errors: must be 'run 1', got 'run 7'"):
         problem.with_input_errors({"run 7": errors})
+    with pytest.raises(ValueError, match=r"input_errors\['run 1'\]: must be 3 errors and"):
+        problem.replace(input_errors={run.name: InputErrors(np.zeros(2), np.zeros((size, 2)), np.zeros(size))})
     assert abs(float(noisy.log_posterior(*at)) - before) > 1.0
+    assert noisy.replace(**noisy.settings).log_posterior(*at) == noisy.log_posterior(*at)
     assert noisy.anchored(at[0]).input_errors[run.name] is errors
     assert noisy.with_input_errors({}).input_errors == noisy.replace().input_errors == {}
     assert float(problem.log_posterior(*at)) == float(noisy.replace().log_posterior(*at)) == before

@@ -478,7 +478,7 @@ def test_transformation_that_changes_an_equation_or_an_output_is_rejected(images
     )
     symbols, delta = model.parameter_symbols, sp.Symbol("delta", real=True)
     moved = {symbols[n]: sp.sympify(e, locals=symbols | {"delta": delta}) for n, e in images.items()}
-    flow = Flow(Generator({}, {}, {}), delta, moved)
+    flow = Flow(Generator({}), delta, moved)
     assert (verified(system_of(model, ["y"]), flow) is not None) == confirmed
 
 

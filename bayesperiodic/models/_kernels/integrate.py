@@ -1,21 +1,25 @@
 """The compiled code of `integrate`; loaded through the kernel cache, not imported."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numba import njit
 
-from bayesperiodic._compile.code_generation import GRID_SIGNATURE
+from bayesperiodic._compile.grid_function import grid_function_at
+
+if TYPE_CHECKING:  # defined in this module by `model.dense_kernels`
+    from bayesperiodic.models._kernels.dense import solve
 
 ARRAY_2D, ARRAY_1D = "float64[:,::1]", "float64[::1]"
-FUNCTION = f"FunctionType({GRID_SIGNATURE})"
 OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
 @njit(
-    f"boolean({FUNCTION}, {ARRAY_1D}, float64, {ARRAY_1D}, float64, int64[::1], {ARRAY_2D}, {ARRAY_2D}, "
-    f"{ARRAY_2D}, {ARRAY_2D}, {ARRAY_2D}, {ARRAY_1D})",
+    f"boolean(int64, {ARRAY_1D}, float64, {ARRAY_1D}, float64, int64[::1], {ARRAY_2D}, {ARRAY_2D}, "
+    f"{ARRAY_2D}, {ARRAY_2D}, {ARRAY_2D}, {ARRAY_2D}, {ARRAY_1D})",
     **OPTIONS,
 )
-def slope(residual_jacobian, y, time, parameters, frequency, orders, states, row, columns, tau, system, rate):
+def slope(residual_jacobian, y, time, parameters, frequency, orders, states, row, columns, tau, highest, g, rate):
     """Fill ẏ; the equations are solved for the highest derivatives, in which they are linear."""
     count = orders.size
     extra = count
@@ -25,53 +29,32 @@ def slope(residual_jacobian, y, time, parameters, frequency, orders, states, row
             states[0, count + s] = y[extra]
             extra += 1
     tau[0, 0] = time
-    residual_jacobian(states, row, parameters, tau[0], frequency, columns)
-    highest, g = system[:count], system[count]
+    grid_function_at(residual_jacobian)(states, row, parameters, tau[0], frequency, columns)
     for e in range(count):
-        g[e] = -columns[0, e]
+        g[e, 0] = -columns[0, e]
         for s in range(count):
             highest[e, s] = columns[0, count + e * 3 * count + orders[s] * count + s]
-    for j in range(count):
-        pivot = j
-        for e in range(j + 1, count):
-            if abs(highest[e, j]) > abs(highest[pivot, j]):
-                pivot = e
-        if not (abs(highest[pivot, j]) > 0.0 and abs(highest[pivot, j]) < np.inf):
-            return False
-        if pivot != j:
-            g[pivot], g[j] = g[j], g[pivot]
-            for s in range(count):
-                highest[pivot, s], highest[j, s] = highest[j, s], highest[pivot, s]
-        for e in range(j + 1, count):
-            multiplier = highest[e, j] / highest[j, j]
-            g[e] -= multiplier * g[j]
-            for s in range(j + 1, count):
-                highest[e, s] -= multiplier * highest[j, s]
-    for j in range(count - 1, -1, -1):
-        for s in range(j + 1, count):
-            g[j] -= highest[j, s] * g[s]
-        g[j] /= highest[j, j]
+    if not solve(highest, g):
+        return False
     extra = count
     for s in range(count):
-        rate[s] = g[s]
+        rate[s] = g[s, 0]
         if orders[s] == 2:
-            rate[s], rate[extra] = y[extra], g[s]
+            rate[s], rate[extra] = y[extra], g[s, 0]
             extra += 1
     return True
 
 
-@njit(
-    f"boolean({FUNCTION}, {ARRAY_1D}, {ARRAY_2D}, int64, {ARRAY_1D}, float64, int64[::1], int64, {ARRAY_2D})", **OPTIONS
-)
+@njit(f"boolean(int64, {ARRAY_1D}, {ARRAY_2D}, int64, {ARRAY_1D}, float64, int64[::1], int64, {ARRAY_2D})", **OPTIONS)
 def runge_kutta(residual_jacobian, start, inputs, samples, parameters, frequency, orders, steps, path):
-    """Fill `path` (kept, size) with the states before the last of the steps; see `models.model.integrate`.
+    """Fill `path` (kept, size) with the states before the last of the steps; see `periodic.solve.integrate`.
 
     Return False if the states overflow or the equations cannot be solved for the highest derivatives.
     """
     size, count = start.size, orders.size
     states, row = np.empty((1, 3 * count)), np.empty((1, inputs.shape[1]))
     columns, tau = np.empty((1, count * (1 + 3 * count))), np.empty((1, 1))
-    system = np.empty((count + 1, count))
+    highest, g = np.empty((count, count)), np.empty((count, 1))
     y, trial, rates = start.copy(), np.empty(size), np.empty((4, size))
     step = 1.0 / (samples * frequency)
     first = steps - path.shape[0]
@@ -89,7 +72,7 @@ def runge_kutta(residual_jacobian, start, inputs, samples, parameters, frequency
                 row[0, u] = inputs[half % inputs.shape[0], u]
             time = 0.5 * half / samples
             if not slope(
-                residual_jacobian, trial, time, parameters, frequency, orders, states, row, columns, tau, system,
+                residual_jacobian, trial, time, parameters, frequency, orders, states, row, columns, tau, highest, g,
                 rates[stage],
             ):  # fmt: skip
                 return False
@@ -115,7 +98,7 @@ def fill_inputs(amplitudes, time, row):
 
 
 @njit(
-    f"int64({FUNCTION}, complex128[:,::1], {ARRAY_1D}, float64, int64[::1], {ARRAY_1D}, {ARRAY_2D}, {ARRAY_2D}, "
+    f"int64(int64, complex128[:,::1], {ARRAY_1D}, float64, int64[::1], {ARRAY_1D}, {ARRAY_2D}, {ARRAY_2D}, "
     f"{ARRAY_1D}, {ARRAY_2D}, {ARRAY_1D}, {ARRAY_1D}, int64)",
     **OPTIONS,
 )
@@ -131,12 +114,12 @@ def dormand_prince(
     size, count, stages = path.shape[1], orders.size, c.size - 1
     states, row = np.empty((1, 3 * count)), np.empty((1, amplitudes.shape[1]))
     columns, tau = np.empty((1, count * (1 + 3 * count))), np.empty((1, 1))
-    system = np.empty((count + 1, count))
+    highest, g = np.empty((count, count)), np.empty((count, 1))
     y, trial, rates = path[0].copy(), np.empty(size), np.empty((stages + 1, size))
     step = 1e-3
     fill_inputs(amplitudes, time[0], row)
     if not slope(
-        residual_jacobian, y, time[0], parameters, frequency, orders, states, row, columns, tau, system, rates[0]
+        residual_jacobian, y, time[0], parameters, frequency, orders, states, row, columns, tau, highest, g, rates[0]
     ):
         return 1
     for k in range(1, time.size):
@@ -158,7 +141,7 @@ def dormand_prince(
                 at = now + c[stage] * used
                 fill_inputs(amplitudes, at, row)
                 if not slope(
-                    residual_jacobian, trial, at, parameters, frequency, orders, states, row, columns, tau, system,
+                    residual_jacobian, trial, at, parameters, frequency, orders, states, row, columns, tau, highest, g,
                     rates[stage],
                 ):  # fmt: skip
                     finite = False

@@ -4,6 +4,7 @@ A bordered system is solved also where ∂g/∂z is singular, as it is along the
 The last functions detect equilibria and repeated orbits of autonomous models.
 """
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -265,8 +266,5 @@ def has_shorter_period(z):
         strongest = max(strongest, powers[k])
     for k in range(powers.size):
         if powers[k] > ABSENT**2 * strongest:
-            one, other = k + 1, divisor
-            while other > 0:
-                one, other = other, one % other
-            divisor = one
+            divisor = math.gcd(k + 1, divisor)
     return divisor > 1

@@ -1,44 +1,16 @@
 """The compiled code of `floquet`; loaded through the kernel cache, not imported."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numba import njit
+
+if TYPE_CHECKING:  # defined in this module by `model.dense_kernels`
+    from bayesperiodic.models._kernels.dense import solve
 
 STAGES = 3
 ARRAY_2D, ARRAY_3D = "float64[:,::1]", "float64[:,:,::1]"
 FLOQUET_OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
-
-
-@njit(f"boolean({ARRAY_2D}, {ARRAY_2D})", **FLOQUET_OPTIONS)
-def solve(matrix, right):
-    """Solve in place for the columns of `right`, with pivoting; return False if the matrix is singular."""
-    size, columns = matrix.shape[0], right.shape[1]
-    for j in range(size):
-        pivot = j
-        for i in range(j + 1, size):
-            if abs(matrix[i, j]) > abs(matrix[pivot, j]):
-                pivot = i
-        if not (abs(matrix[pivot, j]) > 0.0):
-            return False
-        if pivot != j:
-            for k in range(j, size):
-                matrix[pivot, k], matrix[j, k] = matrix[j, k], matrix[pivot, k]
-            for c in range(columns):
-                right[pivot, c], right[j, c] = right[j, c], right[pivot, c]
-        inverse = 1.0 / matrix[j, j]
-        for i in range(j + 1, size):
-            factor = matrix[i, j] * inverse
-            if factor != 0.0:
-                for k in range(j + 1, size):
-                    matrix[i, k] -= factor * matrix[j, k]
-                for c in range(columns):
-                    right[i, c] -= factor * right[j, c]
-    for j in range(size - 1, -1, -1):
-        for c in range(columns):
-            total = right[j, c]
-            for k in range(j + 1, size):
-                total -= matrix[j, k] * right[k, c]
-            right[j, c] = total / matrix[j, j]
-    return True
 
 
 @njit(f"void({ARRAY_3D}, {ARRAY_3D}, int64, float64, {ARRAY_2D}, float64[::1], {ARRAY_3D})", **FLOQUET_OPTIONS)
