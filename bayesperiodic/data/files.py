@@ -72,8 +72,8 @@ def _column(file: Path, column: str, values: Any, text: bool, time: bool) -> np.
     """Return a column of numbers, or of texts too; of times also as dates, and integers as they are."""
     argument, array = f"column {column!r} of {file.name}", np.squeeze(np.asarray(values))
     time = time and not text
-    if time and (found := dates(argument, array)) is not None:
-        array = found
+    if time and (times := dates(argument, array)) is not None:
+        array = times
     if array.dtype == object and not text:
         import pandas as pd
 

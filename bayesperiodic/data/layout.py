@@ -82,7 +82,7 @@ def without_missing(arrays: Mapping[str, np.ndarray], missing: str | None) -> di
     if missing is not None:
         _checks.one_of("missing", missing, (DROP, INTERPOLATE))
     for argument, values in arrays.items():
-        if missing is None and (lost := np.flatnonzero(np.isnan(values))).size:
+        if missing is None and values.ndim == 1 and (lost := np.flatnonzero(np.isnan(values))).size:
             raise ValueError(
                 f"{argument}: must be finite, got nan at index {lost[0]} ({lost.size} of {values.size} values are NaN "
                 f"or masked); missing={DROP!r} leaves such samples out, missing={INTERPOLATE!r} fills in single values."

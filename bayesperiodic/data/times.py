@@ -9,8 +9,8 @@ import numpy as np
 from bayesperiodic import _checks
 
 # Seconds in the units of NumPy's dates and durations, and the units in a second; all are exact as floats.
-LONGER = {"W": 604_800, "D": 86_400, "h": 3600, "m": 60, "s": 1}
-SHORTER = {"ms": 1e3, "us": 1e6, "ns": 1e9, "ps": 1e12, "fs": 1e15, "as": 1e18}
+SECONDS = {"W": 604_800, "D": 86_400, "h": 3600, "m": 60, "s": 1}
+PER_SECOND = {"ms": 1e3, "us": 1e6, "ns": 1e9, "ps": 1e12, "fs": 1e15, "as": 1e18}
 # Integers beyond this one are not all floats.
 LARGEST_EXACT = 2**53
 ISO_DATE = re.compile(r"\s*\d{4}-\d\d")
@@ -48,16 +48,20 @@ def dates(argument: str, values: Any) -> np.ndarray | None:
 def seconds(argument: str, values: Any) -> Any:
     """Return dates and durations in seconds from the first of them that is not missing, NaT as NaN.
 
-    Differences are those of integers, so that each is the nearest float. Integers beyond 2**53, such as nanoseconds
-    since 1970, are counted from the first one too, in their unit. Other values are returned as they are.
+    Differences are those of integers, so that those below 2**53 units are the nearest floats. Integers beyond it, such as
+    nanoseconds since 1970, are counted from the first one too, in their unit. Other values are returned as they are.
     """
+    try:
+        np.shape(values)
+    except ValueError:  # lists of unequal length, which are refused as no real numbers
+        return values
     times = dates(argument, values)
     if times is None:
         return _differences(values)
     unit, step = np.datetime_data(times.dtype)
     if times.dtype.kind == "M" and unit in ("Y", "M", "generic"):
         times, unit, step = times.astype("datetime64[s]"), "s", 1
-    if unit not in LONGER | SHORTER:
+    if unit not in SECONDS | PER_SECOND:
         raise ValueError(
             f"{argument}: must be durations in weeks or a shorter unit, got {times.dtype}, whose length in seconds is "
             "not defined."
@@ -66,7 +70,7 @@ def seconds(argument: str, values: Any) -> Any:
     if lost.all():
         return np.full(times.shape, np.nan)
     steps = np.where(lost, 0, (times - times[~lost][0]).astype(np.int64)) * step
-    return np.where(lost, np.nan, steps * float(LONGER[unit]) if unit in LONGER else steps / SHORTER[unit])
+    return np.where(lost, np.nan, steps * float(SECONDS[unit]) if unit in SECONDS else steps / PER_SECOND[unit])
 
 
 def _differences(values: Any) -> Any:

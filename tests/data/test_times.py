@@ -106,6 +106,14 @@ def test_texts_that_are_no_dates_are_named():
         bp.Recording.from_arrays(["31.01.2026 12:00", "31.01.2026 12:01"], {"x": [1, 2]})
 
 
+@pytest.mark.parametrize(
+    "time", [[[1], [2, 3]], ["a", "b"], None, {"t": [1, 2]}, pd.period_range("2026", periods=2)], ids=str
+)
+def test_what_is_no_time_is_refused_as_such(time):
+    with pytest.raises(ValueError, match="time: must be (an array of real numbers|one-dimensional), got"):
+        bp.Recording.from_arrays(time, {"x": [1, 2]})
+
+
 def test_dates_are_no_values_of_a_channel():
     with pytest.raises(ValueError, match=r"outputs\['x'\]: must be an array of real numbers, got .*datetime64\[ns\]"):
         bp.Recording.from_arrays(EXACT, {"x": DATES})
