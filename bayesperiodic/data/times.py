@@ -48,8 +48,8 @@ def dates(argument: str, values: Any) -> np.ndarray | None:
 def seconds(argument: str, values: Any) -> Any:
     """Return dates and durations in seconds from the first of them that is not missing, NaT as NaN.
 
-    Differences are those of integers, so that those below 2**53 units are the nearest floats. Integers beyond it, such as
-    nanoseconds since 1970, are counted from the first one too, in their unit. Other values are returned as they are.
+    Differences are those of integers, so that those below 2**53 units are the nearest floats. Integers beyond it (as
+    nanoseconds since 1970) are counted from the first one too, in their unit. Other values are returned as they are.
     """
     try:
         np.shape(values)
