@@ -12,90 +12,12 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import one_thread
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.data.files import CSV, MAT, NPZ, Format, Units, convert
+from bayesperiodic.data.files import CSV, MAT, NPZ, Format
 from bayesperiodic.data.folding import AUTO, Signals, automatic_periods, fold_signals, inspect, parts, summary
+from bayesperiodic.data.layout import Layout, without_missing
 from bayesperiodic.data.recording_check import RecordingCheck
-
-DROP, INTERPOLATE = "drop", "interpolate"
-# Successive samples that may be interpolated.
-LONGEST_INTERPOLATION = 3
-# Key of the times of a file without a column of times.
-NO_COLUMN = "\0"
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Meaning of the columns of a file, with the arguments of `Recording.from_csv`."""
-
-    file: str
-    outputs: Mapping[str, str]
-    inputs: Mapping[str, str]
-    time: str | None
-    sampling_rate: float | None
-    units: Units
-    missing: str | None
-
-    def __post_init__(self) -> None:
-        example = "{'force': 'the column of the force'}"
-        for kind in ("outputs", "inputs"):
-            _checks.mapping(kind, getattr(self, kind), example)
-        if (self.time is None) == (self.sampling_rate is None):
-            raise ValueError(
-                f"time: must be given or sampling_rate, and not both, got {self.time!r} and {self.sampling_rate!r}."
-            )
-        for key in self.units:
-            _checks.one_of("units", key, ("time", *self.outputs, *self.inputs))
-        if self.missing is not None:
-            _checks.one_of("missing", self.missing, (DROP, INTERPOLATE))
-
-    @property
-    def columns(self) -> dict[str, None]:
-        """Names of the columns, each once."""
-        return dict.fromkeys([*([self.time] if self.time else []), *self.outputs.values(), *self.inputs.values()])
-
-    def recording(self, columns: Mapping[str, np.ndarray], name: str) -> "Recording":
-        """Return the recording of columns of numbers."""
-        seconds = self.time or NO_COLUMN
-        if not self.time:
-            rows = max((values.size for values in columns.values()), default=0)
-            columns = {**columns, NO_COLUMN: np.arange(rows) / _checks.positive("sampling_rate", self.sampling_rate)}
-        if self.missing and len({values.size for values in columns.values()}) == 1:
-            columns = self._completed(columns, columns[seconds])
-
-        def channel(key: str, column: str) -> np.ndarray:
-            argument = f"{key} (column {column!r} of {self.file})"
-            if self.missing is None and (lost := np.flatnonzero(np.isnan(columns[column]))).size:
-                raise ValueError(
-                    f"{argument}: must be finite, got nan at index {lost[0]} ({lost.size} of {columns[column].size} "
-                    f"values); missing={DROP!r} leaves such rows out, missing={INTERPOLATE!r} fills in single values."
-                )
-            values = _checks.measured_vector(argument, columns[column])
-            return convert(key, values, self.units[key]) if key in self.units else values
-
-        measured, given = (
-            {key: channel(key, column) for key, column in kind.items()} for kind in (self.outputs, self.inputs)
-        )
-        return Recording(channel("time", seconds), measured, given, name)
-
-    def _completed(self, columns: Mapping[str, np.ndarray], seconds: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the columns without NaN."""
-        result = dict(columns)
-        if self.missing == INTERPOLATE:
-            for column, values in columns.items():
-                if values is not seconds:
-                    result[column] = self._interpolated(column, seconds, values)
-        keep = ~np.any([np.isnan(values) for values in result.values()], axis=0)
-        return {column: values[keep] for column, values in result.items()}
-
-    def _interpolated(self, column: str, axis: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return a column with NaN between numbers replaced; those at the ends remain."""
-        known = np.flatnonzero(~np.isnan(values) & ~np.isnan(axis))
-        if (longest := int(np.max(np.diff(known), initial=1)) - 1) > LONGEST_INTERPOLATION:
-            raise ValueError(
-                f"missing: must be {DROP!r} for column {column!r} of {self.file}, got {INTERPOLATE!r}, which fills in "
-                f"at most {LONGEST_INTERPOLATION} successive values, and {longest} are missing."
-            )
-        return np.interp(axis, axis[known], values[known], left=np.nan, right=np.nan) if known.size else values
+from bayesperiodic.data.times import seconds
+from bayesperiodic.data.units import Units
 
 
 def _read(
@@ -105,8 +27,9 @@ def _read(
     file, meaning = Path(path), Layout(Path(path).name, *layout)
     name = name or file.stem
     if split is None:
-        return meaning.recording(form.read(path, meaning.columns), name)
-    columns = form.read(path, dict.fromkeys([*meaning.columns, split]), split)
+        columns = form.read(path, meaning.columns, time=meaning.time)
+        return Recording(*meaning.signals(meaning.timed(columns)), name)
+    columns = form.read(path, dict.fromkeys([*meaning.columns, split]), split, meaning.time)
     label = columns[split] if split in meaning.columns else columns.pop(split)
     if any(lost := [value != value for value in label]):
         row = lost.index(True) + 1
@@ -117,10 +40,12 @@ def _read(
                 f"split: must be a column with one value per sample, got {split!r} with {label.size} values and "
                 f"{column!r} with {values.size}."
             )
+    columns = meaning.timed(columns)
     edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), label.size]
     return [
-        meaning.recording(
-            {c: values[first:last] for c, values in columns.items()}, f"{name} {i}: {split} {label[first]}"
+        Recording(
+            *meaning.signals({column: values[first:last] for column, values in columns.items()}),
+            f"{name} {i}: {split} {label[first]}",
         )
         for i, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True), 1)
     ]
@@ -163,7 +88,8 @@ class Recording(Result):
     Attributes
     ----------
     time : array (samples,)
-        Strictly increasing times [s]; the steps need not be equal.
+        Strictly increasing times [s]; the steps need not be equal. Dates and durations are converted as by
+        `from_arrays`.
     outputs, inputs : dict of str to array (samples,)
     name : str
     synthetic : bool
@@ -172,8 +98,8 @@ class Recording(Result):
     Raises
     ------
     ValueError
-        For fewer than two samples, samples that are NaN or infinite, or of sizes outside 1e-100 to 1e100, different
-        lengths, a time that does not increase, no output, names that are repeated or not identifiers.
+        For fewer than two samples, samples that are masked, NaN or infinite, or of sizes outside 1e-100 to 1e100,
+        different lengths, a time that does not increase, no output, names that are repeated or not identifiers.
 
     Examples
     --------
@@ -194,7 +120,7 @@ class Recording(Result):
 
     def __post_init__(self) -> None:
         _checks.text("name", self.name)
-        object.__setattr__(self, "time", _checks.measured_vector("time", self.time))
+        object.__setattr__(self, "time", _checks.measured_vector("time", seconds("time", self.time)))
         if self.time.size < 2:
             raise ValueError(f"time: must have at least 2 samples, got {self.time.size} in {self.name!r}.")
         step = np.diff(self.time)
@@ -221,16 +147,28 @@ class Recording(Result):
 
     @classmethod
     def from_arrays(
-        cls, time: Any, outputs: Mapping[str, Any], inputs: Mapping[str, Any] | None = None, *, name: str | None = None
+        cls,
+        time: Any,
+        outputs: Mapping[str, Any],
+        inputs: Mapping[str, Any] | None = None,
+        *,
+        missing: str | None = None,
+        name: str | None = None,
     ) -> "Recording":
         """Make a recording from arrays, pandas Series or xarray DataArrays.
 
         Parameters
         ----------
         time : array (samples,)
-            Strictly increasing times [s].
+            Strictly increasing times [s], or dates or durations: datetime64 and timedelta64 of any resolution, pandas
+            and xarray objects, Python's datetime and timedelta, texts after ISO 8601. Dates and durations are converted
+            to seconds from the first sample, without a loss of precision; integers beyond 2**53 are counted from the
+            first sample as well. Dates with a time zone are compared in UTC, those without are taken as UTC.
         outputs, inputs : mapping of str to array (samples,)
             Values in the units of the model's channels.
+        missing : "drop" or "interpolate", optional
+            What to do with missing samples (NaN, masked values, pandas' NA, NaT), which are refused by default: leave
+            their times out in all channels, or interpolate linearly in time over at most three successive ones.
         name : str, optional
             By default "recording".
 
@@ -241,11 +179,29 @@ class Recording(Result):
         Raises
         ------
         ValueError
-            As for `Recording`.
+            As for `Recording`, and for missing samples without `missing`.
+
+        Examples
+        --------
+        >>> dates = np.datetime64("2026-01-31T12:00:00.000") + np.arange(500) * np.timedelta64(20, "ms")
+        >>> angle = np.sin(2 * np.pi * np.arange(500) / 50)
+        >>> angle[100:103] = np.nan
+        >>> run = bp.Recording.from_arrays(dates, {"angle": angle}, missing="drop")
+        >>> print(run.time[:3], run.time.size)
+        [0.   0.02 0.04] 497
         """
-        measured = _checks.mapping("outputs", outputs, "{'force': values}")
-        given = _checks.mapping("inputs", {} if inputs is None else inputs, "{'force': values}")
-        return cls(time, dict(measured.items()), dict(given.items()), name or "recording")
+        channels = {
+            f"{kind}[{key!r}]": (kind, key, values)
+            for kind, given in (("outputs", outputs), ("inputs", {} if inputs is None else inputs))
+            for key, values in _checks.mapping(kind, given, "{'force': values}").items()
+        }
+        arrays = {"time": _checks.real_array("time", seconds("time", time))}
+        arrays |= {argument: _checks.real_array(argument, values) for argument, (*_, values) in channels.items()}
+        present = without_missing(arrays, missing)
+        signals: dict[str, dict[str, np.ndarray]] = {"outputs": {}, "inputs": {}}
+        for argument, (kind, key, _) in channels.items():
+            signals[kind][key] = present[argument]
+        return cls(present["time"], signals["outputs"], signals["inputs"], name or "recording")
 
     @overload
     @classmethod
@@ -279,11 +235,15 @@ class Recording(Result):
         outputs, inputs : mapping of str to str
             Column in the file by channel, such as ``{"force": "force_N"}``.
         time : str, optional
-            Column of times [s].
+            Column of times [s], or of dates after ISO 8601, such as 2026-01-31T12:00:00.01, which are converted to
+            seconds from the first one as by `from_arrays`.
         sampling_rate : float, optional
             Sampling rate [Hz], if the file has no column of times.
         units : mapping of str to float or (from, to), optional
-            Conversion of a channel (or of "time") by a factor or a pair of units such as ``("mm", "m")``.
+            Conversion of a channel (or of "time") by a factor or a pair of units such as ``("mm", "m")``. Angles must
+            be in both units or in neither; a hertz is a cycle per second where the other unit has an angle: ``("rpm",
+            "Hz")`` divides by 60, ``("Hz", "rad/s")`` multiplies by 2π. Temperatures are absolute, differences are
+            "delta_degC". Logarithmic units such as dB are refused.
         missing : "drop" or "interpolate", optional
             What to do with NaN and empty cells (in a file with one column: empty lines), which are refused by default:
             leave their rows out, or interpolate linearly in time over at most three successive ones.
@@ -349,7 +309,8 @@ class Recording(Result):
         ValueError
             If fewer than two samples remain.
         """
-        keep = (self.time >= start) & (self.time <= stop)
+        first, last = _checks.real_array("start, stop", [start, stop])
+        keep = (self.time >= first) & (self.time <= last)
         if keep.sum() < 2:
             raise ValueError(
                 f"start, stop: must select at least two samples between {self.time[0]:g} and {self.time[-1]:g} s, got "
