@@ -26,48 +26,52 @@ COMPARED_LINES, NEGLIGIBLE_AMPLITUDE = 4, 1e-6
 FINENESS = 4
 FALSE_ALARM_RATE = 0.01
 # Least power of a line that stands out, relative to the mean of the lines beside it, and least share of a channel's
-# variance in the lines that a longer response period adds. Leaving out a share s changes the other lines by about s.
-STANDS_OUT, LEAST_SHARE = 10.0, 1e-4
+# variance in the lines that a longer response period adds, which is also that of a subharmonic of 1 % of the signal's
+# amplitude. Neglected, a share s changes the other lines by about s. Least part of it in the later half.
+STANDS_OUT, LEAST_SHARE, LASTING = 20.0, 1e-4, 0.5
 # Lines of the mains [Hz], relative error of their frequency, and the fewest of their periods that show a line.
 MAINS = np.array([k * base for base in (50.0, 60.0) for k in range(1, 7)])
 MAINS_ERROR, MAINS_PERIODS = 2e-3, 4
 # Lines that are listed in a text.
 LISTED = 3
 CHOSEN, REST, NOTHING_ADDED, MORE_LINES = "chosen", "not periodic", "adds no lines", "lacks lines"
-TOO_SMALL, FOREIGN = "lines too small", "mains or alias"
+TOO_SMALL, FOREIGN, FADING = "lines too small", "mains or alias", "lines fade"
 PRIMES = (2, 3, 5, 7)
 
 
 class Added(NamedTuple):
     """Lines of one channel that a response period adds to a shorter one."""
 
-    channel: str
+    row: int  # of the channel
     standing: np.ndarray  # numbers of those that stand out, in units of the response frequency
     foreign: np.ndarray  # the same of those that may be lines of the mains or aliases of harmonics of the drive
     share: float  # of the variance, in those that stand out and are not foreign
     contrast: float  # power of the strongest line relative to those beside it
     p: float
+    later: float = np.inf  # share of the variance of the later half, if it is long enough
 
     def verdict(self, level: float) -> str:
         """Return what the lines say about the response period."""
         if self.p >= level or not self.standing.size + self.foreign.size:
             return NOTHING_ADDED
-        if self.share >= LEAST_SHARE:
-            return CHOSEN
-        return TOO_SMALL if self.standing.size else FOREIGN
+        if self.share < LEAST_SHARE:
+            return TOO_SMALL if self.standing.size else FOREIGN
+        return CHOSEN if self.later >= LASTING * self.share else FADING
 
-    def remark(self, periods: int, level: float) -> str:
+    def remark(self, channel: str, periods: int, level: float) -> str:
         """Return in words what lines there are, and what would be needed."""
         verdict = self.verdict(level)
         if verdict == NOTHING_ADDED:
-            return f"no lines are {STANDS_OUT:g} times as strong as those beside them"
+            return f"no lines stand out, with {STANDS_OUT:g} times the power of those beside"
         lines = self.foreign if verdict == FOREIGN else self.standing
         listed = ", ".join(str(Fraction(int(n), periods)) for n in lines[:LISTED])
-        text = f"lines at {listed}{', …' if lines.size > LISTED else ''} of the drive in {self.channel!r}"
+        text = f"lines at {listed}{', …' if lines.size > LISTED else ''} of the drive's frequency in {channel!r}"
         if verdict == FOREIGN:
-            return f"{text} may be those of the mains or aliases of the drive's harmonics"
-        text += f" are up to {self.contrast:.2g} times as strong as those beside them, with {self.share:.1e} of the variance"
-        return text if verdict == CHOSEN else f"{text}; {LEAST_SHARE:g} is needed"
+            return f"{text} may be those of the mains, or aliases of the drive's harmonics"
+        text += f" have {self.share:.1e} of its variance, and up to {self.contrast:.3g} times the power of those beside"
+        if verdict == TOO_SMALL:
+            return f"{text}; a share of {LEAST_SHARE:.0e} is needed"
+        return f"{text}; they fade, to {self.later:.1e} in the later half" if verdict == FADING else text
 
 
 class Lines(NamedTuple):
@@ -98,7 +102,7 @@ class Lines(NamedTuple):
         inside = apart & (place <= TESTED_HARMONICS)
         return float(self.rest[inside].mean() * np.count_nonzero(place <= TESTED_HARMONICS) / variance)
 
-    def added(self, channel: str, variance: float, divisor: int, foreign: np.ndarray, channels: int) -> Added:
+    def added(self, row: int, variance: float, divisor: int, foreign: np.ndarray, channels: int) -> Added:
         """Return the lines that a response period shorter by `divisor` lacks, and the p-value that there are none.
 
         An F-test of their power against that of the nearest lines between harmonics, both divided by a smooth spectrum,
@@ -124,7 +128,7 @@ class Lines(NamedTuple):
         stands, own = power > STANDS_OUT * nearest, ~foreign[number - 1]
         share = float((power - nearest)[stands & own].sum() / variance)
         contrast = float((power / nearest)[stands].max(initial=0.0))
-        return Added(channel, number[stands & own], number[stands & ~own], share, contrast, min(channels * p, 1.0))
+        return Added(row, number[stands & own], number[stands & ~own], share, contrast, min(channels * p, 1.0))
 
 
 def _lines(time: np.ndarray, values: np.ndarray, frequency: float, periods: int, cycles: int) -> list[Lines]:
@@ -177,23 +181,30 @@ def _aliases(line: Lines, periods: int, per_period: float) -> np.ndarray:
 
 
 def _added(
-    lines: list[Lines], values: np.ndarray, channels: tuple[str, ...], periods: int, level: float, time: np.ndarray, f: float
+    time: np.ndarray, values: np.ndarray, frequency: float, periods: int, lines: list[Lines], level: float
 ) -> Added | None:
-    """Return the lines of the response period that are needed least, of the channel that shows them best."""
-    step = np.ptp(time) / (time.size - 1)
-    divisors, order = [prime for prime in PRIMES if periods % prime == 0], (NOTHING_ADDED, FOREIGN, TOO_SMALL, CHOSEN)
+    """Return the lines of a response period that are least needed, in the channel that shows them best."""
+    cycles, step = lines[0].cycles, np.ptp(time) / (time.size - 1)
+    order = (NOTHING_ADDED, FOREIGN, TOO_SMALL, FADING, CHOSEN)
 
     def rank(added: Added) -> tuple[int, float, float]:
         return order.index(added.verdict(level)), added.share, -added.p
 
+    later = time >= 0.5 * (time[0] + time[-1])
+    fewer, half = int(np.ptp(time[later]) * frequency) // periods, None
     found = []
-    for divisor in divisors:
+    for divisor in [prime for prime in PRIMES if periods % prime == 0]:
         every = []
-        for line, signal, channel in zip(lines, values, channels, strict=True):
-            foreign = _mains(f / periods, line.harmonics.size, step, line.cycles * periods / f)
-            foreign |= _aliases(line, periods, 1.0 / (step * f))
-            every.append(line.added(channel, float(signal.var()), divisor, foreign, len(lines)))
-        found.append(max(every, key=rank))
+        for row, (line, signal) in enumerate(zip(lines, values, strict=True)):
+            foreign = _mains(frequency / periods, line.harmonics.size, step, cycles * periods / frequency)
+            foreign |= _aliases(line, periods, 1.0 / (step * frequency))
+            every.append(line.added(row, float(signal.var()), divisor, foreign, len(lines)))
+        best = max(every, key=rank)
+        if best.verdict(level) == CHOSEN and fewer >= MINIMUM_CYCLES:
+            half = half or _lines(time[later], values[:, later], frequency, periods, fewer)
+            power = half[best.row].harmonics[best.standing[best.standing <= half[best.row].harmonics.size] - 1]
+            best = best._replace(later=float(power.sum() / values[best.row, later].var()))
+        found.append(best)
     return min(found, key=rank, default=None)
 
 
@@ -214,7 +225,7 @@ def response_period(
         lines = _lines(time, values, frequency, periods, cycles)
         between = [line.unexplained(periods, float(v.var())) for line, v in zip(lines, values, strict=True)]
         worst = int(np.argmax(between))
-        added = _added(lines, values, channels, periods, level, time, frequency)
+        added = _added(time, values, frequency, periods, lines, level)
         verdict = CHOSEN if added is None else added.verdict(level)
         rows.append(
             {
@@ -227,7 +238,7 @@ def response_period(
                 "share": np.nan if added is None else added.share,
                 "contrast": np.nan if added is None else added.contrast,
                 "verdict": REST if between[worst] > LARGEST_BETWEEN else verdict,
-                "remark": "" if added is None else added.remark(periods, level),
+                "remark": "" if added is None else added.remark(channels[added.row], periods, level),
             }
         )
     table = pd.DataFrame(rows)
@@ -250,6 +261,25 @@ def even_times(time: np.ndarray, values: np.ndarray, frequency: float) -> np.nda
     few = min(TESTED_HARMONICS, resolved_harmonics(time, frequency, time.size))
     given, better = (fit_harmonics(t, values, frequency, few).variances for t in (time, even))
     return even if np.log(better / given).sum() < 0.0 else time
+
+
+def summary(evidence: "pd.DataFrame", periods: int) -> str:
+    """Return in words which response period of a driven system was chosen, and which lines were not enough."""
+    chosen = evidence.loc[evidence.periods == periods].iloc[0]
+    text = (
+        f"response period {periods} drive period{'s' if periods > 1 else ''}, chosen of 1 to {evidence.periods.max()}: "
+    )
+    text += f"it explains {chosen.explained:.2%} of the variance; "
+    text += f"{chosen.remark} (p = {chosen.p:.1g})" if periods > 1 else ""
+    unused = evidence[evidence.verdict.isin([TOO_SMALL, FOREIGN, FADING])]
+    if len(unused):
+        row = unused.loc[unused.share.idxmax()]
+        text += (
+            f"{'; ' if periods > 1 else ''}{row.remark}, or fold with periods={row.periods} if they are the response's"
+        )
+    elif periods == 1:
+        text += "no lines between those of the drive stand out"
+    return text
 
 
 def aperiodic(name: str, frequency: float, evidence: "pd.DataFrame") -> ValueError:
