@@ -29,11 +29,11 @@ FALSE_ALARM_RATE = 0.01
 # variance in the lines that a longer response period adds, which is also that of a subharmonic of 1 % of the signal's
 # amplitude. Neglected, a share s changes the other lines by about s. Least part of it in the later half.
 STANDS_OUT, LEAST_SHARE, LASTING = 20.0, 1e-4, 0.5
-# Lines of the mains [Hz], relative error of their frequency, and the fewest of their periods that show a line.
-MAINS = np.array([k * base for base in (50.0, 60.0) for k in range(1, 7)])
-MAINS_ERROR, MAINS_PERIODS = 2e-3, 4
-# Lines that are listed in a text.
-LISTED = 3
+# Lines of the mains [Hz], relative error of their frequency, fewest of their periods that show a line, and the lowest
+# frequency [Hz] of their aliases; lower ones are drifts.
+MAINS, MAINS_ERROR, MAINS_PERIODS, LOWEST_ALIAS = np.array([50.0, 60.0, 100.0, 120.0, 150.0, 180.0]), 1e-3, 4, 1.0
+# Lines that are listed in a text, and the smallest p-value that is.
+LISTED, SMALLEST_P = 3, 1e-16
 CHOSEN, REST, NOTHING_ADDED, MORE_LINES = "chosen", "not periodic", "adds no lines", "lacks lines"
 TOO_SMALL, FOREIGN, FADING = "lines too small", "mains or alias", "lines fade"
 PRIMES = (2, 3, 5, 7)
@@ -164,7 +164,7 @@ def _mains(frequency: float, count: int, step: float, duration: float) -> np.nda
         return np.zeros(count, dtype=bool)
     alias = np.abs(MAINS - np.rint(MAINS * step) / step)
     away = np.abs(frequency * (1 + np.arange(count))[:, None] - alias)
-    return np.any(away < 1.0 / duration + MAINS_ERROR * MAINS, axis=1)
+    return np.any((away < 1.0 / duration + MAINS_ERROR * MAINS) & (alias > LOWEST_ALIAS), axis=1)
 
 
 def _aliases(line: Lines, periods: int, per_period: float) -> np.ndarray:
@@ -269,8 +269,11 @@ def summary(evidence: "pd.DataFrame", periods: int) -> str:
     text = (
         f"response period {periods} drive period{'s' if periods > 1 else ''}, chosen of 1 to {evidence.periods.max()}: "
     )
-    text += f"it explains {chosen.explained:.2%} of the variance; "
-    text += f"{chosen.remark} (p = {chosen.p:.1g})" if periods > 1 else ""
+    text += (
+        f"{chosen.remark} (p {f'= {chosen.p:.1g}' if chosen.p > SMALLEST_P else f'< {SMALLEST_P:g}'})"
+        if periods > 1
+        else ""
+    )
     unused = evidence[evidence.verdict.isin([TOO_SMALL, FOREIGN, FADING])]
     if len(unused):
         row = unused.loc[unused.share.idxmax()]
@@ -285,10 +288,12 @@ def summary(evidence: "pd.DataFrame", periods: int) -> str:
 def aperiodic(name: str, frequency: float, evidence: "pd.DataFrame") -> ValueError:
     """Return the error of a recording that has no response period."""
     best = evidence.iloc[int(np.argmin(evidence["between"]))]
+    doubtful = evidence[evidence.remark.ne("") & evidence.p.lt(FALSE_ALARM_RATE) & evidence.between.le(LARGEST_BETWEEN)]
+    seen = f" With {doubtful.iloc[0].periods} drive periods, {doubtful.iloc[0].remark}." if len(doubtful) else ""
     return ValueError(
         f"recording: must be periodic, got {name!r}, in which no response period of 1 to {len(evidence)} drive periods "
         f"of {1.0 / frequency:.6g} s repeats: with the best one, of {best['periods']}, {best['between']:.1%} of the "
-        f"variance of {best['channel']!r} is between the lines of its spectrum. A chaotic response has periodic orbits "
-        "for `find_orbits`; otherwise record longer, check the frequency, select a steady part with `between`, or give "
-        "`periods`."
+        f"variance of {best['channel']!r} is between the lines of its spectrum.{seen} A chaotic response has periodic "
+        "orbits for `find_orbits`; otherwise record longer, check the frequency, select a steady part with `between`, "
+        "or give `periods`."
     )
