@@ -62,13 +62,15 @@ class Added(NamedTuple):
         """Return in words what lines there are, and what would be needed."""
         verdict = self.verdict(level)
         if verdict == NOTHING_ADDED:
-            return f"no lines stand out, with {STANDS_OUT:g} times the power of those beside"
+            return f"no lines have {STANDS_OUT:g} times the power of their neighbours"
         lines = self.foreign if verdict == FOREIGN else self.standing
         listed = ", ".join(str(Fraction(int(n), periods)) for n in lines[:LISTED])
         text = f"lines at {listed}{', …' if lines.size > LISTED else ''} of the drive's frequency in {channel!r}"
         if verdict == FOREIGN:
             return f"{text} may be those of the mains, or aliases of the drive's harmonics"
-        text += f" have {self.share:.1e} of its variance, and up to {self.contrast:.3g} times the power of those beside"
+        text += (
+            f" have {self.share:.1e} of its variance, and up to {self.contrast:.3g} times the power of their neighbours"
+        )
         if verdict == TOO_SMALL:
             return f"{text}; a share of {LEAST_SHARE:.0e} is needed"
         return f"{text}; they fade, to {self.later:.1e} in the later half" if verdict == FADING else text
@@ -288,7 +290,7 @@ def summary(evidence: "pd.DataFrame", periods: int) -> str:
 def aperiodic(name: str, frequency: float, evidence: "pd.DataFrame") -> ValueError:
     """Return the error of a recording that has no response period."""
     best = evidence.iloc[int(np.argmin(evidence["between"]))]
-    doubtful = evidence[evidence.remark.ne("") & evidence.p.lt(FALSE_ALARM_RATE) & evidence.between.le(LARGEST_BETWEEN)]
+    doubtful = evidence[evidence.verdict.isin([TOO_SMALL, FOREIGN, FADING])]
     seen = f" With {doubtful.iloc[0].periods} drive periods, {doubtful.iloc[0].remark}." if len(doubtful) else ""
     return ValueError(
         f"recording: must be periodic, got {name!r}, in which no response period of 1 to {len(evidence)} drive periods "
