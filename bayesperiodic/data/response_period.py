@@ -61,6 +61,8 @@ class Added(NamedTuple):
     def remark(self, channel: str, periods: int, level: float) -> str:
         """Return in words what lines there are, and what would be needed."""
         verdict = self.verdict(level)
+        if verdict == NOTHING_ADDED and self.standing.size + self.foreign.size:
+            return f"the lines that stand out are as likely by chance: p = {self.p:.1g}, below {level:.1g} is needed"
         if verdict == NOTHING_ADDED:
             return f"no lines have {STANDS_OUT:g} times the power of their neighbours"
         lines = self.foreign if verdict == FOREIGN else self.standing
