@@ -280,7 +280,7 @@ def summary(evidence: "pd.DataFrame", periods: int) -> str:
     )
     unused = evidence[evidence.verdict.isin([TOO_SMALL, FOREIGN, FADING])]
     if len(unused):
-        row = unused.loc[unused.share.idxmax()]
+        row = unused.sort_values("share").iloc[-1]
         text += (
             f"{'; ' if periods > 1 else ''}{row.remark}, or fold with periods={row.periods} if they are the response's"
         )
