@@ -129,10 +129,10 @@ class Lines(NamedTuple):
         power = self.harmonics[number - 1]
         p = float(fdtrc(2 * number.size, freedom, np.mean(power / (noise + floor))))
         nearest = self.rest[beside].mean(axis=1) + floor
-        stands, own = power > STANDS_OUT * nearest, ~foreign[number - 1]
-        share = float((power - nearest)[stands & own].sum() / variance)
+        stands, native = power > STANDS_OUT * nearest, ~foreign[number - 1]
+        share = float((power - nearest)[stands & native].sum() / variance)
         contrast = float((power / nearest)[stands].max(initial=0.0))
-        return Added(row, number[stands & own], number[stands & ~own], share, contrast, min(channels * p, 1.0))
+        return Added(row, number[stands & native], number[stands & ~native], share, contrast, min(channels * p, 1.0))
 
 
 def _lines(time: np.ndarray, values: np.ndarray, frequency: float, periods: int, cycles: int) -> list[Lines]:
@@ -196,7 +196,7 @@ def _added(
 
     later = time >= 0.5 * (time[0] + time[-1])
     fewer, half = int(np.ptp(time[later]) * frequency) // periods, None
-    found = []
+    weakest = []
     for divisor in [prime for prime in PRIMES if periods % prime == 0]:
         every = []
         for row, (line, signal) in enumerate(zip(lines, values, strict=True)):
@@ -208,8 +208,8 @@ def _added(
             half = half or _lines(time[later], values[:, later], frequency, periods, fewer)
             power = half[best.row].harmonics[best.standing[best.standing <= half[best.row].harmonics.size] - 1]
             best = best._replace(later=float(power.sum() / values[best.row, later].var()))
-        found.append(best)
-    return min(found, key=rank, default=None)
+        weakest.append(best)
+    return min(weakest, key=rank, default=None)
 
 
 def response_period(
