@@ -54,7 +54,16 @@ WITHOUT_RESULTS = {
     "docs/how_to/chaotic_recordings.md": {SETTING: ("a recording of 3,000 drive periods",)},
     "docs/how_to/export.md": {ELSEWHERE: ("0.23 with Python 3.11 and 1.x with later versions",)},
     "docs/how_to/noisy_inputs.md": {DEFINITION: ("warns from 0.3 on", "false-alarm rate of 1 %")},
-    "docs/how_to/period_doubled.md": {SETTING: ("response periods of 1 to 8 drive periods",)},
+    "docs/how_to/period_doubled.md": {
+        SETTING: ("response periods of 1 to 8 drive periods",),
+        DEFINITION: (
+            "at multiples of 1/P of the drive", "with a false-alarm rate of 1 % over all periods",
+            "only lines with 20 times the power", "They have at least 1e-4 of the channel",
+            "a subharmonic of 1 % of the signal", "not at 50, 60, 100, 120, 150 or 180 Hz",
+            "the tests allow 1 %", "where more than 0.5 % of",
+        ),
+        UNSTORED: ("Of 400 simulated recordings of period one",),
+    },
     "docs/how_to/priors.md": {DEFINITION: ("a spread of 0.7 is a factor of two",)},
     "docs/how_to/read_my_data.md": {SETTING: ("version 5 and 7.3", "grid points per period, 800 by default")},
     "docs/how_to/running.md": {

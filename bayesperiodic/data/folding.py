@@ -34,7 +34,7 @@ from bayesperiodic.data.recording_check import (
     sample_findings,
     signal_faults,
 )
-from bayesperiodic.data.response_period import FALSE_ALARM_RATE, FINENESS, aperiodic, response_period
+from bayesperiodic.data.response_period import FALSE_ALARM_RATE, FINENESS, aperiodic, even_times, response_period
 from bayesperiodic.data.steadiness import Steady, Windows, steady_part, windows
 
 if TYPE_CHECKING:
@@ -328,7 +328,9 @@ def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, 
     if frequency is None:
         driven = values[: signals.inputs]
         tracked = track_frequency(time, driven, drive)
+        time = even_times(time, driven, tracked)
         drive = refine_frequency(time, driven, tracked, resolved_harmonics(time, tracked, time.size))[0].frequency
+    time = even_times(time, values, drive)
     chosen, evidence = response_period(time, values, signals.channels, drive)
     later = time >= 0.5 * (time[0] + time[-1])
     if chosen is None and _cycles(time[later], drive) >= LATER_CYCLES:

@@ -539,8 +539,10 @@ class Recording(Result):
             Forcing periods per response period. "auto" tests 1 to 8, as far as the recording has three cycles of them,
             and stores the evidence in ``Experiment.period_test``. A period is refused where more than 0.5 % of a
             channel's variance is between the lines of its spectrum, noise apart that is as strong above half of the
-            resolved band. Of the others the longest one is taken whose lines are all needed: F-tests of those that its
-            divisors lack against the lines beside them, with a false-alarm rate of 1 % over all periods. If there is
+            resolved band. Of the others the longest one is taken whose lines are all needed: those that its divisors
+            lack are not chance (F-tests against the lines beside them, with a false-alarm rate of 1 % over all
+            periods), have 20 times the power of their neighbours, together 1e-4 of a channel's variance, do not fade
+            in the later half, and are not those of the mains or aliases of the drive's harmonics. If there is
             none, the later half is tested, with at least six cycles. Without ``frequency``, the drive period is that of
             the inputs.
         harmonics : int or mapping of str to int, optional
