@@ -9,55 +9,29 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, softmax
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic.data.faults import ChannelFaults, jumps, outliers_of
 from bayesperiodic.data.harmonics import (
-    MINIMUM_CYCLES,
     NEGLIGIBLE_PHASE,
     HarmonicFit,
     Pace,
     fit_harmonics,
-    guess_frequency,
     refine_frequency,
     resolved_harmonics,
     track_frequency,
 )
+from bayesperiodic.data.inspection import inspect
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
-from bayesperiodic.data.recording_check import (
-    SEVERITIES,
-    WRAPS,
-    Finding,
-    RecordingCheck,
-    bounded,
-    clock_findings,
-    cycle_findings,
-    refuse,
-    sample_findings,
-    signal_faults,
-)
+from bayesperiodic.data.recording_check import refuse
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, FINENESS, aperiodic, even_times, response_period
-from bayesperiodic.data.steadiness import Steady, Windows, steady_part, windows
+from bayesperiodic.data.signals import Signals, cycles_of, explains_more, first_guess, refuse_gaps
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# Steps of time that are gaps, in periods, if they are longer than so many usual steps; if the period is unknown,
-# in usual steps.
-GAP, USUAL_STEPS, MANY_STEPS = 0.25, 3.0, 30.0
 # Spreads of a channel whose squares and inverse squares are ordinary numbers, and grid points of a response period.
 MAXIMUM_POINTS = 1_000_000
-# A crossing counts after the signal was below minus this fraction of its standard deviation.
-HYSTERESIS = 0.25
-# Smallest relative step of the period, in itself and in standard errors.
-SMALLEST_PERIOD_STEP, SIGNIFICANT_PERIOD_STEP = 1e-3, 8.0
 MINIMUM_PERIODICITY = 0.5
 # Ratio of residual variances from which the estimated frequency is right, and the given one wrong.
 CLEARLY = 4.0
-# Difference of two phases [cycles] at the ends of a recording that selects other cycles.
-OTHER_CYCLES = 0.05
-# Largest relative change of an amplitude within half of a steady part.
-LARGEST_CHANGE = 0.1
-# Harmonics of the first mean period, from which outliers are left out.
-ROUGH_HARMONICS = 40
 # Response cycles of the later half of a recording that show a period which the whole has not.
 LATER_CYCLES = 6
 CROSSING, AUTO = "crossing", "auto"
@@ -72,31 +46,6 @@ LINES_NEAR_ZERO, WHITE_LINES, SLOW_LINES = 40, 8, 2
 # Correlation times in recording lengths, white floors relative to line 1, and line 0 of 1/f noise relative to line 1
 # if its spectrum is flat below a quarter of a line.
 CORRELATION_TIMES, FLOORS, ZERO_OF_PINK = (0.45, 0.1, 0.05, 0.025), (0.0, 0.01, 0.1), 2.75
-
-
-@dataclass(frozen=True)
-class Signals:
-    """Channels sampled at the same times."""
-
-    name: str  # of the recording, for messages
-    time: np.ndarray  # (samples,)
-    channels: tuple[str, ...]  # inputs first
-    values: np.ndarray  # (channels, samples)
-    inputs: int  # number of inputs
-
-    def __post_init__(self) -> None:
-        for i, (channel, values) in enumerate(zip(self.channels, self.values, strict=True)):
-            if np.ptp(values) == 0.0:
-                kind, remedy = "outputs", ""
-                if i < self.inputs:
-                    kind, remedy = "inputs", ", and write it in the model as a parameter with its value in `fixed`"
-                raise ValueError(
-                    f"{kind}[{channel!r}]: must vary, got the constant {values[0]:g}; leave the channel out{remedy}."
-                )
-
-    def part(self, samples: np.ndarray | slice) -> "Signals":
-        """Return the signals at the selected samples."""
-        return replace(self, time=self.time[samples], values=self.values[:, samples])
 
 
 def fold_signals(
@@ -171,150 +120,6 @@ def fold_signals(
     }
 
 
-@dataclass(frozen=True)
-class Inspection:
-    """Faults, steady part and mean period of signals."""
-
-    signals: Signals
-    faults: list[ChannelFaults]
-    findings: tuple[Finding, ...]
-    total: int = 0  # whole cycles
-    steady: Steady | None = None
-    fit: HarmonicFit | None = None  # of the steady part, at the estimated frequency
-    pace: Pace = Pace(0.0, 0, 0.0, False)
-    limit: int = 0  # of the harmonics
-    reason: str = ""  # why there is no steady part or no mean period
-
-
-def inspect(signals: Signals, periods: int, frequency: float | None, points: int) -> Inspection:
-    """Return what signals are like; without a steady part or a mean period, the reason."""
-    faults = [signal_faults(values) for values in signals.values]
-
-    def found(rate: float | None, limit: int = 0, used: slice = slice(0, signals.time.size)) -> list[Finding]:
-        rows = zip(signals.channels, signals.values, faults, strict=True)
-        every = [f for c, v, fault in rows for f in sample_findings(c, signals.time, v, fault, rate, limit, used)]
-        return every + [*clock_findings(signals.time, rate)]
-
-    def sorted_(findings: list[Finding]) -> tuple[Finding, ...]:
-        return tuple(sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity)))
-
-    if any(fault.wrap for fault in faults):
-        return Inspection(signals, faults, sorted_(found(None)), reason=_wrapped(signals.name, found(None)))
-    moving = np.ones(signals.time.size, dtype=bool)
-    for fault in faults:
-        for part in fault.stuck:
-            moving[part] = False
-    calm = replace(signals, values=bounded(signals.values))
-    calm = calm if moving.all() else calm.part(np.flatnonzero(moving))
-    try:
-        fundamental = _first_guess(calm, frequency, periods)
-        _refuse_gaps(signals, fundamental)
-        tracked = _tracked(calm, fundamental, frequency is not None)
-    except ValueError as error:
-        return Inspection(signals, faults, sorted_(found(None)), reason=str(error))
-    total = int(_cycles(signals.time, tracked))
-    sound = _sound(signals, calm, faults, np.flatnonzero(moving), tracked, points)
-    some = signals if sound.size == signals.time.size else signals.part(sound)
-    every = windows(some.time, some.values, tracked)
-    steady = steady_part(every)
-    if steady is not None and frequency is None and steady.level != (0, sound.size):
-        # The frequency of a part that ramps is not that of the steady one.
-        part = some.part(steady.samples)
-        few = min(ROUGH_HARMONICS, resolved_harmonics(part.time, tracked, points))
-        tracked = refine_frequency(part.time, part.values, tracked, few)[0].frequency
-        every = windows(some.time, some.values, tracked)
-        steady = steady_part(every)
-    if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
-        return Inspection(signals, faults, sorted_(found(tracked)), total, reason=_unsteady(signals, every))
-    steady = steady.among(sound)
-    used = signals.part(steady.samples)
-    limit = resolved_harmonics(used.time, tracked, points)
-    fit, pace = refine_frequency(used.time, used.values, tracked, limit)
-    residuals = fit.residuals
-    here = sound[(sound >= steady.samples.start) & (sound < steady.samples.stop)]
-    if here.size < used.time.size:
-        near = fit_harmonics(signals.time[here], signals.values[:, here], tracked, limit).amplitudes
-        residuals = used.values - _fourier.at_times(near, tracked * used.time)
-    for fault, rest, values in zip(faults, residuals, used.values, strict=True):
-        place = outliers_of(rest, used.time * fit.frequency, values, fault.step)
-        fault.outliers = place + steady.samples.start
-    findings = found(fit.frequency, limit, steady.samples)
-    findings += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
-    return Inspection(signals, faults, sorted_(findings), total, steady, fit, pace, limit)
-
-
-def _wrapped(name: str, findings: list[Finding]) -> str:
-    return f"recording: must be without wraps, got {name!r}: {'. '.join(str(f) for f in findings if f.kind == WRAPS)}."
-
-
-def _sound(
-    signals: Signals, calm: Signals, faults: list[ChannelFaults], moving: np.ndarray, fundamental: float, points: int
-) -> np.ndarray:
-    """Return the numbers of the samples without outliers from a first mean period, of those that are not stuck."""
-    if not jumps(signals.values):
-        return moving
-    limit = min(resolved_harmonics(calm.time, fundamental, points), ROUGH_HARMONICS)
-    fit = fit_harmonics(calm.time, calm.values, fundamental, limit)
-    bad = np.zeros(moving.size, dtype=bool)
-    for fault, values, near, rest in zip(faults, signals.values[:, moving], calm.values, fit.residuals, strict=True):
-        bad[outliers_of(values - near + rest, calm.time * fundamental, values, fault.step)] = True
-    return moving[~bad]
-
-
-def _unsteady(signals: Signals, every: Windows) -> str:
-    size = every.sizes
-    worst = int(np.argmax(np.ptp(size, axis=0) / size.mean(axis=0)))
-    low, high = size[:, worst].min(), size[:, worst].max()
-    return (
-        f"recording: must have a steady part of {MINIMUM_CYCLES} cycles, got {signals.name!r}, in which the amplitude of "
-        f"{signals.channels[worst]!r} changes between {low / high:.0%} and 100 % of its largest value throughout; record "
-        "at a constant amplitude, or select a part by `between`."
-    )
-
-
-def summary(name: str, seen: Inspection) -> RecordingCheck:
-    """Return what was seen as the result of `Recording.check`."""
-    import pandas as pd
-
-    time, part = seen.signals.time, seen.steady
-    bad = {
-        channel: {
-            "outliers": fault.outliers,
-            "stuck": np.concatenate([np.arange(s.start, s.stop) for s in fault.stuck] or [np.zeros(0, dtype=int)]),
-            "clipped": np.concatenate([fault.low, fault.high]),
-        }
-        for channel, fault in zip(seen.signals.channels, seen.faults, strict=True)
-    }
-    named = {(finding.channel, finding.kind) for finding in seen.findings}
-    bad = {c: {kind: v if (c, kind) in named else v[:0] for kind, v in each.items()} for c, each in bad.items()}
-    rows = [
-        {
-            "lowest": values.min(),
-            "highest": values.max(),
-            "resolution": fault.step,
-            "bits": np.log2(np.ptp(values) / fault.step + 1.0) if fault.step else np.nan,
-            **{kind: places.size for kind, places in bad[channel].items()},
-            "wraps": fault.wraps.size,
-        }
-        for channel, values, fault in zip(seen.signals.channels, seen.signals.values, seen.faults, strict=True)
-    ]
-    step = np.diff(time)
-    step = step[step <= USUAL_STEPS * np.median(step)]
-    return RecordingCheck(
-        name,
-        pd.DataFrame(rows, index=[*seen.signals.channels]),
-        seen.findings,
-        seen.fit.frequency if seen.fit else np.nan,
-        round(np.ptp(time[part.samples]) * seen.fit.frequency) if part and seen.fit else 0,
-        seen.total,
-        float(time[part.samples.start]) if part else float(time[0]),
-        float(time[part.samples.stop - 1]) if part else float(time[-1]),
-        float(step.std() / np.median(step)),
-        bad,
-        seen.reason,
-    )
-
-
 def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, pd.DataFrame]":
     """Return the response period in drive periods, and its evidence, of the signals or else of their later half."""
     if frequency is None and not signals.inputs:
@@ -322,8 +127,8 @@ def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, 
             f"frequency: must be given for periods={AUTO!r}, because {signals.name!r} has no input that shows the "
             "drive period, got None."
         )
-    drive = _first_guess(signals, frequency, 1)
-    _refuse_gaps(signals, drive)
+    drive = first_guess(signals, frequency, 1)
+    refuse_gaps(signals, drive)
     time, values = signals.time, signals.values
     if frequency is None:
         driven = values[: signals.inputs]
@@ -333,82 +138,12 @@ def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, 
     time = even_times(time, values, drive)
     chosen, evidence = response_period(time, values, signals.channels, drive)
     later = time >= 0.5 * (time[0] + time[-1])
-    if chosen is None and _cycles(time[later], drive) >= LATER_CYCLES:
+    if chosen is None and cycles_of(time[later], drive) >= LATER_CYCLES:
         chosen, again = response_period(time[later], values[:, later], signals.channels, drive, LATER_CYCLES)
         evidence = evidence if chosen is None else again
     if chosen is None:
         raise aperiodic(signals.name, drive, evidence)
     return chosen, evidence
-
-
-def _first_guess(signals: Signals, frequency: float | None, periods: int) -> float:
-    remedy = "give the forcing frequency"
-    time, values = _longest_stretch(signals)
-    if frequency is not None:
-        fundamental: float | None = _checks.positive("frequency", frequency) / periods
-        remedy = f"check frequency = {frequency!r} Hz and periods = {periods}"
-    elif signals.inputs:
-        guess = guess_frequency(time, values[: signals.inputs])
-        fundamental = guess / periods if guess else None
-    else:
-        fundamental = guess_frequency(time, values)
-    if fundamental is None or _cycles(signals.time, fundamental) < MINIMUM_CYCLES:
-        period = "no period" if fundamental is None else f"{_cycles(signals.time, fundamental):.2f} cycles"
-        raise ValueError(
-            f"recording: must have at least {MINIMUM_CYCLES} cycles, got {period} in {signals.name!r} of "
-            f"{np.ptp(signals.time):g} s; record longer, or {remedy}."
-        )
-    return fundamental
-
-
-def _longest_stretch(signals: Signals) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times and values of the longest part without gaps of many steps."""
-    step = np.diff(signals.time)
-    edges = np.concatenate([[0], np.flatnonzero(step > MANY_STEPS * np.median(step)) + 1, [signals.time.size]])
-    longest = int(np.argmax(np.diff(edges)))
-    part = slice(edges[longest], edges[longest + 1])
-    return signals.time[part], signals.values[:, part]
-
-
-def _cycles(time: np.ndarray, fundamental: float) -> float:
-    """Return the number of cycles, the last sample's step included."""
-    return float(np.ptp(time) * time.size / (time.size - 1) * fundamental * (1 + 1e-9))
-
-
-def gaps(time: np.ndarray, period: float) -> np.ndarray:
-    """Return the last samples before gaps."""
-    step = np.diff(time)
-    return np.flatnonzero(step > max(GAP * period, USUAL_STEPS * np.median(step)))
-
-
-def _refuse_gaps(signals: Signals, fundamental: float) -> None:
-    if (ends := gaps(signals.time, 1.0 / fundamental)).size:
-        first, last = signals.time[ends[0]], signals.time[ends[0] + 1]
-        raise ValueError(
-            f"recording: must have no gap longer than {GAP:g} periods, got {signals.name!r} without samples from "
-            f"{first:g} to {last:g} s (period {1.0 / fundamental:g} s); fold the parts that `split` returns."
-        )
-
-
-def _tracked(signals: Signals, fundamental: float, given: bool) -> float:
-    """Return the frequency by which cycles are compared: the estimated one, if the given one is clearly another one."""
-    time, values = signals.time, signals.values
-    tracked = track_frequency(time, values, fundamental)
-    if given:
-        few = min(10, resolved_harmonics(time, max(tracked, fundamental), time.size))
-        near = abs(tracked - fundamental) * np.ptp(time) < OTHER_CYCLES
-        if near or not _explains_more(*(fit_harmonics(time, values, rate, few) for rate in (tracked, fundamental))):
-            return fundamental
-    if (cycles := _cycles(time, tracked)) < MINIMUM_CYCLES:
-        raise ValueError(
-            f"recording: must have at least {MINIMUM_CYCLES} cycles, got {cycles:.2f} cycles of {tracked:.6g} Hz in "
-            f"{signals.name!r}; record longer."
-        )
-    return tracked
-
-
-def _explains_more(fit: HarmonicFit, other: HarmonicFit) -> bool:
-    return bool(np.sum(np.log(fit.variances / other.variances)) < 0.0)
 
 
 def _refuse_frequency(estimated: HarmonicFit, given: HarmonicFit, pace: Pace, duration: float, periods: int) -> None:
@@ -417,7 +152,7 @@ def _refuse_frequency(estimated: HarmonicFit, given: HarmonicFit, pace: Pace, du
     # Few cycles have too few degrees of freedom for a test, but noise of any kind would not shrink so much.
     shrinks = np.mean(np.log(given.variances / estimated.variances)) > np.log(CLEARLY)
     clear = shrinks and abs(difference) * duration > NEGLIGIBLE_PHASE
-    if clear or (_explains_more(estimated, given) and pace.differs(difference, duration)):
+    if clear or (explains_more(estimated, given) and pace.differs(difference, duration)):
         raise ValueError(
             f"frequency: must be that of the recording, which is estimated as {estimated.frequency * periods:.9g} Hz "
             f"with a standard error of {pace.se * periods:.1g} Hz, got {given.frequency * periods:.9g} Hz, whose phase "
@@ -647,61 +382,3 @@ def _chosen(harmonics: int | Mapping[str, int] | None, names: tuple[str, ...], l
 def _power(variance: np.ndarray) -> float:
     """Return the variance of a signal whose complex amplitudes have these variances."""
     return float(variance[0] + 0.5 * variance[1:].sum())
-
-
-def parts(time: np.ndarray, signal: np.ndarray) -> list[slice]:
-    """Return the parts of at least three cycles between gaps of time and steps of the signal's frequency."""
-    rising = _rising(time, signal)
-    if rising.size < 2:
-        return [slice(0, time.size)]
-    period = float(np.median(np.diff(time[rising])))
-    edges = np.concatenate([[0], gaps(time, period) + 1, [time.size]])
-    pieces = []
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
-        inside = first + _rising(time[first:last], signal[first:last])
-        steps = inside[_steps(time, signal, inside)]
-        bounds = [first, *steps.tolist(), last]
-        pieces += [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-    cycles = [np.searchsorted(rising, part.stop) - np.searchsorted(rising, part.start) for part in pieces]
-    return [part for part, count in zip(pieces, cycles, strict=True) if count > MINIMUM_CYCLES]
-
-
-def _rising(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
-    """Return the samples at which the signal rises above its mean, which it must have left by the hysteresis."""
-    centred = signal - signal.mean()
-    level = HYSTERESIS * centred.std()
-    outside = np.flatnonzero(np.abs(centred) > level)
-    above = centred[outside] > 0.0
-    return outside[1:][above[1:] & ~above[:-1]]
-
-
-def _steps(time: np.ndarray, signal: np.ndarray, rising: np.ndarray) -> list[int]:
-    """Return the numbers of the crossings at which the period changes, by binary segmentation of its logarithm."""
-    if rising.size < 2 * MINIMUM_CYCLES + 2:
-        return []
-    level = signal[rising[0] : rising[-1] + 1].mean()
-    level += HYSTERESIS * signal[rising[0] : rising[-1] + 1].std()
-    fraction = (signal[rising] - level) / np.maximum(signal[rising] - signal[rising - 1], np.finfo(float).tiny)
-    crossing = time[rising] - np.clip(fraction, 0.0, 1.0) * (time[rising] - time[rising - 1])
-    period = np.log(np.diff(crossing))
-    noise = max(float(np.median(np.abs(np.diff(period)))), 1e-4)
-    # A single odd period, as at a jump of the phase, is no step.
-    mirrored = np.concatenate([period[1:2], period, period[-2:-1]])
-    period = np.median([mirrored[:-2], period, mirrored[2:]], axis=0)
-    steps, stack = [], [(0, period.size)]
-    while stack:
-        first, last = stack.pop()
-        size = last - first
-        number = np.arange(MINIMUM_CYCLES, size - MINIMUM_CYCLES + 1)
-        if not number.size:
-            continue
-        segment = period[first:last]
-        before = np.cumsum(segment)[number - 1]
-        difference = before / number - (segment.sum() - before) / (size - number)
-        score = np.abs(difference) * np.sqrt(number * (size - number) / size)
-        best = int(np.argmax(score))
-        if score[best] > SIGNIFICANT_PERIOD_STEP * noise and abs(difference[best]) > SMALLEST_PERIOD_STEP:
-            middle = first + int(number[best])
-            steps.append(middle)
-            stack += [(first, middle), (middle, last)]
-    return sorted(steps)

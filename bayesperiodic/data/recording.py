@@ -13,9 +13,11 @@ from bayesperiodic._io import Result
 from bayesperiodic._linalg import one_thread
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.files import CSV, MAT, NPZ, Format
-from bayesperiodic.data.folding import AUTO, Signals, automatic_periods, fold_signals, inspect, parts, summary
+from bayesperiodic.data.folding import AUTO, automatic_periods, fold_signals
+from bayesperiodic.data.inspection import inspect, summary
 from bayesperiodic.data.layout import Layout, without_missing
 from bayesperiodic.data.recording_check import RecordingCheck
+from bayesperiodic.data.signals import Signals, parts
 from bayesperiodic.data.times import seconds
 from bayesperiodic.data.units import Units
 
@@ -321,15 +323,15 @@ class Recording(Result):
     def check(self, frequency: float | None = None, *, periods: int = 1) -> RecordingCheck:
         """Look for faults of the sensors and the clock, and for the steady part.
 
-        Samples: values that wrap at the range of a sensor (2π, 360, 1, or a power of two of its steps), stuck and clipped
-        stretches, outliers (more than eight standard deviations from the mean period, with jumps before and after, not
-        in every cycle), gaps. Cycles: ramps, the rest of a transient, steps of amplitude and phase, slow changes,
-        beating. `fold` makes the same check, leaves ramps and transients out, warns of serious findings and refuses
-        ruinous ones.
+        Samples: values that wrap at the range of a sensor (2π, 360, 1, or a power of two of its steps), stuck and
+        clipped stretches, outliers (more than eight standard deviations from the mean period, with jumps before and
+        after, not in every cycle), gaps. Cycles: ramps, the rest of a transient, steps of amplitude and phase, slow
+        changes, beating. `fold` makes the same check, leaves ramps and transients out, warns of serious findings and
+        refuses ruinous ones.
 
-        The rest of a transient is exp(−t/T) times a cosine with unknown T and frequency in all channels; cycles are left
-        out until its expected bias of all amplitudes together is below 0.3 standard errors, at most half of them, and
-        what remains is added to ``amplitude_variance``.
+        The rest of a transient is exp(−t/T) times a cosine with unknown T and frequency in all channels; cycles are
+        left out until its expected bias of all amplitudes together is below 0.3 standard errors, at most half of them,
+        and what remains is added to ``amplitude_variance``.
 
         Parameters
         ----------
@@ -380,10 +382,10 @@ class Recording(Result):
         ValueError
             If there is none.
         """
-        found = self.check(frequency, periods=periods)
-        if found.reason:
-            raise ValueError(found.reason)
-        return self.between(found.start, found.stop)
+        check = self.check(frequency, periods=periods)
+        if check.reason:
+            raise ValueError(check.reason)
+        return self.between(check.start, check.stop)
 
     def without(
         self,
@@ -419,14 +421,11 @@ class Recording(Result):
             _checks.one_of("channel", channel, channels)
         wanted = {"outliers": outliers, "stuck": stuck, "clipped": clipped}
         bad = np.zeros(self.time.size, dtype=bool)
-        found = self.check(frequency).bad if any(value is True for value in wanted.values()) else {}
+        known = self.check(frequency).bad if any(value is True for value in wanted.values()) else {}
         for kind, value in wanted.items():
-            if isinstance(value, bool):
-                for name, places in found.items():
-                    if value and channel in (None, name):
-                        bad[places[kind]] = True
-                continue
-            mask = np.asarray(value)
+            mask = np.zeros(bad.shape, dtype=bool) if isinstance(value, bool) else np.asarray(value)
+            for name in [name for name in known if value is True and channel in (None, name)]:
+                mask[known[name][kind]] = True
             if mask.dtype != bool or mask.shape != bad.shape:
                 raise ValueError(
                     f"{kind}: must be True, False or a bool array of shape {bad.shape}, got {mask.dtype} of shape "

@@ -121,8 +121,8 @@ def effect_of(time: np.ndarray, values: np.ndarray, bad: np.ndarray, frequency: 
     for order in (*FITTED_HARMONICS, 0):
         if 0 < order <= harmonics and used.size > 6 * order and np.ptp(used) * frequency > 2.0:
             moments = _fourier.sums(np.ones((1, used.size)), frequency * used, 2 * order)[0]
-            size = np.linalg.eigvalsh(toeplitz(moments[: 2 * order + 1]))
-            if size[0] * LARGEST_CONDITION > size[-1]:
+            spectrum = np.linalg.eigvalsh(toeplitz(moments[: 2 * order + 1]))
+            if spectrum[0] * LARGEST_CONDITION > spectrum[-1]:
                 break
     if not order:
         return UNKNOWN
@@ -135,8 +135,8 @@ def effect_of(time: np.ndarray, values: np.ndarray, bad: np.ndarray, frequency: 
     sums = np.abs(_fourier.sums(wrong[None], frequency * time, order)[0]) / time.size
     weights = np.r_[1.0, np.full(order, 2.0)]
     size = float(np.sqrt(weights @ sums**2))
-    error = max(noise, 1e-9 * float(np.abs(values[~bad]).max())) / np.sqrt(time.size)
-    return Effect(size / error, size / float(predicted.std()), predicted, noise)
+    scatter = max(noise, 1e-9 * float(np.abs(values[~bad]).max())) / np.sqrt(time.size)
+    return Effect(size / scatter, size / float(predicted.std()), predicted, noise)
 
 
 def times_of(time: np.ndarray, samples: np.ndarray) -> np.ndarray:
@@ -171,14 +171,15 @@ def sample_findings(
     if fault.wrap:
         yield Finding(
             WRAPS, channel, RUINOUS, times_of(time, fault.wraps), fault.wraps.size, fault.wraps.size / total, np.nan,
-            f"{channel} jumps by {fault.wrap:.6g} {fault.wraps.size} times, first {_when(times_of(time, fault.wraps))}: "
-            "the sensor wraps at its range",
+            f"{channel} jumps by {fault.wrap:.6g} {fault.wraps.size} times, first "
+            f"{_when(times_of(time, fault.wraps))}: the sensor wraps at its range",
             f"recording.unwrapped({channel!r}, {fault.wrap:.6g}) removes the jumps",
         )  # fmt: skip
         return
     bad = np.zeros(total, dtype=bool)
-    for samples in (*fault.stuck, fault.low, fault.high, fault.outliers):
-        bad[samples] = True
+    for part in fault.stuck:
+        bad[part] = True
+    bad[np.concatenate([fault.low, fault.high, fault.outliers])] = True
     if not bad.any():
         return
     every = effect_of(time[used], values[used], bad[used], frequency, harmonics) if frequency else UNKNOWN
@@ -188,8 +189,7 @@ def sample_findings(
         every = replace(every, predicted=predicted)
 
     def finding(kind: str, samples: np.ndarray, what: str) -> Finding:
-        only = np.zeros(total, dtype=bool)
-        only[samples] = True
+        only = np.isin(np.arange(total), samples)
         own = every
         if every.predicted.size:
             kept = np.where(bad & ~only, every.predicted, values)
@@ -211,15 +211,17 @@ def sample_findings(
         level = ", ".join(f"{values[part.start]:.6g}" for part in stuck[:3])
         yield finding("stuck", samples, f"is stuck at {level}")
     clipped = [
-        (end, sign) for end, sign in ((fault.low, -1.0), (fault.high, 1.0)) if end.size and _beyond(every, values, end, sign)
+        (end, sign)
+        for end, sign in ((fault.low, -1.0), (fault.high, 1.0))
+        if end.size and _beyond(every, values, end, sign)
     ]
     if clipped:
         samples = np.sort(np.concatenate([end for end, _ in clipped]))
         level = " and ".join(f"{values[end[0]]:.6g}" for end, _ in clipped)
         yield finding("clipped", samples, f"is clipped at {level}")
     if fault.outliers.size:
-        level = np.unique(values[fault.outliers])
-        which = f"reads {level[0]:.6g}" if level.size == 1 else f"has outliers between {level[0]:.6g} and {level[-1]:.6g}"
+        low, high = values[fault.outliers].min(), values[fault.outliers].max()
+        which = f"reads {low:.6g}" if low == high else f"has outliers between {low:.6g} and {high:.6g}"
         yield finding("outliers", fault.outliers, which)
 
 
@@ -262,8 +264,9 @@ def cycle_findings(
             f"{what} {place:.6g} s; {start:.6g} to {stop:.6g} s are used ({cycles} of {total} cycles)",
         )  # fmt: skip
     if steady.bias > ALLOWED_BIAS:
+        severity = SERIOUS if steady.bias > SERIOUS_BIAS else HARMLESS
         yield Finding(
-            "transient", "", SERIOUS if steady.bias > SERIOUS_BIAS else HARMLESS, np.array([[start, stop]]), cycles, 1.0,
+            "transient", "", severity, np.array([[start, stop]]), cycles, 1.0,
             steady.bias, f"a rest of the transient is in the part used, {start:.6g} to {stop:.6g} s, and biases the "
             f"amplitudes by {steady.bias:.2g} standard errors", "record longer, or begin later with recording.between",
         )  # fmt: skip
@@ -307,8 +310,8 @@ def _steps(channels: list[str], time: np.ndarray, part: Windows, frequency: floa
                 delay = float(size[k]) / frequency
                 samples = delay * (time.size - 1) / float(np.ptp(time))
                 text = (
-                    f"the phase of {channel} steps by {360.0 * size[k]:.3g}° ({delay:.3g} s, {abs(samples):.3g} samples) at "
-                    f"about {at:.6g} s: samples were lost, or the clock or the drive stepped"
+                    f"the phase of {channel} steps by {360.0 * size[k]:.3g}° ({delay:.3g} s, {abs(samples):.3g} "
+                    f"samples) at about {at:.6g} s: samples were lost, or the clock or the drive stepped"
                 )
             else:
                 text = f"the amplitude of {channel} steps by {np.expm1(size[k]):+.1%} at about {at:.6g} s"
@@ -380,8 +383,9 @@ class RecordingCheck(Result):
     name : str
         Of the recording.
     table : DataFrame
-        A row for each channel: ``lowest`` and ``highest`` value, ``resolution`` (step of quantised values, 0 if they are
-        not), ``bits`` that the range uses, numbers of ``clipped``, ``stuck`` and ``outliers`` samples and of ``wraps``.
+        A row for each channel: ``lowest`` and ``highest`` value, ``resolution`` (step of quantised values, 0 if they
+        are not), ``bits`` that the range uses, numbers of ``clipped``, ``stuck`` and ``outliers`` samples and of
+        ``wraps``.
     findings : tuple of Finding
         The worst ones first.
     frequency : float

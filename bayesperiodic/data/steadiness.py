@@ -30,8 +30,8 @@ FEWEST_FOR_TRANSIENT, SIGNIFICANT_SLOPE = 6, 4.0
 SMALLEST_DISTANCE, SMALLEST_NOISE = 1e-9, 1e-6
 # Bias of the mean amplitudes by a transient that is allowed, in standard errors of all together.
 ALLOWED_BIAS = 0.3
-# Probability of a transient that the ends do not show, before the data.
-PROBABLE = 0.1
+# Probability of a rest of a transient before the data, where the start was left out, and where it was not.
+PROBABLE, IMPROBABLE = 0.9, 0.1
 # Decay times of transients, in cycles and relative to the recording, their number, and the number of frequencies.
 SHORTEST_DECAY, LONGEST_DECAY, DECAYS, FREQUENCIES = 0.3, 1.0 / 6.0, 12, 13
 # Decay times in which a transient is compared with noise, and most places of the recording with which it is compared.
@@ -51,8 +51,8 @@ class Windows:
 
     def chosen(self, used: "slice | list[int]") -> "Windows":
         """Return the windows with these indices."""
-        every = (v[used] for v in (self.first, self.last, self.place))
-        return Windows(*every, self.overlap, self.cycles, self.amplitudes[used])
+        first, last, place = (array[used] for array in (self.first, self.last, self.place))
+        return Windows(first, last, place, self.overlap, self.cycles, self.amplitudes[used])
 
     def apart(self) -> "Windows":
         """Return windows that do not overlap, the last one among them."""
@@ -107,7 +107,9 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     amplitudes[:, 1:] *= 2.0
     first, last = edges[: count - fine + 1].copy(), stops[fine - 1 :]
     # Whole cycles before the first of many windows of several cycles are in it; its amplitudes are without them.
-    first[0] -= np.count_nonzero(((time[-1] - time[: first[0]]) * fundamental + 1e-9).astype(int) < int(duration * fundamental))
+    first[0] -= np.count_nonzero(
+        ((time[-1] - time[: first[0]]) * fundamental + 1e-9).astype(int) < int(duration * fundamental)
+    )
     return Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2))
 
 
@@ -141,7 +143,9 @@ def steady_part(every: Windows) -> Steady | None:
     level = (int(part.first[0]), int(part.last[-1]))
     first, bias, squares = 0, 0.0, np.zeros(part.amplitudes.shape[1:])
     if len(part.first) >= FEWEST_FOR_TRANSIENT:
-        first, bias, squares = _after_transient(part)
+        first, bias, squares = _after_transient(
+            part, PROBABLE if part.place[0] - every.place[0] >= part.overlap else IMPROBABLE
+        )
     part = part.chosen(slice(first, None))
     change = np.array([_change(half) for half in np.array_split(part.sizes, 2)])
     return Steady(part, slice(int(part.first[0]), int(part.last[-1])), level, bias, squares, change)
@@ -200,20 +204,22 @@ def _trimmed(part: Windows, usual: Callable[..., Any] | None = None) -> tuple[in
     return first, last
 
 
-def transient_bias(shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def transient_bias(shape: np.ndarray, probability: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the bias of means over cycles k, k + 1, … by a transient, in standard errors, and its expected squares.
 
-    They are (cycles,) and (cycles, components), for the components (cycles, components) of the amplitudes. A transient of linear
-    decay is exp(−t/T) times a cosine and a sine, with unknown T and frequency, in all components; its sizes have a
-    normal prior of that variance which makes the data most probable. What noise does at the other end of the recording
-    is no transient. The mean squares are averages over all T and frequencies by their probabilities, and over no
-    transient, whose probability before the data is 1 − PROBABLE.
+    They are (cycles,) and (cycles, components), for the components (cycles, components) of the amplitudes. A transient
+    of linear decay is exp(−t/T) times a cosine and a sine, with unknown T and frequency, in all components; its sizes
+    have a normal prior of that variance which makes the data most probable. What noise does at the other end of the
+    recording is no transient. The averages are over all T and frequencies by their probabilities, and over no
+    transient; before the data, one has this probability.
     """
     count = len(shape)
     step = np.diff(shape, axis=0)
     noise = np.maximum(np.sqrt(np.mean(step[count // 3 :] ** 2, axis=0) / 2.0), SMALLEST_NOISE)
-    scaled = (shape - shape.mean(axis=0)) / noise
-    share = _independent(step / noise) / shape.shape[1]
+    # Components without noise, as of a computed input, tell nothing about the others.
+    noisy = noise > SMALLEST_NOISE if (noise > SMALLEST_NOISE).any() else np.ones(noise.size, dtype=bool)
+    scaled = ((shape - shape.mean(axis=0)) / noise)[:, noisy]
+    share = _independent((step / noise)[:, noisy]) / scaled.shape[1]
     cycle, remaining = np.arange(count, dtype=float), np.arange(count, 0, -1.0)
     gains, means, variances = [], [], []
     for decay in np.geomspace(SHORTEST_DECAY, max(LONGEST_DECAY * count, 2.0 * SHORTEST_DECAY), DECAYS):
@@ -230,19 +236,23 @@ def transient_bias(shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             usual = max(float(np.mean(behind**2)), 1.0)
             ratio = max(float(np.mean(ahead**2)) / usual, 1.0)
             free, known = ahead.size * share, behind.size * share
-            gains.append(0.5 * ((free + known) * np.log((free * ratio + known) / (free + known)) - free * np.log(ratio)))
+            gains.append(
+                0.5 * ((free + known) * np.log((free * ratio + known) / (free + known)) - free * np.log(ratio))
+            )
             # The transient ends at zero, so that its mean is the bias.
             later = np.cumsum(course[::-1], axis=0)[::-1] / remaining[:, None] @ np.linalg.pinv(root)
             kept = 1.0 - 1.0 / ratio
             means.append(kept * later @ ahead)
             variances.append(kept * usual * np.sum(later**2, axis=1))
     weight = np.exp(np.array(gains) - max(gains))
-    weight /= weight.sum() + (1.0 / PROBABLE - 1.0) * len(gains) * np.exp(-max(gains))
+    weight /= weight.sum() + (1.0 / probability - 1.0) * len(gains) * np.exp(-max(gains))
     mean = np.einsum("m,mkd->kd", weight, np.array(means))
     spread = np.einsum("m,mkd->kd", weight, np.array(means) ** 2) - mean**2 + (weight @ np.array(variances))[:, None]
     # The mean in the worst direction of all components, and its uncertainty in any one of them.
     total = (np.sum(mean**2, axis=1) + np.mean(spread, axis=1)) * remaining
-    return np.sqrt(total), (mean**2 + spread) * noise**2
+    squares = np.zeros(shape.shape)
+    squares[:, noisy] = (mean**2 + spread) * noise[noisy] ** 2
+    return np.sqrt(total), squares
 
 
 def _independent(steps: np.ndarray) -> float:
@@ -256,16 +266,18 @@ def _independent(steps: np.ndarray) -> float:
     return float(np.clip(np.median(np.diag(products)) ** 2 / square, 1.0, steps.shape[1]))
 
 
-def _after_transient(part: Windows) -> tuple[int, float, np.ndarray]:
+def _after_transient(part: Windows, probability: float) -> tuple[int, float, np.ndarray]:
     """Return the first window to use, the bias [standard errors] then, and its expected squares by amplitude."""
     shape = part.amplitudes
     count, channels, harmonics = shape.shape
     components = np.concatenate([shape.real, shape.imag[:, :, 1:]], axis=2)
-    bias, squares = transient_bias(components.reshape(count, -1))
+    bias, squares = transient_bias(components.reshape(count, -1), probability)
     bias = bias[: count - MINIMUM_CYCLES + 1]
     allowed = np.flatnonzero(bias[: count // 2 + 1] <= ALLOWED_BIAS)
     # If half of the cycles has more bias, the mean square error of what is biased is least.
-    first = int(allowed[0]) if allowed.size else int(np.argmin((1.0 + bias**2) / np.arange(count, MINIMUM_CYCLES - 1, -1)))
+    first = (
+        int(allowed[0]) if allowed.size else int(np.argmin((1.0 + bias**2) / np.arange(count, MINIMUM_CYCLES - 1, -1)))
+    )
     by_part = squares[first].reshape(channels, -1)
     by_harmonic = by_part[:, :harmonics].copy()
     by_harmonic[:, 1:] += by_part[:, harmonics:]
