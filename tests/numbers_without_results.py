@@ -53,6 +53,9 @@ WITHOUT_RESULTS = {
     },
     "docs/how_to/chaotic_recordings.md": {SETTING: ("a recording of 3,000 drive periods",)},
     "docs/how_to/export.md": {ELSEWHERE: ("0.23 with Python 3.11 and 1.x with later versions",)},
+    "docs/how_to/good_recording.md": {
+        DEFINITION: ("biases them by more than 5 % of the signal", "jumps by 2π, 360, 1, or the range"),
+    },
     "docs/how_to/noisy_inputs.md": {DEFINITION: ("warns from 0.3 on", "false-alarm rate of 1 %")},
     "docs/how_to/period_doubled.md": {
         SETTING: ("response periods of 1 to 8 drive periods",),

@@ -42,6 +42,8 @@ def test_a_good_recording_is_drawn_with_the_part_used_and_nothing_else():
     assert legend(figure) == ["part used"]
     assert figure.axes[0].get_title(loc="left") == "run: 60 of 60 cycles at 1 Hz are used, 0 to 59.99 s."
     assert np.array_equal(x.lines[0].get_xydata(), np.stack([TIME, recorded().outputs["x"]], axis=-1))
+    synthetic = bp.plot.recording(replace(recorded(), synthetic=True)).axes[0].get_title(loc="left")
+    assert synthetic.startswith("run (synthetic data): 60 of 60")
     assert x.lines[0].get_color() == COLOURS["measured"]
     assert force.get_shared_x_axes().joined(force, x)
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from bayesperiodic import _checks
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.data.recording_check import SEVERITIES, Finding, RecordingCheck
-from bayesperiodic.plot.style import COLOURS, legend_entries, styled, wrapped_label
+from bayesperiodic.plot.style import COLOURS, caveats, legend_entries, styled, wrapped_label
 
 # Parts of the time axis in which the smallest and the largest sample are drawn, of recordings with more samples.
 PARTS, MOST_SAMPLES = 1200, 8000
@@ -86,7 +86,8 @@ def recording(recording: Recording, check: RecordingCheck | None = None, *, figu
         axes.locator_params(axis="y", nbins=5)
     panels[-1].set_xlabel("time [s]")
     figure.align_ylabels(panels)
-    title = f"{check.name}: {check.sentence}".replace("$", r"\$")
+    caveat = f" ({caveats(True, True)})" if recording.synthetic else ""
+    title = f"{check.name}{caveat}: {check.sentence}".replace("$", r"\$")
     panels[0].set_title(textwrap.fill(title, int(TITLE_LENGTH * figure.get_figwidth())), loc="left")
     entries = legend_entries(*panels)
     if entries:
