@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.stats import t as student
 
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES, resolved_harmonics
 
@@ -24,14 +25,14 @@ CALMER = 0.25
 DISTANT, DISTANT_MEAN = 3.0, 12.0
 # Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
 FEWEST_FOR_MEDIAN = 9
-# Windows from which a transient is searched for, and standard errors of a significant slope.
-FEWEST_FOR_TRANSIENT, SIGNIFICANT_SLOPE = 6, 4.0
+# Windows from which a transient is searched for, and false-alarm rate of a significant slope.
+FEWEST_FOR_TRANSIENT, SLOPE_FALSE_ALARM = 8, 1e-4
 # Shares of a channel's standard deviation below which distances and noise do not count.
 SMALLEST_DISTANCE, SMALLEST_NOISE = 1e-9, 1e-6
 # Bias of the mean amplitudes by a transient that is allowed, in standard errors of all together.
 ALLOWED_BIAS = 0.3
 # Probability of a rest of a transient before the data, where the start was left out, and where it was not.
-PROBABLE, IMPROBABLE = 0.9, 0.1
+PROBABLE, IMPROBABLE = 0.9, 0.03
 # Decay times of transients, in cycles and relative to the recording, their number, and the number of frequencies.
 SHORTEST_DECAY, LONGEST_DECAY, DECAYS, FREQUENCIES = 0.3, 1.0 / 6.0, 12, 13
 # Decay times in which a transient is compared with noise, and most places of the recording with which it is compared.
@@ -161,7 +162,8 @@ def _change(sizes: np.ndarray) -> np.ndarray:
     rest = sizes - sizes.mean(axis=0) - place[:, None] * slope
     error = np.sqrt(np.sum(rest**2, axis=0) / max(count - 2, 1) / (place @ place))
     change = slope * count / np.abs(sizes.mean(axis=0))
-    return np.where(np.abs(slope) > SIGNIFICANT_SLOPE * error, change, 0.0)
+    significant = np.abs(slope) > error * student.isf(0.5 * SLOPE_FALSE_ALARM, count - 2)
+    return np.where(significant, change, 0.0)
 
 
 def plateau(part: Windows) -> tuple[int, int]:
