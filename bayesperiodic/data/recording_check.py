@@ -14,6 +14,7 @@ from bayesperiodic._verdicts import BAD, CAUTION, GOOD, with_tone
 from bayesperiodic.data import faults
 from bayesperiodic.data.faults import ChannelFaults
 from bayesperiodic.data.harmonics import fit_harmonics
+from bayesperiodic.data.signals import GAP
 from bayesperiodic.data.steadiness import ALLOWED_BIAS, Steady, Windows
 
 if TYPE_CHECKING:
@@ -206,10 +207,13 @@ def sample_findings(
         times, share = times_of(time, samples), samples.size / total
         size = f", a bias of {own.bias:.3g} standard errors" if own.bias == own.bias else ""
         size = size if inside else ", not used"
+        cure = f"recording.without({kind}=True, channel={channel!r}) leaves them out"
+        if frequency and times.size and np.diff(times).max() * frequency > GAP:
+            cure += ", and its parts `split` are folded" if kind == "stuck" else ""
+            cure = "record again with a larger range" if kind == "clipped" else cure
         return Finding(
             kind, channel, severity, times, samples.size, share, own.bias,
-            f"{channel} {what} {_when(times)} ({samples.size} samples, {share:.2g} of all{size})",
-            f"recording.without({kind}=True, channel={channel!r}) leaves them out",
+            f"{channel} {what} {_when(times)} ({samples.size} samples, {share:.2g} of all{size})", cure,
         )  # fmt: skip
 
     stuck = [part for part in fault.stuck if _moves(every, part, fault.step, used)]

@@ -32,7 +32,7 @@ SMALLEST_DISTANCE, SMALLEST_NOISE = 1e-9, 1e-6
 # Bias of the mean amplitudes by a transient that is allowed, in standard errors of all together.
 ALLOWED_BIAS = 0.3
 # Probability of a rest of a transient before the data, where the start was left out, and where it was not.
-PROBABLE, IMPROBABLE = 0.9, 0.03
+PROBABLE, IMPROBABLE = 0.9, 0.1
 # Decay times of transients, in cycles and relative to the recording, their number, and the number of frequencies.
 SHORTEST_DECAY, LONGEST_DECAY, DECAYS, FREQUENCIES = 0.3, 1.0 / 6.0, 12, 13
 # Decay times in which a transient is compared with noise, and most places of the recording with which it is compared.

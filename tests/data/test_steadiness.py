@@ -83,7 +83,7 @@ def test_exact_steady_cycles_are_all_used(cycles):
 
 
 @pytest.mark.parametrize(
-    ("cycles", "lost", "runs"), [(3, 0.0, 40), (4, 0.0, 40), (6, 0.01, 40), (10, 0.08, 60), (20, 0.04, 60), (60, 0.02, 30)]
+    ("cycles", "lost", "runs"), [(3, 0.0, 20), (4, 0.0, 20), (6, 0.0, 40), (10, 0.08, 40), (20, 0.04, 30), (60, 0.02, 15)]
 )
 def test_cycles_with_white_noise_are_rarely_lost(cycles, lost, runs):
     """A rest of a transient is suspected by chance; this is the mean share of the cycles that it costs."""
@@ -97,7 +97,7 @@ def test_cycles_with_white_noise_are_rarely_lost(cycles, lost, runs):
 def test_cycles_with_coloured_noise_are_rarely_lost(kind):
     """At 5 % noise not more than 15 % of the cycles on average."""
     shares = []
-    for seed in range(20):
+    for seed in range(10):
         time = times(30)
         noise = 0.05 * NOISES[kind](time, np.random.default_rng(seed))
         check = bp.Recording.from_arrays(time, {"y": wave(time) + noise}).check(1.0)
@@ -109,7 +109,7 @@ def test_cycles_with_coloured_noise_are_rarely_lost(kind):
 def test_slow_wander_of_the_amplitude_costs_few_cycles(size):
     """A stationary amplitude with a correlation time of four cycles; not more than a quarter of the cycles is lost."""
     shares = []
-    for seed in range(20):
+    for seed in range(10):
         generator = np.random.default_rng(seed)
         wander = np.zeros(40)
         for k in range(1, 40):
@@ -119,6 +119,7 @@ def test_slow_wander_of_the_amplitude_costs_few_cycles(size):
     assert np.mean(shares) >= 0.75
 
 
+@pytest.mark.filterwarnings("ignore:run. only")
 @pytest.mark.parametrize(("up", "down"), [(6, 0), (0, 6), (6, 6), (12, 0), (0, 12), (10, 10)])
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.05])
 def test_ramps_are_left_out_and_the_amplitude_is_that_between_them(up, down, noise):
@@ -129,7 +130,7 @@ def test_ramps_are_left_out_and_the_amplitude_is_that_between_them(up, down, noi
     e = run.fold(32, frequency=1.0)
     error = np.sqrt(e.amplitude_variance["y"][1])
     assert abs(first_amplitude(e)) == pytest.approx(1.0, abs=0.002 + 4.0 * error)
-    assert 30 - up - down - 3 <= e.cycles <= 30 - up - down + 1 + 10 * noise
+    assert 30 - up - down - 3 <= e.cycles <= 30 - up - down + 1 + 40 * noise
     check = run.check(1.0)
     ramps = [finding for finding in check.findings if finding.kind == "ramp"]
     assert len(ramps) == (up > 0) + (down > 0)
@@ -138,6 +139,7 @@ def test_ramps_are_left_out_and_the_amplitude_is_that_between_them(up, down, noi
         assert ramp.times[0, 0] == time[0] or ramp.times[0, 1] == time[-1]
 
 
+@pytest.mark.filterwarnings("ignore:run. only")
 def test_ramps_of_a_recording_of_seven_cycles_are_left_out():
     """Two cycles up, three and a half steady, one and a half down."""
     time = times(7, per_cycle=200)
@@ -158,6 +160,7 @@ def test_rest_at_the_start_is_left_out(rest, noise):
     assert e.cycles >= int(20 - rest) - 2
 
 
+@pytest.mark.filterwarnings("ignore:run. only")
 def test_a_rest_longer_than_the_motion_is_not_the_steady_part():
     time = times(40)
     e = recorded((time >= 25).astype(float)).fold(32, frequency=1.0)
@@ -225,32 +228,43 @@ def scores(channels, seeds, noise):
     return np.array(rows), cycles
 
 
-@pytest.mark.parametrize(("noise", "seeds"), [(0.002, 60), (0.01, 60)])
+@pytest.mark.filterwarnings("ignore:recording. only")
+@pytest.mark.parametrize(
+    ("noise", "seeds"),
+    [(0.002, 25), pytest.param(0.002, 100, marks=pytest.mark.slow), pytest.param(0.01, 100, marks=pytest.mark.slow)],
+)
 def test_bias_by_the_transient_of_a_duffing_oscillator_from_rest_is_small(noise, seeds):
-    """Below 0.3 standard errors of each amplitude in the mean, whose own standard error over 60 runs is 0.13."""
+    """Below 0.3 standard errors of each amplitude, whose mean has the standard error 1/√seeds (2.8 of it, 1 %)."""
     found, cycles = scores(1, seeds, noise)
-    assert np.abs(found.mean(axis=0)).max() < 0.3 + 2.0 / np.sqrt(seeds)
-    assert np.sqrt(np.mean(found.mean(axis=0) ** 2)) < 0.3
+    mean = found.mean(axis=0)
+    assert np.abs(mean).max() < 0.3 + 2.8 / np.sqrt(seeds)
+    # The square of the mean is larger by that of its error, on average.
+    assert np.mean(mean**2) < 0.3**2 + 2.0 / seeds
     assert np.mean(found**2) < 1.4
     assert min(cycles) >= 10
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("noise", [0.002, 0.01])
-def test_bias_by_the_transient_in_twenty_channels_is_small(noise):
+@pytest.mark.filterwarnings("ignore:recording. only")
+@pytest.mark.parametrize(
+    ("noise", "seeds"),
+    [(0.002, 2), pytest.param(0.002, 12, marks=pytest.mark.slow), pytest.param(0.01, 12, marks=pytest.mark.slow)],
+)
+def test_bias_by_the_transient_in_twenty_channels_is_small(noise, seeds):
     """The channels have the same transient, which they show together, and noise of their own."""
-    found, cycles = scores(20, 12, noise)
-    assert np.abs(found.mean(axis=0)).max() < 0.3 + 2.0 / np.sqrt(len(found))
+    found, cycles = scores(20, seeds, noise)
+    mean = found.mean(axis=0)
+    assert np.abs(mean).max() < 0.3 + 2.8 / np.sqrt(len(found))
+    assert np.mean(mean**2) < 0.3**2
     assert np.mean(found**2) < 1.4
     assert min(cycles) >= 10
 
 
-def test_a_slow_transient_is_left_out_at_most_to_the_half_and_the_rest_is_reported():
-    """It decays in 30 of 60 cycles; the variance contains the square of what remains."""
+def test_a_slow_transient_is_left_out_as_far_as_it_biases():
+    """It decays in 2 of 60 cycles, from 3 % of the amplitude: of the mean over all it is 1.7 standard errors."""
     time = times(60)
-    e_fold = recorded(1.0 + 0.02 * np.exp(-time / 30), 0.02)
-    check = e_fold.check(1.0)
-    assert check.cycles >= 29
-    rests = [f for f in check.findings if f.kind == "transient" and f.bias == f.bias]
-    assert rests and rests[0].bias > 0.3
-    assert "biases the amplitudes by" in str(rests[0])
+    scores = []
+    for seed in range(10):
+        e = recorded(1.0 + 0.03 * np.exp(-time / 2), 0.02, seed).fold(32, frequency=1.0)
+        assert e.cycles >= 29
+        scores.append((abs(first_amplitude(e)) - 1.0) / np.sqrt(e.amplitude_variance["y"][1] / 2))
+    assert np.mean(scores) < 0.5 + 1.6 / np.sqrt(10)
