@@ -126,6 +126,11 @@ def _sound(
 
 
 def _unsteady(signals: Signals, every: Windows) -> str:
+    if not every.first.size:
+        return (
+            f"recording: must have samples in all parts of its periods, got {signals.name!r}, which has too few; check "
+            "the frequency and the gaps, or fold a part by `between` or `split`."
+        )
     size = every.sizes
     worst = int(np.argmax(np.ptp(size, axis=0) / size.mean(axis=0)))
     low, high = size[:, worst].min(), size[:, worst].max()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
-from bayesperiodic.data.harmonics import MINIMUM_CYCLES, resolved_harmonics
+from bayesperiodic.data.harmonics import MINIMUM_CYCLES, determined_harmonics, resolved_harmonics
 
 # Parts of a cycle in which ramps begin or end, in recordings of so many cycles; most windows of long recordings.
 FINE, FEW_CYCLES, MOST_WINDOWS = 8, 64, 256
@@ -84,7 +84,8 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     edges = np.searchsorted(-back, np.arange(1 - count, 1))
     stops = np.concatenate([edges[1:], [time.size]])
     empty, edges = edges == stops, np.minimum(edges, time.size - 1)
-    order = np.arange(2 * min(HARMONICS, resolved_harmonics(time, fundamental, time.size)) + 1)
+    resolved = min(HARMONICS, resolved_harmonics(time, fundamental, time.size))
+    order = np.arange(2 * determined_harmonics(time, fundamental, resolved)[0] + 1)
     harmonics = order[: order.size // 2 + 1]
     used = slice(edges[0], None)
     wave, power = np.exp(-2j * np.pi * (fundamental * time[used] % 1.0)), np.ones(time[used].size, dtype=complex)

@@ -58,7 +58,7 @@ def dropouts():
 
 
 def dropouts_within_the_range():
-    """A sensor that reads the mean value at times."""
+    """Return an angle whose sensor reads the mean value at times, and those samples."""
     angle, place = measured(noise=0.0005), np.random.default_rng(1).choice(TIME.size, 60, replace=False)
     place = place[np.abs(clean()[place] - 0.3) > 0.05]
     angle[place] = 0.3
@@ -135,7 +135,7 @@ def test_samples_that_miss_at_the_same_phases_limit_the_harmonics_and_enlarge_th
     phase = TIME % 1.0
     mask = (phase > 0.3) & (phase < 0.5)
     scores = []
-    for seed in range(40):
+    for seed in range(20):
         e = recorded(measured(seed)).without(outliers=mask).fold(64, frequency=1.0, harmonics=2)
         error = np.sqrt(e.amplitude_variance["angle"][:3])
         scores.append(np.abs(amplitudes(e)[:3] - EXACT[:3]) ** 2 / error**2)

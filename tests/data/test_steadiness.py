@@ -83,7 +83,8 @@ def test_exact_steady_cycles_are_all_used(cycles):
 
 
 @pytest.mark.parametrize(
-    ("cycles", "lost", "runs"), [(3, 0.0, 20), (4, 0.0, 20), (6, 0.0, 40), (10, 0.08, 40), (20, 0.04, 30), (60, 0.02, 15)]
+    ("cycles", "lost", "runs"),
+    [(3, 0.0, 20), (4, 0.0, 20), (6, 0.0, 40), (10, 0.08, 40), (20, 0.04, 30), (60, 0.02, 15)],
 )
 def test_cycles_with_white_noise_are_rarely_lost(cycles, lost, runs):
     """A rest of a transient is suspected by chance; this is the mean share of the cycles that it costs."""
@@ -174,8 +175,8 @@ def test_a_recording_without_a_steady_part_is_refused_with_the_range_of_its_ampl
     envelope = 0.1 + 0.9 * np.clip(np.minimum(time / up if up else 1.0, (30 - time) / down if down else 1.0), 0, 1)
     run = recorded(envelope, 0.001)
     message = (
-        r"^recording: must have a steady part of 3 cycles, got 'run', in which the amplitude of 'y' changes throughout, "
-        r"from 1\d% of its largest value on; record at a constant amplitude, or select a part by `between`\.$"
+        r"^recording: must have a steady part of 3 cycles, got 'run', in which the amplitude of 'y' changes "
+        r"throughout, from 1\d% of its largest value on; record at a constant amplitude, or select a part by `between`\.$"
     )
     with pytest.raises(ValueError, match=message):
         run.fold(32, frequency=1.0)
