@@ -18,8 +18,8 @@ FEWEST_CLIPPED, CLIPPED_RUN, PILED = 6, 3, 6.0
 # Distance of outliers from the mean period in standard deviations of the others, and how often they may return.
 FAR, RETURNING = 8.0, 0.5
 MEDIAN_TO_SD = 1.4826
-# Largest step between samples relative to 99 % of them, of so many, without outliers.
-JUMP, SCREENED = 3.0, 100_000
+# Largest step between samples relative to 80 % of them, of so many, without outliers.
+JUMP, USUAL, SCREENED = 5.0, 0.8, 100_000
 
 
 @dataclass
@@ -113,7 +113,7 @@ def _piles_up(values: np.ndarray, top: np.ndarray, place: np.ndarray) -> bool:
 def jumps(values: np.ndarray) -> bool:
     """Return whether some steps between samples (channels, samples) are larger than smooth signals with noise have."""
     steps = np.abs(np.diff(values, axis=1))
-    usual = np.quantile(steps[:, :: 1 + steps.shape[1] // SCREENED], 0.99, axis=1)
+    usual = np.quantile(steps[:, :: 1 + steps.shape[1] // SCREENED], USUAL, axis=1)
     return bool((steps.max(axis=1) > JUMP * usual).any())
 
 
