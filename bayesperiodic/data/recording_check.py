@@ -292,7 +292,11 @@ def _steps(channels: list[str], time: np.ndarray, part: Windows, frequency: floa
     lines = np.take_along_axis(shape, strongest[None, :, None], axis=2)[:, :, 0]
     turns = np.unwrap(np.angle(lines), axis=0) / (2.0 * np.pi) / strongest
     sizes = np.log(np.maximum(np.abs(lines), np.finfo(float).tiny))
-    for kind, series, least in (("amplitude step", sizes, HARMLESS_STEP), ("phase step", turns, HARMLESS_PHASE)):
+    slip = part.slip / np.exp(np.median(sizes, axis=0))
+    for kind, series, least in (
+        ("amplitude step", sizes, HARMLESS_STEP + slip),
+        ("phase step", turns, HARMLESS_PHASE + slip / (2.0 * np.pi)),
+    ):
         mean = 0.5 * (series[1:] + series[:-1])
         jump = mean[2:] - mean[:-2]  # of two cycles after a boundary from the two before it
         spread = np.median(np.abs(jump - np.median(jump, axis=0)), axis=0) / 0.6745
@@ -339,10 +343,11 @@ def _beats(channels: list[str], time: np.ndarray, part: Windows, frequency: floa
         if near.size < 6 or power[line] < np.mean(near) * -np.log(BEAT_FALSE_ALARM / spectrum.shape[0]) * 3.0:
             continue
         amplitude = float(np.sqrt(8.0 * rest[:, i].var() / 4.0) / sizes[:, i].mean())
-        if amplitude > HARMLESS_BEAT:
+        slip = float(part.slip[i] / sizes[:, i].mean())
+        if amplitude > HARMLESS_BEAT + slip:
             beat = (line + 2) * frequency / (count * part.cycles)
             yield Finding(
-                "beating", channel, SERIOUS if amplitude > HARMLESS_DRIFT else HARMLESS,
+                "beating", channel, SERIOUS if amplitude > HARMLESS_DRIFT + slip else HARMLESS,
                 np.array([[time[part.first[0]], time[part.last[-1] - 1]]]),
                 count, 1.0, np.nan, f"the amplitude of {channel} beats at {beat:.4g} Hz by {amplitude:.1%}",
                 "a second frequency is in the signals: remove its source, or average whole beats",

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.special import softmax
 
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES, resolved_harmonics
 
@@ -48,11 +49,12 @@ class Windows:
     overlap: int  # numbers from one window to the next that does not overlap it
     cycles: int  # in a window
     amplitudes: np.ndarray  # complex (windows, channels, harmonics + 1), relative to each channel's standard deviation
+    slip: np.ndarray  # (channels,) changes of amplitudes by one sample more or less at jumps of the signals, likewise
 
     def chosen(self, used: "slice | list[int]") -> "Windows":
         """Return the windows with these indices."""
         first, last, place = (array[used] for array in (self.first, self.last, self.place))
-        return Windows(first, last, place, self.overlap, self.cycles, self.amplitudes[used])
+        return Windows(first, last, place, self.overlap, self.cycles, self.amplitudes[used], self.slip)
 
     def apart(self) -> "Windows":
         """Return windows that do not overlap, the last one among them."""
@@ -110,7 +112,19 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     first[0] -= np.count_nonzero(
         ((time[-1] - time[: first[0]]) * fundamental + 1e-9).astype(int) < int(duration * fundamental)
     )
-    return Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2))
+    slip = _slip(scaled, edges[::fine] - edges[0]) / np.median(last[enough] - first[enough])
+    return Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip)
+
+
+def _slip(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return twice the median of the largest second differences in parts of signals (channels, samples).
+
+    Samples that are not at the same phases of every cycle see jumps and narrow peaks earlier or later.
+    """
+    edges = edges[: max(np.searchsorted(edges, values.shape[1] - 2), 1)]
+    edges = edges[np.r_[True, np.diff(edges) > 0]]
+    largest = [np.median(np.maximum.reduceat(np.abs(np.diff(v, 2)), edges)) for v in values if v.size > 2]
+    return 2.0 * np.array(largest if largest else np.zeros(len(values)))
 
 
 @dataclass(frozen=True)
@@ -169,7 +183,7 @@ def plateau(part: Windows) -> tuple[int, int]:
     size = part.sizes
     level = np.quantile(size, 0.9, axis=0)
     noise = np.quantile(np.abs(size[part.overlap :] - size[: -part.overlap]), 0.15, axis=0) / 0.267
-    limit = np.maximum(SMALL_RANGE * level, NOISE_RANGE * noise)
+    limit = np.maximum(SMALL_RANGE * level, NOISE_RANGE * noise) + 2.0 * part.slip
     best = (0, 0)
     for first in range(len(size)):
         if len(size) - first < best[1] - best[0]:
@@ -194,7 +208,7 @@ def _trimmed(part: Windows, usual: Callable[..., Any] | None = None) -> tuple[in
     usual = usual or (np.max if count // 2 < FEWEST_FOR_MEDIAN * reach else np.median)
     for squares, factor in ((away[:, :, 1:].sum(axis=2), DISTANT), (away[:, :, 0], DISTANT_MEAN)):
         distance = np.sqrt(squares)
-        near &= (distance <= factor * usual(distance[inner], axis=0) + SMALLEST_DISTANCE).all(axis=1)
+        near &= (distance <= factor * usual(distance[inner], axis=0) + part.slip + SMALLEST_DISTANCE).all(axis=1)
     first, last, least = 0, count, (MINIMUM_CYCLES - 1) * reach + 1
     span = min(2 * reach + 1, least)
     while last - first > least and not near[first : first + span].all():
@@ -221,9 +235,10 @@ def transient_bias(shape: np.ndarray, probability: float) -> tuple[np.ndarray, n
     scaled = ((shape - shape.mean(axis=0)) / noise)[:, noisy]
     share = _independent((step / noise)[:, noisy]) / scaled.shape[1]
     cycle, remaining = np.arange(count, dtype=float), np.arange(count, 0, -1.0)
-    gains, means, variances = [], [], []
+    gains, sizes, levels, means, variances = [], [], [], [], []
     for decay in np.geomspace(SHORTEST_DECAY, max(LONGEST_DECAY * count, 2.0 * SHORTEST_DECAY), DECAYS):
-        length = min(int(np.ceil(LENGTH * decay)) + 2, count)
+        # At most half of the recording, so that the other end is without the transient.
+        length = min(int(np.ceil(LENGTH * decay)) + 2, max(count // 2, FEWEST_FOR_TRANSIENT))
         ends = np.unique(np.linspace(0, max(count - length - int(LENGTH * decay / 2), 0), CONTROLS).astype(int))
         starts = ends[ends > 0] + int(LENGTH * decay / 2)
         elsewhere = [scaled[::-1][k : k + length] for k in ends] + [scaled[k : k + length] for k in starts]
@@ -239,13 +254,19 @@ def transient_bias(shape: np.ndarray, probability: float) -> tuple[np.ndarray, n
             gains.append(
                 0.5 * ((free + known) * np.log((free * ratio + known) / (free + known)) - free * np.log(ratio))
             )
+            sizes.append((free, float(np.mean(ahead**2))))
+            levels.append(usual)
             # The transient ends at zero, so that its mean is the bias.
             later = np.cumsum(course[::-1], axis=0)[::-1] / remaining[:, None] @ np.linalg.pinv(root)
             kept = 1.0 - 1.0 / ratio
             means.append(kept * later @ ahead)
             variances.append(kept * usual * np.sum(later**2, axis=1))
-    weight = np.exp(np.array(gains) - max(gains))
-    weight /= weight.sum() + (1.0 / probability - 1.0) * len(gains) * np.exp(-max(gains))
+    # Whether there is one, with the noise known by the other end only; which one, at this noise.
+    odds = np.mean(np.exp(np.array(gains) - max(gains)))
+    free, ratios = np.array(sizes).T
+    ratios = np.maximum(ratios / np.median(levels), 1.0)
+    weight = softmax(0.5 * free * (ratios - 1.0 - np.log(ratios)))
+    weight *= odds / (odds + (1.0 / probability - 1.0) * np.exp(-max(gains)))
     mean = np.einsum("m,mkd->kd", weight, np.array(means))
     spread = np.einsum("m,mkd->kd", weight, np.array(means) ** 2) - mean**2 + (weight @ np.array(variances))[:, None]
     # The mean in the worst direction of all components, and its uncertainty in any one of them.
