@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.special import softmax
 
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES, resolved_harmonics
 
@@ -235,10 +234,9 @@ def transient_bias(shape: np.ndarray, probability: float) -> tuple[np.ndarray, n
     scaled = ((shape - shape.mean(axis=0)) / noise)[:, noisy]
     share = _independent((step / noise)[:, noisy]) / scaled.shape[1]
     cycle, remaining = np.arange(count, dtype=float), np.arange(count, 0, -1.0)
-    gains, sizes, levels, means, variances = [], [], [], [], []
+    gains, means, variances = [], [], []
     for decay in np.geomspace(SHORTEST_DECAY, max(LONGEST_DECAY * count, 2.0 * SHORTEST_DECAY), DECAYS):
-        # At most half of the recording, so that the other end is without the transient.
-        length = min(int(np.ceil(LENGTH * decay)) + 2, max(count // 2, FEWEST_FOR_TRANSIENT))
+        length = min(int(np.ceil(LENGTH * decay)) + 2, count)
         ends = np.unique(np.linspace(0, max(count - length - int(LENGTH * decay / 2), 0), CONTROLS).astype(int))
         starts = ends[ends > 0] + int(LENGTH * decay / 2)
         elsewhere = [scaled[::-1][k : k + length] for k in ends] + [scaled[k : k + length] for k in starts]
@@ -254,19 +252,13 @@ def transient_bias(shape: np.ndarray, probability: float) -> tuple[np.ndarray, n
             gains.append(
                 0.5 * ((free + known) * np.log((free * ratio + known) / (free + known)) - free * np.log(ratio))
             )
-            sizes.append((free, float(np.mean(ahead**2))))
-            levels.append(usual)
             # The transient ends at zero, so that its mean is the bias.
             later = np.cumsum(course[::-1], axis=0)[::-1] / remaining[:, None] @ np.linalg.pinv(root)
             kept = 1.0 - 1.0 / ratio
             means.append(kept * later @ ahead)
             variances.append(kept * usual * np.sum(later**2, axis=1))
-    # Whether there is one, with the noise known by the other end only; which one, at this noise.
-    odds = np.mean(np.exp(np.array(gains) - max(gains)))
-    free, ratios = np.array(sizes).T
-    ratios = np.maximum(ratios / np.median(levels), 1.0)
-    weight = softmax(0.5 * free * (ratios - 1.0 - np.log(ratios)))
-    weight *= odds / (odds + (1.0 / probability - 1.0) * np.exp(-max(gains)))
+    weight = np.exp(np.array(gains) - max(gains))
+    weight /= weight.sum() + (1.0 / probability - 1.0) * len(gains) * np.exp(-max(gains))
     mean = np.einsum("m,mkd->kd", weight, np.array(means))
     spread = np.einsum("m,mkd->kd", weight, np.array(means) ** 2) - mean**2 + (weight @ np.array(variances))[:, None]
     # The mean in the worst direction of all components, and its uncertainty in any one of them.
