@@ -9,6 +9,8 @@ from bayesperiodic.data.quantisation import step_of
 # Ranges at which sensors wrap: radians, degrees, turns; and powers of two of a quantised sensor's steps.
 TURNS = (2.0 * np.pi, 360.0, 1.0)
 FEWEST_BITS, MOST_BITS = 6, 32
+# Steps relative to the range that are rounding errors of exact values.
+ROUNDING = 1e-12
 # A jump wraps if it is a whole range to this share of it; what is left must be smooth, and small beside the jumps.
 WRAP_TOLERANCE, LARGEST_STEP, SMOOTH = 0.35, 0.5, 0.5
 # Samples of one value in a row that may be a stuck sensor, and how many times longer than usual ones they are.
@@ -20,6 +22,12 @@ FAR, RETURNING = 8.0, 0.5
 MEDIAN_TO_SD = 1.4826
 # Largest step between samples relative to 80 % of them, of so many, without outliers.
 JUMP, USUAL, SCREENED = 5.0, 0.8, 100_000
+# Share of the most frequent value of dropouts, and different values of a channel that has such a value.
+MOST_DROPPED, FEWEST_VALUES = 0.45, 18
+# Share of the samples of that value with jumps before and after, from which all are dropouts.
+ALL_DROPPED = 0.4
+# Repeated values of a slower logger: share of the runs that have the usual length.
+HELD = 0.9
 
 
 @dataclass
@@ -33,6 +41,8 @@ class ChannelFaults:
     low: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # clipped samples
     high: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     outliers: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    held: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # that repeat the one before
+    repeats: int = 1  # samples of each value, of a slower logger
 
 
 def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
@@ -104,10 +114,35 @@ def _piles_up(values: np.ndarray, top: np.ndarray, place: np.ndarray) -> bool:
         return False
     levels, counts = np.unique(values[place], return_counts=True)
     # A relay has few values; a quantised one has neighbouring levels with which the highest is compared.
-    if levels.size < 3 * FEWEST_CLIPPED or top.size > 0.45 * place.size:
+    if levels.size < FEWEST_VALUES or top.size > MOST_DROPPED * place.size:
         return False
     below = counts[-6:-1]
     return bool(top.size > PILED * max(float(below.max()), 1.0))
+
+
+def held_of(values: np.ndarray) -> tuple[int, np.ndarray]:
+    """Return how often a slower logger repeats each value, 1 if it does not, and the repeated samples."""
+    first, length = runs(values)
+    usual = int(np.median(length))
+    inner = length[1:-1]
+    if usual < 2 or inner.size < FEWEST_VALUES or np.unique(values[first]).size < FEWEST_VALUES:
+        return 1, np.zeros(0, dtype=int)
+    # Two equal values in a row are a run of twice the length.
+    if np.mean(inner % usual == 0) < HELD:
+        return 1, np.zeros(0, dtype=int)
+    return usual, np.flatnonzero((np.arange(values.size) - first[1]) % usual)
+
+
+def dropped_value(values: np.ndarray) -> float | None:
+    """Return a value that is much more frequent than any other one, as that of dropouts; None without one."""
+    levels, counts = np.unique(values[:: 1 + values.size // SCREENED], return_counts=True)
+    if levels.size < FEWEST_VALUES:
+        return None
+    order = np.argsort(counts)
+    most, others = int(counts[order[-1]]), max(int(counts[order[-2]]), 1)
+    if most < FEWEST_CLIPPED or most < PILED * others or most > MOST_DROPPED * counts.sum():
+        return None
+    return float(levels[order[-1]])
 
 
 def jumps(values: np.ndarray) -> bool:
@@ -118,9 +153,9 @@ def jumps(values: np.ndarray) -> bool:
 
 
 def outliers_of(residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -> np.ndarray:
-    """Return the samples far from the mean period, with jumps before and after them, that do not return.
+    """Return the samples far from the mean period, or of the value of dropouts, with jumps before and after them.
 
-    `phase` is in cycles. Samples of the same value as most of them are outliers too.
+    `phase` is in cycles. What is far at the same phase of many cycles is part of the signal.
     """
     middle = np.median(residuals)
     distance = np.abs(residuals - middle)
@@ -128,7 +163,10 @@ def outliers_of(residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, st
     if not scale > 0.0:
         scale = float(np.quantile(distance, 0.9))
     far = distance > max(FAR * scale, 2.0 * step, 1e-9 * np.abs(values).max())
-    if not far.any():
+    value = dropped_value(values)
+    if value is not None:
+        far |= values == value
+    if not far.any() or far.all() or np.ptp(values[~far]) == 0.0:
         return np.zeros(0, dtype=int)
     first, length = runs(far)
     flagged = far[first]
@@ -140,7 +178,6 @@ def outliers_of(residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, st
     last = first + length - 1
     after = np.where(last < values.size - 1, change[np.minimum(last, change.size - 1)], np.inf)
     lone = np.minimum(before, after) > 2.0 * usual + step
-    # What is far at the same phase of many cycles is part of the signal.
     cycles = max(float(np.ptp(phase)), 1.0)
     bins = np.minimum((phase[first] % 1.0 * 64).astype(int), 63)
     cycle = np.floor(phase[first] - phase[0]).astype(int)
@@ -153,6 +190,8 @@ def outliers_of(residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, st
     result = np.zeros(values.size, dtype=bool)
     for a, n in zip(first[lone], length[lone], strict=True):
         result[a : a + n] = True
+    if value is not None and result[values == value].mean() > ALL_DROPPED:
+        result |= values == value
     return np.flatnonzero(result)
 
 
@@ -164,4 +203,5 @@ def _expected(far: np.ndarray, cycles: float) -> float:
 def resolution(values: np.ndarray) -> tuple[float, float]:
     """Return the step of quantised values and the bits that the range uses; 0 and infinity if they are not."""
     step = step_of(values)
+    step = step if step > ROUNDING * float(np.ptp(values)) else 0.0
     return step, float(np.log2(np.ptp(values) / step + 1.0)) if step > 0.0 else np.inf

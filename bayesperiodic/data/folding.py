@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 # Spreads of a channel whose squares and inverse squares are ordinary numbers, and grid points of a response period.
 MAXIMUM_POINTS = 1_000_000
-MINIMUM_PERIODICITY = 0.5
+# Share of a channel's variance that its mean period explains at least, and of one that is surely periodic.
+MINIMUM_PERIODICITY, CLEARLY_PERIODIC = 0.5, 0.9
 # Ratio of residual variances from which the estimated frequency is right, and the given one wrong.
 CLEARLY = 4.0
 # Response cycles of the later half of a recording that show a period which the whole has not.
@@ -216,11 +217,17 @@ def _periodicity(signals: Signals, fit: HarmonicFit) -> float:
     explained = 1.0 - fit.variances / np.var(signals.values, axis=1, ddof=1)
     worst = int(np.argmin(explained))
     if not explained[worst] >= MINIMUM_PERIODICITY:
+        good = [c for c, share in zip(signals.channels, explained, strict=True) if share >= CLEARLY_PERIODIC]
+        cure = "check the frequency and `periods`, and separate records of different frequencies by `split`"
+        if good:
+            cure = (
+                f"{good[0]!r} is periodic ({explained[signals.channels.index(good[0])]:.1%}): a sensor without a "
+                f"signal, or noise; leave the channel {signals.channels[worst]!r} out"
+            )
         raise ValueError(
             f"recording: must be periodic, got {signals.name!r}, whose mean period at {fit.frequency:.6g} Hz explains "
             f"only {max(explained[worst], 0.0):.1%} of the variance of {signals.channels[worst]!r} (periodicity "
-            f"{explained[worst]:.3f}, at least {MINIMUM_PERIODICITY} is needed); check the frequency and `periods`, "
-            "and separate records of different frequencies by `split`."
+            f"{explained[worst]:.3f}, at least {MINIMUM_PERIODICITY} is needed); {cure}."
         )
     return float(explained[worst])
 

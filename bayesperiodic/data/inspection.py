@@ -1,11 +1,12 @@
 """Inspection of signals: their faults, their steady part and its mean period; what `check` and `fold` both do."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from bayesperiodic import _fourier
-from bayesperiodic.data.faults import ChannelFaults, jumps, outliers_of
+from bayesperiodic.data.faults import ChannelFaults, dropped_value, jumps, outliers_of
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
     HarmonicFit,
@@ -16,6 +17,7 @@ from bayesperiodic.data.harmonics import (
     resolved_harmonics,
 )
 from bayesperiodic.data.recording_check import (
+    RUINOUS,
     SEVERITIES,
     WRAPS,
     Finding,
@@ -31,6 +33,8 @@ from bayesperiodic.data.steadiness import Steady, Windows, steady_part, windows
 
 # Largest relative change of an amplitude within half of a steady part.
 LARGEST_CHANGE = 0.1
+# Least share of samples at which no channel is stuck.
+LEAST_MOVING = 0.1
 # Harmonics of the first mean period, from which outliers are left out.
 ROUGH_HARMONICS = 40
 
@@ -53,7 +57,7 @@ class Inspection:
 
 def inspect(signals: Signals, periods: int, frequency: float | None, points: int) -> Inspection:
     """Return what signals are like; without a steady part or a mean period, the reason."""
-    faults = [signal_faults(values) for values in signals.values]
+    faults = [signal_faults(values, drive=i < signals.inputs) for i, values in enumerate(signals.values)]
 
     def found(rate: float | None, limit: int = 0, used: slice = slice(0, signals.time.size)) -> list[Finding]:
         rows = zip(signals.channels, signals.values, faults, strict=True)
@@ -68,9 +72,12 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     moving = np.ones(signals.time.size, dtype=bool)
     for stuck in [part for fault in faults for part in fault.stuck]:
         moving[stuck] = False
-    calm = replace(signals, values=bounded(signals.values))
-    calm = calm if moving.all() else calm.part(np.flatnonzero(moving))
     try:
+        if not signals.channels:
+            raise ValueError(f"recording: must have a channel that varies, got {signals.name!r} without one.")
+        if np.count_nonzero(moving) < LEAST_MOVING * moving.size:
+            raise ValueError(_still(signals, faults))
+        calm = replace(signals, values=bounded(signals.values)).part(np.flatnonzero(moving))
         fundamental = first_guess(calm, frequency, periods)
         refuse_gaps(signals, fundamental)
         tracked = tracked_frequency(calm, fundamental, frequency is not None)
@@ -111,11 +118,19 @@ def _wrapped(name: str, findings: list[Finding]) -> str:
     return f"recording: must be without wraps, got {name!r}: {'. '.join(str(f) for f in findings if f.kind == WRAPS)}."
 
 
+def _still(signals: Signals, faults: list[ChannelFaults]) -> str:
+    still = [channel for channel, fault in zip(signals.channels, faults, strict=True) if fault.stuck]
+    return (
+        f"recording: must move, got {signals.name!r}, in which one of {', '.join(map(repr, still))} is stuck most of "
+        "the time; leave the channel out."
+    )
+
+
 def _sound(
     signals: Signals, calm: Signals, faults: list[ChannelFaults], moving: np.ndarray, fundamental: float, points: int
 ) -> np.ndarray:
     """Return the numbers of the samples without outliers from a first mean period, of those that are not stuck."""
-    if not jumps(signals.values):
+    if not jumps(signals.values) and all(dropped_value(values) is None for values in signals.values):
         return moving
     limit = min(resolved_harmonics(calm.time, fundamental, points), ROUGH_HARMONICS)
     fit = fit_harmonics(calm.time, calm.values, fundamental, limit)
@@ -141,20 +156,20 @@ def _unsteady(signals: Signals, every: Windows) -> str:
     )
 
 
-def summary(name: str, seen: Inspection) -> RecordingCheck:
-    """Return what was seen as the result of `Recording.check`."""
+def summary(name: str, seen: Inspection, still: Mapping[str, float]) -> RecordingCheck:
+    """Return what was seen, and channels with one value, as the result of `Recording.check`."""
     import pandas as pd
 
     time, part = seen.signals.time, seen.steady
     bad = {
         channel: {
             "outliers": fault.outliers,
-            "stuck": np.concatenate([np.arange(s.start, s.stop) for s in fault.stuck] or [np.zeros(0, dtype=int)]),
+            "stuck": np.concatenate([fault.held, *(np.arange(s.start, s.stop) for s in fault.stuck)]),
             "clipped": np.concatenate([fault.low, fault.high]),
         }
         for channel, fault in zip(seen.signals.channels, seen.faults, strict=True)
     }
-    named = {(finding.channel, finding.kind) for finding in seen.findings}
+    named = {(f.channel, "stuck" if f.kind == "held" else f.kind) for f in seen.findings}
     bad = {c: {kind: v if (c, kind) in named else v[:0] for kind, v in each.items()} for c, each in bad.items()}
     rows = [
         {
@@ -167,12 +182,20 @@ def summary(name: str, seen: Inspection) -> RecordingCheck:
         }
         for channel, values, fault in zip(seen.signals.channels, seen.signals.values, seen.faults, strict=True)
     ]
+    every, share = np.array([[time[0], time[-1]]]), 1.0
+    constant = [
+        Finding(
+            "constant", channel, RUINOUS, every, time.size, share, np.nan,
+            f"{channel} is constant at {value:.6g}", "leave the channel out",
+        )
+        for channel, value in still.items()
+    ]  # fmt: skip
     step = np.diff(time)
     step = step[step <= USUAL_STEPS * np.median(step)]
     return RecordingCheck(
         name,
         pd.DataFrame(rows, index=[*seen.signals.channels]),
-        seen.findings,
+        (*constant, *seen.findings),
         seen.fit.frequency if seen.fit else np.nan,
         round(np.ptp(time[part.samples]) * seen.fit.frequency) if part and seen.fit else 0,
         seen.total,

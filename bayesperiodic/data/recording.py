@@ -1,6 +1,6 @@
 """Recordings: measured signals over time."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, overload
@@ -360,10 +360,11 @@ class Recording(Result):
         """
         if frequency is not None:
             _checks.positive("frequency", frequency)
-        signals = self._signals()
+        still = {c: v[0] for c, v in (self.inputs | self.outputs).items() if np.ptp(v) == 0.0}
+        signals = self._signals(without=still)
         with one_thread():
             seen = inspect(signals, _checks.integer("periods", periods, 1), frequency, self.time.size)
-        return summary(self.name, seen)
+        return summary(self.name, seen, still)
 
     def steady(self, frequency: float | None = None, *, periods: int = 1) -> "Recording":
         """Return the steady part that `fold` uses, as `check` finds it.
@@ -462,9 +463,11 @@ class Recording(Result):
 
         return replace(self, outputs=cured(self.outputs), inputs=cured(self.inputs))
 
-    def _signals(self) -> Signals:
-        channels = self.inputs | self.outputs
-        return Signals(self.name, self.time, tuple(channels), np.stack([*channels.values()]), len(self.inputs))
+    def _signals(self, without: Iterable[str] = ()) -> Signals:
+        without = {*without}
+        channels = {name: v for name, v in (self.inputs | self.outputs).items() if name not in without}
+        values = np.array([*channels.values()], dtype=float).reshape(len(channels), self.time.size)
+        return Signals(self.name, self.time, tuple(channels), values, len(self.inputs.keys() - without))
 
     def split(self) -> "list[Recording]":
         """Divide the recording at gaps and at steps of the frequency of the first input (or output, without inputs).

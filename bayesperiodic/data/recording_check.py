@@ -50,7 +50,7 @@ class Finding(Storable):
     Attributes
     ----------
     kind : str
-        "wraps", "stuck", "clipped", "outliers", "gaps", "ramp", "transient", "not steady", "drift", "beating",
+        "constant", "wraps", "stuck", "held", "clipped", "outliers", "gaps", "ramp", "transient", "drift", "beating",
         "amplitude step" or "phase step".
     channel : str
         Empty for all channels together.
@@ -94,13 +94,16 @@ class Finding(Storable):
         return f"{self.text}{'; ' + self.cure if self.cure else ''}"
 
 
-def signal_faults(values: np.ndarray) -> ChannelFaults:
-    """Return the faults of one channel that its samples alone show."""
+def signal_faults(values: np.ndarray, *, drive: bool = False) -> ChannelFaults:
+    """Return the faults of one channel that its samples alone show; a drive may be a sawtooth."""
     step, _ = faults.resolution(values)
     wrap, jumps = faults.wrap_of(values, step)
+    if drive and wrap and abs(np.sign(np.diff(values)[jumps - 1]).sum()) == jumps.size:
+        wrap, jumps = 0.0, jumps[:0]
     stuck = faults.stuck_of(values)
     low, high = (np.zeros(0, dtype=int),) * 2 if wrap else faults.clipped_of(values, stuck)
-    return ChannelFaults(step, wrap, jumps, stuck, low, high)
+    repeats, held = faults.held_of(values)
+    return ChannelFaults(step, wrap, jumps, stuck, low, high, held=held, repeats=repeats)
 
 
 def bounded(values: np.ndarray) -> np.ndarray:
@@ -155,7 +158,8 @@ def effect_of(time: np.ndarray, values: np.ndarray, bad: np.ndarray, frequency: 
     weights = np.r_[1.0, np.full(order, 2.0)]
     size = float(np.sqrt(weights @ sums**2))
     scatter = max(noise, 1e-9 * float(np.abs(values[~bad]).max())) / np.sqrt(time.size)
-    return Effect(size / scatter, size / float(predicted.std()), predicted, noise)
+    spread = max(float(predicted.std()), np.finfo(float).tiny)
+    return Effect(size / scatter, size / spread, predicted, noise)
 
 
 def times_of(time: np.ndarray, samples: np.ndarray) -> np.ndarray:
@@ -195,6 +199,14 @@ def sample_findings(
             f"recording.unwrapped({channel!r}, {fault.wrap:.6g}) removes the jumps",
         )  # fmt: skip
         return
+    if fault.repeats > 1:
+        delay = 0.5 * (fault.repeats - 1)
+        yield Finding(
+            "held", channel, SERIOUS, np.array([[time[0], time[-1]]]), fault.held.size, fault.held.size / total, np.nan,
+            f"{channel} repeats each value {fault.repeats} times: a slower logger or a hold, which delays it by "
+            f"{delay:g} samples ({delay * float(np.median(np.diff(time))):.3g} s) and weakens its harmonics",
+            f"recording.without(stuck=True, channel={channel!r}) keeps one sample of each value",
+        )  # fmt: skip
     bad = np.zeros(total, dtype=bool)
     for part in fault.stuck:
         bad[part] = True
@@ -315,7 +327,11 @@ def _steps(channels: list[str], time: np.ndarray, part: Windows, frequency: floa
     turns = np.unwrap(np.angle(lines), axis=0) / (2.0 * np.pi) / strongest
     sizes = np.log(np.maximum(np.abs(lines), np.finfo(float).tiny))
     limit = STEP * max(1.0, (ENOUGH_FOR_STEPS / len(shape)) ** 2)
-    for kind, series, least in (("amplitude step", sizes, HARMLESS_STEP), ("phase step", turns, HARMLESS_PHASE)):
+    slip = part.slip / np.exp(np.median(sizes, axis=0))
+    for kind, series, least in (
+        ("amplitude step", sizes, HARMLESS_STEP + slip),
+        ("phase step", turns, HARMLESS_PHASE + slip / (2.0 * np.pi)),
+    ):
         mean = 0.5 * (series[1:] + series[:-1])
         jump = mean[2:] - mean[:-2]  # of two cycles after a boundary from the two before it
         spread = np.median(np.abs(jump - np.median(jump, axis=0)), axis=0) / 0.6745
@@ -362,10 +378,11 @@ def _beats(channels: list[str], time: np.ndarray, part: Windows, frequency: floa
         if near.size < 6 or power[line] < np.mean(near) * -np.log(BEAT_FALSE_ALARM / spectrum.shape[0]) * 3.0:
             continue
         amplitude = float(np.sqrt(8.0 * rest[:, i].var() / 4.0) / sizes[:, i].mean())
-        if amplitude > HARMLESS_BEAT:
+        slip = float(part.slip[i] / sizes[:, i].mean())
+        if amplitude > HARMLESS_BEAT + slip:
             beat = (line + 2) * frequency / (count * part.cycles)
             yield Finding(
-                "beating", channel, SERIOUS if amplitude > HARMLESS_DRIFT else HARMLESS,
+                "beating", channel, SERIOUS if amplitude > HARMLESS_DRIFT + slip else HARMLESS,
                 np.array([[time[part.first[0]], time[part.last[-1] - 1]]]),
                 count, 1.0, np.nan, f"the amplitude of {channel} beats at {beat:.4g} Hz by {amplitude:.1%}",
                 "a second frequency is in the signals: remove its source, or average whole beats",

@@ -49,11 +49,12 @@ class Windows:
     overlap: int  # numbers from one window to the next that does not overlap it
     cycles: int  # in a window
     amplitudes: np.ndarray  # complex (windows, channels, harmonics + 1), relative to each channel's standard deviation
+    slip: np.ndarray  # (channels,) changes of amplitudes by one sample more or less at jumps of the signals, likewise
 
     def chosen(self, used: "slice | list[int]") -> "Windows":
         """Return the windows with these indices."""
         first, last, place = (array[used] for array in (self.first, self.last, self.place))
-        return Windows(first, last, place, self.overlap, self.cycles, self.amplitudes[used])
+        return Windows(first, last, place, self.overlap, self.cycles, self.amplitudes[used], self.slip)
 
     def apart(self) -> "Windows":
         """Return windows that do not overlap, the last one among them."""
@@ -112,7 +113,19 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     first[0] -= np.count_nonzero(
         ((time[-1] - time[: first[0]]) * fundamental + 1e-9).astype(int) < int(duration * fundamental)
     )
-    return Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2))
+    slip = _slip(scaled, edges[::fine] - edges[0]) / np.median(last[enough] - first[enough])
+    return Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip)
+
+
+def _slip(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return twice the median of the largest second differences in parts of signals (channels, samples).
+
+    Samples that are not at the same phases of every cycle see jumps and narrow peaks earlier or later.
+    """
+    edges = edges[: max(np.searchsorted(edges, values.shape[1] - 2), 1)]
+    edges = edges[np.r_[True, np.diff(edges) > 0]]
+    largest = [np.median(np.maximum.reduceat(np.abs(np.diff(v, 2)), edges)) for v in values if v.size > 2]
+    return 2.0 * np.array(largest if largest else np.zeros(len(values)))
 
 
 @dataclass(frozen=True)
@@ -172,7 +185,7 @@ def plateau(part: Windows) -> tuple[int, int]:
     size = part.sizes
     level = np.quantile(size, 0.9, axis=0)
     noise = np.quantile(np.abs(size[part.overlap :] - size[: -part.overlap]), 0.15, axis=0) / 0.267
-    limit = np.maximum(SMALL_RANGE * level, NOISE_RANGE * noise)
+    limit = np.maximum(SMALL_RANGE * level, NOISE_RANGE * noise) + 2.0 * part.slip
     best = (0, 0)
     for first in range(len(size)):
         if len(size) - first < best[1] - best[0]:
@@ -197,7 +210,7 @@ def _trimmed(part: Windows, usual: Callable[..., Any] | None = None) -> tuple[in
     usual = usual or (np.max if count // 2 < FEWEST_FOR_MEDIAN * reach else np.median)
     for squares, factor in ((away[:, :, 1:].sum(axis=2), DISTANT), (away[:, :, 0], DISTANT_MEAN)):
         distance = np.sqrt(squares)
-        near &= (distance <= factor * usual(distance[inner], axis=0) + SMALLEST_DISTANCE).all(axis=1)
+        near &= (distance <= factor * usual(distance[inner], axis=0) + part.slip + SMALLEST_DISTANCE).all(axis=1)
     first, last, least = 0, count, (MINIMUM_CYCLES - 1) * reach + 1
     span = min(2 * reach + 1, least)
     while last - first > least and not near[first : first + span].all():
