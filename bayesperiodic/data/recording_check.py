@@ -67,6 +67,17 @@ class Finding(Storable):
         Effect on all amplitudes of the channel together [standard errors]; NaN if unknown.
     text, cure : str
         What happened, and what to do.
+
+    Examples
+    --------
+    >>> t = np.arange(0, 60, 0.01)
+    >>> force = np.cos(2 * np.pi * t)
+    >>> force[1000:1200] = force[1000]
+    >>> (finding,) = bp.Recording.from_arrays(t, {"force": force}).check().findings
+    >>> finding.kind, finding.severity, finding.count, finding.times.round(2).tolist()
+    ('stuck', 'ruinous', 201, [[10.0, 12.0]])
+    >>> finding.cure
+    "recording.without(stuck=True, channel='force') leaves them out"
     """
 
     kind: str
@@ -408,10 +419,20 @@ class RecordingCheck(Result):
         Times of the part that `fold` uses [s].
     jitter : float
         Standard deviation of the steps of time, without gaps, relative to their median.
-    bad : dict of str to dict of str to array
+    bad : dict of str to dict of str to array (faulty samples,)
         Numbers of the samples by channel and kind ("outliers", "stuck", "clipped"), for `Recording.without`.
     reason : str
         Why there is no frequency or no steady part; empty otherwise.
+
+    Examples
+    --------
+    >>> t = np.arange(0, 60, 0.01)
+    >>> rising = np.minimum(t / 10, 1) * np.cos(2 * np.pi * t)
+    >>> check = bp.Recording.from_arrays(t, {"x": rising}, name="run 1").check()
+    >>> check.sentence
+    '50 of 60 cycles at 1 Hz are used, 10 to 59.99 s.'
+    >>> print(*check.findings)
+    the signals change until 10 s; 10 to 59.99 s are used (50 of 60 cycles)
     """
 
     name: str
@@ -432,11 +453,13 @@ class RecordingCheck(Result):
         return max((finding.severity for finding in self.findings), key=SEVERITIES.index, default=HARMLESS)
 
     def __str__(self) -> str:
-        lines = [f"Recording {self.name!r}: {self._sentence()}", self.table.to_string(float_format="{:.5g}".format)]
+        lines = [f"Recording {self.name!r}: {self.sentence}", self.table.to_string(float_format="{:.5g}".format)]
         lines += [f"{finding.severity}: {finding}." for finding in self.findings]
         return "\n".join(lines + ([] if self.findings else ["Nothing was found."]))
 
-    def _sentence(self) -> str:
+    @property
+    def sentence(self) -> str:
+        """The part that `Recording.fold` uses, or the reason why there is none."""
         if self.reason:
             return f"no mean period: {self.reason}"
         jitter = f", steps of time vary by {self.jitter:.1%}" if self.jitter > 1e-3 else ""
