@@ -177,7 +177,9 @@ def outliers_of(residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, st
     before = np.where(first > 0, change[np.maximum(first - 1, 0)], np.inf)
     last = first + length - 1
     after = np.where(last < values.size - 1, change[np.minimum(last, change.size - 1)], np.inf)
+    # What such runs do to the mean period is far at their phases in every cycle, but without jumps.
     lone = np.minimum(before, after) > 2.0 * usual + step
+    first, length = first[lone], length[lone]
     cycles = max(float(np.ptp(phase)), 1.0)
     bins = np.minimum((phase[first] % 1.0 * 64).astype(int), 63)
     cycle = np.floor(phase[first] - phase[0]).astype(int)
@@ -186,9 +188,10 @@ def outliers_of(residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, st
         often[k] = np.unique(cycle[bins == k]).size / cycles
     every = often + np.roll(often, 1) + np.roll(often, -1)
     if far.mean() < 0.2:
-        lone &= every[bins] < RETURNING * np.maximum(1.0, 3.0 * _expected(far, cycles))
+        rare = every[bins] < RETURNING * np.maximum(1.0, 3.0 * _expected(far, cycles))
+        first, length = first[rare], length[rare]
     result = np.zeros(values.size, dtype=bool)
-    for a, n in zip(first[lone], length[lone], strict=True):
+    for a, n in zip(first, length, strict=True):
         result[a : a + n] = True
     if value is not None and result[values == value].mean() > ALL_DROPPED:
         result |= values == value

@@ -121,8 +121,8 @@ def _wrapped(name: str, findings: list[Finding]) -> str:
 def _still(signals: Signals, faults: list[ChannelFaults]) -> str:
     still = [channel for channel, fault in zip(signals.channels, faults, strict=True) if fault.stuck]
     return (
-        f"recording: must move, got {signals.name!r}, in which one of {', '.join(map(repr, still))} is stuck most of "
-        "the time; leave the channel out."
+        f"recording: must move, got {signals.name!r}, in which {', '.join(map(repr, still))} is stuck most "
+        "of the time; leave the channel out."
     )
 
 

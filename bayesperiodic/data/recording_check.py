@@ -50,8 +50,8 @@ class Finding(Storable):
     Attributes
     ----------
     kind : str
-        "constant", "wraps", "stuck", "held", "clipped", "outliers", "gaps", "ramp", "transient", "drift", "beating",
-        "amplitude step" or "phase step".
+        "constant", "wraps", "stuck", "held" (a slower logger), "clipped", "outliers", "gaps", "ramp", "transient",
+        "drift", "beating", "amplitude step" or "phase step".
     channel : str
         Empty for all channels together.
     severity : str

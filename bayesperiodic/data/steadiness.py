@@ -27,6 +27,8 @@ DISTANT, DISTANT_MEAN = 3.0, 12.0
 FEWEST_FOR_MEDIAN = 9
 # Windows from which a transient is searched for, and false-alarm rate of a significant slope.
 FEWEST_FOR_TRANSIENT, SLOPE_FALSE_ALARM = 8, 1e-4
+# Largest correlation of the noise of neighbouring windows.
+LONGEST_MEMORY = 0.8
 # Shares of a channel's standard deviation below which distances and noise do not count.
 SMALLEST_DISTANCE, SMALLEST_NOISE = 1e-9, 1e-6
 # Bias of the mean amplitudes by a transient that is allowed, in standard errors of all together.
@@ -175,6 +177,11 @@ def _change(sizes: np.ndarray) -> np.ndarray:
     slope = place @ sizes / (place @ place)
     rest = sizes - sizes.mean(axis=0) - place[:, None] * slope
     error = np.sqrt(np.sum(rest**2, axis=0) / max(count - 2, 1) / (place @ place))
+    # Noise that lasts longer than a window, as first-order autoregressive one.
+    power = np.sum(rest**2, axis=0)
+    memory = np.divide(np.sum(rest[1:] * rest[:-1], axis=0), power, out=np.zeros(power.size), where=power > 0.0)
+    memory = np.clip(memory, 0.0, LONGEST_MEMORY)
+    error *= np.sqrt((1.0 + memory) / (1.0 - memory))
     change = slope * count / np.abs(sizes.mean(axis=0))
     significant = np.abs(slope) > error * student.isf(0.5 * SLOPE_FALSE_ALARM, count - 2)
     return np.where(significant, change, 0.0)
