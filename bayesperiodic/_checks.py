@@ -137,14 +137,24 @@ def integer(argument: str, value: Any, minimum: int | None = None) -> int:
 
 
 def real_array(argument: str, values: Any) -> np.ndarray:
-    """Return `values` as an array of floats; raise a ValueError unless they are real numbers."""
+    """Return `values` as an array of floats; raise a ValueError unless they are real numbers.
+
+    Masked values, and the missing ones of pandas, are NaN. Dates and durations are no numbers.
+    """
     try:
         array = np.asarray(values)
-        if np.iscomplexobj(array):
+        if np.iscomplexobj(array) or array.dtype.kind in "mM":
             raise ValueError
-        return array.astype(float)
+        if array.dtype == object:
+            import pandas as pd
+
+            array = np.where(pd.isna(array), np.nan, array)
+        floats = array.astype(float)
     except (TypeError, ValueError):
-        raise ValueError(f"{argument}: must be an array of real numbers, got {shortened(values)}.") from None
+        kind = getattr(values, "dtype", None)
+        got = f"{shortened(values)}{f' of type {kind}' if kind is not None else ''}"
+        raise ValueError(f"{argument}: must be an array of real numbers, got {got}.") from None
+    return np.where(np.ma.getmaskarray(values), np.nan, floats) if np.ma.isMaskedArray(values) else floats
 
 
 def finite_vector(argument: str, values: Any, length: int | None = None, meaning: str = "") -> np.ndarray:
@@ -159,7 +169,7 @@ def finite_vector(argument: str, values: Any, length: int | None = None, meaning
     if bad.size:
         raise ValueError(
             f"{argument}: must be finite, got {array[bad[0]]} at index {bad[0]} ({bad.size} of {array.size} values are "
-            "NaN or infinite)."
+            "masked, NaN or infinite)."
         )
     return array
 

@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import covariance_cholesky
+from bayesperiodic.data.recording_check import Finding
+from bayesperiodic.data.response_period import summary
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -65,8 +67,12 @@ class Experiment(Result):
     period_test : DataFrame, optional
         Evidence of ``fold(periods="auto")``, a row for each response period tested: drive ``periods``, ``cycles``
         used, ``explained`` fraction of the variance (smallest of the channels), share of the variance ``between`` the
-        lines (largest, of ``channel``; 0 if white), ``p`` of the lines that divisors lack, and ``verdict``: "chosen",
-        "not periodic", "adds no lines" or "lacks lines".
+        lines (largest, of ``channel``; 0 if white), ``p`` of the lines that divisors lack, the ``share`` of a
+        channel's variance in those of them that stand out, the ``contrast`` of the strongest to the lines beside it,
+        ``verdict`` ("chosen", "not periodic", "adds no lines", "lines too small", "lines fade", "mains or alias" or
+        "lacks lines"), and ``remark``, which lines there are and what would be needed.
+    findings : tuple of Finding
+        What the check of the recording found, see `Recording.check`.
     synthetic : bool
         True if the data were simulated.
     mask : bool array (samples·periods,), optional
@@ -124,6 +130,7 @@ class Experiment(Result):
     period_drift: float = field(default=0.0, kw_only=True)
     origin: float = field(default=0.0, kw_only=True)
     period_test: "pd.DataFrame | None" = field(default=None, kw_only=True)
+    findings: tuple[Finding, ...] = field(default=(), kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
     covariance: np.ndarray | None = field(default=None, kw_only=True)
@@ -352,14 +359,11 @@ class Experiment(Result):
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
         text = ""
         if self.period_test is not None:
-            row = self.period_test.loc[self.period_test.periods == self.periods].iloc[0]
-            text = f"; response period {self.periods} drive periods, chosen of 1 to {self.period_test.periods.max()}: "
-            text += f"it explains {row.explained:.1%} of the variance"
-            text += f", p = {row.p:.1g} without the lines it adds to its divisors" if self.periods > 1 else ""
+            text = f"; {summary(self.period_test, self.periods)}"
         return (
             f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples per "
             f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
-            f"{text})"
+            f"{text}{''.join(f'; {finding}' for finding in self.findings)})"
         )
 
 

@@ -1,15 +1,14 @@
-"""Reading of columns from CSV, NPZ and MAT files, and conversion of their units."""
+"""Reading of columns from CSV, NPZ and MAT files."""
 
 import csv
 import io
 import itertools
 import math
-import re
 import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
@@ -17,6 +16,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from bayesperiodic import _checks
+from bayesperiodic.data.times import dates
 
 # Texts of missing values.
 MISSING = [
@@ -37,17 +37,7 @@ NUMERIC = {
     15: "uint64",
 }  # fmt: skip
 
-Units = Mapping[str, float | Sequence[str]]
 Stored = tuple[Iterable[str], Mapping[str, Any]]
-
-LONGEST_UNIT = 100
-# Products, quotients and groups of names with an exponent of one digit; the only number is the 1 of "1/s".
-SUPERSCRIPT_DIGITS = "¹²³⁰⁴⁵⁶⁷⁸⁹"
-UNIT_TOKEN = re.compile(
-    rf"(?:[^\W\d{SUPERSCRIPT_DIGITS}]|[°%])[^\W{SUPERSCRIPT_DIGITS}]*"
-    rf"(?:\s*(?:\*\*|\^)\s*[+-]?[0-9](?:\.5)?(?![\w.])|⁻?[{SUPERSCRIPT_DIGITS}](?!\w))?"
-    r"|1(?![\w.])|[()]|[*/·]|\s+"
-)
 
 
 @dataclass(frozen=True)
@@ -61,8 +51,10 @@ class Format:
     kind: str  # what a file must be, for errors
     columns: Callable[[Path, list[str]], Stored]
 
-    def read(self, path: str | Path, wanted: Iterable[str], label: str | None = None) -> dict[str, np.ndarray]:
-        """Return named columns of numbers; the column `label` may contain text."""
+    def read(
+        self, path: str | Path, wanted: Iterable[str], label: str | None = None, time: str | None = None
+    ) -> dict[str, np.ndarray]:
+        """Return named columns of numbers; the column `label` may contain text, and `time` dates."""
         wanted, file = [*wanted], existing(path)
         try:
             names, stored = self.columns(file, wanted)
@@ -73,23 +65,30 @@ class Format:
             raise ValueError(f"path: must be {self.kind}, got {str(path)!r} ({reason}).") from None
         for column in wanted:
             _checks.one_of(f"column of {file.name}", column, names)
-        return {column: _column(file, column, stored[column], column == label) for column in wanted}
+        return {column: _column(file, column, stored[column], column == label, column == time) for column in wanted}
 
 
-def _column(file: Path, column: str, values: Any, text: bool) -> np.ndarray:
-    """Return a column of numbers, or of texts too."""
+def _column(file: Path, column: str, values: Any, text: bool, time: bool) -> np.ndarray:
+    """Return a column of numbers, or of texts too; of times also as dates, and integers as they are."""
     argument, array = f"column {column!r} of {file.name}", np.squeeze(np.asarray(values))
+    time = time and not text
+    if time and (times := dates(argument, array)) is not None:
+        array = times
     if array.dtype == object and not text:
         import pandas as pd
 
-        rows = np.flatnonzero(pd.isna(pd.to_numeric(array, errors="coerce")) & pd.notna(array))
-        got = f"{array[rows[0]]!r} in data row {rows[0] + 1}" if rows.size else "numbers too long to be read"
-        raise ValueError(f"{argument}: must contain numbers, with a decimal point, got {got}.")
-    if array.ndim != 1 or (array.dtype.kind not in "fiub" and not text):
+        cells = np.atleast_1d(array)
+        rows = np.flatnonzero(pd.isna(pd.to_numeric(cells, errors="coerce")) & pd.notna(cells))
+        got = f"{cells[rows[0]]!r} in data row {rows[0] + 1}" if rows.size else "numbers too long to be read"
+        hint = (
+            "; dates must be those of ISO 8601, others are read by pandas.to_datetime for from_arrays" if time else ""
+        )
+        raise ValueError(f"{argument}: must contain numbers, with a decimal point, got {got}{hint}.")
+    if array.ndim != 1 or (array.dtype.kind not in ("fiubmM" if time else "fiub") and not text):
         raise ValueError(
             f"{argument}: must be one column of real numbers, got shape {np.shape(values)} and type {array.dtype}."
         )
-    return array if text else array.astype(float)
+    return array if text or time else array.astype(float)
 
 
 def _csv_columns(file: Path, wanted: list[str]) -> Stored:
@@ -360,49 +359,3 @@ def _is_no_header(names: list[str]) -> bool:
         return bool([float(name) for name in names])
     except ValueError:
         return False
-
-
-def convert(name: str, values: np.ndarray, unit: float | Sequence[str]) -> np.ndarray:
-    """Return the values of a channel, multiplied by a factor or converted by a pair of units such as ("mm", "m")."""
-    argument = f"units[{name!r}]"
-    if isinstance(unit, int | float):
-        factor = _checks.finite_number(argument, unit)
-        if factor == 0.0:
-            raise ValueError(f"{argument}: must not be zero, got {unit!r}.")
-        return values * factor
-    if isinstance(unit, str) or len(unit) != 2 or not all(isinstance(u, str) for u in unit):
-        raise ValueError(f"{argument}: must be a factor or a pair such as ('mm', 'm'), got {unit!r}.")
-    for text in unit:
-        if len(text) > LONGEST_UNIT or not _is_unit(text):
-            shown = text if len(text) <= LONGEST_UNIT else f"{text[:LONGEST_UNIT]}…"
-            raise ValueError(
-                f"{argument}: must be units that are multiplied or divided, with exponents of one digit, such as "
-                f"'kg*m/s**2', got {shown!r}."
-            )
-    import pint
-
-    try:
-        first, second = (text.replace("·", "*") for text in unit)
-        return np.asarray(pint.UnitRegistry().Quantity(values, first).to(second).magnitude, dtype=float)
-    except (pint.errors.PintError, AssertionError, TypeError, ValueError, ArithmeticError) as error:
-        raise ValueError(
-            f"{argument}: must be two units of the same dimension, got {tuple(unit)!r} ({error})."
-        ) from None
-
-
-def _is_unit(text: str) -> bool:
-    """Return whether a text consists of the permitted tokens, and no operator follows another one."""
-    place, operator, depth = 0, False, 0
-    while place < len(text):
-        token = UNIT_TOKEN.match(text, place)
-        if token is None:
-            return False
-        place, mark = token.end(), token.group().strip()
-        if mark in ("*", "/", "·"):
-            if operator:
-                return False
-            operator = True
-        elif mark:
-            operator = False
-            depth += {"(": 1, ")": -1}.get(mark, 0)
-    return depth == 0

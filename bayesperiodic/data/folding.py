@@ -10,40 +10,29 @@ from scipy.special import chdtrc, fdtrc, softmax
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.harmonics import (
-    MINIMUM_CYCLES,
     NEGLIGIBLE_PHASE,
     HarmonicFit,
     Pace,
     fit_harmonics,
-    guess_frequency,
     refine_frequency,
     resolved_harmonics,
     track_frequency,
 )
+from bayesperiodic.data.inspection import Inspection, inspect
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
-from bayesperiodic.data.response_period import FALSE_ALARM_RATE, FINENESS, aperiodic, response_period
+from bayesperiodic.data.recording_check import refuse
+from bayesperiodic.data.response_period import FALSE_ALARM_RATE, FINENESS, aperiodic, even_times, response_period
+from bayesperiodic.data.signals import Signals, cycles_of, explains_more, first_guess, refuse_gaps
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# Steps of time that are gaps, in periods, if they are longer than so many usual steps; if the period is unknown,
-# in usual steps.
-GAP, USUAL_STEPS, MANY_STEPS = 0.25, 3.0, 30.0
 # Spreads of a channel whose squares and inverse squares are ordinary numbers, and grid points of a response period.
 MAXIMUM_POINTS = 1_000_000
-# A crossing counts after the signal was below minus this fraction of its standard deviation.
-HYSTERESIS = 0.25
-# Smallest relative step of the period, in itself and in standard errors.
-SMALLEST_PERIOD_STEP, SIGNIFICANT_PERIOD_STEP = 1e-3, 8.0
-MINIMUM_PERIODICITY = 0.5
+# Share of a channel's variance that its mean period explains at least, and of one that is surely periodic.
+MINIMUM_PERIODICITY, CLEARLY_PERIODIC = 0.5, 0.9
 # Ratio of residual variances from which the estimated frequency is right, and the given one wrong.
 CLEARLY = 4.0
-# Difference of two phases [cycles] at the ends of a recording that selects other cycles.
-OTHER_CYCLES = 0.05
-# Largest distance of a cycle from the steady ones, relative to their own, in harmonics and in the mean value.
-STEADY, STEADY_MEAN = 3.0, 12.0
-# Cycles from which the median of their distances is taken, the largest one of fewer.
-FEWEST_FOR_MEDIAN = 9
 # Response cycles of the later half of a recording that show a period which the whole has not.
 LATER_CYCLES = 6
 CROSSING, AUTO = "crossing", "auto"
@@ -58,31 +47,6 @@ LINES_NEAR_ZERO, WHITE_LINES, SLOW_LINES = 40, 8, 2
 # Correlation times in recording lengths, white floors relative to line 1, and line 0 of 1/f noise relative to line 1
 # if its spectrum is flat below a quarter of a line.
 CORRELATION_TIMES, FLOORS, ZERO_OF_PINK = (0.45, 0.1, 0.05, 0.025), (0.0, 0.01, 0.1), 2.75
-
-
-@dataclass(frozen=True)
-class Signals:
-    """Channels sampled at the same times."""
-
-    name: str  # of the recording, for messages
-    time: np.ndarray  # (samples,)
-    channels: tuple[str, ...]  # inputs first
-    values: np.ndarray  # (channels, samples)
-    inputs: int  # number of inputs
-
-    def __post_init__(self) -> None:
-        for i, (channel, values) in enumerate(zip(self.channels, self.values, strict=True)):
-            if np.ptp(values) == 0.0:
-                kind, remedy = "outputs", ""
-                if i < self.inputs:
-                    kind, remedy = "inputs", ", and write it in the model as a parameter with its value in `fixed`"
-                raise ValueError(
-                    f"{kind}[{channel!r}]: must vary, got the constant {values[0]:g}; leave the channel out{remedy}."
-                )
-
-    def part(self, samples: np.ndarray) -> "Signals":
-        """Return the signals at the selected samples."""
-        return replace(self, time=self.time[samples], values=self.values[:, samples])
 
 
 def fold_signals(
@@ -101,23 +65,25 @@ def fold_signals(
     if isinstance(origin, str) and origin != CROSSING:
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
-    signals = replace(signals, time=signals.time - start)
-    fundamental = _first_guess(signals, frequency, periods)
-    _refuse_gaps(signals, fundamental)
-    tracked = _tracked(signals, fundamental, frequency is not None)
-    cycle, shape = _cycles_apart(signals, tracked)
-    drift = dict(zip(signals.channels, _drift(shape[::-1]), strict=True))
-    _refuse_drift(signals.name, drift, largest_drift)
-    steady = signals.part(_steady_part(cycle, shape))
-    limit = resolved_harmonics(steady.time, tracked, points)
-    fit, pace = refine_frequency(steady.time, steady.values, tracked, limit)
+    seen = inspect(replace(signals, time=signals.time - start), periods, frequency, points)
+    if seen.steady is None or seen.fit is None:
+        raise ValueError(seen.reason)
+    refuse(signals.name, seen.findings)
+    fit, pace, limit = seen.fit, seen.pace, seen.limit
+    steady = seen.signals.part(seen.steady.samples)
     if frequency is not None:
-        estimated, fit = fit, fit_harmonics(steady.time, steady.values, fundamental, limit)
+        estimated, fit = fit, fit_harmonics(steady.time, steady.values, frequency / periods, limit)
         _refuse_frequency(estimated, fit, pace, float(np.ptp(steady.time)), periods)
+    drift = dict(zip(signals.channels, _drift(seen.steady.part.sizes), strict=True))
+    _refuse_drift(signals.name, drift, largest_drift)
     periodicity = _periodicity(steady, fit)
     cycles = round(np.ptp(steady.time) * fit.frequency)
-    _warn(signals.name, pace, cycles, len(shape))
+    _warn(signals.name, pace, cycles, seen)
     one_cycle, noise = zip(*(_noise(steady, fit, row, cycles) for row in range(len(steady.values))), strict=True)
+    for row, squares in enumerate(seen.steady.squares):
+        order = min(squares.size, noise[row].variance.size)
+        noise[row].variance[:] *= seen.inflation
+        noise[row].variance[:order] += (squares * np.var(seen.signals.values[row]))[:order]
     significant = [_last_significant(a, part) for a, part in zip(fit.amplitudes, noise, strict=True)]
     kept = dict(zip(signals.channels, significant, strict=True)) | _chosen(harmonics, signals.channels, limit)
     amplitudes = fit.amplitudes
@@ -152,6 +118,7 @@ def fold_signals(
         "periodicity": periodicity,
         "drift": drift,
         "origin": start,
+        "findings": seen.findings,
     }
 
 
@@ -162,91 +129,23 @@ def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, 
             f"frequency: must be given for periods={AUTO!r}, because {signals.name!r} has no input that shows the "
             "drive period, got None."
         )
-    drive = _first_guess(signals, frequency, 1)
-    _refuse_gaps(signals, drive)
+    drive = first_guess(signals, frequency, 1)
+    refuse_gaps(signals, drive)
     time, values = signals.time, signals.values
     if frequency is None:
         driven = values[: signals.inputs]
         tracked = track_frequency(time, driven, drive)
+        time = even_times(time, driven, tracked)
         drive = refine_frequency(time, driven, tracked, resolved_harmonics(time, tracked, time.size))[0].frequency
+    time = even_times(time, values, drive)
     chosen, evidence = response_period(time, values, signals.channels, drive)
     later = time >= 0.5 * (time[0] + time[-1])
-    if chosen is None and _cycles(time[later], drive) >= LATER_CYCLES:
+    if chosen is None and cycles_of(time[later], drive) >= LATER_CYCLES:
         chosen, again = response_period(time[later], values[:, later], signals.channels, drive, LATER_CYCLES)
         evidence = evidence if chosen is None else again
     if chosen is None:
         raise aperiodic(signals.name, drive, evidence)
     return chosen, evidence
-
-
-def _first_guess(signals: Signals, frequency: float | None, periods: int) -> float:
-    remedy = "give the forcing frequency"
-    time, values = _longest_stretch(signals)
-    if frequency is not None:
-        fundamental: float | None = _checks.positive("frequency", frequency) / periods
-        remedy = f"check frequency = {frequency!r} Hz and periods = {periods}"
-    elif signals.inputs:
-        guess = guess_frequency(time, values[: signals.inputs])
-        fundamental = guess / periods if guess else None
-    else:
-        fundamental = guess_frequency(time, values)
-    if fundamental is None or _cycles(signals.time, fundamental) < MINIMUM_CYCLES:
-        period = "no period" if fundamental is None else f"{_cycles(signals.time, fundamental):.2f} cycles"
-        raise ValueError(
-            f"recording: must have at least {MINIMUM_CYCLES} cycles, got {period} in {signals.name!r} of "
-            f"{np.ptp(signals.time):g} s; record longer, or {remedy}."
-        )
-    return fundamental
-
-
-def _longest_stretch(signals: Signals) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times and values of the longest part without gaps of many steps."""
-    step = np.diff(signals.time)
-    edges = np.concatenate([[0], np.flatnonzero(step > MANY_STEPS * np.median(step)) + 1, [signals.time.size]])
-    longest = int(np.argmax(np.diff(edges)))
-    part = slice(edges[longest], edges[longest + 1])
-    return signals.time[part], signals.values[:, part]
-
-
-def _cycles(time: np.ndarray, fundamental: float) -> float:
-    """Return the number of cycles, the last sample's step included."""
-    return float(np.ptp(time) * time.size / (time.size - 1) * fundamental * (1 + 1e-9))
-
-
-def gaps(time: np.ndarray, period: float) -> np.ndarray:
-    """Return the last samples before gaps."""
-    step = np.diff(time)
-    return np.flatnonzero(step > max(GAP * period, USUAL_STEPS * np.median(step)))
-
-
-def _refuse_gaps(signals: Signals, fundamental: float) -> None:
-    if (ends := gaps(signals.time, 1.0 / fundamental)).size:
-        first, last = signals.time[ends[0]], signals.time[ends[0] + 1]
-        raise ValueError(
-            f"recording: must have no gap longer than {GAP:g} periods, got {signals.name!r} without samples from "
-            f"{first:g} to {last:g} s (period {1.0 / fundamental:g} s); fold the parts that `split` returns."
-        )
-
-
-def _tracked(signals: Signals, fundamental: float, given: bool) -> float:
-    """Return the frequency by which cycles are compared: the estimated one, if the given one is clearly another one."""
-    time, values = signals.time, signals.values
-    tracked = track_frequency(time, values, fundamental)
-    if given:
-        few = min(10, resolved_harmonics(time, max(tracked, fundamental), time.size))
-        near = abs(tracked - fundamental) * np.ptp(time) < OTHER_CYCLES
-        if near or not _explains_more(*(fit_harmonics(time, values, rate, few) for rate in (tracked, fundamental))):
-            return fundamental
-    if (cycles := _cycles(time, tracked)) < MINIMUM_CYCLES:
-        raise ValueError(
-            f"recording: must have at least {MINIMUM_CYCLES} cycles, got {cycles:.2f} cycles of {tracked:.6g} Hz in "
-            f"{signals.name!r}; record longer."
-        )
-    return tracked
-
-
-def _explains_more(fit: HarmonicFit, other: HarmonicFit) -> bool:
-    return bool(np.sum(np.log(fit.variances / other.variances)) < 0.0)
 
 
 def _refuse_frequency(estimated: HarmonicFit, given: HarmonicFit, pace: Pace, duration: float, periods: int) -> None:
@@ -255,7 +154,7 @@ def _refuse_frequency(estimated: HarmonicFit, given: HarmonicFit, pace: Pace, du
     # Few cycles have too few degrees of freedom for a test, but noise of any kind would not shrink so much.
     shrinks = np.mean(np.log(given.variances / estimated.variances)) > np.log(CLEARLY)
     clear = shrinks and abs(difference) * duration > NEGLIGIBLE_PHASE
-    if clear or (_explains_more(estimated, given) and pace.differs(difference, duration)):
+    if clear or (explains_more(estimated, given) and pace.differs(difference, duration)):
         raise ValueError(
             f"frequency: must be that of the recording, which is estimated as {estimated.frequency * periods:.9g} Hz "
             f"with a standard error of {pace.se * periods:.1g} Hz, got {given.frequency * periods:.9g} Hz, whose phase "
@@ -264,8 +163,9 @@ def _refuse_frequency(estimated: HarmonicFit, given: HarmonicFit, pace: Pace, du
         )
 
 
-def _warn(name: str, pace: Pace, cycles: int, total: int) -> None:
+def _warn(name: str, pace: Pace, cycles: int, seen: Inspection) -> None:
     """Warn of a period that drifts, and of a steady part that is less than half of the recording."""
+    total = seen.total
     if pace.drifts:
         warnings.warn(
             f"{name}: the period changes by {-pace.drift:+.2%} over the {cycles} cycles used (of {total}). The mean "
@@ -284,8 +184,10 @@ def _warn(name: str, pace: Pace, cycles: int, total: int) -> None:
             stacklevel=4,
         )
     elif cycles < total and cycles <= total // 2:
+        last = seen.steady is not None and seen.steady.samples.stop == seen.signals.time.size
+        which, others = ("the last ", "those before") if last else ("", "the others")
         warnings.warn(
-            f"{name}: only the last {cycles} of {total} cycles are used, because those before differ from them: a long "
+            f"{name}: only {which}{cycles} of {total} cycles are used, because {others} differ from them: a long "
             "transient, a drift, or several records in one. Check the recording, and select a part with `between` or "
             "`split`.",
             UserWarning,
@@ -293,42 +195,10 @@ def _warn(name: str, pace: Pace, cycles: int, total: int) -> None:
         )
 
 
-def _cycles_apart(signals: Signals, fundamental: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cycle of each sample, counted back from the end, and the amplitudes of the whole cycles, last first.
-
-    The amplitudes (cycles, channels, harmonics + 1) are relative to each channel's standard deviation.
-    """
-    time, values = signals.time, signals.values
-    period = 1.0 / fundamental
-    total = int(_cycles(time, fundamental))
-    back = np.minimum(((time[-1] - time) / period + 1e-9).astype(int), total)
-    order = np.arange(2 * min(5, resolved_harmonics(time, fundamental, time.size)) + 1)
-    harmonics = order[: order.size // 2 + 1]
-    first = np.searchsorted(-back, np.arange(1 - total, 1))
-    used = slice(first[0], None)
-    wave, power = np.exp(-2j * np.pi * (fundamental * time[used] % 1.0)), np.ones(time[used].size, dtype=complex)
-    scaled = values[:, used] / values.std(axis=1)[:, None]
-    sums = np.empty((order.size, len(values) + 1, total), dtype=complex)
-    for h in order:
-        for row, signal in zip(sums[h], [1.0, *(scaled if h < harmonics.size else ())], strict=False):
-            row[:] = np.add.reduceat(signal * power, first - first[0])
-        power *= wave
-    # Normal equations of each cycle, as in `fit_harmonics`.
-    moments = np.concatenate([np.conj(sums[:0:-1, 0]), sums[:, 0]])
-    place = order[:, None] - order[None, :] + order.size - 1
-    right = np.concatenate([np.conj(sums[harmonics[:0:-1], 1:]), sums[harmonics, 1:]])
-    amplitudes = np.linalg.solve(np.moveaxis(moments[place], -1, 0), np.moveaxis(right, -1, 0))[:, harmonics[-1] :]
-    amplitudes[:, 1:] *= 2.0
-    return back, np.moveaxis(amplitudes, 1, 2)[::-1]
-
-
-def _drift(shape: np.ndarray) -> list[float]:
-    """Return the relative growth of each channel's strongest harmonic from the first cycle to the last."""
-    every = np.abs(shape[:, :, 1:])
-    strongest = every.mean(axis=0).argmax(axis=1)
-    size = np.take_along_axis(every, strongest[None, :, None], axis=2)[:, :, 0]
-    number = np.arange(len(size)) - 0.5 * (len(size) - 1)
-    return (number @ size / (number @ number) * len(size) / size.mean(axis=0)).tolist()
+def _drift(sizes: np.ndarray) -> list[float]:
+    """Return the relative growth of amplitudes (windows, channels) over the part used."""
+    number = np.arange(len(sizes)) - 0.5 * (len(sizes) - 1)
+    return (number @ sizes / max(float(number @ number), 1.0) * len(sizes) / sizes.mean(axis=0)).tolist()
 
 
 def _refuse_drift(name: str, drift: Mapping[str, float], largest: float | None) -> None:
@@ -343,35 +213,21 @@ def _refuse_drift(name: str, drift: Mapping[str, float], largest: float | None) 
         )
 
 
-def _steady_part(cycle: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Return a mask of the last whole cycles, without the first ones if they differ from the later half.
-
-    Mean values differ under noise slower than a cycle too, and are allowed a larger difference.
-    """
-    total = len(shape)
-    half = max(total // 2, MINIMUM_CYCLES)
-    middle = np.median(shape[:half].real, axis=0) + 1j * np.median(shape[:half].imag, axis=0)
-    away, settled = np.abs(shape - middle) ** 2, np.ones(total, dtype=bool)
-    # The median of few cycles is one of them in every component, and the median distance from it is no scale.
-    usual = np.median if half >= FEWEST_FOR_MEDIAN else np.max
-    for squares, factor in ((away[:, :, 1:].sum(axis=2), STEADY), (away[:, :, 0], STEADY_MEAN)):
-        distance = np.sqrt(squares.max(axis=1))
-        settled &= distance <= factor * usual(distance[:half]) + 1e-9
-    used = total
-    while used > MINIMUM_CYCLES and not settled[used - 1 - min(2, used - 1) : used].all():
-        used -= 1
-    return cycle < used
-
-
 def _periodicity(signals: Signals, fit: HarmonicFit) -> float:
     explained = 1.0 - fit.variances / np.var(signals.values, axis=1, ddof=1)
     worst = int(np.argmin(explained))
     if not explained[worst] >= MINIMUM_PERIODICITY:
+        good = [c for c, share in zip(signals.channels, explained, strict=True) if share >= CLEARLY_PERIODIC]
+        cure = "check the frequency and `periods`, and separate records of different frequencies by `split`"
+        if good:
+            cure = (
+                f"{good[0]!r} is periodic ({explained[signals.channels.index(good[0])]:.1%}): a sensor without a "
+                f"signal, or noise; leave the channel {signals.channels[worst]!r} out"
+            )
         raise ValueError(
             f"recording: must be periodic, got {signals.name!r}, whose mean period at {fit.frequency:.6g} Hz explains "
             f"only {max(explained[worst], 0.0):.1%} of the variance of {signals.channels[worst]!r} (periodicity "
-            f"{explained[worst]:.3f}, at least {MINIMUM_PERIODICITY} is needed); check the frequency and `periods`, "
-            "and separate records of different frequencies by `split`."
+            f"{explained[worst]:.3f}, at least {MINIMUM_PERIODICITY} is needed); {cure}."
         )
     return float(explained[worst])
 
@@ -537,61 +393,3 @@ def _chosen(harmonics: int | Mapping[str, int] | None, names: tuple[str, ...], l
 def _power(variance: np.ndarray) -> float:
     """Return the variance of a signal whose complex amplitudes have these variances."""
     return float(variance[0] + 0.5 * variance[1:].sum())
-
-
-def parts(time: np.ndarray, signal: np.ndarray) -> list[slice]:
-    """Return the parts of at least three cycles between gaps of time and steps of the signal's frequency."""
-    rising = _rising(time, signal)
-    if rising.size < 2:
-        return [slice(0, time.size)]
-    period = float(np.median(np.diff(time[rising])))
-    edges = np.concatenate([[0], gaps(time, period) + 1, [time.size]])
-    pieces = []
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
-        inside = first + _rising(time[first:last], signal[first:last])
-        steps = inside[_steps(time, signal, inside)]
-        bounds = [first, *steps.tolist(), last]
-        pieces += [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-    cycles = [np.searchsorted(rising, part.stop) - np.searchsorted(rising, part.start) for part in pieces]
-    return [part for part, count in zip(pieces, cycles, strict=True) if count > MINIMUM_CYCLES]
-
-
-def _rising(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
-    """Return the samples at which the signal rises above its mean, which it must have left by the hysteresis."""
-    centred = signal - signal.mean()
-    level = HYSTERESIS * centred.std()
-    outside = np.flatnonzero(np.abs(centred) > level)
-    above = centred[outside] > 0.0
-    return outside[1:][above[1:] & ~above[:-1]]
-
-
-def _steps(time: np.ndarray, signal: np.ndarray, rising: np.ndarray) -> list[int]:
-    """Return the numbers of the crossings at which the period changes, by binary segmentation of its logarithm."""
-    if rising.size < 2 * MINIMUM_CYCLES + 2:
-        return []
-    level = signal[rising[0] : rising[-1] + 1].mean()
-    level += HYSTERESIS * signal[rising[0] : rising[-1] + 1].std()
-    fraction = (signal[rising] - level) / np.maximum(signal[rising] - signal[rising - 1], np.finfo(float).tiny)
-    crossing = time[rising] - np.clip(fraction, 0.0, 1.0) * (time[rising] - time[rising - 1])
-    period = np.log(np.diff(crossing))
-    noise = max(float(np.median(np.abs(np.diff(period)))), 1e-4)
-    # A single odd period, as at a jump of the phase, is no step.
-    mirrored = np.concatenate([period[1:2], period, period[-2:-1]])
-    period = np.median([mirrored[:-2], period, mirrored[2:]], axis=0)
-    steps, stack = [], [(0, period.size)]
-    while stack:
-        first, last = stack.pop()
-        size = last - first
-        number = np.arange(MINIMUM_CYCLES, size - MINIMUM_CYCLES + 1)
-        if not number.size:
-            continue
-        segment = period[first:last]
-        before = np.cumsum(segment)[number - 1]
-        difference = before / number - (segment.sum() - before) / (size - number)
-        score = np.abs(difference) * np.sqrt(number * (size - number) / size)
-        best = int(np.argmax(score))
-        if score[best] > SIGNIFICANT_PERIOD_STEP * noise and abs(difference[best]) > SMALLEST_PERIOD_STEP:
-            middle = first + int(number[best])
-            steps.append(middle)
-            stack += [(first, middle), (middle, last)]
-    return sorted(steps)

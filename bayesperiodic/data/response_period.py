@@ -1,5 +1,6 @@
 """Response period of a driven system in drive periods, by a test of the lines of its spectrum."""
 
+from fractions import Fraction
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -24,8 +25,57 @@ COMPARED_LINES, NEGLIGIBLE_AMPLITUDE = 4, 1e-6
 # Grid points of a spectrum for each sample.
 FINENESS = 4
 FALSE_ALARM_RATE = 0.01
+# Least power of a line that stands out, relative to the mean of the lines beside it, and least share of a channel's
+# variance in the lines that a longer response period adds, which is also that of a subharmonic of 1 % of the signal's
+# amplitude. Neglected, a share s changes the other lines by about s. Least part of it in the later half.
+STANDS_OUT, LEAST_SHARE, LASTING = 20.0, 1e-4, 0.5
+# Lines of the mains [Hz], relative error of their frequency, fewest of their periods that show a line, and the lowest
+# frequency [Hz] of their aliases; lower ones are drifts.
+MAINS, MAINS_ERROR, MAINS_PERIODS, LOWEST_ALIAS = np.array([50.0, 60.0, 100.0, 120.0, 150.0, 180.0]), 1e-3, 4, 1.0
+# Lines that are listed in a text, and the smallest p-value that is.
+LISTED, SMALLEST_P = 3, 1e-16
 CHOSEN, REST, NOTHING_ADDED, MORE_LINES = "chosen", "not periodic", "adds no lines", "lacks lines"
+TOO_SMALL, FOREIGN, FADING = "lines too small", "mains or alias", "lines fade"
 PRIMES = (2, 3, 5, 7)
+
+
+class Added(NamedTuple):
+    """Lines of one channel that a response period adds to a shorter one."""
+
+    row: int  # of the channel
+    standing: np.ndarray  # numbers of those that stand out, in units of the response frequency
+    foreign: np.ndarray  # the same of those that may be lines of the mains or aliases of harmonics of the drive
+    share: float  # of the variance, in those that stand out and are not foreign
+    contrast: float  # power of the strongest line relative to those beside it
+    p: float
+    later: float = np.inf  # share of the variance of the later half, if it is long enough
+
+    def verdict(self, level: float) -> str:
+        """Return what the lines say about the response period."""
+        if self.p >= level or not self.standing.size + self.foreign.size:
+            return NOTHING_ADDED
+        if self.share < LEAST_SHARE:
+            return TOO_SMALL if self.standing.size else FOREIGN
+        return CHOSEN if self.later >= LASTING * self.share else FADING
+
+    def remark(self, channel: str, periods: int, level: float) -> str:
+        """Return in words what lines there are, and what would be needed."""
+        verdict = self.verdict(level)
+        if verdict == NOTHING_ADDED and self.standing.size + self.foreign.size:
+            return f"the lines that stand out are as likely by chance: p = {self.p:.1g}, below {level:.1g} is needed"
+        if verdict == NOTHING_ADDED:
+            return f"no lines have {STANDS_OUT:g} times the power of their neighbours"
+        lines = self.foreign if verdict == FOREIGN else self.standing
+        listed = ", ".join(str(Fraction(int(n), periods)) for n in lines[:LISTED])
+        text = f"lines at {listed}{', …' if lines.size > LISTED else ''} of the drive's frequency in {channel!r}"
+        if verdict == FOREIGN:
+            return f"{text} may be those of the mains, or aliases of the drive's harmonics"
+        text += (
+            f" have {self.share:.1e} of its variance, and up to {self.contrast:.3g} times the power of their neighbours"
+        )
+        if verdict == TOO_SMALL:
+            return f"{text}; a share of {LEAST_SHARE:.0e} is needed"
+        return f"{text}; they fade, to {self.later:.1e} in the later half" if verdict == FADING else text
 
 
 class Lines(NamedTuple):
@@ -56,10 +106,11 @@ class Lines(NamedTuple):
         inside = apart & (place <= TESTED_HARMONICS)
         return float(self.rest[inside].mean() * np.count_nonzero(place <= TESTED_HARMONICS) / variance)
 
-    def p_value(self, divisor: int) -> float:
-        """Return the p-value of the lines that a shorter response period lacks, by `divisor`: there are none.
+    def added(self, row: int, variance: float, divisor: int, foreign: np.ndarray, channels: int) -> Added:
+        """Return the lines that a response period shorter by `divisor` lacks, and the p-value that there are none.
 
-        An F-test of their power against that of the nearest lines between harmonics, both divided by a smooth spectrum.
+        An F-test of their power against that of the nearest lines between harmonics, both divided by a smooth spectrum,
+        for so many channels. Foreign are those at (harmonics,) of 1, 2, … of the response frequency.
         """
         between, window = self.between, np.ones(2 * max(self.cycles, SMOOTH) + 1)
         total, count = np.convolve(self.rest, window, "same"), np.convolve(between, window, "same")
@@ -75,7 +126,13 @@ class Lines(NamedTuple):
         # Satterthwaite; how quantisation errors are distributed over the lines is hardly known.
         size = float(noise.mean())
         freedom = (size + floor) ** 2 / (size**2 / (2 * beside.size) + floor**2 / REPEATED_FREEDOM)
-        return float(fdtrc(2 * number.size, freedom, np.mean(self.harmonics[number - 1] / (noise + floor))))
+        power = self.harmonics[number - 1]
+        p = float(fdtrc(2 * number.size, freedom, np.mean(power / (noise + floor))))
+        nearest = self.rest[beside].mean(axis=1) + floor
+        stands, native = power > STANDS_OUT * nearest, ~foreign[number - 1]
+        share = float((power - nearest)[stands & native].sum() / variance)
+        contrast = float((power / nearest)[stands].max(initial=0.0))
+        return Added(row, number[stands & native], number[stands & ~native], share, contrast, min(channels * p, 1.0))
 
 
 def _lines(time: np.ndarray, values: np.ndarray, frequency: float, periods: int, cycles: int) -> list[Lines]:
@@ -105,6 +162,56 @@ def _highest(time: np.ndarray, frequency: float, periods: int) -> int:
     return min(limit, max(TESTED_HARMONICS * periods, 1))
 
 
+def _mains(frequency: float, count: int, step: float, duration: float) -> np.ndarray:
+    """Return which of lines 1, 2, …, `count` of a frequency are near those of the mains, or their aliases."""
+    if duration * MAINS[0] < MAINS_PERIODS:
+        return np.zeros(count, dtype=bool)
+    alias = np.abs(MAINS - np.rint(MAINS * step) / step)
+    away = np.abs(frequency * (1 + np.arange(count))[:, None] - alias)
+    return np.any((away < 1.0 / duration + MAINS_ERROR * MAINS) & (alias > LOWEST_ALIAS), axis=1)
+
+
+def _aliases(line: Lines, periods: int, per_period: float) -> np.ndarray:
+    """Return which harmonics of the response may be aliases of the drive's, whose power falls as 1/h² or faster."""
+    number = 1 + np.arange(line.harmonics.size)
+    drive = number[periods - 1 :: periods] // periods
+    if not drive.size:
+        return np.zeros(number.size, dtype=bool)
+    power = line.harmonics[periods - 1 :: periods] * drive**2
+    largest = power[drive.size // 2 :].max()
+    order = per_period + np.stack([number, -number]) / periods
+    near = np.abs(order - np.rint(order)) < 1.0 / (line.cycles * periods)
+    return np.any(near & (line.harmonics < largest / order**2), axis=0)
+
+
+def _added(
+    time: np.ndarray, values: np.ndarray, frequency: float, periods: int, lines: list[Lines], level: float
+) -> Added | None:
+    """Return the lines of a response period that are least needed, in the channel that shows them best."""
+    cycles, step = lines[0].cycles, np.ptp(time) / (time.size - 1)
+    order = (NOTHING_ADDED, FOREIGN, TOO_SMALL, FADING, CHOSEN)
+
+    def rank(added: Added) -> tuple[int, float, float]:
+        return order.index(added.verdict(level)), added.share, -added.p
+
+    later = time >= 0.5 * (time[0] + time[-1])
+    fewer, half = int(np.ptp(time[later]) * frequency) // periods, None
+    weakest = []
+    for divisor in [prime for prime in PRIMES if periods % prime == 0]:
+        every = []
+        for row, (line, signal) in enumerate(zip(lines, values, strict=True)):
+            foreign = _mains(frequency / periods, line.harmonics.size, step, cycles * periods / frequency)
+            foreign |= _aliases(line, periods, 1.0 / (step * frequency))
+            every.append(line.added(row, float(signal.var()), divisor, foreign, len(lines)))
+        best = max(every, key=rank)
+        if best.verdict(level) == CHOSEN and fewer >= MINIMUM_CYCLES:
+            half = half or _lines(time[later], values[:, later], frequency, periods, fewer)
+            power = half[best.row].harmonics[best.standing[best.standing <= half[best.row].harmonics.size] - 1]
+            best = best._replace(later=float(power.sum() / values[best.row, later].var()))
+        weakest.append(best)
+    return min(weakest, key=rank, default=None)
+
+
 def response_period(
     time: np.ndarray, values: np.ndarray, channels: tuple[str, ...], frequency: float, cycles: int = MINIMUM_CYCLES
 ) -> "tuple[int | None, pd.DataFrame]":
@@ -120,28 +227,77 @@ def response_period(
     for periods in range(1, longest + 1):
         cycles = int(min(total, MOST_PERIODS)) // periods
         lines = _lines(time, values, frequency, periods, cycles)
-        share = [line.unexplained(periods, float(v.var())) for line, v in zip(lines, values, strict=True)]
-        worst = int(np.argmax(share))
-        divisors = [prime for prime in PRIMES if periods % prime == 0]
-        p = max((min(line.p_value(d) for line in lines) * len(lines) for d in divisors), default=np.nan)
-        verdict = REST if share[worst] > LARGEST_BETWEEN else NOTHING_ADDED if p >= level else CHOSEN
-        explained = min(line.explained for line in lines)
-        rows.append((periods, cycles, explained, share[worst], channels[worst], np.minimum(p, 1.0), verdict))
-    names = ["periods", "cycles", "explained", "between", "channel", "p", "verdict"]
-    table = pd.DataFrame(rows, columns=names)
+        between = [line.unexplained(periods, float(v.var())) for line, v in zip(lines, values, strict=True)]
+        worst = int(np.argmax(between))
+        added = _added(time, values, frequency, periods, lines, level)
+        verdict = CHOSEN if added is None else added.verdict(level)
+        rows.append(
+            {
+                "periods": periods,
+                "cycles": cycles,
+                "explained": min(line.explained for line in lines),
+                "between": between[worst],
+                "channel": channels[worst],
+                "p": np.nan if added is None else added.p,
+                "share": np.nan if added is None else added.share,
+                "contrast": np.nan if added is None else added.contrast,
+                "verdict": REST if between[worst] > LARGEST_BETWEEN else verdict,
+                "remark": "" if added is None else added.remark(channels[added.row], periods, level),
+            }
+        )
+    table = pd.DataFrame(rows)
     needed = table.loc[table.verdict == CHOSEN, "periods"]
     chosen = int(needed.max()) if len(needed) else None
     table.loc[(table.verdict == CHOSEN) & (table.periods != chosen), "verdict"] = MORE_LINES
     return chosen, table
 
 
+def even_times(time: np.ndarray, values: np.ndarray, frequency: float) -> np.ndarray:
+    """Return equidistant times if the signals (channels, samples) repeat better with them than with the times given.
+
+    Rounded times modulate the phase, with lines at parts of the sampling rate beside those of the drive.
+    """
+    number = np.arange(time.size) - 0.5 * (time.size - 1)
+    step = (number @ time) / (number @ number)
+    even = time.mean() + step * number
+    if not 1e-9 * step < np.abs(time - even).max() < 0.5 * step:
+        return time
+    few = min(TESTED_HARMONICS, resolved_harmonics(time, frequency, time.size))
+    given, better = (fit_harmonics(t, values, frequency, few).variances for t in (time, even))
+    return even if np.log(better / given).sum() < 0.0 else time
+
+
+def summary(evidence: "pd.DataFrame", periods: int) -> str:
+    """Return in words which response period of a driven system was chosen, and which lines were not enough."""
+    chosen = evidence.loc[evidence.periods == periods].iloc[0]
+    text = (
+        f"response period {periods} drive period{'s' if periods > 1 else ''}, chosen of 1 to {evidence.periods.max()}: "
+    )
+    text += (
+        f"{chosen.remark} (p {f'= {chosen.p:.1g}' if chosen.p > SMALLEST_P else f'< {SMALLEST_P:g}'})"
+        if periods > 1
+        else ""
+    )
+    unused = evidence[evidence.verdict.isin([TOO_SMALL, FOREIGN, FADING])]
+    if len(unused):
+        row = unused.sort_values("share").iloc[-1]
+        text += (
+            f"{'; ' if periods > 1 else ''}{row.remark}, or fold with periods={row.periods} if they are the response's"
+        )
+    elif periods == 1:
+        text += "no lines between those of the drive stand out"
+    return text
+
+
 def aperiodic(name: str, frequency: float, evidence: "pd.DataFrame") -> ValueError:
     """Return the error of a recording that has no response period."""
     best = evidence.iloc[int(np.argmin(evidence["between"]))]
+    doubtful = evidence[evidence.verdict.isin([TOO_SMALL, FOREIGN, FADING])]
+    seen = f" With {doubtful.iloc[0].periods} drive periods, {doubtful.iloc[0].remark}." if len(doubtful) else ""
     return ValueError(
         f"recording: must be periodic, got {name!r}, in which no response period of 1 to {len(evidence)} drive periods "
         f"of {1.0 / frequency:.6g} s repeats: with the best one, of {best['periods']}, {best['between']:.1%} of the "
-        f"variance of {best['channel']!r} is between the lines of its spectrum. A chaotic response has periodic orbits "
-        "for `find_orbits`; otherwise record longer, check the frequency, select a steady part with `between`, or give "
-        "`periods`."
+        f"variance of {best['channel']!r} is between the lines of its spectrum.{seen} A chaotic response has periodic "
+        "orbits for `find_orbits`; otherwise record longer, check the frequency, select a steady part with `between`, "
+        "or give `periods`."
     )

@@ -52,7 +52,7 @@ def written(unit: Unit) -> str:
 
 
 def same(one: Unit, other: Unit) -> bool:
-    """Return whether two units have the same dimension."""
+    """Return whether two units have the same dimension; those of Hz and rad/s are the same, as nothing is converted."""
     total: Unit = {}
     for name, exponent in product(one, other, -1.0).items():
         total = product(total, BASE.get(name, {name: 1}), exponent)

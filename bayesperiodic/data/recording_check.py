@@ -1,0 +1,488 @@
+"""Check of a recording: faults of its sensors and its clock, and its steady part, before it is folded."""
+
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.linalg import toeplitz
+
+from bayesperiodic import _fourier
+from bayesperiodic._io import Result, Storable
+from bayesperiodic._verdicts import BAD, CAUTION, GOOD, with_tone
+from bayesperiodic.data import faults
+from bayesperiodic.data.faults import ChannelFaults
+from bayesperiodic.data.harmonics import fit_harmonics
+from bayesperiodic.data.signals import GAP
+from bayesperiodic.data.steadiness import ALLOWED_BIAS, Steady, Windows
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: Severities of findings: without effect, a bias that counts, and a result that is wrong.
+HARMLESS, SERIOUS, RUINOUS = with_tone("harmless", GOOD), with_tone("serious", CAUTION), with_tone("ruinous", BAD)
+WRAPS = "wraps"
+SEVERITIES = (HARMLESS, SERIOUS, RUINOUS)
+# Bias in standard errors of all amplitudes together that is serious, and relative to the signal that is ruinous.
+SERIOUS_BIAS, RUINOUS_BIAS = 0.5, 0.05
+# Harmonics of a fit without the faulty samples, as many of them as these show: with this largest condition number.
+FITTED_HARMONICS, LARGEST_CONDITION = (10, 5, 3, 2, 1), 1e3
+# Share of the samples at each end that may be outliers where a signal is bounded by its range without them.
+EXTREMES = 0.1
+# Times of each finding that are listed.
+LISTED = 200
+# Steps of time that are gaps, in usual steps.
+USUAL_STEPS = 3.0
+# Relative changes over the part used: of an amplitude, and of the mean value in amplitudes.
+HARMLESS_DRIFT, HARMLESS_STEP, HARMLESS_PHASE = 0.05, 0.02, 1.0 / 180.0
+# Change between neighbouring cycles that is a step, in standard deviations of the other changes, and cycles needed;
+# the standard deviation is uncertain if there are fewer cycles than this.
+STEP, FEWEST_FOR_STEPS, ENOUGH_FOR_STEPS = 8.0, 10, 20
+# Amplitude of a beat relative to the mean one, its false-alarm rate, and the cycles needed.
+HARMLESS_BEAT, BEAT_FALSE_ALARM, FEWEST_FOR_BEATS = 0.01, 1e-4, 24
+
+
+@dataclass(frozen=True)
+class Finding(Storable):
+    """A fault of a recording.
+
+    Attributes
+    ----------
+    kind : str
+        "constant", "wraps", "stuck", "held" (a slower logger), "clipped", "outliers", "gaps", "ramp", "transient",
+        "drift", "beating", "amplitude step" or "phase step".
+    channel : str
+        Empty for all channels together.
+    severity : str
+        "harmless", "serious" (the amplitudes are biased by more than half a standard error, all together) or "ruinous"
+        (by more than 5 % of the signal, or unknown).
+    times : array (parts, 2)
+        Start and end of each part [s], at most 200.
+    count : int
+        Samples, or cycles for faults of cycles.
+    share : float
+        Fraction of the samples or cycles.
+    bias : float
+        Effect on all amplitudes of the channel together [standard errors]; NaN if unknown.
+    text, cure : str
+        What happened, and what to do.
+
+    Examples
+    --------
+    >>> t = np.arange(0, 60, 0.01)
+    >>> force = np.cos(2 * np.pi * t)
+    >>> force[1000:1200] = force[1000]
+    >>> (finding,) = bp.Recording.from_arrays(t, {"force": force}).check().findings
+    >>> finding.kind, finding.severity, finding.count, finding.times.round(2).tolist()
+    ('stuck', 'ruinous', 201, [[10.0, 12.0]])
+    >>> finding.cure
+    "recording.without(stuck=True, channel='force') leaves them out"
+    """
+
+    kind: str
+    channel: str
+    severity: str
+    times: np.ndarray
+    count: int
+    share: float
+    bias: float
+    text: str
+    cure: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.text}{'; ' + self.cure if self.cure else ''}"
+
+
+def signal_faults(values: np.ndarray, *, drive: bool = False) -> ChannelFaults:
+    """Return the faults of one channel that its samples alone show; a drive may be a sawtooth."""
+    step, _ = faults.resolution(values)
+    wrap, jumps = faults.wrap_of(values, step)
+    if drive and wrap and abs(np.sign(np.diff(values)[jumps - 1]).sum()) == jumps.size:
+        wrap, jumps = 0.0, jumps[:0]
+    stuck = faults.stuck_of(values)
+    low, high = (np.zeros(0, dtype=int),) * 2 if wrap else faults.clipped_of(values, stuck)
+    repeats, held = faults.held_of(values)
+    return ChannelFaults(step, wrap, jumps, stuck, low, high, held=held, repeats=repeats)
+
+
+def bounded(values: np.ndarray) -> np.ndarray:
+    """Return values (channels, samples) without rare extremes, for a first estimate of the frequency."""
+    some = values[:, :: 1 + values.shape[1] // faults.SCREENED]
+    low, high = np.quantile(some, [EXTREMES, 1.0 - EXTREMES], axis=1, keepdims=True)
+    return np.where(high > low, np.clip(values, low - (high - low), high + (high - low)), values)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What faulty samples of a channel do to its amplitudes."""
+
+    bias: float  # of all amplitudes together [standard errors]
+    relative: float  # size of the contamination relative to the signal
+    predicted: np.ndarray  # at all samples
+    noise: float  # standard deviation of the others about the prediction
+
+    @property
+    def severity(self) -> str:
+        """Severity by the effect."""
+        if not self.bias <= np.inf or self.relative > RUINOUS_BIAS:
+            return RUINOUS
+        return SERIOUS if self.bias > SERIOUS_BIAS else HARMLESS
+
+
+UNKNOWN = Effect(np.nan, np.nan, np.zeros(0), np.nan)
+
+
+def effect_of(time: np.ndarray, values: np.ndarray, bad: np.ndarray, frequency: float, harmonics: int) -> Effect:
+    """Return the effect of faulty samples (bool), by the mean period of the others; unknown if they do not show it."""
+    used, best, order, fit = time[~bad], np.inf, 0, None
+    for highest in FITTED_HARMONICS:
+        if highest <= harmonics and used.size > 6 * highest and np.ptp(used) * frequency > 2.0:
+            moments = _fourier.sums(np.ones((1, used.size)), frequency * used, 2 * highest)[0]
+            spectrum = np.linalg.eigvalsh(toeplitz(moments))
+            if spectrum[0] * LARGEST_CONDITION > spectrum[-1]:
+                trial = fit_harmonics(used, values[None, ~bad], frequency, highest)
+                # The Bayesian information criterion: needless harmonics predict nothing where samples are missing.
+                least = max(float(trial.variances[0]), 1e-24 * float(values.var()))
+                score = used.size * np.log(least) + 2 * highest * np.log(used.size)
+                if score < best:
+                    best, order, fit = score, highest, trial
+    if fit is None:
+        return UNKNOWN
+    predicted = _fourier.at_times(fit.amplitudes, frequency * time)[0]
+    noise = float(np.sqrt(fit.variances[0]))
+    if not np.isfinite(predicted).all() or noise > 0.9 * float(values[~bad].std()):
+        return UNKNOWN
+    wrong = np.where(bad, values - predicted, 0.0)
+    sums = np.abs(_fourier.sums(wrong[None], frequency * time, order)[0]) / time.size
+    weights = np.r_[1.0, np.full(order, 2.0)]
+    size = float(np.sqrt(weights @ sums**2))
+    scatter = max(noise, 1e-9 * float(np.abs(values[~bad]).max())) / np.sqrt(time.size)
+    spread = max(float(predicted.std()), np.finfo(float).tiny)
+    return Effect(size / scatter, size / spread, predicted, noise)
+
+
+def times_of(time: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """Return the first and last times (parts, 2) of runs of samples."""
+    if not samples.size:
+        return np.zeros((0, 2))
+    edges = np.flatnonzero(np.diff(samples) > 1)
+    first, last = samples[np.r_[0, edges + 1]], samples[np.r_[edges, samples.size - 1]]
+    return np.column_stack([time[first], time[last]])[:LISTED]
+
+
+def _when(times: np.ndarray) -> str:
+    """Return times in words."""
+    shown = [f"{a:.6g} s" if a == b else f"{a:.6g} to {b:.6g} s" for a, b in times[:3]]
+    return ("at " if times[0, 0] == times[0, 1] else "from ") + ", ".join(shown) + (", …" if len(times) > 3 else "")
+
+
+def sample_findings(
+    channel: str,
+    time: np.ndarray,
+    values: np.ndarray,
+    fault: ChannelFaults,
+    frequency: float | None,
+    harmonics: int,
+    used: slice,
+) -> Iterator[Finding]:
+    """Return the findings of one channel; stuck and clipped samples count if the mean period of the others differs.
+
+    Those outside of the part used are harmless.
+    """
+    total = values.size
+    if fault.wrap:
+        yield Finding(
+            WRAPS, channel, RUINOUS, times_of(time, fault.wraps), fault.wraps.size, fault.wraps.size / total, np.nan,
+            f"{channel} jumps by {fault.wrap:.6g} {fault.wraps.size} times, first "
+            f"{_when(times_of(time, fault.wraps))}: the sensor wraps at its range",
+            f"recording.unwrapped({channel!r}, {fault.wrap:.6g}) removes the jumps",
+        )  # fmt: skip
+        return
+    if fault.repeats > 1:
+        delay = 0.5 * (fault.repeats - 1)
+        yield Finding(
+            "held", channel, SERIOUS, np.array([[time[0], time[-1]]]), fault.held.size, fault.held.size / total, np.nan,
+            f"{channel} repeats each value {fault.repeats} times: a slower logger or a hold, which delays it by "
+            f"{delay:g} samples ({delay * float(np.median(np.diff(time))):.3g} s) and weakens its harmonics",
+            f"recording.without(stuck=True, channel={channel!r}) keeps one sample of each value",
+        )  # fmt: skip
+    bad = np.zeros(total, dtype=bool)
+    for part in fault.stuck:
+        bad[part] = True
+    bad[np.concatenate([fault.low, fault.high, fault.outliers])] = True
+    if not bad.any():
+        return
+    every = effect_of(time[used], values[used], bad[used], frequency, harmonics) if frequency else UNKNOWN
+    if every.predicted.size:  # at the other samples too
+        predicted = values.astype(float)
+        predicted[used] = every.predicted
+        every = replace(every, predicted=predicted)
+
+    def finding(kind: str, samples: np.ndarray, what: str) -> Finding:
+        only = np.isin(np.arange(total), samples)
+        own = every
+        if every.predicted.size:
+            kept = np.where(bad & ~only, every.predicted, values)
+            own = effect_of(time[used], kept[used], only[used], frequency or 1.0, harmonics)
+        inside = bool(only[used].any())
+        severity = (own.severity if frequency else SERIOUS) if inside else HARMLESS
+        times, share = times_of(time, samples), samples.size / total
+        size = f", a bias of {own.bias:.3g} standard errors" if own.bias == own.bias else ""
+        size = size if inside else ", not used"
+        cure = f"recording.without({kind}=True, channel={channel!r}) leaves them out"
+        if frequency and times.size and np.diff(times).max() * frequency > GAP:
+            cure += ", and its parts `split` are folded" if kind == "stuck" else ""
+            cure = "record again with a larger range" if kind == "clipped" else cure
+        return Finding(
+            kind, channel, severity, times, samples.size, share, own.bias,
+            f"{channel} {what} {_when(times)} ({samples.size} samples, {share:.2g} of all{size})", cure,
+        )  # fmt: skip
+
+    stuck = [part for part in fault.stuck if _moves(every, part, fault.step, used)]
+    if stuck:
+        samples = np.concatenate([np.arange(part.start, part.stop) for part in stuck])
+        level = ", ".join(f"{values[part.start]:.6g}" for part in stuck[:3])
+        yield finding("stuck", samples, f"is stuck at {level}")
+    clipped = [
+        (end, sign)
+        for end, sign in ((fault.low, -1.0), (fault.high, 1.0))
+        if end.size and _beyond(every, values, end, sign)
+    ]
+    if clipped:
+        samples = np.sort(np.concatenate([end for end, _ in clipped]))
+        level = " and ".join(f"{values[end[0]]:.6g}" for end, _ in clipped)
+        yield finding("clipped", samples, f"is clipped at {level}")
+    if fault.outliers.size:
+        low, high = values[fault.outliers].min(), values[fault.outliers].max()
+        which = f"reads {low:.6g}" if low == high else f"has outliers between {low:.6g} and {high:.6g}"
+        yield finding("outliers", fault.outliers, which)
+
+
+def _moves(effect: Effect, part: slice, step: float, used: slice) -> bool:
+    """Return whether the mean period changes where the values do not; unknown outside of the part used."""
+    if not effect.predicted.size or part.start < used.start or part.stop > used.stop:
+        return True
+    return bool(np.ptp(effect.predicted[part]) > max(4.0 * effect.noise, 3.0 * step, 1e-9))
+
+
+def _beyond(effect: Effect, values: np.ndarray, samples: np.ndarray, sign: float) -> bool:
+    """Return whether the mean period goes beyond the level of clipped samples."""
+    if not effect.predicted.size:
+        return True
+    excess = sign * (effect.predicted[samples] - values[samples])
+    return bool(np.median(excess) > max(effect.noise, 1e-6 * float(np.ptp(values))))
+
+
+def cycle_findings(
+    channels: Iterable[str], time: np.ndarray, steady: Steady, frequency: float, total: int
+) -> Iterator[Finding]:
+    """Return the findings about the cycles: what was left out, and what changes in the part that is used."""
+    part, step = steady.part, steady.part.cycles
+    channels = [*channels]
+    start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
+    cycles = len(part.first) * step
+    level = [float(time[i]) for i in (steady.level[0], steady.level[1] - 1)]
+    end = float(time[-1])
+    for kind, a, b, what in (
+        ("ramp", float(time[0]), level[0], "the signals change until"),
+        ("ramp", level[1], end, "the signals change from"),
+        ("transient", level[0], start, "a rest of the transient is in the amplitudes until"),
+    ):
+        if (b - a) * frequency < 1.0:
+            continue
+        count = int((b - a) * frequency)
+        place = b if what.endswith("until") else a
+        yield Finding(
+            kind, "", HARMLESS, np.array([[a, b]]), count, count / total, np.nan,
+            f"{what} {place:.6g} s; {start:.6g} to {stop:.6g} s are used ({cycles} of {total} cycles)",
+        )  # fmt: skip
+    if steady.bias > ALLOWED_BIAS:
+        severity = SERIOUS if steady.bias > SERIOUS_BIAS else HARMLESS
+        yield Finding(
+            "transient", "", severity, np.array([[start, stop]]), cycles, 1.0,
+            steady.bias, f"a rest of the transient is in the part used, {start:.6g} to {stop:.6g} s, and biases the "
+            f"amplitudes by {steady.bias:.2g} standard errors", "record longer, or begin later with recording.between",
+        )  # fmt: skip
+    changes = steady.change[np.argmax(np.abs(steady.change), axis=0), np.arange(len(channels))]
+    for channel, change in zip(channels, changes, strict=True):
+        if abs(change) > HARMLESS_DRIFT:
+            yield Finding(
+                "drift", channel, SERIOUS, np.array([[start, stop]]), cycles, 1.0, np.nan,
+                f"the amplitude of {channel} changes by {change:+.1%} within half of the part used",
+                "select a steadier part with recording.between(start, stop)",
+            )  # fmt: skip
+    yield from _steps(channels, time, part, frequency)
+    yield from _beats(channels, time, part, frequency)
+
+
+def _steps(channels: list[str], time: np.ndarray, part: Windows, frequency: float) -> Iterator[Finding]:
+    """Return steps of amplitude and of phase between neighbouring cycles."""
+    shape, first = part.amplitudes, part.first
+    if len(shape) < FEWEST_FOR_STEPS:
+        return
+    every = np.abs(shape[:, :, 1:])
+    strongest = 1 + every.mean(axis=0).argmax(axis=1)
+    lines = np.take_along_axis(shape, strongest[None, :, None], axis=2)[:, :, 0]
+    turns = np.unwrap(np.angle(lines), axis=0) / (2.0 * np.pi) / strongest
+    sizes = np.log(np.maximum(np.abs(lines), np.finfo(float).tiny))
+    limit = STEP * max(1.0, (ENOUGH_FOR_STEPS / len(shape)) ** 2)
+    slip = part.slip / np.exp(np.median(sizes, axis=0))
+    for kind, series, least in (
+        ("amplitude step", sizes, HARMLESS_STEP + slip),
+        ("phase step", turns, HARMLESS_PHASE + slip / (2.0 * np.pi)),
+    ):
+        mean = 0.5 * (series[1:] + series[:-1])
+        jump = mean[2:] - mean[:-2]  # of two cycles after a boundary from the two before it
+        spread = np.median(np.abs(jump - np.median(jump, axis=0)), axis=0) / 0.6745
+        large = (np.abs(jump) > limit * spread) & (np.abs(jump) > least)
+        if kind == "phase step" and large.shape[1] > 1 and large.any():
+            together = large.all(axis=1)
+            which = [("all channels", together, jump.mean(axis=1))] if together.any() else []
+        else:
+            which = []
+        which += [] if which else [(c, large[:, i], jump[:, i]) for i, c in enumerate(channels) if large[:, i].any()]
+        for channel, where, size in which:
+            k = int(np.argmax(np.where(where, np.abs(size), 0.0)))
+            at = float(time[first[k + 2]])
+            if kind == "phase step":
+                delay = float(size[k]) / frequency
+                samples = delay * (time.size - 1) / float(np.ptp(time))
+                text = (
+                    f"the phase of {channel} steps by {360.0 * size[k]:.3g}° ({delay:.3g} s, {abs(samples):.3g} "
+                    f"samples) at about {at:.6g} s: samples were lost, or the clock or the drive stepped"
+                )
+            else:
+                text = f"the amplitude of {channel} steps by {np.expm1(size[k]):+.1%} at about {at:.6g} s"
+            yield Finding(
+                kind, "" if channel == "all channels" else channel, SERIOUS, np.array([[at, at]]), 1, 1.0 / len(shape),
+                np.nan, text, "fold the parts before and after it: recording.between(start, stop)",
+            )  # fmt: skip
+
+
+def _beats(channels: list[str], time: np.ndarray, part: Windows, frequency: float) -> Iterator[Finding]:
+    """Return periodic modulations of the amplitudes, by Fisher's test of the largest line of their spectrum."""
+    sizes = part.sizes
+    count = len(sizes)
+    if count < FEWEST_FOR_BEATS:
+        return
+    place = np.linspace(-1.0, 1.0, count)
+    trend = np.polynomial.polynomial.polyfit(place, sizes, 2)
+    rest = sizes - np.polynomial.polynomial.polyval(place, trend).T
+    spectrum = np.abs(np.fft.rfft(rest * np.hanning(count)[:, None], axis=0))[2:] ** 2
+    for i, channel in enumerate(channels):
+        power = spectrum[:, i]
+        line = int(np.argmax(power))
+        # Against the lines about it, so that slow noise is no beat.
+        near = np.r_[power[max(line - 12, 0) : max(line - 2, 0)], power[line + 3 : line + 13]]
+        if near.size < 6 or power[line] < np.mean(near) * -np.log(BEAT_FALSE_ALARM / spectrum.shape[0]) * 3.0:
+            continue
+        amplitude = float(np.sqrt(8.0 * rest[:, i].var() / 4.0) / sizes[:, i].mean())
+        slip = float(part.slip[i] / sizes[:, i].mean())
+        if amplitude > HARMLESS_BEAT + slip:
+            beat = (line + 2) * frequency / (count * part.cycles)
+            yield Finding(
+                "beating", channel, SERIOUS if amplitude > HARMLESS_DRIFT + slip else HARMLESS,
+                np.array([[time[part.first[0]], time[part.last[-1] - 1]]]),
+                count, 1.0, np.nan, f"the amplitude of {channel} beats at {beat:.4g} Hz by {amplitude:.1%}",
+                "a second frequency is in the signals: remove its source, or average whole beats",
+            )  # fmt: skip
+
+
+def clock_findings(time: np.ndarray, frequency: float | None) -> Iterator[Finding]:
+    """Return the gaps of the time axis."""
+    step = np.diff(time)
+    usual = float(np.median(step))
+    ends = np.flatnonzero(step > USUAL_STEPS * usual)
+    if ends.size:
+        lost = int(np.round(step[ends] / usual - 1.0).sum())
+        yield Finding(
+            "gaps", "", HARMLESS, np.column_stack([time[ends], time[ends + 1]])[:LISTED], lost,
+            lost / (lost + time.size), np.nan,
+            f"{lost} samples are missing in {ends.size} gaps, the longest of {step.max():.3g} s",
+        )  # fmt: skip
+
+
+def refuse(name: str, findings: Iterable[Finding]) -> None:
+    """Raise a ValueError for ruinous findings, and warn once of serious ones."""
+    listed = [*findings]
+    ruinous = [finding for finding in listed if finding.severity == RUINOUS]
+    if ruinous:
+        raise ValueError(f"recording: must be sound, got {name!r}, in which {'. '.join(map(str, ruinous))}.")
+    serious = [finding for finding in listed if finding.severity == SERIOUS]
+    if serious:
+        warnings.warn(f"{name}: {'. '.join(map(str, serious))}.", UserWarning, stacklevel=4)
+
+
+@dataclass(frozen=True)
+class RecordingCheck(Result):
+    """What `Recording.check` found.
+
+    Attributes
+    ----------
+    name : str
+        Of the recording.
+    table : DataFrame
+        A row for each channel: ``lowest`` and ``highest`` value, ``resolution`` (step of quantised values, 0 if they
+        are not), ``bits`` that the range uses, numbers of ``clipped``, ``stuck`` and ``outliers`` samples and of
+        ``wraps``.
+    findings : tuple of Finding
+        The worst ones first.
+    frequency : float
+        Fundamental frequency [Hz], NaN if there is none.
+    cycles, total : int
+        Cycles of the part that `fold` uses, and of the recording.
+    start, stop : float
+        Times of the part that `fold` uses [s].
+    jitter : float
+        Standard deviation of the steps of time, without gaps, relative to their median.
+    bad : dict of str to dict of str to array (faulty samples,)
+        Numbers of the samples by channel and kind ("outliers", "stuck", "clipped"), for `Recording.without`.
+    reason : str
+        Why there is no frequency or no steady part; empty otherwise.
+
+    Examples
+    --------
+    >>> t = np.arange(0, 60, 0.01)
+    >>> rising = np.minimum(t / 10, 1) * np.cos(2 * np.pi * t)
+    >>> check = bp.Recording.from_arrays(t, {"x": rising}, name="run 1").check()
+    >>> check.sentence
+    '50 of 60 cycles at 1 Hz are used, 10 to 59.99 s.'
+    >>> print(*check.findings)
+    the signals change until 10 s; 10 to 59.99 s are used (50 of 60 cycles)
+    """
+
+    name: str
+    table: "pd.DataFrame"
+    findings: tuple[Finding, ...]
+    frequency: float
+    cycles: int
+    total: int
+    start: float
+    stop: float
+    jitter: float
+    bad: dict[str, dict[str, np.ndarray]]
+    reason: str = ""
+
+    @property
+    def severity(self) -> str:
+        """The worst severity of the findings; "harmless" without any."""
+        return max((finding.severity for finding in self.findings), key=SEVERITIES.index, default=HARMLESS)
+
+    def __str__(self) -> str:
+        lines = [f"Recording {self.name!r}: {self.sentence}", self.table.to_string(float_format="{:.5g}".format)]
+        lines += [f"{finding.severity}: {finding}." for finding in self.findings]
+        return "\n".join(lines + ([] if self.findings else ["Nothing was found."]))
+
+    @property
+    def sentence(self) -> str:
+        """The part that `Recording.fold` uses, or the reason why there is none."""
+        if self.reason:
+            return f"no mean period: {self.reason}"
+        jitter = f", steps of time vary by {self.jitter:.1%}" if self.jitter > 1e-3 else ""
+        return (
+            f"{self.cycles} of {self.total} cycles at {self.frequency:.6g} Hz are used, {self.start:.6g} to "
+            f"{self.stop:.6g} s{jitter}."
+        )
+
+    __repr__ = __str__

@@ -1,0 +1,181 @@
+"""Sampled signals, their fundamental frequency, and the parts of a record of several."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayesperiodic import _checks
+from bayesperiodic.data.harmonics import (
+    MINIMUM_CYCLES,
+    HarmonicFit,
+    fit_harmonics,
+    guess_frequency,
+    resolved_harmonics,
+    track_frequency,
+)
+
+# Steps of time that are gaps, in periods, if they are longer than so many usual steps; if the period is unknown,
+# in usual steps.
+GAP, USUAL_STEPS, MANY_STEPS = 0.25, 3.0, 30.0
+# A crossing counts after the signal was below minus this fraction of its standard deviation.
+HYSTERESIS = 0.25
+# Smallest relative step of the period, in itself and in standard errors.
+SMALLEST_PERIOD_STEP, SIGNIFICANT_PERIOD_STEP = 1e-3, 8.0
+# Difference of two phases [cycles] at the ends of a recording that selects other cycles.
+OTHER_CYCLES = 0.05
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Channels sampled at the same times."""
+
+    name: str  # of the recording, for messages
+    time: np.ndarray  # (samples,)
+    channels: tuple[str, ...]  # inputs first
+    values: np.ndarray  # (channels, samples)
+    inputs: int  # number of inputs
+
+    def __post_init__(self) -> None:
+        for i, (channel, values) in enumerate(zip(self.channels, self.values, strict=True)):
+            if np.ptp(values) == 0.0:
+                kind, remedy = "outputs", ""
+                if i < self.inputs:
+                    kind, remedy = "inputs", ", and write it in the model as a parameter with its value in `fixed`"
+                raise ValueError(
+                    f"{kind}[{channel!r}]: must vary, got the constant {values[0]:g}; leave the channel out{remedy}."
+                )
+
+    def part(self, samples: np.ndarray | slice) -> "Signals":
+        """Return the signals at the selected samples."""
+        return replace(self, time=self.time[samples], values=self.values[:, samples])
+
+
+def first_guess(signals: Signals, frequency: float | None, periods: int) -> float:
+    """Return a first estimate of the fundamental frequency; raise a ValueError for fewer than three cycles."""
+    remedy = "give the forcing frequency"
+    time, values = _longest_stretch(signals)
+    if frequency is not None:
+        fundamental: float | None = _checks.positive("frequency", frequency) / periods
+        remedy = f"check frequency = {frequency!r} Hz and periods = {periods}"
+    elif signals.inputs:
+        guess = guess_frequency(time, values[: signals.inputs])
+        fundamental = guess / periods if guess else None
+    else:
+        fundamental = guess_frequency(time, values)
+    if fundamental is None or cycles_of(signals.time, fundamental) < MINIMUM_CYCLES:
+        period = "no period" if fundamental is None else f"{cycles_of(signals.time, fundamental):.2f} cycles"
+        raise ValueError(
+            f"recording: must have at least {MINIMUM_CYCLES} cycles, got {period} in {signals.name!r} of "
+            f"{np.ptp(signals.time):g} s; record longer, or {remedy}."
+        )
+    return fundamental
+
+
+def _longest_stretch(signals: Signals) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times and values of the longest part without gaps of many steps."""
+    step = np.diff(signals.time)
+    edges = np.concatenate([[0], np.flatnonzero(step > MANY_STEPS * np.median(step)) + 1, [signals.time.size]])
+    longest = int(np.argmax(np.diff(edges)))
+    part = slice(edges[longest], edges[longest + 1])
+    return signals.time[part], signals.values[:, part]
+
+
+def cycles_of(time: np.ndarray, fundamental: float) -> float:
+    """Return the number of cycles, the last sample's step included."""
+    return float(np.ptp(time) * time.size / (time.size - 1) * fundamental * (1 + 1e-9))
+
+
+def gaps(time: np.ndarray, period: float) -> np.ndarray:
+    """Return the last samples before gaps."""
+    step = np.diff(time)
+    return np.flatnonzero(step > max(GAP * period, USUAL_STEPS * np.median(step)))
+
+
+def refuse_gaps(signals: Signals, fundamental: float) -> None:
+    """Raise a ValueError if there are gaps."""
+    if (ends := gaps(signals.time, 1.0 / fundamental)).size:
+        first, last = signals.time[ends[0]], signals.time[ends[0] + 1]
+        raise ValueError(
+            f"recording: must have no gap longer than {GAP:g} periods, got {signals.name!r} without samples from "
+            f"{first:g} to {last:g} s (period {1.0 / fundamental:g} s); fold the parts that `split` returns."
+        )
+
+
+def tracked_frequency(signals: Signals, fundamental: float, given: bool) -> float:
+    """Return the frequency by which cycles are compared: the estimated one, if the given one is clearly another one."""
+    time, values = signals.time, signals.values
+    tracked = track_frequency(time, values, fundamental)
+    if given:
+        few = min(10, resolved_harmonics(time, max(tracked, fundamental), time.size))
+        near = abs(tracked - fundamental) * np.ptp(time) < OTHER_CYCLES
+        if near or not explains_more(*(fit_harmonics(time, values, rate, few) for rate in (tracked, fundamental))):
+            return fundamental
+    if (cycles := cycles_of(time, tracked)) < MINIMUM_CYCLES:
+        raise ValueError(
+            f"recording: must have at least {MINIMUM_CYCLES} cycles, got {cycles:.2f} cycles of {tracked:.6g} Hz in "
+            f"{signals.name!r}; record longer."
+        )
+    return tracked
+
+
+def explains_more(fit: HarmonicFit, other: HarmonicFit) -> bool:
+    """Return whether a fit leaves less than another one, over all channels."""
+    return bool(np.sum(np.log(fit.variances / other.variances)) < 0.0)
+
+
+def parts(time: np.ndarray, signal: np.ndarray) -> list[slice]:
+    """Return the parts of at least three cycles between gaps of time and steps of the signal's frequency."""
+    rising = _rising(time, signal)
+    if rising.size < 2:
+        return [slice(0, time.size)]
+    period = float(np.median(np.diff(time[rising])))
+    edges = np.concatenate([[0], gaps(time, period) + 1, [time.size]])
+    pieces = []
+    for first, last in zip(edges[:-1], edges[1:], strict=True):
+        inside = first + _rising(time[first:last], signal[first:last])
+        steps = inside[_steps(time, signal, inside)]
+        bounds = [first, *steps.tolist(), last]
+        pieces += [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    cycles = [np.searchsorted(rising, part.stop) - np.searchsorted(rising, part.start) for part in pieces]
+    return [part for part, count in zip(pieces, cycles, strict=True) if count > MINIMUM_CYCLES]
+
+
+def _rising(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
+    """Return the samples at which the signal rises above its mean, which it must have left by the hysteresis."""
+    centred = signal - signal.mean()
+    level = HYSTERESIS * centred.std()
+    outside = np.flatnonzero(np.abs(centred) > level)
+    above = centred[outside] > 0.0
+    return outside[1:][above[1:] & ~above[:-1]]
+
+
+def _steps(time: np.ndarray, signal: np.ndarray, rising: np.ndarray) -> list[int]:
+    """Return the numbers of the crossings at which the period changes, by binary segmentation of its logarithm."""
+    if rising.size < 2 * MINIMUM_CYCLES + 2:
+        return []
+    level = signal[rising[0] : rising[-1] + 1].mean()
+    level += HYSTERESIS * signal[rising[0] : rising[-1] + 1].std()
+    fraction = (signal[rising] - level) / np.maximum(signal[rising] - signal[rising - 1], np.finfo(float).tiny)
+    crossing = time[rising] - np.clip(fraction, 0.0, 1.0) * (time[rising] - time[rising - 1])
+    period = np.log(np.diff(crossing))
+    noise = max(float(np.median(np.abs(np.diff(period)))), 1e-4)
+    # A single odd period, as at a jump of the phase, is no step.
+    mirrored = np.concatenate([period[1:2], period, period[-2:-1]])
+    period = np.median([mirrored[:-2], period, mirrored[2:]], axis=0)
+    steps, stack = [], [(0, period.size)]
+    while stack:
+        first, last = stack.pop()
+        size = last - first
+        number = np.arange(MINIMUM_CYCLES, size - MINIMUM_CYCLES + 1)
+        if not number.size:
+            continue
+        segment = period[first:last]
+        before = np.cumsum(segment)[number - 1]
+        difference = before / number - (segment.sum() - before) / (size - number)
+        score = np.abs(difference) * np.sqrt(number * (size - number) / size)
+        best = int(np.argmax(score))
+        if score[best] > SIGNIFICANT_PERIOD_STEP * noise and abs(difference[best]) > SMALLEST_PERIOD_STEP:
+            middle = first + int(number[best])
+            steps.append(middle)
+            stack += [(first, middle), (middle, last)]
+    return sorted(steps)

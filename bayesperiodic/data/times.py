@@ -1,0 +1,103 @@
+"""Conversion of dates and durations to seconds."""
+
+import datetime
+import re
+from typing import Any
+
+import numpy as np
+
+from bayesperiodic import _checks
+
+# Seconds in the units of NumPy's dates and durations, and the units in a second; all are exact as floats.
+SECONDS = {"W": 604_800, "D": 86_400, "h": 3600, "m": 60, "s": 1}
+PER_SECOND = {"ms": 1e3, "us": 1e6, "ns": 1e9, "ps": 1e12, "fs": 1e15, "as": 1e18}
+# Integers beyond this one are not all floats.
+LARGEST_EXACT = 2**53
+ISO_DATE = re.compile(r"\s*\d{4}-\d\d")
+# More decimals of a second than pandas keeps (3.0.1 drops the others without a word).
+TOO_FINE = re.compile(r"[.,]\d{10}")
+
+
+def dates(argument: str, values: Any) -> np.ndarray | None:
+    """Return dates as an array of datetime64, durations as one of timedelta64; None for anything else.
+
+    Dates are datetime64 arrays, objects of pandas or of Python's `datetime`, or texts after ISO 8601. Those with a time
+    zone are converted to UTC, and those without are taken as UTC. Masked values are NaT. A ValueError is raised for
+    texts or objects of which only some are dates.
+    """
+    if type(getattr(values, "dtype", None)).__name__ == "DatetimeTZDtype":  # of pandas; as an array it has objects
+        return np.asarray(values.to_numpy("datetime64[ns]"))
+    array = np.asarray(values)
+    masked = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else np.zeros(array.shape, bool)
+    if array.dtype.kind in "mM":
+        return np.where(masked, np.array("NaT", array.dtype), array)
+    if array.dtype.kind not in "OUT":
+        return None
+    import pandas as pd
+
+    array = array.astype(object)
+    array[masked] = None
+    first = next((value for value in array.flat if pd.notna(value)), None)
+    if isinstance(first, datetime.timedelta | np.timedelta64):
+        return _read(argument, array, pd.to_timedelta)
+    if isinstance(first, datetime.date | np.datetime64):
+        return _read(argument, array, pd.to_datetime, utc=True)
+    if isinstance(first, str) and ISO_DATE.match(first):
+        if TOO_FINE.search(first):
+            raise ValueError(
+                f"{argument}: must have at most nine decimals of a second, got {first!r}; give seconds as numbers."
+            )
+        return _read(argument, array, pd.to_datetime, utc=True, format="ISO8601")
+    return None
+
+
+def seconds(argument: str, values: Any) -> Any:
+    """Return dates and durations in seconds from the first of them that is not missing, NaT as NaN.
+
+    Differences are those of integers, so that those below 2**53 units are the nearest floats. Integers beyond it (as
+    nanoseconds since 1970) are counted from the first one too, in their unit. Other values are returned as they are.
+    """
+    try:
+        np.shape(values)
+    except ValueError:  # lists of unequal length, which are refused as no real numbers
+        return values
+    times = dates(argument, values)
+    if times is None:
+        return _differences(values)
+    unit, step = np.datetime_data(times.dtype)
+    if times.dtype.kind == "M" and unit in ("Y", "M", "generic"):
+        times, unit, step = times.astype("datetime64[s]"), "s", 1
+    if unit not in SECONDS | PER_SECOND:
+        raise ValueError(
+            f"{argument}: must be durations in weeks or a shorter unit, got {times.dtype}, whose length in seconds is "
+            "not defined."
+        )
+    lost = np.isnat(times)
+    if lost.all():
+        return np.full(times.shape, np.nan)
+    steps = np.where(lost, 0, (times - times[~lost][0]).astype(np.int64)) * step
+    return np.where(lost, np.nan, steps * float(SECONDS[unit]) if unit in SECONDS else steps / PER_SECOND[unit])
+
+
+def _differences(values: Any) -> Any:
+    """Return integers that are too large for floats as differences from the first one, other values as they are."""
+    array = values if np.ma.isMaskedArray(values) else np.asarray(values)
+    if array.dtype.kind not in "iu" or not array.size or max(-int(array.min()), int(array.max())) <= LARGEST_EXACT:
+        return values
+    return (array - array.flat[0]).astype(np.int64)
+
+
+def _read(argument: str, array: np.ndarray, read: Any, **options: Any) -> np.ndarray:
+    """Return objects as dates or durations by a function of pandas; the error names the first that is none."""
+    try:
+        index = read(array, **options)
+    except (TypeError, ValueError, OverflowError):
+        import pandas as pd
+
+        bad = np.flatnonzero(pd.isna(read(array, **options, errors="coerce")) & pd.notna(array))
+        got = f"{_checks.shortened(array[bad[0]])} at index {bad[0]}" if bad.size else _checks.shortened(array)
+        raise ValueError(
+            f"{argument}: must be dates, such as 2026-01-31T12:00:00.01 (ISO 8601), or durations, all of one kind, got "
+            f"{got}."
+        ) from None
+    return np.asarray((index.tz_convert(None) if getattr(index, "tz", None) else index).to_numpy())

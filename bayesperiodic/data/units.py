@@ -1,0 +1,132 @@
+"""Conversion of units: by the package pint, with angles as a dimension of their own."""
+
+import functools
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesperiodic import _checks
+
+Units = Mapping[str, float | Sequence[str]]
+
+LONGEST_UNIT = 100
+# Products, quotients and groups of names with an exponent of one digit; the only number is the 1 of "1/s".
+SUPERSCRIPT_DIGITS = "¹²³⁰⁴⁵⁶⁷⁸⁹"
+UNIT_TOKEN = re.compile(
+    rf"(?:[^\W\d{SUPERSCRIPT_DIGITS}]|[°%])[^\W{SUPERSCRIPT_DIGITS}]*"
+    rf"(?:\s*(?:\*\*|\^)\s*[+-]?[0-9](?:\.5)?(?![\w.])|⁻?[{SUPERSCRIPT_DIGITS}](?!\w))?"
+    r"|1(?![\w.])|[()]|[*/·]|\s+"
+)
+# Logarithmic units, and the formulas that convert their values.
+LOGARITHMIC = {
+    r"d[bB](?!ar)\w*|[dD]eci[bB]els?": (
+        "reference*10**(level/20) for amplitudes such as those of V, Pa or m/s (dBV: 1 V), "
+        "reference*10**(level/10) for powers (dBm: 1 mW)"
+    ),
+    r"d?Np|[nN]epers?": "reference*exp(level) for amplitudes, reference*exp(2*level) for powers",
+    r"pH(?=.*mol)": "10**-pH mol/l",  # else picohenries
+    r"oct|octaves?": "reference*2**level",
+    r"decades?": "reference*10**level",
+}
+
+
+def convert(name: str, values: np.ndarray, unit: float | Sequence[str]) -> np.ndarray:
+    """Return the values of a channel, multiplied by a factor or converted by a pair of units such as ("mm", "m")."""
+    argument = f"units[{name!r}]"
+    if isinstance(unit, int | float):
+        factor = _checks.finite_number(argument, unit)
+        if factor == 0.0:
+            raise ValueError(f"{argument}: must not be zero, got {unit!r}.")
+        return values * factor
+    if isinstance(unit, str) or len(unit) != 2 or not all(isinstance(u, str) for u in unit):
+        raise ValueError(f"{argument}: must be a factor or a pair such as ('mm', 'm'), got {unit!r}.")
+    for text in unit:
+        if len(text) > LONGEST_UNIT or not _is_unit(text):
+            shown = text if len(text) <= LONGEST_UNIT else f"{text[:LONGEST_UNIT]}…"
+            raise ValueError(
+                f"{argument}: must be units that are multiplied or divided, with exponents of one digit, such as "
+                f"'kg*m/s**2', got {shown!r}."
+            )
+    for names, formula in LOGARITHMIC.items():
+        if re.search(rf"(?<!\w)(?:{names})(?!\w)", " ".join((*unit, unit[0]))):
+            raise ValueError(
+                f"{argument}: must be units that are not logarithmic, got {tuple(unit)!r}; convert the values first: "
+                f"{formula}."
+            )
+    return _converted(argument, values, *(text.replace("·", "*") for text in unit))
+
+
+def _converted(argument: str, values: np.ndarray, first: str, second: str) -> np.ndarray:
+    """Return values converted by two units, with as many angles in the one as in the other."""
+    import pint
+
+    registry = _registry()
+    try:
+        one, other = registry.Unit(first), registry.Unit(second)
+        compatible = one.is_compatible_with(other)
+        missing = _angle(registry, one) - _angle(registry, other) if compatible else 0.0
+        if missing:
+            cycles = [_in_cycles(registry, unit) for unit in (one, other)]
+            if _angle(registry, cycles[0]) == _angle(registry, cycles[1]):
+                (one, other), missing = cycles, 0.0
+        if not missing:
+            return np.asarray(registry.Quantity(values, one).to(other).magnitude, dtype=float)
+    except (pint.errors.PintError, AssertionError, TypeError, ValueError, ArithmeticError) as error:
+        raise ValueError(
+            f"{argument}: must be two units of the same dimension, got {(first, second)!r} ({error})."
+        ) from None
+    plain = first if not _angle(registry, one) else second
+    power = missing if plain == second else -missing
+    raise ValueError(
+        f"{argument}: must have an angle in both units or in neither, got {(first, second)!r}, of which {plain!r} may "
+        f"count radians or revolutions; write {_times(plain, 'rad', power)!r} or {_times(plain, 'rev', power)!r}, or "
+        "give a factor."
+    )
+
+
+@functools.cache
+def _registry() -> Any:
+    """Return the units of pint, with the usual abbreviation of a revolution."""
+    import pint
+
+    registry: Any = pint.UnitRegistry()
+    registry.define("@alias turn = rev")
+    return registry
+
+
+def _angle(registry: Any, unit: Any) -> float:
+    """Return the exponent of radians in a unit, which is no dimension in pint."""
+    return float(dict(registry.Quantity(1.0, unit).to_root_units().unit_items()).get("radian", 0.0))
+
+
+def _in_cycles(registry: Any, unit: Any) -> Any:
+    """Return a unit with cycles per second in place of hertz."""
+    powers = [power for name, power in registry.Quantity(1.0, unit).unit_items() if name.endswith("hertz")]
+    return unit * registry.Unit("cycle") ** sum(powers)
+
+
+def _times(text: str, angle: str, power: float) -> str:
+    """Return a unit times a power of an angle, as a text."""
+    if power == 1.0:
+        return angle + text[1:] if text[:1] in ("", "1") else f"{angle}*{text}"
+    return f"{text or '1'}/{angle}" if power == -1.0 else f"{text or '1'}*{angle}**{power:g}"
+
+
+def _is_unit(text: str) -> bool:
+    """Return whether a text consists of the permitted tokens, and no operator follows another one."""
+    place, operator, depth = 0, False, 0
+    while place < len(text):
+        token = UNIT_TOKEN.match(text, place)
+        if token is None:
+            return False
+        place, mark = token.end(), token.group().strip()
+        if mark in ("*", "/", "·"):
+            if operator:
+                return False
+            operator = True
+        elif mark:
+            operator = False
+            depth += {"(": 1, ")": -1}.get(mark, 0)
+    return depth == 0

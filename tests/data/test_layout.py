@@ -1,0 +1,74 @@
+"""Missing samples of arrays; those of files are in `test_recording`."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import bayesperiodic as bp
+
+TIME = np.arange(600) / 100
+ANGLE = 0.5 * np.sin(2 * np.pi * TIME)
+LOST = np.arange(TIME.size) % 17 == 3
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.where(LOST, np.nan, ANGLE),
+        np.ma.array(np.where(LOST, 1e20, ANGLE), mask=LOST),
+        pd.Series(np.where(LOST, np.nan, ANGLE)).astype("Float64"),
+        pd.array(np.where(LOST, np.nan, ANGLE), dtype="Float64"),
+        pd.Series([None if lost else x for lost, x in zip(LOST, ANGLE, strict=True)], dtype=object),
+        [pd.NA if lost else x for lost, x in zip(LOST, ANGLE, strict=True)],
+        xr.DataArray(np.where(LOST, np.nan, ANGLE), dims="time"),
+    ],
+    ids=lambda values: f"{type(values).__name__} {getattr(values, 'dtype', '')}",
+)
+def test_missing_samples_are_refused_left_out_or_interpolated(values):
+    with pytest.raises(ValueError, match=r"outputs\['x'\]: must be finite, got nan at index 3 \(36 of 600 .*") as error:
+        bp.Recording.from_arrays(TIME, {"x": values})
+    assert "missing='drop'" in str(error.value) and "missing='interpolate'" in str(error.value)
+    with pytest.raises(ValueError, match=r"outputs\['x'\]: must be finite, got nan at index 3 \(36 of 600"):
+        bp.Recording(TIME, {"x": values}, {})
+    dropped = bp.Recording.from_arrays(TIME, {"x": values}, {"u": ANGLE}, missing="drop")
+    for kept, whole in ((dropped.time, TIME), (dropped.outputs["x"], ANGLE), (dropped.inputs["u"], ANGLE)):
+        assert np.array_equal(kept, whole[~LOST])
+    run = dropped.fold(64, harmonics=1)
+    assert abs(np.fft.rfft(run.outputs["x"])[1]) / 32 == pytest.approx(0.5, abs=1e-6)
+    filled = bp.Recording.from_arrays(TIME, {"x": values}, missing="interpolate")
+    middle = (ANGLE[np.flatnonzero(LOST) - 1] + ANGLE[np.flatnonzero(LOST) + 1]) / 2
+    assert np.array_equal(filled.time, TIME) and filled.outputs["x"][LOST] == pytest.approx(middle)
+
+
+def test_interpolation_is_over_three_samples_and_linear_in_time():
+    time, x = np.array([0.0, 1.0, 2.0, 4.0, 8.0]), np.array([0.0, np.nan, np.nan, np.nan, 8.0])
+    assert bp.Recording.from_arrays(time, {"x": x}, missing="interpolate").outputs["x"] == pytest.approx(time)
+    with pytest.raises(ValueError, match=r"missing: must be 'drop' for outputs\['x'\], .*at most 3 .*, and 4 are"):
+        bp.Recording.from_arrays(range(6), {"x": [0, None, None, None, None, 5]}, missing="interpolate")
+    with pytest.raises(ValueError, match="missing: must be one of 'drop', 'interpolate', got 'fill'"):
+        bp.Recording.from_arrays(time, {"x": x}, missing="fill")
+
+
+def test_lengths_are_checked_whatever_is_missing():
+    with pytest.raises(ValueError, match=r"outputs\['x'\]: must have 600 values .*got 599"):
+        bp.Recording.from_arrays(TIME, {"x": ANGLE[1:]}, missing="drop")
+    with pytest.raises(ValueError, match=r"outputs\['x'\]: must be one-dimensional, got shape \(600, 1\)"):
+        bp.Recording.from_arrays(TIME, {"x": ANGLE[:, None]}, missing="drop")
+
+
+def test_channels_may_be_called_as_the_arguments_are():
+    run = bp.Recording.from_arrays([0, 1, 2], {"time": [1, None, 3]}, {"outputs": [4, 5, 6]}, missing="drop")
+    assert run.outputs["time"].tolist() == [1.0, 3.0] and run.inputs["outputs"].tolist() == [4.0, 6.0]
+
+
+def test_masks_are_not_ignored_in_an_experiment():
+    masked = np.ma.array(np.cos(2 * np.pi * np.arange(16) / 16), mask=np.arange(16) == 5)
+    with pytest.raises(ValueError, match=r"must be finite, got nan at index 5 \(1 of 16 values are masked, NaN or inf"):
+        bp.Experiment("run", 1.0, {"x": masked}, samples=16)
+
+
+def test_a_cell_of_a_file_with_one_row_is_located(tmp_path):
+    (tmp_path / "run.csv").write_text("0\nx\n\n")
+    with pytest.raises(ValueError, match="column '0' of run.csv: must contain numbers, .* got 'x' in data row 1"):
+        bp.Recording.from_csv(tmp_path / "run.csv", sampling_rate=2.0, outputs={"c": "0"})

@@ -1,0 +1,179 @@
+"""Times as dates and durations, against integer arithmetic and Python's fractions."""
+
+import datetime
+from fractions import Fraction
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import bayesperiodic as bp
+from bayesperiodic.data.times import seconds
+
+COUNT, STEP = 400, 10_000_019  # nanoseconds, no round number
+NANOSECONDS = np.arange(COUNT) * STEP
+START = np.datetime64("2026-03-29T00:59:58.123456789", "ns")  # two seconds before the clocks change
+DATES = START + NANOSECONDS.astype("timedelta64[ns]")
+EXACT = np.array([float(Fraction(int(n), 10**9)) for n in NANOSECONDS])
+SIGNAL = np.sin(2 * np.pi * 3.0 * EXACT)
+
+
+def zoned(zone):
+    return pd.DatetimeIndex(DATES).tz_localize("UTC").tz_convert(zone)
+
+
+@pytest.mark.parametrize(
+    "time",
+    [
+        DATES, DATES - START, DATES - START + np.timedelta64(10**18, "ns"), pd.Series(DATES), pd.DatetimeIndex(DATES),
+        pd.Series(DATES, index=np.arange(COUNT)[::-1]), pd.to_timedelta(NANOSECONDS, unit="ns"), list(DATES),
+        pd.Series(pd.to_timedelta(NANOSECONDS, unit="ns")), zoned("Europe/Berlin"), pd.Series(zoned("Asia/Kolkata")),
+        list(zoned("Europe/Berlin")), xr.DataArray(SIGNAL, coords={"time": DATES}, dims="time").time,
+        xr.DataArray(SIGNAL, coords={"time": DATES}, dims="time")["time"].to_index(), DATES.astype(str),
+        pd.Series(DATES.astype(str)), zoned("Europe/Berlin").map(lambda date: date.isoformat()),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_dates_and_durations_become_seconds_from_the_first_sample(time):
+    recording = bp.Recording.from_arrays(time, {"x": SIGNAL})
+    assert np.array_equal(recording.time, EXACT)
+    assert np.array_equal(bp.Recording(time, {"x": SIGNAL}, {}).time, EXACT)
+    assert recording.fold(16, harmonics=1).frequency == pytest.approx(3.0, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("unit", "size"),
+    [("W", 604_800), ("D", 86_400), ("h", 3600), ("m", 60), ("s", 1), ("10ms", Fraction(1, 100)),
+     *((name, Fraction(1, 1000**power)) for power, name in enumerate(("ms", "us", "ns", "ps", "fs", "as"), 1))],
+)  # fmt: skip
+@pytest.mark.parametrize("kind", ["datetime64", "timedelta64"])
+def test_every_resolution_of_numpy_is_converted_exactly(kind, unit, size):
+    counts = np.array([3, 4, 7, 1_000_003])
+    expected = [float(Fraction(size) * int(count - 3)) for count in counts]
+    assert seconds("time", counts.astype(f"{kind}[{unit}]")).tolist() == expected
+
+
+def test_dates_by_month_and_year_have_the_length_of_the_calendar():
+    assert seconds("time", np.array(["2024-02", "2024-03", "2025-03"], "datetime64[M]")).tolist() == [
+        0, 29 * 86_400, (29 + 365) * 86_400,
+    ]  # fmt: skip
+    with pytest.raises(ValueError, match=r"time: must be durations in weeks or a shorter unit, got timedelta64\[M\]"):
+        bp.Recording.from_arrays(np.arange(3).astype("timedelta64[M]"), {"x": [1.0, 2.0, 3.0]})
+    with pytest.raises(ValueError, match=r"time: must be durations in weeks or a shorter unit, got timedelta64"):
+        bp.Recording.from_arrays(np.arange(3).astype("timedelta64"), {"x": [1.0, 2.0, 3.0]})
+
+
+def test_python_dates_and_durations_are_converted():
+    start, step = datetime.datetime(2026, 1, 31, 12), datetime.timedelta(microseconds=1500)
+    for zone in (None, datetime.UTC, datetime.timezone(datetime.timedelta(hours=5))):
+        dates = [start.replace(tzinfo=zone) + i * step for i in range(4)]
+        assert bp.Recording.from_arrays(dates, {"x": range(4)}).time.tolist() == [0.0, 0.0015, 0.003, 0.0045]
+    durations = [step + i * step for i in range(4)]
+    assert bp.Recording.from_arrays(durations, {"x": range(4)}).time.tolist() == [0.0, 0.0015, 0.003, 0.0045]
+
+
+def test_numbers_keep_their_origin_unless_no_float_holds_them():
+    assert seconds("time", [5.0, 6.0]) == [5.0, 6.0]
+    assert bp.Recording.from_arrays(np.array([5, 6]), {"x": [1, 2]}).time.tolist() == [5.0, 6.0]
+    epoch = 1_774_000_000_123_456_789
+    for kind in (np.int64, np.uint64):
+        assert seconds("time", np.array([epoch, epoch + 1, epoch + 5], kind)).tolist() == [0, 1, 5]
+
+
+@pytest.mark.parametrize("time", [DATES, pd.Series(DATES), list(pd.DatetimeIndex(DATES)), DATES.astype(str)], ids=type)
+def test_missing_times_are_refused_or_left_out(time):
+    lost = [0, 1, 7]
+    if isinstance(time, np.ndarray):
+        time = np.ma.array(time, mask=np.isin(np.arange(COUNT), lost))
+    else:
+        time = pd.Series([pd.NaT if i in lost else date for i, date in enumerate(time)])
+    with pytest.raises(ValueError, match=r"time: must be finite, got nan at index 0 \(3 of 400 .*missing='drop'"):
+        bp.Recording.from_arrays(time, {"x": SIGNAL})
+    recording = bp.Recording.from_arrays(time, {"x": SIGNAL}, missing="drop")
+    rest = np.delete(NANOSECONDS, lost)
+    assert recording.time.tolist() == ((rest - rest[0]) / 1e9).tolist()
+    assert np.array_equal(recording.outputs["x"], np.delete(SIGNAL, lost))
+
+
+def test_texts_with_picoseconds_are_refused():
+    """Pandas would drop the digits, see findings/pandas_digits_of_seconds.sh."""
+    texts = [f"2026-01-01T00:00:00.12345678{k:02d}" for k in range(10)]
+    with pytest.raises(
+        ValueError, match=r"^time: must have at most nine decimals of a second, got '2026-01-01T00:00:00"
+    ):
+        bp.Recording.from_arrays(texts, {"x": np.arange(10.0)})
+
+
+def test_texts_that_are_no_dates_are_named():
+    texts = ["2026-01-31T12:00:00", "2026-01-31T12:00:01", "noon"]
+    with pytest.raises(ValueError, match="time: must be dates, such as 2026-01-31.*, got 'noon' at index 2"):
+        bp.Recording.from_arrays(texts, {"x": [1, 2, 3]})
+    with pytest.raises(ValueError, match="time: must be dates, .*all of one kind, got 'noon' at index 1"):
+        bp.Recording.from_arrays([datetime.datetime(2026, 1, 1), "noon"], {"x": [1, 2]})
+    with pytest.raises(ValueError, match="time: must be an array of real numbers, got .*31.01.2026"):
+        bp.Recording.from_arrays(["31.01.2026 12:00", "31.01.2026 12:01"], {"x": [1, 2]})
+
+
+@pytest.mark.parametrize(
+    "time", [[[1], [2, 3]], ["a", "b"], None, {"t": [1, 2]}, pd.period_range("2026", periods=2)], ids=str
+)
+def test_what_is_no_time_is_refused_as_such(time):
+    with pytest.raises(ValueError, match="time: must be (an array of real numbers|one-dimensional), got"):
+        bp.Recording.from_arrays(time, {"x": [1, 2]})
+
+
+def test_dates_are_no_values_of_a_channel():
+    with pytest.raises(ValueError, match=r"outputs\['x'\]: must be an array of real numbers, got .*datetime64\[ns\]"):
+        bp.Recording.from_arrays(EXACT, {"x": DATES})
+    with pytest.raises(ValueError, match="outputs.*: must be an array of real numbers"):
+        bp.Experiment("run", 1.0, {"x": (DATES - START)[:8]}, samples=8)
+    with pytest.raises(ValueError, match="start, stop: must be an array of real numbers, got"):
+        bp.Recording.from_arrays(DATES, {"x": SIGNAL}).between(DATES[3], DATES[9])
+
+
+@pytest.mark.parametrize("separator", ["T", " "])
+@pytest.mark.parametrize("zone", ["", "Z", "+02:00"])
+def test_iso_dates_of_a_file_are_times(tmp_path, separator, zone):
+    table = pd.DataFrame({"date": [text.replace("T", separator) + zone for text in DATES.astype(str)], "x": SIGNAL})
+    table["step"] = np.arange(COUNT) // 200
+    table.to_csv(tmp_path / "run.csv", index=False)
+    columns = {"time": "date", "outputs": {"x": "x"}}
+    assert np.array_equal(bp.Recording.from_csv(tmp_path / "run.csv", **columns).time, EXACT)
+    first, second = bp.Recording.from_csv(tmp_path / "run.csv", **columns, split="step")
+    assert np.array_equal(np.concatenate([first.time, second.time]), EXACT)
+    with pytest.raises(ValueError, match=r"units\['time'\]: must be left out for a column of dates"):
+        bp.Recording.from_csv(tmp_path / "run.csv", **columns, units={"time": ("ms", "s")})
+    table.loc[[0, 5], "date"] = ""
+    table.to_csv(tmp_path / "run.csv", index=False)
+    with pytest.raises(ValueError, match=r"time \(column 'date' of run.csv\): must be finite, got nan at index 0 \(2"):
+        bp.Recording.from_csv(tmp_path / "run.csv", **columns)
+    time = bp.Recording.from_csv(tmp_path / "run.csv", **columns, missing="drop").time
+    assert np.array_equal(time, np.delete(NANOSECONDS - STEP, [0, 5]) / 1e9)
+    table.loc[7, "date"] = "yesterday"
+    table.to_csv(tmp_path / "run.csv", index=False)
+    with pytest.raises(ValueError, match="column 'date' of run.csv: must be dates, .* got 'yesterday' at index 7"):
+        bp.Recording.from_csv(tmp_path / "run.csv", **columns)
+
+
+def test_other_dates_of_a_file_are_refused_with_the_way_to_read_them(tmp_path):
+    pd.DataFrame({"date": ["31.01.2026 12:00", "31.01.2026 12:01"], "x": [1, 2]}).to_csv(
+        tmp_path / "run.csv", index=False
+    )
+    with pytest.raises(
+        ValueError, match="got '31.01.2026 12:00' in data row 1; dates must be those of ISO 8601, other"
+    ):
+        bp.Recording.from_csv(tmp_path / "run.csv", time="date", outputs={"x": "x"})
+
+
+def test_dates_and_large_integers_of_an_npz_file_are_times(tmp_path):
+    epoch = START.astype(np.int64) + NANOSECONDS
+    np.savez(tmp_path / "run.npz", date=DATES, epoch=epoch, x=SIGNAL)
+    run = bp.Recording.from_npz(tmp_path / "run.npz", time="date", outputs={"x": "x"})
+    assert np.array_equal(run.time, EXACT)
+    with pytest.raises(ValueError, match="column 'date' of run.npz: must be one column of real numbers, .*datetime64"):
+        bp.Recording.from_npz(tmp_path / "run.npz", sampling_rate=1.0, outputs={"x": "date"})
+    columns = {"time": "epoch", "outputs": {"x": "x"}, "units": {"time": ("ns", "s")}}
+    assert bp.Recording.from_npz(tmp_path / "run.npz", **columns).time == pytest.approx(EXACT, rel=1e-15)
+    pd.DataFrame({"epoch": epoch, "x": SIGNAL}).to_csv(tmp_path / "run.csv", index=False)
+    assert bp.Recording.from_csv(tmp_path / "run.csv", **columns).time == pytest.approx(EXACT, rel=1e-15)
