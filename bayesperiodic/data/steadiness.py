@@ -26,7 +26,7 @@ DISTANT, DISTANT_MEAN = 3.0, 12.0
 # Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
 FEWEST_FOR_MEDIAN = 9
 # Windows from which a transient is searched for, and false-alarm rate of a significant slope.
-FEWEST_FOR_TRANSIENT, SLOPE_FALSE_ALARM = 8, 1e-4
+FEWEST_FOR_TRANSIENT, SLOPE_FALSE_ALARM = 10, 1e-4
 # Shares of a channel's standard deviation below which distances and noise do not count.
 SMALLEST_DISTANCE, SMALLEST_NOISE = 1e-9, 1e-6
 # Bias of the mean amplitudes by a transient that is allowed, in standard errors of all together.
