@@ -26,7 +26,7 @@ DISTANT, DISTANT_MEAN = 3.0, 12.0
 # Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
 FEWEST_FOR_MEDIAN = 9
 # Windows from which a transient is searched for, and false-alarm rate of a significant slope.
-FEWEST_FOR_TRANSIENT, SLOPE_FALSE_ALARM = 8, 1e-4
+FEWEST_FOR_TRANSIENT, SLOPE_FALSE_ALARM = 10, 1e-4
 # Largest correlation of the noise of neighbouring windows.
 LONGEST_MEMORY = 0.8
 # Shares of a channel's standard deviation below which distances and noise do not count.

@@ -139,7 +139,9 @@ def test_samples_that_miss_at_the_same_phases_limit_the_harmonics_and_enlarge_th
         e = recorded(measured(seed)).without(outliers=mask).fold(64, frequency=1.0, harmonics=2)
         error = np.sqrt(e.amplitude_variance["angle"][:3])
         scores.append(np.abs(amplitudes(e)[:3] - EXACT[:3]) ** 2 / error**2)
-    assert np.mean(scores, axis=0) == pytest.approx(np.ones(3), abs=0.6)
+    # Twenty recordings: three standard errors of the mean square are 0.7 to 1.
+    assert np.all(np.mean(scores, axis=0) < 2.0)
+    assert np.all(np.mean(scores, axis=0) > 0.3)
 
 
 @pytest.mark.parametrize("limit", [0.38, 0.385, 0.39])
@@ -395,8 +397,8 @@ def alarms(seeds):
 
 
 def test_sound_recordings_have_no_serious_findings():
-    """At most 1 % of 60 recordings: more than two have probability 0.02."""
-    assert len(alarms(range(60))) <= 2
+    """At most 1 % of 40 recordings: more than two have probability 0.008."""
+    assert len(alarms(range(40))) <= 2
 
 
 @pytest.mark.slow
