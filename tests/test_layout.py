@@ -11,6 +11,7 @@ MOST_PARAMETERS = 8
 REASONS = {
     "Experiment": "one field per measured quantity; four are required, the rest are keywords with defaults",
     "sample": "settings of the sampler; two arguments and the seed are required, the rest are keywords with defaults",
+    "Finding": "one field per fact about a fault; made by `Recording.check`",
     "Model": "the definition of a model: name, variables, equations, outputs, units; five are required",
     "Problem": "model, experiments, parameters and noise; two and the priors are required, the rest are keywords",
     "Recording.from_csv": "the columns of a file, gaps in them and several records; path and outputs are required",

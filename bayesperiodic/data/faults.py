@@ -7,16 +7,16 @@ import numpy as np
 from bayesperiodic.data.quantisation import step_of
 
 # Ranges at which sensors wrap: radians, degrees, turns; and powers of two of a quantised sensor's steps.
-TURNS = (2.0 * np.pi, 360.0, 1.0)
+SENSOR_TURNS = (2.0 * np.pi, 360.0, 1.0)
 FEWEST_BITS, MOST_BITS = 6, 32
 # Steps relative to the range that are rounding errors of exact values.
 ROUNDING = 1e-12
 # A jump wraps if it is a whole range to this share of it; what is left must be smooth, and small beside the jumps.
-WRAP_TOLERANCE, LARGEST_STEP, SMOOTH = 0.35, 0.5, 0.5
+WRAP_TOLERANCE, LARGEST_UNWRAPPED_STEP, SMOOTH_UNWRAPPED = 0.35, 0.5, 0.5
 # Samples of one value in a row that may be a stuck sensor, and how many times longer than usual ones they are.
 FEWEST_STUCK, LONG_RUN = 10, 10.0
 # Clipped samples: fewest, fewest in a row, and how many times more than at the next level.
-FEWEST_CLIPPED, CLIPPED_RUN, PILED = 6, 3, 6.0
+FEWEST_CLIPPED, CLIPPED_RUN, PILED_UP = 6, 3, 6.0
 # Distance of outliers from the mean period in standard deviations of the others, and how often they may return.
 FAR, RETURNING = 8.0, 0.5
 MEDIAN_TO_SD = 1.4826
@@ -53,7 +53,7 @@ def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
 def wrap_of(values: np.ndarray, step: float) -> tuple[float, np.ndarray]:
     """Return the range at which the values of a sensor wrap, 0 if they do not, and the samples after its jumps."""
     span, change = float(np.ptp(values)), np.diff(values)
-    turns = [*TURNS, *(step * 2.0**bits for bits in range(FEWEST_BITS, MOST_BITS) if step > 0.0)]
+    turns = [*SENSOR_TURNS, *(step * 2.0**bits for bits in range(FEWEST_BITS, MOST_BITS) if step > 0.0)]
     for turn in turns:
         if not 0.9 * turn < span < 1.001 * turn + step:
             continue
@@ -62,7 +62,9 @@ def wrap_of(values: np.ndarray, step: float) -> tuple[float, np.ndarray]:
             continue
         whole = unwrapped(values, turn)
         steps = np.diff(whole)
-        smooth = np.mean(steps**2) < SMOOTH * np.var(whole) and np.abs(steps).max() < LARGEST_STEP * turn
+        smooth = (
+            np.mean(steps**2) < SMOOTH_UNWRAPPED * np.var(whole) and np.abs(steps).max() < LARGEST_UNWRAPPED_STEP * turn
+        )
         # The steps over the jumps are like those of the samples beside them.
         usual = np.quantile(np.abs(np.delete(steps, jumps)), 0.99)
         if smooth and np.median(np.abs(steps[jumps])) <= 3.0 * usual + step:
@@ -117,7 +119,7 @@ def _piles_up(values: np.ndarray, top: np.ndarray, place: np.ndarray) -> bool:
     if levels.size < FEWEST_VALUES or top.size > MOST_DROPPED * place.size:
         return False
     below = counts[-6:-1]
-    return bool(top.size > PILED * max(float(below.max()), 1.0))
+    return bool(top.size > PILED_UP * max(float(below.max()), 1.0))
 
 
 def held_of(values: np.ndarray) -> tuple[int, np.ndarray]:
@@ -140,7 +142,7 @@ def dropped_value(values: np.ndarray) -> float | None:
         return None
     order = np.argsort(counts)
     most, others = int(counts[order[-1]]), max(int(counts[order[-2]]), 1)
-    if most < FEWEST_CLIPPED or most < PILED * others or most > MOST_DROPPED * counts.sum():
+    if most < FEWEST_CLIPPED or most < PILED_UP * others or most > MOST_DROPPED * counts.sum():
         return None
     return float(levels[order[-1]])
 

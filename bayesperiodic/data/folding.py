@@ -68,7 +68,6 @@ def fold_signals(
     seen = inspect(replace(signals, time=signals.time - start), periods, frequency, points)
     if seen.steady is None or seen.fit is None:
         raise ValueError(seen.reason)
-    refuse(signals.name, seen.findings)
     fit, pace, limit = seen.fit, seen.pace, seen.limit
     steady = seen.signals.part(seen.steady.samples)
     if frequency is not None:
@@ -76,6 +75,7 @@ def fold_signals(
         _refuse_frequency(estimated, fit, pace, float(np.ptp(steady.time)), periods)
     drift = dict(zip(signals.channels, _drift(seen.steady.part.sizes), strict=True))
     _refuse_drift(signals.name, drift, largest_drift)
+    refuse(signals.name, seen.findings)
     periodicity = _periodicity(steady, fit)
     cycles = round(np.ptp(steady.time) * fit.frequency)
     _warn(signals.name, pace, cycles, seen)

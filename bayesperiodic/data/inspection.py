@@ -59,16 +59,16 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     """Return what signals are like; without a steady part or a mean period, the reason."""
     faults = [signal_faults(values, drive=i < signals.inputs) for i, values in enumerate(signals.values)]
 
-    def found(rate: float | None, limit: int = 0, used: slice = slice(0, signals.time.size)) -> list[Finding]:
+    def findings(rate: float | None, limit: int = 0, used: slice = slice(0, signals.time.size)) -> list[Finding]:
         rows = zip(signals.channels, signals.values, faults, strict=True)
         every = [f for c, v, fault in rows for f in sample_findings(c, signals.time, v, fault, rate, limit, used)]
         return every + [*clock_findings(signals.time, rate)]
 
-    def sorted_(findings: list[Finding]) -> tuple[Finding, ...]:
-        return tuple(sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity)))
+    def worst_first(some: list[Finding]) -> tuple[Finding, ...]:
+        return tuple(sorted(some, key=lambda finding: -SEVERITIES.index(finding.severity)))
 
     if any(fault.wrap for fault in faults):
-        return Inspection(signals, faults, sorted_(found(None)), reason=_wrapped(signals.name, found(None)))
+        return Inspection(signals, faults, worst_first(findings(None)), reason=_wrapped(signals.name, findings(None)))
     moving = np.ones(signals.time.size, dtype=bool)
     for stuck in [part for fault in faults for part in fault.stuck]:
         moving[stuck] = False
@@ -82,21 +82,23 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
         refuse_gaps(signals, fundamental)
         tracked = tracked_frequency(calm, fundamental, frequency is not None)
     except ValueError as error:
-        return Inspection(signals, faults, sorted_(found(None)), reason=str(error))
+        return Inspection(signals, faults, worst_first(findings(None)), reason=str(error))
     total = int(cycles_of(signals.time, tracked))
     sound = _sound(signals, calm, faults, np.flatnonzero(moving), tracked, points)
     some = signals if sound.size == signals.time.size else signals.part(sound)
+    few = min(ROUGH_HARMONICS, resolved_harmonics(some.time, tracked, points))
+    if frequency is None and some is not signals:
+        tracked = refine_frequency(some.time, some.values, tracked, few)[0].frequency
     every = windows(some.time, some.values, tracked)
     steady = steady_part(every)
     if steady is not None and frequency is None and steady.level != (0, sound.size):
         # The frequency of a part that ramps is not that of the steady one.
         part = some.part(steady.samples)
-        few = min(ROUGH_HARMONICS, resolved_harmonics(part.time, tracked, points))
         tracked = refine_frequency(part.time, part.values, tracked, few)[0].frequency
         every = windows(some.time, some.values, tracked)
         steady = steady_part(every)
     if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
-        return Inspection(signals, faults, sorted_(found(tracked)), total, reason=_unsteady(signals, every))
+        return Inspection(signals, faults, worst_first(findings(tracked)), total, reason=_unsteady(signals, every))
     steady = steady.among(sound)
     used = signals.part(steady.samples)
     limit, inflation = determined_harmonics(used.time, tracked, resolved_harmonics(used.time, tracked, points))
@@ -108,10 +110,11 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
         residuals = used.values - _fourier.at_times(near, tracked * used.time)
     for fault, rest, values in zip(faults, residuals, used.values, strict=True):
         place = outliers_of(rest, used.time * fit.frequency, values, fault.step)
-        fault.outliers = place + steady.samples.start
-    findings = found(fit.frequency, limit, steady.samples)
-    findings += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
-    return Inspection(signals, faults, sorted_(findings), total, steady, fit, pace, limit, inflation)
+        outliers = place + steady.samples.start
+        fault.outliers = outliers[moving[outliers]]
+    seen = findings(fit.frequency, limit, steady.samples)
+    seen += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
+    return Inspection(signals, faults, worst_first(seen), total, steady, fit, pace, limit, inflation)
 
 
 def _wrapped(name: str, findings: list[Finding]) -> str:

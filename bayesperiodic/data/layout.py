@@ -2,10 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bayesperiodic import _checks
+from bayesperiodic.data.files import Format
 from bayesperiodic.data.times import seconds
 from bayesperiodic.data.units import Units, convert
 
@@ -106,3 +109,33 @@ def _interpolated(argument: str, time: np.ndarray, values: np.ndarray) -> np.nda
             f"{LONGEST_INTERPOLATION} successive values, and {longest} are missing."
         )
     return np.interp(time, time[known], values[known], left=np.nan, right=np.nan) if known.size else values
+
+
+def read(
+    form: Format, path: str | Path, name: str | None, split: str | None, meaning: Layout
+) -> list[tuple[Any, Any, Any, str]]:
+    """Return the arguments of the recordings in a file: one, or one for each part in which `split` is constant."""
+    name = name or Path(path).stem
+    if split is None:
+        columns = form.read(path, meaning.columns, time=meaning.time)
+        return [(*meaning.signals(meaning.timed(columns)), name)]
+    columns = form.read(path, dict.fromkeys([*meaning.columns, split]), split, meaning.time)
+    label = columns[split] if split in meaning.columns else columns.pop(split)
+    if any(lost := [value != value for value in label]):
+        row = lost.index(True) + 1
+        raise ValueError(f"split: must be a column without empty cells, got {split!r}, empty in data row {row}.")
+    for column, values in columns.items():
+        if values.size != label.size:
+            raise ValueError(
+                f"split: must be a column with one value per sample, got {split!r} with {label.size} values and "
+                f"{column!r} with {values.size}."
+            )
+    columns = meaning.timed(columns)
+    edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), label.size]
+    return [
+        (
+            *meaning.signals({column: values[first:last] for column, values in columns.items()}),
+            f"{name} {i}: {split} {label[first]}",
+        )
+        for i, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True), 1)
+    ]

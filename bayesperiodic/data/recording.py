@@ -15,7 +15,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.files import CSV, MAT, NPZ, Format
 from bayesperiodic.data.folding import AUTO, automatic_periods, fold_signals
 from bayesperiodic.data.inspection import inspect, summary
-from bayesperiodic.data.layout import Layout, without_missing
+from bayesperiodic.data.layout import Layout, read, without_missing
 from bayesperiodic.data.recording_check import RecordingCheck
 from bayesperiodic.data.signals import Signals, parts
 from bayesperiodic.data.times import seconds
@@ -26,31 +26,8 @@ def _read(
     form: Format, path: str | Path, name: str | None, split: str | None, layout: tuple[Any, ...]
 ) -> "Recording | list[Recording]":
     """Return the recording in a file; with `split`, one for each part in which this column is constant."""
-    file, meaning = Path(path), Layout(Path(path).name, *layout)
-    name = name or file.stem
-    if split is None:
-        columns = form.read(path, meaning.columns, time=meaning.time)
-        return Recording(*meaning.signals(meaning.timed(columns)), name)
-    columns = form.read(path, dict.fromkeys([*meaning.columns, split]), split, meaning.time)
-    label = columns[split] if split in meaning.columns else columns.pop(split)
-    if any(lost := [value != value for value in label]):
-        row = lost.index(True) + 1
-        raise ValueError(f"split: must be a column without empty cells, got {split!r}, empty in data row {row}.")
-    for column, values in columns.items():
-        if values.size != label.size:
-            raise ValueError(
-                f"split: must be a column with one value per sample, got {split!r} with {label.size} values and "
-                f"{column!r} with {values.size}."
-            )
-    columns = meaning.timed(columns)
-    edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), label.size]
-    return [
-        Recording(
-            *meaning.signals({column: values[first:last] for column, values in columns.items()}),
-            f"{name} {i}: {split} {label[first]}",
-        )
-        for i, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True), 1)
-    ]
+    recordings = [Recording(*part) for part in read(form, path, name, split, Layout(Path(path).name, *layout))]
+    return recordings[0] if split is None else recordings
 
 
 def _reader(name: str, form: Format, source: str, columns: str, refused: str) -> Any:

@@ -27,18 +27,18 @@ SEVERITIES = (HARMLESS, SERIOUS, RUINOUS)
 # Bias in standard errors of all amplitudes together that is serious, and relative to the signal that is ruinous.
 SERIOUS_BIAS, RUINOUS_BIAS = 0.5, 0.05
 # Harmonics of a fit without the faulty samples, as many of them as these show: with this largest condition number.
-FITTED_HARMONICS, LARGEST_CONDITION = (10, 5, 3, 2, 1), 1e3
+FITTED_HARMONICS, LARGEST_FIT_CONDITION = (10, 5, 3, 2, 1), 1e3
 # Share of the samples at each end that may be outliers where a signal is bounded by its range without them.
 EXTREMES = 0.1
 # Times of each finding that are listed.
-LISTED = 200
+MOST_TIMES_LISTED = 200
 # Steps of time that are gaps, in usual steps.
 USUAL_STEPS = 3.0
 # Relative changes over the part used: of an amplitude, and of the mean value in amplitudes.
 HARMLESS_DRIFT, HARMLESS_STEP, HARMLESS_PHASE = 0.05, 0.02, 1.0 / 180.0
 # Change between neighbouring cycles that is a step, in standard deviations of the other changes, and cycles needed;
 # the standard deviation is uncertain if there are fewer cycles than this.
-STEP, FEWEST_FOR_STEPS, ENOUGH_FOR_STEPS = 8.0, 10, 20
+STEP_FROM_CYCLE, FEWEST_FOR_STEPS, ENOUGH_FOR_STEPS = 8.0, 10, 20
 # Amplitude of a beat relative to the mean one, its false-alarm rate, and the cycles needed.
 HARMLESS_BEAT, BEAT_FALSE_ALARM, FEWEST_FOR_BEATS = 0.01, 1e-4, 24
 
@@ -77,7 +77,7 @@ class Finding(Storable):
     >>> finding.kind, finding.severity, finding.count, finding.times.round(2).tolist()
     ('stuck', 'ruinous', 201, [[10.0, 12.0]])
     >>> finding.cure
-    "recording.without(stuck=True, channel='force') leaves them out"
+    "recording.without(stuck=True, channel='force') leaves them out, and its parts `split` are folded"
     """
 
     kind: str
@@ -140,7 +140,7 @@ def effect_of(time: np.ndarray, values: np.ndarray, bad: np.ndarray, frequency: 
         if highest <= harmonics and used.size > 6 * highest and np.ptp(used) * frequency > 2.0:
             moments = _fourier.sums(np.ones((1, used.size)), frequency * used, 2 * highest)[0]
             spectrum = np.linalg.eigvalsh(toeplitz(moments))
-            if spectrum[0] * LARGEST_CONDITION > spectrum[-1]:
+            if spectrum[0] * LARGEST_FIT_CONDITION > spectrum[-1]:
                 trial = fit_harmonics(used, values[None, ~bad], frequency, highest)
                 # The Bayesian information criterion: needless harmonics predict nothing where samples are missing.
                 least = max(float(trial.variances[0]), 1e-24 * float(values.var()))
@@ -168,13 +168,36 @@ def times_of(time: np.ndarray, samples: np.ndarray) -> np.ndarray:
         return np.zeros((0, 2))
     edges = np.flatnonzero(np.diff(samples) > 1)
     first, last = samples[np.r_[0, edges + 1]], samples[np.r_[edges, samples.size - 1]]
-    return np.column_stack([time[first], time[last]])[:LISTED]
+    return np.column_stack([time[first], time[last]])[:MOST_TIMES_LISTED]
 
 
 def _when(times: np.ndarray) -> str:
     """Return times in words."""
     shown = [f"{a:.6g} s" if a == b else f"{a:.6g} to {b:.6g} s" for a, b in times[:3]]
     return ("at " if times[0, 0] == times[0, 1] else "from ") + ", ".join(shown) + (", …" if len(times) > 3 else "")
+
+
+def _finding(
+    channel: str,
+    kind: str,
+    time: np.ndarray,
+    samples: np.ndarray,
+    what: str,
+    effect: Effect,
+    frequency: float | None,
+    inside: bool,
+) -> Finding:
+    """Return the finding of samples that have an effect if they are inside the part used."""
+    severity = (effect.severity if frequency else SERIOUS) if inside else HARMLESS
+    times, share = times_of(time, samples), samples.size / time.size
+    size = "" if np.isnan(effect.bias) else f", a bias of {effect.bias:.3g} standard errors"
+    size = size if inside else ", not used"
+    cure = f"recording.without({kind}=True, channel={channel!r}) leaves them out"
+    if frequency and times.size and np.diff(times).max() * frequency > GAP:
+        cure += ", and its parts `split` are folded" if kind == "stuck" else ""
+        cure = "record again with a larger range" if kind == "clipped" else cure
+    text = f"{channel} {what} {_when(times)} ({samples.size} samples, {share:.2g} of all{size})"
+    return Finding(kind, channel, severity, times, samples.size, share, effect.bias, text, cure)
 
 
 def sample_findings(
@@ -221,23 +244,11 @@ def sample_findings(
 
     def finding(kind: str, samples: np.ndarray, what: str) -> Finding:
         only = np.isin(np.arange(total), samples)
-        own = every
+        effect = every
         if every.predicted.size:
             kept = np.where(bad & ~only, every.predicted, values)
-            own = effect_of(time[used], kept[used], only[used], frequency or 1.0, harmonics)
-        inside = bool(only[used].any())
-        severity = (own.severity if frequency else SERIOUS) if inside else HARMLESS
-        times, share = times_of(time, samples), samples.size / total
-        size = f", a bias of {own.bias:.3g} standard errors" if own.bias == own.bias else ""
-        size = size if inside else ", not used"
-        cure = f"recording.without({kind}=True, channel={channel!r}) leaves them out"
-        if frequency and times.size and np.diff(times).max() * frequency > GAP:
-            cure += ", and its parts `split` are folded" if kind == "stuck" else ""
-            cure = "record again with a larger range" if kind == "clipped" else cure
-        return Finding(
-            kind, channel, severity, times, samples.size, share, own.bias,
-            f"{channel} {what} {_when(times)} ({samples.size} samples, {share:.2g} of all{size})", cure,
-        )  # fmt: skip
+            effect = effect_of(time[used], kept[used], only[used], frequency or 1.0, harmonics)
+        return _finding(channel, kind, time, samples, what, effect, frequency, bool(only[used].any()))
 
     stuck = [part for part in fault.stuck if _moves(every, part, fault.step, used)]
     if stuck:
@@ -326,7 +337,7 @@ def _steps(channels: list[str], time: np.ndarray, part: Windows, frequency: floa
     lines = np.take_along_axis(shape, strongest[None, :, None], axis=2)[:, :, 0]
     turns = np.unwrap(np.angle(lines), axis=0) / (2.0 * np.pi) / strongest
     sizes = np.log(np.maximum(np.abs(lines), np.finfo(float).tiny))
-    limit = STEP * max(1.0, (ENOUGH_FOR_STEPS / len(shape)) ** 2)
+    limit = STEP_FROM_CYCLE * max(1.0, (ENOUGH_FOR_STEPS / len(shape)) ** 2)
     slip = part.slip / np.exp(np.median(sizes, axis=0))
     for kind, series, least in (
         ("amplitude step", sizes, HARMLESS_STEP + slip),
@@ -397,7 +408,7 @@ def clock_findings(time: np.ndarray, frequency: float | None) -> Iterator[Findin
     if ends.size:
         lost = int(np.round(step[ends] / usual - 1.0).sum())
         yield Finding(
-            "gaps", "", HARMLESS, np.column_stack([time[ends], time[ends + 1]])[:LISTED], lost,
+            "gaps", "", HARMLESS, np.column_stack([time[ends], time[ends + 1]])[:MOST_TIMES_LISTED], lost,
             lost / (lost + time.size), np.nan,
             f"{lost} samples are missing in {ends.size} gaps, the longest of {step.max():.3g} s",
         )  # fmt: skip

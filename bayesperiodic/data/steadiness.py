@@ -11,10 +11,10 @@ from scipy.stats import t as student
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES, determined_harmonics, resolved_harmonics
 
 # Parts of a cycle in which ramps begin or end, in recordings of so many cycles; most windows of long recordings.
-FINE, FEW_CYCLES, MOST_WINDOWS = 8, 64, 256
+WINDOWS_PER_CYCLE, FEW_CYCLES, MOST_WINDOWS = 8, 64, 256
 HARMONICS = 5
 # Least share of the usual samples of a window, and largest condition number of its amplitudes.
-ENOUGH, LARGEST_CONDITION = 0.5, 30.0
+ENOUGH, LARGEST_WINDOW_CONDITION = 0.5, 30.0
 # Range of an amplitude in a steady part, relative to the amplitude and in standard deviations of a cycle's noise.
 SMALL_RANGE, NOISE_RANGE = 0.08, 14.0
 # Least level of a steady part relative to the largest amplitudes: a part at rest is steady too.
@@ -78,7 +78,7 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     """Return the amplitudes of signals (channels, samples) in windows along a recording."""
     duration = np.ptp(time) * time.size / (time.size - 1) * (1 + 1e-9)
     total = int(duration * fundamental)
-    fine = FINE if total <= FEW_CYCLES else 1
+    fine = WINDOWS_PER_CYCLE if total <= FEW_CYCLES else 1
     cycles = max(1, total // MOST_WINDOWS)
     # Blocks of a fraction of a cycle, or of some cycles; the last one ends with the recording.
     length = cycles / fine / fundamental
@@ -107,7 +107,7 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     right = np.moveaxis(np.concatenate([np.conj(sums[harmonics[:0:-1], 1:]), sums[harmonics, 1:]]), -1, 0)
     few = sums[0, 0].real < ENOUGH * np.median(sums[0, 0].real)
     size = np.linalg.eigvalsh(matrices)
-    enough = np.flatnonzero(~few & (size[:, 0] * LARGEST_CONDITION > size[:, -1]))
+    enough = np.flatnonzero(~few & (size[:, 0] * LARGEST_WINDOW_CONDITION > size[:, -1]))
     amplitudes = np.linalg.solve(matrices[enough], right[enough])[:, harmonics[-1] :]
     amplitudes[:, 1:] *= 2.0
     first, last = edges[: count - fine + 1].copy(), stops[fine - 1 :]

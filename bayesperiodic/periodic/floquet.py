@@ -31,7 +31,7 @@ GAUSS_MATRIX = np.array(
         [5 / 36 + np.sqrt(15) / 30, 2 / 9 + np.sqrt(15) / 15, 5 / 36],
     ]
 )
-HARMLESS, IN_RANGE = 1e3, 1e60
+HARMLESS_ERROR, IN_RANGE = 1e3, 1e60
 BASIS_SWEEPS, POWER_ROUNDS = 8, 60
 DECOUPLED = 1e-11
 STIFF, MOST_PARTS = 3.0, 32
@@ -179,7 +179,7 @@ def _harmless_products(steps: np.ndarray) -> tuple[np.ndarray, int]:
     while len(products) > 1:
         padded = products if len(products) % 2 == 0 else np.concatenate([products, np.eye(steps.shape[1])[None]])
         longer = padded[1::2] @ padded[0::2]
-        if not np.max(_spread(longer)) < HARMLESS:
+        if not np.max(_spread(longer)) < HARMLESS_ERROR:
             break
         products, length = longer, 2 * length
     return products, length

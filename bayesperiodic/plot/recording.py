@@ -16,7 +16,7 @@ from bayesperiodic.plot.style import COLOURS, caveats, legend_entries, styled, w
 # Parts of the time axis in which the smallest and the largest sample are drawn, of recordings with more samples.
 PARTS, MOST_SAMPLES = 1200, 8000
 # Length of labels, and of the lines of the title in characters for each inch.
-LABEL_LENGTH, TITLE_LENGTH = 16, 13
+CHANNEL_LENGTH, TITLE_LENGTH = 16, 13
 # Shortest span that is drawn, as a fraction of the time axis.
 SHORTEST = 1 / 400
 USED_STYLE: dict[str, Any] = {"color": "#009E73", "alpha": 0.15, "lw": 0.0}
@@ -81,7 +81,7 @@ def recording(recording: Recording, check: RecordingCheck | None = None, *, figu
         axes.plot(*_drawn(recording.time, values, gaps), color=COLOURS["measured"], lw=0.7)
         own = [finding for finding in check.findings if finding.channel in ("", channel)]
         _mark(axes, own, recording.time, values, check)
-        axes.set_ylabel(wrapped_label(channel, "", LABEL_LENGTH))
+        axes.set_ylabel(wrapped_label(channel, "", CHANNEL_LENGTH))
         axes.margins(x=0.0)
         axes.locator_params(axis="y", nbins=5)
     panels[-1].set_xlabel("time [s]")
