@@ -76,7 +76,6 @@ def fold_signals(
     drift = dict(zip(signals.channels, _drift(seen.steady.part.sizes), strict=True))
     _refuse_drift(signals.name, drift, largest_drift)
     refuse(signals.name, seen.findings)
-    periodicity = _periodicity(steady, fit)
     cycles = round(np.ptp(steady.time) * fit.frequency)
     _warn(signals.name, pace, cycles, seen)
     one_cycle, noise = zip(*(_noise(steady, fit, row, cycles) for row in range(len(steady.values))), strict=True)
@@ -115,7 +114,7 @@ def fold_signals(
         "amplitude_variance": by_channel(v.variance[part] for v, part in zip(noise, used, strict=True)),
         "amplitude_freedom": by_channel(v.freedom[part] for v, part in zip(noise, used, strict=True)),
         "error_slopes": _error_slopes(by_channel(noise), inputs, kept),
-        "periodicity": periodicity,
+        "periodicity": _periodicity(steady, fit),
         "drift": drift,
         "origin": start,
         "findings": seen.findings,

@@ -26,15 +26,16 @@ DISTANT, DISTANT_MEAN = 3.0, 12.0
 # Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
 FEWEST_FOR_MEDIAN = 9
 # Windows from which a transient is searched for, and false-alarm rate of a significant slope.
-FEWEST_FOR_TRANSIENT, SLOPE_FALSE_ALARM = 10, 1e-4
+FEWEST_FOR_TRANSIENT, SLOPE_FALSE_ALARM = 6, 1e-4
 # Largest correlation of the noise of neighbouring windows.
 LONGEST_MEMORY = 0.8
 # Shares of a channel's standard deviation below which distances and noise do not count.
 SMALLEST_DISTANCE, SMALLEST_NOISE = 1e-9, 1e-6
 # Bias of the mean amplitudes by a transient that is allowed, in standard errors of all together.
 ALLOWED_BIAS = 0.3
-# Probability of a rest of a transient before the data, where the start was left out, and where it was not.
-PROBABLE, IMPROBABLE = 0.9, 0.1
+# Probability of a rest of a transient before the data, where the start was left out, and where it was not; with few
+# windows, in which noise looks like one more often, it has to be clear.
+PROBABLE, IMPROBABLE, IMPROBABLE_IN_FEW, FEW_WINDOWS = 0.9, 0.1, 1e-4, 10
 # Decay times of transients, in cycles and relative to the recording, their number, and the number of frequencies.
 SHORTEST_DECAY, LONGEST_DECAY, DECAYS, FREQUENCIES = 0.3, 1.0 / 6.0, 12, 13
 # Decay times in which a transient is compared with noise, and most places of the recording with which it is compared.
@@ -160,9 +161,10 @@ def steady_part(every: Windows) -> Steady | None:
     level = (int(part.first[0]), int(part.last[-1]))
     first, bias, squares = 0, 0.0, np.zeros(part.amplitudes.shape[1:])
     if len(part.first) >= FEWEST_FOR_TRANSIENT:
-        first, bias, squares = _after_transient(
-            part, PROBABLE if part.place[0] - every.place[0] >= part.overlap else IMPROBABLE
-        )
+        probability = IMPROBABLE if len(part.first) >= FEW_WINDOWS else IMPROBABLE_IN_FEW
+        if part.place[0] - every.place[0] >= part.overlap:
+            probability = PROBABLE
+        first, bias, squares = _after_transient(part, probability)
     part = part.chosen(slice(first, None))
     change = np.array([_change(half) for half in np.array_split(part.sizes, 2)])
     return Steady(part, slice(int(part.first[0]), int(part.last[-1])), level, bias, squares, change)

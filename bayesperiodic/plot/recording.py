@@ -79,8 +79,8 @@ def recording(recording: Recording, check: RecordingCheck | None = None, *, figu
         if not check.reason:
             axes.axvspan(check.start, check.stop, label="part used", zorder=0.5, **USED_STYLE)
         axes.plot(*_drawn(recording.time, values, gaps), color=COLOURS["measured"], lw=0.7)
-        own = [finding for finding in check.findings if finding.channel in ("", channel)]
-        _mark(axes, own, recording.time, values, check)
+        shown = [finding for finding in check.findings if finding.channel in ("", channel)]
+        _mark(axes, shown, recording.time, values, check)
         axes.set_ylabel(wrapped_label(channel, "", CHANNEL_LENGTH))
         axes.margins(x=0.0)
         axes.locator_params(axis="y", nbins=5)
