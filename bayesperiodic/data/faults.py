@@ -154,17 +154,20 @@ def jumps(values: np.ndarray) -> bool:
     return bool((steps.max(axis=1) > JUMP * usual).any())
 
 
-def outliers_of(residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -> np.ndarray:
+def outliers_of(
+    residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float, least: float = 0.0
+) -> np.ndarray:
     """Return the samples far from the mean period, or of the value of dropouts, with jumps before and after them.
 
-    `phase` is in cycles. What is far at the same phase of many cycles is part of the signal.
+    `phase` is in cycles. What is far at the same phase of many cycles is part of the signal. Distances below `least`
+    times the largest do not count, if the mean period is that of all samples, on which outliers leave their mark.
     """
     middle = np.median(residuals)
     distance = np.abs(residuals - middle)
     scale = MEDIAN_TO_SD * float(np.median(distance))
     if not scale > 0.0:
         scale = float(np.quantile(distance, 0.9))
-    far = distance > max(FAR * scale, 2.0 * step, 1e-9 * np.abs(values).max())
+    far = distance > max(FAR * scale, 2.0 * step, 1e-9 * np.abs(values).max(), least * distance.max())
     value = dropped_value(values)
     if value is not None:
         far |= values == value

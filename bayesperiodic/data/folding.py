@@ -66,14 +66,14 @@ def fold_signals(
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
     seen = inspect(replace(signals, time=signals.time - start), periods, frequency, points)
-    if seen.steady is None or seen.fit is None:
+    if seen.steady is None or seen.fit is None or seen.sizes is None:
         raise ValueError(seen.reason)
     fit, pace, limit = seen.fit, seen.pace, seen.limit
     steady = seen.signals.part(seen.steady.samples)
     if frequency is not None:
         estimated, fit = fit, fit_harmonics(steady.time, steady.values, frequency / periods, limit)
         _refuse_frequency(estimated, fit, pace, float(np.ptp(steady.time)), periods)
-    drift = dict(zip(signals.channels, _drift(seen.steady.part.sizes), strict=True))
+    drift = dict(zip(signals.channels, _drift(seen.sizes), strict=True))
     _refuse_drift(signals.name, drift, largest_drift)
     refuse(signals.name, seen.findings)
     cycles = round(np.ptp(steady.time) * fit.frequency)
@@ -195,7 +195,7 @@ def _warn(name: str, pace: Pace, cycles: int, seen: Inspection) -> None:
 
 
 def _drift(sizes: np.ndarray) -> list[float]:
-    """Return the relative growth of amplitudes (windows, channels) over the part used."""
+    """Return the relative growth of amplitudes (windows, channels) over the recording."""
     number = np.arange(len(sizes)) - 0.5 * (len(sizes) - 1)
     return (number @ sizes / max(float(number @ number), 1.0) * len(sizes) / sizes.mean(axis=0)).tolist()
 

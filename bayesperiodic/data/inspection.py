@@ -35,8 +35,8 @@ from bayesperiodic.data.steadiness import Steady, Windows, steady_part, windows
 LARGEST_CHANGE = 0.1
 # Least share of samples at which no channel is stuck.
 LEAST_MOVING = 0.1
-# Harmonics of the first mean period, from which outliers are left out.
-ROUGH_HARMONICS = 40
+# Harmonics of the first mean period, from which outliers are left out, and their least distance from it.
+ROUGH_HARMONICS, ROUGH_DISTANCE = 40, 0.1
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,9 @@ class Inspection:
     findings: tuple[Finding, ...]
     total: int = 0  # whole cycles
     steady: Steady | None = None
+    sizes: np.ndarray | None = (
+        None  # of the strongest harmonics in all windows that do not overlap, (windows, channels)
+    )
     fit: HarmonicFit | None = None  # of the steady part, at the estimated frequency
     pace: Pace = Pace(0.0, 0, 0.0, False)
     limit: int = 0  # of the harmonics
@@ -114,7 +117,9 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
         fault.outliers = outliers[moving[outliers]]
     seen = findings(fit.frequency, limit, steady.samples)
     seen += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
-    return Inspection(signals, faults, worst_first(seen), total, steady, fit, pace, limit, inflation)
+    return Inspection(
+        signals, faults, worst_first(seen), total, steady, every.apart().sizes, fit, pace, limit, inflation
+    )
 
 
 def _wrapped(name: str, findings: list[Finding]) -> str:
@@ -139,7 +144,7 @@ def _sound(
     fit = fit_harmonics(calm.time, calm.values, fundamental, limit)
     bad = np.zeros(moving.size, dtype=bool)
     for fault, values, near, rest in zip(faults, signals.values[:, moving], calm.values, fit.residuals, strict=True):
-        bad[outliers_of(values - near + rest, calm.time * fundamental, values, fault.step)] = True
+        bad[outliers_of(values - near + rest, calm.time * fundamental, values, fault.step, ROUGH_DISTANCE)] = True
     return moving[~bad]
 
 

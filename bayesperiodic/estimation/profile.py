@@ -375,8 +375,8 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     {'c': 'closed', 'k': 'closed'}
     >>> profile.table[["laplace_low", "low", "laplace_high", "high"]].round(4)
        laplace_low     low  laplace_high    high
-    c       0.1980  0.1979        0.2011  0.2012
-    k       0.9986  0.9984        1.0022  1.0023
+    c       0.1982  0.1981        0.2005  0.2006
+    k       0.9991  0.9990        1.0019  1.0020
     """
     _checks.instance("problem", problem, Problem)
     chosen, executor = _checked_names(problem, names), checked_executor(executor)

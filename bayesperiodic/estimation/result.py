@@ -216,8 +216,8 @@ class MapEstimate(Result):
     >>> fit = bp.map_estimate(problem, progress=False)
     >>> for name, value in fit.theta.items():
     ...     print(f"{name} = {value:.3f} ± {fit.sd[name]:.3f}")
-    c = 0.200 ± 0.001
-    k = 1.000 ± 0.001
+    c = 0.199 ± 0.001
+    k = 1.001 ± 0.001
     >>> low, high = fit.interval(0.9)["k"]
     >>> low < 1.0 < high, fit.whiteness["displacement"].p > 0.01
     (True, True)
@@ -354,7 +354,7 @@ class MapEstimate(Result):
         --------
         >>> fit.derive({"damping_ratio": "c/(2*sqrt(k))"}).round(4)
                         value      sd
-        damping_ratio  0.0998  0.0005
+        damping_ratio  0.0997  0.0004
         """
         if experiment is not None:
             _checks.one_of("experiment", experiment, self.solutions)
