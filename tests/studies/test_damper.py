@@ -125,14 +125,15 @@ def test_map_of_the_measured_damper_by_an_independent_route():
     fit = bp.map_estimate(bp.Problem(bp.models.dahl, [experiment], priors=damper.PRIORS, input_noise="exact"))
     time, x, _, force = np.loadtxt(path, delimiter=",", skiprows=1).T
     f = experiment.frequency
-    last = time > time[-1] - experiment.cycles / f
+    steady = recording.steady().time
+    used = (time >= steady[0]) & (time <= steady[-1])
     order = np.arange(1, 59)
 
     def design(t):
         angle = 2 * np.pi * f * t[:, None] * order
         return np.hstack([np.ones((t.size, 1)), np.cos(angle), np.sin(angle)])
 
-    cx, cf = (np.linalg.lstsq(design(time[last]), s[last], rcond=None)[0] for s in (1e-3 * x, force))
+    cx, cf = (np.linalg.lstsq(design(time[used]), s[used], rcond=None)[0] for s in (1e-3 * x, force))
     for c, kept in ((cx, experiment.harmonics["displacement"]), (cf, experiment.harmonics["force"])):
         c[1 + kept : 59] = c[59 + kept :] = 0.0
     points = 20_000
