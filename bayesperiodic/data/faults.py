@@ -19,6 +19,8 @@ FEWEST_STUCK, LONG_RUN = 10, 10.0
 FEWEST_CLIPPED, CLIPPED_RUN, PILED = 6, 3, 6.0
 # Distance of outliers from the mean period in standard deviations of the others, and how often they may return.
 FAR, RETURNING = 8.0, 0.5
+# Distance of large outliers relative to the largest one.
+LARGE = 0.2
 MEDIAN_TO_SD = 1.4826
 # Largest step between samples relative to 90 % of them, of so many, without outliers.
 JUMP, SCREENED = 3.5, 100_000
@@ -162,10 +164,18 @@ def outliers_of(residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, st
     scale = MEDIAN_TO_SD * float(np.median(distance))
     if not scale > 0.0:
         scale = float(np.quantile(distance, 0.9))
-    far = distance > max(FAR * scale, 2.0 * step, 1e-9 * np.abs(values).max())
+    least = max(FAR * scale, 2.0 * step, 1e-9 * np.abs(values).max())
+    # Large outliers are in the mean period too, so that their neighbours are far from it as well.
+    levels = {least, max(least, LARGE * float(distance.max()))}
+    each = [_lone(distance > level, phase, values, step) for level in levels]
+    return np.unique(np.concatenate(each))
+
+
+def _lone(far: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -> np.ndarray:
+    """Return the samples of runs that are far, or have the value of dropouts, with jumps before and after them."""
     value = dropped_value(values)
     if value is not None:
-        far |= values == value
+        far = far | (values == value)
     if not far.any() or far.all() or np.ptp(values[~far]) == 0.0:
         return np.zeros(0, dtype=int)
     first, length = runs(far)
