@@ -60,7 +60,7 @@ def wrap_of(values: np.ndarray, step: float) -> tuple[float, np.ndarray]:
         if not 0.9 * turn < span < 1.001 * turn + step:
             continue
         jumps = np.flatnonzero(np.abs(change) > (1.0 - WRAP_TOLERANCE) * turn)
-        if not jumps.size:
+        if not jumps.size or jumps.size == change.size:
             continue
         whole = unwrapped(values, turn)
         steps = np.diff(whole)
@@ -187,9 +187,7 @@ def _lone(far: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -
     before = np.where(first > 0, change[np.maximum(first - 1, 0)], np.inf)
     last = first + length - 1
     after = np.where(last < values.size - 1, change[np.minimum(last, change.size - 1)], np.inf)
-    # What such runs do to the mean period is far at their phases in every cycle, but without jumps.
     lone = np.minimum(before, after) > 2.0 * usual + step
-    first, length = first[lone], length[lone]
     cycles = max(float(np.ptp(phase)), 1.0)
     bins = np.minimum((phase[first] % 1.0 * 64).astype(int), 63)
     cycle = np.floor(phase[first] - phase[0]).astype(int)
@@ -198,19 +196,18 @@ def _lone(far: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -
         often[k] = np.unique(cycle[bins == k]).size / cycles
     every = often + np.roll(often, 1) + np.roll(often, -1)
     if far.mean() < 0.2:
-        rare = every[bins] < RETURNING * np.maximum(1.0, 3.0 * _expected(far, cycles))
-        first, length = first[rare], length[rare]
+        lone &= every[bins] < RETURNING * np.maximum(1.0, 3.0 * _expected(first.size, cycles))
     result = np.zeros(values.size, dtype=bool)
-    for a, n in zip(first, length, strict=True):
+    for a, n in zip(first[lone], length[lone], strict=True):
         result[a : a + n] = True
     if value is not None and result[values == value].mean() > ALL_DROPPED:
         result |= values == value
     return np.flatnonzero(result)
 
 
-def _expected(far: np.ndarray, cycles: float) -> float:
-    """Return the expected share of cycles with an outlier in three of 64 bins if they are anywhere."""
-    return float(np.count_nonzero(far) / cycles * 3.0 / 64.0)
+def _expected(runs: int, cycles: float) -> float:
+    """Return the expected share of cycles with a run of outliers in three of 64 bins if they are anywhere."""
+    return runs / cycles * 3.0 / 64.0
 
 
 def resolution(values: np.ndarray) -> tuple[float, float]:
