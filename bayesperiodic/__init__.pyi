@@ -6,6 +6,8 @@ from ._io import load as load
 from ._versions import show_versions as show_versions
 from .data.experiment import Experiment as Experiment
 from .data.recording import Recording as Recording
+from .data.recording_check import Finding as Finding
+from .data.recording_check import RecordingCheck as RecordingCheck
 from .density.problem import Problem as Problem
 from .diagnostics.branch_prediction import BranchPrediction as BranchPrediction
 from .diagnostics.branch_prediction import predict_branch as predict_branch

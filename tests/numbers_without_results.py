@@ -53,6 +53,9 @@ WITHOUT_RESULTS = {
     },
     "docs/how_to/chaotic_recordings.md": {SETTING: ("a recording of 3,000 drive periods",)},
     "docs/how_to/export.md": {ELSEWHERE: ("0.23 with Python 3.11 and 1.x with later versions",)},
+    "docs/how_to/good_recording.md": {
+        DEFINITION: ("biases them by more than 5 % of the signal", "jumps by 2π, 360, 1, or the range"),
+    },
     "docs/how_to/noisy_inputs.md": {DEFINITION: ("warns from 0.3 on", "false-alarm rate of 1 %")},
     "docs/how_to/period_doubled.md": {
         SETTING: ("response periods of 1 to 8 drive periods",),
@@ -65,7 +68,14 @@ WITHOUT_RESULTS = {
         UNSTORED: ("Of 400 simulated recordings of period one",),
     },
     "docs/how_to/priors.md": {DEFINITION: ("a spread of 0.7 is a factor of two",)},
-    "docs/how_to/read_my_data.md": {SETTING: ("version 5 and 7.3", "grid points per period, 800 by default")},
+    "docs/how_to/read_my_data.md": {
+        SETTING: ("version 5 and 7.3", "grid points per period, 800 by default"),
+        ELSEWHERE: ("dates after ISO 8601",),
+        DEFINITION: (
+            "divided by 60, multiplied by 2π, by π/180", "multiplied by 9.80665", r"10\*\*(level/20) for amplitudes",
+            r"10\*\*(level/10) for powers",
+        ),
+    },
     "docs/how_to/running.md": {
         SETTING: ("the scheduler's own address instead of 127.0.0.1", "128 processes"),
         UNSTORED: (
@@ -78,7 +88,7 @@ WITHOUT_RESULTS = {
     "docs/how_to/solve_periodic.md": {
         UNSTORED: ("on 800 points: a batch takes twice as long, and errors are 300 to 1000 times smaller",),
     },
-    "docs/reference/messages.md": {DEFINITION: ("more than 1 % of the posterior mass",)},
+    "docs/reference/messages.md": {DEFINITION: ("more than 1 % of the posterior mass",), ELSEWHERE: ("of ISO 8601",)},
     "docs/start/install.md": {SETTING: ("Python 3.11 or newer",)},
     "docs/start/tour.md": {SETTING: ("one mean period with 1600 grid points",)},
     "docs/studies/calibration.md": {

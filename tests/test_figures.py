@@ -154,9 +154,20 @@ def orbits(count, draws, results):
     return bp.plot.orbits((found * 9)[:count], units={"x": "m", "y": "m/s"})
 
 
+def recording(count, draws, results):
+    """Draw a recording with faults of every kind that can be together."""
+    time = np.concatenate([np.arange(0.0, 20.0, 0.01), np.arange(20.2, 60.0, 0.01)])
+    x = np.cos(2 * np.pi * time) + 0.01 * np.random.default_rng(3).standard_normal(time.size)
+    x[[500, 4000]], x[3000:3050] = 20.0, x[3000]
+    names = [name.translate(str.maketrans("[] ", "___")) for name in NAMES[:count]]
+    values = {name: np.clip(scale * x, -0.9 * abs(scale), np.inf) for name, scale in zip(names, SCALES, strict=False)}
+    name = "a recording with a long name, which was measured on a rainy day by a careful engineer"
+    return bp.plot.recording(bp.Recording.from_arrays(time, values, name=name))
+
+
 DRAWERS = [
-    branch, comparison, corner, fit, loops, marginals, missing_terms, models, modes, orbits, profile, ranks, section,
-    summary, traces,
+    branch, comparison, corner, fit, loops, marginals, missing_terms, models, modes, orbits, profile, ranks, recording,
+    section, summary, traces,
 ]  # fmt: skip
 
 

@@ -22,8 +22,8 @@ FAR, RETURNING = 8.0, 0.5
 # Distance of large outliers relative to the largest one.
 LARGE = 0.2
 MEDIAN_TO_SD = 1.4826
-# Largest step between samples relative to 90 % of them, of so many, without outliers.
-JUMP, SCREENED = 3.5, 100_000
+# Largest step between samples relative to 80 % of them, of so many, without outliers.
+JUMP, USUAL, SCREENED = 5.0, 0.8, 100_000
 # Share of the most frequent value of dropouts, and different values of a channel that has such a value.
 MOST_DROPPED, FEWEST_VALUES = 0.45, 18
 # Share of the samples of that value with jumps before and after, from which all are dropouts.
@@ -150,7 +150,7 @@ def dropped_value(values: np.ndarray) -> float | None:
 def jumps(values: np.ndarray) -> bool:
     """Return whether some steps between samples (channels, samples) are larger than smooth signals with noise have."""
     steps = np.abs(np.diff(values, axis=1))
-    usual = np.quantile(steps[:, :: 1 + steps.shape[1] // SCREENED], 0.9, axis=1)
+    usual = np.quantile(steps[:, :: 1 + steps.shape[1] // SCREENED], USUAL, axis=1)
     return bool((steps.max(axis=1) > JUMP * usual).any())
 
 

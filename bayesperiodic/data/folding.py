@@ -18,7 +18,7 @@ from bayesperiodic.data.harmonics import (
     resolved_harmonics,
     track_frequency,
 )
-from bayesperiodic.data.inspection import inspect
+from bayesperiodic.data.inspection import Inspection, inspect
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
 from bayesperiodic.data.recording_check import refuse
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, FINENESS, aperiodic, even_times, response_period
@@ -78,10 +78,11 @@ def fold_signals(
     _refuse_drift(signals.name, drift, largest_drift)
     periodicity = _periodicity(steady, fit)
     cycles = round(np.ptp(steady.time) * fit.frequency)
-    _warn(signals.name, pace, cycles, seen.total)
+    _warn(signals.name, pace, cycles, seen)
     one_cycle, noise = zip(*(_noise(steady, fit, row, cycles) for row in range(len(steady.values))), strict=True)
     for row, squares in enumerate(seen.steady.squares):
         order = min(squares.size, noise[row].variance.size)
+        noise[row].variance[:] *= seen.inflation
         noise[row].variance[:order] += (squares * np.var(seen.signals.values[row]))[:order]
     significant = [_last_significant(a, part) for a, part in zip(fit.amplitudes, noise, strict=True)]
     kept = dict(zip(signals.channels, significant, strict=True)) | _chosen(harmonics, signals.channels, limit)
@@ -162,8 +163,9 @@ def _refuse_frequency(estimated: HarmonicFit, given: HarmonicFit, pace: Pace, du
         )
 
 
-def _warn(name: str, pace: Pace, cycles: int, total: int) -> None:
+def _warn(name: str, pace: Pace, cycles: int, seen: Inspection) -> None:
     """Warn of a period that drifts, and of a steady part that is less than half of the recording."""
+    total = seen.total
     if pace.drifts:
         warnings.warn(
             f"{name}: the period changes by {-pace.drift:+.2%} over the {cycles} cycles used (of {total}). The mean "
@@ -182,8 +184,10 @@ def _warn(name: str, pace: Pace, cycles: int, total: int) -> None:
             stacklevel=4,
         )
     elif cycles < total and cycles <= total // 2:
+        last = seen.steady is not None and seen.steady.samples.stop == seen.signals.time.size
+        which, others = ("the last ", "those before") if last else ("", "the others")
         warnings.warn(
-            f"{name}: only the last {cycles} of {total} cycles are used, because those before differ from them: a long "
+            f"{name}: only {which}{cycles} of {total} cycles are used, because {others} differ from them: a long "
             "transient, a drift, or several records in one. Check the recording, and select a part with `between` or "
             "`split`.",
             UserWarning,

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.fft import next_fast_len
-from scipy.linalg import solve_toeplitz
+from scipy.linalg import solve_toeplitz, toeplitz
 from scipy.special import fdtri
 from scipy.stats import t as student
 
@@ -14,6 +14,8 @@ from bayesperiodic import _fourier
 MAXIMUM_HARMONICS = 600
 SIGNIFICANT_POWER = 10.0
 MINIMUM_CYCLES = 3
+# Largest condition number of the amplitudes' normal equations where phases are missing.
+LARGEST_CONDITION = 20.0
 # Cycles of a stretch from which its frequency is tracked.
 TRACKED = 48
 # Deviations of the phase [cycles] below this are of no consequence; others count if they are not explained by noise.
@@ -237,3 +239,23 @@ def resolved_harmonics(time: np.ndarray, fundamental: float, points: int) -> int
             "sample faster, or check the frequency."
         )
     return resolved
+
+
+def determined_harmonics(time: np.ndarray, fundamental: float, highest: int) -> tuple[int, np.ndarray]:
+    """Return the harmonics whose amplitudes the samples determine, and what missing phases do to their variances.
+
+    If samples are missing at the same phase of each cycle, as clipped ones that are left out, the normal equations of
+    many harmonics are ill-conditioned. The factors (harmonics + 1,) are 1 for samples at all phases.
+    """
+    phase = fundamental * time
+    bins = 2 * highest + 1
+    if np.bincount(((phase - phase[0]) % 1.0 * bins).astype(int), minlength=bins)[:bins].all():
+        return highest, np.ones(highest + 1)
+    moments = _fourier.sums(np.ones((1, time.size)), phase, 2 * highest)[0] / time.size
+    known, unknown = 1, highest + 1
+    while unknown - known > 1:
+        middle = min(2 * known, (known + unknown) // 2)
+        size = np.linalg.eigvalsh(toeplitz(moments[: 2 * middle + 1]))
+        known, unknown = (middle, unknown) if size[0] * LARGEST_CONDITION > size[-1] else (known, middle)
+    inverse = np.linalg.inv(toeplitz(moments[: 2 * known + 1]))
+    return known, np.diag(inverse).real[known:]

@@ -1,7 +1,7 @@
 """Inspection of signals: their faults, their steady part and its mean period; what `check` and `fold` both do."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
     HarmonicFit,
     Pace,
+    determined_harmonics,
     fit_harmonics,
     refine_frequency,
     resolved_harmonics,
@@ -50,6 +51,7 @@ class Inspection:
     fit: HarmonicFit | None = None  # of the steady part, at the estimated frequency
     pace: Pace = Pace(0.0, 0, 0.0, False)
     limit: int = 0  # of the harmonics
+    inflation: np.ndarray = field(default_factory=lambda: np.ones(1))  # of their variances by missing phases
     reason: str = ""  # why there is no steady part or no mean period
 
 
@@ -97,7 +99,7 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
         return Inspection(signals, faults, sorted_(found(tracked)), total, reason=_unsteady(signals, every))
     steady = steady.among(sound)
     used = signals.part(steady.samples)
-    limit = resolved_harmonics(used.time, tracked, points)
+    limit, inflation = determined_harmonics(used.time, tracked, resolved_harmonics(used.time, tracked, points))
     fit, pace = refine_frequency(used.time, used.values, tracked, limit)
     residuals = fit.residuals
     here = sound[(sound >= steady.samples.start) & (sound < steady.samples.stop)]
@@ -109,7 +111,7 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
         fault.outliers = place + steady.samples.start
     findings = found(fit.frequency, limit, steady.samples)
     findings += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
-    return Inspection(signals, faults, sorted_(findings), total, steady, fit, pace, limit)
+    return Inspection(signals, faults, sorted_(findings), total, steady, fit, pace, limit, inflation)
 
 
 def _wrapped(name: str, findings: list[Finding]) -> str:
@@ -139,6 +141,11 @@ def _sound(
 
 
 def _unsteady(signals: Signals, every: Windows) -> str:
+    if not every.first.size:
+        return (
+            f"recording: must have samples in all parts of its periods, got {signals.name!r}, which has too few; check "
+            "the frequency and the gaps, or fold a part by `between` or `split`."
+        )
     size = every.sizes
     worst = int(np.argmax(np.ptp(size, axis=0) / size.mean(axis=0)))
     low, high = size[:, worst].min(), size[:, worst].max()

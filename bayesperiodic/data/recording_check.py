@@ -14,6 +14,7 @@ from bayesperiodic._verdicts import BAD, CAUTION, GOOD, with_tone
 from bayesperiodic.data import faults
 from bayesperiodic.data.faults import ChannelFaults
 from bayesperiodic.data.harmonics import fit_harmonics
+from bayesperiodic.data.signals import GAP
 from bayesperiodic.data.steadiness import ALLOWED_BIAS, Steady, Windows
 
 if TYPE_CHECKING:
@@ -27,14 +28,17 @@ SEVERITIES = (HARMLESS, SERIOUS, RUINOUS)
 SERIOUS_BIAS, RUINOUS_BIAS = 0.5, 0.05
 # Harmonics of a fit without the faulty samples, as many of them as these show: with this largest condition number.
 FITTED_HARMONICS, LARGEST_CONDITION = (10, 5, 3, 2, 1), 1e3
+# Share of the samples at each end that may be outliers where a signal is bounded by its range without them.
+EXTREMES = 0.1
 # Times of each finding that are listed.
 LISTED = 200
 # Steps of time that are gaps, in usual steps.
 USUAL_STEPS = 3.0
 # Relative changes over the part used: of an amplitude, and of the mean value in amplitudes.
 HARMLESS_DRIFT, HARMLESS_STEP, HARMLESS_PHASE = 0.05, 0.02, 1.0 / 180.0
-# Change between neighbouring cycles that is a step, in standard deviations of the other changes, and cycles needed.
-STEP, FEWEST_FOR_STEPS = 8.0, 10
+# Change between neighbouring cycles that is a step, in standard deviations of the other changes, and cycles needed;
+# the standard deviation is uncertain if there are fewer cycles than this.
+STEP, FEWEST_FOR_STEPS, ENOUGH_FOR_STEPS = 8.0, 10, 20
 # Amplitude of a beat relative to the mean one, its false-alarm rate, and the cycles needed.
 HARMLESS_BEAT, BEAT_FALSE_ALARM, FEWEST_FOR_BEATS = 0.01, 1e-4, 24
 
@@ -63,6 +67,17 @@ class Finding(Storable):
         Effect on all amplitudes of the channel together [standard errors]; NaN if unknown.
     text, cure : str
         What happened, and what to do.
+
+    Examples
+    --------
+    >>> t = np.arange(0, 60, 0.01)
+    >>> force = np.cos(2 * np.pi * t)
+    >>> force[1000:1200] = force[1000]
+    >>> (finding,) = bp.Recording.from_arrays(t, {"force": force}).check().findings
+    >>> finding.kind, finding.severity, finding.count, finding.times.round(2).tolist()
+    ('stuck', 'ruinous', 201, [[10.0, 12.0]])
+    >>> finding.cure
+    "recording.without(stuck=True, channel='force') leaves them out"
     """
 
     kind: str
@@ -94,8 +109,8 @@ def signal_faults(values: np.ndarray, *, drive: bool = False) -> ChannelFaults:
 def bounded(values: np.ndarray) -> np.ndarray:
     """Return values (channels, samples) without rare extremes, for a first estimate of the frequency."""
     some = values[:, :: 1 + values.shape[1] // faults.SCREENED]
-    low, high = np.quantile(some, [0.005, 0.995], axis=1, keepdims=True)
-    return np.where(high > low, np.clip(values, low - 0.5 * (high - low), high + 0.5 * (high - low)), values)
+    low, high = np.quantile(some, [EXTREMES, 1.0 - EXTREMES], axis=1, keepdims=True)
+    return np.where(high > low, np.clip(values, low - (high - low), high + (high - low)), values)
 
 
 @dataclass(frozen=True)
@@ -120,16 +135,20 @@ UNKNOWN = Effect(np.nan, np.nan, np.zeros(0), np.nan)
 
 def effect_of(time: np.ndarray, values: np.ndarray, bad: np.ndarray, frequency: float, harmonics: int) -> Effect:
     """Return the effect of faulty samples (bool), by the mean period of the others; unknown if they do not show it."""
-    used, order = time[~bad], 0
-    for order in (*FITTED_HARMONICS, 0):
-        if 0 < order <= harmonics and used.size > 6 * order and np.ptp(used) * frequency > 2.0:
-            moments = _fourier.sums(np.ones((1, used.size)), frequency * used, 2 * order)[0]
-            spectrum = np.linalg.eigvalsh(toeplitz(moments[: 2 * order + 1]))
+    used, best, order, fit = time[~bad], np.inf, 0, None
+    for highest in FITTED_HARMONICS:
+        if highest <= harmonics and used.size > 6 * highest and np.ptp(used) * frequency > 2.0:
+            moments = _fourier.sums(np.ones((1, used.size)), frequency * used, 2 * highest)[0]
+            spectrum = np.linalg.eigvalsh(toeplitz(moments))
             if spectrum[0] * LARGEST_CONDITION > spectrum[-1]:
-                break
-    if not order:
+                trial = fit_harmonics(used, values[None, ~bad], frequency, highest)
+                # The Bayesian information criterion: needless harmonics predict nothing where samples are missing.
+                least = max(float(trial.variances[0]), 1e-24 * float(values.var()))
+                score = used.size * np.log(least) + 2 * highest * np.log(used.size)
+                if score < best:
+                    best, order, fit = score, highest, trial
+    if fit is None:
         return UNKNOWN
-    fit = fit_harmonics(used, values[None, ~bad], frequency, order)
     predicted = _fourier.at_times(fit.amplitudes, frequency * time)[0]
     noise = float(np.sqrt(fit.variances[0]))
     if not np.isfinite(predicted).all() or noise > 0.9 * float(values[~bad].std()):
@@ -211,10 +230,13 @@ def sample_findings(
         times, share = times_of(time, samples), samples.size / total
         size = f", a bias of {own.bias:.3g} standard errors" if own.bias == own.bias else ""
         size = size if inside else ", not used"
+        cure = f"recording.without({kind}=True, channel={channel!r}) leaves them out"
+        if frequency and times.size and np.diff(times).max() * frequency > GAP:
+            cure += ", and its parts `split` are folded" if kind == "stuck" else ""
+            cure = "record again with a larger range" if kind == "clipped" else cure
         return Finding(
             kind, channel, severity, times, samples.size, share, own.bias,
-            f"{channel} {what} {_when(times)} ({samples.size} samples, {share:.2g} of all{size})",
-            f"recording.without({kind}=True, channel={channel!r}) leaves them out",
+            f"{channel} {what} {_when(times)} ({samples.size} samples, {share:.2g} of all{size})", cure,
         )  # fmt: skip
 
     stuck = [part for part in fault.stuck if _moves(every, part, fault.step, used)]
@@ -304,6 +326,7 @@ def _steps(channels: list[str], time: np.ndarray, part: Windows, frequency: floa
     lines = np.take_along_axis(shape, strongest[None, :, None], axis=2)[:, :, 0]
     turns = np.unwrap(np.angle(lines), axis=0) / (2.0 * np.pi) / strongest
     sizes = np.log(np.maximum(np.abs(lines), np.finfo(float).tiny))
+    limit = STEP * max(1.0, (ENOUGH_FOR_STEPS / len(shape)) ** 2)
     slip = part.slip / np.exp(np.median(sizes, axis=0))
     for kind, series, least in (
         ("amplitude step", sizes, HARMLESS_STEP + slip),
@@ -312,7 +335,7 @@ def _steps(channels: list[str], time: np.ndarray, part: Windows, frequency: floa
         mean = 0.5 * (series[1:] + series[:-1])
         jump = mean[2:] - mean[:-2]  # of two cycles after a boundary from the two before it
         spread = np.median(np.abs(jump - np.median(jump, axis=0)), axis=0) / 0.6745
-        large = (np.abs(jump) > STEP * spread) & (np.abs(jump) > least)
+        large = (np.abs(jump) > limit * spread) & (np.abs(jump) > least)
         if kind == "phase step" and large.shape[1] > 1 and large.any():
             together = large.all(axis=1)
             which = [("all channels", together, jump.mean(axis=1))] if together.any() else []
@@ -413,10 +436,20 @@ class RecordingCheck(Result):
         Times of the part that `fold` uses [s].
     jitter : float
         Standard deviation of the steps of time, without gaps, relative to their median.
-    bad : dict of str to dict of str to array
+    bad : dict of str to dict of str to array (faulty samples,)
         Numbers of the samples by channel and kind ("outliers", "stuck", "clipped"), for `Recording.without`.
     reason : str
         Why there is no frequency or no steady part; empty otherwise.
+
+    Examples
+    --------
+    >>> t = np.arange(0, 60, 0.01)
+    >>> rising = np.minimum(t / 10, 1) * np.cos(2 * np.pi * t)
+    >>> check = bp.Recording.from_arrays(t, {"x": rising}, name="run 1").check()
+    >>> check.sentence
+    '50 of 60 cycles at 1 Hz are used, 10 to 59.99 s.'
+    >>> print(*check.findings)
+    the signals change until 10 s; 10 to 59.99 s are used (50 of 60 cycles)
     """
 
     name: str
@@ -437,11 +470,13 @@ class RecordingCheck(Result):
         return max((finding.severity for finding in self.findings), key=SEVERITIES.index, default=HARMLESS)
 
     def __str__(self) -> str:
-        lines = [f"Recording {self.name!r}: {self._sentence()}", self.table.to_string(float_format="{:.5g}".format)]
+        lines = [f"Recording {self.name!r}: {self.sentence}", self.table.to_string(float_format="{:.5g}".format)]
         lines += [f"{finding.severity}: {finding}." for finding in self.findings]
         return "\n".join(lines + ([] if self.findings else ["Nothing was found."]))
 
-    def _sentence(self) -> str:
+    @property
+    def sentence(self) -> str:
+        """The part that `Recording.fold` uses, or the reason why there is none."""
         if self.reason:
             return f"no mean period: {self.reason}"
         jitter = f", steps of time vary by {self.jitter:.1%}" if self.jitter > 1e-3 else ""

@@ -6,8 +6,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.stats import t as student
 
-from bayesperiodic.data.harmonics import MINIMUM_CYCLES, resolved_harmonics
+from bayesperiodic.data.harmonics import MINIMUM_CYCLES, determined_harmonics, resolved_harmonics
 
 # Parts of a cycle in which ramps begin or end, in recordings of so many cycles; most windows of long recordings.
 FINE, FEW_CYCLES, MOST_WINDOWS = 8, 64, 256
@@ -24,8 +25,8 @@ CALMER = 0.25
 DISTANT, DISTANT_MEAN = 3.0, 12.0
 # Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
 FEWEST_FOR_MEDIAN = 9
-# Windows from which a transient is searched for, and standard errors of a significant slope.
-FEWEST_FOR_TRANSIENT, SIGNIFICANT_SLOPE = 7, 4.0
+# Windows from which a transient is searched for, and false-alarm rate of a significant slope.
+FEWEST_FOR_TRANSIENT, SLOPE_FALSE_ALARM = 8, 1e-4
 # Largest correlation of the noise of neighbouring windows.
 LONGEST_MEMORY = 0.8
 # Shares of a channel's standard deviation below which distances and noise do not count.
@@ -86,7 +87,8 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     edges = np.searchsorted(-back, np.arange(1 - count, 1))
     stops = np.concatenate([edges[1:], [time.size]])
     empty, edges = edges == stops, np.minimum(edges, time.size - 1)
-    order = np.arange(2 * min(HARMONICS, resolved_harmonics(time, fundamental, time.size)) + 1)
+    resolved = min(HARMONICS, resolved_harmonics(time, fundamental, time.size))
+    order = np.arange(2 * determined_harmonics(time, fundamental, resolved)[0] + 1)
     harmonics = order[: order.size // 2 + 1]
     used = slice(edges[0], None)
     wave, power = np.exp(-2j * np.pi * (fundamental * time[used] % 1.0)), np.ones(time[used].size, dtype=complex)
@@ -181,7 +183,8 @@ def _change(sizes: np.ndarray) -> np.ndarray:
     memory = np.clip(memory, 0.0, LONGEST_MEMORY)
     error *= np.sqrt((1.0 + memory) / (1.0 - memory))
     change = slope * count / np.abs(sizes.mean(axis=0))
-    return np.where(np.abs(slope) > SIGNIFICANT_SLOPE * error, change, 0.0)
+    significant = np.abs(slope) > error * student.isf(0.5 * SLOPE_FALSE_ALARM, count - 2)
+    return np.where(significant, change, 0.0)
 
 
 def plateau(part: Windows) -> tuple[int, int]:

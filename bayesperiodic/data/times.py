@@ -14,6 +14,8 @@ PER_SECOND = {"ms": 1e3, "us": 1e6, "ns": 1e9, "ps": 1e12, "fs": 1e15, "as": 1e1
 # Integers beyond this one are not all floats.
 LARGEST_EXACT = 2**53
 ISO_DATE = re.compile(r"\s*\d{4}-\d\d")
+# More decimals of a second than pandas keeps (3.0.1 drops the others without a word).
+TOO_FINE = re.compile(r"[.,]\d{10}")
 
 
 def dates(argument: str, values: Any) -> np.ndarray | None:
@@ -41,6 +43,10 @@ def dates(argument: str, values: Any) -> np.ndarray | None:
     if isinstance(first, datetime.date | np.datetime64):
         return _read(argument, array, pd.to_datetime, utc=True)
     if isinstance(first, str) and ISO_DATE.match(first):
+        if TOO_FINE.search(first):
+            raise ValueError(
+                f"{argument}: must have at most nine decimals of a second, got {first!r}; give seconds as numbers."
+            )
         return _read(argument, array, pd.to_datetime, utc=True, format="ISO8601")
     return None
 

@@ -10,8 +10,9 @@ import pandas as pd
 from scipy import stats
 
 from bayesperiodic._linalg import column_space
-from bayesperiodic._verdicts import BAD, GOOD, NEUTRAL, with_tone
+from bayesperiodic._verdicts import BAD, CAUTION, GOOD, NEUTRAL, with_tone
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.data.recording_check import HARMLESS
 from bayesperiodic.density.log_posterior import Linearisation
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.check import of_periodogram
@@ -145,6 +146,8 @@ SHAPES = 20
 ADEQUACY_TESTS = ("whiteness", "harmonics", "size", "amplitude", "consistency")
 ADEQUATE, MISSPECIFIED = with_tone("adequate", GOOD), with_tone("misspecified", BAD)
 UNTESTED = with_tone("not tested", NEUTRAL)
+# In place of "adequate" where a fault of the recording, such as an amplitude that changes, counts as noise.
+UNSOUND = with_tone("recording not sound", CAUTION)
 MEASURED_SPECTRUM, ASSUMED_SPECTRUM = "measured", "assumed"
 ALL = "all"
 SEARCH = "bp.missing_terms(problem, fit) looks for the term that is missing"
@@ -186,7 +189,10 @@ def adequacy(
     smallest = np.min(np.where(np.isnan(adjusted), np.inf, adjusted), axis=1)
     smallest[-1] = min(smallest)
     table["p"] = np.where(np.isinf(smallest), np.nan, smallest)
-    table["verdict"] = np.select([np.isinf(smallest), smallest < ADEQUACY_LEVEL], [UNTESTED, MISSPECIFIED], ADEQUATE)
+    faulty = {e.name for e in problem.experiments if any(finding.severity != HARMLESS for finding in e.findings)}
+    unsound = table["experiment"].isin(faulty | {ALL} if faulty else set())
+    verdicts = [UNTESTED, MISSPECIFIED, UNSOUND]
+    table["verdict"] = np.select([np.isinf(smallest), smallest < ADEQUACY_LEVEL, unsound], verdicts, ADEQUATE)
     return table
 
 

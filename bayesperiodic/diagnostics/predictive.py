@@ -22,6 +22,7 @@ from bayesperiodic.diagnostics.adequacy import (
     ALL,
     MISSPECIFIED,
     SEARCH,
+    UNSOUND,
     UNTESTED,
     adequacy,
     concerns_noise,
@@ -167,6 +168,14 @@ def _experiment_of(problem: Problem, experiment: str | None) -> str:
     return names[0]
 
 
+# What the verdicts that are neither for nor against the model mean.
+SENTENCES = {
+    UNTESTED: "There are too few values to test the model.",
+    UNSOUND: "No test contradicts the model, but a recording is not sound (see the findings of its experiment), and "
+    "its faults count as noise in these tests.",
+}
+
+
 @dataclass(frozen=True)
 class Prediction(Bands):
     """Posterior prediction of the mean period of each experiment, and tests of the model.
@@ -194,8 +203,9 @@ class Prediction(Bands):
         masked data). ``model_error_share``: the fraction of the residual variance beyond that of ``size``, NaN if
         unknown. ``spectrum``: "measured" if whiteness and harmonics are tested in units of the noise that was measured
         between the harmonics, "assumed" if in those of the noise model. ``p``: the smallest of the row, adjusted by
-        Holm's method for all tests of the table; ``verdict``: "misspecified" if it is below 1 %, "adequate", or "not
-        tested".
+        Holm's method for all tests of the table; ``verdict``: "misspecified" if it is below 1 %, "adequate", "not
+        tested", or "recording not sound" in place of "adequate" where `Experiment.findings` has more than harmless
+        ones, which count as noise.
     transient : Transient or None
         Bands of the recordings of `run`.
     prior_conflict : str
@@ -249,7 +259,7 @@ class Prediction(Bands):
         lines = [
             f"Tests of the model from {self.draws} draws, {self.failed} without a periodic solution",
             self.table.to_string(float_format="{:.2g}".format, na_rep="-"),
-            "There are too few values to test the model." if self.verdict == UNTESTED else verdict,
+            SENTENCES.get(self.verdict, verdict),
             *(f"{label}: {text}." for label, text in self.findings.items()),
             self.remedy,
             self.note,

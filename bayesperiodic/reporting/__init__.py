@@ -30,10 +30,10 @@ def report(
 ) -> Path:
     """Write an HTML report of an identification.
 
-    The report contains the data, the model with its equations, the estimates (MAP, Laplace and MCMC side by side), the
-    residual, the verdicts, the diagnostics of the sampler, and settings, seed and versions, with figures. It is a
-    single accessible file without scripts or external resources: figures are embedded SVG images, equations MathML. All
-    text is escaped. An existing file is replaced only by a complete one.
+    The report contains what was found in the recordings, the data, the model with its equations, the estimates (MAP,
+    Laplace and MCMC side by side), the residual, the verdicts, the diagnostics of the sampler, and settings, seed and
+    versions, with figures. It is a single accessible file without scripts or external resources: figures are embedded
+    SVG images, equations MathML. All text is escaped. An existing file is replaced only by a complete one.
 
     Diagnostics that are not given are computed in a few seconds, except the profiles of `identifiability`, which solve
     anew for every parameter, and the search for missing terms: to include them, give

@@ -176,6 +176,36 @@ def experiments(given: ReportInputs) -> Rows:
     ]
 
 
+def findings(given: ReportInputs) -> Rows:
+    """Return the table of what the checks of the recordings found."""
+    return [
+        {
+            "Experiment": e.name,
+            "Channel": code(finding.channel) if finding.channel else "all",
+            "Finding": finding.kind,
+            "Severity": badge(finding.severity),
+            "Start [s]": number(float(finding.times[0, 0]), 6),
+            "End [s]": number(float(finding.times[-1, 1]), 6),
+            "Samples or cycles": html.Number(finding.count),
+            "Share": html.percent(finding.share),
+            "Bias [standard errors]": number(finding.bias),
+        }
+        for e in given.problem.experiments
+        for finding in e.findings
+    ]
+
+
+def without_findings(given: ReportInputs) -> list[str]:
+    """Return sentences on the experiments without findings."""
+    plain = [e for e in given.problem.experiments if not e.findings]
+    sound = [e.name for e in plain if e.averaged is not None]
+    other = [e.name for e in plain if e.averaged is None]
+    return [
+        *([f"Nothing was found in the recording of {', '.join(sound)}."] if sound else []),
+        *([f"Not folded from a recording, so that none was checked: {', '.join(other)}."] if other else []),
+    ]
+
+
 def channels(given: ReportInputs) -> Rows:
     """Return the table of the channels."""
     rows: list[dict[str, str]] = []

@@ -245,7 +245,7 @@ def usable(records: list[Record]) -> tuple[dict[str, bp.Experiment], dict[str, s
         try:
             with warnings.catch_warnings():
                 # The number of cycles used is in the study's results.
-                warnings.filterwarnings("ignore", r".*: only the last \d+ of \d+ cycles are used")
+                warnings.filterwarnings("ignore", r".*: only (the last )?\d+ of \d+ cycles are used")
                 warnings.filterwarnings("default", r".*: the phase wanders irregularly")
                 admitted[recording.name] = recording.fold(SAMPLES, **settings)
         except ValueError as error:

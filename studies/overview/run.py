@@ -1,14 +1,17 @@
 """Overview in one picture: following unstable motions, finding them in chaos, and identifiability of parameters.
 
 The frequency response of a hardening spring is computed; the pendulum's section and the posterior of two factors come
-from synthetic recordings. Only the product is determined, and the Laplace approximation misses the ridge.
+from synthetic recordings. Only the product is determined, and the Laplace approximation misses the ridge. A second
+figure shows what the check of a recording finds.
 """
 
 import argparse
+from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 import bayesperiodic as bp
 from studies import common
@@ -34,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
         found = find(panels[1], QUICK_PERIODS if options.quick else PERIODS, options.seed)
     with watch.part("judge", "sampling the posterior of the pendulum's parameters"):
         held = judge(panels[2], options.seed, 500 if options.quick else 12_000)
-    paths = common.save_figures(options.out, {"overview": figure})
+    paths = common.save_figures(options.out, {"overview": figure, "recording": faulty_recording()})
     results = {"folds_hz": folds, "orbits": found, "posterior": held, "seed": options.seed, "quick": options.quick}
     print(f"  folds at {folds} Hz; orbits by period {found}; {held}")
     common.finish(options.out, results, watch, paths, synthetic=True)
@@ -87,3 +90,21 @@ def judge(ax: Axes, seed: int, steps: int) -> dict[str, str | bool]:
     ax.legend(handles=handles, loc="upper right", fontsize=8, frameon=False)
     verdicts = bp.identifiability(problem, fit, posterior, profile=False).verdicts
     return {name: verdicts[name] for name in names} | {"converged": posterior.converged}
+
+
+def faulty_recording() -> Figure:
+    """Draw the recording of the page docs/how_to/good_recording.md with what its check finds."""
+
+    def motion(time: np.ndarray) -> np.ndarray:
+        level = np.clip(np.minimum(time / 5, (30 - time) / 3), 0, 1)
+        return np.asarray(0.0126 * level * np.cos(2 * np.pi * 0.84 * time))
+
+    true = {"Kx": 770.0, "K": 300.0, "F0": 4.0, "Kw": 57.0, "rho": 27_000.0}
+    rig = bp.simulate(
+        bp.models.dahl, true, {"displacement": motion}, frequency=0.84, duration=30, sampling_rate=100,
+        noise={"force": 4.0}, seed=2,
+    )  # fmt: skip
+    force = rig.outputs["force"].copy()
+    force[[900, 1500, 1501]] = -500.0
+    force[1250:1275] = force[1250]
+    return bp.plot.recording(replace(rig, outputs={"force": force}, name="run 2"))

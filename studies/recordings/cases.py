@@ -51,8 +51,8 @@ def _rates(system: str) -> Rates:
 def motion(system: str) -> Callable[[np.ndarray], np.ndarray]:
     """Return the displacement of a system as a function of time [s]."""
     end = SETTLED + LONGEST + 1.0
-    found: Any = solve_ivp(_rates(system), (0, end), [0.3, 0.1], rtol=1e-8, atol=1e-9, dense_output=True)
-    return lambda t: found.sol(t)[0]
+    states: Any = solve_ivp(_rates(system), (0, end), [0.3, 0.1], rtol=1e-8, atol=1e-9, dense_output=True).sol
+    return lambda t: states(t)[0]
 
 
 def good(number: int, seed: int) -> tuple[bp.Recording, float | None, int]:

@@ -135,7 +135,8 @@ def test_tone_between_two_harmonics_counts_as_noise_of_the_nearest_one_alone():
     variance = np.zeros(9)
     variance[5] = 0.3**2 / 10
     assert e.cycles == 20
-    assert e.amplitude_variance["y"] == pytest.approx(variance, abs=1e-12)
+    # The possible rest of a transient in these exact data is added.
+    assert e.amplitude_variance["y"] == pytest.approx(variance, abs=1e-3 * variance[5])
 
 
 @pytest.mark.parametrize(("cycles", "freedom"), [(3, 4), (10, 16), (20, 20), (100, 64)])
@@ -283,18 +284,31 @@ def test_drift_of_a_steady_drive_is_small_where_its_period_is_a_fraction_of_the_
     assert max(map(abs, e.drift.values())) < 0.01
 
 
-def test_drift_is_the_growth_of_the_strongest_harmonic_over_the_recording():
+def test_drift_is_the_growth_of_the_strongest_harmonic_over_the_part_used():
+    """It grows by 0.2 of its mean over 46.34 cycles, by 6 % over half of those."""
+    time = np.arange(5000) / 250.0
+    noise = 0.01 * np.random.default_rng(0).standard_normal(time.size)
+    growth = 1.0 + 0.06 * (time - 10.0) / 20.0
+    grown = bp.Recording.from_arrays(time, {"y": growth * np.cos(2 * np.pi * FREQUENCY * time) + noise}, name="grown")
+    e = grown.fold(64)
+    assert e.cycles > 20
+    assert e.drift["y"] == pytest.approx(0.06 * e.cycles / 46.34, rel=0.05)
+    assert grown.fold(64, largest_drift=0.07).cycles == e.cycles
+    with pytest.raises(
+        ValueError, match=r"must be steady, got 'grown', .* strongest harmonic of 'y' changes by .\d\.\d%, .* 1\.0%"
+    ):
+        grown.fold(64, largest_drift=0.01)
+    with pytest.raises(ValueError, match="largest_drift: must be > 0, got 0.0"):
+        grown.fold(64, largest_drift=0.0)
+
+
+def test_a_large_drift_of_the_amplitude_is_reported_with_a_warning():
     time = np.arange(5000) / 250.0
     growth = 1.0 + 0.2 * (time - 10.0) / 20.0
     grown = bp.Recording.from_arrays(time, {"y": growth * np.cos(2 * np.pi * FREQUENCY * time)}, name="grown")
-    assert grown.fold(64).drift["y"] == pytest.approx(0.2, rel=0.02)
-    assert grown.fold(64, largest_drift=0.25).cycles > 3
-    with pytest.raises(
-        ValueError, match="must be steady, got 'grown', .* strongest harmonic of 'y' changes by .19.* 10.0%"
-    ):
-        grown.fold(64, largest_drift=0.1)
-    with pytest.raises(ValueError, match="largest_drift: must be > 0, got 0.0"):
-        grown.fold(64, largest_drift=0.0)
+    with pytest.warns(UserWarning, match=r"grown: the amplitude of y changes by \+[5-9]\.\d% within half of the part"):
+        e = grown.fold(64)
+    assert e.drift["y"] == pytest.approx(0.2 * e.cycles / 46.34, rel=0.1)
 
 
 def driven(cycles, noise, seed, per_cycle=50, kind="white"):
@@ -368,7 +382,7 @@ def drifting(change, cycles=40, noise=0.03):
     return bp.Recording.from_arrays(time, {"y": y}, name="free")
 
 
-@pytest.mark.parametrize("change", [0.01, -0.01, 0.02])
+@pytest.mark.parametrize("change", [0.012, -0.01, 0.02])
 def test_drift_of_the_period_is_reported_with_a_warning(change):
     """The drift over the K cycles used is K/40 of that over the recording."""
     with pytest.warns(
@@ -420,13 +434,14 @@ def test_constant_period_has_no_drift():
     assert abs(drifting(0.0).fold(64).period_drift) < 2e-4
 
 
-def test_warning_if_only_the_later_part_of_a_recording_is_used():
+def test_warning_if_not_more_than_half_of_a_recording_is_used():
+    """Of three levels the longest is used, the last one here."""
     time = np.arange(4000) / 100.0
-    y = np.where(time < 25.0, 3.0, 1.0) * np.cos(2 * np.pi * time) + 0.01 * np.random.default_rng(0).standard_normal(
-        4000
-    )
-    with pytest.warns(UserWarning, match=r"only the last 1\d of \d+ cycles are used"):
-        bp.Recording.from_arrays(time, {"y": y}).fold(64)
+    level = np.where(time < 12.0, 3.0, np.where(time < 24.0, 2.5, 2.0))
+    y = level * np.cos(2 * np.pi * time) + 0.01 * np.random.default_rng(0).standard_normal(4000)
+    with pytest.warns(UserWarning, match=r"only the last 1[56] of \d+ cycles are used"):
+        e = bp.Recording.from_arrays(time, {"y": y}).fold(64)
+    assert abs(np.fft.rfft(e.outputs["y"])[1]) / 32 == pytest.approx(2.0, abs=1e-3)
 
 
 @pytest.mark.parametrize(("first", "last"), [(300, 500), (1000, 1400), (2050, 2380), (2399, 2700)])

@@ -1,4 +1,4 @@
-"""Parts of folding against direct computations: single cycles, the spectrum of the noise, its extrapolation."""
+"""Parts of folding against direct computations: the spectrum of the noise, its extrapolation."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from scipy.integrate import quad
 
 from bayesperiodic import _fourier
 from bayesperiodic.data import folding, harmonics
-from bayesperiodic.data.folding import Signals
+from bayesperiodic.data.signals import Signals
 
 
 def signals(time, *values, inputs=0):
@@ -20,63 +20,6 @@ def design(phase, highest):
     for h in range(1, highest + 1):
         columns += [np.cos(2 * np.pi * h * phase), np.sin(2 * np.pi * h * phase)]
     return np.column_stack(columns)
-
-
-def amplitudes(coefficients):
-    """Return the complex amplitudes c of Σ Re(c_h exp(2πi h f t)) of coefficients of `design`."""
-    return np.concatenate([[coefficients[0]], coefficients[1::2] - 1j * coefficients[2::2]])
-
-
-def test_amplitudes_of_single_cycles_are_those_of_least_squares():
-    generator = np.random.default_rng(3)
-    time = 5.0 + np.sort(generator.uniform(0.0, 4.3, 301)) / 2.0
-    values = np.cos(4 * np.pi * time) + 0.3 * generator.standard_normal((2, time.size)) + 0.5
-    back, shape = folding._cycles_apart(signals(time, *values), 2.0)
-    assert shape.shape == (4, 2, 6)
-    expected_back = np.floor((time[-1] - time) * 2.0 + 1e-9).astype(int)
-    assert back.tolist() == expected_back.tolist()
-    for cycle in range(4):
-        own = expected_back == cycle
-        for row, signal in enumerate(values):
-            fitted = np.linalg.lstsq(design(2.0 * time[own], 5), signal[own] / signal.std(), rcond=None)[0]
-            assert shape[cycle, row] == pytest.approx(amplitudes(fitted), rel=1e-8)
-
-
-def test_drift_is_the_slope_of_a_regression_over_all_cycles():
-    size = np.array([[1.0, 2.0], [1.5, 2.0], [1.1, 2.5], [2.2, 2.1], [2.0, 1.7]])
-    shape = np.zeros((5, 2, 3), dtype=complex)
-    shape[:, :, 1] = size * np.exp(1j * np.arange(10).reshape(5, 2))
-    shape[:, :, 2] = 0.7
-    slopes = [np.polyfit(np.arange(5), own, 1)[0] * 5 / own.mean() for own in size.T]
-    assert folding._drift(shape) == pytest.approx(slopes)
-
-
-def steady(distances, column):
-    """Return how many of the last cycles are steady if they differ by these distances, the last cycle first."""
-    shape = np.ones((len(distances), 1, 3), dtype=complex)
-    shape[:, 0, column] += np.array(distances)
-    return int(folding._steady_part(np.arange(len(distances)), shape).sum())
-
-
-@pytest.mark.parametrize(("column", "limit"), [(1, 3.0), (2, 3.0), (0, 12.0)])
-def test_a_cycle_is_steady_up_to_three_median_distances_and_twelve_of_the_mean(column, limit):
-    """Of the later half, at ±1 about the median value, the median distance is 1."""
-    later = [1.0, -1.0] * 5
-    assert steady(later + [0.999 * limit] * 10, column) == 20
-    # The first of the cycles that differ from the others ends the steady part.
-    assert steady(later + [1.001 * limit] * 10, column) == 10
-    assert steady(later + [1.0] * 7 + [1.001 * limit] * 3, column) == 17
-
-
-def test_a_single_odd_cycle_in_the_middle_is_kept_and_one_near_the_start_is_not():
-    later = [1.0, -1.0] * 5
-    assert steady([*later, 1.0, 50.0, 1.0, 1.0, 1.0, 1.0], 1) == 16
-    assert steady([*later, 1.0, 1.0, 1.0, 50.0, 1.0, 1.0], 1) == 13
-    assert steady([*later, 1.0, 1.0, 1.0, 50.0, 1.0, 1.0, 1.0], 1) == 17
-
-
-def test_at_least_three_cycles_are_steady():
-    assert steady([0.0, 0.1, 0.0, 90.0, 90.0], 1) == 3
 
 
 @pytest.mark.parametrize("row", [0, 1])
@@ -167,42 +110,6 @@ def test_power_of_a_signal_is_that_of_its_amplitudes():
     assert folding._power(np.abs(amplitude) ** 2) == pytest.approx(np.mean(values**2))
 
 
-def test_gaps_are_longer_than_a_quarter_period_and_than_three_usual_steps():
-    time = 0.5 * np.cumsum([0.0, 1.0, 1.0, 2.9, 1.0, 1.0, 3.1, 1.0, 1.0, 6.0, 1.0])
-    assert folding.gaps(time, 2.0).tolist() == [5, 8]
-    assert folding.gaps(time, 5.95).tolist() == [5, 8]
-    assert folding.gaps(time, 6.25).tolist() == [8]
-    assert folding.gaps(time, 12.05).tolist() == []
-
-
-def test_the_longest_stretch_ends_at_gaps_of_more_than_thirty_steps():
-    time = 0.5 * np.cumsum([0.0, 1.0, 1.0, 30.5, 1.0, 1.0, 29.5, 1.0, 1.0, 40.0, 1.0])
-    part, values = folding._longest_stretch(signals(time, np.arange(11.0), np.arange(11.0) ** 2))
-    assert part.tolist() == time[3:9].tolist()
-    assert values.tolist() == [[3, 4, 5, 6, 7, 8], [9, 16, 25, 36, 49, 64]]
-
-
-def test_cycles_include_the_step_of_the_last_sample():
-    assert folding._cycles(2.0 + np.arange(30) / 10.0, 4.0) == pytest.approx(12.0, rel=1e-8)
-    assert folding._cycles(np.arange(30) / 10.0, 1.0) >= 3.0
-
-
-def test_a_signal_rises_only_after_it_was_below_the_mean_by_a_quarter_of_its_sd():
-    """The expected crossings come from a loop over the samples with the state "below"."""
-    signal = np.array([-2.0, 2.0, 0.1, -0.1, 2.0, -2.0, 0.1, 2.0, -0.1, 0.1, 2.0, -2.0, 2.0])
-    signal = np.concatenate([signal, -signal.sum(keepdims=True)])
-    assert signal.mean() == pytest.approx(0.0, abs=1e-15)
-    level, rising = 0.25 * signal.std(), []
-    below = False
-    for i, value in enumerate(signal):
-        if value < -level:
-            below = True
-        elif value > level:
-            rising += [i] if below else []
-            below = False
-    assert folding._rising(np.arange(signal.size), signal + 5.0).tolist() == rising == [1, 7, 12]
-
-
 def test_exact_data_have_no_noise_and_the_degrees_of_freedom_of_the_lines():
     time = np.arange(64) / 8.0
     fit = harmonics.HarmonicFit(1.0, np.array([[0.5, 1.0, 0.0]], dtype=complex), np.zeros((1, 64)))
@@ -224,47 +131,6 @@ def test_repeated_quantisation_errors_count_with_three_degrees_of_freedom():
     repeated = 0.25**2 / 12 / 16
     assert noise.variance == pytest.approx(repeated * np.array([1.0, 4.0, 4.0, 4.0]), rel=1e-3)
     assert noise.freedom == pytest.approx(np.full(4, 3.0))
-
-
-@pytest.mark.parametrize(("change", "found"), [(0.0067, []), (0.0080, [6])])
-@pytest.mark.parametrize("sign", [1, -1])
-def test_a_step_of_the_period_exceeds_eight_times_the_noise_of_single_periods(change, found, sign):
-    """6 and 24 periods, their logarithms ±0.001 about their means: |difference| √(6·24/30) > 8 · 0.002, or 0.0073.
-
-    The median of neighbours changes the means by up to 0.0004.
-    """
-    logs = 0.001 * (-1.0) ** np.arange(30) + sign * change * (np.arange(30) >= 6)
-    rising = np.concatenate([[0.0], np.cumsum(np.exp(logs))])
-    time = np.stack([rising - 0.01, rising], axis=1).ravel()
-    signal = np.tile([-1.0, 1.0], rising.size)
-    assert folding._steps(time, signal, 1 + 2 * np.arange(rising.size)) == found
-
-
-def test_a_step_of_the_period_is_larger_than_a_thousandth():
-    for change, found in ((0.00095, []), (0.00105, [15])):
-        rising = np.concatenate([[0.0], np.cumsum(np.exp(change * (np.arange(30) >= 15)))])
-        time = np.stack([rising - 0.01, rising], axis=1).ravel()
-        assert folding._steps(time, np.tile([-1.0, 1.0], 31), 1 + 2 * np.arange(31)) == found
-    assert folding._steps(time[:14], np.tile([-1.0, 1.0], 7), 1 + 2 * np.arange(7)) == []
-
-
-def test_steps_at_several_places_are_found_and_a_jump_of_the_phase_is_none():
-    logs = np.repeat([0.0, 0.2, 0.5, 0.1], [7, 5, 9, 4])
-    logs[3] = 0.4
-    rising = np.concatenate([[0.0], np.cumsum(np.exp(logs))])
-    time = np.stack([rising - 0.01, rising], axis=1).ravel()
-    assert folding._steps(time, np.tile([-1.0, 1.0], 26), 1 + 2 * np.arange(26)) == [7, 12, 21]
-
-
-def test_constant_channels_are_named():
-    wave, rest = np.array([0.0, 1.0, 0.0]), np.full(3, 2.5)
-    with pytest.raises(
-        ValueError, match=r"^outputs\['y1'\]: must vary, got the constant 2.5; leave the channel out\.$"
-    ):
-        signals(np.arange(3.0), wave, rest, inputs=1)
-    remedy = ", and write it in the model as a parameter with its value in `fixed`"
-    with pytest.raises(ValueError, match=rf"^inputs\['y0'\]: must vary, got the constant 2.5; .* out{remedy}\.$"):
-        signals(np.arange(3.0), rest, wave, inputs=1)
 
 
 def test_every_field_of_a_folded_response_of_two_forcing_periods():

@@ -96,6 +96,15 @@ def test_missing_times_are_refused_or_left_out(time):
     assert np.array_equal(recording.outputs["x"], np.delete(SIGNAL, lost))
 
 
+def test_texts_with_picoseconds_are_refused():
+    """Pandas would drop the digits, see findings/pandas_digits_of_seconds.sh."""
+    texts = [f"2026-01-01T00:00:00.12345678{k:02d}" for k in range(10)]
+    with pytest.raises(
+        ValueError, match=r"^time: must have at most nine decimals of a second, got '2026-01-01T00:00:00"
+    ):
+        bp.Recording.from_arrays(texts, {"x": np.arange(10.0)})
+
+
 def test_texts_that_are_no_dates_are_named():
     texts = ["2026-01-31T12:00:00", "2026-01-31T12:00:01", "noon"]
     with pytest.raises(ValueError, match="time: must be dates, such as 2026-01-31.*, got 'noon' at index 2"):

@@ -247,6 +247,21 @@ def judged(problem: bp.Problem):
     return adequacy(problem, here, problem.noise_values(fit.noise)[None], {})
 
 
+def test_a_model_is_not_adequate_by_a_recording_with_serious_faults():
+    """The verdict of the right model with a recording whose faults count as noise; that of a wrong one stays."""
+    fault = bp.Finding("drift", "x", "serious", np.array([[0.0, 80.0]]), 40, 1.0, np.nan, "the amplitude changes")
+    for severity, coulomb, verdict in (
+        ("harmless", 0.0, "adequate"),
+        ("serious", 0.0, "recording not sound"),
+        ("serious", 25.0, "misspecified"),
+    ):
+        problem = folded(NOISES["white"], 1, coulomb)
+        (run,) = problem.experiments
+        faulty = problem.replace(experiments=[replace(run, findings=(replace(fault, severity=severity),))])
+        table = judged(faulty)
+        assert set(table["verdict"]) == {verdict}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", NOISES.values(), ids=[*NOISES])
 def test_coloured_noise_is_no_model_error(noise):

@@ -318,6 +318,38 @@ def test_missing_terms_have_a_section_where_they_are_given(solved, page, tmp_pat
 
 
 @pytest.mark.usefixtures("pictures_left_out")
+def test_the_first_section_says_what_was_found_in_the_recordings(tmp_path):
+    time, tau = np.arange(2000) / 100, np.arange(64) / 64
+    direct = bp.Experiment("table 3", 1.0, *({c: np.cos(2 * np.pi * tau)} for c in "yx"), samples=64)
+    rng = np.random.default_rng(5)
+    x, y = (size * np.cos(2 * np.pi * time) + 0.01 * rng.standard_normal(time.size) for size in (1.0, 2.0))
+    y[700], ramp = 2.6, np.minimum((20.0 - time) / 5.0, 1.0)
+    recording = bp.Recording(time, {"y": ramp * y}, {"x": ramp * x}, name="ramped")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ramped = recording.fold(64, frequency=1.0)
+    assert {finding.kind for finding in ramped.findings} == {"outliers", "ramp"}
+    _, page = gain_page(tmp_path, [gain_run(cycles=30), ramped, direct], "exact")
+    sections = [e for e in page.all("section")]
+    assert sections[0].attributes["id"] == "recordings"
+    rows = [[cell.text for cell in row] for row in page.tables["table-findings"][-2:]]
+    for row, finding in zip(rows, ramped.findings, strict=True):
+        assert row[:3] == ["ramped", finding.channel or "all", finding.kind]
+        assert row[3].split()[-1] == finding.severity and row[6] == str(finding.count)
+        assert value(row[4]) == pytest.approx(finding.times[0, 0], rel=1e-5)
+        assert f"ramped: {' '.join(str(finding).split())}." in sections[0].text
+    assert "Nothing was found in the recording of run." in sections[0].text
+    assert "Not folded from a recording, so that none was checked: table 3." in sections[0].text
+
+
+@pytest.mark.usefixtures("pictures_left_out")
+def test_a_report_without_findings_has_no_table_of_them(tmp_path):
+    _, page = gain_page(tmp_path, [gain_run(cycles=30)], "exact")
+    assert "table-findings" not in page.tables
+    assert "Nothing was found in the recording of run." in page.all("section")[0].text
+
+
+@pytest.mark.usefixtures("pictures_left_out")
 def test_a_misspecified_model_is_pointed_to_the_search(solved, scored, tmp_path):
     problem, fit, posterior = solved
     table = bp.predict(problem, posterior, draws=20).table.copy()

@@ -1,0 +1,160 @@
+"""Faults of single sensors by their samples: each kind is found exactly, and signals without it have none."""
+
+import numpy as np
+import pytest
+
+from bayesperiodic.data import faults
+
+TIME = np.arange(4000) / 100.0
+PHASE = 2 * np.pi * TIME
+
+
+def quantised(values, step):
+    return step * np.round(values / step)
+
+
+def square(phase):
+    return np.sign(np.sin(phase))
+
+
+# Motions and forces that no sensor has spoiled.
+SOUND = {
+    "sine": np.sin(PHASE + 0.2),
+    "harmonics": np.sin(PHASE) + 0.3 * np.sin(3 * PHASE + 1) + 0.1 * np.cos(7 * PHASE),
+    "8 bits": quantised(np.sin(PHASE + 0.2), 2 / 255),
+    "8 bits, slow": quantised(np.sin(PHASE / 20), 2 / 255),
+    "6 bits with dither": quantised(
+        np.sin(PHASE + 0.2) + np.random.default_rng(0).uniform(-0.02, 0.02, PHASE.size), 2 / 63
+    ),
+    "square wave": square(PHASE + 0.2),
+    "square wave of 1": 0.5 + 0.5 * square(PHASE + 0.2),
+    "square wave of 2 pi with noise": np.pi * square(PHASE + 0.2) + np.random.default_rng(1).normal(0, 0.01, 4000),
+    "pulses": np.where(PHASE / (2 * np.pi) % 1.0 < 0.1, 5.0, 0.0),
+    "dry friction": np.sign(np.cos(PHASE)) * (1 + 0.05 * np.abs(np.cos(PHASE))),
+    "friction with noise": np.tanh(np.cos(PHASE) / 0.02) + np.random.default_rng(2).normal(0, 0.01, 4000),
+    "impacts": np.abs(np.sin(PHASE / 2)),
+    "impulses": 1 / (1 + ((PHASE / (2 * np.pi) % 1.0 - 0.503) / 0.01) ** 2),
+    "noise": np.random.default_rng(3).standard_normal(4000),
+    "random walk": np.cumsum(np.random.default_rng(4).standard_normal(4000)),
+}
+
+
+@pytest.mark.parametrize("values", SOUND.values(), ids=[*SOUND])
+def test_sound_signals_do_not_wrap(values):
+    assert faults.wrap_of(values, faults.resolution(values)[0])[0] == 0.0
+
+
+@pytest.mark.parametrize("values", SOUND.values(), ids=[*SOUND])
+def test_sound_signals_are_neither_stuck_nor_clipped_for_one_period_alone(values):
+    """A relay and pulses rest in every period, as long as in the others."""
+    stuck = faults.stuck_of(values)
+    assert stuck == []
+    low, high = faults.clipped_of(values, stuck)
+    assert low.size == high.size == 0
+
+
+@pytest.mark.parametrize("turn", [2 * np.pi, 360.0, 1.0])
+@pytest.mark.parametrize("rate", [0.11, -0.11])
+def test_wraps_of_an_angle_are_found_with_their_samples_and_removed(turn, rate):
+    """A rotation with an oscillation; the jumps are where the whole number of turns changes."""
+    angle = turn * (0.2 + rate * TIME + 0.05 * np.sin(PHASE)) + 1e-3 * turn * np.random.default_rng(0).normal(size=4000)
+    wrapped = angle % turn
+    found, places = faults.wrap_of(wrapped, 0.0)
+    assert found == turn
+    assert places.tolist() == (np.flatnonzero(np.diff(np.floor(angle / turn))) + 1).tolist()
+    np.testing.assert_allclose(np.diff(faults.unwrapped(wrapped, turn)), np.diff(angle), atol=1e-9 * turn)
+
+
+@pytest.mark.parametrize("bits", [8, 12])
+def test_a_counter_that_overflows_wraps_at_a_power_of_two_of_its_steps(bits):
+    step = 0.0025
+    counts = np.round(2**bits * (0.3 + 0.13 * TIME + 0.05 * np.sin(PHASE)))
+    values = step * (counts % 2**bits)
+    resolved = faults.resolution(values)[0]
+    found, places = faults.wrap_of(values, resolved)
+    assert resolved == pytest.approx(step)
+    assert found == pytest.approx(step * 2**bits)
+    assert places.tolist() == (np.flatnonzero(np.diff(counts // 2**bits)) + 1).tolist()
+
+
+@pytest.mark.parametrize("per_cycle", [20, 50, 200])
+@pytest.mark.parametrize("turn", [2 * np.pi, 360.0, 1.0, 2.0])
+def test_sawtooth_drives_are_no_wraps_unless_their_range_is_a_turn(per_cycle, turn):
+    """A sawtooth of a range of 2.5 volts, or of another number, is no angle."""
+    saw = 2.5 * (np.arange(50 * per_cycle) / per_cycle % 1.0)
+    assert faults.wrap_of(saw, 0.0)[0] == 0.0
+    assert faults.wrap_of(1.3 * turn * saw / 2.5, 0.0)[0] == 0.0
+
+
+@pytest.mark.parametrize(("first", "length"), [(300, 10), (1710, 60), (3500, 500), (0, 40)])
+def test_a_stuck_sensor_is_found_from_its_first_to_its_last_sample(first, length):
+    values = np.sin(PHASE) + np.random.default_rng(0).normal(0, 1e-3, 4000)
+    values[first : first + length] = values[first]
+    assert faults.stuck_of(values) == [slice(first, first + length)]
+
+
+def test_several_stuck_stretches_are_found_in_a_quantised_signal():
+    """A sine of 8 bits rests at its peaks for several samples in a row."""
+    values = quantised(np.sin(PHASE / 2), 2 / 255)
+    longest = max(faults.runs(values)[1])
+    assert 3 <= longest < 10
+    values[1000:1100] = values[1000]
+    values[2210:2290] = values[2210]
+    found = faults.stuck_of(values)
+    assert [(part.start, part.stop) for part in found] == [
+        (int(np.flatnonzero(values[:1050] != values[1000])[-1]) + 1, found[0].stop),
+        (int(np.flatnonzero(values[:2250] != values[2210])[-1]) + 1, found[1].stop),
+    ]
+    assert found[0].stop >= 1100 and found[1].stop >= 2290
+
+
+@pytest.mark.parametrize("low", [-2.0, -0.8])
+@pytest.mark.parametrize("step", [0.0, 2 / 4095])
+def test_clipped_samples_are_those_at_the_limit(low, step):
+    clean = np.sin(PHASE + 0.2) + 0.1 * np.sin(3 * PHASE)
+    clean = clean + np.random.default_rng(0).normal(0, 5e-3, 4000)
+    high = 0.75
+    values = np.clip(quantised(clean, step) if step else clean, low, high)
+    lower, upper = faults.clipped_of(values, [])
+    assert upper.tolist() == np.flatnonzero(values == high).tolist()
+    assert lower.tolist() == (np.flatnonzero(values == low).tolist() if low > -1.0 else [])
+
+
+def test_outliers_are_samples_far_from_the_mean_period_that_do_not_return():
+    """Residuals of sd 1; jumps of 6 standard deviations are none, those of 12 and more are."""
+    generator = np.random.default_rng(0)
+    noise = 0.01 * generator.standard_normal(4000)
+    place = generator.choice(4000, 30, replace=False)
+    residuals = noise.copy()
+    residuals[place] += 0.5 * np.sign(generator.standard_normal(30))
+    residuals[17 if 17 not in place else 18] = 0.06
+    values = np.sin(PHASE) + residuals
+    assert faults.outliers_of(residuals, TIME, values, 0.0).tolist() == sorted(place)
+    assert faults.outliers_of(noise, TIME, np.sin(PHASE) + noise, 0.0).size == 0
+
+
+@pytest.mark.parametrize("width", [1, 3])
+def test_spikes_of_every_period_are_part_of_the_signal(width):
+    """Impacts that a series of few harmonics does not follow: always at the same phase, within a sample."""
+    generator = np.random.default_rng(0)
+    residuals = 0.01 * generator.standard_normal(4000)
+    for k in range(40):
+        start = 100 * k + 37 + generator.integers(0, 2)
+        residuals[start : start + width] += 1.0
+    values = np.sin(PHASE) + residuals
+    assert faults.outliers_of(residuals, TIME, values, 0.0).size == 0
+
+
+def test_heavy_tails_are_no_outliers_where_the_signal_is_smooth():
+    """A slow swelling of the residuals has no jumps into and out of it."""
+    residuals = 0.01 * np.random.default_rng(0).standard_normal(4000)
+    residuals += np.exp(-0.5 * ((TIME - 20) / 0.5) ** 2)
+    assert faults.outliers_of(residuals, TIME, np.sin(PHASE) + residuals, 0.0).size == 0
+
+
+def test_resolution_is_the_step_and_the_bits_of_the_range():
+    """Of ±1 in steps of 2/255, 255 steps or 8 bits are used."""
+    step, bits = faults.resolution(quantised(np.sin(PHASE + 0.1), 2 / 255))
+    assert step == pytest.approx(2 / 255)
+    assert bits == pytest.approx(8.0, abs=0.02)
+    assert faults.resolution(np.random.default_rng(0).standard_normal(4000)) == (0.0, np.inf)
