@@ -158,3 +158,36 @@ def test_resolution_is_the_step_and_the_bits_of_the_range():
     assert step == pytest.approx(2 / 255)
     assert bits == pytest.approx(8.0, abs=0.02)
     assert faults.resolution(np.random.default_rng(0).standard_normal(4000)) == (0.0, np.inf)
+
+
+@pytest.mark.parametrize("repeats", [2, 3, 8])
+def test_a_slower_logger_repeats_each_value(repeats):
+    """Of the first value, whose run is cut, no sample is at the time of a change."""
+    values = np.repeat(np.random.default_rng(1).standard_normal(100), repeats)
+    found, repeated = faults.held_of(values[1:])
+    assert found == repeats and repeated.size == 100 * (repeats - 1)
+    assert faults.held_of(np.random.default_rng(1).standard_normal(100))[0] == 1
+
+
+@pytest.mark.parametrize("levels", [2, 5])
+def test_a_relay_is_no_slower_logger(levels):
+    assert faults.held_of(np.repeat(np.arange(400) % levels, 5).astype(float))[0] == 1
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_dropouts_within_the_range_of_the_signal_are_outliers_by_their_value(share):
+    """Of 4000 samples with noise none other is zero; a sample whose value is zero is a dropout."""
+    rng, phase = np.random.default_rng(2), np.arange(4000) / 50
+    values = np.cos(2 * np.pi * phase) + 0.01 * rng.standard_normal(phase.size)
+    values[rng.random(phase.size) < share] = 0.0
+    residuals = values - (1.0 - share) * np.cos(2 * np.pi * phase)
+    assert np.array_equal(faults.outliers_of(residuals, phase, values, 0.0), np.flatnonzero(values == 0.0))
+
+
+def test_many_impacts_of_every_period_are_no_outliers():
+    """Twelve peaks of three samples a period, which the mean period does not resolve."""
+    phase = np.arange(33 * 1000) / 1000
+    far = np.isin(np.arange(phase.size) % 1000, np.add.outer(np.arange(12) * 80, np.arange(3)))
+    rng = np.random.default_rng(3)
+    values = -20.0 * far * rng.uniform(0.8, 1.2, phase.size) + 0.05 * rng.standard_normal(phase.size)
+    assert not faults.outliers_of(values, phase, values, 0.0).size
