@@ -19,6 +19,8 @@ FEWEST_STUCK, LONG_RUN = 10, 10.0
 FEWEST_CLIPPED, CLIPPED_RUN, PILED_UP = 6, 3, 6.0
 # Distance of outliers from the mean period in standard deviations of the others, and how often they may return.
 FAR, RETURNING = 8.0, 0.5
+# Distance of large outliers relative to the largest one.
+LARGE = 0.2
 MEDIAN_TO_SD = 1.4826
 # Largest step between samples relative to 80 % of them, of so many, without outliers.
 JUMP, USUAL, SCREENED = 5.0, 0.8, 100_000
@@ -45,11 +47,6 @@ class ChannelFaults:
     repeats: int = 1  # samples of each value, of a slower logger
 
 
-def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
-    """Return values without jumps by multiples of a period."""
-    return np.unwrap(values, period=period)
-
-
 def wrap_of(values: np.ndarray, step: float) -> tuple[float, np.ndarray]:
     """Return the range at which the values of a sensor wrap, 0 if they do not, and the samples after its jumps."""
     span, change = float(np.ptp(values)), np.diff(values)
@@ -58,9 +55,9 @@ def wrap_of(values: np.ndarray, step: float) -> tuple[float, np.ndarray]:
         if not 0.9 * turn < span < 1.001 * turn + step:
             continue
         jumps = np.flatnonzero(np.abs(change) > (1.0 - WRAP_TOLERANCE) * turn)
-        if not jumps.size:
+        if not jumps.size or jumps.size == change.size:
             continue
-        whole = unwrapped(values, turn)
+        whole = np.unwrap(values, period=turn)
         steps = np.diff(whole)
         smooth = (
             np.mean(steps**2) < SMOOTH_UNWRAPPED * np.var(whole) and np.abs(steps).max() < LARGEST_UNWRAPPED_STEP * turn
@@ -154,37 +151,40 @@ def jumps(values: np.ndarray) -> bool:
     return bool((steps.max(axis=1) > JUMP * usual).any())
 
 
-def outliers_of(
-    residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float, least: float = 0.0
-) -> np.ndarray:
+def outliers_of(residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -> np.ndarray:
     """Return the samples far from the mean period, or of the value of dropouts, with jumps before and after them.
 
-    `phase` is in cycles. What is far at the same phase of many cycles is part of the signal. Distances below `least`
-    times the largest do not count, if the mean period is that of all samples, on which outliers leave their mark.
+    `phase` is in cycles. What is far at the same phase of many cycles is part of the signal.
     """
     middle = np.median(residuals)
     distance = np.abs(residuals - middle)
     scale = MEDIAN_TO_SD * float(np.median(distance))
     if not scale > 0.0:
         scale = float(np.quantile(distance, 0.9))
-    far = distance > max(FAR * scale, 2.0 * step, 1e-9 * np.abs(values).max(), least * distance.max())
+    least = max(FAR * scale, 2.0 * step, 1e-9 * np.abs(values).max())
+    # Large outliers are in the mean period too, so that their neighbours are far from it as well.
+    levels = {least, max(least, LARGE * float(distance.max()))}
+    each = [_lone(distance > level, phase, values, step) for level in levels]
+    return np.unique(np.concatenate(each))
+
+
+def _lone(far: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -> np.ndarray:
+    """Return the samples of runs that are far, or have the value of dropouts, with jumps before and after them."""
     value = dropped_value(values)
     if value is not None:
-        far |= values == value
+        far = far | (values == value)
     if not far.any() or far.all() or np.ptp(values[~far]) == 0.0:
         return np.zeros(0, dtype=int)
     first, length = runs(far)
     flagged = far[first]
     first, length = first[flagged], length[flagged]
     # A jump into the run and out of it, larger than between the other samples.
-    change = np.abs(np.diff(values))
-    usual = float(np.quantile(change[~(far[1:] | far[:-1])], 0.99)) if (~(far[1:] | far[:-1])).any() else 0.0
+    change, inside = np.abs(np.diff(values)), ~(far[1:] | far[:-1])
+    usual = float(np.quantile(change[inside], 0.99)) if inside.any() else 0.0
     before = np.where(first > 0, change[np.maximum(first - 1, 0)], np.inf)
     last = first + length - 1
     after = np.where(last < values.size - 1, change[np.minimum(last, change.size - 1)], np.inf)
-    # What such runs do to the mean period is far at their phases in every cycle, but without jumps.
     lone = np.minimum(before, after) > 2.0 * usual + step
-    first, length = first[lone], length[lone]
     cycles = max(float(np.ptp(phase)), 1.0)
     bins = np.minimum((phase[first] % 1.0 * 64).astype(int), 63)
     cycle = np.floor(phase[first] - phase[0]).astype(int)
@@ -193,23 +193,21 @@ def outliers_of(
         often[k] = np.unique(cycle[bins == k]).size / cycles
     every = often + np.roll(often, 1) + np.roll(often, -1)
     if far.mean() < 0.2:
-        rare = every[bins] < RETURNING * np.maximum(1.0, 3.0 * _expected(far, cycles))
-        first, length = first[rare], length[rare]
+        lone &= every[bins] < RETURNING * np.maximum(1.0, 3.0 * _expected(first.size, cycles))
     result = np.zeros(values.size, dtype=bool)
-    for a, n in zip(first, length, strict=True):
+    for a, n in zip(first[lone], length[lone], strict=True):
         result[a : a + n] = True
     if value is not None and result[values == value].mean() > ALL_DROPPED:
         result |= values == value
     return np.flatnonzero(result)
 
 
-def _expected(far: np.ndarray, cycles: float) -> float:
-    """Return the expected share of cycles with an outlier in three of 64 bins if they are anywhere."""
-    return float(np.count_nonzero(far) / cycles * 3.0 / 64.0)
+def _expected(runs: int, cycles: float) -> float:
+    """Return the expected share of cycles with a run of outliers in three of 64 bins if they are anywhere."""
+    return runs / cycles * 3.0 / 64.0
 
 
-def resolution(values: np.ndarray) -> tuple[float, float]:
-    """Return the step of quantised values and the bits that the range uses; 0 and infinity if they are not."""
+def resolution(values: np.ndarray) -> float:
+    """Return the step of quantised values; 0 if they are not quantised, or by rounding errors alone."""
     step = step_of(values)
-    step = step if step > ROUNDING * float(np.ptp(values)) else 0.0
-    return step, float(np.log2(np.ptp(values) / step + 1.0)) if step > 0.0 else np.inf
+    return step if step > ROUNDING * float(np.ptp(values)) else 0.0

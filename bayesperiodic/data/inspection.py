@@ -35,8 +35,8 @@ from bayesperiodic.data.steadiness import Steady, Windows, steady_part, windows
 LARGEST_CHANGE = 0.1
 # Least share of samples at which no channel is stuck.
 LEAST_MOVING = 0.1
-# Harmonics of the first mean period, from which outliers are left out, and their least distance from it.
-ROUGH_HARMONICS, ROUGH_DISTANCE = 40, 0.1
+# Harmonics of the first mean period, from which outliers are left out.
+ROUGH_HARMONICS = 40
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,7 @@ class Inspection:
     findings: tuple[Finding, ...]
     total: int = 0  # whole cycles
     steady: Steady | None = None
-    sizes: np.ndarray | None = (
-        None  # of the strongest harmonics in all windows that do not overlap, (windows, channels)
-    )
+    sizes: np.ndarray | None = None  # (windows, channels), of the strongest harmonics in windows that do not overlap
     fit: HarmonicFit | None = None  # of the steady part, at the estimated frequency
     pace: Pace = Pace(0.0, 0, 0.0, False)
     limit: int = 0  # of the harmonics
@@ -65,13 +63,14 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     def findings(rate: float | None, limit: int = 0, used: slice = slice(0, signals.time.size)) -> list[Finding]:
         rows = zip(signals.channels, signals.values, faults, strict=True)
         every = [f for c, v, fault in rows for f in sample_findings(c, signals.time, v, fault, rate, limit, used)]
-        return every + [*clock_findings(signals.time, rate)]
+        return every + [*clock_findings(signals.time)]
 
     def worst_first(some: list[Finding]) -> tuple[Finding, ...]:
         return tuple(sorted(some, key=lambda finding: -SEVERITIES.index(finding.severity)))
 
     if any(fault.wrap for fault in faults):
-        return Inspection(signals, faults, worst_first(findings(None)), reason=_wrapped(signals.name, findings(None)))
+        wraps = worst_first(findings(None))
+        return Inspection(signals, faults, wraps, reason=_wrapped(signals.name, wraps))
     moving = np.ones(signals.time.size, dtype=bool)
     for stuck in [part for fault in faults for part in fault.stuck]:
         moving[stuck] = False
@@ -89,17 +88,8 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     total = int(cycles_of(signals.time, tracked))
     sound = _sound(signals, calm, faults, np.flatnonzero(moving), tracked, points)
     some = signals if sound.size == signals.time.size else signals.part(sound)
-    few = min(ROUGH_HARMONICS, resolved_harmonics(some.time, tracked, points))
-    if frequency is None and some is not signals:
-        tracked = refine_frequency(some.time, some.values, tracked, few)[0].frequency
-    every = windows(some.time, some.values, tracked)
-    steady = steady_part(every)
-    if steady is not None and frequency is None and steady.level != (0, sound.size):
-        # The frequency of a part that ramps is not that of the steady one.
-        part = some.part(steady.samples)
-        tracked = refine_frequency(part.time, part.values, tracked, few)[0].frequency
-        every = windows(some.time, some.values, tracked)
-        steady = steady_part(every)
+    refined = frequency is None
+    every, steady, tracked = _steady_of(some, tracked, points, refined, refined and some is not signals)
     if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
         return Inspection(signals, faults, worst_first(findings(tracked)), total, reason=_unsteady(signals, every))
     steady = steady.among(sound)
@@ -112,9 +102,9 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
         near = fit_harmonics(signals.time[here], signals.values[:, here], tracked, limit).amplitudes
         residuals = used.values - _fourier.at_times(near, tracked * used.time)
     for fault, rest, values in zip(faults, residuals, used.values, strict=True):
-        place = outliers_of(rest, used.time * fit.frequency, values, fault.step)
-        outliers = place + steady.samples.start
-        fault.outliers = outliers[moving[outliers]]
+        inside = outliers_of(rest, used.time * fit.frequency, values, fault.step) + steady.samples.start
+        before, after = (fault.outliers < steady.samples.start), (fault.outliers >= steady.samples.stop)
+        fault.outliers = np.concatenate([fault.outliers[before], inside[moving[inside]], fault.outliers[after]])
     seen = findings(fit.frequency, limit, steady.samples)
     seen += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
     return Inspection(
@@ -122,7 +112,25 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     )
 
 
-def _wrapped(name: str, findings: list[Finding]) -> str:
+def _steady_of(
+    some: Signals, tracked: float, points: int, refined: bool, first: bool
+) -> tuple[Windows, Steady | None, float]:
+    """Return the windows, the steady part and the frequency, which is refined for a part, and `first` for all."""
+    few = min(ROUGH_HARMONICS, resolved_harmonics(some.time, tracked, points))
+    if first:
+        tracked = refine_frequency(some.time, some.values, tracked, few)[0].frequency
+    every = windows(some.time, some.values, tracked)
+    steady = steady_part(every)
+    if steady is not None and refined and steady.level != (0, some.time.size):
+        # The frequency of a part that ramps is not that of the steady one.
+        part = some.part(steady.samples)
+        tracked = refine_frequency(part.time, part.values, tracked, few)[0].frequency
+        every = windows(some.time, some.values, tracked)
+        steady = steady_part(every)
+    return every, steady, tracked
+
+
+def _wrapped(name: str, findings: tuple[Finding, ...]) -> str:
     return f"recording: must be without wraps, got {name!r}: {'. '.join(str(f) for f in findings if f.kind == WRAPS)}."
 
 
@@ -137,15 +145,17 @@ def _still(signals: Signals, faults: list[ChannelFaults]) -> str:
 def _sound(
     signals: Signals, calm: Signals, faults: list[ChannelFaults], moving: np.ndarray, fundamental: float, points: int
 ) -> np.ndarray:
-    """Return the numbers of the samples without outliers from a first mean period, of those that are not stuck."""
+    """Return the numbers of the samples that are not stuck, without outliers from a first mean period.
+
+    These outliers become those of the channels.
+    """
     if not jumps(signals.values) and all(dropped_value(values) is None for values in signals.values):
         return moving
     limit = min(resolved_harmonics(calm.time, fundamental, points), ROUGH_HARMONICS)
     fit = fit_harmonics(calm.time, calm.values, fundamental, limit)
-    bad = np.zeros(moving.size, dtype=bool)
     for fault, values, near, rest in zip(faults, signals.values[:, moving], calm.values, fit.residuals, strict=True):
-        bad[outliers_of(values - near + rest, calm.time * fundamental, values, fault.step, ROUGH_DISTANCE)] = True
-    return moving[~bad]
+        fault.outliers = moving[outliers_of(values - near + rest, calm.time * fundamental, values, fault.step)]
+    return np.setdiff1d(moving, np.concatenate([fault.outliers for fault in faults]))
 
 
 def _unsteady(signals: Signals, every: Windows) -> str:

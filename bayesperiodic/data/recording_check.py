@@ -14,7 +14,7 @@ from bayesperiodic._verdicts import BAD, CAUTION, GOOD, with_tone
 from bayesperiodic.data import faults
 from bayesperiodic.data.faults import ChannelFaults
 from bayesperiodic.data.harmonics import fit_harmonics
-from bayesperiodic.data.signals import GAP
+from bayesperiodic.data.signals import GAP, USUAL_STEPS
 from bayesperiodic.data.steadiness import ALLOWED_BIAS, Steady, Windows
 
 if TYPE_CHECKING:
@@ -32,8 +32,6 @@ FITTED_HARMONICS, LARGEST_FIT_CONDITION = (10, 5, 3, 2, 1), 1e3
 EXTREMES = 0.1
 # Times of each finding that are listed.
 MOST_TIMES_LISTED = 200
-# Steps of time that are gaps, in usual steps.
-USUAL_STEPS = 3.0
 # Relative changes over the part used: of an amplitude, and of the mean value in amplitudes.
 HARMLESS_DRIFT, HARMLESS_STEP, HARMLESS_PHASE = 0.05, 0.02, 1.0 / 180.0
 # Change between neighbouring cycles that is a step, in standard deviations of the other changes, and cycles needed;
@@ -96,7 +94,7 @@ class Finding(Storable):
 
 def signal_faults(values: np.ndarray, *, drive: bool = False) -> ChannelFaults:
     """Return the faults of one channel that its samples alone show; a drive may be a sawtooth."""
-    step, _ = faults.resolution(values)
+    step = faults.resolution(values)
     wrap, jumps = faults.wrap_of(values, step)
     if drive and wrap and abs(np.sign(np.diff(values)[jumps - 1]).sum()) == jumps.size:
         wrap, jumps = 0.0, jumps[:0]
@@ -347,13 +345,11 @@ def _steps(channels: list[str], time: np.ndarray, part: Windows, frequency: floa
         jump = mean[2:] - mean[:-2]  # of two cycles after a boundary from the two before it
         spread = np.median(np.abs(jump - np.median(jump, axis=0)), axis=0) / 0.6745
         large = (np.abs(jump) > limit * spread) & (np.abs(jump) > least)
-        if kind == "phase step" and large.shape[1] > 1 and large.any():
-            together = large.all(axis=1)
-            which = [("all channels", together, jump.mean(axis=1))] if together.any() else []
-        else:
-            which = []
-        which += [] if which else [(c, large[:, i], jump[:, i]) for i, c in enumerate(channels) if large[:, i].any()]
-        for channel, where, size in which:
+        together = large.all(axis=1)
+        stepping = [(c, large[:, i], jump[:, i]) for i, c in enumerate(channels) if large[:, i].any()]
+        if kind == "phase step" and len(channels) > 1 and together.any():
+            stepping = [("all channels", together, jump.mean(axis=1))]
+        for channel, where, size in stepping:
             k = int(np.argmax(np.where(where, np.abs(size), 0.0)))
             at = float(time[first[k + 2]])
             if kind == "phase step":
@@ -388,7 +384,7 @@ def _beats(channels: list[str], time: np.ndarray, part: Windows, frequency: floa
         near = np.r_[power[max(line - 12, 0) : max(line - 2, 0)], power[line + 3 : line + 13]]
         if near.size < 6 or power[line] < np.mean(near) * -np.log(BEAT_FALSE_ALARM / spectrum.shape[0]) * 3.0:
             continue
-        amplitude = float(np.sqrt(8.0 * rest[:, i].var() / 4.0) / sizes[:, i].mean())
+        amplitude = float(np.sqrt(2.0 * rest[:, i].var()) / sizes[:, i].mean())
         slip = float(part.slip[i] / sizes[:, i].mean())
         if amplitude > HARMLESS_BEAT + slip:
             beat = (line + 2) * frequency / (count * part.cycles)
@@ -400,7 +396,7 @@ def _beats(channels: list[str], time: np.ndarray, part: Windows, frequency: floa
             )  # fmt: skip
 
 
-def clock_findings(time: np.ndarray, frequency: float | None) -> Iterator[Finding]:
+def clock_findings(time: np.ndarray) -> Iterator[Finding]:
     """Return the gaps of the time axis."""
     step = np.diff(time)
     usual = float(np.median(step))

@@ -19,8 +19,6 @@ ENOUGH, LARGEST_WINDOW_CONDITION = 0.5, 30.0
 SMALL_RANGE, NOISE_RANGE = 0.08, 14.0
 # Least level of a steady part relative to the largest amplitudes: a part at rest is steady too.
 LEAST_LEVEL = 0.5
-# Largest change per cycle inside the steady part relative to outside.
-CALMER = 0.25
 # Largest distance of a window from the middle of the steady part, relative to usual ones, in harmonics and mean value.
 DISTANT, DISTANT_MEAN = 3.0, 12.0
 # Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
@@ -300,9 +298,8 @@ def _after_transient(part: Windows, probability: float) -> tuple[int, float, np.
     bias = bias[: count - MINIMUM_CYCLES + 1]
     allowed = np.flatnonzero(bias[: count // 2 + 1] <= ALLOWED_BIAS)
     # If half of the cycles has more bias, the mean square error of what is biased is least.
-    first = (
-        int(allowed[0]) if allowed.size else int(np.argmin((1.0 + bias**2) / np.arange(count, MINIMUM_CYCLES - 1, -1)))
-    )
+    error = (1.0 + bias**2) / np.arange(count, MINIMUM_CYCLES - 1, -1)
+    first = int(allowed[0]) if allowed.size else int(np.argmin(error))
     by_part = squares[first].reshape(channels, -1)
     by_harmonic = by_part[:, :harmonics].copy()
     by_harmonic[:, 1:] += by_part[:, harmonics:]

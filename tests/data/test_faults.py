@@ -41,7 +41,7 @@ SOUND = {
 
 @pytest.mark.parametrize("values", SOUND.values(), ids=[*SOUND])
 def test_sound_signals_do_not_wrap(values):
-    assert faults.wrap_of(values, faults.resolution(values)[0])[0] == 0.0
+    assert faults.wrap_of(values, faults.resolution(values))[0] == 0.0
 
 
 @pytest.mark.parametrize("values", SOUND.values(), ids=[*SOUND])
@@ -62,7 +62,7 @@ def test_wraps_of_an_angle_are_found_with_their_samples_and_removed(turn, rate):
     found, places = faults.wrap_of(wrapped, 0.0)
     assert found == turn
     assert places.tolist() == (np.flatnonzero(np.diff(np.floor(angle / turn))) + 1).tolist()
-    np.testing.assert_allclose(np.diff(faults.unwrapped(wrapped, turn)), np.diff(angle), atol=1e-9 * turn)
+    np.testing.assert_allclose(np.diff(np.unwrap(wrapped, period=turn)), np.diff(angle), atol=1e-9 * turn)
 
 
 @pytest.mark.parametrize("bits", [8, 12])
@@ -70,7 +70,7 @@ def test_a_counter_that_overflows_wraps_at_a_power_of_two_of_its_steps(bits):
     step = 0.0025
     counts = np.round(2**bits * (0.3 + 0.13 * TIME + 0.05 * np.sin(PHASE)))
     values = step * (counts % 2**bits)
-    resolved = faults.resolution(values)[0]
+    resolved = faults.resolution(values)
     found, places = faults.wrap_of(values, resolved)
     assert resolved == pytest.approx(step)
     assert found == pytest.approx(step * 2**bits)
@@ -152,9 +152,39 @@ def test_heavy_tails_are_no_outliers_where_the_signal_is_smooth():
     assert faults.outliers_of(residuals, TIME, np.sin(PHASE) + residuals, 0.0).size == 0
 
 
-def test_resolution_is_the_step_and_the_bits_of_the_range():
-    """Of ±1 in steps of 2/255, 255 steps or 8 bits are used."""
-    step, bits = faults.resolution(quantised(np.sin(PHASE + 0.1), 2 / 255))
-    assert step == pytest.approx(2 / 255)
-    assert bits == pytest.approx(8.0, abs=0.02)
-    assert faults.resolution(np.random.default_rng(0).standard_normal(4000)) == (0.0, np.inf)
+def test_resolution_is_the_step():
+    assert faults.resolution(quantised(np.sin(PHASE + 0.1), 2 / 255)) == pytest.approx(2 / 255)
+    assert faults.resolution(np.random.default_rng(0).standard_normal(4000)) == 0.0
+
+
+@pytest.mark.parametrize("repeats", [2, 3, 8])
+def test_a_slower_logger_repeats_each_value(repeats):
+    """Of the first value, whose run is cut, no sample is at the time of a change."""
+    values = np.repeat(np.random.default_rng(1).standard_normal(100), repeats)
+    found, repeated = faults.held_of(values[1:])
+    assert found == repeats and repeated.size == 100 * (repeats - 1)
+    assert faults.held_of(np.random.default_rng(1).standard_normal(100))[0] == 1
+
+
+@pytest.mark.parametrize("levels", [2, 5])
+def test_a_relay_is_no_slower_logger(levels):
+    assert faults.held_of(np.repeat(np.arange(400) % levels, 5).astype(float))[0] == 1
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_dropouts_within_the_range_of_the_signal_are_outliers_by_their_value(share):
+    """Of 4000 samples with noise none other is zero; a sample whose value is zero is a dropout."""
+    rng, phase = np.random.default_rng(2), np.arange(4000) / 50
+    values = np.cos(2 * np.pi * phase) + 0.01 * rng.standard_normal(phase.size)
+    values[rng.random(phase.size) < share] = 0.0
+    residuals = values - (1.0 - share) * np.cos(2 * np.pi * phase)
+    assert np.array_equal(faults.outliers_of(residuals, phase, values, 0.0), np.flatnonzero(values == 0.0))
+
+
+def test_many_impacts_of_every_period_are_no_outliers():
+    """Twelve peaks of three samples a period, which the mean period does not resolve."""
+    phase = np.arange(33 * 1000) / 1000
+    far = np.isin(np.arange(phase.size) % 1000, np.add.outer(np.arange(12) * 80, np.arange(3)))
+    rng = np.random.default_rng(3)
+    values = -20.0 * far * rng.uniform(0.8, 1.2, phase.size) + 0.05 * rng.standard_normal(phase.size)
+    assert not faults.outliers_of(values, phase, values, 0.0).size
