@@ -214,6 +214,17 @@ def test_faults_outside_of_the_part_used_are_harmless():
     assert "not used" in str(finding)
 
 
+def test_outliers_outside_of_the_part_used_are_listed_and_left_out():
+    envelope = np.clip(TIME / 8, 0, 1)
+    angle, spikes = 0.3 + envelope * (measured() - 0.3), [150, 210, 1500]
+    angle[spikes] = 6.283
+    run = recorded(angle)
+    check = run.check(1.0)
+    assert check.start > TIME[210] and check.bad["angle"]["outliers"].tolist() == spikes
+    assert only(check, "outliers").count == 3
+    assert run.without(outliers=True, frequency=1.0).outputs["angle"].max() < 0.5
+
+
 def test_lost_samples_step_the_phase_by_their_number():
     """At 50 samples a cycle, one lost sample is 7.2°, or 0.02 s; more of them end the part used."""
     longer = np.arange((CYCLES + 1) * RATE) / RATE
