@@ -91,19 +91,33 @@ def _refined(
     time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int, iterations: int = 20
 ) -> tuple[HarmonicFit, np.ndarray, np.ndarray, float]:
     """Return the fit at the least-squares frequency, its clear harmonics, the weights, and the information."""
-    duration, middle = np.ptp(time), time - time.mean()
-    floor = 1e-24 * np.var(channels, axis=1)
     for _ in range(iterations):
-        fit = fit_harmonics(time, channels, frequency, harmonics)
-        clear, weights = _clear(fit), 1.0 / np.maximum(fit.variances, floor)
-        slope = _fourier.at_times(_fourier.derivative(clear, 1.0), frequency * time)
-        slope *= middle
-        information = _information(frequency * time, slope, weights, harmonics)
-        step = float(weights @ np.einsum("ij,ij->i", slope, fit.residuals)) / information
-        if abs(step) < max(1e-3 / np.sqrt(information), np.finfo(float).eps * frequency):
+        fit, clear, weights, gradient, information = normal_equation(time, channels, frequency, harmonics)
+        step = next_step(gradient, information, frequency, float(np.ptp(time)))
+        if not step:
             break
-        frequency += np.clip(step, -0.25 / duration, 0.25 / duration)
+        frequency += step
     return fit, clear, weights, information
+
+
+def next_step(gradient: float, information: float, frequency: float, duration: float) -> float:
+    """Return the Gauss-Newton step of a frequency, 0 where it is small compared with the standard error."""
+    step = gradient / information
+    if abs(step) < max(1e-3 / np.sqrt(information), np.finfo(float).eps * frequency):
+        return 0.0
+    return float(np.clip(step, -0.25 / duration, 0.25 / duration))
+
+
+def normal_equation(
+    time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int
+) -> tuple[HarmonicFit, np.ndarray, np.ndarray, float, float]:
+    """Return the fit at a frequency, its clear harmonics, the weights, and the frequency's gradient and information."""
+    fit = fit_harmonics(time, channels, frequency, harmonics)
+    clear, weights = _clear(fit), 1.0 / np.maximum(fit.variances, 1e-24 * np.var(channels, axis=1))
+    slope = _fourier.at_times(_fourier.derivative(clear, 1.0), frequency * time)
+    slope *= time - time.mean()
+    information = _information(frequency * time, slope, weights, harmonics)
+    return fit, clear, weights, float(weights @ np.einsum("ij,ij->i", slope, fit.residuals)), information
 
 
 def _clear(fit: HarmonicFit) -> np.ndarray:
@@ -122,20 +136,33 @@ def _information(phase: np.ndarray, slope: np.ndarray, weights: np.ndarray, harm
 
 
 def _pace(time: np.ndarray, fit: HarmonicFit, clear: np.ndarray, weights: np.ndarray, information: float) -> Pace:
-    """Return the uncertainty and the drift of a frequency from the phases of single cycles.
-
-    Their deviations from a straight line are expanded in orthonormal polynomials. Order 1 is an error of the frequency,
-    order 2 a linear drift; the mean square of the next ones, K/4 of them for K cycles (4 to 16), measures noise that is
-    slow compared with a cycle (as U. K. Müller, J. Econometrics 141 (2007) 1331-1352, with cosines), and is at least
-    that of independent samples. With less than seven cycles, noise of the amplitude is taken to be as large.
-    """
+    """Return the uncertainty and the drift of a frequency from the phases of single cycles."""
     cycle = np.floor((time - time[0]) * fit.frequency).astype(int)
+    return pace_of(*cycle_scores(time, cycle, int(cycle[-1]) + 1, fit, clear, weights), information)
+
+
+def cycle_scores(
+    time: np.ndarray, cycle: np.ndarray, cycles: int, fit: HarmonicFit, clear: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the gradients of phase and of amplitude in each cycle (cycles,), and the information of one cycle."""
     rate = _fourier.derivative(clear, 1.0)
     turned = (_fourier.at_times(r, fit.frequency * time) * fit.residuals for r in (rate, 1j * rate))
-    score, quadrature = (np.bincount(cycle, weights @ part) for part in turned)
+    score, quadrature = (np.bincount(cycle, weights @ part, cycles) for part in turned)
+    power = time.size * float(weights @ np.sum(np.abs(rate) ** 2, axis=1)) / 2.0 / cycles
+    return score, quadrature, power
+
+
+def pace_of(score: np.ndarray, quadrature: np.ndarray, power: float, information: float) -> Pace:
+    """Return the uncertainty and the drift of a frequency from the gradients of single cycles.
+
+    The deviations of their phases from a straight line are expanded in orthonormal polynomials. Order 1 is an error of
+    the frequency, order 2 a linear drift; the mean square of the next ones, K/4 of them for K cycles (4 to 16),
+    measures noise that is slow compared with a cycle (as U. K. Müller, J. Econometrics 141 (2007) 1331-1352, with
+    cosines), and is at least that of independent samples. With less than seven cycles, noise of the amplitude is taken
+    to be as large.
+    """
     if score.size < MINIMUM_CYCLES:
         return Pace(float(np.sqrt(1.0 / information)), 0, 0.0, False)
-    power = time.size * float(weights @ np.sum(np.abs(rate) ** 2, axis=1)) / 2.0 / score.size
     orders = min(max(score.size // 4, 4), 16, score.size - 3)
     number = np.linspace(-1.0, 1.0, score.size)
     basis = np.linalg.qr(np.polynomial.legendre.legvander(number, orders + 2))[0].T
