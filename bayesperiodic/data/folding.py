@@ -1,7 +1,8 @@
 """Estimation of the mean steady period of sampled signals, and of its uncertainty; division of records of several."""
 
+import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -9,11 +10,11 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, softmax
 
 from bayesperiodic import _checks, _fourier
+from bayesperiodic.data.groups import CommonFit, fit_groups, leading
 from bayesperiodic.data.harmonics import (
     NEGLIGIBLE_PHASE,
     HarmonicFit,
     Pace,
-    fit_harmonics,
     refine_frequency,
     resolved_harmonics,
     track_frequency,
@@ -50,7 +51,7 @@ CORRELATION_TIMES, FLOORS, ZERO_OF_PINK = (0.45, 0.1, 0.05, 0.025), (0.0, 0.01, 
 
 
 def fold_signals(
-    signals: Signals,
+    groups: list[Signals],
     samples: int,
     periods: int,
     frequency: float | None,
@@ -58,96 +59,132 @@ def fold_signals(
     origin: float | str,
     largest_drift: float | None,
 ) -> dict[str, Any]:
-    """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`."""
+    """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`.
+
+    Each group of channels with common times is solved on its own samples, for one frequency and phase.
+    """
     points = samples * periods
     if points > MAXIMUM_POINTS:
         raise ValueError(f"samples: must be at most {MAXIMUM_POINTS // periods} for {periods} periods, got {samples}.")
     if isinstance(origin, str) and origin != CROSSING:
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
-    seen = inspect(replace(signals, time=signals.time - start), periods, frequency, points)
+    seen = inspect([replace(group, time=group.time - start) for group in groups], periods, frequency, points)
     if seen.steady is None or seen.fit is None or seen.sizes is None:
         raise ValueError(seen.reason)
-    fit, pace, limit = seen.fit, seen.pace, seen.limit
-    steady = seen.signals.part(seen.steady.samples)
+    fit, parts, name = seen.fit, seen.parts, groups[0].name
     if frequency is not None:
-        estimated, fit = fit, fit_harmonics(steady.time, steady.values, frequency / periods, limit)
-        _refuse_frequency(estimated, fit, pace, float(np.ptp(steady.time)), periods)
-    drift = dict(zip(signals.channels, _drift(seen.sizes), strict=True))
-    _refuse_drift(signals.name, drift, largest_drift)
-    refuse(signals.name, seen.findings)
-    cycles = round(np.ptp(steady.time) * fit.frequency)
-    _warn(signals.name, pace, cycles, seen)
-    one_cycle, noise = zip(*(_noise(steady, fit, row, cycles) for row in range(len(steady.values))), strict=True)
-    for row, squares in enumerate(seen.steady.squares):
-        order = min(squares.size, noise[row].variance.size)
-        noise[row].variance[:] *= seen.inflation
-        noise[row].variance[:order] += (squares * np.var(seen.signals.values[row]))[:order]
-    significant = [_last_significant(a, part) for a, part in zip(fit.amplitudes, noise, strict=True)]
-    kept = dict(zip(signals.channels, significant, strict=True)) | _chosen(harmonics, signals.channels, limit)
-    amplitudes = fit.amplitudes
+        fit = fit_groups(parts, frequency / periods, seen.limits)
+        _refuse_frequency(seen.fit, fit, seen.pace, float(max(np.ptp(part.time) for part in parts)), periods)
+    drift = dict(zip(seen.channels, _drift(seen.sizes), strict=True))
+    _refuse_drift(name, drift, largest_drift)
+    refuse(name, seen.findings)
+    cycles = round(max(np.ptp(part.time) for part in parts) * fit.frequency)
+    _warn(name, seen.pace, cycles, seen)
+    one_cycle, noise = _noises(seen, fit, cycles)
+    amplitudes, limits, size = _by_channel(seen, fit)
+    kept = {c: _last_significant(a, noise[c]) for c, a in amplitudes.items()} | _chosen(harmonics, limits)
+    inputs = [channel for group in groups for channel in group.channels[: group.inputs]]
+    outputs = [channel for channel in amplitudes if channel not in inputs]
     if origin == CROSSING:
         # The first time ≥ 0 at which the fundamental of the first output crosses zero upwards.
-        phase = np.angle(amplitudes[signals.inputs, 1]) / (2 * np.pi)
+        phase = np.angle(amplitudes[outputs[0]][1]) / (2 * np.pi)
         start = float((-0.25 - phase) % 1.0 / fit.frequency)
-        amplitudes = amplitudes * np.exp(2j * np.pi * fit.frequency * start * np.arange(amplitudes.shape[1]))
-    used = [slice(kept[channel] + 1) for channel in signals.channels]
-
-    def by_channel(values: Iterable[Any]) -> dict[str, Any]:
-        return dict(zip(signals.channels, values, strict=True))
-
-    folded = by_channel(_fourier.on_grid(a[part], points) for a, part in zip(amplitudes, used, strict=True))
-    inputs, outputs = signals.channels[: signals.inputs], signals.channels[signals.inputs :]
+        turn = 2j * np.pi * fit.frequency * start
+        amplitudes = {c: a * np.exp(turn * np.arange(a.size)) for c, a in amplitudes.items()}
+    used = {channel: slice(highest + 1) for channel, highest in kept.items()}
+    folded = {channel: _fourier.on_grid(amplitudes[channel][part], points) for channel, part in used.items()}
     return {
         "frequency": fit.frequency * periods,
-        "frequency_se": pace.se * periods if frequency is None else 0.0,
-        "period_drift": -pace.drift,
+        "frequency_se": seen.pace.se * periods if frequency is None else 0.0,
+        "period_drift": -seen.pace.drift,
         "outputs": {channel: folded[channel] for channel in outputs},
         "inputs": {channel: folded[channel] for channel in inputs},
         "samples": samples,
         "periods": periods,
         "cycles": cycles,
-        "averaged": steady.time.size,
-        "scatter": by_channel(float(np.sqrt(_power(v[part]))) for v, part in zip(one_cycle, used, strict=True)),
-        "independent": {channel: min(2 * kept[channel] + 1, steady.time.size) for channel in outputs},
+        "averaged": min(size.values()),
+        "scatter": {channel: float(np.sqrt(_power(one_cycle[channel][part]))) for channel, part in used.items()},
+        "independent": {channel: min(2 * kept[channel] + 1, size[channel]) for channel in outputs},
         "harmonics": kept,
-        "amplitude_variance": by_channel(v.variance[part] for v, part in zip(noise, used, strict=True)),
-        "amplitude_freedom": by_channel(v.freedom[part] for v, part in zip(noise, used, strict=True)),
-        "error_slopes": _error_slopes(by_channel(noise), inputs, kept),
-        "periodicity": _periodicity(steady, fit),
+        "amplitude_variance": {channel: noise[channel].variance[part] for channel, part in used.items()},
+        "amplitude_freedom": {channel: noise[channel].freedom[part] for channel, part in used.items()},
+        "error_slopes": _error_slopes(noise, inputs, kept),
+        "periodicity": _periodicity(seen, fit),
         "drift": drift,
         "origin": start,
         "findings": seen.findings,
     }
 
 
-def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, pd.DataFrame]":
-    """Return the response period in drive periods, and its evidence, of the signals or else of their later half."""
-    if frequency is None and not signals.inputs:
+def _by_channel(seen: Inspection, fit: CommonFit) -> tuple[dict[str, np.ndarray], dict[str, int], dict[str, int]]:
+    """Return by channel the amplitudes, the highest harmonic that its samples resolve, and their number."""
+    amplitudes, limits, sizes = {}, {}, {}
+    for part, one, limit in zip(seen.parts, fit.each, seen.limits, strict=True):
+        for channel, values in zip(part.channels, one.amplitudes, strict=True):
+            amplitudes[channel], limits[channel], sizes[channel] = values, limit, part.time.size
+    return amplitudes, limits, sizes
+
+
+def _noises(
+    seen: Inspection, fit: CommonFit, cycles: int
+) -> tuple[dict[str, np.ndarray], dict[str, "AmplitudeNoise"]]:
+    """Return by channel the variances of one cycle's amplitudes, and those of the mean with a transient's rest."""
+    one_cycle, noise, row = {}, {}, 0
+    start = seen.parts[0].time[0]
+    for group, part, one, inflation in zip(seen.groups, seen.parts, fit.each, seen.inflation, strict=True):
+        for i, channel in enumerate(part.channels):
+            one_cycle[channel], of_mean = _noise(part, one, i, cycles)
+            squares = seen.steady.squares[row] if seen.steady else np.zeros(0)
+            order = min(squares.size, of_mean.variance.size)
+            of_mean.variance[:] *= inflation
+            of_mean.variance[:order] += (squares * np.var(group.values[i]))[:order]
+            # The phase of the noise beside the harmonics is that at the first sample of the group.
+            turn = 2j * np.pi * fit.frequency * (start - part.time[0]) * np.arange(of_mean.variance.size)
+            noise[channel] = replace(of_mean, beside=of_mean.beside * np.exp(turn))
+            row += 1
+    return one_cycle, noise
+
+
+def automatic_periods(groups: list[Signals], frequency: float | None) -> "tuple[int, pd.DataFrame]":
+    """Return the response period in drive periods, and its evidence, of the signals or else of their later half.
+
+    Of several groups of channels it is the least common multiple, and the evidence is that of the longest one.
+    """
+    first = groups[leading(groups)]
+    if frequency is None and not first.inputs:
         raise ValueError(
-            f"frequency: must be given for periods={AUTO!r}, because {signals.name!r} has no input that shows the "
+            f"frequency: must be given for periods={AUTO!r}, because {first.name!r} has no input that shows the "
             "drive period, got None."
         )
-    drive = first_guess(signals, frequency, 1)
-    refuse_gaps(signals, drive)
-    time, values = signals.time, signals.values
+    drive = first_guess(first, frequency, 1)
+    for group in groups:
+        refuse_gaps(group, drive)
     if frequency is None:
-        driven = values[: signals.inputs]
+        time, driven = first.time, first.values[: first.inputs]
         tracked = track_frequency(time, driven, drive)
         time = even_times(time, driven, tracked)
         drive = refine_frequency(time, driven, tracked, resolved_harmonics(time, tracked, time.size))[0].frequency
-    time = even_times(time, values, drive)
+    each = [_response_period(group, drive) for group in groups]
+    for chosen, evidence in each:
+        if chosen is None:
+            raise aperiodic(first.name, drive, evidence)
+    chosen, evidence = max(each, key=lambda one: one[0] or 0)
+    return math.lcm(*(one or 1 for one, _ in each)), evidence
+
+
+def _response_period(signals: Signals, drive: float) -> "tuple[int | None, pd.DataFrame]":
+    """Return the response period of channels with common times, None if there is none, and its evidence."""
+    time, values = even_times(signals.time, signals.values, drive), signals.values
     chosen, evidence = response_period(time, values, signals.channels, drive)
     later = time >= 0.5 * (time[0] + time[-1])
     if chosen is None and cycles_of(time[later], drive) >= LATER_CYCLES:
         chosen, again = response_period(time[later], values[:, later], signals.channels, drive, LATER_CYCLES)
         evidence = evidence if chosen is None else again
-    if chosen is None:
-        raise aperiodic(signals.name, drive, evidence)
     return chosen, evidence
 
 
-def _refuse_frequency(estimated: HarmonicFit, given: HarmonicFit, pace: Pace, duration: float, periods: int) -> None:
+def _refuse_frequency(estimated: CommonFit, given: CommonFit, pace: Pace, duration: float, periods: int) -> None:
     """Raise a ValueError if the given frequency is not that of the recording."""
     difference = given.frequency - estimated.frequency
     # Few cycles have too few degrees of freedom for a test, but noise of any kind would not shrink so much.
@@ -183,7 +220,7 @@ def _warn(name: str, pace: Pace, cycles: int, seen: Inspection) -> None:
             stacklevel=4,
         )
     elif cycles < total and cycles <= total // 2:
-        last = seen.steady is not None and seen.steady.samples.stop == seen.signals.time.size
+        last = seen.used[0].stop == seen.groups[0].time.size
         which, others = ("the last ", "those before") if last else ("", "the others")
         warnings.warn(
             f"{name}: only {which}{cycles} of {total} cycles are used, because {others} differ from them: a long "
@@ -212,20 +249,21 @@ def _refuse_drift(name: str, drift: Mapping[str, float], largest: float | None) 
         )
 
 
-def _periodicity(signals: Signals, fit: HarmonicFit) -> float:
-    explained = 1.0 - fit.variances / np.var(signals.values, axis=1, ddof=1)
+def _periodicity(seen: Inspection, fit: CommonFit) -> float:
+    total = np.concatenate([np.var(part.values, axis=1, ddof=1) for part in seen.parts])
+    explained, channels, name = 1.0 - fit.variances / total, seen.channels, seen.groups[0].name
     worst = int(np.argmin(explained))
     if not explained[worst] >= MINIMUM_PERIODICITY:
-        good = [c for c, share in zip(signals.channels, explained, strict=True) if share >= CLEARLY_PERIODIC]
+        good = [c for c, share in zip(channels, explained, strict=True) if share >= CLEARLY_PERIODIC]
         cure = "check the frequency and `periods`, and separate records of different frequencies by `split`"
         if good:
             cure = (
-                f"{good[0]!r} is periodic ({explained[signals.channels.index(good[0])]:.1%}): a sensor without a "
-                f"signal, or noise; leave the channel {signals.channels[worst]!r} out"
+                f"{good[0]!r} is periodic ({explained[channels.index(good[0])]:.1%}): a sensor without a "
+                f"signal, or noise; leave the channel {channels[worst]!r} out"
             )
         raise ValueError(
-            f"recording: must be periodic, got {signals.name!r}, whose mean period at {fit.frequency:.6g} Hz explains "
-            f"only {max(explained[worst], 0.0):.1%} of the variance of {signals.channels[worst]!r} (periodicity "
+            f"recording: must be periodic, got {name!r}, whose mean period at {fit.frequency:.6g} Hz explains "
+            f"only {max(explained[worst], 0.0):.1%} of the variance of {channels[worst]!r} (periodicity "
             f"{explained[worst]:.3f}, at least {MINIMUM_PERIODICITY} is needed); {cure}."
         )
     return float(explained[worst])
@@ -376,15 +414,16 @@ def _last_significant(amplitudes: np.ndarray, noise: AmplitudeNoise) -> int:
     return int(np.flatnonzero(significant)[-1]) + 1 if significant.any() else 1
 
 
-def _chosen(harmonics: int | Mapping[str, int] | None, names: tuple[str, ...], limit: int) -> dict[str, int]:
+def _chosen(harmonics: int | Mapping[str, int] | None, limits: Mapping[str, int]) -> dict[str, int]:
     if harmonics is None:
         return {}
-    given = harmonics if isinstance(harmonics, Mapping) else dict.fromkeys(names, harmonics)
+    given = harmonics if isinstance(harmonics, Mapping) else dict.fromkeys(limits, harmonics)
     for channel, count in given.items():
-        _checks.one_of("harmonics", channel, names)
-        if _checks.integer(f"harmonics[{channel!r}]", count, 1) > limit:
+        _checks.one_of("harmonics", channel, limits)
+        if _checks.integer(f"harmonics[{channel!r}]", count, 1) > limits[channel]:
             raise ValueError(
-                f"harmonics[{channel!r}]: must be at most {limit}, which the samples and the grid resolve, got {count}."
+                f"harmonics[{channel!r}]: must be at most {limits[channel]}, which the samples and the grid resolve, "
+                f"got {count}."
             )
     return {channel: int(count) for channel, count in given.items()}
 

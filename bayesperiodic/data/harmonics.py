@@ -109,11 +109,14 @@ def next_step(gradient: float, information: float, frequency: float, duration: f
 
 
 def normal_equation(
-    time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int
+    time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int, counted: np.ndarray | float = 1.0
 ) -> tuple[HarmonicFit, np.ndarray, np.ndarray, float, float]:
-    """Return the fit at a frequency, its clear harmonics, the weights, and the frequency's gradient and information."""
+    """Return the fit at a frequency, its clear harmonics, the weights, and the frequency's gradient and information.
+
+    Weights are zero for channels that are not `counted` (1 or 0).
+    """
     fit = fit_harmonics(time, channels, frequency, harmonics)
-    clear, weights = _clear(fit), 1.0 / np.maximum(fit.variances, 1e-24 * np.var(channels, axis=1))
+    clear, weights = _clear(fit), counted / np.maximum(fit.variances, 1e-24 * np.var(channels, axis=1))
     slope = _fourier.at_times(_fourier.derivative(clear, 1.0), frequency * time)
     slope *= time - time.mean()
     information = _information(frequency * time, slope, weights, harmonics)

@@ -1,19 +1,18 @@
 """Inspection of signals: their faults, their steady part and its mean period; what `check` and `fold` both do."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from bayesperiodic import _fourier
 from bayesperiodic.data.faults import ChannelFaults, dropped_value, jumps, outliers_of
+from bayesperiodic.data.groups import CommonFit, Windowed, common_span, common_windows, leading, refine_groups
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
-    HarmonicFit,
     Pace,
     determined_harmonics,
     fit_harmonics,
-    refine_frequency,
     resolved_harmonics,
 )
 from bayesperiodic.data.recording_check import (
@@ -29,7 +28,7 @@ from bayesperiodic.data.recording_check import (
     signal_faults,
 )
 from bayesperiodic.data.signals import USUAL_STEPS, Signals, cycles_of, first_guess, refuse_gaps, tracked_frequency
-from bayesperiodic.data.steadiness import Steady, Windows, steady_part, windows
+from bayesperiodic.data.steadiness import Steady, Windows, steady_part
 
 # Largest relative change of an amplitude within half of a steady part.
 LARGEST_CHANGE = 0.1
@@ -41,92 +40,166 @@ ROUGH_HARMONICS = 40
 
 @dataclass(frozen=True)
 class Inspection:
-    """Faults, steady part and mean period of signals."""
+    """Faults, steady part and mean period of signals, in groups of channels that have common times."""
 
-    signals: Signals
-    faults: list[ChannelFaults]
+    groups: list[Signals]
+    faults: list[list[ChannelFaults]]  # by group
     findings: tuple[Finding, ...]
     total: int = 0  # whole cycles
-    steady: Steady | None = None
+    steady: Steady | None = None  # of all groups; its samples are those of the first
+    used: list[slice] = field(default_factory=list)  # samples of each group in the steady part
     sizes: np.ndarray | None = None  # (windows, channels), of the strongest harmonics in windows that do not overlap
-    fit: HarmonicFit | None = None  # of the steady part, at the estimated frequency
+    fit: CommonFit | None = None  # of the steady part, at the estimated frequency
     pace: Pace = Pace(0.0, 0, 0.0, False)
-    limit: int = 0  # of the harmonics
-    inflation: np.ndarray = field(default_factory=lambda: np.ones(1))  # of their variances by missing phases
+    limits: list[int] = field(default_factory=list)  # of the harmonics of each group
+    inflation: list[np.ndarray] = field(default_factory=list)  # of their variances by missing phases
     reason: str = ""  # why there is no steady part or no mean period
 
+    @property
+    def channels(self) -> list[str]:
+        """Names of the channels, group by group."""
+        return [channel for group in self.groups for channel in group.channels]
 
-def inspect(signals: Signals, periods: int, frequency: float | None, points: int) -> Inspection:
-    """Return what signals are like; without a steady part or a mean period, the reason."""
-    faults = [signal_faults(values, drive=i < signals.inputs) for i, values in enumerate(signals.values)]
+    @property
+    def parts(self) -> list[Signals]:
+        """The steady part of each group."""
+        return [group.part(used) for group, used in zip(self.groups, self.used, strict=True)]
 
-    def findings(rate: float | None, limit: int = 0, used: slice = slice(0, signals.time.size)) -> list[Finding]:
-        rows = zip(signals.channels, signals.values, faults, strict=True)
-        every = [f for c, v, fault in rows for f in sample_findings(c, signals.time, v, fault, rate, limit, used)]
-        return every + [*clock_findings(signals.time)]
+
+def inspect(
+    groups: list[Signals], periods: int, frequency: float | None, points: int, other: Iterable[str] = ()
+) -> Inspection:
+    """Return what signals are like; without a steady part or a mean period, the reason.
+
+    Channels of `other` clocks, whose times were corrected, tell nothing about the frequency.
+    """
+    faults = [[signal_faults(v, drive=i < group.inputs) for i, v in enumerate(group.values)] for group in groups]
+
+    def findings(rate: float | None, limits: Iterable[int] = (), used: Iterable[slice] = ()) -> list[Finding]:
+        limits, used = [*limits] or [0] * len(groups), [*used] or [slice(0, group.time.size) for group in groups]
+        every: list[Finding] = []
+        for group, fault, limit, part in zip(groups, faults, limits, used, strict=True):
+            for c, v, f in zip(group.channels, group.values, fault, strict=True):
+                every += sample_findings(c, group.time, v, f, rate, limit, part)
+        return every + _gaps(groups)
 
     def worst_first(some: list[Finding]) -> tuple[Finding, ...]:
         return tuple(sorted(some, key=lambda finding: -SEVERITIES.index(finding.severity)))
 
-    if any(fault.wrap for fault in faults):
+    name = groups[0].name
+    if any(fault.wrap for group in faults for fault in group):
         wraps = worst_first(findings(None))
-        return Inspection(signals, faults, wraps, reason=_wrapped(signals.name, wraps))
-    moving = np.ones(signals.time.size, dtype=bool)
-    for stuck in [part for fault in faults for part in fault.stuck]:
-        moving[stuck] = False
+        return Inspection(groups, faults, wraps, reason=_wrapped(name, wraps))
+    moving = [_moving(group, fault) for group, fault in zip(groups, faults, strict=True)]
     try:
-        if not signals.channels:
-            raise ValueError(f"recording: must have a channel that varies, got {signals.name!r} without one.")
-        if np.count_nonzero(moving) < LEAST_MOVING * moving.size:
-            raise ValueError(_still(signals, faults))
-        calm = replace(signals, values=bounded(signals.values)).part(np.flatnonzero(moving))
-        fundamental = first_guess(calm, frequency, periods)
-        refuse_gaps(signals, fundamental)
-        tracked = tracked_frequency(calm, fundamental, frequency is not None)
+        if not any(group.channels for group in groups):
+            raise ValueError(f"recording: must have a channel that varies, got {name!r} without one.")
+        for group, fault, these in zip(groups, faults, moving, strict=True):
+            if these.size < LEAST_MOVING * group.time.size:
+                raise ValueError(_still(group, fault))
+        calm = [
+            replace(group, values=bounded(group.values)).part(these)
+            for group, these in zip(groups, moving, strict=True)
+        ]
+        first = calm[leading(groups)]
+        fundamental = first_guess(first, frequency, periods)
+        for group in groups:
+            refuse_gaps(group, fundamental)
+        tracked = tracked_frequency(first, fundamental, frequency is not None)
+        span = common_span(groups, tracked)
     except ValueError as error:
-        return Inspection(signals, faults, worst_first(findings(None)), reason=str(error))
-    total = int(cycles_of(signals.time, tracked))
-    sound = _sound(signals, calm, faults, np.flatnonzero(moving), tracked, points)
-    some = signals if sound.size == signals.time.size else signals.part(sound)
+        return Inspection(groups, faults, worst_first(findings(None)), reason=str(error))
+    total = int(min(cycles_of(group.time[part], tracked) for group, part in zip(groups, span, strict=True)))
+    sound = [_sound(*each, tracked, points) for each in zip(groups, calm, faults, moving, strict=True)]
+    whole = all(these.size == group.time.size for these, group in zip(sound, groups, strict=True))
+    sound = [these[(these >= part.start) & (these < part.stop)] for these, part in zip(sound, span, strict=True)]
+    some = [
+        group if these.size == group.time.size else group.part(these)
+        for group, these in zip(groups, sound, strict=True)
+    ]
     refined = frequency is None
-    every, steady, tracked = _steady_of(some, tracked, points, refined, refined and some is not signals)
+    every, steady, tracked = _steady_of(some, tracked, points, refined, refined and not whole, other)
     if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
-        return Inspection(signals, faults, worst_first(findings(tracked)), total, reason=_unsteady(signals, every))
-    steady = steady.among(sound)
-    used = signals.part(steady.samples)
-    limit, inflation = determined_harmonics(used.time, tracked, resolved_harmonics(used.time, tracked, points))
-    fit, pace = refine_frequency(used.time, used.values, tracked, limit)
-    residuals = fit.residuals
-    here = sound[(sound >= steady.samples.start) & (sound < steady.samples.stop)]
-    if here.size < used.time.size:
-        near = fit_harmonics(signals.time[here], signals.values[:, here], tracked, limit).amplitudes
-        residuals = used.values - _fourier.at_times(near, tracked * used.time)
-    for fault, rest, values in zip(faults, residuals, used.values, strict=True):
-        inside = outliers_of(rest, used.time * fit.frequency, values, fault.step) + steady.samples.start
-        before, after = (fault.outliers < steady.samples.start), (fault.outliers >= steady.samples.stop)
-        fault.outliers = np.concatenate([fault.outliers[before], inside[moving[inside]], fault.outliers[after]])
-    seen = findings(fit.frequency, limit, steady.samples)
-    seen += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
+        return Inspection(groups, faults, worst_first(findings(tracked)), total, reason=_unsteady(groups, every.all))
+    used = [
+        slice(int(these[part.start]), int(these[part.stop - 1]) + 1)
+        for these, part in zip(sound, every.samples(steady.part), strict=True)
+    ]
+    steady = steady.among(sound[0])
+    parts = [group.part(part) for group, part in zip(groups, used, strict=True)]
+    determined = [
+        determined_harmonics(part.time, tracked, resolved_harmonics(part.time, tracked, points)) for part in parts
+    ]
+    limits, inflation = [limit for limit, _ in determined], [factors for _, factors in determined]
+    fit, pace = refine_groups(parts, tracked, limits, other)
+    for i, (group, part) in enumerate(zip(groups, used, strict=True)):
+        residuals = fit.each[i].residuals
+        here = sound[i][(sound[i] >= part.start) & (sound[i] < part.stop)]
+        if here.size < parts[i].time.size:
+            near = fit_harmonics(group.time[here], group.values[:, here], tracked, limits[i]).amplitudes
+            residuals = parts[i].values - _fourier.at_times(near, tracked * parts[i].time)
+        _set_outliers(faults[i], parts[i], residuals, fit.frequency, part, moving[i])
+    seen = findings(fit.frequency, limits, used)
+    channels = [channel for group in groups for channel in group.channels]
+    seen += cycle_findings(channels, groups[0].time, steady, fit.frequency, total)
     return Inspection(
-        signals, faults, worst_first(seen), total, steady, every.apart().sizes, fit, pace, limit, inflation
+        groups, faults, worst_first(seen), total, steady, used, every.all.apart().sizes, fit, pace, limits, inflation
     )
 
 
+def _moving(group: Signals, faults: list[ChannelFaults]) -> np.ndarray:
+    """Return the numbers of the samples at which no channel is stuck."""
+    moving = np.ones(group.time.size, dtype=bool)
+    for stuck in [part for fault in faults for part in fault.stuck]:
+        moving[stuck] = False
+    return np.flatnonzero(moving)
+
+
+def _gaps(groups: list[Signals]) -> list[Finding]:
+    """Return the gaps of the time axes, of several by channel."""
+    if len(groups) == 1:
+        return [*clock_findings(groups[0].time)]
+    return [
+        replace(finding, channel=channel, text=f"{channel}: {finding.text}")
+        for group in groups
+        for finding in clock_findings(group.time)
+        for channel in group.channels
+    ]
+
+
+def _set_outliers(
+    faults: list[ChannelFaults],
+    part: Signals,
+    residuals: np.ndarray,
+    frequency: float,
+    used: slice,
+    moving: np.ndarray,
+) -> None:
+    """Set the outliers of each channel in the part used by residuals there, and keep those outside of it."""
+    still = np.ones(used.stop, dtype=bool)
+    still[moving[moving < used.stop]] = False
+    for fault, rest, values in zip(faults, residuals, part.values, strict=True):
+        inside = outliers_of(rest, part.time * frequency, values, fault.step) + used.start
+        before, after = (fault.outliers < used.start), (fault.outliers >= used.stop)
+        fault.outliers = np.concatenate([fault.outliers[before], inside[~still[inside]], fault.outliers[after]])
+
+
 def _steady_of(
-    some: Signals, tracked: float, points: int, refined: bool, first: bool
-) -> tuple[Windows, Steady | None, float]:
+    some: list[Signals], tracked: float, points: int, refined: bool, first: bool, other: Iterable[str]
+) -> tuple[Windowed, Steady | None, float]:
     """Return the windows, the steady part and the frequency, which is refined for a part, and `first` for all."""
-    few = min(ROUGH_HARMONICS, resolved_harmonics(some.time, tracked, points))
+    few = [min(ROUGH_HARMONICS, resolved_harmonics(group.time, tracked, points)) for group in some]
     if first:
-        tracked = refine_frequency(some.time, some.values, tracked, few)[0].frequency
-    every = windows(some.time, some.values, tracked)
-    steady = steady_part(every)
-    if steady is not None and refined and steady.level != (0, some.time.size):
+        tracked = refine_groups(some, tracked, few, other)[0].frequency
+    every = common_windows(some, tracked)
+    steady = steady_part(every.all)
+    if steady is not None and refined and steady.level != (0, some[0].time.size):
         # The frequency of a part that ramps is not that of the steady one.
-        part = some.part(steady.samples)
-        tracked = refine_frequency(part.time, part.values, tracked, few)[0].frequency
-        every = windows(some.time, some.values, tracked)
-        steady = steady_part(every)
+        used = every.samples(steady.part)
+        parts = [group.part(part) for group, part in zip(some, used, strict=True)]
+        tracked = refine_groups(parts, tracked, few, other)[0].frequency
+        every = common_windows(some, tracked)
+        steady = steady_part(every.all)
     return every, steady, tracked
 
 
@@ -158,68 +231,70 @@ def _sound(
     return np.setdiff1d(moving, np.concatenate([fault.outliers for fault in faults]))
 
 
-def _unsteady(signals: Signals, every: Windows) -> str:
+def _unsteady(groups: list[Signals], every: Windows) -> str:
+    name = groups[0].name
     if not every.first.size:
         return (
-            f"recording: must have samples in all parts of its periods, got {signals.name!r}, which has too few; check "
+            f"recording: must have samples in all parts of its periods, got {name!r}, which has too few; check "
             "the frequency and the gaps, or fold a part by `between` or `split`."
         )
     size = every.sizes
     worst = int(np.argmax(np.ptp(size, axis=0) / size.mean(axis=0)))
     low, high = size[:, worst].min(), size[:, worst].max()
+    channel = [channel for group in groups for channel in group.channels][worst]
     return (
-        f"recording: must have a steady part of {MINIMUM_CYCLES} cycles, got {signals.name!r}, in which the amplitude "
-        f"of {signals.channels[worst]!r} changes throughout, from {low / high:.0%} of its largest value on; record at "
+        f"recording: must have a steady part of {MINIMUM_CYCLES} cycles, got {name!r}, in which the amplitude "
+        f"of {channel!r} changes throughout, from {low / high:.0%} of its largest value on; record at "
         "a constant amplitude, or select a part by `between`."
     )
 
 
-def summary(name: str, seen: Inspection, still: Mapping[str, float]) -> RecordingCheck:
+def summary(name: str, channels: Iterable[str], seen: Inspection, still: Mapping[str, float]) -> RecordingCheck:
     """Return what was seen, and channels with one value, as the result of `Recording.check`."""
     import pandas as pd
 
-    time, part = seen.signals.time, seen.steady
-    bad = {
-        channel: {
-            "outliers": fault.outliers,
-            "stuck": np.concatenate([fault.held, *(np.arange(s.start, s.stop) for s in fault.stuck)]),
-            "clipped": np.concatenate([fault.low, fault.high]),
-        }
-        for channel, fault in zip(seen.signals.channels, seen.faults, strict=True)
-    }
+    bad: dict[str, dict[str, np.ndarray]] = {}
+    rows: dict[str, dict[str, float]] = {}
     named = {(f.channel, "stuck" if f.kind == "held" else f.kind) for f in seen.findings}
-    bad = {c: {kind: v if (c, kind) in named else v[:0] for kind, v in each.items()} for c, each in bad.items()}
-    rows = [
-        {
-            "lowest": values.min(),
-            "highest": values.max(),
-            "resolution": fault.step,
-            "bits": np.log2(np.ptp(values) / fault.step + 1.0) if fault.step else np.nan,
-            **{kind: places.size for kind, places in bad[channel].items()},
-            "wraps": fault.wraps.size,
-        }
-        for channel, values, fault in zip(seen.signals.channels, seen.signals.values, seen.faults, strict=True)
-    ]
-    every, share = np.array([[time[0], time[-1]]]), 1.0
+    for group, faults in zip(seen.groups, seen.faults, strict=True):
+        for channel, values, fault in zip(group.channels, group.values, faults, strict=True):
+            places = {
+                "outliers": fault.outliers,
+                "stuck": np.concatenate([fault.held, *(np.arange(s.start, s.stop) for s in fault.stuck)]),
+                "clipped": np.concatenate([fault.low, fault.high]),
+            }
+            bad[channel] = {kind: v if (channel, kind) in named else v[:0] for kind, v in places.items()}
+            rows[channel] = {
+                "lowest": values.min(),
+                "highest": values.max(),
+                "resolution": fault.step,
+                "bits": np.log2(np.ptp(values) / fault.step + 1.0) if fault.step else np.nan,
+                **{kind: v.size for kind, v in bad[channel].items()},
+                "wraps": fault.wraps.size,
+            }
+    times = [group.time for group in seen.groups]
+    every = np.array([[min(time[0] for time in times), max(time[-1] for time in times)]])
     constant = [
         Finding(
-            "constant", channel, RUINOUS, every, time.size, share, np.nan,
+            "constant", channel, RUINOUS, every, max(time.size for time in times), 1.0, np.nan,
             f"{channel} is constant at {value:.6g}", "leave the channel out",
         )
         for channel, value in still.items()
     ]  # fmt: skip
-    step = np.diff(time)
-    step = step[step <= USUAL_STEPS * np.median(step)]
+    used = [time[part] for time, part in zip(times, seen.used, strict=False)]
+    steps = [np.diff(time) for time in times]
+    steps = [step[step <= USUAL_STEPS * np.median(step)] for step in steps]
+    order = [channel for channel in channels if channel in rows]
     return RecordingCheck(
         name,
-        pd.DataFrame(rows, index=[*seen.signals.channels]),
+        pd.DataFrame([rows[channel] for channel in order], index=order),
         (*constant, *seen.findings),
         seen.fit.frequency if seen.fit else np.nan,
-        round(np.ptp(time[part.samples]) * seen.fit.frequency) if part and seen.fit else 0,
+        round(np.ptp(used[0]) * seen.fit.frequency) if seen.fit else 0,
         seen.total,
-        float(time[part.samples.start]) if part else float(time[0]),
-        float(time[part.samples.stop - 1]) if part else float(time[-1]),
-        float(step.std() / np.median(step)),
+        float(min(time[0] for time in used or times)),
+        float(max(time[-1] for time in used or times)),
+        float(max(step.std() / np.median(step) for step in steps)),
         bad,
         seen.reason,
     )

@@ -340,8 +340,8 @@ class Recording(Result):
         still = {c: v[0] for c, v in (self.inputs | self.outputs).items() if np.ptp(v) == 0.0}
         signals = self._signals(without=still)
         with one_thread():
-            seen = inspect(signals, _checks.integer("periods", periods, 1), frequency, self.time.size)
-        return summary(self.name, seen, still)
+            seen = inspect([signals], _checks.integer("periods", periods, 1), frequency, self.time.size)
+        return summary(self.name, self.inputs | self.outputs, seen, still)
 
     def steady(self, frequency: float | None = None, *, periods: int = 1) -> "Recording":
         """Return the steady part that `fold` uses, as `check` finds it.
@@ -578,10 +578,10 @@ class Recording(Result):
         signals, evidence = self._signals(), None
         try:
             if periods == AUTO:
-                periods, evidence = automatic_periods(signals, frequency)
+                periods, evidence = automatic_periods([signals], frequency)
             periods = _checks.integer("periods", periods, 1)
             with one_thread():
-                folded = fold_signals(signals, samples, periods, frequency, harmonics, origin, largest_drift)
+                folded = fold_signals([signals], samples, periods, frequency, harmonics, origin, largest_drift)
         except np.linalg.LinAlgError:
             raise ValueError(
                 f"recording: must have samples in all parts of its periods, got {self.name!r}, which has too few; "

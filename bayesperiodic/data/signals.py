@@ -1,13 +1,13 @@
 """Sampled signals, their fundamental frequency, and the parts of a record of several."""
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
-    HarmonicFit,
     fit_harmonics,
     guess_frequency,
     resolved_harmonics,
@@ -23,6 +23,15 @@ HYSTERESIS = 0.25
 SMALLEST_PERIOD_STEP, SIGNIFICANT_PERIOD_STEP = 1e-3, 8.0
 # Difference of two phases [cycles] at the ends of a recording that selects other cycles.
 OTHER_CYCLES = 0.05
+
+
+class Fit(Protocol):
+    """A Fourier series fitted to several channels."""
+
+    @property
+    def variances(self) -> np.ndarray:
+        """Residual variance of each channel, (channels,)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -118,7 +127,7 @@ def tracked_frequency(signals: Signals, fundamental: float, given: bool) -> floa
     return tracked
 
 
-def explains_more(fit: HarmonicFit, other: HarmonicFit) -> bool:
+def explains_more(fit: Fit, other: Fit) -> bool:
     """Return whether a fit leaves less than another one, over all channels."""
     return bool(np.sum(np.log(fit.variances / other.variances)) < 0.0)
 

@@ -146,7 +146,7 @@ def test_every_field_of_a_folded_response_of_two_forcing_periods():
         + 0.05 * generator.standard_normal(u.size)
     )
     given = Signals("record", time, ("u", "y"), np.array([u, y]), 1)
-    found = folding.fold_signals(given, 20, 2, 2.5, {"y": 3}, 1.0, None)
+    found = folding.fold_signals([given], 20, 2, 2.5, {"y": 3}, 1.0, None)
     basis = design(1.25 * (time - 1.0), 3)
     fitted = np.linalg.lstsq(basis, np.array([u, y]).T, rcond=None)[0].T
     grid = design(np.arange(40) / 40, 3)
@@ -167,7 +167,7 @@ def test_every_field_of_a_folded_response_of_two_forcing_periods():
     size = np.abs(own[:, 1])
     slope = np.polyfit(np.arange(cycles), size, 1)[0] * cycles / size.mean()
     assert found["drift"]["y"] == pytest.approx(slope, rel=0.05)
-    estimated = folding.fold_signals(given, 20, 2, None, None, "crossing", None)
+    estimated = folding.fold_signals([given], 20, 2, None, None, "crossing", None)
     assert estimated["frequency"] == pytest.approx(2.5, rel=1e-3) and estimated["frequency_se"] > 0.0
     # Response and phase at the upward crossing of its fundamental: −π/2, the first after time 0.
     start = (-0.25 - 0.4 / (2 * np.pi)) % 1.0 / 1.25
@@ -198,4 +198,4 @@ def test_arguments_of_a_fold_are_checked(changes, message):
     y = (1.0 + 0.001 * time) * np.cos(2 * np.pi * 1.25 * time)
     given = {"samples": 20, "periods": 2, "frequency": 2.5, "harmonics": None, "origin": 0.0, "largest_drift": None}
     with pytest.raises(ValueError, match=message):
-        folding.fold_signals(Signals("record", time, ("y",), y[None], 0), **(given | changes))
+        folding.fold_signals([Signals("record", time, ("y",), y[None], 0)], **(given | changes))
