@@ -126,9 +126,7 @@ def _by_channel(seen: Inspection, fit: CommonFit) -> tuple[dict[str, np.ndarray]
     return amplitudes, limits, sizes
 
 
-def _noises(
-    seen: Inspection, fit: CommonFit, cycles: int
-) -> tuple[dict[str, np.ndarray], dict[str, "AmplitudeNoise"]]:
+def _noises(seen: Inspection, fit: CommonFit, cycles: int) -> tuple[dict[str, np.ndarray], dict[str, "AmplitudeNoise"]]:
     """Return by channel the variances of one cycle's amplitudes, and those of the mean with a transient's rest."""
     one_cycle, noise, row = {}, {}, 0
     start = seen.parts[0].time[0]

@@ -141,7 +141,8 @@ def inspect(
         _set_outliers(faults[i], parts[i], residuals, fit.frequency, part, moving[i])
     seen = findings(fit.frequency, limits, used)
     channels = [channel for group in groups for channel in group.channels]
-    seen += cycle_findings(channels, groups[0].time, steady, fit.frequency, total)
+    ends = (max(group.time[0] for group in groups), min(group.time[-1] for group in groups))
+    seen += cycle_findings(channels, groups[0].time, steady, fit.frequency, total, ends)
     return Inspection(
         groups, faults, worst_first(seen), total, steady, used, every.all.apart().sizes, fit, pace, limits, inflation
     )

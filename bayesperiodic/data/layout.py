@@ -18,6 +18,8 @@ LONGEST_INTERPOLATION = 3
 # Key of the times of a file without a column of times.
 NO_COLUMN = "\0"
 
+Times = np.ndarray | dict[str, np.ndarray]
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -60,44 +62,65 @@ class Layout:
         argument = f"time (column {self.time!r} of {self.file})"
         return {**columns, self.time: _checks.real_array(argument, seconds(argument, times))}
 
-    def signals(
-        self, columns: Mapping[str, np.ndarray]
-    ) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return time, outputs and inputs, without missing samples, from columns of numbers."""
+    def signals(self, columns: Mapping[str, np.ndarray]) -> tuple[Times, dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Return times, outputs and inputs, without missing samples, from columns of numbers."""
         if not self.time:
             rows = max((values.size for values in columns.values()), default=0)
             columns = {**columns, NO_COLUMN: np.arange(rows) / _checks.positive("sampling_rate", self.sampling_rate)}
-        sources = [("time", self.time or NO_COLUMN), *self.outputs.items(), *self.inputs.items()]
-        labels = [f"{key} (column {column!r} of {self.file})" for key, column in sources]
-        given = {label: columns[column] for label, (_, column) in zip(labels, sources, strict=True)}
-        present = without_missing(given, self.missing)
-        values = []
-        for label, (key, _) in zip(labels, sources, strict=True):
-            vector = _checks.measured_vector(label, present[label])
-            values.append(convert(key, vector, self.units[key]) if key in self.units else vector)
-        first = 1 + len(self.outputs)
-        outputs = dict(zip(self.outputs, values[1:first], strict=True))
-        return values[0], outputs, dict(zip(self.inputs, values[first:], strict=True))
+
+        def label(key: str, column: str) -> str:
+            return f"{key} (column {column!r} of {self.file})"
+
+        def converted(argument: str, key: str, values: np.ndarray) -> np.ndarray:
+            vector = _checks.measured_vector(argument, values)
+            return convert(key, vector, self.units[key]) if key in self.units else vector
+
+        sources = {**self.outputs, **self.inputs}
+        at = label("time", self.time or NO_COLUMN)
+        given = {label(key, column): columns[column] for key, column in sources.items()}
+        times, present = without_missing(at, columns[self.time or NO_COLUMN], given, self.missing)
+        if isinstance(times, dict):
+            timed = {key: converted(at, "time", time) for key, time in zip(sources, times.values(), strict=True)}
+        else:
+            timed = converted(at, "time", times)
+        values = {
+            key: converted(argument, key, vector)
+            for key, (argument, vector) in zip(sources, present.items(), strict=True)
+        }
+        return timed, {key: values[key] for key in self.outputs}, {key: values[key] for key in self.inputs}
 
 
-def without_missing(arrays: Mapping[str, np.ndarray], missing: str | None) -> dict[str, np.ndarray]:
-    """Return arrays of numbers, of which the first is the time, without NaN; by default NaN is refused."""
+def without_missing(
+    argument: str, time: Any, channels: Mapping[str, np.ndarray], missing: str | None
+) -> tuple[Times, dict[str, np.ndarray]]:
+    """Return times and values of channels without NaN, by default refused; the times by channel if they differ.
+
+    `time` is an array, or a mapping with the keys of `channels`.
+    """
     if missing is not None:
         _checks.one_of("missing", missing, (DROP, INTERPOLATE))
-    for argument, values in arrays.items():
+    times = (
+        {f"{argument}[{key!r}]": values for key, values in time.items()} if isinstance(time, dict) else {argument: time}
+    )
+    for name, values in {**times, **channels}.items():
         if missing is None and values.ndim == 1 and (lost := np.flatnonzero(np.isnan(values))).size:
             raise ValueError(
-                f"{argument}: must be finite, got nan at index {lost[0]} ({lost.size} of {values.size} values are NaN "
+                f"{name}: must be finite, got nan at index {lost[0]} ({lost.size} of {values.size} values are NaN "
                 f"or masked); missing={DROP!r} leaves such samples out, missing={INTERPOLATE!r} fills in single values."
             )
-    result = dict(arrays)
-    if missing is None or len({values.shape for values in arrays.values()}) > 1:  # shapes are checked by `Recording`
-        return result
+    each = time if isinstance(time, dict) else dict.fromkeys(channels, time)
+    if missing is None or any(each[key].shape != values.shape for key, values in channels.items()):
+        return time, dict(channels)  # shapes are checked by `Recording`
     if missing == INTERPOLATE:
-        time = next(iter(arrays.values()))
-        result |= {name: _interpolated(name, time, values) for name, values in [*arrays.items()][1:]}
-    keep = ~np.any([np.isnan(values) for values in result.values()], axis=0)
-    return {name: values[keep] for name, values in result.items()}
+        channels = {key: _interpolated(key, each[key], values) for key, values in channels.items()}
+    keep = {key: ~(np.isnan(each[key]) | np.isnan(values)) for key, values in channels.items()}
+    if missing == INTERPOLATE and not isinstance(time, dict):  # of the ends, in all channels
+        keep = dict.fromkeys(keep, np.all([*keep.values()], axis=0))
+    kept = {key: values[keep[key]] for key, values in channels.items()}
+    first = next(iter(keep.values()), None)
+    if not isinstance(time, dict) and all(np.array_equal(first, mask) for mask in keep.values()):
+        return (time if first is None else time[first]), kept
+    return {key: each[key][keep[key]] for key in channels}, kept
 
 
 def _interpolated(argument: str, time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -109,6 +132,44 @@ def _interpolated(argument: str, time: np.ndarray, values: np.ndarray) -> np.nda
             f"{LONGEST_INTERPOLATION} successive values, and {longest} are missing."
         )
     return np.interp(time, time[known], values[known], left=np.nan, right=np.nan) if known.size else values
+
+
+def reader(name: str, form: Format, source: str, columns: str, refused: str) -> Any:
+    """Return a class method of this name that reads a format as `Recording.from_csv` reads its own."""
+
+    def read(
+        cls: Any, path: str | Path, *, outputs: Mapping[str, str], inputs: Mapping[str, str] | None = None,
+        time: str | None = None, sampling_rate: float | None = None, units: Units | None = None,
+        missing: str | None = None, split: str | None = None, name: str | None = None,
+    ) -> Any:  # fmt: skip
+        layout = Layout(Path(path).name, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
+        return recordings(cls, form, path, name, split, layout)
+
+    read.__name__, read.__qualname__ = name, f"Recording.{name}"
+    read.__annotations__["return"] = "Recording | list[Recording]"
+    read.__doc__ = f"""Read a recording from the {source}.
+
+        Parameters
+        ----------
+        path, outputs, inputs, time, sampling_rate, units, missing, split, name
+            As for `from_csv`, with {columns} in place of columns.
+
+        Returns
+        -------
+        Recording, or list of Recording with `split`
+
+        Raises
+        ------
+        FileNotFoundError, ValueError
+            As for `from_csv`, and {refused}.
+        """
+    return classmethod(read)
+
+
+def recordings(cls: Any, form: Format, path: str | Path, name: str | None, split: str | None, meaning: Layout) -> Any:
+    """Return the recording in a file; with `split`, one for each part in which this column is constant."""
+    parts = [cls(*part) for part in read(form, path, name, split, meaning)]
+    return parts[0] if split is None else parts
 
 
 def read(

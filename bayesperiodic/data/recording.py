@@ -1,6 +1,6 @@
 """Recordings: measured signals over time."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, overload
@@ -9,59 +9,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesperiodic import _checks
-from bayesperiodic._io import Result
 from bayesperiodic._linalg import one_thread
+from bayesperiodic.data.channels import Channels
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.data.files import CSV, MAT, NPZ, Format
+from bayesperiodic.data.files import CSV, MAT, NPZ
 from bayesperiodic.data.folding import AUTO, automatic_periods, fold_signals
 from bayesperiodic.data.inspection import inspect, summary
-from bayesperiodic.data.layout import Layout, read, without_missing
+from bayesperiodic.data.layout import Layout, reader, recordings, without_missing
 from bayesperiodic.data.recording_check import RecordingCheck
-from bayesperiodic.data.signals import Signals, parts
-from bayesperiodic.data.times import seconds
+from bayesperiodic.data.signals import parts
+from bayesperiodic.data.times import channel_seconds, seconds
 from bayesperiodic.data.units import Units
 
 
-def _read(
-    form: Format, path: str | Path, name: str | None, split: str | None, layout: tuple[Any, ...]
-) -> "Recording | list[Recording]":
-    """Return the recording in a file; with `split`, one for each part in which this column is constant."""
-    recordings = [Recording(*part) for part in read(form, path, name, split, Layout(Path(path).name, *layout))]
-    return recordings[0] if split is None else recordings
-
-
-def _reader(name: str, form: Format, source: str, columns: str, refused: str) -> Any:
-    """Return a class method of this name that reads a format as `Recording.from_csv` reads its own."""
-
-    def read(
-        cls: type, path: str | Path, *, outputs: Mapping[str, str], inputs: Mapping[str, str] | None = None,
-        time: str | None = None, sampling_rate: float | None = None, units: Units | None = None,
-        missing: str | None = None, split: str | None = None, name: str | None = None,
-    ) -> "Recording | list[Recording]":  # fmt: skip
-        return _read(form, path, name, split, (outputs, inputs or {}, time, sampling_rate, units or {}, missing))
-
-    read.__name__, read.__qualname__ = name, f"Recording.{name}"
-    read.__doc__ = f"""Read a recording from the {source}.
-
-        Parameters
-        ----------
-        path, outputs, inputs, time, sampling_rate, units, missing, split, name
-            As for `from_csv`, with {columns} in place of columns.
-
-        Returns
-        -------
-        Recording, or list of Recording with `split`
-
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            As for `from_csv`, and {refused}.
-        """
-    return classmethod(read)
-
-
-@dataclass(frozen=True)
-class Recording(Result):
+@dataclass(frozen=True, repr=False)
+class Recording(Channels):
     """Signals measured at the same times.
 
     Attributes
@@ -90,39 +52,6 @@ class Recording(Result):
     >>> print(f"{experiment.cycles} cycles at {experiment.frequency:.6f} Hz")
     78 cycles at 1.300000 Hz
     """
-
-    time: np.ndarray
-    outputs: dict[str, np.ndarray]
-    inputs: dict[str, np.ndarray]
-    name: str = "recording"
-    synthetic: bool = False
-
-    def __post_init__(self) -> None:
-        _checks.text("name", self.name)
-        object.__setattr__(self, "time", _checks.measured_vector("time", seconds("time", self.time)))
-        if self.time.size < 2:
-            raise ValueError(f"time: must have at least 2 samples, got {self.time.size} in {self.name!r}.")
-        step = np.diff(self.time)
-        if np.any(step <= 0):
-            index = int(np.flatnonzero(step <= 0)[0])
-            raise ValueError(
-                f"time: must increase, got {self.time[index + 1]:g} s after {self.time[index]:g} s at index "
-                f"{index + 1} of {self.name!r}; a file of several records is divided by `from_csv(split=…)`."
-            )
-        if not self.outputs:
-            raise ValueError("outputs: must have at least one channel, got none.")
-        _checks.identifiers("outputs and inputs", (*self.outputs, *self.inputs))
-        for kind in ("outputs", "inputs"):
-            channels = {
-                name: _checks.measured_vector(f"{kind}[{name!r}]", values, self.time.size, "one per time")
-                for name, values in getattr(self, kind).items()
-            }
-            object.__setattr__(self, kind, channels)
-
-    @property
-    def sampling_rate(self) -> float:
-        """Mean sampling rate [Hz]."""
-        return float((self.time.size - 1) / (self.time[-1] - self.time[0]))
 
     @classmethod
     def from_arrays(
@@ -174,13 +103,61 @@ class Recording(Result):
             for kind, given in (("outputs", outputs), ("inputs", {} if inputs is None else inputs))
             for key, values in _checks.mapping(kind, given, "{'force': values}").items()
         }
-        arrays = {"time": _checks.real_array("time", seconds("time", time))}
-        arrays |= {argument: _checks.real_array(argument, values) for argument, (*_, values) in channels.items()}
-        present = without_missing(arrays, missing)
+        if isinstance(time, Mapping):
+            _checks.same_names("time", time, [key for _, key, _ in channels.values()])
+            own = channel_seconds(time)
+            at: Any = {argument: own[key] for argument, (_, key, _) in channels.items()}
+        else:
+            at = _checks.real_array("time", seconds("time", time))
+        arrays = {argument: _checks.real_array(argument, values) for argument, (*_, values) in channels.items()}
+        times, present = without_missing("time", at, arrays, missing)
         signals: dict[str, dict[str, np.ndarray]] = {"outputs": {}, "inputs": {}}
         for argument, (kind, key, _) in channels.items():
             signals[kind][key] = present[argument]
-        return cls(present["time"], signals["outputs"], signals["inputs"], name or "recording")
+        if isinstance(times, dict):
+            times = {channels[argument][1]: values for argument, values in times.items()}
+        return cls(times, signals["outputs"], signals["inputs"], name or "recording")
+
+    @classmethod
+    def join(cls, *recordings: "Recording", name: str | None = None) -> "Recording":
+        """Return one recording of the channels of several, such as of different files, each with its own times.
+
+        Parameters
+        ----------
+        *recordings : Recording
+            With different channels. Their times must be counted from one instant; dates are counted from the first
+            sample of each, so that recordings read from files with dates are joined by `from_arrays`.
+        name : str, optional
+            By default that of the first.
+
+        Returns
+        -------
+        Recording
+
+        Raises
+        ------
+        ValueError
+            For no recording, or a channel that two of them have.
+
+        Examples
+        --------
+        >>> fast, slow = np.arange(0, 20, 1e-3), np.arange(0.137, 19.5, 1 / 97)
+        >>> force = bp.Recording.from_arrays(fast, {"force": np.cos(6 * np.pi * fast)})
+        >>> x = bp.Recording.from_arrays(slow, {"x": 0.1 * np.sin(6 * np.pi * slow)})
+        >>> bp.Recording.join(force, x, name="run 1")
+        Recording('run 1': recording of outputs ['force'] (20000 samples at 1000 Hz), ['x'] (1879 samples at 97 Hz))
+        """
+        for recording in recordings:
+            _checks.instance("recordings", recording, Recording)
+        if not recordings:
+            raise ValueError("recordings: must be one or more, got none.")
+        _checks.identifiers("channels", [channel for one in recordings for channel in one.times])
+        kinds = [
+            {channel: values for one in recordings for channel, values in getattr(one, kind).items()}
+            for kind in ("outputs", "inputs")
+        ]
+        times = {channel: time for one in recordings for channel, time in one.times.items()}
+        return cls(times, *kinds, name or recordings[0].name, any(one.synthetic for one in recordings))
 
     @overload
     @classmethod
@@ -254,16 +231,17 @@ class Recording(Result):
         >>> run.name, round(float(run.outputs["x"].max()), 3)
         ('run', 0.025)
         """
-        return _read(CSV, path, name, split, (outputs, inputs or {}, time, sampling_rate, units or {}, missing))
+        layout = Layout(Path(path).name, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
+        return recordings(cls, CSV, path, name, split, layout)
 
-    from_npz = _reader(
+    from_npz = reader(
         "from_npz",
         NPZ,
         "named arrays of an NPZ file",
         "arrays",
         "for a damaged file or an array of objects, which would have to be unpickled",
     )
-    from_mat = _reader(
+    from_mat = reader(
         "from_mat",
         MAT,
         "variables of a MAT file, version 5 or 7.3",
@@ -289,11 +267,12 @@ class Recording(Result):
             If fewer than two samples remain.
         """
         first, last = _checks.real_array("start, stop", [start, stop])
-        keep = (self.time >= first) & (self.time <= last)
-        if keep.sum() < 2:
+        keep = self._by_time(lambda time: (time >= first) & (time <= last))
+        if any(np.count_nonzero(kept) < 2 for kept in keep.values()):
+            every = self.times.values()
             raise ValueError(
-                f"start, stop: must select at least two samples between {self.time[0]:g} and {self.time[-1]:g} s, got "
-                f"{start!r}, {stop!r}."
+                f"start, stop: must select at least two samples between {max(time[0] for time in every):g} and "
+                f"{min(time[-1] for time in every):g} s, got {start!r}, {stop!r}."
             )
         return self._part(keep, self.name)
 
@@ -338,9 +317,10 @@ class Recording(Result):
         if frequency is not None:
             _checks.positive("frequency", frequency)
         still = {c: v[0] for c, v in (self.inputs | self.outputs).items() if np.ptp(v) == 0.0}
-        signals = self._signals(without=still)
+        groups = self._groups(without=still)
+        points = max(time.size for time in self.times.values())
         with one_thread():
-            seen = inspect([signals], _checks.integer("periods", periods, 1), frequency, self.time.size)
+            seen = inspect(groups, _checks.integer("periods", periods, 1), frequency, points)
         return summary(self.name, self.inputs | self.outputs, seen, still)
 
     def steady(self, frequency: float | None = None, *, periods: int = 1) -> "Recording":
@@ -394,25 +374,31 @@ class Recording(Result):
         ValueError
             For an unknown channel, a mask of another shape, or if fewer than two samples remain.
         """
-        channels = self.inputs | self.outputs
+        times = self.times
         if channel is not None:
-            _checks.one_of("channel", channel, channels)
+            _checks.one_of("channel", channel, times)
         wanted = {"outliers": outliers, "stuck": stuck, "clipped": clipped}
-        bad = np.zeros(self.time.size, dtype=bool)
+        bad = self._by_time(lambda time: np.zeros(time.size, dtype=bool))
         known = self.check(frequency).bad if any(value is True for value in wanted.values()) else {}
         for kind, value in wanted.items():
-            mask = np.zeros(bad.shape, dtype=bool) if isinstance(value, bool) else np.asarray(value)
             for name in [name for name in known if value is True and channel in (None, name)]:
-                mask[known[name][kind]] = True
-            if mask.dtype != bool or mask.shape != bad.shape:
+                bad[name][known[name][kind]] = True
+            if isinstance(value, bool):
+                continue
+            mask, (name, *others) = (
+                np.asarray(value),
+                [channel] if channel else [*{id(v): c for c, v in bad.items()}.values()],
+            )
+            if others or mask.dtype != bool or mask.shape != bad[name].shape:
+                shape = f"of shape {bad[name].shape}" if not others else "with `channel`, whose samples it marks"
                 raise ValueError(
-                    f"{kind}: must be True, False or a bool array of shape {bad.shape}, got {mask.dtype} of shape "
-                    f"{mask.shape}."
+                    f"{kind}: must be True, False or a bool array {shape}, got {mask.dtype} of shape {mask.shape}."
                 )
-            bad |= mask
-        if self.time.size - np.count_nonzero(bad) < 2:
+            bad[name] |= mask
+        if any(np.count_nonzero(~mask) < 2 for mask in bad.values()):
             raise ValueError(f"recording: must have at least two sound samples, got none or one in {self.name!r}.")
-        return self._part(~bad, self.name)
+        keep = {id(mask): ~mask for mask in bad.values()}
+        return self._part({name: keep[id(mask)] for name, mask in bad.items()}, self.name)
 
     def unwrapped(self, channel: str, period: float = 2.0 * np.pi) -> "Recording":
         """Return the recording with a channel whose jumps by multiples of a range are removed.
@@ -440,12 +426,6 @@ class Recording(Result):
 
         return replace(self, outputs=cured(self.outputs), inputs=cured(self.inputs))
 
-    def _signals(self, without: Iterable[str] = ()) -> Signals:
-        without = {*without}
-        channels = {name: v for name, v in (self.inputs | self.outputs).items() if name not in without}
-        values = np.array([*channels.values()], dtype=float).reshape(len(channels), self.time.size)
-        return Signals(self.name, self.time, tuple(channels), values, len(self.inputs.keys() - without))
-
     def split(self) -> "list[Recording]":
         """Divide the recording at gaps and at steps of the frequency of the first input (or output, without inputs).
 
@@ -470,16 +450,21 @@ class Recording(Result):
         >>> [f"{run.name}: {run.fold(32).frequency:.2f} Hz" for run in runs]
         ['sweep 1: 1.00 Hz', 'sweep 2: 1.50 Hz']
         """
-        pieces = parts(self.time, next(iter((self.inputs or self.outputs).values())))
+        channel, values = next(iter((self.inputs or self.outputs).items()))
+        time = self.times[channel]
+        pieces = parts(time, values)
         if not pieces:
             raise ValueError(f"recording: must have a part of at least three cycles, got none in {self.name!r}.")
-        if len(pieces) == 1:
-            return [self._part(pieces[0], self.name)]
-        return [self._part(piece, f"{self.name} {i}") for i, piece in enumerate(pieces, 1)]
-
-    def _part(self, samples: Any, name: str) -> "Recording":
-        outputs, inputs = ({key: v[samples] for key, v in kind.items()} for kind in (self.outputs, self.inputs))
-        return replace(self, time=self.time[samples], outputs=outputs, inputs=inputs, name=name)
+        if len(pieces) == 1 and pieces[0] == slice(0, time.size):
+            return [self]
+        divided = []
+        for i, piece in enumerate(pieces, 1):
+            # Other times are divided where those of this channel are.
+            first = time[piece.start] if piece.start else -np.inf
+            stop = time[piece.stop] if piece.stop < time.size else np.inf
+            samples = self._by_time(lambda own, ends=(first, stop): slice(*np.searchsorted(own, ends).tolist()))
+            divided.append(self._part(samples, self.name if len(pieces) == 1 else f"{self.name} {i}"))
+        return divided
 
     def fold(
         self,
@@ -575,25 +560,20 @@ class Recording(Result):
         (2, ['not periodic', 'chosen'])
         """
         samples = _checks.integer("samples", samples, 4)
-        signals, evidence = self._signals(), None
+        groups, evidence = self._groups(), None
         try:
             if periods == AUTO:
-                periods, evidence = automatic_periods([signals], frequency)
+                periods, evidence = automatic_periods(groups, frequency)
             periods = _checks.integer("periods", periods, 1)
             with one_thread():
-                folded = fold_signals([signals], samples, periods, frequency, harmonics, origin, largest_drift)
+                folded = fold_signals(groups, samples, periods, frequency, harmonics, origin, largest_drift)
         except np.linalg.LinAlgError:
             raise ValueError(
                 f"recording: must have samples in all parts of its periods, got {self.name!r}, which has too few; "
                 "check the frequency and the gaps, or fold a part by `between` or `split`."
             ) from None
+        for kind, channels in (("outputs", self.outputs), ("inputs", self.inputs)):
+            folded[kind] = {channel: folded[kind][channel] for channel in channels}
         return Experiment(
             name or self.name, synthetic=self.synthetic, period_test=evidence, guess=guess or {}, **folded
-        )
-
-    def __repr__(self) -> str:
-        kind = "synthetic recording" if self.synthetic else "recording"
-        return (
-            f"Recording({self.name!r}: {kind} of {self.time.size} samples at {self.sampling_rate:.6g} Hz, "
-            f"inputs {list(self.inputs)}, outputs {list(self.outputs)})"
         )

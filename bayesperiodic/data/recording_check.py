@@ -284,17 +284,25 @@ def _beyond(effect: Effect, values: np.ndarray, samples: np.ndarray, sign: float
 
 
 def cycle_findings(
-    channels: Iterable[str], time: np.ndarray, steady: Steady, frequency: float, total: int
+    channels: Iterable[str],
+    time: np.ndarray,
+    steady: Steady,
+    frequency: float,
+    total: int,
+    ends: tuple[float, float],
 ) -> Iterator[Finding]:
-    """Return the findings about the cycles: what was left out, and what changes in the part that is used."""
+    """Return the findings about the cycles: what was left out, and what changes in the part that is used.
+
+    `ends` are the first and the last time that all channels have in common.
+    """
     part, step = steady.part, steady.part.cycles
     channels = [*channels]
     start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
     cycles = len(part.first) * step
     level = [float(time[i]) for i in (steady.level[0], steady.level[1] - 1)]
-    end = float(time[-1])
+    first, end = ends
     for kind, a, b, what in (
-        ("ramp", float(time[0]), level[0], "the signals change until"),
+        ("ramp", first, level[0], "the signals change until"),
         ("ramp", level[1], end, "the signals change from"),
         ("transient", level[0], start, "a rest of the transient is in the amplitudes until"),
     ):

@@ -2,6 +2,7 @@
 
 import datetime
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -77,6 +78,36 @@ def seconds(argument: str, values: Any) -> Any:
         return np.full(times.shape, np.nan)
     steps = np.where(lost, 0, (times - times[~lost][0]).astype(np.int64)) * step
     return np.where(lost, np.nan, steps * float(SECONDS[unit]) if unit in SECONDS else steps / PER_SECOND[unit])
+
+
+def channel_seconds(times: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the times of channels in seconds; dates and large integers from the earliest one of all channels."""
+    read = {channel: dates(f"time[{channel!r}]", values) for channel, values in times.items()}
+    dated = {channel: values for channel, values in read.items() if values is not None}
+    if dated and len(dated) < len(read):
+        other = next(channel for channel in read if channel not in dated)
+        raise ValueError(
+            f"time: must be dates or durations of all channels, or numbers of all, got dates of {next(iter(dated))!r} "
+            f"and numbers of {other!r}; convert them to seconds from one instant."
+        )
+    if not dated and all(_differences(values) is values for values in times.values()):
+        return {channel: _checks.real_array(f"time[{channel!r}]", values) for channel, values in times.items()}
+    given = [np.atleast_1d(values) for values in (dated or times).values()]
+    every = _checks.real_array("time", seconds("time", np.concatenate(given) if dated else np.ma.concatenate(given)))
+    parts = np.split(every - np.nanmin(every), np.cumsum([values.size for values in given])[:-1])
+    return dict(zip(times, parts, strict=True))
+
+
+def shared(times: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the times of channels, one array for those that have the same ones."""
+    distinct: list[np.ndarray] = []
+    result = {}
+    for channel, time in times.items():
+        same = (other for other in distinct if other is time or (other.size == time.size and (other == time).all()))
+        result[channel] = next(same, time)
+        if result[channel] is time and not any(time is other for other in distinct):
+            distinct.append(time)
+    return result
 
 
 def _differences(values: Any) -> Any:

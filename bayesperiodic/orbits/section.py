@@ -1,6 +1,6 @@
 """PoincareSection: points of a motion, once a forcing period or where it crosses a plane."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -290,6 +290,11 @@ def _signals(
     names, angle_names = _names(coordinates, angles)
     for name in names:
         _checks.one_of("coordinates", name, recording.outputs)
+    if isinstance(recording.time, Mapping):
+        raise ValueError(
+            f"recording: must have the same times for all channels, got {recording!r}; leave other channels out, or "
+            "record the coordinates together."
+        )
     signals = np.stack([recording.outputs[name] for name in names], -1)
     for name in angle_names:
         k = names.index(name)

@@ -70,17 +70,18 @@ def recording(recording: Recording, check: RecordingCheck | None = None, *, figu
     _checks.instance("check", check, RecordingCheck)
     channels = recording.inputs | recording.outputs
     _checks.same_names("check", dict.fromkeys(check.table.index), channels)
-    if any(at.size and at.max() >= recording.time.size for bad in check.bad.values() for at in bad.values()):
+    times = recording.times
+    if any(at.size and at.max() >= times[c].size for c, bad in check.bad.items() for at in bad.values()):
         raise ValueError("check: must be recording.check() of this recording, got that of one with more samples.")
     figure = figure or plt.figure(figsize=(8.0, 1.3 * len(channels) + 1.1), layout="constrained")
     panels = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
-    gaps = np.concatenate([np.zeros((0, 2)), *(f.times for f in check.findings if f.kind == "gaps")])
     for axes, (channel, values) in zip(panels, channels.items(), strict=True):
+        shown = [finding for finding in check.findings if finding.channel in ("", channel)]
+        gaps = np.concatenate([np.zeros((0, 2)), *(f.times for f in shown if f.kind == "gaps")])
         if not check.reason:
             axes.axvspan(check.start, check.stop, label="part used", zorder=0.5, **USED_STYLE)
-        axes.plot(*_drawn(recording.time, values, gaps), color=COLOURS["measured"], lw=0.7)
-        shown = [finding for finding in check.findings if finding.channel in ("", channel)]
-        _mark(axes, shown, recording.time, values, check)
+        axes.plot(*_drawn(times[channel], values, gaps), color=COLOURS["measured"], lw=0.7)
+        _mark(axes, shown, times[channel], values, check)
         axes.set_ylabel(wrapped_label(channel, "", CHANNEL_LENGTH))
         axes.margins(x=0.0)
         axes.locator_params(axis="y", nbins=5)

@@ -32,8 +32,12 @@ def test_missing_samples_are_refused_left_out_or_interpolated(values):
     with pytest.raises(ValueError, match=r"outputs\['x'\]: must be finite, got nan at index 3 \(36 of 600"):
         bp.Recording(TIME, {"x": values}, {})
     dropped = bp.Recording.from_arrays(TIME, {"x": values}, {"u": ANGLE}, missing="drop")
-    for kept, whole in ((dropped.time, TIME), (dropped.outputs["x"], ANGLE), (dropped.inputs["u"], ANGLE)):
+    # Only the channel with missing samples loses them; its times are then its own.
+    for kept, whole in ((dropped.time["x"], TIME), (dropped.outputs["x"], ANGLE)):
         assert np.array_equal(kept, whole[~LOST])
+    assert np.array_equal(dropped.time["u"], TIME) and np.array_equal(dropped.inputs["u"], ANGLE)
+    alone = bp.Recording.from_arrays(TIME, {"x": values}, missing="drop")
+    assert np.array_equal(alone.time, TIME[~LOST])
     run = dropped.fold(64, harmonics=1)
     assert abs(np.fft.rfft(run.outputs["x"])[1]) / 32 == pytest.approx(0.5, abs=1e-6)
     filled = bp.Recording.from_arrays(TIME, {"x": values}, missing="interpolate")
@@ -59,7 +63,8 @@ def test_lengths_are_checked_whatever_is_missing():
 
 def test_channels_may_be_called_as_the_arguments_are():
     run = bp.Recording.from_arrays([0, 1, 2], {"time": [1, None, 3]}, {"outputs": [4, 5, 6]}, missing="drop")
-    assert run.outputs["time"].tolist() == [1.0, 3.0] and run.inputs["outputs"].tolist() == [4.0, 6.0]
+    assert run.outputs["time"].tolist() == [1.0, 3.0] and run.inputs["outputs"].tolist() == [4.0, 5.0, 6.0]
+    assert run.times["time"].tolist() == [0.0, 2.0] and run.times["outputs"].tolist() == [0.0, 1.0, 2.0]
 
 
 def test_masks_are_not_ignored_in_an_experiment():

@@ -10,7 +10,7 @@ import xarray as xr
 
 import bayesperiodic as bp
 from bayesperiodic.data import files
-from bayesperiodic.data.recording import _reader
+from bayesperiodic.data.layout import reader
 
 TIME = np.arange(200) / 50
 FORCE, DISPLACEMENT = np.cos(TIME), 3.0 * np.sin(TIME)
@@ -70,7 +70,7 @@ def test_pickled_npz_is_refused(tmp_path):
         bp.Recording.from_npz(tmp_path / "run.npz", time="t", outputs={"force": "F"})
 
 
-def test_error_for_other_files_names_the_right_reader(csv, tmp_path):
+def test_error_for_other_files_names_the_rightreader(csv, tmp_path):
     with pytest.raises(ValueError, match=r"must be an NPZ file .*, or be read by from_csv or from_mat, got"):
         bp.Recording.from_npz(csv, time="t", **CHANNELS)
     np.save(tmp_path / "force.npy", FORCE)
@@ -297,7 +297,9 @@ def test_rows_with_nan_are_dropped_or_interpolated_by_request(csv, tmp_path):
     rest = np.delete(np.arange(200), [0, 5, 20, 21])
     for arguments in ({"time": "t"}, {"sampling_rate": 50.0}):
         dropped = bp.Recording.from_csv(csv, **arguments, **CHANNELS, missing="drop")
-        assert dropped.time == pytest.approx(TIME[rest]) and np.array_equal(dropped.outputs["force"], FORCE[rest])
+        assert dropped.time["displacement"] == pytest.approx(TIME[rest])
+        assert np.array_equal(dropped.inputs["displacement"], DISPLACEMENT[rest])
+        assert dropped.time["force"] == pytest.approx(TIME) and np.array_equal(dropped.outputs["force"], FORCE)
         filled = bp.Recording.from_csv(csv, **arguments, **CHANNELS, missing="interpolate")
         assert filled.time == pytest.approx(TIME[1:])
         middle = DISPLACEMENT[19] + (DISPLACEMENT[22] - DISPLACEMENT[19]) / 3
@@ -376,7 +378,7 @@ def test_further_format_is_a_function_of_named_columns_and_one_line(tmp_path):
         return list(table), {name: [float(x) for x in table[name].split()] for name in wanted if name in table}
 
     class Further(bp.Recording):
-        from_lines = _reader("from_lines", files.Format("a file of lines", columns), "lines", "lines", "")
+        from_lines = reader("from_lines", files.Format("a file of lines", columns), "lines", "lines", "")
 
     path = tmp_path / "run.txt"
     path.write_text("x:1 nan 3 4\ngroup:1 1 2 2\n")

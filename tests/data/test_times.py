@@ -116,11 +116,29 @@ def test_texts_that_are_no_dates_are_named():
 
 
 @pytest.mark.parametrize(
-    "time", [[[1], [2, 3]], ["a", "b"], None, {"t": [1, 2]}, pd.period_range("2026", periods=2)], ids=str
+    "time", [[[1], [2, 3]], ["a", "b"], None, {"x": ["a", "b"]}, pd.period_range("2026", periods=2)], ids=str
 )
 def test_what_is_no_time_is_refused_as_such(time):
-    with pytest.raises(ValueError, match="time: must be (an array of real numbers|one-dimensional), got"):
+    with pytest.raises(ValueError, match=r"time(\['x'\])?: must be (an array of real numbers|one-dimensional), got"):
         bp.Recording.from_arrays(time, {"x": [1, 2]})
+
+
+def test_times_by_channel_are_those_of_all_channels():
+    with pytest.raises(ValueError, match="time: must be 'x', got 't'|time: must be one of 'x', got 't'"):
+        bp.Recording.from_arrays({"t": [1, 2]}, {"x": [1, 2]})
+    with pytest.raises(ValueError, match="time: must have 'x', 'y', got no 'y'"):
+        bp.Recording.from_arrays({"x": [1, 2]}, {"x": [1, 2], "y": [1, 2]})
+    with pytest.raises(ValueError, match="time: must be dates or durations of all channels, .* numbers of 'y'"):
+        bp.Recording.from_arrays({"x": DATES, "y": EXACT}, {"x": SIGNAL, "y": SIGNAL})
+
+
+def test_dates_of_several_channels_are_counted_from_the_earliest_one():
+    late = DATES + np.timedelta64(2, "s")
+    run = bp.Recording.from_arrays({"x": late, "y": DATES}, {"x": SIGNAL, "y": SIGNAL})
+    assert run.time["y"][0] == 0.0 and run.time["x"] == pytest.approx(run.time["y"] + 2.0, abs=1e-9)
+    large = 10**18 + np.arange(5) * 1000
+    run = bp.Recording.from_arrays({"x": large + 500, "y": large}, {"x": range(5), "y": range(5)})
+    assert run.time["y"].tolist() == [0, 1000, 2000, 3000, 4000] and run.time["x"][0] == 500
 
 
 def test_dates_are_no_values_of_a_channel():
