@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bayesperiodic import _fourier
+from bayesperiodic.data import clocks
 from bayesperiodic.data.faults import ChannelFaults, dropped_value, jumps, outliers_of
 from bayesperiodic.data.groups import CommonFit, Windowed, common_span, common_windows, leading, refine_groups
 from bayesperiodic.data.harmonics import (
@@ -143,9 +144,37 @@ def inspect(
     channels = [channel for group in groups for channel in group.channels]
     ends = (max(group.time[0] for group in groups), min(group.time[-1] for group in groups))
     seen += cycle_findings(channels, groups[0].time, steady, fit.frequency, total, ends)
+    seen += _clock_findings(groups, every, some[0].time, steady, used[0], fit.frequency, total, pace.drifts)
     return Inspection(
         groups, faults, worst_first(seen), total, steady, used, every.all.apart().sizes, fit, pace, limits, inflation
     )
+
+
+def _clock_findings(
+    groups: list[Signals],
+    every: Windowed,
+    time: np.ndarray,
+    steady: Steady,
+    used: slice,
+    frequency: float,
+    total: int,
+    varies: bool,
+) -> list[Finding]:
+    """Return steps and steady drifts of the phases of channels against the first one; of a drive that varies, steps."""
+    channels = [channel for group in groups for channel in group.channels]
+    rates = {c: (g.time.size - 1) / float(np.ptp(g.time)) for g in groups for c in g.channels}
+    start, stop = float(groups[0].time[used.start]), float(groups[0].time[used.stop - 1])
+    phases = clocks.phases_of(every.all, time)
+    inside = (phases.start >= start) & (phases.start + phases.length / frequency <= stop + 1.5 / rates[channels[0]])
+    if np.count_nonzero(inside) < clocks.FEWEST_WINDOWS:
+        return []
+    steps, relative = clocks.steps(channels, phases, inside)
+    found = [*clocks.step_findings(steps, rates, frequency, inside.size)]
+    if not varies:
+        cycles = round((stop - start) * frequency)
+        drifts = clocks.clock_drifts(phases, relative, inside, steady.bias)
+        found += clocks.drift_findings(drifts, channels, phases, (start, stop), cycles, total)
+    return found
 
 
 def _moving(group: Signals, faults: list[ChannelFaults]) -> np.ndarray:

@@ -49,7 +49,8 @@ class Finding(Storable):
     ----------
     kind : str
         "constant", "wraps", "stuck", "held" (a slower logger), "clipped", "outliers", "gaps", "ramp", "transient",
-        "drift", "beating", "amplitude step" or "phase step".
+        "drift", "beating", "amplitude step", "phase step" or "clock" (the phase of a channel drifts steadily against
+        the first one).
     channel : str
         Empty for all channels together.
     severity : str
@@ -329,49 +330,30 @@ def cycle_findings(
                 f"the amplitude of {channel} changes by {change:+.1%} within half of the part used",
                 "select a steadier part with recording.between(start, stop)",
             )  # fmt: skip
-    yield from _steps(channels, time, part, frequency)
+    yield from _steps(channels, time, part)
     yield from _beats(channels, time, part, frequency)
 
 
-def _steps(channels: list[str], time: np.ndarray, part: Windows, frequency: float) -> Iterator[Finding]:
-    """Return steps of amplitude and of phase between neighbouring cycles."""
+def _steps(channels: list[str], time: np.ndarray, part: Windows) -> Iterator[Finding]:
+    """Return steps of amplitude between neighbouring cycles."""
     shape, first = part.amplitudes, part.first
     if len(shape) < FEWEST_FOR_STEPS:
         return
-    every = np.abs(shape[:, :, 1:])
-    strongest = 1 + every.mean(axis=0).argmax(axis=1)
-    lines = np.take_along_axis(shape, strongest[None, :, None], axis=2)[:, :, 0]
-    turns = np.unwrap(np.angle(lines), axis=0) / (2.0 * np.pi) / strongest
-    sizes = np.log(np.maximum(np.abs(lines), np.finfo(float).tiny))
+    sizes = np.log(np.maximum(part.sizes, np.finfo(float).tiny))
     limit = STEP_FROM_CYCLE * max(1.0, (ENOUGH_FOR_STEPS / len(shape)) ** 2)
-    slip = part.slip / np.exp(np.median(sizes, axis=0))
-    for kind, series, least in (
-        ("amplitude step", sizes, HARMLESS_STEP + slip),
-        ("phase step", turns, HARMLESS_PHASE + slip / (2.0 * np.pi)),
-    ):
-        mean = 0.5 * (series[1:] + series[:-1])
-        jump = mean[2:] - mean[:-2]  # of two cycles after a boundary from the two before it
-        spread = np.median(np.abs(jump - np.median(jump, axis=0)), axis=0) / 0.6745
-        large = (np.abs(jump) > limit * spread) & (np.abs(jump) > least)
-        together = large.all(axis=1)
-        stepping = [(c, large[:, i], jump[:, i]) for i, c in enumerate(channels) if large[:, i].any()]
-        if kind == "phase step" and len(channels) > 1 and together.any():
-            stepping = [("all channels", together, jump.mean(axis=1))]
-        for channel, where, size in stepping:
-            k = int(np.argmax(np.where(where, np.abs(size), 0.0)))
+    least = HARMLESS_STEP + part.slip / np.exp(np.median(sizes, axis=0))
+    mean = 0.5 * (sizes[1:] + sizes[:-1])
+    jump = mean[2:] - mean[:-2]  # of two cycles after a boundary from the two before it
+    spread = np.median(np.abs(jump - np.median(jump, axis=0)), axis=0) / 0.6745
+    large = (np.abs(jump) > limit * spread) & (np.abs(jump) > least)
+    for i, channel in enumerate(channels):
+        if large[:, i].any():
+            k = int(np.argmax(np.where(large[:, i], np.abs(jump[:, i]), 0.0)))
             at = float(time[first[k + 2]])
-            if kind == "phase step":
-                delay = float(size[k]) / frequency
-                samples = delay * (time.size - 1) / float(np.ptp(time))
-                text = (
-                    f"the phase of {channel} steps by {360.0 * size[k]:.3g}° ({delay:.3g} s, {abs(samples):.3g} "
-                    f"samples) at about {at:.6g} s: samples were lost, or the clock or the drive stepped"
-                )
-            else:
-                text = f"the amplitude of {channel} steps by {np.expm1(size[k]):+.1%} at about {at:.6g} s"
             yield Finding(
-                kind, "" if channel == "all channels" else channel, SERIOUS, np.array([[at, at]]), 1, 1.0 / len(shape),
-                np.nan, text, "fold the parts before and after it: recording.between(start, stop)",
+                "amplitude step", channel, SERIOUS, np.array([[at, at]]), 1, 1.0 / len(shape), np.nan,
+                f"the amplitude of {channel} steps by {np.expm1(jump[k, i]):+.1%} at about {at:.6g} s",
+                "fold the parts before and after it: recording.between(start, stop)",
             )  # fmt: skip
 
 
