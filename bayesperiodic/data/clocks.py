@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import t as student
 
-from bayesperiodic.data.recording_check import HARMLESS_PHASE, RUINOUS, RUINOUS_BIAS, SERIOUS, Finding
-from bayesperiodic.data.steadiness import ALLOWED_BIAS, SMALL_RANGE, Windows
+from bayesperiodic.data.recording_check import HARMLESS_DRIFT, HARMLESS_PHASE, RUINOUS, RUINOUS_BIAS, SERIOUS, Finding
+from bayesperiodic.data.steadiness import SMALL_RANGE, Windows
 
 # Windows on each side of a step, shortest and as a share of all, and the size of a step in robust standard deviations.
 SHORTEST_SIDE, SIDES, SIGNIFICANT_STEP = 3, 20, 8.0
-# Largest change of the phase on one side of a step, relative to the step: a slope or a transient has 0.5 and more.
-FLAT = 1.0 / 3.0
 # Windows that may be missing at a step, and most steps that are searched for.
 MISSING, MOST_STEPS = 4, 50
 # Windows, like those of the steady part in amplitude: largest distance in robust standard deviations.
@@ -21,9 +19,10 @@ ALIKE = 6.0
 ROUNDING_PHASE = 1e-4
 # False-alarm rate of a drift over all channels, fewest windows, and orders of polynomials that measure the noise.
 DRIFT_FALSE_ALARM, FEWEST_WINDOWS, FEWEST_ORDERS, MOST_ORDERS = 1e-4, 10, 4, 16
-# Changes of amplitude [1] that explain a drift of the phase [rad] twice as large; curvature of a clock's drift.
+# Drift of the phase [rad] that a relative change of amplitudes explains; curvature of a clock's drift.
 BY_AMPLITUDE, CURVED = 2.0, 0.1
-MEDIAN_TO_SD = 1.4826
+# Quantile of the differences of means that are no steps although there may be many, and that of a normal distribution.
+FEW, FEW_TO_SD, MEDIAN_TO_SD = 0.15, 0.189, 1.4826
 CLOCK = "clock"
 
 
@@ -64,6 +63,7 @@ class Drift:
     rate: float  # relative difference of the frequencies
     se: float
     turns: float  # over the windows used [cycles]
+    steady: bool  # as that of a clock, and not of a transient or a system whose amplitudes change
 
 
 def phases_of(every: Windows, time: np.ndarray) -> Phases:
@@ -87,48 +87,45 @@ def alike(phases: Phases, used: np.ndarray) -> np.ndarray:
     return (np.abs(phases.sizes - middle) <= limit).all(axis=1)
 
 
-def steps_of(series: np.ndarray, cycle: np.ndarray, least: float) -> tuple[list[tuple[int, float]], np.ndarray]:
-    """Return the steps of a series of phases [cycles], as first windows after them and sizes, and the rest.
+def steps_of(series: np.ndarray, cycle: np.ndarray, least: float) -> list[tuple[int, float]]:
+    """Return the steps of a series of phases [cycles]: windows in which they are, and sizes.
 
-    Means over as many windows before and after a window, which may be that of the step, are compared with the usual
-    differences of such means, and with the changes on both sides: a slope is no step, and neither is a transient.
+    A straight line and a step are fitted to as many windows before and after each window, which may contain the step;
+    the step is compared with those elsewhere. Slopes and slow curves, as of a transient, are no steps.
     """
     rest, found = series.copy(), []
-    length = float(np.median(np.diff(cycle))) if cycle.size > 1 else 1.0
+    if series.size < FEWEST_WINDOWS:
+        return found
+    length, next_ones = float(np.median(np.diff(cycle))), np.diff(series)
+    white = MEDIAN_TO_SD / np.sqrt(2.0) * float(np.median(np.abs(next_ones - np.median(next_ones))))
+    few = max(1.0, (SIDES / series.size) ** 2)
     while len(found) < MOST_STEPS:
-        best = (0.0, 0, 0.0)
+        best = (1.0, 0, 0.0, 0.0)
         side = SHORTEST_SIDE
-        while side == SHORTEST_SIDE or side * SIDES <= rest.size:
-            if rest.size < 2 * side + 1:
-                break
-            sums = np.concatenate([[0.0], np.cumsum(rest)])
-            mean = (sums[side:] - sums[:-side]) / side
-            before, after = mean[: -side - 1], mean[side + 1 :]
-            half = side // 2
-            part = (sums[half:] - sums[:-half]) / half
-            change = part[side - half :] - part[: part.size - (side - half)]  # within each stretch of so many windows
-            inside = np.maximum(np.abs(change[: before.size]), np.abs(change[side + 1 :][: before.size]))
-            jump = after - before
-            near = cycle[side + 1 :][: jump.size] - cycle[side - 1 :][: jump.size] <= (MISSING + 2) * length
-            usual = MEDIAN_TO_SD * float(np.median(np.abs(jump - np.median(jump))))
-            limit = max(SIGNIFICANT_STEP * usual * max(1.0, (SIDES / rest.size) ** 2), least)
-            score = np.where(near & (inside <= FLAT * np.abs(jump)), np.abs(jump) / limit, 0.0)
+        while 2 * side + 1 <= rest.size and (side == SHORTEST_SIDE or side * SIDES <= rest.size):
+            number = np.arange(-side, side + 1.0)
+            design = np.column_stack([np.ones(number.size), number, np.sign(number)])[number != 0.0]
+            line, step = np.insert(np.linalg.pinv(design)[[0, 2]], side, 0.0, axis=1)
+            jump = 2.0 * np.correlate(rest, step)
+            usual = float(np.quantile(np.abs(jump), FEW)) / FEW_TO_SD
+            usual = max(usual, 2.0 * white * float(np.linalg.norm(step)))
+            near = cycle[2 * side :] - cycle[: -2 * side] <= (2 * side + MISSING) * length
+            score = np.where(near, np.abs(jump) / max(SIGNIFICANT_STEP * few * usual, least), 0.0)
             k = int(np.argmax(score))
-            if score[k] > max(best[0], 1.0):
-                # The window between them belongs to the side to which it is nearer.
-                middle = rest[k + side]
-                first = k + side if abs(middle - after[k]) < abs(middle - before[k]) else k + side + 1
-                best = (float(score[k]), first, float(jump[k]))
+            if score[k] > best[0]:
+                best = (float(score[k]), k + side, float(jump[k]), float(line @ rest[k : k + 2 * side + 1]))
             side *= 2
-        if not best[0]:
+        _, k, size, middle = best
+        if not size:
             break
-        found.append(best[1:])
-        rest[best[1] :] -= best[2]
-    return found, rest
+        found.append((k, size))
+        rest[k] = middle - 0.5 * size
+        rest[k + 1 :] -= size
+    return found
 
 
-def steps(channels: Sequence[str], phases: Phases, used: np.ndarray) -> tuple[list[Step], np.ndarray]:
-    """Return the steps of phases, and the phases relative to the first channel without them, (windows, channels − 1).
+def steps(channels: Sequence[str], phases: Phases, used: np.ndarray) -> tuple[list[Step], list[np.ndarray]]:
+    """Return the steps of phases, and the windows of each channel but the first in which its relative phase steps.
 
     Steps of one channel relative to the others count wherever the amplitudes are those of the windows used; steps of
     all together only where they are used.
@@ -136,22 +133,21 @@ def steps(channels: Sequence[str], phases: Phases, used: np.ndarray) -> tuple[li
     found: list[Step] = []
     inside = phases.chosen(used)
     least = HARMLESS_PHASE + inside.slip.max()
-    for k, turns in steps_of(inside.turns[:, 0], inside.cycle, least)[0]:
+    for k, turns in steps_of(inside.turns[:, 0], inside.cycle, least):
         found.append(Step("", "", float(inside.start[k]), turns, int(phases.order[0])))
     same = np.flatnonzero(alike(phases, used))
     near = phases.chosen(same)
-    relative = phases.turns[:, 1:] - phases.turns[:, :1]
-    apart: list[list[tuple[int, float]]] = []
+    places = []
     for row, channel in enumerate(channels[1:], 1):
         least = ROUNDING_PHASE + phases.slip[[0, row]].max()
-        each, relative[same, row - 1] = steps_of(relative[same, row - 1], near.cycle, least)
-        apart.append(each)
+        each = steps_of(near.turns[:, row] - near.turns[:, 0], near.cycle, least)
+        places.append(same[[k for k, _ in each]])
         for k, turns in each:
             found.append(Step(channel, channels[0], float(near.start[k]), turns, int(phases.order[row])))
-    return _attributed(channels, found, phases, float(np.median(np.diff(phases.start)))), relative
+    return _attributed(channels, found, float(np.median(np.diff(phases.start))), int(phases.order[0])), places
 
 
-def _attributed(channels: Sequence[str], found: list[Step], phases: Phases, length: float) -> list[Step]:
+def _attributed(channels: Sequence[str], found: list[Step], length: float, order: int) -> list[Step]:
     """Return steps of the first channel alone as its own ones, not as those of all others or of all together."""
     together = [step for step in found if not step.other]
     result = [step for step in found if step.other]
@@ -160,46 +156,66 @@ def _attributed(channels: Sequence[str], found: list[Step], phases: Phases, leng
         if len(channels) > 1 and len({other.channel for other in near}) == len(channels) - 1:
             result = [other for other in result if other not in near]
             turns = -float(np.mean([other.turns for other in near]))
-            result.append(Step(channels[0], channels[1], near[0].time, turns, int(phases.order[0])))
+            result.append(Step(channels[0], channels[1], near[0].time, turns, order))
         elif not near:
             result.append(replace(step, channel="" if len(channels) > 1 else channels[0]))
     return sorted(result, key=lambda step: step.time)
 
 
-def drifts(phases: Phases, relative: np.ndarray, bias: float) -> Iterator[Drift]:
-    """Return the significant drifts of phases relative to the first channel (windows, channels − 1).
+def drifts(phases: Phases, used: np.ndarray, steps: Sequence[np.ndarray]) -> Iterator[Drift]:
+    """Return the significant drifts of phases relative to the first channel in the windows used.
 
-    The deviations from a constant are expanded in orthonormal polynomials: order 1 is the drift, orders from 3 on
-    measure noise that may be slow. What changes of amplitudes explain is none, nor is a rest of a transient.
+    The deviations from a constant, which may step and follow the frequency of the first channel, are expanded in
+    orthonormal polynomials: order 1 is the drift, orders from 3 on measure noise that may be slow.
     """
-    count = len(relative)
-    orders = min(max(count // 4, FEWEST_ORDERS), MOST_ORDERS, count - 3)
-    if count < FEWEST_WINDOWS:
-        return
-    middle = phases.cycle - phases.cycle.mean()
-    scaled = middle / np.abs(middle).max()
-    basis = np.linalg.qr(np.polynomial.legendre.legvander(scaled, orders + 2))[0].T
-    growth = np.abs(basis[1] @ phases.sizes)
-    limit = float(student.isf(0.5 * DRIFT_FALSE_ALARM / relative.shape[1], orders)) if relative.shape[1] else np.inf
-    long = float(np.ptp(phases.cycle)) * count / (count - 1)
-    for row in range(1, len(phases.order)):
-        component = basis @ relative[:, row - 1]
-        noise = float(np.sqrt(np.mean(component[3:] ** 2)))
-        rate = float(component[1] / (basis[1] @ middle))
-        angle = 2.0 * np.pi * phases.order[row] * abs(component[1])
-        transient = bias > ALLOWED_BIAS and abs(component[2]) > CURVED * abs(component[1]) + limit * noise
-        if abs(component[1]) <= limit * noise or transient or angle <= BY_AMPLITUDE * growth[[0, row]].max():
+    level = DRIFT_FALSE_ALARM / max(len(steps), 1)
+    for row, places in enumerate(steps, 1):
+        numbers = np.setdiff1d(np.flatnonzero(used), places)
+        if numbers.size < FEWEST_WINDOWS:
             continue
-        if abs(rate) * long > ROUNDING_PHASE + phases.slip[[0, row]].max():
-            yield Drift(row, rate, noise / abs(float(basis[1] @ middle)), rate * long)
+        middle = phases.cycle[numbers] - phases.cycle[numbers].mean()
+        others = _others(phases, numbers, middle, places)
+        orders = min(max(numbers.size // 4, FEWEST_ORDERS), MOST_ORDERS, numbers.size - 2 - others.shape[1])
+        if orders < FEWEST_ORDERS:
+            continue
+        polynomials = np.polynomial.legendre.legvander(middle / np.abs(middle).max(), orders + 2)[:, 1:]
+        basis = np.linalg.qr(np.column_stack([others, polynomials]))[0].T[others.shape[1] - 1 :]
+        component = basis @ (phases.turns[numbers, row] - phases.turns[numbers, 0])
+        noise, size = float(np.sqrt(np.mean(component[3:] ** 2))), abs(float(component[1]))
+        limit = float(student.isf(0.5 * level, orders)) * noise
+        per_cycle = float(basis[1] @ middle)
+        turns = float(component[1]) / per_cycle * float(np.ptp(middle)) * numbers.size / (numbers.size - 1)
+        if size <= limit or abs(turns) <= ROUNDING_PHASE + phases.slip[[0, row]].max():
+            continue
+        growth = float(np.abs(basis[1] @ phases.sizes[numbers][:, [0, row]]).max())
+        by_amplitude = 2.0 * np.pi * phases.order[row] * size <= BY_AMPLITUDE * growth
+        if by_amplitude and 2.0 * np.pi * phases.order[row] * abs(turns) < HARMLESS_DRIFT:
+            continue
+        steady = not by_amplitude and abs(component[2]) <= CURVED * size + limit
+        yield Drift(row, float(component[1]) / per_cycle, noise / abs(per_cycle), turns, steady)
 
 
-def clock_drifts(phases: Phases, relative: np.ndarray, used: np.ndarray, bias: float) -> list[Drift]:
+def _others(phases: Phases, numbers: np.ndarray, middle: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return a constant, steps, and the frequency of the first channel in the windows with these numbers, (windows, …).
+
+    A response follows the frequency of its drive by its delay.
+    """
+    jumps = numbers[:, None] > places
+    jumps = jumps[:, jumps.any(axis=0) & ~jumps.all(axis=0)]
+    scaled = middle / np.abs(middle).max()
+    series = np.polynomial.legendre.legfit(scaled, phases.turns[numbers, 0], min(MOST_ORDERS, numbers.size // 4))
+    rate = np.polynomial.legendre.legval(scaled, np.polynomial.legendre.legder(series))
+    rate -= rate.mean()
+    varies = [rate / np.abs(rate).max()] if np.abs(rate).max() > ROUNDING_PHASE else []
+    return np.column_stack([np.ones(numbers.size), jumps, *varies])
+
+
+def clock_drifts(phases: Phases, used: np.ndarray, steps: Sequence[np.ndarray]) -> list[Drift]:
     """Return the drifts over the windows used, or over all of their amplitude if most of these are not used."""
     same = alike(phases, used)
-    found = [*drifts(phases.chosen(used), relative[used], bias)]
+    found = [*drifts(phases, used, steps)]
     if not found and 2 * np.count_nonzero(used) < np.count_nonzero(same):
-        found = [*drifts(phases.chosen(same), relative[same], 0.0)]
+        found = [drift for drift in drifts(phases, same, steps) if drift.steady]
     return found
 
 
@@ -235,8 +251,9 @@ def _relative(step: Step, rates: dict[str, float], frequency: float) -> str:
     delay = -step.turns / frequency
     loser, sooner = (step.channel, "earlier") if delay < 0.0 else (step.other, "later")
     return (
-        f"{step.channel} is {sooner} by {abs(delay):.3g} s ({360.0 * abs(step.turns):.3g}°) against {step.other} from "
-        f"about {step.time:.6g} s on, as after {abs(delay) * rates[loser]:.3g} lost samples of {loser}"
+        f"{step.channel} is {sooner} by {abs(delay):.3g} s ({360.0 * abs(step.turns):.3g}°, up to whole cycles) "
+        f"against {step.other} from about {step.time:.6g} s on, as after {abs(delay) * rates[loser]:.3g} lost samples "
+        f"of {loser}"
     )
 
 
@@ -246,6 +263,14 @@ def drift_findings(
     """Return the findings of drifts of phases."""
     for drift in found:
         channel, angle = channels[drift.row], 360.0 * drift.turns
+        if not drift.steady:
+            yield Finding(
+                "drift", channel, SERIOUS, np.array([span]), cycles, 1.0, np.nan,
+                f"the phase of {channel} against {channels[0]} changes by {angle:.3g}° over the cycles used ({cycles} "
+                f"of {total}), but not steadily: a transient, or a drive or a system that changes",
+                "record longer, or select a steadier part with recording.between(start, stop)",
+            )  # fmt: skip
+            continue
         ppm, se, above = 1e6 * abs(drift.rate), 1e6 * drift.se, "above" if drift.rate > 0.0 else "below"
         severity = RUINOUS if np.pi * phases.order[drift.row] * abs(drift.turns) > RUINOUS_BIAS else SERIOUS
         yield Finding(

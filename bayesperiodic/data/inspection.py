@@ -144,7 +144,8 @@ def inspect(
     channels = [channel for group in groups for channel in group.channels]
     ends = (max(group.time[0] for group in groups), min(group.time[-1] for group in groups))
     seen += cycle_findings(channels, groups[0].time, steady, fit.frequency, total, ends)
-    seen += _clock_findings(groups, every, some[0].time, steady, used[0], fit.frequency, total, pace.drifts)
+    varies = pace.drifts or pace.wander > 0.0
+    seen += _clock_findings(groups, every, some[0].time, used[0], fit.frequency, total, varies)
     return Inspection(
         groups, faults, worst_first(seen), total, steady, used, every.all.apart().sizes, fit, pace, limits, inflation
     )
@@ -154,7 +155,6 @@ def _clock_findings(
     groups: list[Signals],
     every: Windowed,
     time: np.ndarray,
-    steady: Steady,
     used: slice,
     frequency: float,
     total: int,
@@ -168,11 +168,11 @@ def _clock_findings(
     inside = (phases.start >= start) & (phases.start + phases.length / frequency <= stop + 1.5 / rates[channels[0]])
     if np.count_nonzero(inside) < clocks.FEWEST_WINDOWS:
         return []
-    steps, relative = clocks.steps(channels, phases, inside)
+    steps, places = clocks.steps(channels, phases, inside)
     found = [*clocks.step_findings(steps, rates, frequency, inside.size)]
     if not varies:
         cycles = round((stop - start) * frequency)
-        drifts = clocks.clock_drifts(phases, relative, inside, steady.bias)
+        drifts = clocks.clock_drifts(phases, inside, places)
         found += clocks.drift_findings(drifts, channels, phases, (start, stop), cycles, total)
     return found
 
