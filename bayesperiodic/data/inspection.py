@@ -6,15 +6,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bayesperiodic import _fourier
+from bayesperiodic.data.coverage import determined_harmonics, resolved_harmonics
 from bayesperiodic.data.faults import ChannelFaults, dropped_value, jumps, outliers_of
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
     HarmonicFit,
     Pace,
-    determined_harmonics,
     fit_harmonics,
     refine_frequency,
-    resolved_harmonics,
 )
 from bayesperiodic.data.recording_check import (
     RUINOUS,
@@ -28,7 +27,7 @@ from bayesperiodic.data.recording_check import (
     sample_findings,
     signal_faults,
 )
-from bayesperiodic.data.signals import USUAL_STEPS, Signals, cycles_of, first_guess, refuse_gaps, tracked_frequency
+from bayesperiodic.data.signals import USUAL_STEPS, Signals, counted_cycles, cycles_of, first_guess
 from bayesperiodic.data.steadiness import Steady, Windows, steady_part, windows
 
 # Largest relative change of an amplitude within half of a steady part.
@@ -56,8 +55,11 @@ class Inspection:
     reason: str = ""  # why there is no steady part or no mean period
 
 
-def inspect(signals: Signals, periods: int, frequency: float | None, points: int) -> Inspection:
-    """Return what signals are like; without a steady part or a mean period, the reason."""
+def inspect(signals: Signals, periods: int, frequency: float | None, points: int, asked: int = 0) -> Inspection:
+    """Return what signals are like; without a steady part or a mean period, the reason.
+
+    Harmonics that are asked for are fitted as far as the samples determine them.
+    """
     faults = [signal_faults(values, drive=i < signals.inputs) for i, values in enumerate(signals.values)]
 
     def findings(rate: float | None, limit: int = 0, used: slice = slice(0, signals.time.size)) -> list[Finding]:
@@ -81,12 +83,14 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
             raise ValueError(_still(signals, faults))
         calm = replace(signals, values=bounded(signals.values)).part(np.flatnonzero(moving))
         fundamental = first_guess(calm, frequency, periods)
-        refuse_gaps(signals, fundamental)
-        tracked = tracked_frequency(calm, fundamental, frequency is not None)
+        part, tracked = counted_cycles(calm, fundamental, frequency is not None)
+        resolved_harmonics(calm.time[part], tracked, points)
     except ValueError as error:
         return Inspection(signals, faults, worst_first(findings(None)), reason=str(error))
     total = int(cycles_of(signals.time, tracked))
-    sound = _sound(signals, calm, faults, np.flatnonzero(moving), tracked, points)
+    calm, numbers = calm.part(part), np.flatnonzero(moving)[part]
+    moving[: numbers[0]] = moving[numbers[-1] + 1 :] = False
+    sound = _sound(signals, calm, faults, numbers, tracked, points)
     some = signals if sound.size == signals.time.size else signals.part(sound)
     refined = frequency is None
     every, steady, tracked = _steady_of(some, tracked, points, refined, refined and some is not signals)
@@ -94,7 +98,11 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
         return Inspection(signals, faults, worst_first(findings(tracked)), total, reason=_unsteady(signals, every))
     steady = steady.among(sound)
     used = signals.part(steady.samples)
-    limit, inflation = determined_harmonics(used.time, tracked, resolved_harmonics(used.time, tracked, points))
+    try:
+        limit = resolved_harmonics(used.time, tracked, points, asked)
+    except ValueError as error:
+        return Inspection(signals, faults, worst_first(findings(tracked)), total, reason=str(error))
+    limit, inflation = determined_harmonics(used.time, tracked, limit)
     fit, pace = refine_frequency(used.time, used.values, tracked, limit)
     residuals = fit.residuals
     here = sound[(sound >= steady.samples.start) & (sound < steady.samples.stop)]
