@@ -7,23 +7,23 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.special import chdtrc, fdtrc, softmax
+from scipy.special import chdtrc, fdtrc
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic.data.groups import CommonFit, fit_groups, leading
+from bayesperiodic.data.coverage import resolved_harmonics
+from bayesperiodic.data.groups import CommonFit, fit_groups, leading, within
 from bayesperiodic.data.harmonics import (
     NEGLIGIBLE_PHASE,
     HarmonicFit,
     Pace,
     refine_frequency,
-    resolved_harmonics,
-    track_frequency,
 )
 from bayesperiodic.data.inspection import Inspection, inspect
+from bayesperiodic.data.lines import Sampling
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
 from bayesperiodic.data.recording_check import refuse
-from bayesperiodic.data.response_period import FALSE_ALARM_RATE, FINENESS, aperiodic, even_times, response_period
-from bayesperiodic.data.signals import Signals, cycles_of, explains_more, first_guess, refuse_gaps
+from bayesperiodic.data.response_period import FALSE_ALARM_RATE, aperiodic, even_times, response_period
+from bayesperiodic.data.signals import Signals, counted_cycles, cycles_of, explains_more, first_guess
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,16 +38,8 @@ CLEARLY = 4.0
 LATER_CYCLES = 6
 CROSSING, AUTO = "crossing", "auto"
 
-# The spectrum of the noise: grid points a cycle if there are not many harmonics; neighbouring lines on each side of a
-# harmonic.
-FINEST, NEIGHBOURING_LINES = 1 << 14, 16
 # Neighbouring harmonics on each side with which variances and slopes of one are averaged.
 POOLED = 2
-# Lines from which frequency zero is extrapolated: for the kind of noise, and for the level of white and slow noise.
-LINES_NEAR_ZERO, WHITE_LINES, SLOW_LINES = 40, 8, 2
-# Correlation times in recording lengths, white floors relative to line 1, and line 0 of 1/f noise relative to line 1
-# if its spectrum is flat below a quarter of a line.
-CORRELATION_TIMES, FLOORS, ZERO_OF_PINK = (0.45, 0.1, 0.05, 0.025), (0.0, 0.01, 0.1), 2.75
 
 
 def fold_signals(
@@ -131,8 +123,9 @@ def _noises(seen: Inspection, fit: CommonFit, cycles: int) -> tuple[dict[str, np
     one_cycle, noise, row = {}, {}, 0
     start = seen.parts[0].time[0]
     for group, part, one, inflation in zip(seen.groups, seen.parts, fit.each, seen.inflation, strict=True):
+        sampling = Sampling.of(part.time, fit.frequency, one.amplitudes.shape[1] - 1, cycles)
         for i, channel in enumerate(part.channels):
-            one_cycle[channel], of_mean = _noise(part, one, i, cycles)
+            one_cycle[channel], of_mean = _noise(part, one, i, cycles, sampling)
             squares = seen.steady.squares[row] if seen.steady else np.zeros(0)
             order = min(squares.size, of_mean.variance.size)
             of_mean.variance[:] *= inflation
@@ -156,11 +149,12 @@ def automatic_periods(groups: list[Signals], frequency: float | None) -> "tuple[
             "drive period, got None."
         )
     drive = first_guess(first, frequency, 1)
-    for group in groups:
-        refuse_gaps(group, drive)
     if frequency is None:
-        time, driven = first.time, first.values[: first.inputs]
-        tracked = track_frequency(time, driven, drive)
+        driven = replace(first, values=first.values[: first.inputs])
+        part, tracked = counted_cycles(driven, drive, given=False)
+        driven = driven.part(part)
+        groups = [group.part(within(group.time, driven.time)) for group in groups]
+        time, driven = driven.time, driven.values
         time = even_times(time, driven, tracked)
         drive = refine_frequency(time, driven, tracked, resolved_harmonics(time, tracked, time.size))[0].frequency
     each = [_response_period(group, drive) for group in groups]
@@ -280,38 +274,31 @@ class AmplitudeNoise:
     beside: np.ndarray
 
 
-def _noise(signals: Signals, fit: HarmonicFit, row: int, cycles: int) -> tuple[np.ndarray, AmplitudeNoise]:
+def _noise(
+    signals: Signals, fit: HarmonicFit, row: int, cycles: int, sampling: Sampling
+) -> tuple[np.ndarray, AmplitudeNoise]:
     """Return the variances of one cycle's complex amplitudes, (harmonics + 1,), and the noise of the mean's.
 
     The spectrum of the K cycles has lines at multiples of 1/K of the fundamental, and those between the harmonics
     contain noise only. The variance at a harmonic is the mean over the nearest of these lines on both sides, plus that
     of quantisation errors that repeat in every cycle.
     """
-    time, residuals = signals.time, fit.residuals[row]
-    per_cycle = (time.size - 1) / (np.ptp(time) * fit.frequency)
-    harmonic = np.arange(fit.amplitudes.shape[1])
-    # On a grid in phase, finer than the samples or the harmonics, the lines are those of a discrete Fourier transform
-    # at any sampling.
-    grid = FINENESS * int(np.ceil(per_cycle - 1e-6))
-    points = min(grid, max(FINEST, 2 * FINENESS * harmonic.size))
-    phase = (time - time[0]) * fit.frequency
-    place = np.minimum(np.rint(phase * points).astype(int), points * cycles - 1)
-    signal = np.bincount(place, residuals, points * cycles)
-    size = np.bincount(place // points, minlength=cycles)[:, None]
-    deviation = np.fft.rfft(signal.reshape(cycles, points), axis=1)[:, harmonic] / size
-    sides = np.clip(cycles // 4, min(4, cycles // 2), NEIGHBOURING_LINES)
-    amplitude = _between(signal.reshape(cycles, points)) / time.size
+    residuals, harmonic = fit.residuals[row], np.arange(fit.amplitudes.shape[1])
+    signal = sampling.on_grid(residuals)
+    deviation = np.fft.rfft(signal, axis=1)[:, harmonic] / sampling.samples[:, None]
+    amplitude = sampling.between(signal)
+    sides = len(sampling.left) // 2
     beside = np.concatenate([amplitude[:sides, harmonic], np.conj(amplitude[:sides, -harmonic])])
-    near = np.mean(np.abs(beside) ** 2, axis=0)
-    freedom = np.full(harmonic.size, 4.0 * sides)
-    near[0], freedom[0] = _at_zero(np.abs(amplitude[:, : points // 2].T.ravel()[:LINES_NEAR_ZERO]) ** 2)
-    repeated = _repeated_error(signals.values[row], residuals, fit.amplitudes[row], phase, grid)
+    near = np.sum(np.abs(beside) ** 2, axis=0) / sampling.left.sum(axis=0)
+    freedom = sampling.freedom.copy()
+    near[0], freedom[0] = sampling.at_zero(amplitude)
+    repeated = _repeated_error(signals.values[row], residuals, fit.amplitudes[row], sampling.phase, sampling.grid)
     # Satterthwaite; how the repeated error is distributed over the harmonics is hardly known.
     uncertain = near**2 / freedom + repeated**2 / REPEATED_FREEDOM
     total = np.divide((near + repeated) ** 2, uncertain, out=freedom.copy(), where=uncertain > 0.0)
     near += repeated
     scale = np.where(harmonic == 0, 1.0, 4.0)
-    one_cycle = scale * np.sum(np.abs(deviation) ** 2, axis=0) / (cycles - 1)
+    one_cycle = scale * np.sum(np.abs(deviation) ** 2, axis=0) / (len(signal) - 1)
     return one_cycle, AmplitudeNoise(scale * near, total, freedom, beside)
 
 
@@ -348,19 +335,6 @@ def neighbours_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return result
 
 
-def _between(signal: np.ndarray) -> np.ndarray:
-    """Return the sums of lines s = 1, 2, … above the harmonics 0 … points − 1 of a signal (cycles, points).
-
-    By sums over the cycles first, so that the time does not depend on the prime factors of their number.
-    """
-    cycles, points = signal.shape
-    side = np.arange(1, min(cycles, LINES_NEAR_ZERO + 1))[:, None]
-    turn = 2.0 * np.pi / cycles * side * np.arange(cycles)
-    total = np.cos(turn) @ signal - 1j * (np.sin(turn) @ signal)
-    total *= np.exp(-2j * np.pi / (cycles * points) * side * np.arange(points))
-    return np.asarray(np.fft.fft(total, axis=1))
-
-
 def _repeated_error(
     values: np.ndarray, residuals: np.ndarray, amplitudes: np.ndarray, phase: np.ndarray, points: int
 ) -> float:
@@ -372,36 +346,6 @@ def _repeated_error(
     again = values.size - phases
     fitted = _fourier.on_grid(amplitudes, points)
     return repeated_variance(values, fitted, int(phases), square / again) if again else 0.0
-
-
-def _at_zero(power: np.ndarray) -> tuple[float, float]:
-    """Return the expected power of the noise at frequency zero, and its degrees of freedom, from lines 1, 2, ….
-
-    Noise that is slower than the recording is in the mean, and hardly in the lines, which have to be extrapolated.
-    White noise, 1/f noise, and noise of exponential correlation over a part of the recording, each with white floors,
-    are weighted by their likelihoods (P. Whittle, Ark. Mat. 2 (1953) 423-434), their levels integrated out, and their
-    extrapolations averaged geometrically.
-    """
-    if not power.sum() > 0.0:
-        return 0.0, 2.0 * WHITE_LINES
-    line = np.arange(1.0, power.size + 1)
-    coloured = [np.concatenate([[ZERO_OF_PINK], 1.0 / line]), *(_exponential(t, power.size) for t in CORRELATION_TIMES)]
-    slow = np.array([shape / shape[1] + floor for shape in coloured for floor in FLOORS])
-    shapes = np.concatenate([np.ones((1, power.size + 1)), slow])
-    prior = np.log(np.where(np.arange(len(shapes)) == 0, 1.0, 1.0 / len(slow)))
-    level = np.mean(power / shapes[:, 1:], axis=1)
-    weight = softmax(prior - np.log(shapes[:, 1:]).sum(axis=1) - power.size * np.log(level))
-    nearest = power[:SLOW_LINES].sum() / shapes[:, 1 : SLOW_LINES + 1].sum(axis=1)
-    nearest[0] = power[:WHITE_LINES].mean()
-    expected = np.exp(weight @ np.log(np.maximum(nearest * shapes[:, 0], np.finfo(float).tiny)))
-    # Extrapolated slow noise is as uncertain as one line.
-    return float(expected), float(1.0 / (weight[0] / (2.0 * WHITE_LINES) + (1.0 - weight[0]) / 2.0))
-
-
-def _exponential(time: float, lines: int) -> np.ndarray:
-    """Return the expected power (lines + 1,) of lines 0, 1, … of noise with a correlation time in recording lengths."""
-    rate = 1.0 / time + 2j * np.pi * np.arange(lines + 1)
-    return (1.0 / rate + np.expm1(-1.0 / time) / rate**2).real
 
 
 def _last_significant(amplitudes: np.ndarray, noise: AmplitudeNoise) -> int:

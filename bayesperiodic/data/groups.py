@@ -51,7 +51,12 @@ def common_span(groups: Sequence[Signals], frequency: float) -> list[slice]:
             f"recording: must have at least {MINIMUM_CYCLES} cycles that all channels have in common, got "
             f"{groups[0].name!r} with {spans}; record at the same time, or correct the times."
         )
-    return [slice(*np.searchsorted(group.time, [start, np.nextafter(stop, np.inf)]).tolist()) for group in groups]
+    return [within(group.time, np.array([start, stop])) for group in groups]
+
+
+def within(time: np.ndarray, other: np.ndarray) -> slice:
+    """Return the samples from the first to the last of other times."""
+    return slice(*np.searchsorted(time, [other[0], np.nextafter(other[-1], np.inf)]).tolist())
 
 
 def common_windows(groups: Sequence[Signals], frequency: float) -> Windowed:

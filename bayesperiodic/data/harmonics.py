@@ -5,19 +5,18 @@ from functools import cached_property
 
 import numpy as np
 from scipy.fft import next_fast_len
-from scipy.linalg import solve_toeplitz, toeplitz
+from scipy.linalg import solve_toeplitz
 from scipy.special import fdtri
 from scipy.stats import t as student
 
 from bayesperiodic import _fourier
+from bayesperiodic.data.coverage import covered_harmonics
 
 MAXIMUM_HARMONICS = 600
 SIGNIFICANT_POWER = 10.0
 MINIMUM_CYCLES = 3
-# Largest condition number of the amplitudes' normal equations where phases are missing.
-LARGEST_CONDITION = 20.0
-# Cycles of a stretch from which its frequency is tracked.
-TRACKED = 48
+# Cycles of a stretch from which its frequency is tracked, fewest samples in them, and fewest to begin with.
+TRACKED, FEWEST_TRACKED, FEWEST_REFINED = 48, 384, 12
 # Deviations of the phase [cycles] below this are of no consequence; others count if they are not explained by noise.
 NEGLIGIBLE_PHASE, PHASE_FALSE_ALARM = 1.0 / 360.0, 1e-4
 
@@ -241,51 +240,24 @@ def _largest_equivalent(time: np.ndarray, channels: np.ndarray, frequency: float
 def track_frequency(time: np.ndarray, channels: np.ndarray, fundamental: float) -> float:
     """Refine a frequency on the last few cycles, then on more and more of them, so that no cycle is miscounted.
 
-    The result is that of the later half. Of a long stretch every so many cycles are used.
+    The result is that of the later half. Of a long stretch every so many cycles are used. Few samples in a cycle need
+    more cycles.
     """
     cycles, total = float(MINIMUM_CYCLES), np.ptp(time) * fundamental
     while True:
         window = slice(np.searchsorted(time, time[-1] - cycles / fundamental), None)
-        few = min(10, resolved_harmonics(time[window], fundamental, time.size))
-        stride = int(np.ceil(cycles / TRACKED))
-        if stride > 1:
-            used = (time[-1] - time[window]) * fundamental % stride < 1.0
-            part, values = time[window][used], channels[:, window][:, used]
-        else:
-            part, values = time[window], channels[:, window]
-        fundamental = _refined(part, values, fundamental, few)[0].frequency
+        count = time.size - window.start
+        few = min(10, covered_harmonics(time[window], fundamental, time.size)) if count >= FEWEST_REFINED else 0
+        if few:
+            stride = min(int(np.ceil(cycles / TRACKED)), max(count // FEWEST_TRACKED, 1))
+            if stride > 1:
+                used = (time[-1] - time[window]) * fundamental % stride < 1.0
+                part, values = time[window][used], channels[:, window][:, used]
+            else:
+                part, values = time[window], channels[:, window]
+            found = _refined(part, values, fundamental, few)[0].frequency
+            # A frequency that is further away has another number of cycles.
+            fundamental = found if abs(found - fundamental) * np.ptp(part) < 1.0 else fundamental
         if cycles >= total / 2:
             return fundamental
         cycles = min(2 * cycles, total / 2)
-
-
-def resolved_harmonics(time: np.ndarray, fundamental: float, points: int) -> int:
-    """Return the highest harmonic that the samples and a grid resolve; raise a ValueError if there is none."""
-    per_cycle = (time.size - 1) / (np.ptp(time) * fundamental)
-    resolved = min(int((per_cycle - 1.0) / 2.0), _fourier.highest_harmonic(points), (time.size - 2) // 2)
-    if resolved < 1:
-        raise ValueError(
-            f"recording: must have at least 3 samples per cycle, to resolve the fundamental, got {per_cycle:.1f}; "
-            "sample faster, or check the frequency."
-        )
-    return resolved
-
-
-def determined_harmonics(time: np.ndarray, fundamental: float, highest: int) -> tuple[int, np.ndarray]:
-    """Return the harmonics whose amplitudes the samples determine, and what missing phases do to their variances.
-
-    If samples are missing at the same phase of each cycle, as clipped ones that are left out, the normal equations of
-    many harmonics are ill-conditioned. The factors (harmonics + 1,) are 1 for samples at all phases.
-    """
-    phase = fundamental * time
-    bins = 2 * highest + 1
-    if np.bincount(((phase - phase[0]) % 1.0 * bins).astype(int), minlength=bins)[:bins].all():
-        return highest, np.ones(highest + 1)
-    moments = _fourier.sums(np.ones((1, time.size)), phase, 2 * highest)[0] / time.size
-    known, unknown = 1, highest + 1
-    while unknown - known > 1:
-        middle = min(2 * known, (known + unknown) // 2)
-        size = np.linalg.eigvalsh(toeplitz(moments[: 2 * middle + 1]))
-        known, unknown = (middle, unknown) if size[0] * LARGEST_CONDITION > size[-1] else (known, middle)
-    inverse = np.linalg.inv(toeplitz(moments[: 2 * known + 1]))
-    return known, np.diag(inverse).real[known:]

@@ -7,14 +7,13 @@ import numpy as np
 
 from bayesperiodic import _fourier
 from bayesperiodic.data import clocks
+from bayesperiodic.data.coverage import determined_harmonics, resolved_harmonics
 from bayesperiodic.data.faults import ChannelFaults, dropped_value, jumps, outliers_of
-from bayesperiodic.data.groups import CommonFit, Windowed, common_span, common_windows, leading, refine_groups
+from bayesperiodic.data.groups import CommonFit, Windowed, common_span, common_windows, leading, refine_groups, within
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
     Pace,
-    determined_harmonics,
     fit_harmonics,
-    resolved_harmonics,
 )
 from bayesperiodic.data.recording_check import (
     RUINOUS,
@@ -28,7 +27,7 @@ from bayesperiodic.data.recording_check import (
     sample_findings,
     signal_faults,
 )
-from bayesperiodic.data.signals import USUAL_STEPS, Signals, cycles_of, first_guess, refuse_gaps, tracked_frequency
+from bayesperiodic.data.signals import USUAL_STEPS, Signals, counted_cycles, cycles_of, first_guess
 from bayesperiodic.data.steadiness import Steady, Windows, steady_part
 
 # Largest relative change of an amplitude within half of a steady part.
@@ -68,11 +67,12 @@ class Inspection:
 
 
 def inspect(
-    groups: list[Signals], periods: int, frequency: float | None, points: int, other: Iterable[str] = ()
+    groups: list[Signals], periods: int, frequency: float | None, points: int, other: Iterable[str] = (), asked: int = 0
 ) -> Inspection:
     """Return what signals are like; without a steady part or a mean period, the reason.
 
-    Channels of `other` clocks, whose times were corrected, tell nothing about the frequency.
+    Channels of `other` clocks, whose times were corrected, tell nothing about the frequency. Harmonics that are asked
+    for are fitted as far as the samples determine them.
     """
     faults = [[signal_faults(v, drive=i < group.inputs) for i, v in enumerate(group.values)] for group in groups]
 
@@ -103,14 +103,18 @@ def inspect(
             for group, these in zip(groups, moving, strict=True)
         ]
         first = calm[leading(groups)]
-        fundamental = first_guess(first, frequency, periods)
-        for group in groups:
-            refuse_gaps(group, fundamental)
-        tracked = tracked_frequency(first, fundamental, frequency is not None)
+        counted, tracked = counted_cycles(first, first_guess(first, frequency, periods), frequency is not None)
+        counted = first.time[counted]
+        for group in calm:
+            resolved_harmonics(group.time[within(group.time, counted)], tracked, points)
         span = common_span(groups, tracked)
     except ValueError as error:
         return Inspection(groups, faults, worst_first(findings(None)), reason=str(error))
     total = int(min(cycles_of(group.time[part], tracked) for group, part in zip(groups, span, strict=True)))
+    # Without the parts behind gaps over which the cycles cannot be counted.
+    among = [within(group.time, counted) for group in calm]
+    calm = [group.part(part) for group, part in zip(calm, among, strict=True)]
+    moving = [these[part] for these, part in zip(moving, among, strict=True)]
     sound = [_sound(*each, tracked, points) for each in zip(groups, calm, faults, moving, strict=True)]
     whole = all(these.size == group.time.size for these, group in zip(sound, groups, strict=True))
     sound = [these[(these >= part.start) & (these < part.stop)] for these, part in zip(sound, span, strict=True)]
@@ -128,9 +132,11 @@ def inspect(
     ]
     steady = steady.among(sound[0])
     parts = [group.part(part) for group, part in zip(groups, used, strict=True)]
-    determined = [
-        determined_harmonics(part.time, tracked, resolved_harmonics(part.time, tracked, points)) for part in parts
-    ]
+    try:
+        highest = [resolved_harmonics(part.time, tracked, points, asked) for part in parts]
+    except ValueError as error:
+        return Inspection(groups, faults, worst_first(findings(tracked)), total, reason=str(error))
+    determined = [determined_harmonics(part.time, tracked, limit) for part, limit in zip(parts, highest, strict=True)]
     limits, inflation = [limit for limit, _ in determined], [factors for _, factors in determined]
     fit, pace = refine_groups(parts, tracked, limits, other)
     for i, (group, part) in enumerate(zip(groups, used, strict=True)):

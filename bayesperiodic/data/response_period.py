@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.special import fdtrc
 
-from bayesperiodic.data.harmonics import MINIMUM_CYCLES, fit_harmonics, resolved_harmonics
+from bayesperiodic.data.coverage import resolved_harmonics
+from bayesperiodic.data.harmonics import MINIMUM_CYCLES, fit_harmonics
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
 
 if TYPE_CHECKING:

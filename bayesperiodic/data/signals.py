@@ -6,11 +6,13 @@ from typing import Protocol
 import numpy as np
 
 from bayesperiodic import _checks
+from bayesperiodic.data.aliases import SEARCHED, aliases, samples_per_cycle, search_frequency
+from bayesperiodic.data.coverage import SLOW, covered_harmonics, per_cycle, resolved_harmonics
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
     fit_harmonics,
     guess_frequency,
-    resolved_harmonics,
+    refine_frequency,
     track_frequency,
 )
 
@@ -21,6 +23,12 @@ GAP, USUAL_STEPS, MANY_STEPS = 0.25, 3.0, 30.0
 HYSTERESIS = 0.25
 # Smallest relative step of the period, in itself and in standard errors.
 SMALLEST_PERIOD_STEP, SIGNIFICANT_PERIOD_STEP = 1e-3, 8.0
+# Fewest samples of which a frequency is guessed, and fewest in a cycle of the strongest harmonic at a regular rate; aliases
+# that are listed.
+FEWEST_SAMPLES, FEWEST_PER_CYCLE, LISTED_ALIASES = 8, 4.0, 4
+# Standard error of the phase [cycles] behind a gap with which cycles can be counted: five of them are less than a
+# quarter of a cycle.
+COUNTED = 0.05
 # Difference of two phases [cycles] at the ends of a recording that selects other cycles.
 OTHER_CYCLES = 0.05
 
@@ -62,15 +70,12 @@ class Signals:
 def first_guess(signals: Signals, frequency: float | None, periods: int) -> float:
     """Return a first estimate of the fundamental frequency; raise a ValueError for fewer than three cycles."""
     remedy = "give the forcing frequency"
-    time, values = _longest_stretch(signals)
     if frequency is not None:
         fundamental: float | None = _checks.positive("frequency", frequency) / periods
         remedy = f"check frequency = {frequency!r} Hz and periods = {periods}"
-    elif signals.inputs:
-        guess = guess_frequency(time, values[: signals.inputs])
-        fundamental = guess / periods if guess else None
     else:
-        fundamental = guess_frequency(time, values)
+        guess = _estimate(replace(signals, values=signals.values[: signals.inputs or None]))
+        fundamental = guess / (periods if signals.inputs else 1) if guess else None
     if fundamental is None or cycles_of(signals.time, fundamental) < MINIMUM_CYCLES:
         period = "no period" if fundamental is None else f"{cycles_of(signals.time, fundamental):.2f} cycles"
         raise ValueError(
@@ -78,6 +83,27 @@ def first_guess(signals: Signals, frequency: float | None, periods: int) -> floa
             f"{np.ptp(signals.time):g} s; record longer, or {remedy}."
         )
     return fundamental
+
+
+def _estimate(signals: Signals) -> float | None:
+    """Return a frequency from the longest stretch, or else from spectral lines; refuse one that has aliases."""
+    time, values = _longest_stretch(signals)
+    guess = guess_frequency(time, values) if time.size > FEWEST_SAMPLES else None
+    if guess is not None and per_cycle(time, guess) >= SLOW and cycles_of(time, guess) >= MINIMUM_CYCLES:
+        return guess
+    some = slice(0, SEARCHED)
+    time, values = signals.time[some], signals.values[:, some]
+    found = search_frequency(time, values, guess)
+    if found is None:
+        return guess
+    others = aliases(time, values, found)
+    if (many := samples_per_cycle(time, values, found, others)) < FEWEST_PER_CYCLE:
+        raise ValueError(
+            f"frequency: must be given for {signals.name!r}, in which {many:.3g} samples per cycle do not tell "
+            f"{found:.6g} Hz from {', '.join(f'{f:.6g}' for f in others[:LISTED_ALIASES])} Hz (aliases), got None; give "
+            "`frequency=`, or sample faster or at irregular times."
+        )
+    return found
 
 
 def _longest_stretch(signals: Signals) -> tuple[np.ndarray, np.ndarray]:
@@ -100,31 +126,83 @@ def gaps(time: np.ndarray, period: float) -> np.ndarray:
     return np.flatnonzero(step > max(GAP * period, USUAL_STEPS * np.median(step)))
 
 
-def refuse_gaps(signals: Signals, fundamental: float) -> None:
-    """Raise a ValueError if there are gaps."""
-    if (ends := gaps(signals.time, 1.0 / fundamental)).size:
-        first, last = signals.time[ends[0]], signals.time[ends[0] + 1]
-        raise ValueError(
-            f"recording: must have no gap longer than {GAP:g} periods, got {signals.name!r} without samples from "
-            f"{first:g} to {last:g} s (period {1.0 / fundamental:g} s); fold the parts that `split` returns."
-        )
+def counted_cycles(signals: Signals, fundamental: float, given: bool) -> tuple[slice, float]:
+    """Return the samples over whose gaps the cycles can be counted, and the frequency by which they are compared.
 
-
-def tracked_frequency(signals: Signals, fundamental: float, given: bool) -> float:
-    """Return the frequency by which cycles are compared: the estimated one, if the given one is clearly another one."""
-    time, values = signals.time, signals.values
-    tracked = track_frequency(time, values, fundamental)
-    if given:
-        few = min(10, resolved_harmonics(time, max(tracked, fundamental), time.size))
-        near = abs(tracked - fundamental) * np.ptp(time) < OTHER_CYCLES
-        if near or not explains_more(*(fit_harmonics(time, values, rate, few) for rate in (tracked, fundamental))):
-            return fundamental
-    if (cycles := cycles_of(time, tracked)) < MINIMUM_CYCLES:
+    With a given frequency these are all, and it is the estimated one if the given one is clearly another one.
+    """
+    if not given:
+        part, tracked = _coherent_part(signals, fundamental)
+    else:
+        part, tracked = slice(0, signals.time.size), _given_or_tracked(signals, fundamental)
+    if (cycles := cycles_of(signals.time[part], tracked)) < MINIMUM_CYCLES:
         raise ValueError(
             f"recording: must have at least {MINIMUM_CYCLES} cycles, got {cycles:.2f} cycles of {tracked:.6g} Hz in "
             f"{signals.name!r}; record longer."
         )
-    return tracked
+    return part, tracked
+
+
+def _given_or_tracked(signals: Signals, given: float) -> float:
+    """Return the given frequency, or the estimated one if that explains more."""
+    time, values = signals.time, signals.values
+    tracked = track_frequency(time, values, given)
+    if abs(tracked - given) * np.ptp(time) < OTHER_CYCLES:
+        return given
+    few = min(10, resolved_harmonics(time, max(tracked, given), time.size))
+    more = explains_more(*(fit_harmonics(time, values, rate, few) for rate in (tracked, given)))
+    return tracked if more else given
+
+
+def _coherent_part(signals: Signals, fundamental: float) -> tuple[slice, float]:
+    """Return the longest part over whose gaps the cycles can be counted, and its frequency.
+
+    A part behind a gap belongs to it if the standard errors of the frequencies on both sides are a small part of a
+    cycle over the time from the middle of one to that of the other.
+    """
+    time, values = signals.time, signals.values
+    step = np.diff(time)
+    ends = np.flatnonzero(step > max(MINIMUM_CYCLES / fundamental, MANY_STEPS * np.median(step)))
+    edges = np.concatenate([[0], ends + 1, [time.size]])
+    pieces = [slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    first = last = int(np.argmax([np.ptp(time[piece]) for piece in pieces]))
+    part = pieces[first]
+    known = _measured(time[part], values[:, part], fundamental) if ends.size else None
+    if known is None:
+        return slice(0, time.size), track_frequency(time, values, fundamental)
+    added = True
+    while added:
+        added = False
+        for near in (first - 1, last + 1):
+            if not 0 <= near < len(pieces):
+                continue
+            other = pieces[near]
+            frequency, error = known
+            if (own := _measured(time[other], values[:, other], frequency)) is not None:
+                weight = error**2 / (error**2 + own[1] ** 2)
+                frequency += weight * (own[0] - frequency)
+                error *= np.sqrt(1.0 - weight)
+            apart = 0.5 * abs(time[[other.start, other.stop - 1]].sum() - time[[part.start, part.stop - 1]].sum())
+            if error * apart > COUNTED:
+                continue
+            first, last, added = min(first, near), max(last, near), True
+            part = slice(pieces[first].start, pieces[last].stop)
+            few = min(10, resolved_harmonics(time[part], frequency, time.size))
+            fit, pace = refine_frequency(time[part], values[:, part], frequency, few)
+            known = fit.frequency, pace.se
+    return part, known[0]
+
+
+def _measured(time: np.ndarray, values: np.ndarray, fundamental: float) -> tuple[float, float] | None:
+    """Return the frequency of a part and its standard error; None if the part is too short."""
+    if np.ptp(time) * fundamental < MINIMUM_CYCLES:
+        return None
+    tracked = track_frequency(time, values, fundamental)
+    few = min(10, covered_harmonics(time, tracked, time.size))
+    if few < 1:
+        return None
+    fit, pace = refine_frequency(time, values, tracked, few)
+    return fit.frequency, pace.se
 
 
 def explains_more(fit: Fit, other: Fit) -> bool:

@@ -8,13 +8,19 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
-from bayesperiodic.data.harmonics import MINIMUM_CYCLES, determined_harmonics, resolved_harmonics
+from bayesperiodic import _fourier
+from bayesperiodic.data.coverage import SLOW, determined_harmonics, per_cycle, resolved_harmonics
+from bayesperiodic.data.harmonics import MINIMUM_CYCLES, fit_harmonics
 
 # Parts of a cycle in which ramps begin or end, in recordings of so many cycles; most windows of long recordings.
 WINDOWS_PER_CYCLE, FEW_CYCLES, MOST_WINDOWS = 8, 64, 256
 HARMONICS = 5
 # Least share of the usual samples of a window, and largest condition number of its amplitudes.
 ENOUGH, LARGEST_WINDOW_CONDITION = 0.5, 30.0
+# Share of the windows with samples that have enough of them; longer windows are tried otherwise.
+MOST_COVERED = 0.75
+# Samples for each unknown in a window of slow sampling.
+SLOW_SAMPLES = 2.0
 # Range of an amplitude in a steady part, relative to the amplitude and in standard deviations of a cycle's noise.
 SMALL_RANGE, NOISE_RANGE = 0.08, 14.0
 # Least level of a steady part relative to the largest amplitudes: a part at rest is steady too.
@@ -74,11 +80,33 @@ class Windows:
 
 
 def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows:
-    """Return the amplitudes of signals (channels, samples) in windows along a recording."""
+    """Return the amplitudes of signals (channels, samples) in windows along a recording.
+
+    They are as long as needed for samples at all phases in most of them, gaps apart.
+    """
     duration = np.ptp(time) * time.size / (time.size - 1) * (1 + 1e-9)
     total = int(duration * fundamental)
-    fine = WINDOWS_PER_CYCLE if total <= FEW_CYCLES else 1
     cycles = max(1, total // MOST_WINDOWS)
+    highest = resolved_harmonics(time, fundamental, time.size)
+    if (many := per_cycle(time, fundamental)) < SLOW:
+        # Higher harmonics of few samples would look like changes of the lower ones.
+        higher = fit_harmonics(time, values, fundamental, highest).amplitudes
+        higher[:, : HARMONICS + 1] = 0.0
+        values = values - _fourier.at_times(higher, fundamental * time)
+        unknowns = 2 * min(HARMONICS, highest) + 1
+        cycles = max(cycles, min(int(np.ceil(SLOW_SAMPLES * unknowns / many)), total // (2 * MINIMUM_CYCLES)))
+    while True:
+        found, share = _windows_of(time, values, fundamental, duration, total, cycles, min(HARMONICS, highest))
+        if share >= MOST_COVERED or 2 * MINIMUM_CYCLES * cycles > total:
+            return found
+        cycles *= 2
+
+
+def _windows_of(
+    time: np.ndarray, values: np.ndarray, fundamental: float, duration: float, total: int, cycles: int, highest: int
+) -> tuple[Windows, float]:
+    """Return windows of so many cycles, and the share that has enough samples of those that have any."""
+    fine = WINDOWS_PER_CYCLE if total <= FEW_CYCLES else 1
     # Blocks of a fraction of a cycle, or of some cycles; the last one ends with the recording.
     length = cycles / fine / fundamental
     count = int(duration / length)
@@ -86,8 +114,8 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     edges = np.searchsorted(-back, np.arange(1 - count, 1))
     stops = np.concatenate([edges[1:], [time.size]])
     empty, edges = edges == stops, np.minimum(edges, time.size - 1)
-    resolved = min(HARMONICS, resolved_harmonics(time, fundamental, time.size))
-    order = np.arange(2 * determined_harmonics(time, fundamental, resolved)[0] + 1)
+    highest = min(highest, max((int(time.size * cycles / total) - 1) // 2, 1))
+    order = np.arange(2 * determined_harmonics(time, fundamental, highest)[0] + 1)
     harmonics = order[: order.size // 2 + 1]
     used = slice(edges[0], None)
     wave, power = np.exp(-2j * np.pi * (fundamental * time[used] % 1.0)), np.ones(time[used].size, dtype=complex)
@@ -104,7 +132,9 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     place = order[:, None] - order[None, :] + order.size - 1
     matrices = np.moveaxis(moments[place], -1, 0)
     right = np.moveaxis(np.concatenate([np.conj(sums[harmonics[:0:-1], 1:]), sums[harmonics, 1:]]), -1, 0)
-    few = sums[0, 0].real < ENOUGH * np.median(sums[0, 0].real)
+    samples = sums[0, 0].real
+    some = samples > 0.5
+    few = samples < ENOUGH * np.median(samples[some])
     size = np.linalg.eigvalsh(matrices)
     enough = np.flatnonzero(~few & (size[:, 0] * LARGEST_WINDOW_CONDITION > size[:, -1]))
     amplitudes = np.linalg.solve(matrices[enough], right[enough])[:, harmonics[-1] :]
@@ -114,8 +144,11 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     first[0] -= np.count_nonzero(
         ((time[-1] - time[: first[0]]) * fundamental + 1e-9).astype(int) < int(duration * fundamental)
     )
-    slip = _slip(scaled, edges[::fine] - edges[0]) / np.median(last[enough] - first[enough])
-    return Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip)
+    slip = np.zeros(len(values))
+    if enough.size and per_cycle(time, fundamental) >= SLOW:
+        slip = _slip(scaled, edges[::fine] - edges[0]) / np.median(last[enough] - first[enough])
+    found = Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip)
+    return found, enough.size / np.count_nonzero(some)
 
 
 def _slip(values: np.ndarray, edges: np.ndarray) -> np.ndarray:

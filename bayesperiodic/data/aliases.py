@@ -1,0 +1,108 @@
+"""Frequencies of slow or irregular sampling: search among spectral lines, and others that explain signals as well."""
+
+import numpy as np
+
+from bayesperiodic.data.coverage import covered_harmonics
+from bayesperiodic.data.harmonics import MINIMUM_CYCLES, HarmonicFit, refine_frequency
+
+# Samples that are searched, points of a grid of time for the shortest period, and the highest frequency in mean
+# sampling rates.
+SEARCHED, POINTS_PER_PERIOD, HIGHEST_RATE = 4000, 8, 30.0
+# Largest spectral lines whose frequencies, and parts of them, may be the fundamental, and harmonics that are compared.
+PEAKS, DIVISORS, COMPARED_HARMONICS = 8, (1, 2, 3), 5
+# Least height of the spectral window where frequencies may be confused, most of its peaks that are compared, and the
+# difference of the deviances of two frequencies that tells them.
+CONFUSED, WINDOW_PEAKS, DECISIVE = 0.7, 12, 25.0
+# Least share of the variance that a frequency explains.
+LEAST_EXPLAINED = 0.5
+
+
+def spectral_lines(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return frequencies (lines,), four for each one of the recording, and powers there of signals (channels, samples).
+
+    Samples are added at the nearest points of a fine grid of time, whatever the times are.
+    """
+    step = float(np.ptp(time)) / (time.size - 1) / (HIGHEST_RATE * POINTS_PER_PERIOD)
+    place = np.rint((time - time[0]) / step).astype(int)
+    length = 1 << int(4 * (place[-1] + 1)).bit_length()
+    count = length // POINTS_PER_PERIOD
+    spectra = np.array([np.fft.rfft(np.bincount(place, row), length)[:count] for row in values])
+    return np.arange(count) / (length * step), np.abs(spectra / time.size) ** 2
+
+
+def search_frequency(time: np.ndarray, values: np.ndarray, guess: float | None) -> float | None:
+    """Return the fundamental frequency that explains signals (channels, samples) best, the lowest one of aliases.
+
+    Candidates are a guess, the largest lines of the spectrum, and parts of them; None explains half of the variance.
+    """
+    scaled = (values - values.mean(axis=1, keepdims=True)) / values.std(axis=1, keepdims=True)
+    frequency, power = spectral_lines(time, scaled)
+    peaks = _peaks(power.sum(axis=0), MINIMUM_CYCLES / np.ptp(time), frequency)[:PEAKS]
+    candidates = [line / k for line in frequency[peaks] for k in DIVISORS] + ([guess] if guess else [])
+    found: dict[float, float] = {}
+    for candidate in candidates:
+        fit = _fitted(time, scaled, candidate)
+        if fit is not None and np.max(fit.variances) < 1.0 - LEAST_EXPLAINED:
+            found[fit.frequency] = _deviance(fit)
+    if not found:
+        return None
+    near = sorted(f for f, deviance in found.items() if deviance < min(found.values()) + DECISIVE)
+    # A multiple that explains as much is the fundamental.
+    width = 1.0 / np.ptp(time)
+    for factor in reversed(DIVISORS):
+        for other in near:
+            if abs(other - factor * near[0]) < width:
+                return other
+    return near[0]
+
+
+def aliases(time: np.ndarray, values: np.ndarray, frequency: float) -> list[float]:
+    """Return other frequencies that explain signals (channels, samples) as well as this one, the lowest first.
+
+    They are its sums and differences with frequencies at which the times of the samples are in step.
+    """
+    lines, power = spectral_lines(time, np.ones((1, time.size)))
+    window = np.sqrt(power[0])
+    peaks = _peaks(window, MINIMUM_CYCLES / np.ptp(time), lines)
+    peaks = peaks[window[peaks] > CONFUSED][:WINDOW_PEAKS]
+    own = _fitted(time, values, frequency)
+    if own is None:
+        return []
+    found: list[float] = []
+    for candidate in sorted({abs(rate + sign * frequency) for rate in lines[peaks] for sign in (-1, 1)}):
+        fit = _fitted(time, values, candidate) if candidate * np.ptp(time) > MINIMUM_CYCLES else None
+        near = fit is not None and min(abs(fit.frequency - f) for f in [frequency, *found]) * np.ptp(time) < 1.0
+        if fit is not None and not near and _deviance(fit) < _deviance(own) + DECISIVE:
+            found.append(fit.frequency)
+    return sorted(found)
+
+
+def samples_per_cycle(time: np.ndarray, values: np.ndarray, frequency: float, others: list[float]) -> float:
+    """Return the steps of the times' common grid in a cycle of the strongest harmonic, if there are aliases of it."""
+    fit = _fitted(time, values, frequency)
+    if not others or fit is None:
+        return np.inf
+    strongest = 1 + int(np.abs(fit.amplitudes[:, 1:]).argmax(axis=1).max())
+    return (others[0] + frequency) / (strongest * frequency)
+
+
+def _peaks(height: np.ndarray, lowest: float, frequency: np.ndarray) -> np.ndarray:
+    """Return the local maxima at this frequency or above, the largest first."""
+    inside = height[1:-1]
+    places = 1 + np.flatnonzero((inside > height[:-2]) & (inside >= height[2:]) & (frequency[1:-1] >= lowest))
+    return places[np.argsort(-height[places])]
+
+
+def _fitted(time: np.ndarray, values: np.ndarray, frequency: float) -> HarmonicFit | None:
+    """Return the fit at the best frequency near this one; None if its phases are not covered."""
+    few = min(COMPARED_HARMONICS, covered_harmonics(time, frequency, time.size))
+    return None if few < 1 else refine_frequency(time, values, frequency, few)[0]
+
+
+def _deviance(fit: HarmonicFit) -> float:
+    """Return −2·log-likelihood of normal noise, up to a constant, with the penalty of the harmonics (BIC)."""
+    channels, samples = fit.residuals.shape
+    unknowns = channels * (2 * fit.amplitudes.shape[1] - 1)
+    least = np.finfo(float).eps ** 2 * np.sum(np.abs(fit.amplitudes) ** 2, axis=1)
+    power = np.mean(fit.residuals**2, axis=1)
+    return float(samples * np.sum(np.log(np.maximum(power, least))) + unknowns * np.log(samples))
