@@ -1,0 +1,233 @@
+"""What sensors make of the outputs of a model: gain, low-pass filter, delay and offset of the Fourier harmonics.
+
+A sensor measures gain · lowpass(signal(t − delay)) + offset. At the frequency ν a harmonic is multiplied by
+gain · H(ν/cutoff) · exp(−2πi ν delay), H being the response of a Butterworth filter, and the mean by the gain.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+GAIN, OFFSET, DELAY, CUTOFF = "gain", "offset", "delay", "cutoff"
+KINDS = (GAIN, OFFSET, DELAY, CUTOFF)
+# The delay of all outputs of an experiment.
+SHIFT = "shift"
+NO_PLACE = -1
+
+
+class Factors(NamedTuple):
+    """Complex factors in real numbers: the rounding of NumPy's complex products depends on how many there are."""
+
+    real: np.ndarray
+    imag: np.ndarray
+
+    def times(self, other: "Factors") -> "Factors":
+        """Return the product."""
+        real, imag = self.real * other.real - self.imag * other.imag, self.real * other.imag + self.imag * other.real
+        return Factors(real, imag)
+
+    def scaled(self, factor: np.ndarray | float) -> "Factors":
+        """Return the factors times real numbers."""
+        return Factors(self.real * factor, self.imag * factor)
+
+    @property
+    def conjugate(self) -> "Factors":
+        """The complex conjugates."""
+        return Factors(self.real, -self.imag)
+
+    @property
+    def complex(self) -> np.ndarray:
+        """The factors as complex numbers."""
+        return self.real + 1j * self.imag
+
+
+class SensorNames(NamedTuple):
+    """Parameters of the sensors in one experiment."""
+
+    names: tuple[str, ...]  # of outputs, and delays of inputs; last the delay of all outputs, "shift"
+    orders: Mapping[str, int]  # of the filters, by channel
+    late_inputs: tuple[str, ...]  # inputs with a delay among the names
+    delayed: bool  # whether all outputs may be late
+
+
+def sensor_name(kind: str, channel: str) -> str:
+    """Return what a parameter of the sensor of a channel is called, such as ``gain[force]``."""
+    return f"{kind}[{channel}]"
+
+
+@lru_cache
+def butterworth(order: int) -> tuple[float, ...]:
+    """Return the coefficients b of B(s) = Σ_k b_k sᵏ, the denominator of a Butterworth filter of cutoff 1 rad/s."""
+    angle, result = math.pi / (2 * order), [1.0]
+    for k in range(1, order + 1):
+        result.append(result[-1] * math.cos((k - 1) * angle) / math.sin(k * angle))
+    return tuple(result)
+
+
+def _denominator(ratio: np.ndarray, order: int, slope: int = 0) -> Factors:
+    """Return B(i·ratio), or its derivative by ln(ratio) if `slope` is 1."""
+    coefficients = [b * k**slope for k, b in enumerate(butterworth(order))]
+    square = -ratio * ratio
+    parts = []
+    for some in (coefficients[::2], coefficients[1::2]):
+        total = np.full_like(ratio, some[-1])
+        for b in some[-2::-1]:
+            total = total * square + b
+        parts.append(total)
+    return Factors(parts[0], parts[1] * ratio)
+
+
+def lowpass(ratio: np.ndarray, order: int) -> Factors:
+    """Return the response of a Butterworth filter at frequencies in units of its cutoff."""
+    below = _denominator(ratio, order)
+    return below.conjugate.scaled(1.0 / (1.0 + ratio ** (2 * order)))
+
+
+class Sensing:
+    """The sensors of the measured channels of one experiment, as functions of their parameters.
+
+    `values` (…, names) are those of the parameters `names`, the delay of all outputs last. What is returned of a
+    channel, by its index c, is at the harmonics (size,) of the response period, at the frequency (…,) of the forcing.
+    """
+
+    def __init__(self, channels: Sequence[str], sensors: SensorNames, periods: int, *, delayed: bool = False):
+        names, orders = sensors.names, sensors.orders
+
+        def place(kind: str, channel: str) -> int:
+            name = sensor_name(kind, channel)
+            return names.index(name) if name in names else NO_PLACE
+
+        self._periods, self._orders = periods, tuple(orders.get(channel, 0) for channel in channels)
+        self._gain, self._offset, self._cutoff = (
+            tuple(place(kind, channel) for channel in channels) for kind in (GAIN, OFFSET, CUTOFF)
+        )
+        # A late input is as good as outputs that are too early.
+        common = [(place(DELAY, name), -1.0) for name in sensors.late_inputs]
+        common += [(len(names) - 1, 1.0)] * (sensors.delayed or delayed)
+        own = [[(i, 1.0)] * (i != NO_PLACE) for i in (place(DELAY, channel) for channel in channels)]
+        self._delay = tuple(tuple(one + common) for one in own)
+        self.frequency_place = len(names)
+        places = (*self._gain, *self._offset, *self._cutoff)
+        self.active = any(self._delay) or any(i != NO_PLACE for i in places)
+        self.layout = self._gain, self._offset, self._cutoff, self._orders, self._delay, periods
+
+    def offset(self, c: int, values: np.ndarray) -> np.ndarray | None:
+        """Return the offset (…,) of a channel; None if it has none."""
+        return None if self._offset[c] == NO_PLACE else values[..., self._offset[c]]
+
+    def offset_place(self, c: int) -> int:
+        """Return the place of a channel's offset among the parameters."""
+        return self._offset[c]
+
+    def offset_places(self) -> Iterator[tuple[int, int]]:
+        """Yield index and place of the parameter of every channel that has an offset."""
+        return ((c, i) for c, i in enumerate(self._offset) if i != NO_PLACE)
+
+    def delay(self, c: int, values: np.ndarray) -> np.ndarray | None:
+        """Return the delay (…,) of a channel [s]; None if it is zero."""
+        total: np.ndarray | None = None
+        for i, sign in self._delay[c]:
+            one = values[..., i] if sign > 0.0 else -values[..., i]
+            total = one if total is None else total + one
+        return total
+
+    def lag(self, c: int, values: np.ndarray, frequency: np.ndarray) -> np.ndarray:
+        """Return the delay (…,) of a channel in response periods."""
+        delay = self.delay(c, values)
+        return np.zeros(()) if delay is None else delay * (frequency / self._periods)
+
+    def lag_slopes(self, c: int, values: np.ndarray, frequency: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield places of parameters with the derivatives (…,) of the lag by them, that of the frequency last."""
+        delay = self.delay(c, values)
+        if delay is not None:
+            for i, sign in self._delay[c]:
+                yield i, sign * frequency / self._periods
+            yield self.frequency_place, delay / self._periods
+
+    def factors(
+        self, c: int, values: np.ndarray, frequency: np.ndarray, harmonic: np.ndarray, *, phase: np.ndarray | None = None
+    ) -> Factors | None:
+        """Return what multiplies the harmonics (…, size) of a channel; None if it is 1.
+
+        With `phase` (…,) the channel comes these response periods later too.
+        """
+        result = self._without_gain(c, values, frequency, harmonic, phase)
+        if self._gain[c] == NO_PLACE:
+            return result
+        gain = values[..., self._gain[c], None]
+        if result is None:
+            return Factors(np.broadcast_to(gain, (*gain.shape[:-1], harmonic.size)), np.zeros(harmonic.size))
+        return result.scaled(gain)
+
+    def _without_gain(
+        self, c: int, values: np.ndarray, frequency: np.ndarray, harmonic: np.ndarray, phase: np.ndarray | None = None
+    ) -> Factors | None:
+        """Return the factors of delay and filter."""
+        result, late = None, self.delay(c, values)
+        if late is not None or phase is not None:
+            lag = phase if late is None else late * (frequency / self._periods)
+            lag = lag + phase if late is not None and phase is not None else lag
+            angle = (-2.0 * np.pi * np.asarray(lag))[..., None] * harmonic
+            result = Factors(np.cos(angle), np.sin(angle))
+        if self._cutoff[c] != NO_PLACE:
+            filtered = lowpass(self._ratio(c, values, frequency, harmonic), self._orders[c])
+            result = filtered if result is None else result.times(filtered)
+        return result
+
+    def _ratio(self, c: int, values: np.ndarray, frequency: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
+        """Return the harmonics' frequencies in units of the cutoff, (…, size)."""
+        return np.asarray(frequency / (self._periods * values[..., self._cutoff[c]]))[..., None] * harmonic
+
+    def slopes(
+        self, c: int, values: np.ndarray, frequency: np.ndarray, harmonic: np.ndarray, *, phase: np.ndarray | None = None
+    ) -> Iterator[tuple[int, Factors]]:
+        """Yield places of parameters with the derivatives of the factors by them, that of the frequency last."""
+        whole = self.factors(c, values, frequency, harmonic, phase=phase)
+        if whole is None:
+            return
+        by_frequency = None
+        if self._gain[c] != NO_PLACE:
+            alone = self._without_gain(c, values, frequency, harmonic, phase)
+            none = np.zeros(harmonic.size)
+            yield self._gain[c], alone or Factors(none + 1.0, none)
+        if (delay := self.delay(c, values)) is not None:
+            turn = Factors(np.zeros(harmonic.size), -2.0 * np.pi * harmonic)
+            by_lag = whole.times(turn)
+            for i, slope in self.lag_slopes(c, values, frequency):
+                if i == self.frequency_place:
+                    by_frequency = by_lag.scaled(np.asarray(slope)[..., None])
+                else:
+                    yield i, by_lag.scaled(np.asarray(slope)[..., None])
+        if self._cutoff[c] != NO_PLACE:
+            ratio, cutoff = self._ratio(c, values, frequency, harmonic), values[..., self._cutoff[c], None]
+            order = self._orders[c]
+            relative = lowpass(ratio, order).times(_denominator(ratio, order, slope=1))
+            by_logarithm = whole.times(relative)
+            yield self._cutoff[c], by_logarithm.scaled(1.0 / cutoff)
+            by_rate = by_logarithm.scaled(-1.0 / np.asarray(frequency)[..., None])
+            if by_frequency is None:
+                by_frequency = by_rate
+            else:
+                by_frequency = Factors(by_frequency.real + by_rate.real, by_frequency.imag + by_rate.imag)
+        if by_frequency is not None:
+            yield self.frequency_place, by_frequency
+
+    def first_harmonic(self, values: np.ndarray, frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the factors (…, channels) of the first harmonic without the delay of all outputs, and their slopes.
+
+        The slopes (names + 1, channels) by the parameters and the frequency are those of a single response.
+        """
+        alone, one = np.array(values), np.ones(1)
+        alone[..., -1] = 0.0
+        channels, factors = range(len(self._gain)), []
+        slopes = np.zeros((alone.shape[-1] + 1, len(channels)), dtype=complex)
+        for c in channels:
+            whole = self.factors(c, alone, frequency, one)
+            factors.append(np.ones(()) if whole is None else whole.complex[..., 0])
+            for place, slope in self.slopes(c, alone, frequency, one) if alone.ndim == 1 else ():
+                slopes[place, c] += slope.complex[0]
+        slopes[-2] = 0.0
+        return np.stack(np.broadcast_arrays(*factors), axis=-1), slopes

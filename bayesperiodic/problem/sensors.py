@@ -1,0 +1,314 @@
+"""Sensors between the signals of a model and the measured channels: gain, offset, delay and low-pass filter.
+
+Sensors of outputs act on the response, see `likelihood.sensing`. The model is driven by what the sensors of inputs have
+measured, corrected: known entries correct the measured inputs, unknown ones become parameters of the model, whose
+inputs are replaced by those that gain, offset and filter give back. A Butterworth filter has no zeros, so that its
+inverse is a sum of time derivatives. A delay of the only input is one of all outputs with the other sign.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from bayesperiodic import _checks, _fourier
+from bayesperiodic._io import Storable
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.likelihood.sensing import (
+    CUTOFF,
+    DELAY,
+    GAIN,
+    KINDS,
+    OFFSET,
+    SHIFT,
+    SensorNames,
+    butterworth,
+    lowpass,
+    sensor_name,
+)
+from bayesperiodic.models.model import DERIVATIVES, Model
+from bayesperiodic.priors.joint import as_prior
+
+HIGHEST_ORDER = 10
+# Response of a filter below which the correction of an input would be mostly noise, and amplitudes that are rounding
+# errors, relative to the largest.
+LEAST_RESPONSE, ROUNDED_AMPLITUDE = 0.05, 1e-10
+UNITS = {GAIN: "1", DELAY: "s", CUTOFF: "Hz"}
+
+
+@dataclass(frozen=True)
+class Sensor(Storable):
+    """The path from a signal to the measured channel, for ``Problem(sensors={channel: Sensor(…)})``.
+
+    The channel is gain · lowpass(signal(t − delay)) + offset. Every entry but the order is a number, or a prior of a
+    parameter, called ``gain[channel]``, ``offset[channel]``, ``delay[channel]`` or ``cutoff[channel]``.
+
+    Parameters
+    ----------
+    gain : float or prior
+        Not zero.
+    offset : float or prior
+        In the channel's unit.
+    delay : float or prior
+        [s], positive if the channel is late.
+    cutoff : float or prior, optional
+        Frequency [Hz] at which the filter has lost 3 dB; by default there is no filter.
+    order : int
+        Number of poles of the filter, 1 to 10. It is a Butterworth filter [1]_, flat below the cutoff, as
+        anti-aliasing filters are.
+
+    Raises
+    ------
+    ValueError
+        For an entry that is neither a finite number nor a prior, a gain of zero, a cutoff that is not positive.
+
+    References
+    ----------
+    .. [1] S. Butterworth, On the theory of filter amplifiers, Experimental Wireless and the Wireless Engineer 7, 1930,
+       536-541.
+
+    Examples
+    --------
+    >>> bp.Sensor(gain=bp.LogNormal(1.0, 0.02), cutoff=50.0)
+    Sensor(gain=LogNormal(median=1.0, spread=0.02), cutoff=50.0, order=2)
+    """
+
+    gain: Any = 1.0
+    offset: Any = 0.0
+    delay: Any = 0.0
+    cutoff: Any = None
+    order: int = 2
+
+    def __post_init__(self) -> None:
+        for kind, value in self.entries():
+            if value is not None:
+                number = np.ndim(value) == 0 and isinstance(value, int | float | np.number)
+                checked = _checks.finite_number(kind, value) if number else as_prior(kind, value)
+                object.__setattr__(self, kind, checked)
+            elif kind != CUTOFF:
+                raise ValueError(f"{kind}: must be a number or a prior, got None.")
+        if self.gain == 0.0:
+            raise ValueError("gain: must not be 0, got 0.0.")
+        if self.cutoff is not None:
+            low = self.cutoff if isinstance(self.cutoff, float) else self.cutoff.support[0] or 1.0
+            if not low > 0.0:
+                raise ValueError(
+                    f"cutoff: must be > 0, got {self.cutoff!r}. Give a number or a prior of positive values, such as "
+                    "bp.LogNormal(…)."
+                )
+        _checks.integer("order", self.order, 1)
+        if self.order > HIGHEST_ORDER:
+            raise ValueError(f"order: must be at most {HIGHEST_ORDER}, got {self.order}.")
+
+    def entries(self) -> Iterator[tuple[str, Any]]:
+        """Yield the kinds of the entries but the order, with their values."""
+        return ((kind, getattr(self, kind)) for kind in KINDS)
+
+    def acting(self) -> Iterator[tuple[str, Any]]:
+        """Yield the kinds of the entries that change the signal, with their values."""
+        plain = {f.name: f.default for f in fields(self)}
+        return ((kind, value) for kind, value in self.entries() if not value_is(value, plain[kind]))
+
+    def __repr__(self) -> str:
+        shown = [f"{kind}={value!r}" for kind, value in self.acting()]
+        shown += [f"order={self.order}"] * (self.cutoff is not None)
+        return f"Sensor({', '.join(shown)})"
+
+
+def value_is(value: Any, plain: float | None) -> bool:
+    """Return whether an entry is a number, or None, of this value."""
+    return value is plain or (isinstance(value, float) and value == plain)
+
+
+class Sensors:
+    """The sensors of a problem: parameters, the model that contains those of its inputs, and known corrections.
+
+    Attributes
+    ----------
+    given : dict of str to Sensor
+    model : Model
+        Whose inputs are the measured ones, with the known entries corrected.
+    names : tuple of str
+        Parameters that act on the outputs: all entries of outputs, and unknown delays of inputs.
+    priors, fixed : dict
+        By full name.
+    units : dict of str to str
+    """
+
+    def __init__(self, sensors: Mapping[str, Sensor] | None, model: Model, experiments: Sequence[Experiment]):
+        measured = [channel for channel in model.outputs if any(channel in e.outputs for e in experiments)]
+        self.given = _checked(sensors or {}, model, measured)
+        self._inputs = {name: self.given[name] for name in model.inputs if name in self.given}
+        acting = [(c, kind, value) for c, sensor in self.given.items() for kind, value in sensor.acting()]
+        unknown = {sensor_name(kind, c): value for c, kind, value in acting if not isinstance(value, float)}
+        outputs = [(sensor_name(kind, c), value) for c, kind, value in acting if c not in model.inputs]
+        self.late_inputs = tuple(name for name in self._inputs if sensor_name(DELAY, name) in unknown)
+        for name in self.late_inputs:
+            _check_late_input(name, model)
+        self.names = (*(name for name, _ in outputs), *(sensor_name(DELAY, name) for name in self.late_inputs))
+        self.priors = unknown
+        self.fixed = {name: value for name, value in outputs if name not in unknown}
+        self.units = {
+            sensor_name(kind, c): UNITS.get(kind, model.units.get(c, "")) for c, kind, _ in acting
+        }  # fmt: skip
+        self.model = self._with_unknown_inputs(model)
+        for e in experiments:
+            for name, sensor in self._inputs.items():
+                _check_passed(e, name, sensor)
+
+    @property
+    def of_inputs(self) -> bool:
+        """Whether any input has a sensor."""
+        return bool(self._inputs)
+
+    def parameters(self, delayed: bool) -> SensorNames:
+        """Return the parameters that act on the outputs, the delay of all of them last."""
+        orders = {channel: sensor.order for channel, sensor in self.given.items()}
+        return SensorNames((*self.names, SHIFT), orders, self.late_inputs, delayed)
+
+    def planned(self) -> dict[str, Sensor]:
+        """Return the sensors of a problem whose measured inputs are corrected already."""
+        plain = {f.name: f.default for f in fields(Sensor)}
+        return self.given | {
+            name: replace(sensor, **{k: plain[k] for k, v in sensor.entries() if isinstance(v, float)})
+            for name, sensor in self._inputs.items()
+        }
+
+    def _with_unknown_inputs(self, model: Model) -> Model:
+        """Return the model of the measured inputs, with the unknown gains, offsets and cutoffs as parameters."""
+        changed: dict[sp.Symbol, sp.Expr] = {}
+        symbols: dict[str, sp.Symbol] = {}
+        for name, sensor in self._inputs.items():
+            new = {
+                kind: sp.Symbol(f"sensor_{kind}_{name}", real=True)
+                for kind, value in sensor.acting()
+                if kind != DELAY and not isinstance(value, float) and sensor_name(kind, name) not in model.parameters
+            }
+            if not new:
+                continue
+            highest, weights = model.input_derivatives()[name], (1.0,)
+            if CUTOFF in new:
+                weights = butterworth(sensor.order)
+                if highest + sensor.order > 2:
+                    raise ValueError(
+                        f"sensors[{name!r}]: order must be at most {2 - highest} for an unknown cutoff of an input"
+                        f"{f' whose derivative of order {highest} the model uses' if highest else ''}, got "
+                        f"{sensor.order}; give the cutoff as a number."
+                    )
+            inputs, rate = [model.input_symbols[d + name] for d in DERIVATIVES], 2 * sp.pi * new.get(CUTOFF, 1)
+            known = sensor.gain if isinstance(sensor.gain, float) else 1.0
+            for order in range(highest + 1):
+                total = sum(b / rate**k * inputs[order + k] for k, b in enumerate(weights))
+                total = total - new.get(OFFSET, 0) / known if order == 0 else total
+                changed[inputs[order]] = total / new.get(GAIN, 1)
+            symbols |= {sensor_name(kind, name): symbol for kind, symbol in new.items()}
+        if not symbols:
+            return model
+        other = copy(model)
+        other.parameters = (*model.parameters, *symbols)
+        other.parameter_symbols = {**model.parameter_symbols, **symbols}
+        other.units = {**model.units, **{name: self.units[name] for name in symbols}}
+        other.equations = tuple(e.xreplace(changed) for e in model.equations)
+        other.output_expressions = tuple(e.xreplace(changed) for e in model.output_expressions)
+        return other
+
+    def corrected(
+        self, experiment: Experiment, inputs: Mapping[str, np.ndarray], parameters: Mapping[str, float] | None = None
+    ) -> dict[str, np.ndarray]:
+        """Return measured inputs (points,) corrected by the known entries, and by the unknown ones if they are given."""
+        result = dict(inputs)
+        for name, sensor in self._inputs.items():
+            here, values = self._known(name, sensor, parameters), result[name]
+            amplitudes = _fourier.coefficients(values)
+            amplitudes[0] -= here.offset
+            factors = _response(experiment, here, amplitudes.size)
+            _drop_rounding(amplitudes, factors)
+            result[name] = _fourier.on_grid(amplitudes / factors, values.size)
+        return result
+
+    def corrected_changes(self, experiment: Experiment, names: Sequence[str], changes: np.ndarray) -> np.ndarray:
+        """Return changes (…, points, 3·inputs) of the measured inputs and their rates as those of the corrected ones."""
+        result = np.array(changes)
+        for name, sensor in self._inputs.items():
+            here = self._known(name, sensor, None)
+            for column in range(names.index(name), result.shape[-1], len(names)):
+                amplitudes = _fourier.coefficients(changes[..., column])
+                factors = _response(experiment, here, amplitudes.shape[-1])
+                result[..., column] = _fourier.on_grid(amplitudes / factors, changes.shape[-2])
+        return result
+
+    def _known(self, name: str, sensor: Sensor, parameters: Mapping[str, float] | None) -> Sensor:
+        """Return the sensor of an input with its unknown entries at their values, or without them."""
+        plain = {f.name: f.default for f in fields(Sensor)}
+        unknown = {kind: sensor_name(kind, name) for kind, v in sensor.acting() if not isinstance(v, float)}
+        given = parameters or {}
+        return replace(sensor, **{kind: given.get(full, plain[kind]) for kind, full in unknown.items()})
+
+
+def _checked(sensors: Any, model: Model, measured: Sequence[str]) -> dict[str, Sensor]:
+    """Return the sensors by channel, those that do something; raise a ValueError if one is impossible."""
+    result = {}
+    for channel, sensor in _checks.mapping("sensors", sensors, "{'force': bp.Sensor(delay=1e-3)}").items():
+        argument = f"sensors[{channel!r}]"
+        _checks.one_of("sensors", channel, (*measured, *model.inputs))
+        if not isinstance(sensor, Sensor):
+            raise ValueError(f"{argument}: must be a Sensor, got {_checks.shortened(sensor)}.")
+        acting = dict(sensor.acting())
+        if channel in model.angles and (wrong := next((k for k in (GAIN, CUTOFF) if k in acting), "")):
+            raise ValueError(
+                f"{argument}: must be without {wrong} for an angle, which is compared modulo 2π, got {sensor!r}."
+            )
+        if channel in model.inputs and model.autonomous:
+            raise ValueError(
+                f"{argument}: must be of an output for {model.name!r}, whose equations have no input, got {sensor!r}."
+            )
+        if acting:
+            result[channel] = sensor
+    return result
+
+
+def _check_late_input(name: str, model: Model) -> None:
+    """Refuse an unknown delay of an input where it is not one of all outputs."""
+    explicit = any(e.has(model.time_symbols["tau"]) for e in (*model.equations, *model.output_expressions))
+    if explicit or len(model.inputs) > 1:
+        reason = "equations contain tau" if explicit else f"inputs are {', '.join(model.inputs)}"
+        raise ValueError(
+            f"sensors[{name!r}]: delay must be a number for an input of {model.name!r}, whose {reason}, got a prior. "
+            "Give its value, or delays of the outputs."
+        )
+
+
+def _response(experiment: Experiment, sensor: Sensor, size: int) -> np.ndarray:
+    """Return what a sensor with known entries makes of the harmonics of an experiment, complex (size,)."""
+    harmonic = np.arange(float(size))
+    rate = harmonic * experiment.frequency / experiment.periods
+    factors = sensor.gain * np.exp(-2j * np.pi * rate * sensor.delay)
+    return factors if sensor.cutoff is None else factors * lowpass(rate / sensor.cutoff, sensor.order).complex
+
+
+def _drop_rounding(amplitudes: np.ndarray, factors: np.ndarray) -> None:
+    """Set rounding errors to zero where a filter has left nothing else."""
+    largest = np.abs(amplitudes).max(initial=0.0)
+    weak = np.abs(factors) < LEAST_RESPONSE * np.abs(factors[0])
+    amplitudes[weak & (np.abs(amplitudes) < ROUNDED_AMPLITUDE * largest)] = 0.0
+
+
+def _check_passed(experiment: Experiment, name: str, sensor: Sensor) -> None:
+    """Refuse harmonics of a measured input of which a filter has left next to nothing."""
+    if sensor.cutoff is None:
+        return
+    cutoff = sensor.cutoff if isinstance(sensor.cutoff, float) else float(sensor.cutoff.quantile(np.array(0.5)))
+    amplitudes = _fourier.coefficients(experiment.inputs[name])
+    passed = np.abs(_response(experiment, Sensor(cutoff=cutoff, order=sensor.order), amplitudes.size))
+    present = np.abs(amplitudes) > ROUNDED_AMPLITUDE * np.abs(amplitudes[1:]).max(initial=0.0)
+    highest = int(np.flatnonzero(present).max(initial=0))
+    if passed[highest] < LEAST_RESPONSE:
+        most = int(np.flatnonzero(passed >= LEAST_RESPONSE).max())
+        raise ValueError(
+            f"sensors[{name!r}]: the filter must pass at least {LEAST_RESPONSE:.0%} of the harmonics of "
+            f"{experiment.name!r}, got {passed[highest]:.1%} of harmonic {highest}; its correction would amplify noise "
+            f"{1.0 / passed[highest]:.3g} times. Fold with harmonics={{{name!r}: {most}}}, or less."
+        )
