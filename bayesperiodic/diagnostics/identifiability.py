@@ -37,7 +37,7 @@ def structure_of(problem: Problem) -> Structure:
     A parameter that is fixed at zero in every experiment is removed from the equations, any other fixed one is known. A
     local parameter counts as one.
     """
-    free = {name for name in problem.names if "[" not in name} | set(local_names(problem.names))
+    free = set(problem.plain_names.values())
     known = tuple(name for name in problem.model.parameters if name in problem.fixed and name not in free)
     zeros = tuple(sorted(name for name in known if set(problem.fixed[name].values()) == {0.0}))
     return _structure(problem.model, problem.channels, known, zeros, tuple(problem.ties.items()))
@@ -287,7 +287,7 @@ def identifiability(
             "together": left,
             "collinearity": information.collinearity,
             "profile": [shapes.get(name, "") for name in problem.names],
-            "structural": [_partners(structure, name) for name in problem.names],
+            "structural": [_partners(structure, problem.plain_names[name]) for name in problem.names],
         },
         index=[*problem.names],
     )
@@ -357,9 +357,8 @@ def _structural_images(problem: Problem, fit: MapEstimate, structure: Structure)
     return images
 
 
-def _partners(structure: Structure, name: str) -> str:
+def _partners(structure: Structure, plain: str) -> str:
     """Return the parameters of the structural symmetries that contain one, itself included."""
-    plain = name.partition("[")[0]
     names = [p for symmetry in structure.symmetries if plain in symmetry.parameters for p in symmetry.parameters]
     return ", ".join(dict.fromkeys(names))
 
@@ -394,7 +393,7 @@ def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, n
     NaN for the delay of a free-running model too: its zero is that of an arbitrary phase.
     """
     low, high = problem.joint_prior.supports[name]
-    if not low < 0.0 < high or (problem.model.autonomous and name.partition("[")[0] == SHIFT):
+    if not low < 0.0 < high or (problem.model.autonomous and problem.plain_names[name] == SHIFT):
         return np.nan, np.nan
     if posterior is None:
         freedom = min(fit.degrees_of_freedom[name], 1e9)

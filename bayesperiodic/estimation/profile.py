@@ -383,7 +383,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     objective, peak = at_estimate(problem, fit)
     with TaskPool(executor, (objective, peak)) as pool:
         followed = dict(pool.run(_followed, [problem.names.index(name) for name in chosen]))
-    top, best, units = peak.objective, peak.theta, problem.model.units | {SHIFT: "s"}
+    top, best, units = peak.objective, peak.theta, problem.units
     values, density, paths, limits = {}, {}, {}, {}
     for number, name in enumerate(chosen):
         limits[name], values[name], density[name], paths[name] = followed[number]
@@ -398,7 +398,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
         limits=limits,
         best=dict(zip(problem.names, best.tolist(), strict=True)),
         improvement=float(top - peak.objective),
-        units={name: units.get(name.partition("[")[0], "") for name in problem.names},
+        units={name: units.get(problem.plain_names[name], "") for name in problem.names},
     )
     if result.improvement > BETTER:
         warnings.warn(

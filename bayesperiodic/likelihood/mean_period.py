@@ -11,7 +11,7 @@ import numpy as np
 from bayesperiodic import _fourier
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.block import Block, ComparedSignals, Timed, common, measured_channels
-from bayesperiodic.likelihood.sensing import Factors, Sensing
+from bayesperiodic.likelihood.sensing import NO_PLACE, Factors, Sensing
 from bayesperiodic.models.model import Model
 
 LARGEST_TRANSFORM = 16_384
@@ -89,10 +89,9 @@ class MeanPeriod(Timed):
         """Return components (…, size) as the channel's sensor shows them, with parameters (…, names)."""
         factors = sensing.factors(self.place, values, frequency, self._waves)
         result = components if factors is None else self._multiplied(components, factors)
-        offset = sensing.offset(self.place, values)
-        if offset is not None:
+        if (place := sensing.offset_place[self.place]) != NO_PLACE:
             result = np.array(result)
-            result[..., 0] += offset * math.sqrt(self.size)
+            result[..., 0] += values[..., place] * math.sqrt(self.size)
         return result
 
     def through_sensor_vjp(
@@ -101,15 +100,28 @@ class MeanPeriod(Timed):
         """Return the derivatives of Σ weights · `through_sensor` by the components of signals and by the values."""
         by_values, c = np.zeros(values.shape), self.place
         factors = sensing.factors(c, values, frequency, self._waves)
-        if sensing.offset(c, values) is not None:
-            by_values[..., sensing.offset_place(c)] += weights[..., 0] * math.sqrt(self.size)
+        if (place := sensing.offset_place[c]) != NO_PLACE:
+            by_values[..., place] += weights[..., 0] * math.sqrt(self.size)
         if factors is None:
             return weights, by_values
-        components = self.transform(signals[..., c])
-        for place, slope in sensing.slopes(c, values, frequency, self._waves):
-            if place < values.shape[-1]:
-                by_values[..., place] += np.sum(weights * self._multiplied(components, slope), axis=-1)
+        products = Factors(*self._products(self.transform(signals[..., c]), weights))
+        for relative, by in sensing.slopes(c, values, frequency, self._waves):
+            slope = factors if relative is None else factors.times(relative)
+            total = np.add.reduce(slope.real * products.real - slope.imag * products.imag, axis=-1)
+            for place, factor in by:
+                if place < values.shape[-1]:
+                    by_values[..., place] += total * factor
         return self._multiplied(weights, factors.conjugate), by_values
+
+    def _products(self, components: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the complex p of Σ weights · `_multiplied`(components, factors) = Σ Re(factors · p)."""
+        highest = (self.size - 1) // 2
+        real, imag = components * weights, np.zeros((*components.shape[:-1], self._waves.size))
+        cosine, sine = slice(1, highest + 1), slice(highest + 1, 2 * highest + 1)
+        imag[..., cosine] = components[..., sine] * weights[..., cosine] - components[..., cosine] * weights[..., sine]
+        total = np.concatenate([real[..., : highest + 1], real[..., 2 * highest + 1 :]], axis=-1)
+        total[..., cosine] += real[..., sine]
+        return total, imag
 
     def _multiplied(self, components: np.ndarray, factors: Factors) -> np.ndarray:
         """Return components (…, size) whose harmonics are multiplied by factors, by their real part at Nyquist."""

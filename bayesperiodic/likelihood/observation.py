@@ -181,16 +181,18 @@ class Observation:
 
         Where there is a `layout`, response and weights may be of several experiments, on the leading axis.
         """
-        predicted, outputs, sensors = response, np.zeros(response.outputs.shape), np.zeros(response.sensors.shape)
+        outputs, sensors = np.zeros(response.outputs.shape), np.zeros(response.sensors.shape)
         by = ComparedSignals(outputs[..., self.picked], np.zeros(self.multipliers), np.zeros(()))
-        if self.layout and self.sensing.active:
-            signals = response.outputs[..., self.picked]
+        if self.layout is not None:
+            signals, given = response.outputs[..., self.picked], (response.sensors, response.frequency)
             for block, weight in zip(self.blocks, weights, strict=True):
-                plain = block.through_sensor_vjp(self.sensing, signals, response.sensors, response.frequency, weight)
-                block.add_vjp(predicted, plain[0], by)
-                sensors += plain[1]
+                if self.sensing.active:
+                    weight, by_sensors = block.through_sensor_vjp(self.sensing, signals, *given, weight)
+                    sensors += by_sensors
+                block.add_vjp(None, weight, by)
             outputs[..., self.picked] = by.values
             return Response(outputs, by.frequency, by.log_multipliers, sensors)
+        predicted = self._signals(response)
         for block, weight in zip(self.blocks, weights, strict=True):
             block.add_vjp(predicted, weight, by)
         values = by.values
@@ -325,12 +327,13 @@ class Observation:
 
     def _slopes(self, response: Response) -> np.ndarray:
         """Return the derivatives of `_factors` by all parameters, the frequency last, (parameters + 1, …)."""
-        given = response.sensors, response.frequency, self._harmonic
-        phase, size = self._phase(response), response.sensors.shape[-1] + 1
-        result = np.zeros((size, self._harmonic.size, len(self.channels)), dtype=complex)
+        given, factors = (response.sensors, response.frequency, self._harmonic), self._factors_between(response)
+        result = np.zeros((response.sensors.shape[-1] + 1, *factors.shape), dtype=complex)
         for c in range(len(self.channels)):
-            for place, factors in self.sensing.slopes(c, *given, phase=phase):
-                result[place, :, c] += factors.complex
+            for relative, by in self.sensing.slopes(c, *given):
+                slope = factors[:, c] if relative is None else factors[:, c] * relative.complex
+                for place, scale in by:
+                    result[place, :, c] += slope * scale
         return self._at_nyquist(result)
 
     def _sensed_changes(self, moved: np.ndarray, response: Response, directions: Response) -> np.ndarray:

@@ -7,7 +7,7 @@ gain · H(ν/cutoff) · exp(−2πi ν delay), H being the response of a Butterw
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ KINDS = (GAIN, OFFSET, DELAY, CUTOFF)
 # The delay of all outputs of an experiment.
 SHIFT = "shift"
 NO_PLACE = -1
+Slopes = list[tuple[int, Any]]
 
 
 class Factors(NamedTuple):
@@ -28,10 +29,6 @@ class Factors(NamedTuple):
         """Return the product."""
         real, imag = self.real * other.real - self.imag * other.imag, self.real * other.imag + self.imag * other.real
         return Factors(real, imag)
-
-    def scaled(self, factor: np.ndarray | float) -> "Factors":
-        """Return the factors times real numbers."""
-        return Factors(self.real * factor, self.imag * factor)
 
     @property
     def conjugate(self) -> "Factors":
@@ -83,7 +80,8 @@ def _denominator(ratio: np.ndarray, order: int, slope: int = 0) -> Factors:
 def lowpass(ratio: np.ndarray, order: int) -> Factors:
     """Return the response of a Butterworth filter at frequencies in units of its cutoff."""
     below = _denominator(ratio, order)
-    return below.conjugate.scaled(1.0 / (1.0 + ratio ** (2 * order)))
+    inverse = 1.0 / (1.0 + ratio ** (2 * order))
+    return Factors(below.real * inverse, -below.imag * inverse)
 
 
 class Sensing:
@@ -101,7 +99,7 @@ class Sensing:
             return names.index(name) if name in names else NO_PLACE
 
         self._periods, self._orders = periods, tuple(orders.get(channel, 0) for channel in channels)
-        self._gain, self._offset, self._cutoff = (
+        self._gain, self.offset_place, self._cutoff = (
             tuple(place(kind, channel) for channel in channels) for kind in (GAIN, OFFSET, CUTOFF)
         )
         # A late input is as good as outputs that are too early.
@@ -110,21 +108,13 @@ class Sensing:
         own = [[(i, 1.0)] * (i != NO_PLACE) for i in (place(DELAY, channel) for channel in channels)]
         self._delay = tuple(tuple(one + common) for one in own)
         self.frequency_place = len(names)
-        places = (*self._gain, *self._offset, *self._cutoff)
+        places = (*self._gain, *self.offset_place, *self._cutoff)
         self.active = any(self._delay) or any(i != NO_PLACE for i in places)
-        self.layout = self._gain, self._offset, self._cutoff, self._orders, self._delay, periods
-
-    def offset(self, c: int, values: np.ndarray) -> np.ndarray | None:
-        """Return the offset (…,) of a channel; None if it has none."""
-        return None if self._offset[c] == NO_PLACE else values[..., self._offset[c]]
-
-    def offset_place(self, c: int) -> int:
-        """Return the place of a channel's offset among the parameters."""
-        return self._offset[c]
+        self.layout = self._gain, self.offset_place, self._cutoff, self._orders, self._delay, periods
 
     def offset_places(self) -> Iterator[tuple[int, int]]:
         """Yield index and place of the parameter of every channel that has an offset."""
-        return ((c, i) for c, i in enumerate(self._offset) if i != NO_PLACE)
+        return ((c, i) for c, i in enumerate(self.offset_place) if i != NO_PLACE)
 
     def delay(self, c: int, values: np.ndarray) -> np.ndarray | None:
         """Return the delay (…,) of a channel [s]; None if it is zero."""
@@ -139,13 +129,13 @@ class Sensing:
         delay = self.delay(c, values)
         return np.zeros(()) if delay is None else delay * (frequency / self._periods)
 
-    def lag_slopes(self, c: int, values: np.ndarray, frequency: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield places of parameters with the derivatives (…,) of the lag by them, that of the frequency last."""
+    def lag_slopes(self, c: int, values: np.ndarray, frequency: np.ndarray) -> Slopes:
+        """Return places of parameters with the derivatives (…,) of the lag by them, that of the frequency last."""
         delay = self.delay(c, values)
-        if delay is not None:
-            for i, sign in self._delay[c]:
-                yield i, sign * frequency / self._periods
-            yield self.frequency_place, delay / self._periods
+        if delay is None:
+            return []
+        rate = frequency / self._periods
+        return [(i, sign * rate) for i, sign in self._delay[c]] + [(self.frequency_place, delay / self._periods)]
 
     def factors(
         self, c: int, values: np.ndarray, frequency: np.ndarray, harmonic: np.ndarray, *, phase: np.ndarray | None = None
@@ -154,18 +144,6 @@ class Sensing:
 
         With `phase` (…,) the channel comes these response periods later too.
         """
-        result = self._without_gain(c, values, frequency, harmonic, phase)
-        if self._gain[c] == NO_PLACE:
-            return result
-        gain = values[..., self._gain[c], None]
-        if result is None:
-            return Factors(np.broadcast_to(gain, (*gain.shape[:-1], harmonic.size)), np.zeros(harmonic.size))
-        return result.scaled(gain)
-
-    def _without_gain(
-        self, c: int, values: np.ndarray, frequency: np.ndarray, harmonic: np.ndarray, phase: np.ndarray | None = None
-    ) -> Factors | None:
-        """Return the factors of delay and filter."""
         result, late = None, self.delay(c, values)
         if late is not None or phase is not None:
             lag = phase if late is None else late * (frequency / self._periods)
@@ -175,6 +153,12 @@ class Sensing:
         if self._cutoff[c] != NO_PLACE:
             filtered = lowpass(self._ratio(c, values, frequency, harmonic), self._orders[c])
             result = filtered if result is None else result.times(filtered)
+        if self._gain[c] != NO_PLACE:
+            gain = values[..., self._gain[c], None]
+            if result is not None:
+                return Factors(result.real * gain, result.imag * gain)
+            ones = np.ones(harmonic.size)
+            return Factors(gain * ones, 0.0 * ones)
         return result
 
     def _ratio(self, c: int, values: np.ndarray, frequency: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
@@ -182,38 +166,20 @@ class Sensing:
         return np.asarray(frequency / (self._periods * values[..., self._cutoff[c]]))[..., None] * harmonic
 
     def slopes(
-        self, c: int, values: np.ndarray, frequency: np.ndarray, harmonic: np.ndarray, *, phase: np.ndarray | None = None
-    ) -> Iterator[tuple[int, Factors]]:
-        """Yield places of parameters with the derivatives of the factors by them, that of the frequency last."""
-        whole = self.factors(c, values, frequency, harmonic, phase=phase)
-        if whole is None:
-            return
-        by_frequency = None
+        self, c: int, values: np.ndarray, frequency: np.ndarray, harmonic: np.ndarray
+    ) -> Iterator[tuple[Factors | None, Slopes]]:
+        """Yield relative derivatives of the factors, and what they are by each parameter times a number (…,).
+
+        None stands for the derivative 1. The place of the frequency is `frequency_place`.
+        """
         if self._gain[c] != NO_PLACE:
-            alone = self._without_gain(c, values, frequency, harmonic, phase)
-            none = np.zeros(harmonic.size)
-            yield self._gain[c], alone or Factors(none + 1.0, none)
-        if (delay := self.delay(c, values)) is not None:
-            turn = Factors(np.zeros(harmonic.size), -2.0 * np.pi * harmonic)
-            by_lag = whole.times(turn)
-            for i, slope in self.lag_slopes(c, values, frequency):
-                if i == self.frequency_place:
-                    by_frequency = by_lag.scaled(np.asarray(slope)[..., None])
-                else:
-                    yield i, by_lag.scaled(np.asarray(slope)[..., None])
-        if self._cutoff[c] != NO_PLACE:
-            ratio, cutoff = self._ratio(c, values, frequency, harmonic), values[..., self._cutoff[c], None]
-            order = self._orders[c]
-            relative = lowpass(ratio, order).times(_denominator(ratio, order, slope=1))
-            by_logarithm = whole.times(relative)
-            yield self._cutoff[c], by_logarithm.scaled(1.0 / cutoff)
-            by_rate = by_logarithm.scaled(-1.0 / np.asarray(frequency)[..., None])
-            if by_frequency is None:
-                by_frequency = by_rate
-            else:
-                by_frequency = Factors(by_frequency.real + by_rate.real, by_frequency.imag + by_rate.imag)
-        if by_frequency is not None:
-            yield self.frequency_place, by_frequency
+            yield None, [(self._gain[c], 1.0 / values[..., self._gain[c]])]
+        if by_lag := self.lag_slopes(c, values, frequency):
+            yield Factors(np.zeros(harmonic.size), -2.0 * np.pi * harmonic), by_lag
+        if (place := self._cutoff[c]) != NO_PLACE:
+            ratio = self._ratio(c, values, frequency, harmonic)
+            relative = lowpass(ratio, self._orders[c]).times(_denominator(ratio, self._orders[c], slope=1))
+            yield relative, [(place, 1.0 / values[..., place]), (self.frequency_place, -1.0 / frequency)]
 
     def first_harmonic(self, values: np.ndarray, frequency: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the factors (…, channels) of the first harmonic without the delay of all outputs, and their slopes.
@@ -227,7 +193,8 @@ class Sensing:
         for c in channels:
             whole = self.factors(c, alone, frequency, one)
             factors.append(np.ones(()) if whole is None else whole.complex[..., 0])
-            for place, slope in self.slopes(c, alone, frequency, one) if alone.ndim == 1 else ():
-                slopes[place, c] += slope.complex[0]
+            for relative, by in self.slopes(c, alone, frequency, one) if alone.ndim == 1 else ():
+                for place, slope in by:
+                    slopes[place, c] += factors[c] * slope * (1.0 if relative is None else relative.complex[0])
         slopes[-2] = 0.0
         return np.stack(np.broadcast_arrays(*factors), axis=-1), slopes

@@ -88,6 +88,12 @@ class Description:
                     f"{_checks.shortened(input_noise)}; take noise='independent' or 'measured', or whole periods."
                 )
             self.input_noise = EXACT if self.input_noise == FROM_CYCLES else self.input_noise
+        for e in self.experiments:
+            if e.name in self.sensors.given:
+                raise ValueError(
+                    f"experiments: must have other names than channels with sensors, got {e.name!r}. Name it with "
+                    "fold(name=…)."
+                )
         measured = {channel for experiment in self.experiments for channel in experiment.outputs}
         self.channels = tuple(channel for channel in model.outputs if channel in measured)
         runs = [e.name for e in self.experiments]
@@ -266,6 +272,11 @@ class Description:
                     f"parameters or {group[0]!r}, give it a proper prior (noise.Independent(prior=…)), keep more "
                     "harmonics, or add experiments."
                 )
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units by the plain names of parameters and by signals."""
+        return self.model.units | self.sensors.units | {SHIFT: "s"}
 
     @property
     def noise_names(self) -> tuple[str, ...]:

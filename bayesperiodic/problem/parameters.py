@@ -186,7 +186,10 @@ def _ordered(expressions: dict[str, Expression]) -> dict[str, Expression]:
 
 def full_name(variable: str, place: Sequence[str]) -> str:
     """Return what one place of a variable is called: k, or variance[force, run 7]."""
-    return f"{variable}[{', '.join(place)}]" if place else variable
+    if not place:
+        return variable
+    labels = ", ".join(place)
+    return f"{variable[:-1]}, {labels}]" if variable.endswith("]") else f"{variable}[{labels}]"
 
 
 def pack(
@@ -260,14 +263,15 @@ def in_experiment(names: Iterable[str], experiment: str | None) -> dict[str, str
     return result
 
 
-def local_names(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the plain names of the parameters that experiments have their own of."""
-    return tuple(dict.fromkeys(name.partition("[")[0] for name in names if "[" in name))
+def local_names(names: Iterable[str], experiments: Iterable[str]) -> tuple[str, ...]:
+    """Return the plain names of the model's parameters that experiments have their own of."""
+    ends = tuple(f"[{experiment}]" for experiment in experiments)
+    return tuple(dict.fromkeys(name.partition("[")[0] for name in names if name.endswith(ends)))
 
 
-def local_hint(names: Iterable[str], experiment: str | None) -> str:
+def local_hint(names: Iterable[str], experiments: Iterable[str], experiment: str | None) -> str:
     """Return what to say of expressions that name a local parameter but no experiment."""
-    local = local_names(names)
+    local = local_names(names, experiments)
     if not local or experiment is not None:
         return ""
     return f"Experiments have their own {', '.join(local)}; derive(…, experiment=…) takes those of one."
