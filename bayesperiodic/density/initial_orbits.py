@@ -140,7 +140,9 @@ class _SimultaneousFit:
             for name, z in self.guess.items():
                 at, equations = self.problem.parameters(theta[None], name)[0], self.equations[name]
                 g = _weighed(equations, equations.residual_jacobian(z, at)[:, : equations.count, None]).ravel()
-                by = _weighed(equations, equations.derivatives(z, at).g_theta @ self.maps[name].slopes(theta)[: at.size])
+                by = _weighed(
+                    equations, equations.derivatives(z, at).g_theta @ self.maps[name].slopes(theta)[: at.size]
+                )
                 by = by.reshape(g.size, theta.size)
                 hessian, gradient = hessian + by.T @ by, gradient - by.T @ g
                 total, count = total + g @ g, count + g.size

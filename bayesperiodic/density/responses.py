@@ -163,11 +163,15 @@ class ResponseSolver:
         return result
 
     def solutions(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
-        """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""
+        """Return the periodic solution of every experiment at one θ (names,), with its sensitivities.
+
+        Inputs and outputs are those of the model, without the sensors.
+        """
         simulation, solutions = self.solve(theta[None], keep=True, polish=True), {}
-        for name in self.anchors:
-            (here, z), code = self._solved(simulation, name), int(simulation.statuses(name)[0])
-            solutions[name] = describe(here, self.problem.parameters(theta[None], name)[0], Solved(z, code, NO_HISTORY))
+        for e in self.problem.experiments:
+            (here, z), code = self._solved(simulation, e.name), int(simulation.statuses(e.name)[0])
+            here, parameters = self.problem.without_sensors(here, e, theta)
+            solutions[e.name] = describe(here, parameters, Solved(z, code, NO_HISTORY))
         return solutions
 
     def jacobian(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:

@@ -25,7 +25,7 @@ from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
 from bayesperiodic.problem.fingerprint import check_results
-from bayesperiodic.problem.parameters import SHIFT, local_names
+from bayesperiodic.problem.parameters import SHIFT
 from bayesperiodic.sampling.draws import Posterior
 from bayesperiodic.symmetry.determining import system_of, with_signs
 from bayesperiodic.symmetry.structure import Structure, analyse_structure

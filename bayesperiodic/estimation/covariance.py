@@ -458,7 +458,8 @@ def input_loadings(
         changes, solution = directions(e, problem.model.inputs, noise), solutions[e.name]
         if not len(changes):
             continue
-        changes = problem.sensors.corrected_changes(e, problem.model.inputs, changes)
+        for column, name in enumerate(3 * problem.model.inputs):
+            changes[..., column] = problem.sensors.corrected_changes(e, name, changes[..., column])
         equations = problem.equations[e.name].at_frequency(solution.frequency)
         parameters, z = problem.parameters(theta[None], e.name)[0], periodic_part(equations, solution.states)
         moved = input_sensitivities(equations, z, parameters, changes)
@@ -541,8 +542,9 @@ def estimated_inputs(
                 errors[e.name] = InputErrors(expected, remaining, response @ expected)
                 covariances[e.name] = covariance
         sd[e.name] = {name: np.zeros_like(u) for name, u in e.inputs.items()}
-        signals = _fourier.on_grid(waves, e.samples * e.periods)
+        measured = _fourier.on_grid(waves, e.samples * e.periods)
         for name in set(where):
             mine = np.array([owner == name for owner in where])
+            signals = problem.sensors.corrected_changes(e, name, measured, problem.sensor_values(e, estimate.theta))
             sd[e.name][name] = np.sqrt(np.sum((covariance[np.ix_(mine, mine)] @ signals[mine]) * signals[mine], axis=0))
     return InputEstimate(errors, covariances, sd, residuals)

@@ -20,7 +20,6 @@ from bayesperiodic.estimation.check import at_estimate
 from bayesperiodic.estimation.gauss_newton import PRESSED, Iterate, Objective, climb
 from bayesperiodic.estimation.result import MapEstimate, written
 from bayesperiodic.priors.single import Prior
-from bayesperiodic.problem.parameters import SHIFT
 
 # Distance of points, as the change of the root of the drop; growth, shortening and smallest size of steps.
 ROOT_SPACING, STEP_WIDENING, SHORTENED, SHORTEST_STEP = 0.5, 3.0, 0.25, 0.01

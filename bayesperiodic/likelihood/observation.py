@@ -120,7 +120,7 @@ class Observation:
         between = slice(columns[0], columns[-1] + 1)
         self.picked = between if len(columns) == between.stop - between.start else columns
         self.angles = [channel in model.angles for channel in self.channels]
-        self._angle_places = np.flatnonzero(self.angles)
+        self._angle_places = [c for c, angle in enumerate(self.angles) if angle]
         self._free_phase = model.autonomous
         self.sensing = Sensing(self.channels, sensors, experiment.periods, delayed=model.autonomous)
         self.data = np.stack([experiment.outputs[channel] for channel in self.channels], axis=-1)
@@ -315,7 +315,7 @@ class Observation:
         trend = self._trend(signals)
         spectrum = np.fft.rfft(signals - trend * self._ramp, axis=-2) * self._factors(response)
         result = np.fft.irfft(spectrum, n=self._points, axis=-2)
-        if self._angle_places.size:
+        if self._angle_places:
             phase = self._phase(response)
             lags = [self.sensing.lag(c, response.sensors, response.frequency) for c in range(len(self.channels))]
             lag = np.stack(np.broadcast_arrays(*lags), axis=-1)[..., None, :]
@@ -349,7 +349,7 @@ class Observation:
             changes += self._at_nyquist(turned[:, None, None] * turn)
         every = np.fft.rfft(moved, axis=-2) * factors + spectrum * changes
         result = np.fft.irfft(every, n=self._points, axis=-2)
-        if self._angle_places.size:
+        if self._angle_places:
             lag = np.zeros((len(along), len(self.channels)))
             for c in range(len(self.channels)):
                 for place, slope in self.sensing.lag_slopes(c, response.sensors, response.frequency):

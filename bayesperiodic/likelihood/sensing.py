@@ -138,7 +138,13 @@ class Sensing:
         return [(i, sign * rate) for i, sign in self._delay[c]] + [(self.frequency_place, delay / self._periods)]
 
     def factors(
-        self, c: int, values: np.ndarray, frequency: np.ndarray, harmonic: np.ndarray, *, phase: np.ndarray | None = None
+        self,
+        c: int,
+        values: np.ndarray,
+        frequency: np.ndarray,
+        harmonic: np.ndarray,
+        *,
+        phase: np.ndarray | None = None,
     ) -> Factors | None:
         """Return what multiplies the harmonics (…, size) of a channel; None if it is 1.
 

@@ -26,6 +26,7 @@ from bayesperiodic.likelihood.kinds import blocks_of
 from bayesperiodic.likelihood.likelihood import Likelihood
 from bayesperiodic.likelihood.noise import PER_EXPERIMENT, Noise, as_noise
 from bayesperiodic.likelihood.observation import Observation
+from bayesperiodic.likelihood.sensing import DELAY, sensor_name
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
@@ -109,7 +110,11 @@ class Description:
         self._check_free(fixed)
         self.parameter_maps = {
             run: ParameterMap.of(
-                model.parameters, self.names, run, {n: v[run] for n, v in self.fixed.items() if run in v}, tied,
+                model.parameters,
+                self.names,
+                run,
+                {n: v[run] for n, v in self.fixed.items() if run in v},
+                tied,
                 self.sensors.names,
             )  # fmt: skip
             for run in runs
@@ -173,7 +178,9 @@ class Description:
         common = {*measured.outputs} if SHIFT in columns else set()
         result = {}
         for channel in (*measured.outputs, *measured.inputs):
-            own = [n for n in (SHIFT,) if channel in common] + [n for n in (f"delay[{channel}]",) if n in columns]
+            own = [n for n in (SHIFT,) if channel in common] + [
+                n for n in (sensor_name(DELAY, channel),) if n in columns
+            ]
             result[channel] = tuple(self.names[columns[name]] for name in own)
         return result
 
@@ -507,6 +514,51 @@ class Description:
         """
         parameter_map = self.parameter_maps[experiment]
         return np.ascontiguousarray(parameter_map.values(theta)[:, : parameter_map.count])
+
+    def sensor_values(self, experiment: Experiment, theta: np.ndarray) -> dict[str, float]:
+        """Return the parameters of the sensors of inputs at one θ (names,), without the delays, by plain name."""
+        if not self.sensors.of_inputs:
+            return {}
+        parameter_map = self.parameter_maps[experiment.name]
+        every = zip(parameter_map.parameters, parameter_map.values(theta[None])[0].tolist(), strict=True)
+        return {name: value for name, value in every if name.endswith("]") and not name.startswith(f"{DELAY}[")}
+
+    def model_inputs(self, experiment: Experiment, theta: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the measured inputs of an experiment less their expected errors, corrected by their sensors.
+
+        The time is that of the input: an unknown delay is not removed, but added to the outputs with the other sign.
+
+        Parameters
+        ----------
+        experiment : Experiment
+        theta : array (names,)
+            With the unknown entries of the sensors.
+
+        Returns
+        -------
+        dict of str to array (points,)
+            In the inputs' units.
+        """
+        measured = true_inputs(experiment, self.input_noise, self.input_errors.get(experiment.name))
+        return self.sensors.corrected(experiment, measured, self.sensor_values(experiment, theta))
+
+    def without_sensors(
+        self, equations: PeriodicEquations, experiment: Experiment, theta: np.ndarray
+    ) -> tuple[PeriodicEquations, np.ndarray]:
+        """Return equations at one θ (names,) as those of the model driven by corrected inputs, and its parameters."""
+        parameters, count = self.parameters(theta[None], experiment.name)[0], len(self.sensors.plain_model.parameters)
+        if self.sensors.model is self.sensors.plain_model:
+            return equations, parameters
+        plain = PeriodicEquations.build(
+            self.sensors.plain_model,
+            self.model_inputs(experiment, theta),
+            frequency=equations.frequency,
+            samples=experiment.samples,
+            scheme=self.scheme,
+            periods=experiment.periods,
+            winding=experiment.winding,
+        )
+        return plain, parameters[:count]
 
     def sample_prior(self, size: int, seed: int) -> dict[str, np.ndarray]:
         """Return independent draws of every free parameter from its prior.

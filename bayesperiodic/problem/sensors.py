@@ -8,7 +8,7 @@ inverse is a sum of time derivatives. A delay of the only input is one of all ou
 
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ HIGHEST_ORDER = 10
 # Response of a filter below which the correction of an input would be mostly noise, and amplitudes that are rounding
 # errors, relative to the largest.
 LEAST_RESPONSE, ROUNDED_AMPLITUDE = 0.05, 1e-10
+# Entries of a sensor that changes nothing.
+PLAIN: dict[str, Any] = {GAIN: 1.0, OFFSET: 0.0, DELAY: 0.0, CUTOFF: None}
 UNITS = {GAIN: "1", DELAY: "s", CUTOFF: "Hz"}
 
 
@@ -109,8 +111,7 @@ class Sensor(Storable):
 
     def acting(self) -> Iterator[tuple[str, Any]]:
         """Yield the kinds of the entries that change the signal, with their values."""
-        plain = {f.name: f.default for f in fields(self)}
-        return ((kind, value) for kind, value in self.entries() if not value_is(value, plain[kind]))
+        return ((kind, value) for kind, value in self.entries() if not _is_plain(kind, value))
 
     def __repr__(self) -> str:
         shown = [f"{kind}={value!r}" for kind, value in self.acting()]
@@ -118,9 +119,9 @@ class Sensor(Storable):
         return f"Sensor({', '.join(shown)})"
 
 
-def value_is(value: Any, plain: float | None) -> bool:
-    """Return whether an entry is a number, or None, of this value."""
-    return value is plain or (isinstance(value, float) and value == plain)
+def _is_plain(kind: str, value: Any) -> bool:
+    """Return whether an entry has the value of a sensor that changes nothing."""
+    return value is None or (isinstance(value, float) and value == PLAIN[kind])
 
 
 class Sensors:
@@ -129,8 +130,8 @@ class Sensors:
     Attributes
     ----------
     given : dict of str to Sensor
-    model : Model
-        Whose inputs are the measured ones, with the known entries corrected.
+    plain_model, model : Model
+        Of the true inputs, and of the measured ones with the known entries corrected.
     names : tuple of str
         Parameters that act on the outputs: all entries of outputs, and unknown delays of inputs.
     priors, fixed : dict
@@ -154,7 +155,7 @@ class Sensors:
         self.units = {
             sensor_name(kind, c): UNITS.get(kind, model.units.get(c, "")) for c, kind, _ in acting
         }  # fmt: skip
-        self.model = self._with_unknown_inputs(model)
+        self.plain_model, self.model = model, self._with_unknown_inputs(model)
         for e in experiments:
             for name, sensor in self._inputs.items():
                 _check_passed(e, name, sensor)
@@ -171,9 +172,8 @@ class Sensors:
 
     def planned(self) -> dict[str, Sensor]:
         """Return the sensors of a problem whose measured inputs are corrected already."""
-        plain = {f.name: f.default for f in fields(Sensor)}
         return self.given | {
-            name: replace(sensor, **{k: plain[k] for k, v in sensor.entries() if isinstance(v, float)})
+            name: replace(sensor, **{k: PLAIN[k] for k, v in sensor.entries() if isinstance(v, float)})
             for name, sensor in self._inputs.items()
         }
 
@@ -189,9 +189,9 @@ class Sensors:
             }
             if not new:
                 continue
-            highest, weights = model.input_derivatives()[name], (1.0,)
+            highest = model.input_derivatives()[name]
+            weights = butterworth(sensor.order) if CUTOFF in new else (1.0,)
             if CUTOFF in new:
-                weights = butterworth(sensor.order)
                 if highest + sensor.order > 2:
                     raise ValueError(
                         f"sensors[{name!r}]: order must be at most {2 - highest} for an unknown cutoff of an input"
@@ -221,31 +221,23 @@ class Sensors:
         """Return measured inputs (points,) corrected by the known entries, and by the unknown ones if they are given."""
         result = dict(inputs)
         for name, sensor in self._inputs.items():
-            here, values = self._known(name, sensor, parameters), result[name]
-            amplitudes = _fourier.coefficients(values)
-            amplitudes[0] -= here.offset
-            factors = _response(experiment, here, amplitudes.size)
-            _drop_rounding(amplitudes, factors)
-            result[name] = _fourier.on_grid(amplitudes / factors, values.size)
+            here = self._known(name, sensor, parameters)
+            result[name] = _corrected(experiment, here, result[name] - here.offset)
         return result
 
-    def corrected_changes(self, experiment: Experiment, names: Sequence[str], changes: np.ndarray) -> np.ndarray:
-        """Return changes (…, points, 3·inputs) of the measured inputs and their rates as those of the corrected ones."""
-        result = np.array(changes)
-        for name, sensor in self._inputs.items():
-            here = self._known(name, sensor, None)
-            for column in range(names.index(name), result.shape[-1], len(names)):
-                amplitudes = _fourier.coefficients(changes[..., column])
-                factors = _response(experiment, here, amplitudes.shape[-1])
-                result[..., column] = _fourier.on_grid(amplitudes / factors, changes.shape[-2])
-        return result
+    def corrected_changes(
+        self, experiment: Experiment, name: str, changes: np.ndarray, parameters: Mapping[str, float] | None = None
+    ) -> np.ndarray:
+        """Return changes (…, points) of a measured input, or of its rates, as those of the corrected one."""
+        if name not in self._inputs:
+            return changes
+        return _corrected(experiment, self._known(name, self._inputs[name], parameters), changes)
 
     def _known(self, name: str, sensor: Sensor, parameters: Mapping[str, float] | None) -> Sensor:
         """Return the sensor of an input with its unknown entries at their values, or without them."""
-        plain = {f.name: f.default for f in fields(Sensor)}
         unknown = {kind: sensor_name(kind, name) for kind, v in sensor.acting() if not isinstance(v, float)}
         given = parameters or {}
-        return replace(sensor, **{kind: given.get(full, plain[kind]) for kind, full in unknown.items()})
+        return replace(sensor, **{kind: given.get(full, PLAIN[kind]) for kind, full in unknown.items()})
 
 
 def _checked(sensors: Any, model: Model, measured: Sequence[str]) -> dict[str, Sensor]:
@@ -289,11 +281,16 @@ def _response(experiment: Experiment, sensor: Sensor, size: int) -> np.ndarray:
     return factors if sensor.cutoff is None else factors * lowpass(rate / sensor.cutoff, sensor.order).complex
 
 
-def _drop_rounding(amplitudes: np.ndarray, factors: np.ndarray) -> None:
-    """Set rounding errors to zero where a filter has left nothing else."""
-    largest = np.abs(amplitudes).max(initial=0.0)
-    weak = np.abs(factors) < LEAST_RESPONSE * np.abs(factors[0])
-    amplitudes[weak & (np.abs(amplitudes) < ROUNDED_AMPLITUDE * largest)] = 0.0
+def _corrected(experiment: Experiment, sensor: Sensor, signals: np.ndarray) -> np.ndarray:
+    """Return measured signals (…, points) as they were before gain, delay and filter.
+
+    Rounding errors are set to zero where the filter has left nothing else.
+    """
+    amplitudes = _fourier.coefficients(signals)
+    factors, sizes = _response(experiment, sensor, amplitudes.shape[-1]), np.abs(amplitudes)
+    lost = np.abs(factors) < LEAST_RESPONSE * np.abs(factors[0])
+    amplitudes[lost & (sizes < ROUNDED_AMPLITUDE * sizes.max(axis=-1, keepdims=True))] = 0.0
+    return _fourier.on_grid(amplitudes / factors, signals.shape[-1])
 
 
 def _check_passed(experiment: Experiment, name: str, sensor: Sensor) -> None:
