@@ -29,8 +29,8 @@ from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import FROM_CYCLES, JOINT, error_waves, noisy_inputs
-from bayesperiodic.likelihood.observation import Response
 from bayesperiodic.likelihood.noise import PER_EXPERIMENT, VARIANCE, Independent
+from bayesperiodic.likelihood.observation import Response
 from bayesperiodic.priors.joint import as_prior
 from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.sampling.draws import Posterior

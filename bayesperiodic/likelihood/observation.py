@@ -459,7 +459,7 @@ class Comparisons:
     ) -> tuple[list[np.ndarray], list[np.ndarray], dict[str, np.ndarray]]:
         """Return the derivatives of Σ weights · predicted components by the responses at one θ.
 
-        They are by the outputs (experiments, points, channels) and the sensors (experiments, names) of each group, and by
+        They are by the outputs (experiments, points, channels) and sensors (experiments, names) of each group, and by
         log|μ| of the experiments whose multipliers were measured. The weights are arranged as the residuals at this θ.
         """
         by_outputs = [np.empty((len(group.outputs), *group.outputs.shape[2:])) for group in simulation.groups]

@@ -218,7 +218,7 @@ class Sensors:
     def corrected(
         self, experiment: Experiment, inputs: Mapping[str, np.ndarray], parameters: Mapping[str, float] | None = None
     ) -> dict[str, np.ndarray]:
-        """Return measured inputs (points,) corrected by the known entries, and by the unknown ones if they are given."""
+        """Return measured inputs (points,) corrected by the known entries, and by unknown ones if they are given."""
         result = dict(inputs)
         for name, sensor in self._inputs.items():
             here = self._known(name, sensor, parameters)
