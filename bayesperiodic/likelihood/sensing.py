@@ -4,17 +4,13 @@ A sensor measures gain · lowpass(signal(t − delay)) + offset. At the frequenc
 gain · H(ν/cutoff) · exp(−2πi ν delay), H being the response of a Butterworth filter, and the mean by the gain.
 """
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-GAIN, OFFSET, DELAY, CUTOFF = "gain", "offset", "delay", "cutoff"
-KINDS = (GAIN, OFFSET, DELAY, CUTOFF)
-# The delay of all outputs of an experiment.
-SHIFT = "shift"
+from bayesperiodic.models.sensed import CUTOFF, DELAY, GAIN, OFFSET, butterworth, sensor_name
+
 NO_PLACE = -1
 Slopes = list[tuple[int, Any]]
 
@@ -48,20 +44,6 @@ class SensorNames(NamedTuple):
     orders: Mapping[str, int]  # of the filters, by channel
     late_inputs: tuple[str, ...]  # inputs with a delay among the names
     delayed: bool  # whether all outputs may be late
-
-
-def sensor_name(kind: str, channel: str) -> str:
-    """Return what a parameter of the sensor of a channel is called, such as ``gain[force]``."""
-    return f"{kind}[{channel}]"
-
-
-@lru_cache
-def butterworth(order: int) -> tuple[float, ...]:
-    """Return the coefficients b of B(s) = Σ_k b_k sᵏ, the denominator of a Butterworth filter of cutoff 1 rad/s."""
-    angle, result = math.pi / (2 * order), [1.0]
-    for k in range(1, order + 1):
-        result.append(result[-1] * math.cos((k - 1) * angle) / math.sin(k * angle))
-    return tuple(result)
 
 
 def _denominator(ratio: np.ndarray, order: int, slope: int = 0) -> Factors:

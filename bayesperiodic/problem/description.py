@@ -26,8 +26,8 @@ from bayesperiodic.likelihood.kinds import blocks_of
 from bayesperiodic.likelihood.likelihood import Likelihood
 from bayesperiodic.likelihood.noise import PER_EXPERIMENT, Noise, as_noise
 from bayesperiodic.likelihood.observation import Observation
-from bayesperiodic.likelihood.sensing import DELAY, sensor_name
 from bayesperiodic.models.model import Model
+from bayesperiodic.models.sensed import DELAY, sensor_name
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.priors.joint import JointPrior

@@ -15,7 +15,7 @@ import xarray as xr
 
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse
-from bayesperiodic.likelihood.sensing import SHIFT
+from bayesperiodic.models.sensed import SHIFT
 
 CHAIN, DRAW, CHANNEL, EXPERIMENT = "chain", "draw", "channel", "experiment"
 NOISE = "noise"

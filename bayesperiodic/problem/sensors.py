@@ -7,29 +7,17 @@ inverse is a sum of time derivatives. A delay of the only input is one of all ou
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import sympy as sp
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Storable
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.sensing import (
-    CUTOFF,
-    DELAY,
-    GAIN,
-    KINDS,
-    OFFSET,
-    SHIFT,
-    SensorNames,
-    butterworth,
-    lowpass,
-    sensor_name,
-)
-from bayesperiodic.models.model import DERIVATIVES, Model
+from bayesperiodic.likelihood.sensing import SensorNames, lowpass
+from bayesperiodic.models.model import Model
+from bayesperiodic.models.sensed import CUTOFF, DELAY, GAIN, KINDS, OFFSET, SHIFT, sensor_name, with_sensed_inputs
 from bayesperiodic.priors.joint import as_prior
 
 HIGHEST_ORDER = 10
@@ -179,40 +167,12 @@ class Sensors:
 
     def _with_unknown_inputs(self, model: Model) -> Model:
         """Return the model of the measured inputs, with the unknown gains, offsets and cutoffs as parameters."""
-        changed: dict[sp.Symbol, sp.Expr] = {}
-        symbols: dict[str, sp.Symbol] = {}
-        for name, sensor in self._inputs.items():
-            new = {
-                kind: sp.Symbol(f"sensor_{kind}_{name}", real=True)
-                for kind, value in sensor.acting()
-                if kind != DELAY and not isinstance(value, float) and sensor_name(kind, name) not in model.parameters
-            }
-            if not new:
-                continue
-            highest = model.input_derivatives()[name]
-            weights = butterworth(sensor.order) if CUTOFF in new else (1.0,)
-            if CUTOFF in new:
-                if highest + sensor.order > 2:
-                    raise ValueError(
-                        f"sensors[{name!r}]: order must be at most {2 - highest} for an unknown cutoff of an input"
-                        f"{f' whose derivative of order {highest} the model uses' if highest else ''}, got "
-                        f"{sensor.order}; give the cutoff as a number."
-                    )
-            inputs, rate = [model.input_symbols[d + name] for d in DERIVATIVES], 2 * sp.pi * new.get(CUTOFF, 1)
-            known = sensor.gain if isinstance(sensor.gain, float) else 1.0
-            for order in range(highest + 1):
-                total = sum(b / rate**k * inputs[order + k] for k, b in enumerate(weights))
-                total = total - new.get(OFFSET, 0) / known if order == 0 else total
-                changed[inputs[order]] = total / new.get(GAIN, 1)
-            symbols |= {sensor_name(kind, name): symbol for kind, symbol in new.items()}
-        if not symbols:
-            return model
-        other = copy(model)
-        other.parameters = (*model.parameters, *symbols)
-        other.parameter_symbols = {**model.parameter_symbols, **symbols}
-        other.units = {**model.units, **{name: self.units[name] for name in symbols}}
-        other.equations = tuple(e.xreplace(changed) for e in model.equations)
-        other.output_expressions = tuple(e.xreplace(changed) for e in model.output_expressions)
+        unknown = {n: [k for k, v in s.acting() if not isinstance(v, float)] for n, s in self._inputs.items()}
+        orders = {name: sensor.order for name, sensor in self._inputs.items()}
+        gains = {name: sensor.gain for name, sensor in self._inputs.items() if isinstance(sensor.gain, float)}
+        other = with_sensed_inputs(model, unknown, orders, gains)
+        if other is not model:
+            other.units = {**model.units, **{name: u for name, u in self.units.items() if name in other.parameters}}
         return other
 
     def corrected(
