@@ -63,6 +63,7 @@ from .priors.single import Normal as Normal
 from .priors.single import StudentT as StudentT
 from .priors.single import TruncatedNormal as TruncatedNormal
 from .priors.single import Uniform as Uniform
+from .problem.sensors import Sensor as Sensor
 from .reporting import report as report
 from .sampling.draws import Posterior as Posterior
 from .sampling.evidence import Evidence as Evidence

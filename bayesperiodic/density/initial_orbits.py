@@ -113,7 +113,10 @@ class _SimultaneousFit:
     def __init__(self, problem: Description, guesses: Guesses):
         self.problem, self.maps, self.equations = problem, problem.parameter_maps, problem.equations
         experiments = [e.without_multipliers() for e in problem.experiments]
-        self.observations = {e.name: Observation(e, problem.model, self.maps[e.name].delayed) for e in experiments}
+        self.observations = {
+            e.name: Observation(e, problem.model, problem.sensors.parameters(self.maps[e.name].delayed))
+            for e in experiments
+        }
         blocks = [block for observation in self.observations.values() for block in observation.blocks]
         self.likelihood = Likelihood(problem.noise, blocks, problem.likelihood.fixed)
         self.guess = {}
@@ -137,7 +140,9 @@ class _SimultaneousFit:
             for name, z in self.guess.items():
                 at, equations = self.problem.parameters(theta[None], name)[0], self.equations[name]
                 g = _weighed(equations, equations.residual_jacobian(z, at)[:, : equations.count, None]).ravel()
-                by = _weighed(equations, equations.derivatives(z, at).g_theta @ self.maps[name].slopes(theta)[:-1])
+                by = _weighed(
+                    equations, equations.derivatives(z, at).g_theta @ self.maps[name].slopes(theta)[: at.size]
+                )
                 by = by.reshape(g.size, theta.size)
                 hessian, gradient = hessian + by.T @ by, gradient - by.T @ g
                 total, count = total + g @ g, count + g.size
@@ -166,19 +171,19 @@ class _SimultaneousFit:
         of its derivatives.
         """
         equations, observation, z = self.equations[name], self.observations[name], self.guess[name]
-        parameters = np.ascontiguousarray(self.maps[name].values(theta[None])[0])
-        at, (points, count) = parameters[:-1], z.shape
+        (at, sensors), (points, count) = self.maps[name].split(theta), z.shape
         phase = 2 * np.pi * np.outer(np.arange(SEEN * equations.grid.periods + 1), np.arange(points) / points)
         waves = np.concatenate([np.cos(phase), np.sin(phase[1:])])[: points - 1]
         sizes = np.ptp(z, axis=0) + SMALL_TURN * np.abs(z).max()
         basis = np.einsum("hn,st->hsnt", waves, np.diag(np.where(sizes > 0.0, sizes, 1.0)))
         basis = basis.reshape(-1, points, count)
         changes, none = equations.changes(basis), np.zeros(len(basis))
+        still = np.zeros((len(basis), sensors.size))
         for _ in range(SEEN_ROUNDS):
             d, columns = equations.derivatives(z, at), equations.residual_jacobian(z, at)
             by_q = columns[:, count:].reshape(points, count, -1)
-            here = Response(equations.outputs(z, at), np.array(equations.frequency), none[:0], parameters[-1])
-            moved = Response(along(d.f_q, changes), none, none[:, None][:, :0], none)
+            here = Response(equations.outputs(z, at), np.array(equations.frequency), none[:0], sensors)
+            moved = Response(along(d.f_q, changes), none, none[:, None][:, :0], still)
             g = _weighed(equations, columns[:, :count, None])[..., 0]
             dg = _weighed(equations, np.einsum("neq,dnq->ned", by_q, changes))
             parts = [
@@ -249,8 +254,7 @@ class _SimultaneousFit:
     def _linearise(self, name: str, z: np.ndarray, theta: np.ndarray) -> LinearisedOrbit | None:
         """Return one experiment's equations linearised at an orbit and θ; None where ∂g/∂z is singular."""
         equations, mapped = self.equations[name], self.maps[name]
-        parameters, slopes = np.ascontiguousarray(mapped.values(theta[None])[0]), mapped.slopes(theta)
-        at, by = parameters[:-1], slopes[:-1]
+        (at, sensors), (by, of_sensors) = mapped.split(theta), np.split(mapped.slopes(theta), [mapped.count])
         d, columns = equations.derivatives(z, at), equations.residual_jacobian(z, at)
         factors = equations.factors(columns)
         if not np.isfinite(columns).all() or not factors.regular:
@@ -260,8 +264,8 @@ class _SimultaneousFit:
         outputs = along(d.f_q, equations.changes(dz))
         outputs[:-1] += np.tensordot(by, d.f_theta, (0, 2))
         frequency, none = np.array(equations.frequency), np.zeros(0)
-        here = Response(equations.outputs(z, at) + outputs[-1], frequency, none, parameters[-1])
-        directions = Response(outputs[:-1], np.zeros(theta.size), np.zeros((theta.size, 0)), slopes[-1])
+        here = Response(equations.outputs(z, at) + outputs[-1], frequency, none, sensors)
+        directions = Response(outputs[:-1], np.zeros(theta.size), np.zeros((theta.size, 0)), of_sensors.T)
         observation = self.observations[name]
         return LinearisedOrbit(
             factors, dz[-1], dz[:-1], observation.residuals(here), observation.changes(here, directions)

@@ -189,6 +189,7 @@ class Problem(Description):
         changes = {
             "experiments": [experiment], "priors": {name: self.joint_prior.marginals[name] for name in acting},
             "fixed": {name: {run: v[run]} for name, v in self.fixed.items() if run in v} | known, "input_noise": EXACT,
+            "sensors": self.sensors.planned(),
             "input_errors": None, "anchors": None,
         }  # fmt: skip
         return Problem(**written_out(self) | changes)

@@ -111,7 +111,7 @@ class ResponseSolver:
         groups = []
         for experiments, maps, batch, multipliers in self._batches:
             values = maps.values(theta)
-            parameters = values[..., :-1]
+            parameters, sensors = values[..., : maps.count], values[..., maps.count :]
             if isinstance(batch, AutonomousBatch):
                 solved = batch.solve(parameters, threads, keep=keep or multipliers, whole=whole)
             else:
@@ -123,7 +123,8 @@ class ResponseSolver:
                     self._log_multipliers(e, solved.z[i], solved.frequency[i], parameters[i], status[i])
                     for i, e in enumerate(experiments)
                 ]
-            groups.append(GroupSolution(solved.outputs, solved.frequency, values, logarithms, solved.z, status))
+            of_all = solved.outputs, solved.frequency, parameters, sensors, logarithms, solved.z, status
+            groups.append(GroupSolution(*of_all))
         return Simulation(groups, self._places)
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
@@ -162,28 +163,34 @@ class ResponseSolver:
         return result
 
     def solutions(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
-        """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""
+        """Return the periodic solution of every experiment at one θ (names,), with its sensitivities.
+
+        Inputs and outputs are those of the model, without the sensors.
+        """
         simulation, solutions = self.solve(theta[None], keep=True, polish=True), {}
-        for name in self.anchors:
-            (here, z), code = self._solved(simulation, name), int(simulation.statuses(name)[0])
-            solutions[name] = describe(here, self.problem.parameters(theta[None], name)[0], Solved(z, code, NO_HISTORY))
+        for e in self.problem.experiments:
+            (here, z), code = self._solved(simulation, e.name), int(simulation.statuses(e.name)[0])
+            here, parameters = self.problem.without_sensors(here, e, theta)
+            solutions[e.name] = describe(here, parameters, Solved(z, code, NO_HISTORY))
         return solutions
 
     def jacobian(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:
         """Return the derivatives of a response at the anchor by θ, (names, …); None where they do not exist."""
-        slopes, derivative = self.problem.parameter_maps[experiment].slopes(theta), self.anchors[experiment].derivatives
+        parameter_map, derivative = self.problem.parameter_maps[experiment], self.anchors[experiment].derivatives
         if derivative is None:
             return None
-        outputs = np.tensordot(slopes[:-1], derivative.outputs, (0, 0))
+        of_model, of_sensors = np.split(parameter_map.slopes(theta), [parameter_map.count])
+        outputs = np.tensordot(of_model, derivative.outputs, (0, 0))
         multipliers = np.zeros((theta.size, 0))
         if response.log_multipliers.size:
             multipliers = self._multiplier_jacobian(theta, experiment, z, response)
-        return Response(outputs, slopes[:-1].T @ derivative.frequency, multipliers, slopes[-1])
+        return Response(outputs, of_model.T @ derivative.frequency, multipliers, of_sensors.T)
 
     def _multiplier_jacobian(self, theta: np.ndarray, experiment: str, z: np.ndarray, response: Response) -> np.ndarray:
         """Return ∂ log|μ|/∂θ at the anchor, (names, multipliers)."""
         anchor = self.anchors[experiment].anchor
-        directions = self.problem.parameter_maps[experiment].slopes(theta)[:-1].T
+        parameter_map = self.problem.parameter_maps[experiment]
+        directions = parameter_map.slopes(theta)[: parameter_map.count].T
         assert anchor.sensitivities is not None and anchor.frequency_sensitivities is not None
         equations = self.problem.equations[experiment].at_frequency(float(response.frequency))
         parameters, count = self.problem.parameters(theta[None], experiment)[0], response.log_multipliers.size
@@ -205,7 +212,7 @@ class ResponseSolver:
         theta: np.ndarray,
         simulation: Simulation,
         by_outputs: Sequence[np.ndarray],
-        by_delay: Sequence[np.ndarray],
+        by_sensors: Sequence[np.ndarray],
         by_multipliers: Mapping[str, np.ndarray],
     ) -> dict[str, np.ndarray]:
         """Return the derivatives of a scalar by θ, (names,) by experiment, from those that `Comparisons.vjp` returns.
@@ -217,10 +224,11 @@ class ResponseSolver:
         for g, (experiments, maps, batch, _) in enumerate(self._batches):
             assert isinstance(batch, Batch)
             solved = simulation.groups[g]
-            values = solved.values[:, 0]
+            parameters = solved.parameters[:, 0]
+            values = np.concatenate([parameters, solved.sensors[:, 0]], axis=1)
             by_parameter = np.zeros(values.shape)
-            by_parameter[:, maps.moving] = batch.vjp(values[:, :-1], solved.z[:, 0], by_outputs[g], maps.moving)
-            by_parameter[:, -1] = by_delay[g]
+            by_parameter[:, maps.moving] = batch.vjp(parameters, solved.z[:, 0], by_outputs[g], maps.moving)
+            by_parameter[:, maps.count :] = by_sensors[g]
             result |= zip((e.name for e in experiments), maps.vjp(values, by_parameter), strict=True)
         for name, by_logarithm in by_multipliers.items():
             if by_logarithm.size:
@@ -248,7 +256,8 @@ def _initial_orbit(
             return InitialOrbit(guess, Anchor(parameters, z, equations.frequency), None)
         solved = here, z
     here, z = solved
-    moving = np.flatnonzero(problem.parameter_maps[experiment].slopes(theta)[:-1].any(axis=1))
+    parameter_map = problem.parameter_maps[experiment]
+    moving = np.flatnonzero(parameter_map.slopes(theta)[: parameter_map.count].any(axis=1))
     directions = np.eye(parameters.size)[moving]
     derivative = directional_sensitivities(here, z, parameters, directions)
     by_all = derivative and derivative._replace(

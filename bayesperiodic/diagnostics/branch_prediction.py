@@ -142,7 +142,8 @@ def predict_branch(
 ) -> BranchPrediction:
     """Follow the periodic solution of an experiment along a quantity for draws of the posterior.
 
-    Every branch is continued through folds, stable and unstable (see `continue_periodic`), without measurement noise.
+    Every branch is continued through folds, stable and unstable (see `continue_periodic`), without measurement noise
+    and without the sensors: inputs and outputs are those of the model.
 
     Parameters
     ----------
@@ -193,7 +194,9 @@ def predict_branch(
         if not start.converged:
             failed += 1
             continue
-        branches = [continue_periodic(problem.model, start, vary, until=end, progress=False) for end in ends]
+        branches = [
+            continue_periodic(problem.sensors.plain_model, start, vary, until=end, progress=False) for end in ends
+        ]
         incomplete += not all(branch.complete for branch in branches)
         curves.append(_curve(draw, branches))
     if not curves:

@@ -30,6 +30,7 @@ from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import FROM_CYCLES, JOINT, error_waves, noisy_inputs
 from bayesperiodic.likelihood.noise import PER_EXPERIMENT, VARIANCE, Independent
+from bayesperiodic.likelihood.observation import Response
 from bayesperiodic.priors.joint import as_prior
 from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.sampling.draws import Posterior
@@ -344,7 +345,6 @@ def check_supported(problem: Problem) -> None:
             **{block.description: not block.spectral for block in problem.observations[e.name].blocks},
             f"periods = {e.periods}": e.periods > 1,
             "a winding number": any(turns),
-            "a delay (shift)": problem.parameter_maps[e.name].delayed,
         }
         if what := next((what for what, applies in excluded.items() if applies), ""):
             raise ValueError(
@@ -383,7 +383,11 @@ def _measured(
     """Return a simulated repetition of an experiment."""
     model, (row,) = problem.model, problem.parameters(problem.vector(theta)[None], e.name).tolist()
     values, start = dict(zip(model.parameters, row, strict=True)), _first_state(problem, e, theta)
-    cycle = steady_cycle(model, values, e.inputs, frequency=e.frequency, samples=e.samples, start=start)
+    inputs = problem.sensors.corrected(e, e.inputs)
+    cycle = steady_cycle(model, values, inputs, frequency=e.frequency, samples=e.samples, start=start)
+    sensors = problem.parameter_maps[e.name].split(problem.vector(theta))[1]
+    signals = np.stack([cycle[channel] for channel in model.outputs], axis=-1)
+    shown = problem.observations[e.name].predicted(Response(signals, np.array(e.frequency), np.empty(0), sensors))
     limit, cycles = _fourier.highest_harmonic(e.samples), max(e.cycles, SIMULATED_CYCLES)
     size = cycles * e.samples
     kept = {channel: e.harmonics.get(channel, limit) for channel in (*e.inputs, *e.outputs)}
@@ -391,7 +395,7 @@ def _measured(
     for channel in e.outputs:
         place = f"{channel}, {e.name}" if problem.noise.per == PER_EXPERIMENT else channel
         noise = np.sqrt(variances[f"{VARIANCE}[{place}]"]) * generator.standard_normal(size)
-        outputs[channel] = np.tile(cycle[channel], cycles) + noise
+        outputs[channel] = np.tile(shown[channel], cycles) + noise
     time = np.arange(size) / (e.samples * e.frequency)
     inputs = {name: np.tile(signal, cycles) for name, signal in e.inputs.items()}
     for name in noisy_inputs(e, problem.input_noise):

@@ -24,10 +24,12 @@ from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
+from bayesperiodic.models.sensed import DELAY, sensor_name
 from bayesperiodic.problem.fingerprint import check_results
-from bayesperiodic.problem.parameters import SHIFT, local_names
+from bayesperiodic.problem.parameters import SHIFT
 from bayesperiodic.sampling.draws import Posterior
 from bayesperiodic.symmetry.determining import system_of, with_signs
+from bayesperiodic.symmetry.sensors import with_sensors
 from bayesperiodic.symmetry.structure import Structure, analyse_structure
 
 
@@ -37,10 +39,19 @@ def structure_of(problem: Problem) -> Structure:
     A parameter that is fixed at zero in every experiment is removed from the equations, any other fixed one is known. A
     local parameter counts as one.
     """
-    free = {name for name in problem.names if "[" not in name} | set(local_names(problem.names))
+    free = set(problem.plain_names.values())
     known = tuple(name for name in problem.model.parameters if name in problem.fixed and name not in free)
     zeros = tuple(sorted(name for name in known if set(problem.fixed[name].values()) == {0.0}))
-    return _structure(problem.model, problem.channels, known, zeros, tuple(problem.ties.items()))
+    unknown = {
+        channel: kinds
+        for channel, sensor in problem.sensors.given.items()
+        if (kinds := tuple(kind for kind, _ in sensor.acting() if sensor_name(kind, channel) in free))
+    }
+    sensors = tuple((channel, kinds, problem.sensors.given[channel].order) for channel, kinds in unknown.items())
+    shifted = SHIFT in free and not problem.model.autonomous and any(DELAY in kinds for kinds in unknown.values())
+    return _structure(
+        problem.model, problem.channels, known, zeros, tuple(problem.ties.items()), sensors=sensors, shifted=shifted
+    )
 
 
 @lru_cache(maxsize=64)
@@ -50,12 +61,18 @@ def _structure(
     known: tuple[str, ...],
     zeros: tuple[str, ...],
     tied: tuple[tuple[str, sp.Expr], ...],
+    *,
+    sensors: tuple[tuple[str, tuple[str, ...], int], ...],
+    shifted: bool,
 ) -> Structure:
     symbols = model.parameter_symbols
     values = {symbols[name]: sp.S.Zero for name in zeros}
     ties = {symbols[name]: with_signs(expression).subs(values) for name, expression in tied}
-    system = system_of(model, outputs)
-    return analyse_structure(model.name, system.given(known, values | ties), known)
+    system = system_of(model, outputs).given(known, values | ties)
+    if sensors:
+        unknown = {channel: kinds for channel, kinds, _ in sensors}
+        system = with_sensors(system, unknown, {channel: order for channel, _, order in sensors}, shifted)
+    return analyse_structure(model.name, system, known)
 
 
 POWER, NOTICEABLE = 1.25, 0.05
@@ -287,7 +304,7 @@ def identifiability(
             "together": left,
             "collinearity": information.collinearity,
             "profile": [shapes.get(name, "") for name in problem.names],
-            "structural": [_partners(structure, name) for name in problem.names],
+            "structural": [_partners(structure, problem.plain_names[name]) for name in problem.names],
         },
         index=[*problem.names],
     )
@@ -357,9 +374,8 @@ def _structural_images(problem: Problem, fit: MapEstimate, structure: Structure)
     return images
 
 
-def _partners(structure: Structure, name: str) -> str:
+def _partners(structure: Structure, plain: str) -> str:
     """Return the parameters of the structural symmetries that contain one, itself included."""
-    plain = name.partition("[")[0]
     names = [p for symmetry in structure.symmetries if plain in symmetry.parameters for p in symmetry.parameters]
     return ", ".join(dict.fromkeys(names))
 
@@ -394,7 +410,7 @@ def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, n
     NaN for the delay of a free-running model too: its zero is that of an arbitrary phase.
     """
     low, high = problem.joint_prior.supports[name]
-    if not low < 0.0 < high or (problem.model.autonomous and name.partition("[")[0] == SHIFT):
+    if not low < 0.0 < high or (problem.model.autonomous and problem.plain_names[name] == SHIFT):
         return np.nan, np.nan
     if posterior is None:
         freedom = min(fit.degrees_of_freedom[name], 1e9)

@@ -14,7 +14,6 @@ from bayesperiodic.estimation.map_estimate import nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
 from bayesperiodic.priors.single import LogNormal, Normal
-from bayesperiodic.problem.parameters import local_names
 
 # Standard deviations of the difference of two log-likelihoods from which on the data tell two terms apart.
 DISTINCT = 2.0
@@ -119,7 +118,9 @@ def distinct(one: Optimum, other: Optimum) -> bool:
 def held_out_error(state: Optimum) -> float:
     """Return the mean fraction unexplained in experiments that are left out, one at a time; NaN for few experiments."""
     problem = state.problem
-    if len(problem.experiments) < FEWEST_EXPERIMENTS or any(local_names(problem.names)):
+    if len(problem.experiments) < FEWEST_EXPERIMENTS or any(
+        problem.plain_names[name] != name for name in problem.names
+    ):
         return np.nan
     whole, fractions = problem.anchored(state.iterate.theta, state.orbits), []
     for e in problem.experiments:

@@ -126,7 +126,7 @@ def _transient(problem: Problem, theta: np.ndarray, run: Run, experiment: str | 
     time, signals, failures = np.empty(0), dict[str, list[np.ndarray]](), Counter[str]()
     for row in problem.parameters(theta, _experiment_of(problem, experiment)):
         try:
-            recording = run(dict(zip(problem.model.parameters, row.tolist(), strict=True)))
+            recording = run(dict(zip(problem.sensors.plain_model.parameters, row.tolist(), strict=False)))
         # Raised by integrators that fail, and by recordings of values that are not finite.
         except (RuntimeError, ArithmeticError, ValueError) as error:
             failures[f"{type(error).__name__}: {error}"] += 1
@@ -300,7 +300,7 @@ def predict(
     run : callable, optional
         Returns the recording of a transient for a mapping of all parameters of the model, such as
         ``lambda p: bp.simulate(model, p, inputs, frequency=1.0, duration=30.0, sampling_rate=100.0)``, once per draw;
-        all recordings must have the same times and outputs.
+        all recordings must have the same times and outputs. Sensors are not applied to them.
     experiment : str, optional
         The experiment whose parameters `run` gets; required if experiments differ in some.
 

@@ -21,7 +21,6 @@ from bayesperiodic.likelihood.input_noise import (
     error_waves,
     errors_of_outputs,
     expected_errors,
-    true_inputs,
 )
 from bayesperiodic.likelihood.likelihood import Likelihood
 from bayesperiodic.likelihood.noise import LENGTHSCALE, VARIANCE
@@ -405,7 +404,7 @@ def input_nonlinearity(
             ends = []
             for sign in (1.0, -1.0):
                 other = replace(measured, expected=measured.expected + sign * errors)
-                inputs = true_inputs(e, problem.input_noise, other)
+                inputs = problem.true_inputs(e, other)
                 response = _solved(problem, estimate.theta, e, solutions[e.name], inputs)
                 if response is None:
                     return np.full(estimate.theta.size, np.nan)
@@ -434,8 +433,7 @@ def _solved(
         periods=experiment.periods,
         winding=experiment.winding,
     )
-    values = problem.parameter_maps[experiment.name].values(theta[None])[0]
-    parameters, delay = np.ascontiguousarray(values[:-1]), values[-1]
+    parameters, sensors = problem.parameter_maps[experiment.name].split(theta)
     if problem.model.autonomous:
         equations, solved, _ = solve_free(equations, parameters, near)
     else:
@@ -445,7 +443,7 @@ def _solved(
     count = experiment.measured_multipliers.size
     multipliers = orbit_multipliers(equations, parameters, solved.z, count)
     outputs = equations.outputs(solved.z, parameters)[::finer]
-    return Response(outputs, np.array(equations.frequency), np.log(np.abs(multipliers)), np.array(delay))
+    return Response(outputs, np.array(equations.frequency), np.log(np.abs(multipliers)), sensors)
 
 
 def input_loadings(
@@ -460,6 +458,8 @@ def input_loadings(
         changes, solution = directions(e, problem.model.inputs, noise), solutions[e.name]
         if not len(changes):
             continue
+        for column, name in enumerate(3 * problem.model.inputs):
+            changes[..., column] = problem.sensors.corrected_changes(e, name, changes[..., column])
         equations = problem.equations[e.name].at_frequency(solution.frequency)
         parameters, z = problem.parameters(theta[None], e.name)[0], periodic_part(equations, solution.states)
         moved = input_sensitivities(equations, z, parameters, changes)
@@ -478,11 +478,10 @@ def predicted_changes(
     moved: Sensitivities,
 ) -> np.ndarray:
     """Return the changes of the predicted components of all blocks (directions, components) along sensitivities."""
-    values = problem.parameter_maps[experiment.name].values(theta[None])[0]
-    count, none = experiment.measured_multipliers.size, np.zeros(len(moved.frequency))
-    outputs = equations.outputs(z, np.ascontiguousarray(values[:-1]))
-    here = Response(outputs, np.array(equations.frequency), np.empty(count), np.array(values[-1]))
-    along = Response(moved.outputs, moved.frequency, np.zeros((none.size, count)), none)
+    parameters, sensors = problem.parameter_maps[experiment.name].split(theta)
+    count, size = experiment.measured_multipliers.size, len(moved.frequency)
+    here = Response(equations.outputs(z, parameters), np.array(equations.frequency), np.empty(count), sensors)
+    along = Response(moved.outputs, moved.frequency, np.zeros((size, count)), np.zeros((size, sensors.size)))
     return np.concatenate(problem.observations[experiment.name].changes(here, along), axis=1)
 
 
@@ -543,8 +542,9 @@ def estimated_inputs(
                 errors[e.name] = InputErrors(expected, remaining, response @ expected)
                 covariances[e.name] = covariance
         sd[e.name] = {name: np.zeros_like(u) for name, u in e.inputs.items()}
-        signals = _fourier.on_grid(waves, e.samples * e.periods)
+        measured = _fourier.on_grid(waves, e.samples * e.periods)
         for name in set(where):
             mine = np.array([owner == name for owner in where])
+            signals = problem.sensors.corrected_changes(e, name, measured, problem.sensor_values(e, estimate.theta))
             sd[e.name][name] = np.sqrt(np.sum((covariance[np.ix_(mine, mine)] @ signals[mine]) * signals[mine], axis=0))
     return InputEstimate(errors, covariances, sd, residuals)

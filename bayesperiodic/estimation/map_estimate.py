@@ -337,7 +337,7 @@ def _describe(
         rms={c: _pooled(problem, c, residuals) for c in problem.channels},
         fvu=_fractions_left(problem, residuals),
         true_inputs=TrueInputs(
-            {e.name: problem.true_inputs(e) for e in problem.experiments},
+            {e.name: problem.model_inputs(e, best.theta) for e in problem.experiments},
             estimated_inputs(problem, best).sd,
             problem.input_errors,
         ),

@@ -20,7 +20,6 @@ from bayesperiodic.estimation.check import at_estimate
 from bayesperiodic.estimation.gauss_newton import PRESSED, Iterate, Objective, climb
 from bayesperiodic.estimation.result import MapEstimate, written
 from bayesperiodic.priors.single import Prior
-from bayesperiodic.problem.parameters import SHIFT
 
 # Distance of points, as the change of the root of the drop; growth, shortening and smallest size of steps.
 ROOT_SPACING, STEP_WIDENING, SHORTENED, SHORTEST_STEP = 0.5, 3.0, 0.25, 0.01
@@ -383,7 +382,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     objective, peak = at_estimate(problem, fit)
     with TaskPool(executor, (objective, peak)) as pool:
         followed = dict(pool.run(_followed, [problem.names.index(name) for name in chosen]))
-    top, best, units = peak.objective, peak.theta, problem.model.units | {SHIFT: "s"}
+    top, best, units = peak.objective, peak.theta, problem.units
     values, density, paths, limits = {}, {}, {}, {}
     for number, name in enumerate(chosen):
         limits[name], values[name], density[name], paths[name] = followed[number]
@@ -398,7 +397,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
         limits=limits,
         best=dict(zip(problem.names, best.tolist(), strict=True)),
         improvement=float(top - peak.objective),
-        units={name: units.get(name.partition("[")[0], "") for name in problem.names},
+        units={name: units.get(problem.plain_names[name], "") for name in problem.names},
     )
     if result.improvement > BETTER:
         warnings.warn(

@@ -360,8 +360,8 @@ class MapEstimate(Result):
             _checks.one_of("experiment", experiment, self.solutions)
         named = in_experiment(self.theta, experiment)
         values = self._fixed(experiment) | {plain: self.theta[name] for plain, name in named.items()}
-        hint = local_hint(self.theta, experiment)
-        quantities = parse_all("expressions", expressions, values, local_names(self.theta), hint)
+        hint, local = local_hint(self.theta, self.solutions, experiment), local_names(self.theta, self.solutions)
+        quantities = parse_all("expressions", expressions, values, local, hint)
         at = {name: float(quantity.value(values)) for name, quantity in quantities.items()}
         for name, value in at.items():
             if not np.isfinite(value):
@@ -435,7 +435,7 @@ class MapEstimate(Result):
 
     def _fixed(self, experiment: str | None) -> dict[str, float]:
         """Return the fixed and tied parameters of one experiment, or those with the same value in all."""
-        free = {*self.theta, *(local_names(self.theta) if experiment is None else ())}
+        free = {*self.theta, *(local_names(self.theta, self.solutions) if experiment is None else ())}
         first, *others = (solution.parameters for run, solution in self.solutions.items() if experiment in (None, run))
         return {
             name: value

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesperiodic.density.problem import Problem
+from bayesperiodic.likelihood.observation import Response
 from bayesperiodic.periodic.equations import FREQUENCY
 from bayesperiodic.periodic.floquet import first_order_matrix
 
@@ -27,7 +28,7 @@ def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
     """
     scales = {}
     for e in problem.experiments:
-        equations, parameters = problem.equations[e.name], problem.parameters(theta[None], e.name)[0]
+        equations, (parameters, sensors) = problem.equations[e.name], problem.parameter_maps[e.name].split(theta)
         measured, modelled = {FREQUENCY: e.frequency}, {}
         with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
             z = equations.static_guess(parameters)
@@ -39,10 +40,10 @@ def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
                 modelled[FREQUENCY] = float(sizes[np.argmin(np.abs(np.log(sizes / e.frequency)))])
             if not problem.model.autonomous:
                 z = z - equations.factors(columns).solve(np.ascontiguousarray(columns[:, : equations.count]))
-                outputs = equations.outputs(z, parameters)
-                for channel, values in e.outputs.items():
-                    measured[channel] = 0.5 * float(np.ptp(values))
-                    modelled[channel] = 0.5 * float(np.ptp(outputs[:, problem.model.outputs.index(channel)]))
+                response = Response(equations.outputs(z, parameters), np.array(e.frequency), np.empty(0), sensors)
+                for channel, values in problem.observations[e.name].predicted(response).items():
+                    measured[channel] = 0.5 * float(np.ptp(e.outputs[channel]))
+                    modelled[channel] = 0.5 * float(np.ptp(values))
         scales[e.name] = Scales(measured, {name: size for name, size in modelled.items() if 0.0 < size < np.inf})
     return scales
 

@@ -103,6 +103,16 @@ class Block(ABC):
         """What blocks have in common whose experiments are compared all at once; None if they are not."""
         return None
 
+    def through_sensor(self, sensing: Any, components: np.ndarray, values: Any, frequency: Any) -> np.ndarray:
+        """Return components (…, size) as a sensor with parameters (…, names) shows them, of blocks with a `layout`."""
+        raise NotImplementedError
+
+    def through_sensor_vjp(
+        self, sensing: Any, signals: np.ndarray, values: np.ndarray, frequency: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of Σ weights · `through_sensor` by the components of signals and by the values."""
+        raise NotImplementedError
+
     def parameter_names(self, noise: Any) -> tuple[str, ...]:
         """Return the names of the noise parameters under a noise model, the variance first."""
         return ()

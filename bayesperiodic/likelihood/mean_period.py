@@ -11,6 +11,7 @@ import numpy as np
 from bayesperiodic import _fourier
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.block import Block, ComparedSignals, Timed, common, measured_channels
+from bayesperiodic.likelihood.sensing import NO_PLACE, Factors, Sensing
 from bayesperiodic.models.model import Model
 
 LARGEST_TRANSFORM = 16_384
@@ -75,6 +76,66 @@ class MeanPeriod(Timed):
         result[..., 0] *= ROOT_TWO
         if self.size % 2 == 0:
             result[..., -1] = np.sum(signal * self._alternating, axis=-1) * math.sqrt(self.size)
+
+    @cached_property
+    def _waves(self) -> np.ndarray:
+        """The harmonics that the components are of, the Nyquist harmonic last where it is compared."""
+        highest = (self.size - 1) // 2
+        return np.arange(highest + 1.0) if self.size % 2 else np.append(np.arange(highest + 1.0), self.points // 2)
+
+    def through_sensor(
+        self, sensing: Sensing, components: np.ndarray, values: np.ndarray, frequency: np.ndarray
+    ) -> np.ndarray:
+        """Return components (…, size) as the channel's sensor shows them, with parameters (…, names)."""
+        factors = sensing.factors(self.place, values, frequency, self._waves)
+        result = components if factors is None else self._multiplied(components, factors)
+        if (place := sensing.offset_place[self.place]) != NO_PLACE:
+            result = np.array(result)
+            result[..., 0] += values[..., place] * math.sqrt(self.size)
+        return result
+
+    def through_sensor_vjp(
+        self, sensing: Sensing, signals: np.ndarray, values: np.ndarray, frequency: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of Σ weights · `through_sensor` by the components of signals and by the values."""
+        by_values, c = np.zeros(values.shape), self.place
+        factors = sensing.factors(c, values, frequency, self._waves)
+        if (place := sensing.offset_place[c]) != NO_PLACE:
+            by_values[..., place] += weights[..., 0] * math.sqrt(self.size)
+        if factors is None:
+            return weights, by_values
+        products = Factors(*self._products(self.transform(signals[..., c]), weights))
+        for relative, by in sensing.slopes(c, values, frequency, self._waves):
+            slope = factors if relative is None else factors.times(relative)
+            total = np.add.reduce(slope.real * products.real - slope.imag * products.imag, axis=-1)
+            for place, factor in by:
+                if place < values.shape[-1]:
+                    by_values[..., place] += total * factor
+        return self._multiplied(weights, factors.conjugate), by_values
+
+    def _products(self, components: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the complex p of Σ weights · `_multiplied`(components, factors) = Σ Re(factors · p)."""
+        highest = (self.size - 1) // 2
+        real, imag = components * weights, np.zeros((*components.shape[:-1], self._waves.size))
+        cosine, sine = slice(1, highest + 1), slice(highest + 1, 2 * highest + 1)
+        imag[..., cosine] = components[..., sine] * weights[..., cosine] - components[..., cosine] * weights[..., sine]
+        total = np.concatenate([real[..., : highest + 1], real[..., 2 * highest + 1 :]], axis=-1)
+        total[..., cosine] += real[..., sine]
+        return total, imag
+
+    def _multiplied(self, components: np.ndarray, factors: Factors) -> np.ndarray:
+        """Return components (…, size) whose harmonics are multiplied by factors, by their real part at Nyquist."""
+        highest = (self.size - 1) // 2
+        real, imag = factors.real, factors.imag[..., 1 : highest + 1]
+        cosine, sine = components[..., : highest + 1], components[..., highest + 1 : 2 * highest + 1]
+        result = np.empty(np.broadcast_shapes(components.shape, (*real.shape[:-1], self.size)))
+        np.multiply(cosine, real[..., : highest + 1], out=result[..., : highest + 1])
+        result[..., 1 : highest + 1] -= sine * imag
+        np.multiply(sine, real[..., 1 : highest + 1], out=result[..., highest + 1 : 2 * highest + 1])
+        result[..., highest + 1 : 2 * highest + 1] += cosine[..., 1:] * imag
+        if self.size % 2 == 0:
+            result[..., -1] = components[..., -1] * real[..., -1]
+        return result
 
     @cached_property
     def _alternating(self) -> np.ndarray:

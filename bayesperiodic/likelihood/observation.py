@@ -12,6 +12,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.block import ComparedSignals, measured_channels, measured_variance
 from bayesperiodic.likelihood.kinds import blocks_of
 from bayesperiodic.likelihood.likelihood import Residuals
+from bayesperiodic.likelihood.sensing import Sensing, SensorNames
 from bayesperiodic.models.model import Model
 
 # Outputs (numbers) from which on their comparison with the data is shared among the cores.
@@ -24,7 +25,7 @@ class Response(NamedTuple):
     outputs: np.ndarray  # (…, points, channels), in the order of the model's outputs
     frequency: np.ndarray  # (…,) [Hz]
     log_multipliers: np.ndarray  # (…, multipliers), log|μ|, largest first, as many as were measured
-    delay: np.ndarray  # (…,) of the measured outputs against the model's [s]
+    sensors: np.ndarray  # (…, names) of the sensors' parameters, the delay of all outputs [s] last
 
 
 class GroupSolution(NamedTuple):
@@ -32,7 +33,8 @@ class GroupSolution(NamedTuple):
 
     outputs: np.ndarray  # (experiments, solves, points, channels), in the order of the model's outputs
     frequency: np.ndarray  # (experiments, solves) [Hz]
-    values: np.ndarray  # (experiments, solves, parameters + 1), all parameters, the delay last
+    parameters: np.ndarray  # (experiments, solves, parameters) of the model
+    sensors: np.ndarray  # (experiments, solves, names) of the sensors, the delay of all outputs last
     log_multipliers: list[np.ndarray]  # (solves, multipliers) of each experiment, log|μ|, largest first
     z: np.ndarray  # (experiments, solves, points, states), periodic parts of the states
     status: np.ndarray  # int (experiments, solves), index into `compiled.STATUSES`
@@ -41,14 +43,15 @@ class GroupSolution(NamedTuple):
         """Return the responses of one experiment (an index), θ on the leading axis; of several without multipliers."""
         at = members, solves
         multipliers = self.log_multipliers[members][solves] if isinstance(members, int) else np.empty(0)
-        return Response(self.outputs[at], self.frequency[at], multipliers, self.values[at][..., -1])
+        return Response(self.outputs[at], self.frequency[at], multipliers, self.sensors[at])
 
     def at(self, solves: Any) -> "GroupSolution":
         """Return the solutions at some of the θ."""
         return GroupSolution(
             self.outputs[:, solves],
             self.frequency[:, solves],
-            self.values[:, solves],
+            self.parameters[:, solves],
+            self.sensors[:, solves],
             [values[solves] for values in self.log_multipliers],
             self.z[:, solves],
             self.status[:, solves],
@@ -86,9 +89,9 @@ class Simulation:
 class Observation:
     """Comparison of a response with one experiment.
 
-    Outputs are delayed and compared with the data (angles modulo 2π), each kind of data as its `Block` says. The orbit
-    of an autonomous model, whose phase is free, is first turned until the first harmonics of its measured outputs agree
-    best with those of the data. Other outputs are shifted only if the delay is a parameter.
+    Outputs pass through their sensors and are compared with the data (angles modulo 2π), each kind of data as its
+    `Block` says. The orbit of an autonomous model, whose phase is free, is first turned until the first harmonics of
+    its measured outputs agree best with those of the data.
 
     Attributes
     ----------
@@ -100,6 +103,7 @@ class Observation:
         Which of the channels are angles.
     blocks : tuple of Block
         The data of the experiment, one entry a vector of components.
+    sensing : Sensing
     multipliers : int
         The number of Floquet multipliers that are compared.
     data : array (points, channels)
@@ -107,21 +111,24 @@ class Observation:
         What the expected errors of the inputs cause in the components of each block, see `input_noise`.
     """
 
-    def __init__(self, experiment: Experiment, model: Model, delayed: bool, caused: Sequence[np.ndarray] | None = None):
+    def __init__(
+        self, experiment: Experiment, model: Model, sensors: SensorNames, caused: Sequence[np.ndarray] | None = None
+    ):
         self.experiment, self.caused = experiment, caused
         self.channels, self.blocks = measured_channels(experiment, model), blocks_of(experiment, model)
         columns = [model.outputs.index(channel) for channel in self.channels]
         between = slice(columns[0], columns[-1] + 1)
         self.picked = between if len(columns) == between.stop - between.start else columns
         self.angles = [channel in model.angles for channel in self.channels]
-        self._angle_places = np.flatnonzero(self.angles)
+        self._angle_places = [c for c, angle in enumerate(self.angles) if angle]
         self._free_phase = model.autonomous
-        self._shifted = delayed or model.autonomous
+        self.sensing = Sensing(self.channels, sensors, experiment.periods, delayed=model.autonomous)
         self.data = np.stack([experiment.outputs[channel] for channel in self.channels], axis=-1)
         logarithms = np.log(np.abs(experiment.measured_multipliers))
         self._measured = ComparedSignals(self.data, logarithms, np.array(experiment.frequency))
         self._points = len(self.data)
         self._ramp = np.arange(self._points)[:, None] / self._points
+        self._harmonic = np.arange(self._points // 2 + 1.0)
         self.multipliers = logarithms.size
 
     @property
@@ -157,14 +164,15 @@ class Observation:
     def layout(self) -> tuple[Hashable, ...] | None:
         """What experiments have in common that are compared all at once; None where there is more to compare."""
         layouts = tuple(block.layout for block in self.blocks)
-        return None if self._shifted or any(self.angles) or None in layouts else layouts
+        if self._free_phase or any(self.angles) or None in layouts:
+            return None
+        return *layouts, self.sensing.layout
 
     def changes(self, response: Response, directions: Response) -> list[np.ndarray]:
         """Return the derivatives of the predicted components along directions, one array (directions, size) a block."""
         predicted, moved = self._signals(response), directions.outputs[..., self.picked]
-        if self._shifted:
-            turned = self._fraction_changes(response, directions)[:, None, None]
-            moved = self._shift(moved, self._fraction(response)) - self._rate(predicted.values) * turned
+        if self.sensing.active:
+            moved = self._sensed_changes(moved, response, directions)
         along = ComparedSignals(moved, directions.log_multipliers, directions.frequency)
         return [block.changes(predicted, along) for block in self.blocks]
 
@@ -173,20 +181,28 @@ class Observation:
 
         Where there is a `layout`, response and weights may be of several experiments, on the leading axis.
         """
-        predicted, outputs, by_delay = self._signals(response), np.zeros(response.outputs.shape), 0.0
+        outputs, sensors = np.zeros(response.outputs.shape), np.zeros(response.sensors.shape)
         by = ComparedSignals(outputs[..., self.picked], np.zeros(self.multipliers), np.zeros(()))
+        if self.layout is not None:
+            signals, given = response.outputs[..., self.picked], (response.sensors, response.frequency)
+            for block, weight in zip(self.blocks, weights, strict=True):
+                if self.sensing.active:
+                    weight, by_sensors = block.through_sensor_vjp(self.sensing, signals, *given, weight)
+                    sensors += by_sensors
+                block.add_vjp(None, weight, by)
+            outputs[..., self.picked] = by.values
+            return Response(outputs, by.frequency, by.log_multipliers, sensors)
+        predicted = self._signals(response)
         for block, weight in zip(self.blocks, weights, strict=True):
             block.add_vjp(predicted, weight, by)
         values = by.values
-        if self._shifted:
-            fraction = float(response.frequency) / self.experiment.periods
-            by_delay = -float(np.sum(values * self._rate(predicted.values))) * fraction
-            values = self._shift(values, -self._fraction(response))
+        if self.sensing.active:
+            values, sensors = self._sensed_vjp(values, response)
         outputs[..., self.picked] = values
-        return Response(outputs, by.frequency, by.log_multipliers, np.array(by_delay))
+        return Response(outputs, by.frequency, by.log_multipliers, sensors)
 
     def predicted(self, response: Response) -> dict[str, np.ndarray]:
-        """Return ŷ (…, points) of each measured channel, turned and delayed."""
+        """Return ŷ (…, points) of each measured channel, as its sensor shows it."""
         return dict(zip(self.channels, np.moveaxis(self._signals(response).values, -1, 0), strict=True))
 
     def replicates(self, response: Response, components: list[np.ndarray]) -> dict[str, np.ndarray]:
@@ -214,10 +230,10 @@ class Observation:
         return {channel: self.experiment.compared(channel, e) for channel, e in pairs}
 
     def _signals(self, response: Response) -> ComparedSignals:
-        """Return the prediction of what was measured, the outputs turned and delayed."""
+        """Return the prediction of what was measured, the outputs turned and passed through their sensors."""
         values = response.outputs[..., self.picked]
-        if self._shifted:
-            values = self._shift(values, self._fraction(response), turning=True)
+        if self.sensing.active:
+            values = self._sensed(values, response)
         return ComparedSignals(values, response.log_multipliers, response.frequency)
 
     def _difference(self, predicted: np.ndarray) -> np.ndarray:
@@ -227,20 +243,28 @@ class Observation:
             values[..., c] = _fourier.within_half_turn(values[..., c])
         return values
 
-    def _fraction(self, response: Response) -> np.ndarray:
-        """Return by what fraction of the response period the outputs are shifted, (…,)."""
-        fraction = np.asarray(response.delay) * response.frequency / self.experiment.periods
-        if self._free_phase:
-            amplitudes, reference = self._fundamentals(response.outputs), self._reference
-            # In real numbers: the rounding of NumPy's complex products depends on how many there are.
-            cosine = np.sum(amplitudes.real * reference.real - amplitudes.imag * reference.imag, axis=-1)
-            sine = np.sum(amplitudes.real * reference.imag + amplitudes.imag * reference.real, axis=-1)
-            fraction = fraction + np.arctan2(sine, cosine) / (2 * np.pi)
-        return fraction
+    def _phase(self, response: Response) -> np.ndarray | None:
+        """Return by what fraction (…,) of the response period the orbit of an autonomous model is turned."""
+        if not self._free_phase:
+            return None
+        amplitudes = self._fundamentals(response)
+        reference = self._reference
+        # In real numbers: the rounding of NumPy's complex products depends on how many there are.
+        cosine = np.sum(amplitudes.real * reference.real - amplitudes.imag * reference.imag, axis=-1)
+        sine = np.sum(amplitudes.real * reference.imag + amplitudes.imag * reference.real, axis=-1)
+        return np.arctan2(sine, cosine) / (2 * np.pi)
 
-    def _fundamentals(self, outputs: np.ndarray) -> np.ndarray:
-        """Return the complex amplitude of the first harmonic of each channel, (…, channels)."""
-        return _fourier.coefficients(np.moveaxis(outputs[..., self.picked], -1, -2), 1)[..., 1]
+    def _fundamentals(self, response: Response) -> np.ndarray:
+        """Return the complex amplitude of the first harmonic that each channel would show, (…, channels)."""
+        bare = _fourier.coefficients(np.moveaxis(response.outputs[..., self.picked], -1, -2), 1)[..., 1]
+        return self._own_factors(response)[0] * bare
+
+    def _own_factors(self, response: Response) -> tuple[np.ndarray, np.ndarray]:
+        """Return the factors (…, channels) of the first harmonic without the common delay, and their slopes by all.
+
+        The slopes (parameters + 1, channels) are those at one response, the frequency last.
+        """
+        return self.sensing.first_harmonic(response.sensors, response.frequency)
 
     @cached_property
     def _reference(self) -> np.ndarray:
@@ -257,31 +281,102 @@ class Observation:
         weights[angles & ~angles.all()] = 0.0
         return weights * np.conj(_fourier.coefficients(self.data.T, 1)[:, 1])
 
-    def _fraction_changes(self, response: Response, directions: Response) -> np.ndarray:
-        delays = directions.delay * response.frequency + response.delay * directions.frequency
-        changes = delays / self.experiment.periods
-        if self._free_phase:
-            moved = directions.outputs[..., self.picked]
-            changes = changes + np.einsum("...pc,pc->...", moved, self._phase_gradient(response))
-        return changes
-
-    def _phase_gradient(self, response: Response) -> np.ndarray:
-        """Return the derivatives (points, channels) of the outputs' phase [turns] by their values."""
-        agreement = np.sum(self._fundamentals(response.outputs) * self._reference)
+    def _phase_changes(self, response: Response, directions: Response) -> np.ndarray:
+        """Return the derivatives (directions,) of the turn of an autonomous model's orbit along directions."""
+        first, slopes = self._own_factors(response)
         wave = np.exp(-2j * np.pi * self._ramp[:, 0]) * 2.0 / self._points
-        return np.imag(np.outer(wave, self._reference) / agreement) / (2 * np.pi)
+        bare = wave @ response.outputs[..., self.picked]
+        moved = np.einsum("n,dnc->dc", wave, directions.outputs[..., self.picked]) * first
+        moved += (_with_frequency(directions) @ slopes) * bare
+        agreement = np.sum(bare * first * self._reference)
+        return np.imag(moved @ self._reference / agreement) / (2 * np.pi)
 
-    def _shift(self, signals: np.ndarray, fraction: np.ndarray, turning: bool = False) -> np.ndarray:
-        """Return signals (…, points, channels) that come a fraction of the response period later."""
-        phase = np.asarray(fraction)[..., None, None]
-        trend = self._trend(signals) if turning else 0.0
-        spectrum = np.fft.rfft(signals - trend * self._ramp, axis=-2)
-        harmonic = np.arange(spectrum.shape[-2])[:, None]
-        turn = np.exp(-2j * np.pi * harmonic * phase)
+    def _factors(self, response: Response) -> np.ndarray:
+        """Return what multiplies the harmonics of the channels, complex (…, harmonics, channels)."""
+        return self._at_nyquist(self._factors_between(response))
+
+    def _factors_between(self, response: Response) -> np.ndarray:
+        """Return the factors before that of the Nyquist harmonic is made real."""
+        phase, result = self._phase(response), []
+        for c in range(len(self.channels)):
+            factors = self.sensing.factors(c, response.sensors, response.frequency, self._harmonic, phase=phase)
+            result.append(np.ones(self._harmonic.size) if factors is None else factors.complex)
+        return np.stack(np.broadcast_arrays(*result), axis=-1)
+
+    def _at_nyquist(self, factors: np.ndarray) -> np.ndarray:
+        """Return factors (…, harmonics, channels), real ones at the Nyquist harmonic."""
         if self._points % 2 == 0:
-            turn[..., -1, :] = turn[..., -1, :].real
-        shifted = np.fft.irfft(spectrum * turn, n=self._points, axis=-2)
-        return shifted + trend * (self._ramp - phase)
+            factors = np.array(factors, dtype=complex)
+            factors[..., -1, :] = factors[..., -1, :].real
+        return factors
+
+    def _sensed(self, signals: np.ndarray, response: Response) -> np.ndarray:
+        """Return signals (…, points, channels) as the sensors show them."""
+        trend = self._trend(signals)
+        spectrum = np.fft.rfft(signals - trend * self._ramp, axis=-2) * self._factors(response)
+        result = np.fft.irfft(spectrum, n=self._points, axis=-2)
+        if self._angle_places:
+            phase = self._phase(response)
+            lags = [self.sensing.lag(c, response.sensors, response.frequency) for c in range(len(self.channels))]
+            lag = np.stack(np.broadcast_arrays(*lags), axis=-1)[..., None, :]
+            lag = lag if phase is None else lag + phase[..., None, None]
+            result += trend * (self._ramp - lag)
+        for c, place in self.sensing.offset_places():
+            result[..., c] += response.sensors[..., place, None]
+        return result
+
+    def _slopes(self, response: Response) -> np.ndarray:
+        """Return the derivatives of `_factors` by all parameters, the frequency last, (parameters + 1, …)."""
+        given, factors = (response.sensors, response.frequency, self._harmonic), self._factors_between(response)
+        result = np.zeros((response.sensors.shape[-1] + 1, *factors.shape), dtype=complex)
+        for c in range(len(self.channels)):
+            for relative, by in self.sensing.slopes(c, *given):
+                slope = factors[:, c] if relative is None else factors[:, c] * relative.complex
+                for place, scale in by:
+                    result[place, :, c] += slope * scale
+        return self._at_nyquist(result)
+
+    def _sensed_changes(self, moved: np.ndarray, response: Response, directions: Response) -> np.ndarray:
+        """Return the derivatives of `_sensed` along directions in which the signals move."""
+        signals, factors = response.outputs[..., self.picked], self._factors(response)
+        trend, along = self._trend(signals), _with_frequency(directions)
+        spectrum = np.fft.rfft(signals - trend * self._ramp, axis=-2)
+        changes = np.tensordot(along, self._slopes(response), (1, 0))
+        turned = np.zeros(len(along))
+        if self._free_phase:
+            turned = self._phase_changes(response, directions)
+            turn = -2j * np.pi * self._harmonic[:, None] * self._factors_between(response)
+            changes += self._at_nyquist(turned[:, None, None] * turn)
+        every = np.fft.rfft(moved, axis=-2) * factors + spectrum * changes
+        result = np.fft.irfft(every, n=self._points, axis=-2)
+        if self._angle_places:
+            lag = np.zeros((len(along), len(self.channels)))
+            for c in range(len(self.channels)):
+                for place, slope in self.sensing.lag_slopes(c, response.sensors, response.frequency):
+                    lag[:, c] += along[:, place] * slope
+            result -= trend * (lag + turned[:, None])[:, None]
+        for c, place in self.sensing.offset_places():
+            result[..., c] += along[:, place, None]
+        return result
+
+    def _sensed_vjp(self, weights: np.ndarray, response: Response) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of Σ weights · `_sensed` by the signals and by the sensors of a driven model."""
+        signals, factors = response.outputs[..., self.picked], self._factors(response)
+        trend = self._trend(signals)
+        pulled, spectrum = np.fft.rfft(weights, axis=0), np.fft.rfft(signals - trend * self._ramp, axis=0)
+        halves = np.full((self._harmonic.size, 1), 2.0 / self._points)
+        halves[0] = 1.0 / self._points
+        if self._points % 2 == 0:
+            halves[-1] = 1.0 / self._points
+        by_factors = np.conj(pulled) * spectrum * halves
+        sensors = np.real(np.tensordot(self._slopes(response)[:-1], by_factors, 2))
+        for c, place in self.sensing.offset_places():
+            sensors[place] += np.sum(weights[:, c])
+        for c in self._angle_places:
+            for place, slope in self.sensing.lag_slopes(c, response.sensors, response.frequency):
+                if place < sensors.size:
+                    sensors[place] -= trend[0, c] * slope * np.sum(weights[:, c])
+        return np.fft.irfft(pulled * np.conj(factors), n=self._points, axis=0), sensors
 
     def _trend(self, signals: np.ndarray) -> np.ndarray:
         """Return what angles advance in a response period, (…, 1, channels), whole turns; zero for other channels."""
@@ -289,14 +384,10 @@ class Observation:
         turns = np.rint((ahead - signals[..., :1, :]) / (2 * np.pi))
         return 2 * np.pi * np.where(self.angles, turns, 0.0)
 
-    def _rate(self, predicted: np.ndarray) -> np.ndarray:
-        """Return the derivative (points, channels) of the predicted outputs by their phase [per response period]."""
-        trend = self._trend(predicted)
-        spectrum = np.fft.rfft(predicted - trend * self._ramp, axis=0)
-        spectrum *= 2j * np.pi * np.arange(len(spectrum))[:, None]
-        if self._points % 2 == 0:
-            spectrum[-1] = 0.0
-        return np.fft.irfft(spectrum, n=self._points, axis=0) + trend
+
+def _with_frequency(directions: Response) -> np.ndarray:
+    """Return the changes (directions, parameters + 1) of the sensors and of the frequency."""
+    return np.concatenate([directions.sensors, np.asarray(directions.frequency)[:, None]], axis=1)
 
 
 class _Part(NamedTuple):
@@ -353,7 +444,12 @@ class Comparisons:
             solved = simulation.groups[group]
             if data:
                 signals = ComparedSignals(solved.outputs[members][..., first.picked], np.empty(0), np.empty(0))
-                result += [part - block.errors(signals) for part, block in zip(data, first.blocks, strict=True)]
+                sensors, frequency = solved.sensors[members], solved.frequency[members]
+                for part, block in zip(data, first.blocks, strict=True):
+                    shown = block.errors(signals)
+                    if first.sensing.active:
+                        shown = block.through_sensor(first.sensing, shown, sensors, frequency)
+                    result.append(part - shown)
             else:
                 result += [part[None] for part in first.residuals(solved.response(members))]
         return result
@@ -363,15 +459,15 @@ class Comparisons:
     ) -> tuple[list[np.ndarray], list[np.ndarray], dict[str, np.ndarray]]:
         """Return the derivatives of Σ weights · predicted components by the responses at one θ.
 
-        They are by the outputs (experiments, points, channels) and the delays (experiments,) of each group, and by
+        They are by the outputs (experiments, points, channels) and sensors (experiments, names) of each group, and by
         log|μ| of the experiments whose multipliers were measured. The weights are arranged as the residuals at this θ.
         """
         by_outputs = [np.empty((len(group.outputs), *group.outputs.shape[2:])) for group in simulation.groups]
-        by_delay, by_multipliers = [np.empty(len(group.outputs)) for group in simulation.groups], {}
+        by_sensors, by_multipliers = [np.empty(group.sensors[:, 0].shape) for group in simulation.groups], {}
         stacks = iter(weights.stacks)
         for group, members, first, data in self._parts:
             pulls = [next(stacks) if data else next(stacks)[0] for _ in first.blocks]
             pulled = first.vjp(simulation.groups[group].response(members, 0), pulls)
-            by_outputs[group][members], by_delay[group][members] = pulled.outputs, pulled.delay
+            by_outputs[group][members], by_sensors[group][members] = pulled.outputs, pulled.sensors
             by_multipliers[first.experiment.name] = pulled.log_multipliers
-        return by_outputs, by_delay, by_multipliers
+        return by_outputs, by_sensors, by_multipliers

@@ -27,11 +27,13 @@ from bayesperiodic.likelihood.likelihood import Likelihood
 from bayesperiodic.likelihood.noise import PER_EXPERIMENT, Noise, as_noise
 from bayesperiodic.likelihood.observation import Observation
 from bayesperiodic.models.model import Model
+from bayesperiodic.models.sensed import DELAY, sensor_name
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.priors.joint import JointPrior
 from bayesperiodic.priors.single import Uniform
-from bayesperiodic.problem.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
+from bayesperiodic.problem.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name, plain_names
+from bayesperiodic.problem.sensors import Sensor, Sensors
 
 # Least width of a prior relative to its median; below it the log-posterior is not smooth in double precision.
 LEAST_WIDTH = 1e-12
@@ -52,6 +54,7 @@ class Description:
         noise: str | Noise = "independent",
         scheme: str | Scheme | None = None,
         input_noise: InputNoise = FROM_CYCLES,
+        sensors: Mapping[str, Sensor] | None = None,
         input_errors: Mapping[str, InputErrors] | None = None,
         anchors: Mapping[str, Any] | None = None,
     ):
@@ -66,13 +69,17 @@ class Description:
             "model": model, "experiments": self.experiments, "priors": dict(priors), "fixed": dict(fixed or {}),
             "tied": dict(tied or {}), "local": local, "noise": noise, "scheme": scheme,
             "input_noise": input_noise if isinstance(input_noise, str) else self.input_noise,
-            "input_errors": dict(input_errors or {}), "anchors": dict(anchors or {}),
+            "sensors": dict(sensors or {}), "input_errors": dict(input_errors or {}), "anchors": dict(anchors or {}),
         }  # fmt: skip
         if self.input_noise == JOINT:
             model, errors, none = with_errors_as_parameters(model, self.experiments)
             priors, fixed = {**priors, **errors}, {**(fixed or {}), **none}
             plain = self._settings["model"].parameters
             local = (*local,) + tuple(name for name in model.parameters if name not in plain)
+        self.sensors = Sensors(sensors, model, self.experiments)
+        if self.input_noise == JOINT and self.sensors.of_inputs:
+            raise ValueError("input_noise: must be 'measured' or 'exact' where inputs have sensors, got 'joint'.")
+        model = self.sensors.model
         self.model, self.scheme = model, scheme or default_scheme(model)
         find_scheme(self.scheme)
         if any(b.is_dense(self.noise) for e in self.experiments for b in blocks_of(e, model)):
@@ -82,21 +89,34 @@ class Description:
                     f"{_checks.shortened(input_noise)}; take noise='independent' or 'measured', or whole periods."
                 )
             self.input_noise = EXACT if self.input_noise == FROM_CYCLES else self.input_noise
+        for e in self.experiments:
+            if e.name in self.sensors.given:
+                raise ValueError(
+                    f"experiments: must have other names than channels with sensors, got {e.name!r}. Name it with "
+                    "fold(name=…)."
+                )
         measured = {channel for experiment in self.experiments for channel in experiment.outputs}
         self.channels = tuple(channel for channel in model.outputs if channel in measured)
         runs = [e.name for e in self.experiments]
-        fixed, tied, every = dict(fixed or {}), dict(tied or {}), (*model.parameters, SHIFT)
+        every = (*model.parameters, *self.sensors.names, SHIFT)
+        priors, fixed, tied = self._with_sensors(priors, dict(fixed or {})) + (dict(tied or {}),)
         self.local = _checked_local(local, every, priors, tied)
         self.fixed = {n: _constant(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
         given = expand_priors(priors, self.local, runs, self.fixed) | self._free_phases(priors, fixed, tied)
-        self.joint_prior = JointPrior.of(given, free_names(model.parameters, self.local, runs))
+        self.joint_prior = JointPrior.of(given, free_names(every[:-1], self.local, runs))
         self.names = self.joint_prior.names
+        self.plain_names = plain_names(self.names, self.local, runs)
         self._check_widths()
         self._check_free(fixed)
         self.parameter_maps = {
             run: ParameterMap.of(
-                model.parameters, self.names, run, {n: v[run] for n, v in self.fixed.items() if run in v}, tied
-            )
+                model.parameters,
+                self.names,
+                run,
+                {n: v[run] for n, v in self.fixed.items() if run in v},
+                tied,
+                self.sensors.names,
+            )  # fmt: skip
             for run in runs
         }
         self.ties = self._ties()
@@ -119,6 +139,50 @@ class Description:
 
     def __delattr__(self, name: str) -> None:
         self.__setattr__(name, None)
+
+    def _with_sensors(self, priors: Mapping[Any, Any], fixed: dict[str, Any]) -> tuple[dict[Any, Any], dict[str, Any]]:
+        """Return the priors and values with those of the sensors, unless a name has one of its own."""
+        taken = {*fixed}.union(*(key if isinstance(key, tuple) else (key,) for key in priors))
+        free = {name: prior for name, prior in self.sensors.priors.items() if name not in taken}
+        known = {name: value for name, value in self.sensors.fixed.items() if name not in taken}
+        return {**free, **priors}, fixed | known
+
+    def delay_parameters(self, experiment: str) -> dict[str, tuple[str, ...]]:
+        """Return the free parameters that delay each channel in an experiment.
+
+        The time between two channels is unknown if they are not delayed by the same ones.
+
+        Parameters
+        ----------
+        experiment : str
+
+        Returns
+        -------
+        dict of str to tuple of str
+            Full names by channel, outputs and inputs; empty for a channel without a free delay.
+
+        Raises
+        ------
+        ValueError
+            For an unknown experiment.
+
+        Examples
+        --------
+        >>> late = problem.replace(sensors={"displacement": bp.Sensor(delay=bp.Normal(0.0, 0.01))})
+        >>> late.delay_parameters("synthetic duffing")
+        {'displacement': ('delay[displacement]',), 'force': ()}
+        """
+        _checks.one_of("experiment", experiment, self.parameter_maps)
+        measured = next(e for e in self.experiments if e.name == experiment)
+        columns = self.parameter_maps[experiment].columns
+        common = {*measured.outputs} if SHIFT in columns else set()
+        result = {}
+        for channel in (*measured.outputs, *measured.inputs):
+            own = [n for n in (SHIFT,) if channel in common] + [
+                n for n in (sensor_name(DELAY, channel),) if n in columns
+            ]
+            result[channel] = tuple(self.names[columns[name]] for name in own)
+        return result
 
     def _free_phases(self, priors: Any, fixed: Mapping[str, Any], tied: Mapping[str, Any]) -> dict[str, Uniform]:
         """Return the priors of the delays that an autonomous model needs and that were not given."""
@@ -151,7 +215,7 @@ class Description:
         for e in self.experiments:
             delayed, errors = self.parameter_maps[e.name].delayed, self.input_errors.get(e.name)
             caused = None if errors is None else errors.parts([block.size for block in blocks_of(e, self.model)])
-            result[e.name] = Observation(e, self.model, delayed, caused)
+            result[e.name] = Observation(e, self.model, self.sensors.parameters(delayed), caused)
         return result
 
     @cached_property
@@ -173,7 +237,7 @@ class Description:
                     f"{plain!r}. Rename the model's parameter."
                 )
         for name, value in known.items():
-            _checks.one_of("fixed", name, (*self.model.parameters, SHIFT, *names))
+            _checks.one_of("fixed", name, (*self.model.parameters, *self.sensors.names, SHIFT, *names))
             _checks.positive(f"fixed[{name!r}]", value)
         return known
 
@@ -215,6 +279,11 @@ class Description:
                     f"parameters or {group[0]!r}, give it a proper prior (noise.Independent(prior=…)), keep more "
                     "harmonics, or add experiments."
                 )
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units by the plain names of parameters and by signals."""
+        return self.model.units | self.sensors.units | {SHIFT: "s"}
 
     @property
     def noise_names(self) -> tuple[str, ...]:
@@ -286,7 +355,7 @@ class Description:
         """
         chosen = tuple(experiments)
         gone = {e.name for e in self.experiments} - {getattr(e, "name", None) for e in chosen}
-        ends = tuple(local_name("", name) for name in gone)
+        ends = tuple(end for name in gone for end in (f"[{name}]", f", {name}]"))
         priors, fixed = (
             {key: value for key, value in given.items() if not (isinstance(key, str) and key.endswith(ends))}
             for given in (self._settings["priors"], self._settings["fixed"])
@@ -304,12 +373,13 @@ class Description:
 
     def _ties(self) -> dict[str, sp.Expr]:
         """Return the expressions of the model's tied parameters by its symbols, those of others inserted."""
-        symbols: dict[str, sp.Expr] = self.model.parameter_symbols | {SHIFT: sp.Symbol(SHIFT, real=True)}
+        others = {name: sp.Symbol(name, real=True) for name in (*self.sensors.names, SHIFT)}
+        symbols: dict[str, sp.Expr] = self.model.parameter_symbols | others
         degrees: dict[str, float] = {}
         tied = next(iter(self.parameter_maps.values())).tied  # each only of those before it
         for name, tie in tied.items():
             symbols[name], degrees[name] = tie.symbolic(f"tied[{name!r}]", symbols, degrees)
-        return {name: symbols[name] for name in tied if name != SHIFT}
+        return {name: symbols[name] for name in tied if name not in others}
 
     @property
     def priors(self) -> dict[str | tuple[str, ...], Any]:
@@ -390,19 +460,24 @@ class Description:
         every = {e.name: noisy_inputs(e, self.input_noise) for e in self.experiments}
         return {name: inputs for name, inputs in every.items() if inputs}
 
-    def true_inputs(self, experiment: Experiment) -> dict[str, np.ndarray]:
+    def true_inputs(self, experiment: Experiment, errors: InputErrors | None = None) -> dict[str, np.ndarray]:
         """Return the inputs of the model in an experiment: the measured ones less their expected errors.
+
+        They are corrected by what is known of their sensors.
 
         Parameters
         ----------
         experiment : Experiment
+        errors : InputErrors, optional
+            By default those of the problem.
 
         Returns
         -------
         dict of str to array (points,)
             In the inputs' units.
         """
-        return true_inputs(experiment, self.input_noise, self.input_errors.get(experiment.name))
+        errors = errors or self.input_errors.get(experiment.name)
+        return self.sensors.corrected(experiment, true_inputs(experiment, self.input_noise, errors))
 
     @cached_property
     def equations(self) -> dict[str, PeriodicEquations]:
@@ -437,7 +512,53 @@ class Description:
         array (draws, parameters)
             In the order of the model.
         """
-        return np.ascontiguousarray(self.parameter_maps[experiment].values(theta)[:, :-1])
+        parameter_map = self.parameter_maps[experiment]
+        return np.ascontiguousarray(parameter_map.values(theta)[:, : parameter_map.count])
+
+    def sensor_values(self, experiment: Experiment, theta: np.ndarray) -> dict[str, float]:
+        """Return the parameters of the sensors of inputs at one θ (names,), without the delays, by plain name."""
+        if not self.sensors.of_inputs:
+            return {}
+        parameter_map = self.parameter_maps[experiment.name]
+        every = zip(parameter_map.parameters, parameter_map.values(theta[None])[0].tolist(), strict=True)
+        return {name: value for name, value in every if name.endswith("]") and not name.startswith(f"{DELAY}[")}
+
+    def model_inputs(self, experiment: Experiment, theta: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the measured inputs of an experiment less their expected errors, corrected by their sensors.
+
+        The time is that of the input: an unknown delay is not removed, but added to the outputs with the other sign.
+
+        Parameters
+        ----------
+        experiment : Experiment
+        theta : array (names,)
+            With the unknown entries of the sensors.
+
+        Returns
+        -------
+        dict of str to array (points,)
+            In the inputs' units.
+        """
+        measured = true_inputs(experiment, self.input_noise, self.input_errors.get(experiment.name))
+        return self.sensors.corrected(experiment, measured, self.sensor_values(experiment, theta))
+
+    def without_sensors(
+        self, equations: PeriodicEquations, experiment: Experiment, theta: np.ndarray
+    ) -> tuple[PeriodicEquations, np.ndarray]:
+        """Return equations at one θ (names,) as those of the model driven by corrected inputs, and its parameters."""
+        parameters, count = self.parameters(theta[None], experiment.name)[0], len(self.sensors.plain_model.parameters)
+        if self.sensors.model is self.sensors.plain_model:
+            return equations, parameters
+        plain = PeriodicEquations.build(
+            self.sensors.plain_model,
+            self.model_inputs(experiment, theta),
+            frequency=equations.frequency,
+            samples=experiment.samples,
+            scheme=self.scheme,
+            periods=experiment.periods,
+            winding=experiment.winding,
+        )
+        return plain, parameters[:count]
 
     def sample_prior(self, size: int, seed: int) -> dict[str, np.ndarray]:
         """Return independent draws of every free parameter from its prior.
@@ -456,11 +577,13 @@ class Description:
         return dict(zip(self.names, draws.T.copy(), strict=True))
 
     def __repr__(self) -> str:
+        sensors = ", ".join(f"{channel} {sensor!r}" for channel, sensor in self.sensors.given.items())
         noisy = ", ".join(dict.fromkeys(name for inputs in self.noisy_inputs.values() for name in inputs))
         return (
             f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
             f"channels: {', '.join(self.channels)} with {self.counted:.0f} independent values, {self.noise.name} noise"
-            f"{f', noise of {noisy} integrated out' if noisy else ''})"
+            f"{f', noise of {noisy} integrated out' if noisy else ''}"
+            f"{f', sensors: {sensors}' if sensors else ''})"
         )
 
 
@@ -469,8 +592,9 @@ def written_out(problem: Description) -> dict[str, Any]:
 
     Errors of inputs that are parameters belong to the model.
     """
+    model = problem.model if problem.input_noise == JOINT else problem.settings["model"]
     return problem.settings | {
-        "model": problem.model, "priors": problem.priors, "fixed": problem.fixed | problem.likelihood.fixed,
+        "model": model, "priors": problem.priors, "fixed": problem.fixed | problem.likelihood.fixed,
         "local": problem.local, "input_noise": EXACT if problem.input_noise == JOINT else problem.input_noise,
     }  # fmt: skip
 

@@ -29,6 +29,8 @@ def fingerprint(problem: Description) -> str:
     }
     if problem.input_noise != EXACT:
         parts["input_noise"] = [problem.input_noise]
+    if problem.sensors.given:
+        parts["sensors"] = repr(problem.sensors.given)
     return " ".join(f"{part}:{digest(value)}" for part, value in parts.items())
 
 

@@ -1,7 +1,7 @@
 """Parameters of a model that are free, fixed or tied, and names of parameters and their draws.
 
 A parameter local to an experiment is called ``theta16[run 7]``; its draws are one place of a variable with the dim
-"experiment".
+"experiment". The parameters of sensors are called ``delay[force]``, local ones ``delay[force, run 7]``.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,15 +15,15 @@ import xarray as xr
 
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse
+from bayesperiodic.models.sensed import SHIFT
 
-SHIFT = "shift"
 CHAIN, DRAW, CHANNEL, EXPERIMENT = "chain", "draw", "channel", "experiment"
 NOISE = "noise"
 
 
 def local_name(name: str, experiment: str) -> str:
-    """Return what a parameter local to an experiment is called, such as ``theta16[run 7]``."""
-    return f"{name}[{experiment}]"
+    """Return what a parameter local to an experiment is called, ``theta16[run 7]`` or ``delay[force, run 7]``."""
+    return f"{name[:-1]}, {experiment}]" if name.endswith("]") else f"{name}[{experiment}]"
 
 
 def expand_priors(
@@ -43,6 +43,12 @@ def expand_priors(
     return result
 
 
+def plain_names(names: Iterable[str], local: Iterable[str], experiments: Iterable[str]) -> dict[str, str]:
+    """Return the plain names of parameters by their full names: k by k, and theta16 by ``theta16[run 7]``."""
+    own = {local_name(plain, run): plain for plain in local for run in experiments}
+    return {name: own.get(name, name) for name in names}
+
+
 def free_names(parameters: Iterable[str], local: Iterable[str], experiments: Iterable[str]) -> list[str]:
     """Return every name that a free parameter may have, in order."""
     result: list[str] = []
@@ -58,7 +64,8 @@ def free_names(parameters: Iterable[str], local: Iterable[str], experiments: Ite
 class ParameterMap:
     """Map from θ, the free parameters of all experiments, to all parameters of one experiment."""
 
-    parameters: tuple[str, ...]  # all of the model's, and last "shift", the delay of the measured outputs [s]
+    parameters: tuple[str, ...]  # the model's, those of sensors, and last "shift", the delay of all outputs [s]
+    count: int  # number of the model's
     columns: dict[str, int]  # places of this experiment's free ones in θ
     size: int  # length of θ
     fixed: dict[str, float]
@@ -72,9 +79,10 @@ class ParameterMap:
         experiment: str,
         fixed: Mapping[str, float],
         tied: Mapping[str, Any],
+        sensors: tuple[str, ...] = (),
     ) -> "ParameterMap":
-        """Return the checked map of an experiment; `names` are those of θ."""
-        every = (*parameters, SHIFT)
+        """Return the checked map of an experiment; `names` are those of θ, `sensors` parameters of sensors."""
+        every = (*parameters, *sensors, SHIFT)
         columns = {name: names.index(n) for name in every for n in (name, local_name(name, experiment)) if n in names}
         for name in tied:
             _checks.one_of("tied", name, every)
@@ -90,7 +98,7 @@ class ParameterMap:
                 "`tied`."
             )
         expressions = {name: parse(f"tied[{name!r}]", text, every) for name, text in tied.items()}
-        return cls(every, columns, len(names), known, _ordered(expressions))
+        return cls(every, len(parameters), columns, len(names), known, _ordered(expressions))
 
     @property
     def delayed(self) -> bool:
@@ -98,15 +106,20 @@ class ParameterMap:
         return SHIFT in self.columns or SHIFT in self.tied or self.fixed[SHIFT] != 0.0
 
     def values(self, theta: np.ndarray) -> np.ndarray:
-        """Return all parameters (points, parameters + 1), the delay last, of θ (points, names)."""
+        """Return all parameters (points, parameters) of θ (points, names)."""
         return self._alone.values(theta)[0]
+
+    def split(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parameters of the model and those of the sensors at one θ (names,)."""
+        values = self.values(theta[None])[0]
+        return np.ascontiguousarray(values[: self.count]), values[self.count :]
 
     @cached_property
     def _alone(self) -> "ParameterMaps":
         return ParameterMaps([self])
 
     def slopes(self, theta: np.ndarray) -> np.ndarray:
-        """Return ∂(all parameters)/∂θ at one θ (names,), (parameters + 1, names)."""
+        """Return ∂(all parameters)/∂θ at one θ (names,), (parameters, names)."""
         nothing = np.zeros(self.size)
         by_name = {name: np.eye(1, self.size, i)[0] for name, i in self.columns.items()}
         known: dict[str, Any] = {**self.fixed, **{name: float(theta[i]) for name, i in self.columns.items()}}
@@ -122,18 +135,18 @@ class ParameterMaps:
 
     def __init__(self, maps: Sequence[ParameterMap]):
         first = maps[0]
-        self._tied, self._size = first.tied, first.size
+        self._tied, self._size, self.count = first.tied, first.size, first.count
         self._fixed = np.array([[m.fixed.get(name, np.nan) for name in first.parameters] for m in maps])
         self._places = np.array([first.parameters.index(name) for name in first.columns], dtype=int)
         self._columns = np.array([[m.columns[name] for name in first.columns] for m in maps], dtype=int)
         named = {name for expression in self._tied.values() for name in expression.names} | self._tied.keys()
         self._named = {name: i for i, name in enumerate(first.parameters) if name in named}
-        free = {*first.columns, *self._tied} - {SHIFT}
+        free = {*first.columns, *self._tied}
         self._rows = np.arange(len(maps))[:, None]
-        self.moving = tuple(i for i, name in enumerate(first.parameters) if name in free)
+        self.moving = tuple(i for i, name in enumerate(first.parameters[: self.count]) if name in free)
 
     def values(self, theta: np.ndarray) -> np.ndarray:
-        """Return all parameters (maps, points, parameters + 1), the delay last, of θ (points, names)."""
+        """Return all parameters (maps, points, parameters) of θ (points, names)."""
         result = np.empty((len(self._fixed), len(theta), self._fixed.shape[1]))
         result[...] = self._fixed[:, None]
         result[:, :, self._places] = theta[:, self._columns].transpose(1, 0, 2)
@@ -144,7 +157,7 @@ class ParameterMaps:
         return result
 
     def vjp(self, values: np.ndarray, by_parameter: np.ndarray) -> np.ndarray:
-        """Return derivatives by θ, (maps, names), from those by all parameters, (maps, parameters + 1)."""
+        """Return derivatives by θ, (maps, names), from those by all parameters, (maps, parameters)."""
         left, result = by_parameter.copy(), np.zeros((len(by_parameter), self._size))
         if self._tied:
             known = {name: values[:, i] for name, i in self._named.items()}
@@ -173,7 +186,10 @@ def _ordered(expressions: dict[str, Expression]) -> dict[str, Expression]:
 
 def full_name(variable: str, place: Sequence[str]) -> str:
     """Return what one place of a variable is called: k, or variance[force, run 7]."""
-    return f"{variable}[{', '.join(place)}]" if place else variable
+    if not place:
+        return variable
+    labels = ", ".join(place)
+    return f"{variable[:-1]}, {labels}]" if variable.endswith("]") else f"{variable}[{labels}]"
 
 
 def pack(
@@ -247,14 +263,15 @@ def in_experiment(names: Iterable[str], experiment: str | None) -> dict[str, str
     return result
 
 
-def local_names(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the plain names of the parameters that experiments have their own of."""
-    return tuple(dict.fromkeys(name.partition("[")[0] for name in names if "[" in name))
+def local_names(names: Iterable[str], experiments: Iterable[str]) -> tuple[str, ...]:
+    """Return the plain names of the model's parameters that experiments have their own of."""
+    ends = tuple(f"[{experiment}]" for experiment in experiments)
+    return tuple(dict.fromkeys(name.partition("[")[0] for name in names if name.endswith(ends)))
 
 
-def local_hint(names: Iterable[str], experiment: str | None) -> str:
+def local_hint(names: Iterable[str], experiments: Iterable[str], experiment: str | None) -> str:
     """Return what to say of expressions that name a local parameter but no experiment."""
-    local = local_names(names)
+    local = local_names(names, experiments)
     if not local or experiment is not None:
         return ""
     return f"Experiments have their own {', '.join(local)}; derive(…, experiment=…) takes those of one."

@@ -27,7 +27,7 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import FROM_CYCLES, JOINT
 from bayesperiodic.periodic.schemes import find_scheme
 from bayesperiodic.problem.fingerprint import check_results, fingerprint
-from bayesperiodic.problem.parameters import SHIFT, squared
+from bayesperiodic.problem.parameters import SHIFT, local_name, squared
 from bayesperiodic.reporting import html
 from bayesperiodic.reporting.html import Rows, code, number
 from bayesperiodic.sampling.draws import Posterior
@@ -111,13 +111,12 @@ class ReportInputs:
 
     def unit(self, name: str) -> str:
         """Return the formatted unit of a parameter, a channel or a noise parameter, by its full name."""
-        units, (plain, _, place) = self.problem.model.units, name.partition("[")
-        if plain == SHIFT:
-            return "s"
+        units = self.problem.units
         if name in self.problem.noise_names:
+            plain, _, place = name.partition("[")
             channel = units.get(place.rstrip("]").partition(",")[0], "")
             return html.unit(squared(channel) if plain == "variance" and channel else "")
-        return html.unit(units.get(plain, ""))
+        return html.unit(units.get(self.problem.plain_names.get(name, name), ""))
 
 
 def badge(verdict: str) -> html.Badge:
@@ -241,7 +240,7 @@ def parameters(given: ReportInputs) -> Rows:
             "Role": role,
             "Prior, value or expression": known,
         }
-        for plain in (*given.problem.model.parameters, SHIFT)
+        for plain in (*given.problem.model.parameters, *given.problem.sensors.names, SHIFT)
         for name, role, known in _roles(given.problem, plain)
     ]
 
@@ -249,7 +248,7 @@ def parameters(given: ReportInputs) -> Rows:
 def _roles(problem: Problem, plain: str) -> Iterator[tuple[str, str, str]]:
     """Yield the full names of a parameter with its role and its prior, value or expression."""
     partners = {name: key for key in problem.priors if isinstance(key, tuple) for name in key}
-    for name in (n for n in problem.names if n.partition("[")[0] == plain):
+    for name in (n for n, own in problem.plain_names.items() if own == plain):
         prior = repr(problem.joint_prior.marginals[name])
         prior = prior if len(prior) <= LONGEST_PRIOR else f"{prior[:LONGEST_PRIOR]}…"
         others = ", ".join(other for other in partners.get(name, ()) if other != name)
@@ -260,7 +259,7 @@ def _roles(problem: Problem, plain: str) -> Iterator[tuple[str, str, str]]:
     if len(by_run) == len(problem.experiments) and len(set(by_run.values())) == 1:
         by_run = {"": next(iter(by_run.values()))}
     for run, value in by_run.items():
-        yield (f"{plain}[{run}]" if run else plain), "fixed", str(number(value, 6))
+        yield (local_name(plain, run) if run else plain), "fixed", str(number(value, 6))
 
 
 def summary(given: ReportInputs) -> Rows:

@@ -27,13 +27,11 @@ from bayesperiodic.problem.parameters import (
     DRAW,
     EXPERIMENT,
     NOISE,
-    SHIFT,
     checked_key,
     column,
     full_name,
     in_experiment,
     local_hint,
-    local_names,
     pack,
     places,
     squared,
@@ -278,7 +276,7 @@ class Posterior(Result):
             _checks.one_of("experiment", experiment, group[EXPERIMENT].values.tolist())
         kept = [name for name in places(group) if name not in noise]
         named = in_experiment(kept, experiment)
-        note = f"{SAMPLED_ONLY} {local_hint(kept, experiment)}".strip()
+        note = f"{SAMPLED_ONLY} {local_hint(kept, group[EXPERIMENT].values.tolist(), experiment)}".strip()
         quantities = parse_all("expressions", expressions, named, ["variance", *map(str, group.data_vars)], note)
         values = {plain: column(group, name) for plain, name in named.items()}
         rows = {}
@@ -506,7 +504,8 @@ def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr
     columns = {name: theta[..., i] for i, name in enumerate(problem.names)}
     columns |= _fixed_locals(problem, theta.shape[:-1])
     columns |= {name: noise[..., i] for i, name in enumerate(problem.noise_names)}
-    dims = {name.partition("[")[0]: _dims(problem, name) for name in (*problem.names, *problem.noise_names)}
+    dims = {plain: (EXPERIMENT,) * (plain != name) for name, plain in problem.plain_names.items()}
+    dims |= {name.partition("[")[0]: _noise_dims(problem, name) for name in problem.noise_names}
     coords = {CHANNEL: list(problem.channels), EXPERIMENT: [e.name for e in problem.experiments]}
     noises = {name.partition("[")[0] for name in problem.noise_names}
     attributes = {v: _noise_attributes(problem, v) if v in noises else _attributes(problem, v) for v in dims}
@@ -518,17 +517,17 @@ def _fixed_locals(problem: Description, shape: tuple[int, ...]) -> dict[str, np.
     """Return the values of local parameters in the experiments where they are fixed."""
     return {
         full_name(plain, (run,)): np.full(shape, parameter_map.fixed[plain])
-        for plain in local_names(problem.names)
+        for plain in {plain for name, plain in problem.plain_names.items() if plain != name}
         for run, parameter_map in problem.parameter_maps.items()
         if plain in parameter_map.fixed
     }
 
 
-def _dims(problem: Description, name: str) -> tuple[str, ...]:
-    """Return the dims, after chain and draw, of the variable of a full name."""
+def _noise_dims(problem: Description, name: str) -> tuple[str, ...]:
+    """Return the dims, after chain and draw, of the variable of a noise parameter's full name."""
     if "[" not in name:
         return ()
-    if name in problem.names or name.startswith(f"{SCALE}["):
+    if name.startswith(f"{SCALE}["):
         return (EXPERIMENT,)
     return (CHANNEL,) if problem.noise.per == CHANNEL else (CHANNEL, EXPERIMENT)
 
@@ -536,8 +535,8 @@ def _dims(problem: Description, name: str) -> tuple[str, ...]:
 def _attributes(problem: Description, parameter: str) -> dict[str, Any]:
     """Return the unit of a parameter, and the support of its prior, one for each experiment that has its own."""
     supports = problem.joint_prior.supports.items()
-    each = {f"support of {name}": list(ends) for name, ends in supports if name.partition("[")[0] == parameter}
-    return {"units": "s" if parameter == SHIFT else problem.model.units.get(parameter, "")} | each
+    each = {f"support of {name}": list(ends) for name, ends in supports if problem.plain_names[name] == parameter}
+    return {"units": problem.units.get(parameter, "")} | each
 
 
 def _noise_attributes(problem: Description, variable: str) -> dict[str, str]:

@@ -1,7 +1,8 @@
 """Structural identifiability: parameters and combinations that the equations and measured channels can determine."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
 
 import pandas as pd
 import sympy as sp
@@ -9,6 +10,7 @@ import sympy as sp
 from bayesperiodic import _checks
 from bayesperiodic._io import Result, Storable
 from bayesperiodic.models.model import Model
+from bayesperiodic.models.sensed import with_sensed_inputs
 from bayesperiodic.symmetry import invariants
 from bayesperiodic.symmetry.determining import (
     Generator,
@@ -20,6 +22,17 @@ from bayesperiodic.symmetry.determining import (
 )
 from bayesperiodic.symmetry.discrete import discrete_flows
 from bayesperiodic.symmetry.invariants import Directions, Flow
+from bayesperiodic.symmetry.sensors import DELAY_OF, with_sensors
+
+
+@runtime_checkable
+class SensorEntries(Protocol):
+    """What is needed of a sensor."""
+
+    order: int
+
+    def acting(self) -> Iterator[tuple[str, Any]]:
+        """Yield the kinds of the entries that change the signal, with their values, numbers where they are known."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +227,11 @@ def _power(base: sp.Expr, power: sp.Expr, names: Mapping[sp.Symbol, str], beside
 
 
 def structure(
-    model: Model, *, outputs: Iterable[str] | None = None, fixed: Mapping[str, float] | Iterable[str] = ()
+    model: Model,
+    *,
+    outputs: Iterable[str] | None = None,
+    fixed: Mapping[str, float] | Iterable[str] = (),
+    sensors: Mapping[str, SensorEntries] | None = None,
 ) -> Structure:
     """Analyse structural identifiability: find the parameters and combinations that the outputs can determine.
 
@@ -238,6 +255,9 @@ def structure(
         The measured outputs; by default all.
     fixed : iterable of str, or mapping of str to number, optional
         Known parameters. A value of zero removes their terms; any other value is treated as generic.
+    sensors : mapping of str to Sensor, optional
+        Of outputs and inputs, as those of a `Problem`. Entries that are priors are unknown parameters, numbers are
+        known.
 
     Returns
     -------
@@ -246,7 +266,8 @@ def structure(
     Raises
     ------
     ValueError
-        For an unknown output or parameter, no output, or a value of zero that the equations divide by.
+        For an unknown output or parameter, no output, a value of zero that the equations divide by, or a sensor of
+        something else.
 
     References
     ----------
@@ -264,6 +285,9 @@ def structure(
     ('k1/(m*l**2)', 'k2/(m*l**2)', 'k3/(m*l**2)')
     >>> found.table.verdict["l"]
     'determined'
+    >>> unknown = {"force": bp.Sensor(gain=bp.LogNormal(1.0, 0.1))}
+    >>> bp.structure(bp.models.duffing, sensors=unknown).combinations
+    ('c/m', 'k/m', 'k3/m', '1/(m*gain[force])')
     """
     _checks.instance("model", model, Model)
     measured = model.outputs if outputs is None else tuple(outputs)
@@ -276,12 +300,30 @@ def structure(
         _checks.one_of("fixed", name, model.parameters)
     values = dict(fixed) if isinstance(fixed, Mapping) else {}
     zeros = [name for name, value in values.items() if _checks.finite_number(f"fixed[{name!r}]", value) == 0.0]
-    whole = system_of(model, measured)
+    unknown = _unknown_entries(model, measured, sensors or {})
+    orders = {channel: sensor.order for channel, sensor in (sensors or {}).items()}
+    of_inputs = {channel: kinds for channel, kinds in unknown.items() if channel in model.inputs}
+    whole = system_of(with_sensed_inputs(model, of_inputs, orders, {}), measured)
     system = whole.given(known, {whole.parameters[name]: sp.S.Zero for name in zeros})
     for name in zeros:
         if any(e.has(sp.zoo, sp.nan, sp.oo) for e in system.expressions):
             raise ValueError(f"fixed: must not be zero if the equations divide by it, got {name} = 0.")
+    system = with_sensors(system, unknown, orders) if unknown else system
     return analyse_structure(model.name, system, known)
+
+
+def _unknown_entries(
+    model: Model, measured: Sequence[str], sensors: Mapping[str, SensorEntries]
+) -> dict[str, tuple[str, ...]]:
+    """Return the kinds of the unknown entries of sensors by channel."""
+    result = {}
+    for channel, sensor in sensors.items():
+        _checks.one_of("sensors", channel, (*measured, *model.inputs))
+        if not isinstance(sensor, SensorEntries):
+            raise ValueError(f"sensors[{channel!r}]: must be a Sensor, got {_checks.shortened(sensor)}.")
+        kinds = tuple(kind for kind, value in sensor.acting() if not isinstance(value, float))
+        result |= {channel: kinds} if kinds else {}
+    return result
 
 
 def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Structure:
@@ -301,7 +343,7 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
     discrete = discrete_flows(system, generators, settled) if system.parameters else []
     return Structure(
         model=name,
-        outputs=tuple(system.outputs),
+        outputs=tuple(name for name in system.outputs if not name.startswith(DELAY_OF)),
         known=known,
         table=_table(whole, generators, directions, coefficients, combinations),
         combinations=tuple(combinations.values()),
