@@ -315,7 +315,7 @@ class Likelihood:
         rows = []
         for b, _, order, starts in self._parts:
             block = self.blocks[b]
-            spectral = block.spectral and b not in self._even
+            spectral = block.spectral and not block.by_instants(b in self._even)
             harmonic = block.harmonic[order][starts] if spectral else np.full(len(starts), np.nan)
             rows += [(block.experiment, block.channel, h, block.weight) for h in harmonic]
         columns = map(np.array, zip(*rows, strict=True))
