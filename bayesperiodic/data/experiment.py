@@ -1,8 +1,8 @@
 """Experiments: one measured period on an equidistant grid, with its uncertainty."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,6 +50,9 @@ class Experiment(Result):
     harmonics : mapping of str to int, optional
         Highest harmonic of the response period that each channel keeps; the model's outputs are projected onto the
         same harmonics before the comparison. By default all harmonics are kept.
+    unmeasured : mapping of str to sequence of int, optional
+        Harmonics among those kept that the outputs do not contain, such as 0, the mean, of an AC-coupled sensor: they
+        are no data, are not compared, and do not count as independent values.
     amplitude_variance : mapping of str to array (harmonics + 1,), optional
         Variance of the mean's complex Fourier amplitudes.
     amplitude_freedom : mapping of str to array (harmonics + 1,), optional
@@ -121,6 +124,7 @@ class Experiment(Result):
     averaged: int | None = field(default=None, kw_only=True)
     independent: Mapping[str, int] = field(default_factory=dict, kw_only=True)
     harmonics: Mapping[str, int] = field(default_factory=dict, kw_only=True)
+    unmeasured: Mapping[str, Sequence[int]] = field(default_factory=dict, kw_only=True)
     amplitude_variance: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
     amplitude_freedom: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
     error_slopes: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict, kw_only=True)
@@ -177,6 +181,9 @@ class Experiment(Result):
         counts = {key: min(measured, 2 * self.harmonics.get(key, points) + 1) for key in self.outputs}
         counts |= self.independent
         _checks.same_names("independent", counts, self.outputs)
+        for key, without in self._checked_unmeasured(points).items():
+            kept = min(points, 2 * self.harmonics.get(key, points) + 1)
+            counts[key] = min(counts[key], kept - 2 * len(without) + (0 in without))
         object.__setattr__(self, "independent", counts)
         self._check_multipliers()
         self._check_covariance(measured * len(self.outputs))
@@ -189,6 +196,24 @@ class Experiment(Result):
         if mask.all() or kind == "inputs" or array.shape != mask.shape or array.dtype.kind not in "fiu":
             return values
         return np.where(mask, array, 0.0)
+
+    def _checked_unmeasured(self, points: int) -> dict[str, tuple[int, ...]]:
+        """Store and return the harmonics that were not measured, by output, in ascending order."""
+        checked = {}
+        for key, without in (self.unmeasured or {}).items():
+            _checks.one_of("unmeasured", key, self.outputs)
+            highest = _fourier.highest_harmonic(points)
+            highest = min(self.harmonics.get(key, highest), highest)
+            lines = tuple(sorted({_checks.integer(f"unmeasured[{key!r}]", h, 0) for h in without}))
+            if self.mask is not None or len(lines) > highest or max(lines, default=0) > highest:
+                raise ValueError(
+                    f"unmeasured[{key!r}]: must be some of the harmonics 0 … {highest} that a whole period keeps, got "
+                    f"{list(without)}{' and a mask' * (self.mask is not None)}."
+                )
+            if lines:
+                checked[key] = lines
+        object.__setattr__(self, "unmeasured", checked)
+        return checked
 
     def _check_multipliers(self) -> None:
         if self.multipliers is None:
@@ -256,14 +281,16 @@ class Experiment(Result):
             Frequency of harmonic 1, the forcing frequency [Hz].
         outputs, inputs : mapping of str to complex array (harmonics + 1,)
             Amplitudes c of harmonics 0, 1, 2, …: the signal is Re Σ c[h] exp(2πi h τ), so that c[0] is the mean (real),
-            ``|c[h]|`` the amplitude, and c[h] of a cosine real and positive.
+            ``|c[h]|`` the amplitude, and c[h] of a cosine real and positive. None in outputs is a harmonic that was
+            not measured; so is exactly zero, which no measurement with noise gives.
         samples : int
             Grid points per period, more than twice the highest harmonic.
 
         Returns
         -------
         Experiment
-            Only these harmonics of the outputs are compared; each channel has 2·harmonics + 1 independent values.
+            Only the measured harmonics of the outputs are compared, each with two independent values, the mean with
+            one.
 
         Raises
         ------
@@ -276,12 +303,21 @@ class Experiment(Result):
         >>> run = bp.Experiment.from_harmonics("run", 2.0, {"x": [0.1, 0.02 - 0.01j]}, {"force": [0, 5]}, samples=8)
         >>> run.independent, run.inputs["force"].round(3)[:3].tolist()
         ({'x': 3}, [5.0, 3.536, 0.0])
+
+        A stepped sine, of which only the fundamental was measured:
+
+        >>> bp.Experiment.from_harmonics("run", 2.0, {"x": [None, 0.02 - 0.01j]}, {"force": [0, 5]}).independent
+        {'x': 2}
         """
         samples = _checks.integer("samples", samples, 4)
+        given = {channel: _without_none(values) for channel, values in outputs.items()}
         measured, driven = (
-            {channel: _amplitudes(f"{kind}[{channel!r}]", values, samples) for channel, values in given.items()}
-            for kind, given in (("outputs", outputs), ("inputs", inputs or {}))
+            {channel: _amplitudes(f"{kind}[{channel!r}]", values, samples) for channel, values in values_of.items()}
+            for kind, values_of in (("outputs", given), ("inputs", inputs or {}))
         )
+        for channel, amplitudes in measured.items():
+            if not amplitudes.any():
+                raise ValueError(f"outputs[{channel!r}]: must have an amplitude that is not zero or None, got none.")
         return cls(
             name,
             frequency,
@@ -289,7 +325,7 @@ class Experiment(Result):
             {channel: _fourier.on_grid(amplitudes, samples) for channel, amplitudes in driven.items()},
             samples=samples,
             harmonics={channel: amplitudes.size - 1 for channel, amplitudes in measured.items()},
-            independent={channel: 2 * amplitudes.size - 1 for channel, amplitudes in measured.items()},
+            unmeasured={channel: np.flatnonzero(c == 0.0).tolist() for channel, c in measured.items()},
         )
 
     @property
@@ -351,15 +387,22 @@ class Experiment(Result):
         -------
         array (…, samples·periods)
         """
-        if channel not in self.harmonics:
+        points, without = values.shape[-1], list(self.unmeasured.get(channel, ()))
+        if channel in self.harmonics:
+            values = _fourier.on_grid(_fourier.coefficients(values, self.harmonics[channel]), points)
+        if not without:
             return values
-        return _fourier.on_grid(_fourier.coefficients(values, self.harmonics[channel]), values.shape[-1])
+        amplitudes = _fourier.coefficients(values)
+        others = np.delete(np.arange(amplitudes.shape[-1]), without)
+        amplitudes[..., others] = 0.0
+        return values - _fourier.on_grid(amplitudes, points)
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
-        text = ""
+        without = (f"{k} without harmonics {', '.join(map(str, h))}" for k, h in self.unmeasured.items())
+        text = "".join(f"; {each}" for each in without)
         if self.period_test is not None:
-            text = f"; {summary(self.period_test, self.periods)}"
+            text += f"; {summary(self.period_test, self.periods)}"
         return (
             f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples per "
             f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
@@ -377,6 +420,12 @@ def _checked_mask(given: ArrayLike, points: int) -> np.ndarray:
     return mask
 
 
+def _without_none(values: Any) -> Any:
+    """Return amplitudes with zero in place of None."""
+    listed = isinstance(values, list | tuple) or (isinstance(values, np.ndarray) and values.ndim == 1)
+    return [0.0 if value is None else value for value in values] if listed else values
+
+
 def _amplitudes(argument: str, values: ArrayLike, samples: int) -> np.ndarray:
     try:
         amplitudes = np.array(values, dtype=complex)
@@ -384,7 +433,8 @@ def _amplitudes(argument: str, values: ArrayLike, samples: int) -> np.ndarray:
         raise ValueError(f"{argument}: must be an array of complex numbers, got {values!r}.") from None
     if amplitudes.ndim != 1 or not amplitudes.size or not np.isfinite(amplitudes).all():
         raise ValueError(
-            f"{argument}: must be a vector of finite amplitudes of harmonics 0, 1, 2, …, got {amplitudes.tolist()}."
+            f"{argument}: must be a vector of finite amplitudes of harmonics 0, 1, 2, …, got {amplitudes.tolist()}. "
+            "Give None for harmonics of outputs that were not measured."
         )
     if amplitudes[0].imag != 0.0:
         raise ValueError(f"{argument}: must have a real mean (harmonic 0), got {amplitudes[0]}.")

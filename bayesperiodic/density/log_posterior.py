@@ -238,13 +238,14 @@ class LogPosterior(SamplingCoordinates):
             return self._nothing(status)
         if count < good.size:
             simulation, noise = simulation.at(good), noise[good]
-        residuals = self.comparisons.residuals(simulation, threads)
-        values, moments = self.problem.likelihood(residuals, noise), np.empty((count, 0))
+        residuals, moments = self.comparisons.residuals(simulation, threads), np.empty((count, 0))
         if self.collapsed:
             by_name = self.problem.likelihood.moments(residuals)
             moments = np.stack([by_name[name] for name in self.collapsed], axis=-1)
-            values = values + np.sum(0.5 * moments + self._integrals(moments), axis=-1)
-            values = np.where(np.isfinite(values), values, -np.inf)
+            # Of these blocks the integral contains all that depends on the residuals; what is left is ln|S|.
+            residuals = residuals.without(self._integrated)
+        values = self.problem.likelihood(residuals, noise) + np.sum(self._integrals(moments), axis=-1)
+        values = np.where(np.isfinite(values), values, -np.inf)
         return Evaluation(_placed(values, good, -np.inf), _placed(moments, good, np.nan), status)
 
     def _nothing(self, status: np.ndarray) -> Evaluation:
@@ -330,6 +331,11 @@ class LogPosterior(SamplingCoordinates):
             return gammaln(self._shapes) - self._shapes * np.log(0.5 * moments)
 
     @cached_property
+    def _integrated(self) -> list[int]:
+        """Indices of the blocks whose variances are integrated out."""
+        return [b for names, members in self.problem.likelihood.groups() if names[0] in self.collapsed for b in members]
+
+    @cached_property
     def _shapes(self) -> np.ndarray:
         """Shape parameters of the inverse-gamma distributions of the collapsed variances."""
         counts = np.array([self.problem.likelihood.counts[name] for name in self.collapsed])
@@ -343,12 +349,13 @@ class LogPosterior(SamplingCoordinates):
         It is InvGamma(n/2, M/2), with the flat prior InvGamma(n/2 − 1, M/2). The points returned are coordinates of the
         density with all variances, (…, dimension + collapsed).
         """
-        variances = 0.5 * moments / generator.gamma(self._shapes, size=moments.shape)
-        joint = -self._shapes * np.log(variances) - 0.5 * moments / variances
-        log_prob = log_prob + np.sum(joint - self._integrals(moments), axis=-1)
+        precisions = generator.gamma(self._shapes, size=moments.shape)  # in units of 2/M
+        logarithms = np.log(precisions)
+        log_prob = log_prob + np.sum(self._shapes * logarithms - precisions - gammaln(self._shapes), axis=-1)
+        variances = np.log(0.5 * moments) - logarithms
         count = len(self.problem.names)
         columns = {name: points[..., count + i] for i, name in enumerate(self.free)}
-        columns |= {name: np.log(variances[..., i]) for i, name in enumerate(self.collapsed)}
+        columns |= {name: variances[..., i] for i, name in enumerate(self.collapsed)}
         noise = np.stack([columns[name] for name in self.problem.free_noise], axis=-1)
         return np.concatenate([points[..., :count], noise], axis=-1), log_prob
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from bayesperiodic._linalg import column_space
+from bayesperiodic._linalg import TINY, column_space
 from bayesperiodic._verdicts import BAD, CAUTION, GOOD, NEUTRAL, with_tone
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording_check import HARMLESS
@@ -20,6 +20,8 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.block import Block
 
 ABSORBED = 1e-3
+# Part of the largest component below which the mean of residual and derivatives is a rounding error.
+MATCHED = 1e-6
 NOT_TESTED = float("nan")
 
 
@@ -27,10 +29,12 @@ class Unexplained:
     """Whitened residual components (size,), projected orthogonally to their derivatives (parameters, size).
 
     The components are independent with equal variances under the model; derivatives may be dependent or zero. `square`
-    is the sum of squares, `freedom` the number of its degrees of freedom.
+    is the sum of squares, `freedom` the number of its degrees of freedom. A mean that data and model have in common to
+    rounding, as a centred signal and a linear model, has no noise and is left out.
     """
 
     def __init__(self, components: np.ndarray, jacobian: np.ndarray, harmonic: np.ndarray):
+        components, jacobian, harmonic = _without_matched_mean(components, jacobian, harmonic)
         self._basis = column_space(jacobian)
         self._rest = components - self._basis @ (self._basis.T @ components)
         self.square = float(self._rest @ self._rest)
@@ -41,14 +45,15 @@ class Unexplained:
     def of_measured_noise(
         cls, components: np.ndarray, jacobian: np.ndarray, harmonic: np.ndarray, behind: np.ndarray
     ) -> "Unexplained":
-        """Return what is unexplained in units of measured standard deviations with degrees of freedom (harmonics,).
+        """Return what is unexplained in units of measured standard deviations with degrees of freedom (highest + 1,).
 
         The square of each harmonic is F distributed. It is weighted so that it is the χ² quantile of its probability.
         """
+        components, jacobian, harmonic = _without_matched_mean(components, jacobian, harmonic)
         first = cls(components, jacobian, harmonic)
         square, freedom = first.explained(np.eye(first.harmonics.size, dtype=bool))
         free = np.maximum(freedom, 1)
-        p = np.maximum(stats.f.sf(square / free, free, behind), np.finfo(float).tiny)
+        p = np.maximum(stats.f.sf(square / free, free, behind[first.harmonics]), np.finfo(float).tiny)
         known = np.where((freedom > 0) & (square > 0.0), stats.chi2.isf(p, free), square)
         factor = np.sqrt(np.divide(known, square, out=np.ones_like(square), where=known > 0.0))[first._group]
         return cls(components * factor, jacobian * factor, harmonic)
@@ -95,6 +100,16 @@ class Unexplained:
         p = np.where(tested, stats.f.sf(np.nan_to_num(ratio, nan=0.0, posinf=np.inf), freedom, rest), 1.0)
         _, _, power, size = self._sums
         return min(1.0, float(p.min() * tested.sum())), float(self.harmonics[np.argmax(power / size)])
+
+
+def _without_matched_mean(
+    components: np.ndarray, jacobian: np.ndarray, harmonic: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return components, derivatives and harmonics without a mean that is matched to rounding."""
+    size = np.abs(jacobian) / np.maximum(np.abs(jacobian).max(axis=1, keepdims=True), TINY)
+    moved = size.max(axis=0, initial=0.0) > MATCHED
+    kept = (harmonic > 0) | moved | (np.abs(components) > MATCHED * np.abs(components).max(initial=0.0))
+    return (components, jacobian, harmonic) if kept.all() else (components[kept], jacobian[:, kept], harmonic[kept])
 
 
 def excess(variance: float, freedom: float, known: float, known_freedom: float) -> float:
@@ -387,7 +402,9 @@ def measured_spectrum(experiment: Experiment, block: Block) -> tuple[np.ndarray,
     freedom = experiment.amplitude_freedom.get(block.channel)
     if not block.spectral or variance is None or freedom is None:
         return None
-    if block.size != 2 * variance.size - 1 or not np.all(variance > 0.0):
+    harmonics = np.unique(block.harmonic)
+    nyquist = 2 * harmonics[-1] == block.points
+    if nyquist or harmonics[-1] >= variance.size or not np.all(variance[harmonics] > 0.0):
         return None
     return block.size * variance * np.where(np.arange(variance.size) == 0, 1.0, 0.25), freedom
 
@@ -411,7 +428,7 @@ def _amplitude(problem: Problem, block: Block, replicates: Mapping[tuple[str, st
         return NOT_TESTED
     e = next(e for e in problem.experiments if e.name == block.experiment)
     mask = e.measured_points
-    values = replicates[block.experiment, block.channel][:, mask]
+    values = e.compared(block.channel, replicates[block.experiment, block.channel])[:, mask]
     rms = values[np.isfinite(values).all(axis=1)].std(axis=1)
     sd = rms.std(ddof=1) if rms.size > 1 else 0.0
     if not sd > 0.0:

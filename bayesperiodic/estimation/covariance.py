@@ -35,6 +35,9 @@ LENGTHSCALES = np.geomspace(1e-3, 3.0, 40)
 WHITE_PROBABILITY = 0.5
 SPECTRUM_ROUNDS, SETTLED_SPECTRUM = 10, 1e-3
 LEAST_INFORMATION = 1e-12
+# Values that the noise model's variance is worth as a prior of that of a single block; it limits how far that departs
+# where the fit takes up most values of the block, as where these are no more than the parameters.
+PRIOR_VALUES = 1.0
 # Pairs of errors of the inputs that are tried.
 INPUT_PROBES = 8
 # Change of the logarithm of a variance in a difference.
@@ -104,6 +107,7 @@ def _residual_variance(
     """Return the variance (size,) of a block's whitened residual r, averaged over the spectra that it may have.
 
     For every spectrum r is fitted again by least squares; the information of other blocks and the prior on θ is kept.
+    The variance of the noise model counts as `PRIOR_VALUES` more values.
     """
     shape, log_prior = _shapes(block, unit)
     scale = hessian_scale(information)
@@ -122,11 +126,12 @@ def _residual_variance(
         # Expected squares: the independent values per component, less those removed by the fit.
         left = np.maximum(block.weight - taken, 0.0)
         before = size
-        size = np.maximum(square.sum(axis=1), TINY) / np.maximum(left.sum(axis=1), LEAST_INFORMATION)
+        size = (square.sum(axis=1) + PRIOR_VALUES) / (left.sum(axis=1) + PRIOR_VALUES)
         if np.allclose(size, before, rtol=SETTLED_SPECTRUM, atol=0.0):
             break
     misfit = square.sum(axis=1) / size + np.einsum("ga,ab,gb->g", step, others, step) + 2.0 * step @ score
     logarithms = block.weight * np.sum(np.log(size[:, None] * shape), axis=1) + np.linalg.slogdet(total)[1]
+    logarithms += PRIOR_VALUES * (np.log(size) + 1.0 / size)
     ratios = [_smoothed(block, *one) for one in zip(square / size[:, None], left, strict=True)]
     return softmax(log_prior - 0.5 * (misfit + logarithms)) @ (size[:, None] * shape * ratios)
 
@@ -151,7 +156,7 @@ def _smoothed(block: Block, square: np.ndarray, left: np.ndarray) -> np.ndarray:
         for values, weights in ((square, window), (left, window), (left, window**2))
     )
     freedom = expected**2 / np.maximum(doubled, LEAST_INFORMATION)
-    ratio = power / np.maximum(expected, LEAST_INFORMATION) * _excess(freedom) / _excess(np.sum(left))
+    ratio = (power + PRIOR_VALUES) / (expected + PRIOR_VALUES) * _excess(freedom) / _excess(np.sum(left))
     return ratio[block.harmonic]
 
 

@@ -148,6 +148,10 @@ class Block(ABC):
         """Return components (…, size) as the independent values that `places` names."""
         return r
 
+    def by_instants(self, even: bool) -> bool:
+        """Return whether the independent parts of Fourier components are values at instants."""
+        return even
+
     def along_period(self, part: np.ndarray) -> np.ndarray:
         """Return components (…, size) as waves along the period, those of `wave_numbers`."""
         return part
@@ -226,7 +230,8 @@ def measured_channels(experiment: Experiment, model: Model) -> tuple[str, ...]:
 def measured_variance(experiment: Experiment, channel: str) -> float:
     """Return the variance of one value of the mean period that the scatter of the cycles explains; NaN if unknown."""
     if channel in experiment.amplitude_variance:
-        variance = experiment.amplitude_variance[channel]
+        variance = np.array(experiment.amplitude_variance[channel])
+        variance[[h for h in experiment.unmeasured.get(channel, ()) if h < variance.size]] = 0.0
         return float(variance[0] + 0.5 * np.sum(variance[1:]))
     if channel in experiment.scatter:
         return float(experiment.scatter[channel] ** 2 / experiment.cycles)

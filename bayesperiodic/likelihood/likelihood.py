@@ -52,10 +52,19 @@ class Residuals(Sequence[np.ndarray]):
         scales = self.like(list(factors)).stacks
         return Residuals([scale * stack for scale, stack in zip(scales, self.stacks, strict=True)], self._places)
 
+    def without(self, blocks: Sequence[int]) -> "Residuals":
+        """Return the same with components of zero in some blocks."""
+        places = [self._places[block] for block in blocks]
+        stacks = [np.array(stack) if s in {p for p, _ in places} else stack for s, stack in enumerate(self.stacks)]
+        for stack, member in places:
+            stacks[stack][member] = 0.0
+        return Residuals(stacks, self._places)
+
     @cached_property
     def squares(self) -> np.ndarray:
         """The sum of the squares of each block, (…, blocks)."""
-        sums = [np.einsum("...i,...i->...", stack, stack) for stack in self.stacks]
+        with np.errstate(over="ignore", invalid="ignore"):
+            sums = [np.einsum("...i,...i->...", stack, stack) for stack in self.stacks]
         result = np.empty((*sums[0].shape[1:], len(self._places)))
         for block, (stack, member) in enumerate(self._places):
             result[..., block] = sums[stack][member]
@@ -185,7 +194,8 @@ class Likelihood:
             if variances.size == 1:
                 squares[..., b] /= variances[0]
             else:
-                squares[..., b] = np.add.reduce(residuals[b] ** 2 / variances, axis=-1)
+                with np.errstate(over="ignore", invalid="ignore"):
+                    squares[..., b] = np.add.reduce(residuals[b] ** 2 / variances, axis=-1)
         return self._summed(block.weight * squares[..., b] for b, block in enumerate(self.blocks))
 
     def value_variances(self, values: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
@@ -305,7 +315,7 @@ class Likelihood:
         rows = []
         for b, _, order, starts in self._parts:
             block = self.blocks[b]
-            spectral = block.spectral and b not in self._even
+            spectral = block.spectral and not block.by_instants(b in self._even)
             harmonic = block.harmonic[order][starts] if spectral else np.full(len(starts), np.nan)
             rows += [(block.experiment, block.channel, h, block.weight) for h in harmonic]
         columns = map(np.array, zip(*rows, strict=True))

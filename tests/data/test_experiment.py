@@ -13,7 +13,8 @@ def test_harmonics_become_the_signal_they_describe():
     expected = 0.3 + np.cos(tau) + 2.0 * np.sin(tau) - 0.5 * np.sin(3 * tau)
     assert run.outputs["x"] == pytest.approx(expected, abs=1e-14)
     assert run.inputs["u"] == pytest.approx(1.0 + 2.0 * np.cos(tau), abs=1e-14)
-    assert run.independent == {"x": 7} and run.harmonics == {"x": 3} and run.frequency == 2.0
+    assert run.independent == {"x": 5} and run.harmonics == {"x": 3} and run.frequency == 2.0
+    assert run.unmeasured == {"x": (2,)}
 
 
 def test_estimate_compares_only_the_given_harmonics():

@@ -4,12 +4,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy import stats
 from scipy.integrate import quad
 
 import bayesperiodic as bp
 from bayesperiodic import noise
-from bayesperiodic.density.log_posterior import SamplingCoordinates, collapsible
+from bayesperiodic.density.log_posterior import LogPosterior, SamplingCoordinates, collapsible
+from bayesperiodic.likelihood.likelihood import Residuals
 from bayesperiodic.likelihood.mean_period import MeanPeriod
 from bayesperiodic.likelihood.multipliers import Multipliers
 from bayesperiodic.likelihood.samples import Samples
@@ -80,6 +83,50 @@ def test_a_collapsed_density_is_the_integral_over_the_variance(prior):
     shape = 0.5 * problem.likelihood.counts["variance[force]"] - (prior == "flat")
     gamma = 0.5 * found.moments[0, 0] / np.exp(points[:, 3])
     assert stats.kstest(gamma, stats.gamma(shape).cdf).pvalue > 1e-3
+
+
+GAIN = bp.Model("gain", states=["w"], inputs=["u"], parameters=["a"], equations=["dw + w - u"], outputs={"y": "a*u"})
+DRIVE = np.cos(2 * np.pi * np.arange(32) / 32)
+SIGNAL = 1.2 * DRIVE + 0.02 * np.sin(2 * np.pi * np.arange(32) / 32) + 0.03 * np.cos(6 * np.pi * np.arange(32) / 32)
+
+
+def gain(unit):
+    run = bp.Experiment("run", 0.3, {"y": unit * SIGNAL}, {"u": DRIVE}, samples=32, harmonics={"y": 3})
+    return bp.Problem(GAIN, [run], priors={"a": bp.LogNormal(unit, 2.0)}, scheme="fourier")
+
+
+@settings(deadline=None)
+@given(first=st.floats(-300.0, 300.0), second=st.floats(-300.0, 300.0))
+def test_a_collapsed_likelihood_falls_as_a_power_of_the_sum_of_squares_however_large_it_is(first, second):
+    """∫ v^(−n/2) exp(−M/2v) dv/v ∝ M^(−n/2), with n = 7 values, for M from 1e-300 to 1e300."""
+    density = gain(1.0).density(variances="collapsed")
+    sizes = 10.0 ** np.array([[first / 2.0], [second / 2.0]])
+    residuals = SimpleNamespace(residuals=lambda *_: Residuals.of([sizes * np.linspace(-1.0, 1.0, 7)]))
+    density = LogPosterior(density.problem, density.solver, variances="collapsed", comparisons=residuals)
+    found = density.log_likelihood(np.ones((2, 1)), np.ones((2, 1)))[0]
+    assert found[0] - found[1] == pytest.approx(-3.5 * (first - second) * np.log(10.0), rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-90, 1e-6, 1.0, 1e3, 1e90])
+@pytest.mark.parametrize("a", [1e-30, 0.5, 1e3, 1e10, 1e15, 1e50])
+def test_a_collapsed_density_of_a_gain_has_its_closed_form(unit, a):
+    problem = gain(unit)
+    density = problem.density(variances="collapsed")
+    found = density.log_likelihood(unit * np.array([[a], [1.25]]), np.ones((2, 1)))[0]
+    moments = np.sum((SIGNAL[:, None] - DRIVE[:, None] * [a, 1.25]) ** 2, axis=0)
+    assert found[0] - found[1] == pytest.approx(-3.5 * np.log(moments[0] / moments[1]), rel=1e-9)
+
+
+def test_collapsed_draws_are_the_same_in_all_units():
+    """Newton, kilonewton, and a pressure of 1e-6 m²; the prior reaches to where the residual is 1e6 times the noise."""
+    draws = []
+    for unit in (1.0, 1e-3, 1e6):
+        problem = gain(unit)
+        fit = bp.map_estimate(problem, progress=False, starts=1)
+        kept = {"ensembles": 2, "walkers": 8, "max_steps": 60, "variances": "collapsed", "start": "prior"}
+        draws.append(bp.sample(problem, fit, seed=1, progress=False, **kept).draws("a") / unit)
+    for other in draws[1:]:
+        assert other == pytest.approx(draws[0], rel=1e-6)
 
 
 def test_coordinates_are_logarithms_of_positive_parameters_and_free_noise():

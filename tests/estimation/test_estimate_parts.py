@@ -28,7 +28,10 @@ def test_a_variance_exceeds_its_estimate_by_the_mean_of_the_inverse_chi_square()
 
 
 def smoothed(square, left):
-    """Return squares over their expectation, smoothed over about √H harmonics with parabolic weights."""
+    """Return squares over their expectation, smoothed over about √H harmonics with parabolic weights.
+
+    One more value is as expected.
+    """
     half, result = int(np.ceil(np.sqrt(HIGHEST + 1.0))), []
     for h in HARMONIC:
         weight = np.array([1.0 - ((h - k) / (half + 1)) ** 2 if abs(h - k) <= half else 0.0 for k in HARMONIC])
@@ -37,7 +40,7 @@ def smoothed(square, left):
         squared = sum((1.0 - ((h - k) / (half + 1)) ** 2) ** 2 * power[k] for k in power if abs(h - k) <= half)
         freedom, total = expected**2 / squared, np.sum(left)
         excess = freedom / (freedom - 2.0) / (total / (total - 2.0))
-        result.append(np.sum(weight * square) / expected * excess)
+        result.append((np.sum(weight * square) + 1.0) / (expected + 1.0) * excess)
     return np.array(result)
 
 
@@ -56,7 +59,7 @@ def spectra(unit):
 
 
 def test_variance_of_a_residual_is_that_of_restricted_likelihood_averaged_over_the_spectra():
-    """The size of each spectrum is found by a search."""
+    """The size of each spectrum is found by a search; its prior is one value of variance 1."""
     generator = np.random.default_rng(1)
     unit = generator.uniform(0.8, 1.2, 19)
     s = generator.standard_normal((2, 19)) * np.exp(-HARMONIC / 3.0) * np.array([[1.0], [50.0]])
@@ -74,6 +77,7 @@ def test_variance_of_a_residual_is_that_of_restricted_likelihood_averaged_over_t
             misfit = np.sum((r - step @ s) ** 2 / variance) + step @ others @ step + 2 * step @ (s @ r)
             taken = np.einsum("am,am->m", s, np.linalg.solve(total, s / variance))
             value = misfit + BLOCK.weight * np.sum(np.log(variance)) + np.linalg.slogdet(total)[1]
+            value += log_size + np.exp(-log_size)
             return value, (r - step @ s) ** 2 / variance, np.maximum(BLOCK.weight - taken, 0.0)
 
         best = minimize_scalar(lambda x: restricted(x)[0], bounds=(-12.0, 8.0), method="bounded")  # noqa: B023
