@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MEANING, DATA = "samples·periods", "data"
+CHANNEL_MAPPINGS = (
+    "scatter", "independent", "harmonics", "amplitude_variance", "amplitude_freedom", "drift", "middle",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,9 @@ class Experiment(Result):
     frequency_se, periodicity, origin : float
         Standard error of the frequency [Hz], zero if it is known; fraction of the variance that the mean period
         explains, of the channel with the smallest one; time [s] of the recording at which τ = 0.
+    middle : mapping of str to float, optional
+        Time [s] from τ = 0 to the middle of the samples that a channel averages, by default zero: an error δ of the
+        frequency turns its harmonics h, of the forcing period, by −2π h δ·middle.
     drift : mapping of str to float
         Relative growth of the strongest harmonic of each channel over the recording.
     period_drift : float
@@ -129,6 +135,7 @@ class Experiment(Result):
     drift: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     period_drift: float = field(default=0.0, kw_only=True)
     origin: float = field(default=0.0, kw_only=True)
+    middle: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     period_test: "pd.DataFrame | None" = field(default=None, kw_only=True)
     findings: tuple[Finding, ...] = field(default=(), kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
@@ -161,7 +168,9 @@ class Experiment(Result):
                 for key, values in (self.guess or {}).items()
             }
             object.__setattr__(self, "guess", guess)
-        for argument in ("scatter", "independent", "harmonics", "amplitude_variance", "amplitude_freedom", "drift"):
+        if not (np.isfinite(self.frequency_se) and self.frequency_se >= 0.0):
+            raise ValueError(f"frequency_se: must be a finite number ≥ 0 [Hz], got {self.frequency_se!r}.")
+        for argument in CHANNEL_MAPPINGS:
             given = dict(getattr(self, argument) or {})
             object.__setattr__(self, argument, given)
             for key in given:
@@ -246,6 +255,7 @@ class Experiment(Result):
         inputs: Mapping[str, ArrayLike] | None = None,
         *,
         samples: int = 800,
+        frequency_se: float = 0.0,
     ) -> "Experiment":
         """Make an experiment from harmonic amplitudes.
 
@@ -259,6 +269,8 @@ class Experiment(Result):
             ``|c[h]|`` the amplitude, and c[h] of a cosine real and positive.
         samples : int
             Grid points per period, more than twice the highest harmonic.
+        frequency_se : float
+            Standard error of the frequency [Hz], zero if it is known.
 
         Returns
         -------
@@ -290,6 +302,7 @@ class Experiment(Result):
             samples=samples,
             harmonics={channel: amplitudes.size - 1 for channel, amplitudes in measured.items()},
             independent={channel: 2 * amplitudes.size - 1 for channel, amplitudes in measured.items()},
+            frequency_se=frequency_se,
         )
 
     @property

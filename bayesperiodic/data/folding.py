@@ -117,6 +117,8 @@ def fold_signals(
         "periodicity": _periodicity(steady, fit),
         "drift": drift,
         "origin": start,
+        # The phase of a channel that defines τ = 0 is not turned.
+        "middle": {} if origin == CROSSING else dict.fromkeys(signals.channels, float(steady.time.mean())),
         "findings": seen.findings,
     }
 

@@ -182,8 +182,8 @@ def nearest_optimum(
 
 
 def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Problem, End]:
-    """Return problem and end of the climb with the errors of the inputs, linearised about the estimate."""
-    for _ in range(MOST_LINEARISATIONS if problem.noisy_inputs else 0):
+    """Return problem and end of the climb with errors of inputs and frequencies, linearised about the estimate."""
+    for _ in range(MOST_LINEARISATIONS if problem.noisy_inputs or problem.frequency_errors else 0):
         now, before = end.iterate, problem.input_errors
         loadings = input_loadings(problem, now.theta, now.here.solver.solutions(now.theta), problem.input_noise)
         errors = estimated_inputs(problem, now, loadings).errors
@@ -197,11 +197,12 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
         still = all(np.abs(change).max(initial=0.0) < SETTLED_INPUTS for change in moved)
         if still and step @ objective.hessian_and_gradient(end.iterate)[0] @ step < SETTLED_INPUTS**2:
             return problem, resumed(objective, end) or end
-    if problem.noisy_inputs:
+    if problem.noisy_inputs or problem.frequency_errors:
+        names = " and ".join(["inputs"] * bool(problem.noisy_inputs) + ["frequencies"] * bool(problem.frequency_errors))
+        joint = ", or take input_noise='joint', in which those of the inputs are parameters" * bool(problem.noisy_inputs)
         warnings.warn(
-            "The errors of the inputs could not be linearised: estimate or inputs still move when this is repeated, by "
-            f"more than {SETTLED_INPUTS:g} of their standard deviations. Average more cycles, or take "
-            "input_noise='joint', in which they are parameters.",
+            f"The errors of the {names} could not be linearised: estimate or {names} still move when this is repeated, "
+            f"by more than {SETTLED_INPUTS:g} of their standard deviations. Average more cycles{joint}.",
             UserWarning,
             stacklevel=4,
         )
