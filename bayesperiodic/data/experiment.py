@@ -66,6 +66,9 @@ class Experiment(Result):
     middle : mapping of str to float, optional
         Time [s] from τ = 0 to the middle of the samples that a channel averages, by default zero: an error δ of the
         frequency turns its harmonics h, of the forcing period, by −2π h δ·middle.
+    phase_diffusion : float
+        Variance per time [rad²/s] by which the phase of the drive, or of a free-running oscillation, wanders at random.
+        Zero unless the phases of the cycles show it; ``frequency_se`` contains what it causes.
     drift : mapping of str to float
         Relative growth of the strongest harmonic of each channel over the recording.
     period_drift : float
@@ -136,6 +139,7 @@ class Experiment(Result):
     period_drift: float = field(default=0.0, kw_only=True)
     origin: float = field(default=0.0, kw_only=True)
     middle: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    phase_diffusion: float = field(default=0.0, kw_only=True)
     period_test: "pd.DataFrame | None" = field(default=None, kw_only=True)
     findings: tuple[Finding, ...] = field(default=(), kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
@@ -370,12 +374,14 @@ class Experiment(Result):
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
-        text = ""
+        text, error = "", f" ± {self.frequency_se:.2g} Hz" if self.frequency_se else ""
+        if self.phase_diffusion:
+            error += f" with a phase diffusion of {self.phase_diffusion:.2g} rad²/s"
         if self.period_test is not None:
             text = f"; {summary(self.period_test, self.periods)}"
         return (
-            f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples per "
-            f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
+            f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz{error}, {self.samples} "
+            f"samples per period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
             f"{text}{''.join(f'; {finding}' for finding in self.findings)})"
         )
 

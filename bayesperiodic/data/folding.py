@@ -33,6 +33,8 @@ MAXIMUM_POINTS = 1_000_000
 MINIMUM_PERIODICITY, CLEARLY_PERIODIC = 0.5, 0.9
 # Ratio of residual variances from which the estimated frequency is right, and the given one wrong.
 CLEARLY = 4.0
+# Phase [cycles] by which a frequency that is given with an error drifts at most: more would shrink the harmonics.
+LARGEST_TURN = 0.05
 # Response cycles of the later half of a recording that show a period which the whole has not.
 LATER_CYCLES = 6
 CROSSING, AUTO = "crossing", "auto"
@@ -53,26 +55,30 @@ def fold_signals(
     signals: Signals,
     samples: int,
     periods: int,
-    frequency: float | None,
+    given: tuple[float, float] | None,
     harmonics: int | Mapping[str, int] | None,
     origin: float | str,
     largest_drift: float | None,
 ) -> dict[str, Any]:
-    """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`."""
+    """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`.
+
+    `given` are the frequency and its standard error.
+    """
     points = samples * periods
     if points > MAXIMUM_POINTS:
         raise ValueError(f"samples: must be at most {MAXIMUM_POINTS // periods} for {periods} periods, got {samples}.")
     if isinstance(origin, str) and origin != CROSSING:
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
+    frequency = None if given is None else given[0]
     seen = inspect(replace(signals, time=signals.time - start), periods, frequency, points)
     if seen.steady is None or seen.fit is None or seen.sizes is None:
         raise ValueError(seen.reason)
     fit, pace, limit = seen.fit, seen.pace, seen.limit
     steady = seen.signals.part(seen.steady.samples)
-    if frequency is not None:
-        estimated, fit = fit, fit_harmonics(steady.time, steady.values, frequency / periods, limit)
-        _refuse_frequency(estimated, fit, pace, float(np.ptp(steady.time)), periods)
+    if given is not None:
+        estimated, fit = fit, fit_harmonics(steady.time, steady.values, given[0] / periods, limit)
+        _refuse_frequency(estimated, fit, pace, float(np.ptp(steady.time)), periods, given[1] / periods)
     drift = dict(zip(signals.channels, _drift(seen.sizes), strict=True))
     _refuse_drift(signals.name, drift, largest_drift)
     refuse(signals.name, seen.findings)
@@ -100,7 +106,8 @@ def fold_signals(
     inputs, outputs = signals.channels[: signals.inputs], signals.channels[signals.inputs :]
     return {
         "frequency": fit.frequency * periods,
-        "frequency_se": pace.se * periods if frequency is None else 0.0,
+        "frequency_se": pace.se * periods if given is None else given[1],
+        "phase_diffusion": (2.0 * np.pi * periods) ** 2 * pace.diffusion * fit.frequency if given is None else 0.0,
         "period_drift": -pace.drift,
         "outputs": {channel: folded[channel] for channel in outputs},
         "inputs": {channel: folded[channel] for channel in inputs},
@@ -121,6 +128,17 @@ def fold_signals(
         "middle": {} if origin == CROSSING else dict.fromkeys(signals.channels, float(steady.time.mean())),
         "findings": seen.findings,
     }
+
+
+def given_frequency(frequency: Any) -> tuple[float, float] | None:
+    """Return a given frequency and its standard error, zero for an exact one."""
+    if frequency is None:
+        return None
+    if not isinstance(frequency, tuple | list):
+        return _checks.positive("frequency", frequency), 0.0
+    if len(frequency) != 2:
+        raise ValueError(f"frequency: must be a number or (frequency, standard error), got {frequency!r}.")
+    return _checks.positive("frequency", frequency[0]), _checks.positive("frequency[1]", frequency[1])
 
 
 def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, pd.DataFrame]":
@@ -149,13 +167,15 @@ def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, 
     return chosen, evidence
 
 
-def _refuse_frequency(estimated: HarmonicFit, given: HarmonicFit, pace: Pace, duration: float, periods: int) -> None:
-    """Raise a ValueError if the given frequency is not that of the recording."""
+def _refuse_frequency(
+    estimated: HarmonicFit, given: HarmonicFit, pace: Pace, duration: float, periods: int, error: float
+) -> None:
+    """Raise a ValueError if the given frequency, with its standard error, is not that of the recording."""
     difference = given.frequency - estimated.frequency
     # Few cycles have too few degrees of freedom for a test, but noise of any kind would not shrink so much.
     shrinks = np.mean(np.log(given.variances / estimated.variances)) > np.log(CLEARLY)
-    clear = shrinks and abs(difference) * duration > NEGLIGIBLE_PHASE
-    if clear or (explains_more(estimated, given) and pace.differs(difference, duration)):
+    clear = shrinks and abs(difference) * duration > (LARGEST_TURN if error else NEGLIGIBLE_PHASE)
+    if clear or (explains_more(estimated, given) and pace.differs(difference, duration, error)):
         raise ValueError(
             f"frequency: must be that of the recording, which is estimated as {estimated.frequency * periods:.9g} Hz "
             f"with a standard error of {pace.se * periods:.1g} Hz, got {given.frequency * periods:.9g} Hz, whose phase "

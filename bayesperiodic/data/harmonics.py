@@ -10,6 +10,7 @@ from scipy.special import fdtri
 from scipy.stats import t as student
 
 from bayesperiodic import _fourier
+from bayesperiodic.data.phase_diffusion import phase_diffusion
 
 MAXIMUM_HARMONICS = 600
 SIGNIFICANT_POWER = 10.0
@@ -68,10 +69,12 @@ class Pace:
     drift: float  # relative change of the frequency over the recording, by linear regression
     drifts: bool  # the phase deviates from that of a constant frequency by more than noise and a negligible angle
     wander: float = 0.0  # range of slow irregular phase deviations [cycles], 0 if not above those of the amplitude
+    diffusion: float = 0.0  # variance of the phase's random step in a cycle [cycles²], 0 without evidence of any
 
-    def differs(self, difference: float, duration: float) -> bool:
-        """Return whether a frequency differs from the estimated one significantly, and by a phase that matters."""
-        significant = abs(difference) > self.se * student.isf(0.5 * PHASE_FALSE_ALARM, self.freedom)
+    def differs(self, difference: float, duration: float, error: float = 0.0) -> bool:
+        """Return whether a frequency with a standard error differs significantly, and by a phase that matters."""
+        spread = np.hypot(self.se, error)
+        significant = abs(difference) > spread * student.isf(0.5 * PHASE_FALSE_ALARM, self.freedom)
         return bool(significant and abs(difference) * duration > NEGLIGIBLE_PHASE)
 
 
@@ -127,7 +130,9 @@ def _pace(time: np.ndarray, fit: HarmonicFit, clear: np.ndarray, weights: np.nda
     Their deviations from a straight line are expanded in orthonormal polynomials. Order 1 is an error of the frequency,
     order 2 a linear drift; the mean square of the next ones, K/4 of them for K cycles (4 to 16), measures noise that is
     slow compared with a cycle (as U. K. Müller, J. Econometrics 141 (2007) 1331-1352, with cosines), and is at least
-    that of independent samples. With less than seven cycles, noise of the amplitude is taken to be as large.
+    that of independent samples. With less than seven cycles, noise of the amplitude is taken to be as large. Where the
+    phases show a random walk, as those of a free-running oscillator do, what it adds to orders 1 and 2 counts if it is
+    more: it is larger there than in the next orders.
     """
     cycle = np.floor((time - time[0]) * fit.frequency).astype(int)
     rate = _fourier.derivative(clear, 1.0)
@@ -145,16 +150,19 @@ def _pace(time: np.ndarray, fit: HarmonicFit, clear: np.ndarray, weights: np.nda
     irregular = float(np.ptp(phase[3:] @ basis[3:]))
     allowed = fdtri(orders, orders, 1.0 - PHASE_FALSE_ALARM) * max(float(np.sum(amplitude[3:] ** 2)), orders / power)
     wanders = orders >= 4 and irregular > NEGLIGIBLE_PHASE and float(np.sum(phase[3:] ** 2)) > allowed
+    walk = phase_diffusion(score / power, basis[:3], 1.0 / power)
+    slope, bent = (noise, noise) if walk is None else np.maximum(walk.slopes[1:], noise)
     curvature = phase[2] * basis[2]
     bend = float(np.ptp(curvature))
     limit = student.isf(0.5 * PHASE_FALSE_ALARM, others.size)
     sign = float(np.sign(curvature[0] - curvature[score.size // 2]))
     return Pace(
-        float(np.sqrt(noise * power / information)),
+        float(np.sqrt(slope * power / information)),
         others.size,
         8.0 * sign * bend * score.size / (score.size - 1) ** 2,
-        bool(bend > NEGLIGIBLE_PHASE and abs(phase[2]) > limit * np.sqrt(noise)),
+        bool(bend > NEGLIGIBLE_PHASE and abs(phase[2]) > limit * np.sqrt(bent)),
         irregular if wanders else 0.0,
+        0.0 if walk is None or slope == noise else walk.step,
     )
 
 
