@@ -14,6 +14,7 @@ from bayesperiodic.data.harmonics import (
     HarmonicFit,
     Pace,
     fit_harmonics,
+    followed_phase,
     refine_frequency,
     resolved_harmonics,
     track_frequency,
@@ -79,11 +80,16 @@ def fold_signals(
     if given is not None:
         estimated, fit = fit, fit_harmonics(steady.time, steady.values, given[0] / periods, limit)
         _refuse_frequency(estimated, fit, pace, float(np.ptp(steady.time)), periods, given[1] / periods)
+    elif pace.diffusion and not signals.inputs:
+        # The cycles of a free-running oscillation are compared at equal phases; others would smear its harmonics.
+        ahead = followed_phase(steady.time, steady.values, fit, pace.diffusion)
+        steady = replace(steady, time=steady.time + ahead / fit.frequency)
+        fit = fit_harmonics(steady.time, steady.values, fit.frequency, limit)
     drift = dict(zip(signals.channels, _drift(seen.sizes), strict=True))
     _refuse_drift(signals.name, drift, largest_drift)
     refuse(signals.name, seen.findings)
     cycles = round(np.ptp(steady.time) * fit.frequency)
-    _warn(signals.name, pace, cycles, seen)
+    _warn(signals.name, pace, cycles, seen, given is None)
     one_cycle, noise = zip(*(_noise(steady, fit, row, cycles) for row in range(len(steady.values))), strict=True)
     for row, squares in enumerate(seen.steady.squares):
         order = min(squares.size, noise[row].variance.size)
@@ -184,7 +190,7 @@ def _refuse_frequency(
         )
 
 
-def _warn(name: str, pace: Pace, cycles: int, seen: Inspection) -> None:
+def _warn(name: str, pace: Pace, cycles: int, seen: Inspection, estimated: bool) -> None:
     """Warn of a period that drifts, and of a steady part that is less than half of the recording."""
     total = seen.total
     if pace.drifts:
@@ -196,11 +202,17 @@ def _warn(name: str, pace: Pace, cycles: int, seen: Inspection) -> None:
             stacklevel=4,
         )
     elif pace.wander:
+        followed = estimated and pace.diffusion > 0.0 and not seen.signals.inputs
         warnings.warn(
             f"{name}: the phase wanders irregularly by {360.0 * pace.wander:.2g}° of the response period over the "
-            f"{cycles} cycles used, while the amplitude is steadier. The mean period assumes a constant frequency: its "
-            "higher harmonics are smeared. Fold shorter parts with `between`, or measure with a steadier drive or "
-            "clock.",
+            f"{cycles} cycles used, while the amplitude is steadier. "
+            + (
+                "The mean period follows the phase, and the standard error of the frequency contains its random walk; "
+                "slow changes of the frequency by other causes are not told from it."
+                if followed
+                else "The mean period assumes a constant frequency: its higher harmonics are smeared. Fold shorter "
+                "parts with `between`, or measure with a steadier drive or clock."
+            ),
             UserWarning,
             stacklevel=4,
         )

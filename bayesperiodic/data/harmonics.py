@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.fft import next_fast_len
-from scipy.linalg import solve_toeplitz, toeplitz
+from scipy.linalg import solve_toeplitz, solveh_banded, toeplitz
 from scipy.special import fdtri
 from scipy.stats import t as student
 
@@ -21,6 +21,8 @@ LARGEST_CONDITION = 20.0
 TRACKED = 48
 # Deviations of the phase [cycles] below this are of no consequence; others count if they are not explained by noise.
 NEGLIGIBLE_PHASE, PHASE_FALSE_ALARM = 1.0 / 360.0, 1e-4
+# Gauss-Newton steps towards a wandering phase.
+FOLLOWED = 4
 
 
 @dataclass(frozen=True)
@@ -164,6 +166,33 @@ def _pace(time: np.ndarray, fit: HarmonicFit, clear: np.ndarray, weights: np.nda
         irregular if wanders else 0.0,
         0.0 if walk is None or slope == noise else walk.step,
     )
+
+
+def followed_phase(time: np.ndarray, channels: np.ndarray, fit: HarmonicFit, step: float) -> np.ndarray:
+    """Return by how many cycles a wandering phase is ahead of that of a constant frequency at each time (samples,).
+
+    It is the likeliest random walk with the step's variance in a cycle, without its mean and slope; the Fourier series
+    (channels, samples) is fitted to it again. Each Gauss-Newton step solves tridiagonal equations.
+    """
+    frequency, harmonics = fit.frequency, fit.amplitudes.shape[1] - 1
+    stiff = 1.0 / np.maximum(step * frequency * np.diff(time), np.finfo(float).tiny)
+    ahead = np.zeros(time.size)
+    for _ in range(FOLLOWED):
+        phase = frequency * time + ahead
+        clear, weights = _clear(fit), 1.0 / fit.variances
+        slope = _fourier.at_times(_fourier.derivative(clear, 1.0), phase)
+        information = weights @ slope**2
+        bands = np.zeros((2, time.size))
+        bands[1] = information
+        bands[1, 1:] += stiff
+        bands[1, :-1] += stiff
+        bands[0, 1:] = -stiff
+        ahead = solveh_banded(bands, weights @ (slope * fit.residuals) + information * ahead)
+        root = np.sqrt(information)
+        line = np.stack([np.ones(time.size), time - time.mean()], axis=1)
+        ahead -= line @ np.linalg.lstsq(line * root[:, None], ahead * root, rcond=None)[0]
+        fit = fit_harmonics(time + ahead / frequency, channels, frequency, harmonics)
+    return ahead
 
 
 def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
