@@ -22,6 +22,7 @@ from bayesperiodic.estimation.covariance import (
     input_loadings,
     uncertainty,
 )
+from bayesperiodic.estimation.frequencies import updated_frequencies
 from bayesperiodic.estimation.gauss_newton import (
     MAX_STEPS,
     End,
@@ -321,7 +322,7 @@ def _describe(
     acting = np.diag(uncertain.information) * problem.joint_prior.widths**2 > INFORMED
     sampled = objective.density.with_settings(coordinates=RIDGE_COORDINATES)
     joints = [joint_laplace(sampled, end.iterate) for end in modes] if checks or len(modes) > 1 else []
-    residuals = best.here.compared()
+    residuals, solutions = best.here.compared(), best.here.solver.solutions(best.theta)
     fit = MapEstimate(
         status=STATUSES[OTHER_ORBIT] if best.here.other_orbits else status,
         theta=_by_name(problem, best.theta),
@@ -333,7 +334,7 @@ def _describe(
             problem.noise.prior_text,
             {_short(name): count for name, count in noise_names.items()},
         ),
-        solutions=best.here.solver.solutions(best.theta),
+        solutions=solutions,
         residuals=residuals,
         rms={c: _pooled(problem, c, residuals) for c in problem.channels},
         fvu=_fractions_left(problem, residuals),
@@ -351,6 +352,7 @@ def _describe(
         ),
         tied=_tied_slopes(problem, best.theta),
         fingerprint=fingerprint(problem),
+        frequencies=updated_frequencies(problem, best, solutions, covariance),
     )
     return replace(fit, checks=checked(problem, best, uncertain, factor, fit.solutions)) if checks else fit
 
