@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MEANING, DATA = "samples·periods", "data"
+CHANNEL_MAPPINGS = (
+    "scatter", "independent", "harmonics", "amplitude_variance", "amplitude_freedom", "drift", "middle",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,12 @@ class Experiment(Result):
     frequency_se, periodicity, origin : float
         Standard error of the frequency [Hz], zero if it is known; fraction of the variance that the mean period
         explains, of the channel with the smallest one; time [s] of the recording at which τ = 0.
+    middle : mapping of str to float, optional
+        Time [s] from τ = 0 to the middle of the samples that a channel averages, by default zero: an error δ of the
+        frequency turns its harmonics h, of the forcing period, by −2π h δ·middle.
+    phase_diffusion : float
+        Variance per time [rad²/s] by which the phase of the drive, or of a free-running oscillation, wanders at random.
+        Zero unless the phases of the cycles show it; ``frequency_se`` contains what it causes.
     drift : mapping of str to float
         Relative growth of the strongest harmonic of each channel over the recording.
     period_drift : float
@@ -133,6 +142,8 @@ class Experiment(Result):
     drift: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     period_drift: float = field(default=0.0, kw_only=True)
     origin: float = field(default=0.0, kw_only=True)
+    middle: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    phase_diffusion: float = field(default=0.0, kw_only=True)
     period_test: "pd.DataFrame | None" = field(default=None, kw_only=True)
     findings: tuple[Finding, ...] = field(default=(), kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
@@ -165,7 +176,9 @@ class Experiment(Result):
                 for key, values in (self.guess or {}).items()
             }
             object.__setattr__(self, "guess", guess)
-        for argument in ("scatter", "independent", "harmonics", "amplitude_variance", "amplitude_freedom", "drift"):
+        if not (np.isfinite(self.frequency_se) and self.frequency_se >= 0.0):
+            raise ValueError(f"frequency_se: must be a finite number ≥ 0 [Hz], got {self.frequency_se!r}.")
+        for argument in CHANNEL_MAPPINGS:
             given = dict(getattr(self, argument) or {})
             object.__setattr__(self, argument, given)
             for key in given:
@@ -271,6 +284,7 @@ class Experiment(Result):
         inputs: Mapping[str, ArrayLike] | None = None,
         *,
         samples: int = 800,
+        frequency_se: float = 0.0,
     ) -> "Experiment":
         """Make an experiment from harmonic amplitudes.
 
@@ -285,6 +299,8 @@ class Experiment(Result):
             not measured; so is exactly zero, which no measurement with noise gives.
         samples : int
             Grid points per period, more than twice the highest harmonic.
+        frequency_se : float
+            Standard error of the frequency [Hz], zero if it is known.
 
         Returns
         -------
@@ -326,6 +342,7 @@ class Experiment(Result):
             samples=samples,
             harmonics={channel: amplitudes.size - 1 for channel, amplitudes in measured.items()},
             unmeasured={channel: np.flatnonzero(c == 0.0).tolist() for channel, c in measured.items()},
+            frequency_se=frequency_se,
         )
 
     @property
@@ -401,11 +418,14 @@ class Experiment(Result):
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
         without = (f"{k} without harmonics {', '.join(map(str, h))}" for k, h in self.unmeasured.items())
         text = "".join(f"; {each}" for each in without)
+        error = f" ± {self.frequency_se:.2g} Hz" if self.frequency_se else ""
+        if self.phase_diffusion:
+            error += f" with a phase diffusion of {self.phase_diffusion:.2g} rad²/s"
         if self.period_test is not None:
             text += f"; {summary(self.period_test, self.periods)}"
         return (
-            f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples per "
-            f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
+            f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz{error}, {self.samples} "
+            f"samples per period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
             f"{text}{''.join(f'; {finding}' for finding in self.findings)})"
         )
 

@@ -16,6 +16,7 @@ from bayesperiodic.data.harmonics import (
     NEGLIGIBLE_PHASE,
     HarmonicFit,
     Pace,
+    followed_phase,
     refine_frequency,
 )
 from bayesperiodic.data.inspection import Inspection, inspect
@@ -34,6 +35,8 @@ MAXIMUM_POINTS = 1_000_000
 MINIMUM_PERIODICITY, CLEARLY_PERIODIC = 0.5, 0.9
 # Ratio of residual variances from which the estimated frequency is right, and the given one wrong.
 CLEARLY = 4.0
+# Phase [cycles] by which a frequency that is given with an error drifts at most: more would shrink the harmonics.
+LARGEST_TURN = 0.05
 # Response cycles of the later half of a recording that show a period which the whole has not.
 LATER_CYCLES = 6
 CROSSING, AUTO = "crossing", "auto"
@@ -46,14 +49,15 @@ def fold_signals(
     groups: list[Signals],
     samples: int,
     periods: int,
-    frequency: float | None,
+    given: tuple[float, float] | None,
     harmonics: int | Mapping[str, int] | None,
     origin: float | str,
     largest_drift: float | None,
 ) -> dict[str, Any]:
     """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`.
 
-    Each group of channels with common times is solved on its own samples, for one frequency and phase.
+    Each group of channels with common times is solved on its own samples, for one frequency and phase. `given` are the
+    frequency and its standard error.
     """
     points = samples * periods
     if points > MAXIMUM_POINTS:
@@ -61,22 +65,29 @@ def fold_signals(
     if isinstance(origin, str) and origin != CROSSING:
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
+    frequency = None if given is None else given[0]
     seen = inspect([replace(group, time=group.time - start) for group in groups], periods, frequency, points)
     if seen.steady is None or seen.fit is None or seen.sizes is None:
         raise ValueError(seen.reason)
-    fit, parts, name = seen.fit, seen.parts, groups[0].name
-    if frequency is not None:
-        fit = fit_groups(parts, frequency / periods, seen.limits)
-        _refuse_frequency(seen.fit, fit, seen.pace, float(max(np.ptp(part.time) for part in parts)), periods)
+    fit, pace, parts, name = seen.fit, seen.pace, seen.parts, groups[0].name
+    inputs = [channel for group in groups for channel in group.channels[: group.inputs]]
+    if given is not None:
+        duration = float(max(np.ptp(part.time) for part in parts))
+        fit = fit_groups(parts, given[0] / periods, seen.limits)
+        _refuse_frequency(seen.fit, fit, pace, duration, periods, given[1] / periods)
+    elif pace.diffusion and not inputs and len(parts) == 1:
+        # The cycles of a free-running oscillation are compared at equal phases; others would smear its harmonics.
+        ahead = followed_phase(parts[0].time, parts[0].values, fit.each[0], pace.diffusion)
+        parts = [replace(parts[0], time=parts[0].time + ahead / fit.frequency)]
+        fit = fit_groups(parts, fit.frequency, seen.limits)
     drift = dict(zip(seen.channels, _drift(seen.sizes), strict=True))
     _refuse_drift(name, drift, largest_drift)
     refuse(name, seen.findings)
     cycles = round(max(np.ptp(part.time) for part in parts) * fit.frequency)
-    _warn(name, seen.pace, cycles, seen)
-    one_cycle, noise = _noises(seen, fit, cycles)
-    amplitudes, limits, size = _by_channel(seen, fit)
+    _warn(name, pace, cycles, seen, given is None)
+    one_cycle, noise = _noises(seen, parts, fit, cycles)
+    amplitudes, limits, size = _by_channel(parts, seen.limits, fit)
     kept = {c: _last_significant(a, noise[c]) for c, a in amplitudes.items()} | _chosen(harmonics, limits)
-    inputs = [channel for group in groups for channel in group.channels[: group.inputs]]
     outputs = [channel for channel in amplitudes if channel not in inputs]
     if origin == CROSSING:
         # The first time ≥ 0 at which the fundamental of the first output crosses zero upwards.
@@ -88,8 +99,9 @@ def fold_signals(
     folded = {channel: _fourier.on_grid(amplitudes[channel][part], points) for channel, part in used.items()}
     return {
         "frequency": fit.frequency * periods,
-        "frequency_se": seen.pace.se * periods if frequency is None else 0.0,
-        "period_drift": -seen.pace.drift,
+        "frequency_se": pace.se * periods if given is None else given[1],
+        "phase_diffusion": (2.0 * np.pi * periods) ** 2 * pace.diffusion * fit.frequency if given is None else 0.0,
+        "period_drift": -pace.drift,
         "outputs": {channel: folded[channel] for channel in outputs},
         "inputs": {channel: folded[channel] for channel in inputs},
         "samples": samples,
@@ -105,24 +117,30 @@ def fold_signals(
         "periodicity": _periodicity(seen, fit),
         "drift": drift,
         "origin": start,
+        # The phase of a channel that defines τ = 0 is not turned.
+        "middle": {} if origin == CROSSING else {c: float(p.time.mean()) for p in parts for c in p.channels},
         "findings": seen.findings,
     }
 
 
-def _by_channel(seen: Inspection, fit: CommonFit) -> tuple[dict[str, np.ndarray], dict[str, int], dict[str, int]]:
+def _by_channel(
+    parts: list[Signals], highest: list[int], fit: CommonFit
+) -> tuple[dict[str, np.ndarray], dict[str, int], dict[str, int]]:
     """Return by channel the amplitudes, the highest harmonic that its samples resolve, and their number."""
     amplitudes, limits, sizes = {}, {}, {}
-    for part, one, limit in zip(seen.parts, fit.each, seen.limits, strict=True):
+    for part, one, limit in zip(parts, fit.each, highest, strict=True):
         for channel, values in zip(part.channels, one.amplitudes, strict=True):
             amplitudes[channel], limits[channel], sizes[channel] = values, limit, part.time.size
     return amplitudes, limits, sizes
 
 
-def _noises(seen: Inspection, fit: CommonFit, cycles: int) -> tuple[dict[str, np.ndarray], dict[str, "AmplitudeNoise"]]:
+def _noises(
+    seen: Inspection, parts: list[Signals], fit: CommonFit, cycles: int
+) -> tuple[dict[str, np.ndarray], dict[str, "AmplitudeNoise"]]:
     """Return by channel the variances of one cycle's amplitudes, and those of the mean with a transient's rest."""
     one_cycle, noise, row = {}, {}, 0
-    start = seen.parts[0].time[0]
-    for group, part, one, inflation in zip(seen.groups, seen.parts, fit.each, seen.inflation, strict=True):
+    start = parts[0].time[0]
+    for group, part, one, inflation in zip(seen.groups, parts, fit.each, seen.inflation, strict=True):
         sampling = Sampling.of(part.time, fit.frequency, one.amplitudes.shape[1] - 1, cycles)
         for i, channel in enumerate(part.channels):
             one_cycle[channel], of_mean = _noise(part, one, i, cycles, sampling)
@@ -135,6 +153,17 @@ def _noises(seen: Inspection, fit: CommonFit, cycles: int) -> tuple[dict[str, np
             noise[channel] = replace(of_mean, beside=of_mean.beside * np.exp(turn))
             row += 1
     return one_cycle, noise
+
+
+def given_frequency(frequency: Any) -> tuple[float, float] | None:
+    """Return a given frequency and its standard error, zero for an exact one."""
+    if frequency is None:
+        return None
+    if not isinstance(frequency, tuple | list):
+        return _checks.positive("frequency", frequency), 0.0
+    if len(frequency) != 2:
+        raise ValueError(f"frequency: must be a number or (frequency, standard error), got {frequency!r}.")
+    return _checks.positive("frequency", frequency[0]), _checks.positive("frequency[1]", frequency[1])
 
 
 def automatic_periods(groups: list[Signals], frequency: float | None) -> "tuple[int, pd.DataFrame]":
@@ -176,13 +205,15 @@ def _response_period(signals: Signals, drive: float) -> "tuple[int | None, pd.Da
     return chosen, evidence
 
 
-def _refuse_frequency(estimated: CommonFit, given: CommonFit, pace: Pace, duration: float, periods: int) -> None:
-    """Raise a ValueError if the given frequency is not that of the recording."""
+def _refuse_frequency(
+    estimated: CommonFit, given: CommonFit, pace: Pace, duration: float, periods: int, error: float
+) -> None:
+    """Raise a ValueError if the given frequency, with its standard error, is not that of the recording."""
     difference = given.frequency - estimated.frequency
     # Few cycles have too few degrees of freedom for a test, but noise of any kind would not shrink so much.
     shrinks = np.mean(np.log(given.variances / estimated.variances)) > np.log(CLEARLY)
-    clear = shrinks and abs(difference) * duration > NEGLIGIBLE_PHASE
-    if clear or (explains_more(estimated, given) and pace.differs(difference, duration)):
+    clear = shrinks and abs(difference) * duration > (LARGEST_TURN if error else NEGLIGIBLE_PHASE)
+    if clear or (explains_more(estimated, given) and pace.differs(difference, duration, error)):
         raise ValueError(
             f"frequency: must be that of the recording, which is estimated as {estimated.frequency * periods:.9g} Hz "
             f"with a standard error of {pace.se * periods:.1g} Hz, got {given.frequency * periods:.9g} Hz, whose phase "
@@ -191,7 +222,7 @@ def _refuse_frequency(estimated: CommonFit, given: CommonFit, pace: Pace, durati
         )
 
 
-def _warn(name: str, pace: Pace, cycles: int, seen: Inspection) -> None:
+def _warn(name: str, pace: Pace, cycles: int, seen: Inspection, estimated: bool) -> None:
     """Warn of a period that drifts, and of a steady part that is less than half of the recording."""
     total = seen.total
     if pace.drifts:
@@ -203,11 +234,17 @@ def _warn(name: str, pace: Pace, cycles: int, seen: Inspection) -> None:
             stacklevel=4,
         )
     elif pace.wander:
+        followed = estimated and pace.diffusion > 0.0 and not seen.signals.inputs
         warnings.warn(
             f"{name}: the phase wanders irregularly by {360.0 * pace.wander:.2g}° of the response period over the "
-            f"{cycles} cycles used, while the amplitude is steadier. The mean period assumes a constant frequency: its "
-            "higher harmonics are smeared. Fold shorter parts with `between`, or measure with a steadier drive or "
-            "clock.",
+            f"{cycles} cycles used, while the amplitude is steadier. "
+            + (
+                "The mean period follows the phase, and the standard error of the frequency contains its random walk; "
+                "slow changes of the frequency by other causes are not told from it."
+                if followed
+                else "The mean period assumes a constant frequency: its higher harmonics are smeared. Fold shorter "
+                "parts with `between`, or measure with a steadier drive or clock."
+            ),
             UserWarning,
             stacklevel=4,
         )

@@ -5,12 +5,13 @@ from functools import cached_property
 
 import numpy as np
 from scipy.fft import next_fast_len
-from scipy.linalg import solve_toeplitz
+from scipy.linalg import solve_toeplitz, solveh_banded
 from scipy.special import fdtri
 from scipy.stats import t as student
 
 from bayesperiodic import _fourier
 from bayesperiodic.data.coverage import covered_harmonics
+from bayesperiodic.data.phase_diffusion import phase_diffusion
 
 MAXIMUM_HARMONICS = 600
 SIGNIFICANT_POWER = 10.0
@@ -19,6 +20,8 @@ MINIMUM_CYCLES = 3
 TRACKED, FEWEST_TRACKED, FEWEST_REFINED = 48, 384, 12
 # Deviations of the phase [cycles] below this are of no consequence; others count if they are not explained by noise.
 NEGLIGIBLE_PHASE, PHASE_FALSE_ALARM = 1.0 / 360.0, 1e-4
+# Gauss-Newton steps towards a wandering phase.
+FOLLOWED = 4
 
 
 @dataclass(frozen=True)
@@ -67,10 +70,12 @@ class Pace:
     drift: float  # relative change of the frequency over the recording, by linear regression
     drifts: bool  # the phase deviates from that of a constant frequency by more than noise and a negligible angle
     wander: float = 0.0  # range of slow irregular phase deviations [cycles], 0 if not above those of the amplitude
+    diffusion: float = 0.0  # variance of the phase's random step in a cycle [cycles²], 0 without evidence of any
 
-    def differs(self, difference: float, duration: float) -> bool:
-        """Return whether a frequency differs from the estimated one significantly, and by a phase that matters."""
-        significant = abs(difference) > self.se * student.isf(0.5 * PHASE_FALSE_ALARM, self.freedom)
+    def differs(self, difference: float, duration: float, error: float = 0.0) -> bool:
+        """Return whether a frequency with a standard error differs significantly, and by a phase that matters."""
+        spread = np.hypot(self.se, error)
+        significant = abs(difference) > spread * student.isf(0.5 * PHASE_FALSE_ALARM, self.freedom)
         return bool(significant and abs(difference) * duration > NEGLIGIBLE_PHASE)
 
 
@@ -161,7 +166,8 @@ def pace_of(score: np.ndarray, quadrature: np.ndarray, power: float, information
     the frequency, order 2 a linear drift; the mean square of the next ones, K/4 of them for K cycles (4 to 16),
     measures noise that is slow compared with a cycle (as U. K. Müller, J. Econometrics 141 (2007) 1331-1352, with
     cosines), and is at least that of independent samples. With less than seven cycles, noise of the amplitude is taken
-    to be as large.
+    to be as large. Where the phases show a random walk, as those of a free-running oscillator do, what it adds to
+    orders 1 and 2 counts if it is more: it is larger there than in the next orders.
     """
     if score.size < MINIMUM_CYCLES:
         return Pace(float(np.sqrt(1.0 / information)), 0, 0.0, False)
@@ -174,17 +180,47 @@ def pace_of(score: np.ndarray, quadrature: np.ndarray, power: float, information
     irregular = float(np.ptp(phase[3:] @ basis[3:]))
     allowed = fdtri(orders, orders, 1.0 - PHASE_FALSE_ALARM) * max(float(np.sum(amplitude[3:] ** 2)), orders / power)
     wanders = orders >= 4 and irregular > NEGLIGIBLE_PHASE and float(np.sum(phase[3:] ** 2)) > allowed
+    walk = phase_diffusion(score / power, basis[:3], 1.0 / power)
+    slope, bent = (noise, noise) if walk is None else np.maximum(walk.slopes[1:], noise)
     curvature = phase[2] * basis[2]
     bend = float(np.ptp(curvature))
     limit = student.isf(0.5 * PHASE_FALSE_ALARM, others.size)
     sign = float(np.sign(curvature[0] - curvature[score.size // 2]))
     return Pace(
-        float(np.sqrt(noise * power / information)),
+        float(np.sqrt(slope * power / information)),
         others.size,
         8.0 * sign * bend * score.size / (score.size - 1) ** 2,
-        bool(bend > NEGLIGIBLE_PHASE and abs(phase[2]) > limit * np.sqrt(noise)),
+        bool(bend > NEGLIGIBLE_PHASE and abs(phase[2]) > limit * np.sqrt(bent)),
         irregular if wanders else 0.0,
+        0.0 if walk is None or slope == noise else walk.step,
     )
+
+
+def followed_phase(time: np.ndarray, channels: np.ndarray, fit: HarmonicFit, step: float) -> np.ndarray:
+    """Return by how many cycles a wandering phase is ahead of that of a constant frequency at each time (samples,).
+
+    It is the likeliest random walk with the step's variance in a cycle, without its mean and slope; the Fourier series
+    (channels, samples) is fitted to it again. Each Gauss-Newton step solves tridiagonal equations.
+    """
+    frequency, harmonics = fit.frequency, fit.amplitudes.shape[1] - 1
+    stiff = 1.0 / np.maximum(step * frequency * np.diff(time), np.finfo(float).tiny)
+    ahead = np.zeros(time.size)
+    for _ in range(FOLLOWED):
+        phase = frequency * time + ahead
+        clear, weights = _clear(fit), 1.0 / fit.variances
+        slope = _fourier.at_times(_fourier.derivative(clear, 1.0), phase)
+        information = weights @ slope**2
+        bands = np.zeros((2, time.size))
+        bands[1] = information
+        bands[1, 1:] += stiff
+        bands[1, :-1] += stiff
+        bands[0, 1:] = -stiff
+        ahead = solveh_banded(bands, weights @ (slope * fit.residuals) + information * ahead)
+        root = np.sqrt(information)
+        line = np.stack([np.ones(time.size), time - time.mean()], axis=1)
+        ahead -= line @ np.linalg.lstsq(line * root[:, None], ahead * root, rcond=None)[0]
+        fit = fit_harmonics(time + ahead / frequency, channels, frequency, harmonics)
+    return ahead
 
 
 def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:

@@ -13,7 +13,7 @@ from bayesperiodic._linalg import one_thread
 from bayesperiodic.data.channels import Channels
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.files import CSV, MAT, NPZ
-from bayesperiodic.data.folding import AUTO, automatic_periods, fold_signals
+from bayesperiodic.data.folding import AUTO, automatic_periods, fold_signals, given_frequency
 from bayesperiodic.data.inspection import inspect, summary
 from bayesperiodic.data.layout import Layout, reader, recordings, without_missing
 from bayesperiodic.data.recording_check import RecordingCheck
@@ -470,7 +470,7 @@ class Recording(Channels):
         self,
         samples: int = 800,
         *,
-        frequency: float | None = None,
+        frequency: float | tuple[float, float] | None = None,
         periods: int | str = 1,
         harmonics: int | Mapping[str, int] | None = None,
         origin: float | str = 0.0,
@@ -495,10 +495,11 @@ class Recording(Channels):
         ----------
         samples : int
             Grid points per forcing period.
-        frequency : float, optional
-            Exact forcing frequency [Hz]; by default it is estimated, with a standard error. A value that differs from
-            the estimate significantly (false-alarm rate 1e-4) and by a drift of more than one degree of phase over the
-            cycles used is refused.
+        frequency : float or (float, float), optional
+            Exact forcing frequency [Hz], or a frequency and its standard error. By default it is estimated; its
+            standard error is that of noise, and of a random walk of the phase where the cycles show one. A value that
+            differs from the estimate significantly (false-alarm rate 1e-4) and by a drift of more than one degree of
+            phase over the cycles used is refused.
         periods : int or "auto"
             Forcing periods per response period. "auto" tests 1 to 8, as far as the recording has three cycles of them,
             and stores the evidence in ``Experiment.period_test``. A period is refused where more than 0.5 % of a
@@ -560,13 +561,13 @@ class Recording(Channels):
         (2, ['not periodic', 'chosen'])
         """
         samples = _checks.integer("samples", samples, 4)
-        groups, evidence = self._groups(), None
+        groups, evidence, given = self._groups(), None, given_frequency(frequency)
         try:
             if periods == AUTO:
-                periods, evidence = automatic_periods(groups, frequency)
+                periods, evidence = automatic_periods(groups, given and given[0])
             periods = _checks.integer("periods", periods, 1)
             with one_thread():
-                folded = fold_signals(groups, samples, periods, frequency, harmonics, origin, largest_drift)
+                folded = fold_signals(groups, samples, periods, given, harmonics, origin, largest_drift)
         except np.linalg.LinAlgError:
             raise ValueError(
                 f"recording: must have samples in all parts of its periods, got {self.name!r}, which has too few; "

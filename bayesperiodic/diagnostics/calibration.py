@@ -204,6 +204,7 @@ def calibrate(
     folds with the harmonics and the frequency of the experiment, and computes the MAP estimate, the Laplace
     approximation and draws of emcee. The periodic solver is not used for the recording, so that its errors are
     detected. Inputs have the noise that `Problem.input_noise` gives them: white, with the measured variance, or given.
+    A frequency with a standard error is missed by a normal error when the recording is folded.
 
     A likelihood that counts too many independent values, or a grid that is too coarse, results in "too narrow" or "not
     uniform". A wrong model is not detected: truths are drawn from the model.
@@ -401,7 +402,10 @@ def _measured(
     for name in noisy_inputs(e, problem.input_noise):
         inputs[name] = inputs[name] + _input_noise(problem, e, name, size, generator)
     recording = Recording(time, outputs, inputs, name=e.name, synthetic=True)
-    again = recording.fold(e.samples, frequency=e.frequency, harmonics=kept)
+    frequency: float | tuple[float, float] = e.frequency
+    if (error := problem.frequency_errors.get(e.name)) is not None:
+        frequency = e.frequency + error.se * float(generator.standard_normal()), error.se
+    again = recording.fold(e.samples, frequency=frequency, harmonics=kept)
     return replace(again, independent=e.independent, guess=e.guess)
 
 

@@ -127,7 +127,9 @@ def checked(
     robust = robust_covariance(problem, estimate, inverse)
     robust[lost, lost] = np.inf
     split = noise_split(problem, estimated_inputs(problem, estimate).residuals, log_variance_factor)
-    loadings = problem.likelihood.loadings or input_loadings(problem, estimate.theta, solutions, ROUGH)
+    loadings = problem.likelihood.loadings
+    if not (problem.noisy_inputs and loadings):
+        loadings = input_loadings(problem, estimate.theta, solutions, ROUGH)
     curved = input_nonlinearity(problem, estimate, solutions, covariance)
     change = partial(_data_change, problem, estimate)
     return FitCheck(

@@ -371,7 +371,8 @@ def doubling_shift(
     """
     finer: list[np.ndarray] = []
     for e in problem.experiments:
-        response = _solved(problem, estimate.theta, e, solutions[e.name], problem.true_inputs(e), finer=2)
+        drive = problem.drive(e, problem.input_errors.get(e.name))
+        response = _solved(problem, estimate.theta, e, solutions[e.name], drive, finer=2)
         if response is None:
             return np.full(estimate.theta.size, np.nan)
         finer += problem.observations[e.name].residuals(response)
@@ -409,8 +410,7 @@ def input_nonlinearity(
             ends = []
             for sign in (1.0, -1.0):
                 other = replace(measured, expected=measured.expected + sign * errors)
-                inputs = problem.true_inputs(e, other)
-                response = _solved(problem, estimate.theta, e, solutions[e.name], inputs)
+                response = _solved(problem, estimate.theta, e, solutions[e.name], problem.drive(e, other))
                 if response is None:
                     return np.full(estimate.theta.size, np.nan)
                 ends.append(observation.residuals(response))
@@ -424,15 +424,18 @@ def _solved(
     theta: np.ndarray,
     experiment: Experiment,
     near: PeriodicSolution,
-    inputs: Mapping[str, np.ndarray],
+    drive: tuple[Mapping[str, np.ndarray], float],
     finer: int = 1,
 ) -> Response | None:
-    """Return the response to inputs (points,), solved on a finer grid, at the points; None if the solve fails."""
-    points = finer * experiment.samples * experiment.periods
+    """Return the response to inputs (points,) and frequency, solved on a finer grid, at the points.
+
+    None if the solve fails; the frequency of an autonomous model is that of the near solution at first.
+    """
+    points, (inputs, frequency) = finer * experiment.samples * experiment.periods, drive
     equations = PeriodicEquations.build(
         problem.model,
         {n: _fourier.on_grid(_fourier.coefficients(u), points) for n, u in inputs.items()},
-        frequency=near.frequency,
+        frequency=near.frequency if problem.model.autonomous else frequency,
         samples=finer * experiment.samples,
         scheme=problem.scheme,
         periods=experiment.periods,
@@ -454,20 +457,25 @@ def _solved(
 def input_loadings(
     problem: Problem, theta: np.ndarray, solutions: Mapping[str, PeriodicSolution], noise: InputNoise
 ) -> dict[str, np.ndarray]:
-    """Return L (components of all blocks, errors) of every experiment with noisy inputs, at its periodic solution.
+    """Return L (components of all blocks, errors) of every experiment with errors, at its periodic solution.
 
-    Without those whose problem is singular.
+    The errors are those of the inputs, and last that of the frequency, if it has one. Without experiments whose problem
+    is singular.
     """
     loadings = {}
     for e in problem.experiments:
         changes, solution = directions(e, problem.model.inputs, noise), solutions[e.name]
+        rates, of_frequency = np.zeros(len(changes)), problem.frequency_errors.get(e.name)
+        if of_frequency is not None:
+            turned = of_frequency.direction(e, problem.model.inputs)
+            changes, rates = np.concatenate([changes, turned[None]]), np.append(rates, of_frequency.se)
         if not len(changes):
             continue
         for column, name in enumerate(3 * problem.model.inputs):
             changes[..., column] = problem.sensors.corrected_changes(e, name, changes[..., column])
         equations = problem.equations[e.name].at_frequency(solution.frequency)
         parameters, z = problem.parameters(theta[None], e.name)[0], periodic_part(equations, solution.states)
-        moved = input_sensitivities(equations, z, parameters, changes)
+        moved = input_sensitivities(equations, z, parameters, changes, rates)
         if moved is not None:
             caused = predicted_changes(problem, e, equations, theta, z, moved)
             loadings[e.name] = (caused - _common(problem, e, noise)).T
@@ -491,9 +499,12 @@ def predicted_changes(
 
 
 def _common(problem: Problem, experiment: Experiment, noise: InputNoise) -> np.ndarray:
-    """Return what goes with each error of inputs in the errors of the outputs' components (errors, components)."""
-    observation = problem.observations[experiment.name]
+    """Return what goes with each error of inputs and frequency in that of the outputs (errors, components)."""
+    observation, of_frequency = problem.observations[experiment.name], problem.frequency_errors.get(experiment.name)
     errors = errors_of_outputs(experiment, observation.channels, noise)
+    if of_frequency is not None:
+        turns = np.array([of_frequency.turns[channel] for channel in observation.channels])
+        errors = np.concatenate([errors, -(turns * observation.measured_rate)[None]])
     return np.concatenate(observation.errors(errors), axis=1)
 
 
@@ -503,8 +514,8 @@ def caused_by_inputs(problem: Problem, loadings: Mapping[str, np.ndarray]) -> di
     The variance is averaged over the period.
     """
     variances: dict[str, list[float]] = {channel: [0.0] for channel in problem.channels}
-    for name, matrix in loadings.items():
-        blocks = problem.observations[name].blocks
+    for name, every in loadings.items():
+        blocks, matrix = problem.observations[name].blocks, every[:, :-1] if name in problem.frequency_errors else every
         for block, part in zip(blocks, np.split(matrix, np.cumsum([b.size for b in blocks])[:-1]), strict=True):
             if block.channel in variances:
                 variances[block.channel].append(float(np.sum(np.mean(part**2, axis=0))))
@@ -535,7 +546,7 @@ def estimated_inputs(
                 residuals[b] = residuals[b] + part
         matrix = likelihood.loadings.get(e.name) if loadings is None else loadings.get(e.name)
         where, waves = error_waves(e, problem.input_noise)
-        covariance = np.eye(len(where))
+        covariance = np.eye(len(where) + (e.name in problem.frequency_errors))
         if matrix is not None:
             expected = np.zeros(matrix.shape[1]) if before is None else before.expected
             sizes, response = [residuals[b].size for b in members], matrix + _common(problem, e, problem.input_noise).T
@@ -549,7 +560,7 @@ def estimated_inputs(
         sd[e.name] = {name: np.zeros_like(u) for name, u in e.inputs.items()}
         measured = _fourier.on_grid(waves, e.samples * e.periods)
         for name in set(where):
-            mine = np.array([owner == name for owner in where])
+            mine = np.flatnonzero([owner == name for owner in where])
             signals = problem.sensors.corrected_changes(e, name, measured, problem.sensor_values(e, estimate.theta))
             sd[e.name][name] = np.sqrt(np.sum((covariance[np.ix_(mine, mine)] @ signals[mine]) * signals[mine], axis=0))
     return InputEstimate(errors, covariances, sd, residuals)

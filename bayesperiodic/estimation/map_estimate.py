@@ -22,6 +22,7 @@ from bayesperiodic.estimation.covariance import (
     input_loadings,
     uncertainty,
 )
+from bayesperiodic.estimation.frequencies import updated_frequencies
 from bayesperiodic.estimation.gauss_newton import (
     MAX_STEPS,
     End,
@@ -182,8 +183,8 @@ def nearest_optimum(
 
 
 def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Problem, End]:
-    """Return problem and end of the climb with the errors of the inputs, linearised about the estimate."""
-    for _ in range(MOST_LINEARISATIONS if problem.noisy_inputs else 0):
+    """Return problem and end of the climb with errors of inputs and frequencies, linearised about the estimate."""
+    for _ in range(MOST_LINEARISATIONS if problem.noisy_inputs or problem.frequency_errors else 0):
         now, before = end.iterate, problem.input_errors
         loadings = input_loadings(problem, now.theta, now.here.solver.solutions(now.theta), problem.input_noise)
         errors = estimated_inputs(problem, now, loadings).errors
@@ -197,11 +198,14 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
         still = all(np.abs(change).max(initial=0.0) < SETTLED_INPUTS for change in moved)
         if still and step @ objective.hessian_and_gradient(end.iterate)[0] @ step < SETTLED_INPUTS**2:
             return problem, resumed(objective, end) or end
-    if problem.noisy_inputs:
+    if problem.noisy_inputs or problem.frequency_errors:
+        names = " and ".join(["inputs"] * bool(problem.noisy_inputs) + ["frequencies"] * bool(problem.frequency_errors))
+        joint = ", or take input_noise='joint', in which those of the inputs are parameters" * bool(
+            problem.noisy_inputs
+        )
         warnings.warn(
-            "The errors of the inputs could not be linearised: estimate or inputs still move when this is repeated, by "
-            f"more than {SETTLED_INPUTS:g} of their standard deviations. Average more cycles, or take "
-            "input_noise='joint', in which they are parameters.",
+            f"The errors of the {names} could not be linearised: estimate or {names} still move when this is repeated, "
+            f"by more than {SETTLED_INPUTS:g} of their standard deviations. Average more cycles{joint}.",
             UserWarning,
             stacklevel=4,
         )
@@ -320,7 +324,7 @@ def _describe(
     acting = np.diag(uncertain.information) * problem.joint_prior.widths**2 > INFORMED
     sampled = objective.density.with_settings(coordinates=RIDGE_COORDINATES)
     joints = [joint_laplace(sampled, end.iterate) for end in modes] if checks or len(modes) > 1 else []
-    residuals = best.here.compared()
+    residuals, solutions = best.here.compared(), best.here.solver.solutions(best.theta)
     fit = MapEstimate(
         status=STATUSES[OTHER_ORBIT] if best.here.other_orbits else status,
         theta=_by_name(problem, best.theta),
@@ -332,7 +336,7 @@ def _describe(
             problem.noise.prior_text,
             {_short(name): count for name, count in noise_names.items()},
         ),
-        solutions=best.here.solver.solutions(best.theta),
+        solutions=solutions,
         residuals=residuals,
         rms={c: _pooled(problem, c, residuals) for c in problem.channels},
         fvu=_fractions_left(problem, residuals),
@@ -350,6 +354,7 @@ def _describe(
         ),
         tied=_tied_slopes(problem, best.theta),
         fingerprint=fingerprint(problem),
+        frequencies=updated_frequencies(problem, best, solutions, covariance),
     )
     return replace(fit, checks=checked(problem, best, uncertain, factor, fit.solutions)) if checks else fit
 

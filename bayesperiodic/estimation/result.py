@@ -23,6 +23,8 @@ from bayesperiodic.problem.parameters import checked_key, in_experiment, local_h
 
 # Fraction of a channel's variance below which its residual consists of rounding errors of the periodic solves.
 ROUNDING_VARIANCE = 1e-16
+# Standard deviation of a frequency, relative to that of its measurement, below which it is printed, and how many are.
+UPDATED, MOST_FREQUENCIES = 0.8, 3
 
 
 @dataclass(frozen=True)
@@ -208,6 +210,10 @@ class MapEstimate(Result):
         Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
     fingerprint : str
         Digests of the problem, by which results of another problem are refused.
+    frequencies : DataFrame, optional
+        A row for each experiment whose frequency was measured with an error: ``measured`` and its standard error ``se``
+        [Hz], the ``estimate`` by data and model, and its standard deviation ``sd``. The estimates of the parameters
+        take the error into account.
     checks : FitCheck, optional
         What `check` gives, whose fields are attributes of the estimate too; None with ``map_estimate(checks=False)``.
 
@@ -238,6 +244,7 @@ class MapEstimate(Result):
     tied: dict[str, dict[str, float]]
     fingerprint: str
     checks: FitCheck | None = None
+    frequencies: pd.DataFrame | None = None
 
     joint_mode, joint_covariance = _part("joint", "mode"), _part("joint", "covariance")
     noise, noise_prior = _part("noise_estimate", "values"), _part("noise_estimate", "prior")
@@ -444,6 +451,23 @@ class MapEstimate(Result):
         }
 
     @property
+    def noisy_inputs(self) -> bool:
+        """Whether errors of inputs are part of the covariance of the residual."""
+        return any(sd.any() for name in self.input_errors for sd in self.input_sd[name].values())
+
+    def _on_frequencies(self) -> list[str]:
+        """Return a sentence on frequencies that the model determines better than the recording."""
+        table = self.frequencies
+        if table is None or not self.input_errors or not len(table := table[table["sd"] < UPDATED * table["se"]]):
+            return []
+        rows = [
+            f"{row.estimate:.9g} ± {row.sd:.2g} Hz in {name!r} (recording: {row.measured:.9g} ± {row.se:.2g} Hz)"
+            for name, row in table.iloc[:MOST_FREQUENCIES].iterrows()
+        ]
+        more = f" and {len(table) - len(rows)} more" if len(table) > len(rows) else ""
+        return [f"Frequencies by data and model: {', '.join(rows)}{more}."]
+
+    @property
     def without_noise(self) -> tuple[str, ...]:
         """Channels of unknown variance whose residuals are rounding errors: no standard deviation follows from them."""
         names = {name.partition(", ")[0] for name in self.independent}
@@ -469,9 +493,10 @@ class MapEstimate(Result):
         residuals = pd.DataFrame.from_dict(channels, orient="index")
         lines = [f"MapEstimate ({status})", estimates.to_string(), "Residuals", residuals.to_string()]
         lines += [f"The noise has the {self.noise_prior}."] if self.noise else []
-        if self.input_errors and self.checks:
+        if self.noisy_inputs and self.checks:
             caused = ", ".join(f"{sd:.3g} in {channel}" for channel, sd in self.checks.input_noise.items())
             lines.append(f"The noise of the inputs, included in the covariance, causes {caused}.")
+        lines += self._on_frequencies()
         lines += [
             f"The orbit is another one than the recorded one in {name!r}: {text}."
             for name, text in self.other_orbits.items()

@@ -40,7 +40,7 @@ InputNoise = str | Mapping[str, Any]
 
 @dataclass(frozen=True)
 class InputErrors(Storable):
-    """Errors of the inputs of one experiment, linearised about an estimate."""
+    """Errors of the inputs of one experiment, and last of its frequency, linearised about an estimate."""
 
     expected: np.ndarray  # (errors,), η̂
     loadings: np.ndarray  # (components of all blocks, errors), L
@@ -72,7 +72,7 @@ def true_inputs(experiment: Experiment, noise: InputNoise, errors: InputErrors |
     if errors is not None:
         where, waves = error_waves(experiment, noise)
         signals = _fourier.on_grid(waves, experiment.samples * experiment.periods)
-        for name, error, signal in zip(where, errors.expected, signals, strict=True):
+        for name, error, signal in zip(where, errors.expected[: len(where)], signals, strict=True):
             result[name] -= error * signal
     return result
 

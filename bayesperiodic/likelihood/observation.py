@@ -154,6 +154,11 @@ class Observation:
         """Return the components (size,) of the measured values, without what errors of the inputs caused."""
         return self._less_caused(self.errors(self.data))
 
+    @cached_property
+    def measured_rate(self) -> np.ndarray:
+        """Derivative (points, channels) of the measured outputs by their phase [per response period]."""
+        return self._rate(self.data)
+
     def errors(self, values: np.ndarray) -> list[np.ndarray]:
         """Return the components (…, size) of errors of the measured values (…, points, channels), an array a block."""
         shape = values.shape[:-2]

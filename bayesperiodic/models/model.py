@@ -220,6 +220,11 @@ class Model:
         return not _symbols(self.equations) & forcing
 
     @cached_property
+    def explicit_time(self) -> bool:
+        """True if equations or outputs contain τ, so that a shift of all signals in time matters."""
+        return self.time_symbols["tau"] in _symbols((*self.equations, *self.output_expressions))
+
+    @cached_property
     def smooth_signs(self) -> tuple[sp.Expr, ...]:
         """The tanh and arctan terms in the equations whose arguments vary along an orbit."""
         moving = {*self.state_symbols.values(), *self.input_symbols.values(), self.time_symbols["tau"]}

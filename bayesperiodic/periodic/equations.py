@@ -420,11 +420,19 @@ def parameter_sensitivities(
 
 
 def input_sensitivities(
-    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
+    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray, frequency: np.ndarray
 ) -> Sensitivities | None:
-    """Return derivatives along perturbations (directions, points, 3·inputs) of (u, u̇, ü); None if singular."""
+    """Return derivatives along perturbations of a driven model's inputs and frequency; None if singular.
+
+    They are (directions, points, 3·inputs) of (u, u̇, ü) as functions of τ, and (directions,) of the frequency [Hz].
+    """
     d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
-    return respond(equations, z, columns, d, along(d.g_u, directions), along(d.f_u, directions))
+    g, f = along(d.g_u, directions), along(d.f_u, directions)
+    if frequency.any():
+        g_frequency, f_frequency = frequency_derivatives(equations, z, columns, d)
+        g, f = g + frequency[:, None, None] * g_frequency, f + frequency[:, None, None] * f_frequency
+    result = respond(equations, z, columns, d, g, f)
+    return result and result._replace(frequency=frequency)
 
 
 def along(derivatives: np.ndarray, directions: np.ndarray) -> np.ndarray:

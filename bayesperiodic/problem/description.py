@@ -10,6 +10,7 @@ import sympy as sp
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import DATA, Experiment
 from bayesperiodic.data.recording import Recording
+from bayesperiodic.likelihood.frequency_error import FrequencyError
 from bayesperiodic.likelihood.input_noise import (
     EXACT,
     FROM_CYCLES,
@@ -120,6 +121,8 @@ class Description:
             for run in runs
         }
         self.ties = self._ties()
+        errors = {e.name: FrequencyError.of(e, self.model) for e in self.experiments}
+        self.frequency_errors = {name: error for name, error in errors.items() if error is not None}
         self.input_errors = self._checked_input_errors(input_errors or {})
         self.anchors = dict(anchors or {})
         if anchors:
@@ -195,12 +198,12 @@ class Description:
         }
 
     def _checked_input_errors(self, errors: Mapping[str, InputErrors]) -> dict[str, InputErrors]:
-        """Return the errors of the inputs; raise a ValueError unless they are those of these experiments."""
+        """Return the errors of inputs and frequencies; raise a ValueError unless they are of these experiments."""
         for name, one in errors.items():
             _checks.one_of("input_errors", name, self.parameter_maps)
             experiment = next(e for e in self.experiments if e.name == name)
             size = sum(block.size for block in blocks_of(experiment, self.model))
-            count = len(error_waves(experiment, self.input_noise)[0])
+            count = len(error_waves(experiment, self.input_noise)[0]) + (name in self.frequency_errors)
             if one.caused.shape != (size,) or one.loadings.shape[:1] != (size,) or one.expected.shape != (count,):
                 raise ValueError(
                     f"input_errors[{name!r}]: must be {count} errors and {size} components, got {one.expected.size} "
@@ -476,24 +479,43 @@ class Description:
         dict of str to array (points,)
             In the inputs' units.
         """
-        errors = errors or self.input_errors.get(experiment.name)
-        return self.sensors.corrected(experiment, true_inputs(experiment, self.input_noise, errors))
+        return self.drive(experiment, self.input_errors.get(experiment.name))[0]
+
+    def drive(self, experiment: Experiment, errors: InputErrors | None) -> tuple[dict[str, np.ndarray], float]:
+        """Return inputs (points,) and frequency [Hz] of an experiment, the measured ones less expected errors.
+
+        Parameters
+        ----------
+        experiment : Experiment
+        errors : InputErrors, optional
+
+        Returns
+        -------
+        (dict of str to array (points,), float)
+        """
+        inputs = self.sensors.corrected(experiment, true_inputs(experiment, self.input_noise, errors))
+        of_frequency = self.frequency_errors.get(experiment.name)
+        if of_frequency is None or errors is None:
+            return inputs, experiment.frequency
+        error = float(errors.expected[-1])
+        return of_frequency.true_inputs(inputs, error), experiment.frequency - error * of_frequency.se
 
     @cached_property
     def equations(self) -> dict[str, PeriodicEquations]:
         """The discretised equations of every experiment."""
-        return {
-            e.name: PeriodicEquations.build(
+        result = {}
+        for e in self.experiments:
+            inputs, frequency = self.drive(e, self.input_errors.get(e.name))
+            result[e.name] = PeriodicEquations.build(
                 self.model,
-                self.true_inputs(e),
-                frequency=e.frequency,
+                inputs,
+                frequency=frequency,
                 samples=e.samples,
                 scheme=self.scheme,
                 periods=e.periods,
                 winding=e.winding,
             )
-            for e in self.experiments
-        }
+        return result
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled functions cannot be pickled; they are loaded again where they are needed.

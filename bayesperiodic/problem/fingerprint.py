@@ -13,15 +13,15 @@ from bayesperiodic.problem.description import Description
 
 # What makes or computes each kind of result again.
 RESULTS = {"MapEstimate": "map_estimate(problem)", "Posterior": "sample(problem, fit)"}
-# Fields of experiments that no density depends on.
-LABELS = ("synthetic",)
+# Fields of experiments that no density depends on, and those that are left out where they are empty.
+LABELS, LATER_FIELDS = ("synthetic",), ("middle", "phase_diffusion")
 
 
 def fingerprint(problem: Description) -> str:
     """Return digests of all that the density depends on, part by part: "model:… experiments:… priors:… …"."""
     parts = {
         "model": problem.model.definition,
-        "experiments": [[getattr(e, f.name) for f in fields(e) if f.name not in LABELS] for e in problem.experiments],
+        "experiments": [_content(e) for e in problem.experiments],
         "priors": repr(problem.priors),
         "constants": [problem.fixed, problem.tied, problem.likelihood.fixed],
         "noise": repr(problem.noise),
@@ -32,6 +32,12 @@ def fingerprint(problem: Description) -> str:
     if problem.sensors.given:
         parts["sensors"] = repr(problem.sensors.given)
     return " ".join(f"{part}:{digest(value)}" for part, value in parts.items())
+
+
+def _content(experiment: Any) -> list[Any]:
+    """Return the values of an experiment that a density depends on."""
+    values = {f.name: getattr(experiment, f.name) for f in fields(experiment) if f.name not in LABELS}
+    return [value for name, value in values.items() if name not in LATER_FIELDS or value]
 
 
 def digest(value: Any) -> str:

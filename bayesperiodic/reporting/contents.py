@@ -369,7 +369,7 @@ def input_noise(given: ReportInputs) -> str:
         source = "the scatter of the cycles" if problem.input_noise == FROM_CYCLES else "the problem, which states it"
         text = f"The noise of the inputs ({names}), known from {source}, is " + (
             "integrated out: the covariance of the residual includes it, and so do standard deviations and intervals."
-            if fit.input_errors
+            if fit.noisy_inputs
             else "negligible beside that of the outputs."
         )
         text += f" The inputs of {exact} are taken as exact." if exact else ""
@@ -381,7 +381,7 @@ def input_noise(given: ReportInputs) -> str:
         if caused:
             text += f" Their noise {before} a standard deviation of {sd}{unit} in {channel}; "
             text += f"the rms of the residual {after} is {rms}{unit}."
-    if fit.input_errors:
+    if fit.noisy_inputs:
         worst = max(curved, key=lambda name: np.nan_to_num(curved[name], nan=np.inf))
         most = "less than 0.01" if curved[worst] < 0.01 else f"up to {number(curved[worst], 2)}"
         text += f" What is not linear in it changes estimates by {most} standard deviations ({worst})."
