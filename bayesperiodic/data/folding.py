@@ -19,10 +19,11 @@ from bayesperiodic.data.harmonics import (
     resolved_harmonics,
     track_frequency,
 )
-from bayesperiodic.data.inspection import Inspection, inspect
+from bayesperiodic.data.inspection import Inspection
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
 from bayesperiodic.data.recording_check import refuse
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, FINENESS, aperiodic, even_times, response_period
+from bayesperiodic.data.several_clocks import ONE, Clocks, inspect_clocks
 from bayesperiodic.data.signals import Signals, cycles_of, explains_more, first_guess, refuse_gaps
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def fold_signals(
     harmonics: int | Mapping[str, int] | None,
     origin: float | str,
     largest_drift: float | None,
+    clocks: Clocks = ONE,
 ) -> dict[str, Any]:
     """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`.
 
@@ -69,7 +71,8 @@ def fold_signals(
     if isinstance(origin, str) and origin != CROSSING:
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
-    seen = inspect([replace(group, time=group.time - start) for group in groups], periods, frequency, points)
+    groups = [replace(group, time=group.time - start) for group in groups]
+    seen, others = inspect_clocks(groups, clocks, periods, frequency, points)
     if seen.steady is None or seen.fit is None or seen.sizes is None:
         raise ValueError(seen.reason)
     fit, parts, name = seen.fit, seen.parts, groups[0].name
@@ -114,6 +117,7 @@ def fold_signals(
         "drift": drift,
         "origin": start,
         "findings": seen.findings,
+        "clocks": others,
     }
 
 

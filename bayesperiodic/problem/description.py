@@ -31,7 +31,7 @@ from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.priors.joint import JointPrior
 from bayesperiodic.priors.single import Uniform
-from bayesperiodic.problem.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
+from bayesperiodic.problem.parameters import SHIFT, ParameterMap, check_delays, expand_priors, free_names, local_name
 
 # Least width of a prior relative to its median; below it the log-posterior is not smooth in double precision.
 LEAST_WIDTH = 1e-12
@@ -93,6 +93,7 @@ class Description:
         self.names = self.joint_prior.names
         self._check_widths()
         self._check_free(fixed)
+        check_delays(self.experiments, (*self.names, *fixed, *tied))
         self.parameter_maps = {
             run: ParameterMap.of(
                 model.parameters, self.names, run, {n: v[run] for n, v in self.fixed.items() if run in v}, tied
