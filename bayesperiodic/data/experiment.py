@@ -85,6 +85,9 @@ class Experiment(Result):
         "lacks lines"), and ``remark``, which lines there are and what would be needed.
     findings : tuple of Finding
         What the check of the recording found, see `Recording.check`.
+    clocks : mapping of str to tuple of str
+        Channels that other clocks than the first one have sampled, by clock. How late they are is unknown, and has to
+        be a parameter of a `Problem`.
     synthetic : bool
         True if the data were simulated.
     mask : bool array (samples·periods,), optional
@@ -146,6 +149,7 @@ class Experiment(Result):
     phase_diffusion: float = field(default=0.0, kw_only=True)
     period_test: "pd.DataFrame | None" = field(default=None, kw_only=True)
     findings: tuple[Finding, ...] = field(default=(), kw_only=True)
+    clocks: Mapping[str, tuple[str, ...]] = field(default_factory=dict, kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
     covariance: np.ndarray | None = field(default=None, kw_only=True)
@@ -183,6 +187,10 @@ class Experiment(Result):
             object.__setattr__(self, argument, given)
             for key in given:
                 _checks.one_of(argument, key, (*self.inputs, *self.outputs))
+        object.__setattr__(self, "clocks", {name: tuple(channels) for name, channels in self.clocks.items()})
+        for name, channels in self.clocks.items():
+            for channel in channels:
+                _checks.one_of(f"clocks[{name!r}]", channel, (*self.inputs, *self.outputs))
         for name, slopes in self.error_slopes.items():
             _checks.one_of("error_slopes", name, self.inputs)
             for channel in slopes:
@@ -423,6 +431,8 @@ class Experiment(Result):
             error += f" with a phase diffusion of {self.phase_diffusion:.2g} rad²/s"
         if self.period_test is not None:
             text += f"; {summary(self.period_test, self.periods)}"
+        if self.clocks:
+            text += f"; other clocks: {', '.join(f'{name} {list(own)}' for name, own in self.clocks.items())}"
         return (
             f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz{error}, {self.samples} "
             f"samples per period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"

@@ -19,11 +19,12 @@ from bayesperiodic.data.harmonics import (
     followed_phase,
     refine_frequency,
 )
-from bayesperiodic.data.inspection import Inspection, inspect
+from bayesperiodic.data.inspection import Inspection
 from bayesperiodic.data.lines import Sampling
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
 from bayesperiodic.data.recording_check import refuse
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, aperiodic, even_times, response_period
+from bayesperiodic.data.several_clocks import ONE, Clocks, inspect_clocks
 from bayesperiodic.data.signals import Signals, counted_cycles, cycles_of, explains_more, first_guess
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ def fold_signals(
     harmonics: int | Mapping[str, int] | None,
     origin: float | str,
     largest_drift: float | None,
+    clocks: Clocks = ONE,
 ) -> dict[str, Any]:
     """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`.
 
@@ -66,7 +68,8 @@ def fold_signals(
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
     frequency = None if given is None else given[0]
-    seen = inspect([replace(group, time=group.time - start) for group in groups], periods, frequency, points)
+    groups = [replace(group, time=group.time - start) for group in groups]
+    seen, others = inspect_clocks(groups, clocks, periods, frequency, points)
     if seen.steady is None or seen.fit is None or seen.sizes is None:
         raise ValueError(seen.reason)
     fit, pace, parts, name = seen.fit, seen.pace, seen.parts, groups[0].name
@@ -120,6 +123,7 @@ def fold_signals(
         # The phase of a channel that defines τ = 0 is not turned.
         "middle": {} if origin == CROSSING else {c: float(p.time.mean()) for p in parts for c in p.channels},
         "findings": seen.findings,
+        "clocks": others,
     }
 
 

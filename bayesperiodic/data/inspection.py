@@ -53,6 +53,7 @@ class Inspection:
     pace: Pace = Pace(0.0, 0, 0.0, False)
     limits: list[int] = field(default_factory=list)  # of the harmonics of each group
     inflation: list[np.ndarray] = field(default_factory=list)  # of their variances by missing phases
+    drifts: list[clocks.Drift] = field(default_factory=list)  # of phases against the first channel
     reason: str = ""  # why there is no steady part or no mean period
 
     @property
@@ -151,9 +152,10 @@ def inspect(
     ends = (max(group.time[0] for group in groups), min(group.time[-1] for group in groups))
     seen += cycle_findings(channels, groups[0].time, steady, fit.frequency, total, ends)
     varies = pace.drifts or pace.wander > 0.0
-    seen += _clock_findings(groups, every, some[0].time, used[0], fit.frequency, total, varies)
+    of_clocks, drifts = _clock_findings(groups, every, some[0].time, used[0], fit.frequency, total, varies)
+    sizes = every.all.apart().sizes
     return Inspection(
-        groups, faults, worst_first(seen), total, steady, used, every.all.apart().sizes, fit, pace, limits, inflation
+        groups, faults, worst_first(seen + of_clocks), total, steady, used, sizes, fit, pace, limits, inflation, drifts
     )
 
 
@@ -165,7 +167,7 @@ def _clock_findings(
     frequency: float,
     total: int,
     varies: bool,
-) -> list[Finding]:
+) -> tuple[list[Finding], list[clocks.Drift]]:
     """Return steps and steady drifts of the phases of channels against the first one; of a drive that varies, steps."""
     channels = [channel for group in groups for channel in group.channels]
     rates = {c: (g.time.size - 1) / float(np.ptp(g.time)) for g in groups for c in g.channels}
@@ -173,14 +175,15 @@ def _clock_findings(
     phases = clocks.phases_of(every.all, time)
     inside = (phases.start >= start) & (phases.start + phases.length / frequency <= stop + 1.5 / rates[channels[0]])
     if np.count_nonzero(inside) < clocks.FEWEST_WINDOWS:
-        return []
+        return [], []
     steps, places = clocks.steps(channels, phases, inside)
     found = [*clocks.step_findings(steps, rates, frequency, inside.size)]
+    drifts: list[clocks.Drift] = []
     if not varies:
         cycles = round((stop - start) * frequency)
         drifts = clocks.clock_drifts(phases, inside, places)
         found += clocks.drift_findings(drifts, channels, phases, (start, stop), cycles, total)
-    return found
+    return found, drifts
 
 
 def _moving(group: Signals, faults: list[ChannelFaults]) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Recordings: measured signals over time."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, overload
@@ -17,6 +17,7 @@ from bayesperiodic.data.folding import AUTO, automatic_periods, fold_signals, gi
 from bayesperiodic.data.inspection import inspect, summary
 from bayesperiodic.data.layout import Layout, reader, recordings, without_missing
 from bayesperiodic.data.recording_check import RecordingCheck
+from bayesperiodic.data.several_clocks import ONE
 from bayesperiodic.data.signals import parts
 from bayesperiodic.data.times import channel_seconds, seconds
 from bayesperiodic.data.units import Units
@@ -475,6 +476,7 @@ class Recording(Channels):
         harmonics: int | Mapping[str, int] | None = None,
         origin: float | str = 0.0,
         largest_drift: float | None = None,
+        clocks: str | Mapping[str, Sequence[str]] = ONE,
         guess: str | Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> Experiment:
@@ -519,6 +521,11 @@ class Recording(Channels):
             at which the fundamental of the first output crosses zero upwards.
         largest_drift : float, optional
             Limit of the relative change of a channel's strongest harmonic over the recording, by linear regression.
+        clocks : "one", "auto" or mapping of str to sequence of str
+            Channels that other clocks have sampled, such as ``{"logger 2": ["x"]}``; the others have the first clock,
+            whose frequency is that of the experiment. Each clock's channels are folded at its own frequency, and their
+            delay, which is unknown, must be a parameter of the `Problem`. "one" tests whether the channels' phases
+            step or drift against the first one; "auto" gives those that drift steadily clocks of their own.
         guess : "data" or mapping of str to array (samples·periods,), optional
             See `Experiment`.
         name : str, optional
@@ -535,7 +542,8 @@ class Recording(Channels):
             For fewer than three cycles, a constant channel, a signal that is not periodic, ``periods="auto"`` without
             frequency and inputs, a gap of more than a quarter
             of a period, a frequency that is not that of the recording, more harmonics than the samples resolve, an
-            unknown channel in `harmonics`, a drift beyond the limit.
+            unknown channel in `harmonics` or `clocks`, a drift beyond the limit, clocks that differ, or samples lost by
+            one of the channels, so far that its phase is wrong by more than 0.05 rad.
 
         Warns
         -----
@@ -567,7 +575,7 @@ class Recording(Channels):
                 periods, evidence = automatic_periods(groups, given and given[0])
             periods = _checks.integer("periods", periods, 1)
             with one_thread():
-                folded = fold_signals(groups, samples, periods, given, harmonics, origin, largest_drift)
+                folded = fold_signals(groups, samples, periods, given, harmonics, origin, largest_drift, clocks)
         except np.linalg.LinAlgError:
             raise ValueError(
                 f"recording: must have samples in all parts of its periods, got {self.name!r}, which has too few; "

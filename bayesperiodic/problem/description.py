@@ -33,7 +33,15 @@ from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.priors.joint import JointPrior
 from bayesperiodic.priors.single import Uniform
-from bayesperiodic.problem.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name, plain_names
+from bayesperiodic.problem.parameters import (
+    SHIFT,
+    ParameterMap,
+    check_delays,
+    expand_priors,
+    free_names,
+    local_name,
+    plain_names,
+)
 from bayesperiodic.problem.sensors import Sensor, Sensors
 
 # Least width of a prior relative to its median; below it the log-posterior is not smooth in double precision.
@@ -109,6 +117,7 @@ class Description:
         self.plain_names = plain_names(self.names, self.local, runs)
         self._check_widths()
         self._check_free(fixed)
+        check_delays(self.experiments, (*self.names, *fixed, *tied, *self.sensors.known_delays))
         self.parameter_maps = {
             run: ParameterMap.of(
                 model.parameters,

@@ -15,6 +15,7 @@ import xarray as xr
 
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse
+from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.models.sensed import SHIFT
 
 CHAIN, DRAW, CHANNEL, EXPERIMENT = "chain", "draw", "channel", "experiment"
@@ -47,6 +48,28 @@ def plain_names(names: Iterable[str], local: Iterable[str], experiments: Iterabl
     """Return the plain names of parameters by their full names: k by k, and theta16 by ``theta16[run 7]``."""
     own = {local_name(plain, run): plain for plain in local for run in experiments}
     return {name: own.get(name, name) for name in names}
+
+
+def check_delays(experiments: Iterable[Experiment], known: Iterable[str]) -> None:
+    """Raise a ValueError unless the delays of channels of other clocks are known or parameters.
+
+    A delay of all outputs is enough if they have one clock, and so have the inputs.
+    """
+    names = [*known]
+    for e in experiments:
+        clock = {channel: name for name, channels in e.clocks.items() for channel in channels}
+        whole = all(len({clock.get(channel) for channel in kind}) <= 1 for kind in (e.inputs, e.outputs))
+        if whole and (SHIFT in names or local_name(SHIFT, e.name) in names):
+            continue
+        for channel in clock:
+            if not any(name == f"delay[{channel}]" or name.startswith(f"delay[{channel}][") for name in names):
+                all_late = f"priors={{{SHIFT!r}: bp.Uniform(…)}} for all outputs or " if whole else ""
+                raise ValueError(
+                    f"experiments: must have known delays or free ones, got {e.name!r}, in which {channel!r} has "
+                    f"another clock ({clock[channel]!r}), so that its delay is unknown; give {all_late}"
+                    f"sensors={{{channel!r}: bp.Sensor(delay=…)}}, with a prior of plus or minus half a period "
+                    f"({0.5 * e.periods / e.frequency:.3g} s) if the loggers have no common start."
+                )
 
 
 def free_names(parameters: Iterable[str], local: Iterable[str], experiments: Iterable[str]) -> list[str]:

@@ -153,6 +153,15 @@ class Sensors:
         """Whether any input has a sensor."""
         return bool(self._inputs)
 
+    @property
+    def known_delays(self) -> list[str]:
+        """Names of the delays that are numbers other than zero."""
+        return [
+            sensor_name(DELAY, c)
+            for c, sensor in self.given.items()
+            if isinstance(sensor.delay, float) and sensor.delay
+        ]
+
     def parameters(self, delayed: bool) -> SensorNames:
         """Return the parameters that act on the outputs, the delay of all of them last."""
         orders = {channel: sensor.order for channel, sensor in self.given.items()}
