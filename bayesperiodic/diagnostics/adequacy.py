@@ -1,7 +1,6 @@
 """Tests of the model: discrepancy of every experiment and channel, and the verdict."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
 from itertools import compress
 from typing import Any
 
@@ -9,107 +8,14 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from bayesperiodic._linalg import TINY, column_space
 from bayesperiodic._verdicts import BAD, CAUTION, GOOD, NEUTRAL, with_tone
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording_check import HARMLESS
 from bayesperiodic.density.log_posterior import Linearisation
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.estimation.check import of_periodogram
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.estimation.unexplained import NOT_TESTED, Unexplained, testable, used
 from bayesperiodic.likelihood.block import Block
-
-ABSORBED = 1e-3
-# Part of the largest component below which the mean of residual and derivatives is a rounding error.
-MATCHED = 1e-6
-NOT_TESTED = float("nan")
-
-
-class Unexplained:
-    """Whitened residual components (size,), projected orthogonally to their derivatives (parameters, size).
-
-    The components are independent with equal variances under the model; derivatives may be dependent or zero. `square`
-    is the sum of squares, `freedom` the number of its degrees of freedom. A mean that data and model have in common to
-    rounding, as a centred signal and a linear model, has no noise and is left out.
-    """
-
-    def __init__(self, components: np.ndarray, jacobian: np.ndarray, harmonic: np.ndarray):
-        components, jacobian, harmonic = _without_matched_mean(components, jacobian, harmonic)
-        self._basis = column_space(jacobian)
-        self._rest = components - self._basis @ (self._basis.T @ components)
-        self.square = float(self._rest @ self._rest)
-        self.freedom = components.size - self._basis.shape[1]
-        self.harmonics, self._group = np.unique(harmonic, return_inverse=True)
-
-    @classmethod
-    def of_measured_noise(
-        cls, components: np.ndarray, jacobian: np.ndarray, harmonic: np.ndarray, behind: np.ndarray
-    ) -> "Unexplained":
-        """Return what is unexplained in units of measured standard deviations with degrees of freedom (highest + 1,).
-
-        The square of each harmonic is F distributed. It is weighted so that it is the χ² quantile of its probability.
-        """
-        components, jacobian, harmonic = _without_matched_mean(components, jacobian, harmonic)
-        first = cls(components, jacobian, harmonic)
-        square, freedom = first.explained(np.eye(first.harmonics.size, dtype=bool))
-        free = np.maximum(freedom, 1)
-        p = np.maximum(stats.f.sf(square / free, free, behind[first.harmonics]), np.finfo(float).tiny)
-        known = np.where((freedom > 0) & (square > 0.0), stats.chi2.isf(p, free), square)
-        factor = np.sqrt(np.divide(known, square, out=np.ones_like(square), where=known > 0.0))[first._group]
-        return cls(components * factor, jacobian * factor, harmonic)
-
-    @cached_property
-    def _sums(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Sums over each harmonic: b bᵀ of the basis, b·e, e² of the residual e, and the number of components."""
-        b, e = self._basis, self._rest
-        each = np.eye(self.harmonics.size)[:, self._group]
-        gram = np.einsum("hs,si,sj->hij", each, b, b, optimize=True)
-        return gram, each @ (b * e[:, None]), each @ e**2, each.sum(axis=1)
-
-    def explained(self, sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the sums of squares (sets,) explained by sets (sets, harmonics) of harmonics, and their sizes."""
-        gram, along, square, size = (np.tensordot(sets.astype(float), part, 1) for part in self._sums)
-        values, vectors = np.linalg.eigh(gram)
-        left = 1.0 - values
-        # Combinations of the components of a set that the parameters can produce have no information.
-        absorbed = left < ABSORBED
-        turned = np.einsum("srj,sr->sj", vectors, along) ** 2
-        ratio = np.where(absorbed, -1.0 / np.maximum(values, 0.5), 1.0 / np.maximum(left, ABSORBED))
-        return square + np.sum(turned * ratio, axis=1), np.rint(size - absorbed.sum(axis=1)).astype(int)
-
-    def whiteness(self) -> float:
-        """Return p of Bartlett's test of the cumulative power of the harmonics, the highest first."""
-        tails = np.tri(self.harmonics.size, dtype=bool)[:, ::-1]
-        square, freedom = self.explained(tails)
-        pairs = np.diff(freedom, prepend=0) == 2
-        power = np.diff(square, prepend=0.0)[pairs][::-1]
-        return of_periodogram(np.maximum(power, 0.0)).p if power.size >= 2 else NOT_TESTED
-
-    def harmonic_content(self) -> tuple[float, float]:
-        """Return p of excess power in one harmonic or in the lowest 2ᵏ + 1 (Bonferroni), and the strongest harmonic."""
-        count = self.harmonics.size
-        lowest = np.array([np.arange(count) <= 2**k for k in range(count.bit_length()) if 2**k < count - 1], dtype=bool)
-        sets = np.concatenate([np.eye(count, dtype=bool), lowest.reshape(-1, count)])
-        square, freedom = self.explained(sets)
-        rest = self.freedom - freedom
-        tested = (freedom > 0) & (rest > 0)
-        if not tested.any():
-            return NOT_TESTED, NOT_TESTED
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = square / freedom / (np.maximum(self.square - square, 0.0) / rest)
-        p = np.where(tested, stats.f.sf(np.nan_to_num(ratio, nan=0.0, posinf=np.inf), freedom, rest), 1.0)
-        _, _, power, size = self._sums
-        return min(1.0, float(p.min() * tested.sum())), float(self.harmonics[np.argmax(power / size)])
-
-
-def _without_matched_mean(
-    components: np.ndarray, jacobian: np.ndarray, harmonic: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return components, derivatives and harmonics without a mean that is matched to rounding."""
-    size = np.abs(jacobian) / np.maximum(np.abs(jacobian).max(axis=1, keepdims=True), TINY)
-    moved = size.max(axis=0, initial=0.0) > MATCHED
-    kept = (harmonic > 0) | moved | (np.abs(components) > MATCHED * np.abs(components).max(initial=0.0))
-    return (components, jacobian, harmonic) if kept.all() else (components[kept], jacobian[:, kept], harmonic[kept])
 
 
 def excess(variance: float, freedom: float, known: float, known_freedom: float) -> float:
@@ -296,12 +202,12 @@ class Whitened:
         of the spectrum of repeated quantisation errors is not known, and whiteness is not tested where they prevail.
         """
         r, j, harmonic = self.parts[index]
-        if not self.blocks[index].timed or not _testable(r, j):
+        if not self.blocks[index].timed or not testable(r, j):
             return NOT_TESTED, NOT_TESTED, NOT_TESTED
         unexplained = self.in_measured_units(index) or Unexplained(r, j, harmonic)
         spectrum = self.spectrum(index)
         known = spectrum is None or np.median(spectrum[1]) >= SHAPE_KNOWN
-        return unexplained.whiteness() if known else NOT_TESTED, *unexplained.harmonic_content()
+        return unexplained.whiteness().p if known else NOT_TESTED, *unexplained.harmonic_content()
 
     def in_measured_units(self, index: int) -> Unexplained | None:
         """Return what is unexplained of a block in units of the measured spectrum; None if that is not known."""
@@ -346,27 +252,15 @@ class Whitened:
 
     def consistency(self) -> float:
         """Return p of the test of common parameters."""
-        parts = [(r, j, g) for (r, j, _), g in zip(self.parts, self.groups, strict=True) if _testable(r, j)]
+        parts = [(r, j, g) for (r, j, _), g in zip(self.parts, self.groups, strict=True) if testable(r, j)]
         return consistency(parts, self.known) if len(parts) == len(self.parts) else NOT_TESTED
-
-
-def _testable(r: np.ndarray, j: np.ndarray) -> bool:
-    return bool(np.isfinite(r).all() and np.isfinite(j).all())
-
-
-def used(block: Block, *parts: np.ndarray) -> list[np.ndarray]:
-    """Return the components (…, used) for the tests, points as cosine components along the period, and harmonics."""
-    harmonic = block.wave_numbers
-    number = min(block.size, int(np.rint(block.count))) if block.timed else block.size
-    order = np.sort(np.argsort(harmonic, kind="stable")[:number])
-    return [part[..., order] for part in (*map(block.along_period, parts), harmonic)]
 
 
 def _size(problem: Problem, here: Linearisation, index: int, white: Whitened) -> tuple[float, float]:
     """Return p of a residual larger than the measured or known noise, and the fraction of model error."""
     block = white.blocks[index]
     known = block.measured > 0.0 or white.groups[index] in white.known
-    if not (known and _testable(here.residuals[index], here.jacobian[index])):
+    if not (known and testable(here.residuals[index], here.jacobian[index])):
         return NOT_TESTED, NOT_TESTED
     if block.measured > 0.0:
         unexplained = white.in_measured_sd(index)
@@ -400,7 +294,7 @@ def measured_spectrum(experiment: Experiment, block: Block) -> tuple[np.ndarray,
     """
     variance = experiment.amplitude_variance.get(block.channel)
     freedom = experiment.amplitude_freedom.get(block.channel)
-    if not block.spectral or variance is None or freedom is None:
+    if not block.spectral or not block.harmonic.size or variance is None or freedom is None:
         return None
     harmonics = np.unique(block.harmonic)
     nyquist = 2 * harmonics[-1] == block.points

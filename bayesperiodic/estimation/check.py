@@ -27,6 +27,7 @@ from bayesperiodic.estimation.covariance import (
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, bias_correction
 from bayesperiodic.estimation.laplace import IN_COMBINATION, SILENT, joint_laplace, undetermined
 from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit, Whiteness, sds, written
+from bayesperiodic.estimation.unexplained import Unexplained, testable, used
 from bayesperiodic.estimation.units import unit_error
 from bayesperiodic.likelihood.input_noise import EXACT, FEWEST_CYCLES, ROUGH
 from bayesperiodic.periodic.solution import PeriodicSolution
@@ -155,20 +156,6 @@ def _data_change(problem: Problem, estimate: Iterate, theta: np.ndarray) -> floa
     return float(np.linalg.norm(np.concatenate(problem.likelihood.whitened(change, estimate.noise))))
 
 
-def of_periodogram(power: np.ndarray) -> Whiteness:
-    """Test whether the squared amplitudes of harmonics 1, 2, … are those of white noise (Bartlett 1955)."""
-    from scipy.stats import kstest
-
-    if power.size < 2 or power.sum() == 0.0:
-        return Whiteness(1.0, 0.0)
-    harmonic = np.arange(1, power.size + 1)
-    cumulative = np.cumsum(power)[:-1] / power.sum()
-    lag = 2.0 * np.pi / (2 * power.size + 1)
-    return Whiteness(
-        float(kstest(cumulative, "uniform").pvalue), float(np.sum(power * np.cos(lag * harmonic)) / power.sum())
-    )
-
-
 def noise_split(
     problem: Problem, residuals: Sequence[np.ndarray], log_variance_factor: float | np.ndarray
 ) -> dict[str, NoiseSplit]:
@@ -189,13 +176,14 @@ def noise_split(
 
 
 def channel_whiteness(problem: Problem, estimate: Iterate) -> dict[str, Whiteness]:
-    """Return `MapEstimate.whiteness`; NaN where only single points were compared."""
-    white = problem.likelihood.whitened(estimate.here.residuals, estimate.noise)
+    """Return `MapEstimate.whiteness`; NaN where no experiment has two harmonics that the parameters leave."""
+    likelihood = problem.likelihood
+    white = (likelihood.whitened(part, estimate.noise) for part in (estimate.here.residuals, estimate.here.jacobian))
     tests: dict[str, list[Whiteness]] = {channel: [] for channel in problem.channels}
-    for block, r in zip(problem.likelihood.blocks, white, strict=True):
-        if block.spectral:
-            complete = np.bincount(block.harmonic) == 2
-            tests[block.channel].append(of_periodogram(np.bincount(block.harmonic, r**2)[complete]))
+    for block, r, j in zip(likelihood.blocks, *white, strict=True):
+        if block.spectral and testable(r, j):
+            test = Unexplained(*used(block, r, j)).whiteness()
+            tests[block.channel] += [test] if np.isfinite(test.p) else []
     return {
         channel: Whiteness(min(1.0, len(each) * min(t.p for t in each)), float(np.mean([t.lag1 for t in each])))
         if each

@@ -32,8 +32,10 @@ class Whiteness(Storable):
     """Test by M. S. Bartlett (An Introduction to Stochastic Processes, 1955) of a residual that repeats every period.
 
     `p` is the probability, for white residuals, of a cumulative periodogram at least as far from a straight line: the
-    Kolmogorov-Smirnov distance of the kept harmonics, exact for independent normal values; NaN if not tested. `lag1` is
-    the circular autocorrelation at the distance of two independent values, one period / (2·harmonics + 1).
+    Kolmogorov-Smirnov distance of the kept harmonics, exact for independent normal values. `lag1` is the circular
+    autocorrelation at the distance of two independent values, one period / (2·harmonics + 1). Both are of what the
+    parameters leave of the residual: a harmonic of which they take up one component or two is left out. NaN where fewer
+    than two harmonics remain, so that nothing can be tested.
     """
 
     p: float
@@ -64,7 +66,7 @@ class FitCheck(Result):
         residual's smoothed spectrum); if they differ much from `MapEstimate.sd`, the noise model is wrong.
     whiteness : dict of str to Whiteness
         Of the residuals in units of the noise model, by channel; with several experiments p is the smallest, corrected
-        for their number, lag1 the mean.
+        for their number, lag1 the mean. NaN where no experiment can be tested.
     noise_split : dict of str to NoiseSplit
         Measurement noise and model error of each channel.
     input_noise : dict of str to float
@@ -115,9 +117,12 @@ class FitCheck(Result):
         return rows
 
     def remarks(self) -> list[str]:
-        """Return sentences on a conflict with the prior and on what the data do not determine."""
-        conflict = [f"{self.prior_conflict.text}."] if self.prior_conflict.text else []
-        return [*conflict, *(f"Not determined by the data: {text}." for text in self.undetermined)]
+        """Return sentences on a conflict with the prior, on what is not tested and what the data do not determine."""
+        remarks = [f"{self.prior_conflict.text}."] if self.prior_conflict.text else []
+        if untested := [repr(channel) for channel, white in self.whiteness.items() if not np.isfinite(white.p)]:
+            named = ", ".join(untested)
+            remarks.append(f"Whiteness of {named} is not tested: the parameters leave fewer than two harmonics.")
+        return [*remarks, *(f"Not determined by the data: {text}." for text in self.undetermined)]
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics.adequacy import Unexplained, consistency, excess, holm, measured_freedom
+from bayesperiodic.diagnostics.adequacy import consistency, excess, holm, measured_freedom
+from bayesperiodic.estimation.unexplained import Unexplained
 
 HARMONIC = np.array([0, *range(1, 21), *range(1, 21)])
 TRIALS = 1000
@@ -24,7 +25,7 @@ def test_p_values_of_white_noise_are_uniform_or_conservative_after_any_fit():
     for i in range(TRIALS):
         misfit = changes.T @ generator.normal(0.0, 50.0, 3)
         tested = Unexplained(7.0 * generator.standard_normal(HARMONIC.size) + misfit, changes, HARMONIC)
-        whiteness[i], harmonics[i] = tested.whiteness(), tested.harmonic_content()[0]
+        whiteness[i], harmonics[i] = tested.whiteness().p, tested.harmonic_content()[0]
     assert stats.kstest(whiteness, "uniform").pvalue > 1e-3
     for level in (0.1, 0.05, 0.01):
         assert np.sum(whiteness <= level) <= stats.binom.ppf(0.999, TRIALS, level)
@@ -48,7 +49,7 @@ def test_power_against_model_error_in_low_harmonics():
         found, named = found + (p < 0.01), named + (harmonic == 2)
         error = 12.0 * np.exp(-HARMONIC / 4.0) * generator.standard_normal(HARMONIC.size)
         tested = Unexplained(noise + error, changes, HARMONIC)
-        smooth += [tested.whiteness() < 0.01, tested.harmonic_content()[0] < 0.01]
+        smooth += [tested.whiteness().p < 0.01, tested.harmonic_content()[0] < 0.01]
     assert found >= 190 and named >= 190
     assert np.all(smooth >= 190)
 
@@ -80,13 +81,13 @@ def test_dependent_parameters_count_once_and_parameters_without_effect_not():
     plain, ridge = Unexplained(components, changes, HARMONIC), Unexplained(components, more, HARMONIC)
     assert ridge.freedom == plain.freedom == HARMONIC.size - 2
     assert ridge.square == pytest.approx(plain.square)
-    assert ridge.whiteness() == pytest.approx(plain.whiteness())
+    assert ridge.whiteness().p == pytest.approx(plain.whiteness().p)
 
 
 def test_no_test_without_residual_degrees_of_freedom():
     everything = Unexplained(np.ones(3), np.eye(3), np.array([0, 1, 1]))
     assert everything.freedom == 0
-    assert np.isnan(everything.whiteness()) and np.isnan(everything.harmonic_content()[0])
+    assert np.isnan(everything.whiteness().p) and np.isnan(everything.harmonic_content()[0])
     assert np.isnan(excess(1.0, 0.0, 1.0, np.inf)) and np.isnan(excess(1.0, 5.0, np.nan, np.inf))
 
 
@@ -163,7 +164,7 @@ def test_p_values_in_units_of_measured_noise_are_uniform(behind):
         sd = np.sqrt(spectrum * generator.chisquare(freedom) / freedom)[HARMONIC]
         misfit = changes.T @ generator.normal(0.0, 50.0, 3)
         tested = Unexplained.of_measured_noise((noise + misfit) / sd, changes / sd, HARMONIC, freedom)
-        whiteness[i], harmonics[i] = tested.whiteness(), tested.harmonic_content()[0]
+        whiteness[i], harmonics[i] = tested.whiteness().p, tested.harmonic_content()[0]
     assert stats.kstest(whiteness, "uniform").pvalue > 1e-3
     for level in (0.1, 0.05, 0.01):
         assert np.sum(whiteness <= level) <= stats.binom.ppf(0.999, 500, level)

@@ -8,10 +8,10 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from bayesperiodic.estimation import check, map_estimate, profile, result
-from bayesperiodic.estimation.check import of_periodogram
+from bayesperiodic.estimation import check, map_estimate, profile
 from bayesperiodic.estimation.modes import Mode
 from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit
+from bayesperiodic.estimation.unexplained import of_periodogram
 from bayesperiodic.likelihood.mean_period import MeanPeriod
 from bayesperiodic.likelihood.multipliers import Multipliers
 
@@ -153,20 +153,21 @@ def test_whiteness_is_the_distance_of_the_cumulative_periodogram():
     assert found.p == pytest.approx(stats.kstest(np.array([4.0, 5.0, 7.0]) / 7.5, "uniform").pvalue)
     assert found.lag1 == pytest.approx(power @ np.cos(2 * np.pi / 9 * np.arange(1, 5)) / 7.5)
     for nothing in (np.zeros(3), np.ones(1)):
-        assert of_periodogram(nothing) == result.Whiteness(1.0, 0.0)
+        assert np.isnan([of_periodogram(nothing).p, of_periodogram(nothing).lag1]).all()
 
 
 def test_noise_is_split_by_channel_and_whiteness_is_corrected_for_the_experiments():
     def block(channel, measured, kind=MeanPeriod):
         harmonic = [np.array([0, 1, 1, 2, 2, 3, 3])] if kind is MeanPeriod else []
-        return kind("run", channel, 0.8 * 7, 7, *harmonic, measured=measured)
+        return kind("run", channel, 6.6, 7, *harmonic, measured=measured)
 
     generator = np.random.default_rng(0)
     blocks = [block("y", 0.1), block("y", 0.3), block("z", 50.0), block("w", 1.0, Multipliers)]
     residuals = list(generator.standard_normal((4, 7)))
     likelihood = SimpleNamespace(blocks=blocks, whitened=lambda vectors, noise: vectors)
     given = SimpleNamespace(channels=("y", "z", "w"), likelihood=likelihood)
-    estimate = SimpleNamespace(here=SimpleNamespace(residuals=residuals), noise=None)
+    derivatives = [np.zeros((1, 7))] * 4
+    estimate = SimpleNamespace(here=SimpleNamespace(residuals=residuals, jacobian=derivatives), noise=None)
     split = check.noise_split(given, estimate.here.residuals, np.array([0.9, 0.7, 0.5, 1.0]))
     total = (residuals[0] @ residuals[0] + residuals[1] @ residuals[1]) / (7 * 0.9 + 7 * 0.7)
     assert list(split) == ["y", "z"]
@@ -230,7 +231,8 @@ def test_a_printed_estimate_lists_what_is_known_of_it():
         "y    2               12.34%               1.5        1.25       0.032",
         "z  0.5               50.00%                 -           -           -",
     ]
-    expected = ["MapEstimate (converged)", *table, *noise, *residuals, "The noise has the prior 1/v."]
+    untested = "Whiteness of 'z' is not tested: the parameters leave fewer than two harmonics."
+    expected = ["MapEstimate (converged)", *table, *noise, *residuals, "The noise has the prior 1/v.", untested]
     assert MapEstimate.__repr__(fit).split("\n") == expected
     fit.converged, fit.status, fit.noise = False, "stalled", {}
     fit.other_orbits, checks.prior_conflict.text = {"run": "half the period"}, "Prior and data disagree"
@@ -245,6 +247,7 @@ def test_a_printed_estimate_lists_what_is_known_of_it():
         *residuals,
         "The orbit is another one than the recorded one in 'run': half the period.",
         "Prior and data disagree.",
+        untested,
         "Not determined by the data: a: no output depends on it.",
         "Another optimum: a = 2 (objective -1, 20.0% of the mass).",
     ]
@@ -254,7 +257,7 @@ def test_a_printed_estimate_lists_what_is_known_of_it():
         "FitCheck", "  robust sd shift on twice the points", "a    0.0612                      0.01",
         "b       0.4                       nan", "Residuals", "  measurement noise model error whiteness p",
         "y               1.5        1.25       0.032", "z                 -           -           -",
-        "Prior and data disagree.", "Not determined by the data: a: no output depends on it.",
+        "Prior and data disagree.", untested, "Not determined by the data: a: no output depends on it.",
     ]  # fmt: skip
     fit.checks = None
     lines = MapEstimate.__repr__(fit).split("\n")

@@ -14,8 +14,8 @@ from scipy import signal, stats
 
 import bayesperiodic as bp
 from bayesperiodic import noise
-from bayesperiodic.estimation.check import of_periodogram
 from bayesperiodic.estimation.result import NoiseSplit
+from bayesperiodic.estimation.unexplained import of_periodogram
 from tests.known import LINEAR, grid, linear_regressors
 
 RECORDINGS, HARMONICS = 300, 20

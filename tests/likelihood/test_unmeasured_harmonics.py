@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics.adequacy import Unexplained
+from bayesperiodic.estimation.unexplained import Unexplained
 from bayesperiodic.likelihood.block import ComparedSignals
 from bayesperiodic.likelihood.kinds import blocks_of
 
