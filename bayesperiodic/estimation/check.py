@@ -13,6 +13,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import ResponseSolver
+from bayesperiodic.estimation.adequacy import misfit_at, of_periodogram
 from bayesperiodic.estimation.conflict import prior_conflict
 from bayesperiodic.estimation.covariance import (
     Uncertainty,
@@ -126,19 +127,24 @@ def checked(
     shift[lost] = np.nan
     robust = robust_covariance(problem, estimate, inverse)
     robust[lost, lost] = np.inf
+    robust_table = pd.DataFrame(robust, index=names, columns=names)
+    conflict, alone = prior_conflict(problem, estimate)
     split = noise_split(problem, estimated_inputs(problem, estimate).residuals, log_variance_factor)
     loadings = problem.likelihood.loadings or input_loadings(problem, estimate.theta, solutions, ROUGH)
     curved = input_nonlinearity(problem, estimate, solutions, covariance)
     change = partial(_data_change, problem, estimate)
     return FitCheck(
-        robust_sd=sds(pd.DataFrame(robust, index=names)),
+        robust_sd=sds(robust_table),
         whiteness=channel_whiteness(problem, estimate),
         noise_split=split,
         input_noise=caused_by_inputs(problem, loadings),
         input_nonlinearity=dict(zip(names, curved.tolist(), strict=True)),
         doubling_shift=dict(zip(names, shift.tolist(), strict=True)),
-        prior_conflict=prior_conflict(problem, estimate)[0],
+        prior_conflict=conflict,
         undetermined=undetermined(uncertain.information, estimate.theta, names, problem.logarithmic, change),
+        robust_covariance=robust_table,
+        # The prior must not count as misfit of the model, which is tested where the data alone are fitted best.
+        misfit=misfit_at(problem, alone if conflict.text else estimate),
     )
 
 
@@ -151,20 +157,6 @@ def _data_change(problem: Problem, estimate: Iterate, theta: np.ndarray) -> floa
         return np.inf
     change = [there - here for there, here in zip(there.residuals, estimate.here.residuals, strict=True)]
     return float(np.linalg.norm(np.concatenate(problem.likelihood.whitened(change, estimate.noise))))
-
-
-def of_periodogram(power: np.ndarray) -> Whiteness:
-    """Test whether the squared amplitudes of harmonics 1, 2, … are those of white noise (Bartlett 1955)."""
-    from scipy.stats import kstest
-
-    if power.size < 2 or power.sum() == 0.0:
-        return Whiteness(1.0, 0.0)
-    harmonic = np.arange(1, power.size + 1)
-    cumulative = np.cumsum(power)[:-1] / power.sum()
-    lag = 2.0 * np.pi / (2 * power.size + 1)
-    return Whiteness(
-        float(kstest(cumulative, "uniform").pvalue), float(np.sum(power * np.cos(lag * harmonic)) / power.sum())
-    )
 
 
 def noise_split(

@@ -9,8 +9,9 @@ from scipy import stats
 from scipy.fft import dct
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics import adequacy, identifiability
-from bayesperiodic.diagnostics.adequacy import Unexplained
+from bayesperiodic.diagnostics import identifiability
+from bayesperiodic.estimation import adequacy
+from bayesperiodic.estimation.adequacy import Unexplained
 from bayesperiodic.likelihood.mean_period import MeanPeriod
 from bayesperiodic.likelihood.samples import Samples
 from bayesperiodic.likelihood.section_points import SectionPoints

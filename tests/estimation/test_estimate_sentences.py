@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from bayesperiodic.estimation import check, map_estimate, profile, result
-from bayesperiodic.estimation.check import of_periodogram
+from bayesperiodic.estimation.adequacy import of_periodogram
 from bayesperiodic.estimation.modes import Mode
 from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit
 from bayesperiodic.likelihood.mean_period import MeanPeriod

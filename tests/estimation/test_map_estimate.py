@@ -6,7 +6,7 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
-from bayesperiodic.estimation.check import of_periodogram
+from bayesperiodic.estimation.adequacy import of_periodogram
 from bayesperiodic.estimation.units import unit_error
 from tests.known import LINEAR, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors, normal_posterior
 

@@ -14,7 +14,7 @@ from scipy import signal, stats
 
 import bayesperiodic as bp
 from bayesperiodic import noise
-from bayesperiodic.estimation.check import of_periodogram
+from bayesperiodic.estimation.adequacy import of_periodogram
 from bayesperiodic.estimation.result import NoiseSplit
 from tests.known import LINEAR, grid, linear_regressors
 

@@ -15,12 +15,26 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording_check import HARMLESS
 from bayesperiodic.density.log_posterior import Linearisation
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.estimation.check import of_periodogram
-from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.estimation.gauss_newton import Iterate
+from bayesperiodic.estimation.result import MapEstimate, Whiteness
 from bayesperiodic.likelihood.block import Block
 
 ABSORBED = 1e-3
 NOT_TESTED = float("nan")
+
+
+def of_periodogram(power: np.ndarray) -> Whiteness:
+    """Test whether the squared amplitudes of harmonics 1, 2, … are those of white noise (Bartlett 1955)."""
+    from scipy.stats import kstest
+
+    if power.size < 2 or power.sum() == 0.0:
+        return Whiteness(1.0, 0.0)
+    harmonic = np.arange(1, power.size + 1)
+    cumulative = np.cumsum(power)[:-1] / power.sum()
+    lag = 2.0 * np.pi / (2 * power.size + 1)
+    return Whiteness(
+        float(kstest(cumulative, "uniform").pvalue), float(np.sum(power * np.cos(lag * harmonic)) / power.sum())
+    )
 
 
 class Unexplained:
@@ -224,15 +238,25 @@ def misfit(problem: Problem, fit: MapEstimate) -> str:
     """Return why the model is misspecified at an estimate, in words; "" if it is not, or not fitted to the data."""
     if fit.other_orbits or fit.prior_conflict.members:
         return ""
-    theta = problem.vector(fit.theta)
-    guesses = {name: solution.states for name, solution in fit.solutions.items()}
-    here = problem.anchored(theta, guesses).density().linearise(theta)
-    noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
-    if not here.converged or not (rejected := rejections(table := adequacy(problem, here, noise[None], {}))):
+    if fit.checks is None or (found := fit.checks.misfit) is None:
+        theta = problem.vector(fit.theta)
+        guesses = {name: solution.states for name, solution in fit.solutions.items()}
+        here = problem.anchored(theta, guesses).density().linearise(theta)
+        noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
+        found = misfit_at(problem, Iterate(theta, here, noise, np.nan))
+    return found and f"{found}; the verdicts take the model for right"
+
+
+def misfit_at(problem: Problem, estimate: Iterate) -> str:
+    """Return why the model is misspecified at an estimate, in words; "" if no test rejects it, or if there is none."""
+    if not estimate.here.converged:
+        return ""
+    table = adequacy(problem, estimate.here, estimate.noise[None], {})
+    if not (rejected := rejections(table)):
         return ""
     reasons = "; ".join(f"{label}: {text}" for label, text in rejected.items())
     subject, remedy = ("model or the noise model", "") if concerns_noise(table) else ("model", f"; {SEARCH}")
-    return f"The {subject} is misspecified, which the verdicts take for right ({reasons}){remedy}"
+    return f"The {subject} is misspecified ({reasons}){remedy}"
 
 
 def concerns_noise(table: pd.DataFrame) -> bool:
