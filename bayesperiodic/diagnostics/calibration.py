@@ -23,8 +23,8 @@ from bayesperiodic._parallel import checkpointed_tasks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.adequacy import holm
 from bayesperiodic.diagnostics.verdicts import NARROW, WIDE
+from bayesperiodic.estimation.adequacy import holm
 from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate

@@ -16,7 +16,6 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.log_posterior import COLLAPSED, NATURAL, LogPosterior, SamplingCoordinates
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics import verdicts
-from bayesperiodic.diagnostics.adequacy import misfit
 from bayesperiodic.diagnostics.verdicts import (
     ELLIPSOID_LEVELS,
     FINE,
@@ -28,13 +27,14 @@ from bayesperiodic.diagnostics.verdicts import (
     WRONG_SHAPE,
     Sample,
 )
+from bayesperiodic.estimation.adequacy import misfit
 from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.modes import notable
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.problem.parameters import unit
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.draws import Posterior
+from bayesperiodic.sampling.draws import Posterior, refuse_robust
 from bayesperiodic.sampling.starts import laplace_approximation
 
 SAMPLING = "sampling"
@@ -189,6 +189,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     _checks.instance("problem", problem, Problem)
     _checks.one_of("coordinates", coordinates, COORDINATES)
     problem, fit = check_results(problem, fit=fit, posterior=posterior), with_joint(problem, fit)
+    refuse_robust(posterior)
     scored = _scores(problem, fit, posterior, coordinates)
     if scored is None:
         raise ValueError(

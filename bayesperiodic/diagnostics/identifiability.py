@@ -14,9 +14,9 @@ from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic._verdicts import BAD, GOOD, with_tone
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.adequacy import misfit
 from bayesperiodic.diagnostics.design import FurtherExperiment, Information, default_candidates, rank_candidates
 from bayesperiodic.diagnostics.predictive import draws_of
+from bayesperiodic.estimation.adequacy import misfit
 from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
 from bayesperiodic.estimation.modes import NOTABLE, notable

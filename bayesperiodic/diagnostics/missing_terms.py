@@ -14,7 +14,6 @@ from bayesperiodic import _checks
 from bayesperiodic._io import NOT_STORED, Result, Storable
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.adequacy import ALL, adequacy
 from bayesperiodic.diagnostics.candidates import (
     Term,
     coefficient_names,
@@ -35,6 +34,7 @@ from bayesperiodic.diagnostics.optima import (
     problem_of,
 )
 from bayesperiodic.diagnostics.score_tests import ScoreTests, lags_to_try, variable_deviations
+from bayesperiodic.estimation.adequacy import ALL, adequacy
 from bayesperiodic.estimation.map_estimate import map_estimate, nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model

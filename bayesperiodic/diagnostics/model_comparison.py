@@ -15,16 +15,17 @@ from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.adequacy import MISSPECIFIED
 from bayesperiodic.diagnostics.predictive import draws_of, predict
 from bayesperiodic.diagnostics.verdicts import UNCONVERGED, USABLE_K
+from bayesperiodic.estimation.adequacy import MISSPECIFIED
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.modes import default_starts
 from bayesperiodic.problem.fingerprint import check_results, digest
 from bayesperiodic.problem.parameters import CHAIN, DRAW, EXPERIMENT
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.draws import OBSERVATION, Posterior, log_likelihood_terms
+from bayesperiodic.sampling.draws import Posterior, refuse_robust
 from bayesperiodic.sampling.evidence import evidence
+from bayesperiodic.sampling.groups import OBSERVATION, log_likelihood_terms
 from bayesperiodic.sampling.sample import sample
 
 # Log evidence ratio of a probability of 95 %. A difference of ELPD below 4 is too small for its standard error to be
@@ -171,6 +172,7 @@ def _checked(models: Any) -> dict[str, tuple[Problem, Posterior]]:
             raise ValueError(f"models[{name!r}]: must be (problem, posterior), got {_checks.shortened(pair)}.")
         try:
             given[name] = check_results(pair[0], posterior=pair[1]), pair[1]
+            refuse_robust(pair[1])
         except ValueError as error:
             raise ValueError(f"models[{name!r}]: {error}") from None
     first, *others = given

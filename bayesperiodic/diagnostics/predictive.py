@@ -17,7 +17,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.density.log_posterior import NATURAL
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.adequacy import (
+from bayesperiodic.estimation.adequacy import (
     ADEQUACY_LEVEL,
     ALL,
     MISSPECIFIED,
@@ -34,7 +34,7 @@ from bayesperiodic.periodic import arclength
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.problem.parameters import CHAIN, DRAW
-from bayesperiodic.sampling.draws import Posterior
+from bayesperiodic.sampling.draws import Posterior, refuse_robust
 
 PROBABILITY = 0.9
 # Of the median and of the ends of the central band.
@@ -330,6 +330,7 @@ def predict(
     if experiment is not None and run is None:
         raise ValueError(f"experiment: must be given together with `run`, got {experiment!r} without `run`.")
     problem = check_results(problem, posterior=posterior)
+    refuse_robust(posterior)
     lp = posterior.tree["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()
     points, noise = draws_of(problem, posterior, np.linspace(0, lp.size - 1, count).astype(int))
     peak = draws_of(problem, posterior, [int(np.argmax(lp))])[0][0]

@@ -11,8 +11,8 @@ from bayesperiodic import _fourier
 from bayesperiodic._linalg import column_space
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.adequacy import Whitened, used
 from bayesperiodic.diagnostics.candidates import MEMORY, Term, factors, places, values
+from bayesperiodic.estimation.adequacy import Whitened, used
 from bayesperiodic.estimation.covariance import predicted_changes, residual_variances
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.result import MapEstimate

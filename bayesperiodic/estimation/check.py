@@ -13,6 +13,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import ResponseSolver
+from bayesperiodic.estimation.adequacy import misfit_at
 from bayesperiodic.estimation.conflict import prior_conflict
 from bayesperiodic.estimation.covariance import (
     Uncertainty,
@@ -127,6 +128,8 @@ def checked(
     shift[lost] = np.nan
     robust = robust_covariance(problem, estimate, inverse)
     robust[lost, lost] = np.inf
+    robust_table = pd.DataFrame(robust, index=names, columns=names)
+    conflict, alone = prior_conflict(problem, estimate)
     split = noise_split(problem, estimated_inputs(problem, estimate).residuals, log_variance_factor)
     loadings = problem.likelihood.loadings
     if not (problem.noisy_inputs and loadings):
@@ -134,14 +137,17 @@ def checked(
     curved = input_nonlinearity(problem, estimate, solutions, covariance)
     change = partial(_data_change, problem, estimate)
     return FitCheck(
-        robust_sd=sds(pd.DataFrame(robust, index=names)),
+        robust_sd=sds(robust_table),
         whiteness=channel_whiteness(problem, estimate),
         noise_split=split,
         input_noise=caused_by_inputs(problem, loadings),
         input_nonlinearity=dict(zip(names, curved.tolist(), strict=True)),
         doubling_shift=dict(zip(names, shift.tolist(), strict=True)),
-        prior_conflict=prior_conflict(problem, estimate)[0],
+        prior_conflict=conflict,
         undetermined=undetermined(uncertain.information, estimate.theta, names, problem.logarithmic, change),
+        robust_covariance=robust_table,
+        # The prior must not count as misfit of the model, which is tested where the data alone are fitted best.
+        misfit=misfit_at(problem, alone if conflict.text else estimate),
     )
 
 

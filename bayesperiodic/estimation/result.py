@@ -25,6 +25,10 @@ from bayesperiodic.problem.parameters import checked_key, in_experiment, local_h
 ROUNDING_VARIANCE = 1e-16
 # Standard deviation of a frequency, relative to that of its measurement, below which it is printed, and how many are.
 UPDATED, MOST_FREQUENCIES = 0.8, 3
+ROBUST_TAKEN = (
+    "Intervals are those of the robust sd: the model is misspecified, and the Laplace sd takes its error for noise "
+    "that is independent from value to value."
+)
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,11 @@ class FitCheck(Result):
     undetermined : tuple of str
         Changes of parameters, in words, that change no output, confirmed by a change of 10 %, or "a combination of …"
         where only a small change leaves the outputs as they are; in these directions the posterior equals the prior.
+    robust_covariance : DataFrame (names × names), optional
+        That of `robust_sd`, in natural values; None in files of earlier versions.
+    misfit : str, optional
+        Why the model is misspecified, by the tests of `predict` at the estimate, or where the data alone are fitted
+        best if the prior is in conflict with them; "" if no test rejects it, None in files of earlier versions.
 
     Examples
     --------
@@ -97,6 +106,8 @@ class FitCheck(Result):
     doubling_shift: dict[str, float]
     prior_conflict: PriorConflict
     undetermined: tuple[str, ...]
+    robust_covariance: pd.DataFrame | None = None
+    misfit: str | None = None
 
     def __repr__(self) -> str:
         columns = {"robust sd": self.robust_sd, "shift on twice the points": self.doubling_shift}
@@ -117,8 +128,9 @@ class FitCheck(Result):
         return rows
 
     def remarks(self) -> list[str]:
-        """Return sentences on a conflict with the prior, on what is not tested and what the data do not determine."""
-        remarks = [f"{self.prior_conflict.text}."] if self.prior_conflict.text else []
+        """Return sentences on a wrong model, a conflict with the prior, what is not tested or not determined."""
+        remarks = [f"{self.misfit}."] if self.misfit else []
+        remarks += [f"{self.prior_conflict.text}."] if self.prior_conflict.text else []
         if untested := [repr(channel) for channel, white in self.whiteness.items() if not np.isfinite(white.p)]:
             named = ", ".join(untested)
             remarks.append(f"Whiteness of {named} is not tested: the parameters leave fewer than two harmonics.")
@@ -230,6 +242,8 @@ class MapEstimate(Result):
     c = 0.199 ± 0.001
     k = 1.001 ± 0.001
     >>> low, high = fit.interval(0.9)["k"]
+    >>> fit.misspecified
+    False
     >>> low < 1.0 < high, fit.whiteness["displacement"].p > 0.01
     (True, True)
     """
@@ -258,8 +272,9 @@ class MapEstimate(Result):
     input_errors = _part("true_inputs", "errors")
     history, starts, at_ends, other_orbits, other_modes = (_part("search", field.name) for field in fields(Search))
     robust_sd, whiteness, noise_split, input_noise, input_nonlinearity, doubling_shift, prior_conflict, undetermined = (
-        _part("checks", field.name) for field in fields(FitCheck)
+        _part("checks", field.name) for field in fields(FitCheck)[:8]
     )
+    robust_covariance, misfit = _part("checks", "robust_covariance"), _part("checks", "misfit")
 
     @property
     def sd(self) -> dict[str, float]:
@@ -307,15 +322,20 @@ class MapEstimate(Result):
         sd = np.sqrt(np.diag(self.covariance))
         return pd.DataFrame(self.covariance / np.outer(sd, sd))
 
-    def interval(self, probability: float = 0.9, *, robust: bool = False) -> dict[str, tuple[float, float]]:
+    @property
+    def misspecified(self) -> bool:
+        """Whether tests reject the model, see `FitCheck.misfit`; robust intervals are the valid ones then."""
+        return bool(self.checks and self.checks.misfit)
+
+    def interval(self, probability: float = 0.9, *, robust: bool | None = None) -> dict[str, tuple[float, float]]:
         """Return the equal-tailed interval of each parameter, by Student's t with `degrees_of_freedom`.
 
         Parameters
         ----------
         probability : float
             Between 0 and 1.
-        robust : bool
-            Take `robust_sd` instead of `sd`.
+        robust : bool, optional
+            Take `robust_sd` instead of `sd`; by default where the model is `misspecified`.
 
         Returns
         -------
@@ -329,7 +349,7 @@ class MapEstimate(Result):
         """
         if not 0.0 < _checks.finite_number("probability", probability) < 1.0:
             raise ValueError(f"probability: must be between 0 and 1, got {probability!r}.")
-        sd, result = self.robust_sd if robust else self.sd, {}
+        sd, result = self.robust_sd if (self.misspecified if robust is None else robust) else self.sd, {}
         for name, value in self.theta.items():
             half = float(stdtrit(min(self.degrees_of_freedom[name], 1e9), 0.5 + 0.5 * probability)) * sd[name]
             result[name] = value - half, value + half
@@ -482,12 +502,12 @@ class MapEstimate(Result):
         status = self.status if self.converged else f"NOT CONVERGED: {self.status}; try another start, or starts=8"
         if self.without_noise:
             status = f"{self.status}; {', '.join(self.without_noise)} without noise"
-        sd, robust = self.sd, self.checks and self.checks.robust_sd
+        spreads = {"Laplace sd": self.sd} | ({"robust sd": self.checks.robust_sd} if self.checks else {})
+        columns = ["estimate", *(sorted(spreads, reverse=True) if self.misspecified else spreads)]
         rows = {
-            name: (f"{value:.6g}", f"{sd[name]:.3g}", *([f"{robust[name]:.3g}"] if robust else []))
+            name: (f"{value:.6g}", *(f"{spreads[column][name]:.3g}" for column in columns[1:]))
             for name, value in self.theta.items()
-        } | {name: (f"{value:.4g}", *"-" * (2 if robust else 1)) for name, value in self.noise.items()}
-        columns = ["estimate", "Laplace sd", "robust sd"][: 3 if robust else 2]
+        } | {name: (f"{value:.4g}", *"-" * len(spreads)) for name, value in self.noise.items()}
         estimates, more = pd.DataFrame.from_dict(rows, orient="index", columns=columns), {}
         if self.checks:
             more = self.checks.by_channel()
@@ -496,7 +516,9 @@ class MapEstimate(Result):
             for channel, rms in self.rms.items()
         }
         residuals = pd.DataFrame.from_dict(channels, orient="index")
-        lines = [f"MapEstimate ({status})", estimates.to_string(), "Residuals", residuals.to_string()]
+        lines = [f"MapEstimate ({status})", estimates.to_string()]
+        lines += [ROBUST_TAKEN] if self.misspecified else []
+        lines += ["Residuals", residuals.to_string()]
         lines += [f"The noise has the {self.noise_prior}."] if self.noise else []
         if self.noisy_inputs and self.checks:
             caused = ", ".join(f"{sd:.3g} in {channel}" for channel, sd in self.checks.input_noise.items())

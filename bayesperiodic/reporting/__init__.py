@@ -6,11 +6,11 @@ from pathlib import Path
 from bayesperiodic import plot
 from bayesperiodic._io import in_folder, written_whole
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.adequacy import ADEQUACY_LEVEL
 from bayesperiodic.diagnostics.comparison import Comparison
 from bayesperiodic.diagnostics.identifiability import Identifiability
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.predictive import Prediction
+from bayesperiodic.estimation.adequacy import ADEQUACY_LEVEL
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.reporting import contents, html
 from bayesperiodic.sampling.draws import Posterior

@@ -17,11 +17,11 @@ from matplotlib.figure import Figure
 from bayesperiodic import _checks
 from bayesperiodic._verdicts import CAUTION, TONES
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.adequacy import ADEQUACY_TESTS
 from bayesperiodic.diagnostics.comparison import Comparison, compare
 from bayesperiodic.diagnostics.identifiability import identifiability
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction, predict
+from bayesperiodic.estimation.adequacy import ADEQUACY_TESTS
 from bayesperiodic.estimation.map_estimate import estimation_warnings
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import FROM_CYCLES, JOINT

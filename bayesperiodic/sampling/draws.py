@@ -3,7 +3,8 @@
 import importlib.metadata
 import warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import emcee
@@ -15,12 +16,13 @@ from bayesperiodic import _checks
 from bayesperiodic._expressions import parse_all
 from bayesperiodic._io import Result
 from bayesperiodic.density.log_posterior import LogPosterior
+from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import InputErrors
 from bayesperiodic.likelihood.section_points import SCALE
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 from bayesperiodic.priors.joint import MultivariateNormal
 from bayesperiodic.problem.description import Description
-from bayesperiodic.problem.fingerprint import fingerprint
+from bayesperiodic.problem.fingerprint import check_fingerprint, fingerprint
 from bayesperiodic.problem.parameters import (
     CHAIN,
     CHANNEL,
@@ -37,8 +39,22 @@ from bayesperiodic.problem.parameters import (
     squared,
 )
 from bayesperiodic.sampling import convergence
+from bayesperiodic.sampling.groups import (
+    LOG_LIKELIHOOD,
+    POSTERIOR_PREDICTIVE,
+    STEP,
+    WALKER,
+    log_likelihood_terms,
+    posterior_predictive,
+    signals,
+)
 from bayesperiodic.sampling.proposals import CallCount
+from bayesperiodic.sampling.robust import MISFIT, ROBUST, no_robust, robust_group, with_robust_covariance
 
+ROBUST_DRAWS = (
+    "sd and interval are robust; draws_sd, that of the draws, takes the error of the model for noise that is "
+    "independent from value to value."
+)
 SAMPLED_ONLY = "Only sampled parameters are part of the draws; write the value of a fixed one as a number."
 
 
@@ -218,16 +234,87 @@ class Posterior(Result):
         """Full names of the noise parameters."""
         return [n for n, (variable, _) in places(self._group).items() if NOISE in self._group[variable].attrs]
 
-    def summary(self, *, mode: int | None = None) -> pd.DataFrame:
+    @property
+    def misfit(self) -> str:
+        """Why the model is misspecified at the estimate from which was sampled, see `FitCheck.misfit`; or ""."""
+        return str(self.tree.attrs.get(MISFIT, ""))
+
+    @property
+    def is_robust(self) -> bool:
+        """Whether these are draws by `robust`, which no density describes."""
+        return ROBUST in self.tree.attrs
+
+    @cached_property
+    def headline(self) -> "Posterior":
+        """The draws whose intervals are valid: of a misspecified model those by `robust`, otherwise these."""
+        if ROBUST not in self.tree.children:
+            return self
+        return self._stretched(self.tree[ROBUST].to_dataset())
+
+    def robust(self, fit: MapEstimate) -> "Posterior":
+        """Return draws whose covariance in sampling coordinates is the robust one of an estimate.
+
+        Use them for quantities that depend on the parameters (`derive`, `predict_branch`, `as_prior`) where the model
+        is misspecified: the covariance of the posterior then takes the error of the model for independent noise. The
+        draws of the parameters are moved linearly about their mean, as in the open-faced sandwich adjustment (B. A.
+        Shaby, J. Comput. Graph. Stat. 23 (2014) 853-876), by the linear map that moves them least; logarithms are moved
+        where parameters are sampled by them, with the covariance at the estimate (delta method).
+
+        Mean, skewness and tails in sampling coordinates remain those of the posterior: an estimate that is biased by
+        the error of the model remains biased. Noise parameters, and parameters without a finite robust standard
+        deviation, keep their draws. Draws that would leave the support of a prior are reflected at its end. No density
+        belongs to these draws: diagnostics that need one refuse them, and `tau` is that of the posterior.
+
+        Parameters
+        ----------
+        fit : MapEstimate
+            Of the same problem, with checks.
+
+        Returns
+        -------
+        Posterior
+
+        Raises
+        ------
+        ValueError
+            For an estimate of another problem, without checks or with a robust covariance that is NaN, for draws that
+            belong to several optima, or for draws that are robust already.
+
+        Examples
+        --------
+        >>> robust = posterior.robust(fit)
+        >>> bool(abs(robust.draws("k").std() / fit.robust_sd["k"] - 1) < 0.01)
+        True
+        """
+        check_fingerprint("fit", fit, self.fingerprint)
+        refuse_robust(self)
+        if reason := no_robust(fit, len(self.modes)):
+            raise ValueError(f"fit: must describe these draws by a robust covariance, got {reason}.")
+        return self._stretched(robust_group(fit, self._group))
+
+    def _stretched(self, robust: xr.Dataset) -> "Posterior":
+        """Return the draws with a robust covariance; groups of the posterior density are left out."""
+        group = with_robust_covariance(self._group, robust)
+        tree = self.tree.drop_nodes([ROBUST, LOG_LIKELIHOOD, POSTERIOR_PREDICTIVE], errors="ignore")
+        tree["posterior"], tree.attrs = xr.DataTree(group), self.tree.attrs | {ROBUST: 1}
+        ess, rhat = (
+            {n: of(column(group, n)) for n in self.names} for of in (convergence.effective_size, convergence.rhat)
+        )
+        return replace(self, tree=tree, ess=ess, rhat=rhat)
+
+    def summary(self, *, mode: int | None = None, robust: bool | None = None) -> pd.DataFrame:
         """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, one row per parameter.
 
         mcse_mean, ess and rhat are mcse_mean, ess_bulk and r_hat of ``arviz.summary``. Its ``attrs`` contain interval,
-        converged, reason and failures.
+        converged, reason and failures. If the model is misspecified at the estimate from which was sampled, all this is
+        that of the draws by `robust`, and draws_sd is the standard deviation of the draws themselves.
 
         Parameters
         ----------
         mode : int, optional
             Row of `modes`: only mean, sd and interval of the draws that belong to this optimum.
+        robust : bool, optional
+            False for that of the draws themselves.
 
         Returns
         -------
@@ -242,8 +329,12 @@ class Posterior(Result):
             _checks.one_of("mode", mode, self.modes.index.tolist())
             inside = self.tree["sample_stats"][MODE].to_numpy().ravel() == mode
             return _table({name: _moments(self.draws(name)[inside]) for name in self.names})
-        rows = {name: _described(column(self._group, name), self.ess[name]) for name in self.names}
-        table = _table(rows).assign(tau=pd.Series(self.tau), rhat=pd.Series(self.rhat))
+        shown = self if robust is False else self.headline
+        rows = {name: _described(column(shown._group, name), shown.ess[name]) for name in self.names}
+        table = _table(rows).assign(tau=pd.Series(self.tau), rhat=pd.Series(shown.rhat))
+        if shown is not self:
+            table.insert(2, "draws_sd", [self.draws(name).std(ddof=1) for name in self.names])
+            table.attrs["interval"] += f", robust: {self.misfit}"
         table.attrs |= {"converged": self.converged, "reason": self.reason, "failures": dict(self.failures)}
         return table
 
@@ -327,6 +418,16 @@ class Posterior(Result):
         draws = np.stack([self.draws(name) for name in key])
         return MultivariateNormal(draws.mean(axis=1), np.cov(draws).reshape(len(key), len(key)))
 
+    @property
+    def remarks(self) -> list[str]:
+        """Sentences on which intervals are shown, where the model is misspecified."""
+        if not self.misfit:
+            return []
+        if ROBUST in self.tree.children:
+            return [f"{ROBUST_DRAWS} {self.misfit}."]
+        kind = "These are robust draws" if self.is_robust else "The intervals take the model for right"
+        return [f"{kind}. {self.misfit}."]
+
     def __repr__(self) -> str:
         failed = ", ".join(f"{share:.2%} {status}" for status, share in self.failures.items())
         tables = [self.summary(), self.modes]
@@ -334,6 +435,7 @@ class Posterior(Result):
             [
                 f"Posterior ({'converged' if self.converged else 'NOT CONVERGED'})",
                 *(t.to_string(float_format="{:.5g}".format) for t in tables if not t.empty),
+                *self.remarks,
                 f"Sampling ended: {self.reason}.",
                 f"Failed solves of {self.log_posterior_calls} proposals: {failed or 'none'}.",
             ]
@@ -355,47 +457,16 @@ def _table(rows: dict[str, dict[str, float]]) -> pd.DataFrame:
     return table
 
 
-REPLICATES = 100
-# Draws at which the terms of the log-likelihood are stored, and the most numbers that these may take.
-TERM_DRAWS, MOST_TERMS = (500, 2000), 10_000_000
+def refuse_robust(posterior: Posterior) -> None:
+    """Raise a ValueError for draws that no density describes."""
+    if posterior.is_robust:
+        raise ValueError(
+            "posterior: must be draws from the posterior density, got those of robust(fit), which have another "
+            "covariance; give sample(problem, fit)."
+        )
 
 
-def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, seed: int) -> xr.Dataset:
-    """Return replicates of the measured mean periods, noise included, for some draws.
-
-    Variables are ``<experiment> <channel>`` with dims (chain, draw, time axis), and ``largest_multiplier``, the modulus
-    of the largest Floquet multiplier, with dims (chain, draw, experiment); NaN where a solve fails.
-    """
-    problem = density.problem
-    chosen, theta, noise = _some(problem, posterior, REPLICATES)
-    shape = chosen.sizes[CHAIN], chosen.sizes[DRAW]
-    components = problem.likelihood.simulate(noise, np.random.default_rng(seed))
-    simulation, variables, largest = density.solver.solve(theta, keep=True, polish=True), {}, []
-    for e in problem.experiments:
-        observation, failed = problem.observations[e.name], simulation.statuses(e.name) != CONVERGED
-        parts, components = components[: len(observation.blocks)], components[len(observation.blocks) :]
-        for channel, values in observation.replicates(simulation.response(e.name), parts).items():
-            values[failed] = np.nan
-            variables[f"{e.name} {channel}"] = ((CHAIN, DRAW, _time(e.name)), values.reshape(*shape, -1))
-        largest.append(density.solver.largest_multipliers(theta, e.name, simulation).reshape(shape))
-    variables["largest_multiplier"] = ((CHAIN, DRAW, EXPERIMENT), np.stack(largest, axis=-1))
-    return xr.Dataset(variables, coords=chosen.coords)
-
-
-def _some(problem: Description, posterior: xr.Dataset, most: int) -> tuple[xr.Dataset, np.ndarray, np.ndarray]:
-    """Return equally spaced draws of every chain, their θ (draws, names) and noise parameters (draws, noise_names)."""
-    each = max(1, most // posterior.sizes[CHAIN])
-    draws = posterior.sizes[DRAW]
-    chosen = posterior.isel({DRAW: np.linspace(0, draws - 1, min(each, draws)).astype(int)})
-    size = chosen.sizes[CHAIN] * chosen.sizes[DRAW]
-    theta, noise = (
-        np.array([column(chosen, name).ravel() for name in names]).reshape(len(names), size).T
-        for names in (problem.names, problem.noise_names)
-    )
-    return chosen, theta, noise
-
-
-STEP, WALKER, OBSERVATION, MODE = "step", "walker", "observation", "mode"
+MODE = "mode"
 INPUT_NOISE, EXPECTED, LOADINGS, CAUSED = "input_noise", "expected errors", "loadings", "caused"
 
 
@@ -458,11 +529,11 @@ def tree(
     groups = {
         "posterior": posterior,
         "sample_stats": xr.Dataset(stats, coords=coords),
-        "log_likelihood": log_likelihood_terms(density, posterior),
-        "posterior_predictive": posterior_predictive(density, posterior, seed),
-        "orbits": _signals(problem, {run: s.states for run, s in density.solver.solutions(best).items()}),
-        "observed_data": _signals(problem, {e.name: e.outputs for e in problem.experiments}),
-        "constant_data": _signals(problem, {e.name: e.inputs for e in problem.experiments}),
+        LOG_LIKELIHOOD: log_likelihood_terms(density, posterior),
+        POSTERIOR_PREDICTIVE: posterior_predictive(density, posterior, seed),
+        "orbits": signals(problem, {run: s.states for run, s in density.solver.solutions(best).items()}),
+        "observed_data": signals(problem, {e.name: e.outputs for e in problem.experiments}),
+        "constant_data": signals(problem, {e.name: e.inputs for e in problem.experiments}),
     }
     if problem.input_errors:
         variables: dict[str, Any] = {}
@@ -479,24 +550,6 @@ def tree(
         "emcee": emcee.__version__,
     }
     return result
-
-
-def log_likelihood_terms(density: LogPosterior, posterior: xr.Dataset) -> xr.Dataset:
-    """Return the terms of the log-likelihood at some draws of the group ``posterior`` as the only variable of a group.
-
-    The observations have the coordinates experiment, channel, harmonic and weight, see `Likelihood.labels`.
-    """
-    likelihood = density.problem.likelihood
-    most = min(max(MOST_TERMS // len(likelihood.observations), TERM_DRAWS[0]), TERM_DRAWS[1])
-    chosen, theta, noise = _some(density.problem, posterior, most)
-    simulation = density.solver.solve(theta, whole=True)
-    terms = likelihood.terms(density.comparisons.residuals(simulation, None), noise)
-    terms[simulation.status != CONVERGED] = np.nan
-    shaped = terms.reshape(chosen.sizes[CHAIN], chosen.sizes[DRAW], -1)
-    coords = {name: chosen.coords[name] for name in (CHAIN, DRAW, STEP, WALKER)}
-    group = xr.Dataset({"data": ((CHAIN, DRAW, OBSERVATION), shaped)}, coords=coords)
-    labels = {name: (OBSERVATION, values) for name, values in likelihood.labels.items()}
-    return group.assign_coords({OBSERVATION: [*likelihood.observations], **labels})
 
 
 def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr.Dataset:
@@ -544,14 +597,3 @@ def _noise_attributes(problem: Description, variable: str) -> dict[str, str]:
     units = problem.model.units if variable == "variance" else {}
     each = {f"units of {channel}": squared(units[channel]) for channel in problem.channels if channel in units}
     return {NOISE: problem.noise.name} | each
-
-
-def _signals(problem: Description, by_run: Mapping[str, Mapping[str, np.ndarray]]) -> xr.Dataset:
-    """Return signals (points,) by experiment and name as variables ``<experiment> <name>`` over time."""
-    signals = {f"{run} {name}": (_time(run), x) for run, signals in by_run.items() for name, x in signals.items()}
-    return xr.Dataset(signals, coords={_time(e.name): e.time for e in problem.experiments})
-
-
-def _time(experiment: str) -> str:
-    """Return the name of an experiment's time axis, which no channel can have."""
-    return f"{experiment} time [s]"

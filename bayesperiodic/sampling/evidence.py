@@ -22,7 +22,7 @@ from bayesperiodic.priors.single import LOG_ROOT_TWO_PI, Uniform
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.problem.parameters import CHAIN, DRAW, SHIFT, local_name
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.draws import Posterior
+from bayesperiodic.sampling.draws import Posterior, refuse_robust
 from bayesperiodic.sampling.proposals import AffineTransform, fit_mixture
 
 # Draws of the posterior and of the mixture for each of the two estimates.
@@ -146,6 +146,7 @@ def evidence(problem: Problem, posterior: Posterior) -> Evidence:
     """
     _checks.instance("problem", problem, Problem)
     problem = check_results(problem, posterior=posterior)
+    refuse_robust(posterior)
     _check_phases(problem)
     for name, prior in _priors(problem):
         _check_normalised(name, prior)

@@ -18,6 +18,7 @@ from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.convergence import PASSES, stop_rule
 from bayesperiodic.sampling.draws import Posterior, gather
 from bayesperiodic.sampling.proposals import AffineTransform, CallCount
+from bayesperiodic.sampling.robust import add_robust
 from bayesperiodic.sampling.starts import mode_of, sampling_axes, start_points
 
 TUNE = 300
@@ -222,4 +223,5 @@ class _Chains:
         described = {name: ((CHAIN, DRAW), values) for name, values in stats.items()}
         result.tree["sample_stats"] = xr.DataTree(result.tree["sample_stats"].to_dataset().assign(described))
         result.tree.attrs["nutpie"] = version
+        add_robust(result.tree, self.fit, len(result.modes))
         return result

@@ -52,6 +52,7 @@ from bayesperiodic.sampling.proposals import (
     fit_mixture,
     moves,
 )
+from bayesperiodic.sampling.robust import add_robust
 from bayesperiodic.sampling.starts import FROM_LAPLACE, STARTS, laplace_mixture, mode_of, sampling_axes, start_points
 
 EMCEE, NUTS = "emcee", "nuts"
@@ -463,6 +464,7 @@ class _EnsembleRun:
             acceptance=float(np.mean(self.backend.accepted / self.backend.iteration)),
             seed=self.seed,
         )
+        add_robust(posterior.tree, self.fit, len(posterior.modes))
         if self.state["mixture"]:
             posterior.tree["proposal"] = xr.DataTree(self._proposal())
         return posterior

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics.adequacy import consistency, excess, holm, measured_freedom
+from bayesperiodic.estimation.adequacy import consistency, excess, holm, measured_freedom
 from bayesperiodic.estimation.unexplained import Unexplained
 
 HARMONIC = np.array([0, *range(1, 21), *range(1, 21)])

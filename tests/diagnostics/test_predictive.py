@@ -6,7 +6,7 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic import _fourier
-from bayesperiodic.diagnostics.adequacy import ADEQUACY_TESTS, adequacy
+from bayesperiodic.estimation.adequacy import ADEQUACY_TESTS, adequacy
 from bayesperiodic.sampling.draws import tree
 from tests.known import LINEAR, NOISES, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors
 from tests.problems import CASES, DUFFING, DUFFING_PRIORS, SAMPLES
@@ -287,12 +287,14 @@ def test_a_misspecified_model_is_named_beside_all_other_verdicts(coulomb, said):
     """Missing friction at its third harmonic; with the right model nothing is said (fixed seed, 1 % false alarms)."""
     problem = folded(NOISES["white"], 1, coulomb)
     fit = bp.map_estimate(problem, progress=False)
-    text = "The model is misspecified, which the verdicts take for right"
-    assert (text in repr(bp.identifiability(problem, fit, profile=False))) is said
+    text, taken = "The model is misspecified (", "; the verdicts take the model for right"
+    assert all((one in repr(bp.identifiability(problem, fit, profile=False))) is said for one in (text, taken))
     found = bp.compare(problem, fit, draw(problem, fit, 1, draws=400))
     assert (text in repr(found)) is said
     odd = "its strongest harmonic is 3, as where a force odd in the motion is missing, if the drive is a sine"
-    search = "; bp.missing_terms(problem, fit) looks for the term that is missing"
+    search = (
+        "; bp.missing_terms(problem, fit) looks for the term that is missing; the verdicts take the model for right"
+    )
     assert all(one.endswith(search) for one in found.limitations)
     assert all(odd in one for one in found.limitations) and len(found.limitations) == said
 

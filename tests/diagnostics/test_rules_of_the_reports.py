@@ -10,7 +10,8 @@ from scipy import stats
 from scipy.fft import dct
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics import adequacy, identifiability
+from bayesperiodic.diagnostics import identifiability
+from bayesperiodic.estimation import adequacy
 from bayesperiodic.estimation.unexplained import Unexplained
 from bayesperiodic.likelihood.mean_period import MeanPeriod
 from bayesperiodic.likelihood.samples import Samples

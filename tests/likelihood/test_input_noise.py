@@ -13,7 +13,7 @@ from scipy import stats
 import bayesperiodic as bp
 from bayesperiodic import _fourier
 from bayesperiodic.diagnostics import calibration
-from bayesperiodic.diagnostics.adequacy import misfit
+from bayesperiodic.estimation.adequacy import misfit
 from bayesperiodic.likelihood.block import Block
 from bayesperiodic.likelihood.input_noise import pooled, same
 from bayesperiodic.likelihood.likelihood import Likelihood

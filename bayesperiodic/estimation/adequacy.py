@@ -13,6 +13,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording_check import HARMLESS
 from bayesperiodic.density.log_posterior import Linearisation
 from bayesperiodic.density.problem import Problem
+from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.estimation.unexplained import NOT_TESTED, Unexplained, testable, used
 from bayesperiodic.likelihood.block import Block
@@ -145,15 +146,25 @@ def misfit(problem: Problem, fit: MapEstimate) -> str:
     """Return why the model is misspecified at an estimate, in words; "" if it is not, or not fitted to the data."""
     if fit.other_orbits or fit.prior_conflict.members:
         return ""
-    theta = problem.vector(fit.theta)
-    guesses = {name: solution.states for name, solution in fit.solutions.items()}
-    here = problem.anchored(theta, guesses).density().linearise(theta)
-    noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
-    if not here.converged or not (rejected := rejections(table := adequacy(problem, here, noise[None], {}))):
+    if fit.checks is None or (found := fit.checks.misfit) is None:
+        theta = problem.vector(fit.theta)
+        guesses = {name: solution.states for name, solution in fit.solutions.items()}
+        here = problem.anchored(theta, guesses).density().linearise(theta)
+        noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
+        found = misfit_at(problem, Iterate(theta, here, noise, np.nan))
+    return found and f"{found}; the verdicts take the model for right"
+
+
+def misfit_at(problem: Problem, estimate: Iterate) -> str:
+    """Return why the model is misspecified at an estimate, in words; "" if no test rejects it, or if there is none."""
+    if not estimate.here.converged:
+        return ""
+    table = adequacy(problem, estimate.here, estimate.noise[None], {})
+    if not (rejected := rejections(table)):
         return ""
     reasons = "; ".join(f"{label}: {text}" for label, text in rejected.items())
     subject, remedy = ("model or the noise model", "") if concerns_noise(table) else ("model", f"; {SEARCH}")
-    return f"The {subject} is misspecified, which the verdicts take for right ({reasons}){remedy}"
+    return f"The {subject} is misspecified ({reasons}){remedy}"
 
 
 def concerns_noise(table: pd.DataFrame) -> bool:
