@@ -4,7 +4,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from scipy.special import erf, erfc
+from scipy.stats import binom
+
 from bayesperiodic.data.quantisation import step_of
+from bayesperiodic.data.saturation import Saturation
 
 # Ranges at which sensors wrap: radians, degrees, turns; and powers of two of a quantised sensor's steps.
 SENSOR_TURNS = (2.0 * np.pi, 360.0, 1.0)
@@ -30,6 +34,14 @@ MOST_DROPPED, FEWEST_VALUES = 0.45, 18
 ALL_DROPPED = 0.4
 # Repeated values of a slower logger: share of the runs that have the usual length.
 HELD = 0.9
+# Short runs of one value: fewest samples, their expected number by noise in a recording, standard deviation of the noise
+# relative to the range below which there is none, and samples from which that is taken.
+FEWEST_HELD, CHANCE_RUNS, EXACT, NOISE_SAMPLES = 3, 1e-3, 1e-9, 20_000
+# Heavy tails: distance from which residuals belong to them [standard deviations of the others], expected number of
+# larger ones beyond which one is an outlier, and fewest samples between the two distances.
+TAIL, RARE, FEWEST_IN_TAIL = 4.0, 0.01, 3
+# Impulses of random size and sign: fewest, ratio of large sizes to small ones, and their p-value as one-sided faults.
+FEWEST_IMPULSES, SPREAD_SIZES, ONE_SIDED = 10, 3.0, 0.01
 
 
 @dataclass
@@ -43,6 +55,12 @@ class ChannelFaults:
     low: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # clipped samples
     high: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     outliers: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    tails: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # as large as outliers, but noise
+    brief: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # of short runs of one value
+    saturation: Saturation | None = None  # flat tops of the mean period
+    saturated: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # samples of the flat tops
+    saturation_bias: float = 0.0  # if these are wrong [standard errors of all amplitudes]
+    noisy: bool = True  # beside the clipped samples, so that no signal without noise rests there
     held: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # that repeat the one before
     repeats: int = 1  # samples of each value, of a slower logger
 
@@ -86,6 +104,92 @@ def stuck_of(values: np.ndarray) -> list[slice]:
     usual = max(usual, float(np.quantile(length, 0.99)) if length.size > 100 else 1.0)
     long = np.flatnonzero(length >= max(FEWEST_STUCK, LONG_RUN * usual))
     return [slice(int(first[i]), int(first[i] + length[i])) for i in long]
+
+
+def brief_of(values: np.ndarray, step: float) -> np.ndarray:
+    """Return the samples of runs of one value that are too long for noise of the size that the values have.
+
+    The next value of normal noise is the same one with a probability of erf(step/√8σ) at most, and with that of chance
+    pairs. Runs at the largest and smallest value are clipped, if anything. Signals without noise have none.
+    """
+    first, length = runs(values)
+    if length.size < 2 or length.max() < FEWEST_HELD:
+        return np.zeros(0, dtype=int)
+    noise = fast_noise(values)
+    if not noise > max(EXACT * float(np.ptp(values)), 0.5 * step):
+        return np.zeros(0, dtype=int)
+    # Runs of two count as chance: a hold of two samples is not told from it.
+    pairs = (np.count_nonzero(length == 2) + 1.0) / values.size
+    same = max(float(erf(step / (np.sqrt(8.0) * noise))), pairs)
+    longest = 1.0 + np.log(CHANCE_RUNS / values.size) / np.log(min(same, 1.0 - 1e-12))
+    level = values[first]
+    long = (length >= max(FEWEST_HELD, longest)) & (level != values.max()) & (level != values.min())
+    return np.flatnonzero(np.repeat(long, length))
+
+
+def fast_noise(values: np.ndarray) -> float:
+    """Return the standard deviation of white noise, by fourth differences, to which smooth signals add little."""
+    start = (values.size - min(values.size, NOISE_SAMPLES)) // 2
+    change = np.abs(np.diff(values[start : start + NOISE_SAMPLES], 4))
+    # Differences over repeated values are none of noise.
+    change = change[change > 0.0]
+    return MEDIAN_TO_SD * float(np.median(change)) / np.sqrt(70.0) if change.size else 0.0
+
+
+def single(samples: np.ndarray, phase: np.ndarray) -> np.ndarray:
+    """Return samples of runs that are not at the same phases [cycles] of most cycles, as those of a rest are."""
+    if not samples.size:
+        return samples
+    first = np.flatnonzero(np.diff(samples, prepend=-2) > 1)
+    often = _often(phase, samples[first])
+    keep = often < RETURNING * np.maximum(1.0, 3.0 * _expected(first.size, max(float(np.ptp(phase)), 1.0)))
+    return samples[np.repeat(keep, np.diff(np.append(first, samples.size)))]
+
+
+def repeat_noise(phase: np.ndarray, values: np.ndarray, left_out: np.ndarray) -> float:
+    """Return the standard deviation of values at the same phase of several cycles, without some of them.
+
+    It is that of values from the line between their neighbours in phase.
+    """
+    some = np.setdiff1d(np.arange(min(values.size, SCREENED)), left_out)
+    if some.size < FEWEST_CLIPPED:
+        return 0.0
+    place = phase[some] % 1.0
+    order = np.argsort(place)
+    place, signal = place[order], values[some][order]
+    width = np.maximum(place[2:] - place[:-2], np.finfo(float).tiny)
+    weight = np.clip((place[1:-1] - place[:-2]) / width, 0.0, 1.0)
+    rest = signal[1:-1] - (1.0 - weight) * signal[:-2] - weight * signal[2:]
+    return MEDIAN_TO_SD * float(np.median(np.abs(rest) / np.sqrt(1.0 + weight**2 + (1.0 - weight) ** 2)))
+
+
+def heavy_tails(residuals: np.ndarray, outliers: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """Return which of the outliers are noise: of heavy tails, or impulses of random size and sign.
+
+    The tails between four and eight standard deviations of the others are continued by a power law (median of the
+    logarithms of sizes; B. M. Hill, Ann. Stat. 3 (1975) 1163-1174). Faults have one size or sign, or replace the signal
+    by a value, and leave a gap in the sizes.
+    """
+    middle = float(np.median(residuals))
+    distance = np.abs(residuals - middle)
+    scale = MEDIAN_TO_SD * float(np.median(distance))
+    result = np.zeros(outliers.size, dtype=bool)
+    if not outliers.size or not scale > 0.0:
+        return result
+    sizes = distance[distance > TAIL * scale] / (TAIL * scale)
+    between = np.count_nonzero(sizes < FAR / TAIL)
+    chance = float(erfc(TAIL / np.sqrt(2.0))) * residuals.size
+    own = distance[outliers] / (TAIL * scale)
+    if between >= 2.0 * chance + FEWEST_IN_TAIL and between - chance >= sizes.size - between:
+        index = np.log(2.0) / float(np.median(np.log(sizes)))
+        result = sizes.size * np.maximum(own, 1.0) ** -index > RARE
+    elif outliers.size >= FEWEST_IMPULSES:
+        above = int(np.count_nonzero(residuals[outliers] > middle))
+        p_value = 2.0 * min(binom.cdf(above, own.size, 0.5), binom.sf(above - 1, own.size, 0.5))
+        spread = np.quantile(own, 0.9) > SPREAD_SIZES * np.quantile(own, 0.1)
+        near = np.corrcoef(residuals[outliers], predicted[outliers])[0, 1]
+        result[:] = spread and p_value > ONE_SIDED and abs(near) < SPREAD_SIZES / np.sqrt(own.size)
+    return result
 
 
 def clipped_of(values: np.ndarray, stuck: list[slice]) -> tuple[np.ndarray, np.ndarray]:
@@ -186,20 +290,25 @@ def _lone(far: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -
     after = np.where(last < values.size - 1, change[np.minimum(last, change.size - 1)], np.inf)
     lone = np.minimum(before, after) > 2.0 * usual + step
     cycles = max(float(np.ptp(phase)), 1.0)
-    bins = np.minimum((phase[first] % 1.0 * 64).astype(int), 63)
-    cycle = np.floor(phase[first] - phase[0]).astype(int)
-    often = np.zeros(64)
-    for k in range(64):
-        often[k] = np.unique(cycle[bins == k]).size / cycles
-    every = often + np.roll(often, 1) + np.roll(often, -1)
     if far.mean() < 0.2:
-        lone &= every[bins] < RETURNING * np.maximum(1.0, 3.0 * _expected(first.size, cycles))
+        lone &= _often(phase, first) < RETURNING * np.maximum(1.0, 3.0 * _expected(first.size, cycles))
     result = np.zeros(values.size, dtype=bool)
     for a, n in zip(first[lone], length[lone], strict=True):
         result[a : a + n] = True
     if value is not None and result[values == value].mean() > ALL_DROPPED:
         result |= values == value
     return np.flatnonzero(result)
+
+
+def _often(phase: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Return the share of the cycles with a run at about the phase of each run, by their first samples."""
+    bins = np.minimum((phase[first] % 1.0 * 64).astype(int), 63)
+    cycle = np.floor(phase[first] - phase[0]).astype(int)
+    often = np.zeros(64)
+    for k in range(64):
+        often[k] = np.unique(cycle[bins == k]).size / max(float(np.ptp(phase)), 1.0)
+    every = often + np.roll(often, 1) + np.roll(often, -1)
+    return np.asarray(every[bins])
 
 
 def _expected(runs: int, cycles: float) -> float:

@@ -6,7 +6,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bayesperiodic import _fourier
-from bayesperiodic.data.faults import ChannelFaults, dropped_value, jumps, outliers_of
+from bayesperiodic.data.faults import (
+    ChannelFaults,
+    dropped_value,
+    heavy_tails,
+    jumps,
+    outliers_of,
+    repeat_noise,
+    single,
+)
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
     HarmonicFit,
@@ -28,6 +36,7 @@ from bayesperiodic.data.recording_check import (
     sample_findings,
     signal_faults,
 )
+from bayesperiodic.data.saturation import EXACT_SERIES, means_of, phase_bins, saturation_of
 from bayesperiodic.data.signals import USUAL_STEPS, Signals, cycles_of, first_guess, refuse_gaps, tracked_frequency
 from bayesperiodic.data.steadiness import Steady, Windows, steady_part, windows
 
@@ -37,6 +46,8 @@ LARGEST_CHANGE = 0.1
 LEAST_MOVING = 0.1
 # Harmonics of the first mean period, from which outliers are left out.
 ROUGH_HARMONICS = 40
+# Findings whose samples are those of another kind.
+SAMPLES_OF = {"held": "stuck", "saturated": "clipped"}
 
 
 @dataclass(frozen=True)
@@ -96,20 +107,52 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     used = signals.part(steady.samples)
     limit, inflation = determined_harmonics(used.time, tracked, resolved_harmonics(used.time, tracked, points))
     fit, pace = refine_frequency(used.time, used.values, tracked, limit)
-    residuals = fit.residuals
+    amplitudes, residuals = fit.amplitudes, fit.residuals
     here = sound[(sound >= steady.samples.start) & (sound < steady.samples.stop)]
     if here.size < used.time.size:
-        near = fit_harmonics(signals.time[here], signals.values[:, here], tracked, limit).amplitudes
-        residuals = used.values - _fourier.at_times(near, tracked * used.time)
+        amplitudes = fit_harmonics(signals.time[here], signals.values[:, here], fit.frequency, limit).amplitudes
+        residuals = used.values - _fourier.at_times(amplitudes, fit.frequency * used.time)
     for fault, rest, values in zip(faults, residuals, used.values, strict=True):
         inside = outliers_of(rest, used.time * fit.frequency, values, fault.step) + steady.samples.start
         before, after = (fault.outliers < steady.samples.start), (fault.outliers >= steady.samples.stop)
         fault.outliers = np.concatenate([fault.outliers[before], inside[moving[inside]], fault.outliers[after]])
+    _describe(faults, used, HarmonicFit(fit.frequency, amplitudes, residuals), steady.samples.start)
     seen = findings(fit.frequency, limit, steady.samples)
     seen += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
     return Inspection(
         signals, faults, worst_first(seen), total, steady, every.apart().sizes, fit, pace, limit, inflation
     )
+
+
+def _describe(faults: list[ChannelFaults], used: Signals, fit: HarmonicFit, start: int) -> None:
+    """Tell heavy tails from outliers, and channels that a sensor limits from those that rest.
+
+    Of the part used, which begins at the sample `start`, by a fit without the faulty samples.
+    """
+    phase, stop = used.time * fit.frequency, start + used.time.size
+    sound = np.ones(used.time.size, dtype=bool)
+    for fault in faults:
+        for part in fault.stuck:
+            sound[max(part.start - start, 0) : max(part.stop - start, 0)] = False
+        some = np.concatenate([fault.brief, fault.outliers])
+        sound[some[(some >= start) & (some < stop)] - start] = False
+    here = slice(None) if sound.all() or np.mean(sound) < LEAST_MOVING else sound
+    bins = phase_bins(phase[here])
+    for i, (fault, values) in enumerate(zip(faults, used.values, strict=True)):
+        rest = fit.residuals[i]
+        far = fault.outliers[(fault.outliers >= start) & (fault.outliers < stop)]
+        if far.size:
+            fault.tails = far[heavy_tails(rest, far - start, values - rest)]
+            fault.outliers = np.setdiff1d(fault.outliers, fault.tails)
+        clipped = np.concatenate([fault.low, fault.high])
+        if clipped.size:
+            scatter = repeat_noise(phase, values, clipped - start)
+            fault.noisy = scatter > max(EXACT_SERIES * float(values.std()), 0.5 * fault.step)
+        means = means_of(bins, rest[here], fit.amplitudes[i], fault.step)
+        fault.saturation = saturation_of(means)
+        if fault.saturation is not None:
+            fault.saturated = np.flatnonzero(fault.saturation.holds(phase)) + start
+            fault.saturation_bias = fault.saturation.bias(means.error)
 
 
 def _steady_of(
@@ -149,6 +192,11 @@ def _sound(
 
     These outliers become those of the channels.
     """
+    for fault in faults:
+        fault.brief = single(fault.brief, signals.time * fundamental)
+        if fault.brief.size:
+            moving = np.setdiff1d(moving, fault.brief)
+            calm = replace(signals, values=bounded(signals.values)).part(moving)
     if not jumps(signals.values) and all(dropped_value(values) is None for values in signals.values):
         return moving
     limit = min(resolved_harmonics(calm.time, fundamental, points), ROUGH_HARMONICS)
@@ -174,6 +222,11 @@ def _unsteady(signals: Signals, every: Windows) -> str:
     )
 
 
+def _union(*samples: np.ndarray) -> np.ndarray:
+    """Return the numbers of samples that are in one of several arrays."""
+    return np.unique(np.concatenate(samples))
+
+
 def summary(name: str, seen: Inspection, still: Mapping[str, float]) -> RecordingCheck:
     """Return what was seen, and channels with one value, as the result of `Recording.check`."""
     import pandas as pd
@@ -182,12 +235,12 @@ def summary(name: str, seen: Inspection, still: Mapping[str, float]) -> Recordin
     bad = {
         channel: {
             "outliers": fault.outliers,
-            "stuck": np.concatenate([fault.held, *(np.arange(s.start, s.stop) for s in fault.stuck)]),
-            "clipped": np.concatenate([fault.low, fault.high]),
+            "stuck": _union(fault.held, fault.brief, *(np.arange(s.start, s.stop) for s in fault.stuck)),
+            "clipped": _union(fault.low, fault.high, fault.saturated),
         }
         for channel, fault in zip(seen.signals.channels, seen.faults, strict=True)
     }
-    named = {(f.channel, "stuck" if f.kind == "held" else f.kind) for f in seen.findings}
+    named = {(f.channel, SAMPLES_OF.get(f.kind, f.kind)) for f in seen.findings}
     bad = {c: {kind: v if (c, kind) in named else v[:0] for kind, v in each.items()} for c, each in bad.items()}
     rows = [
         {
