@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from scipy.special import erf, erfc
+from scipy.special import erf, erfc, pdtrc
 from scipy.stats import binom
 
 from bayesperiodic.data.quantisation import step_of
@@ -34,14 +34,15 @@ MOST_DROPPED, FEWEST_VALUES = 0.45, 18
 ALL_DROPPED = 0.4
 # Repeated values of a slower logger: share of the runs that have the usual length.
 HELD = 0.9
-# Short runs of one value: fewest samples, their expected number by noise in a recording, standard deviation of the noise
-# relative to the range below which there is none, and samples from which that is taken.
-FEWEST_HELD, CHANCE_RUNS, EXACT, NOISE_SAMPLES = 3, 1e-3, 1e-9, 20_000
+# Short runs of one value: fewest samples, p-value of as many by noise, and largest share of these; standard deviation of
+# the noise relative to the range below which there is none, and samples from which that is taken.
+FEWEST_HELD, CHANCE_RUNS, CHANCE_SHARE, EXACT, NOISE_SAMPLES = 3, 1e-3, 0.05, 1e-9, 20_000
 # Heavy tails: distance from which residuals belong to them [standard deviations of the others], expected number of
 # larger ones beyond which one is an outlier, and fewest samples between the two distances.
 TAIL, RARE, FEWEST_IN_TAIL = 4.0, 0.01, 3
-# Impulses of random size and sign: fewest, ratio of large sizes to small ones, and their p-value as one-sided faults.
-FEWEST_IMPULSES, SPREAD_SIZES, ONE_SIDED = 10, 3.0, 0.01
+# Impulses of random size and sign: fewest, ratio of large sizes to small ones, the p-value from which they are not
+# one-sided, and standard errors of their correlation with the signal from which they replace it.
+FEWEST_IMPULSES, SPREAD_SIZES, ONE_SIDED, REPLACED = 10, 2.5, 0.01, 3.0
 
 
 @dataclass
@@ -120,10 +121,15 @@ def brief_of(values: np.ndarray, step: float) -> np.ndarray:
         return np.zeros(0, dtype=int)
     # Runs of two count as chance: a hold of two samples is not told from it.
     pairs = (np.count_nonzero(length == 2) + 1.0) / values.size
-    same = max(float(erf(step / (np.sqrt(8.0) * noise))), pairs)
-    longest = 1.0 + np.log(CHANCE_RUNS / values.size) / np.log(min(same, 1.0 - 1e-12))
+    same = min(max(float(erf(step / (np.sqrt(8.0) * noise))), pairs), 1.0 - 1e-12)
+    size = np.arange(FEWEST_HELD, length.max() + 1)
+    found = np.cumsum(np.bincount(length)[::-1])[::-1][size]  # runs of that size or longer
+    chance = values.size * same ** (size - 1.0)
+    held = (chance < CHANCE_SHARE * found) & (pdtrc(found - 1, chance) < CHANCE_RUNS)
+    if not held.any():
+        return np.zeros(0, dtype=int)
     level = values[first]
-    long = (length >= max(FEWEST_HELD, longest)) & (level != values.max()) & (level != values.min())
+    long = (length >= size[np.argmax(held)]) & (level != values.max()) & (level != values.min())
     return np.flatnonzero(np.repeat(long, length))
 
 
@@ -180,15 +186,16 @@ def heavy_tails(residuals: np.ndarray, outliers: np.ndarray, predicted: np.ndarr
     between = np.count_nonzero(sizes < FAR / TAIL)
     chance = float(erfc(TAIL / np.sqrt(2.0))) * residuals.size
     own = distance[outliers] / (TAIL * scale)
-    if between >= 2.0 * chance + FEWEST_IN_TAIL and between - chance >= sizes.size - between:
+    far = np.flatnonzero(distance > FAR * scale)
+    if between >= 2.0 * chance + FEWEST_IN_TAIL and between - chance >= far.size:
         index = np.log(2.0) / float(np.median(np.log(sizes)))
         result = sizes.size * np.maximum(own, 1.0) ** -index > RARE
-    elif outliers.size >= FEWEST_IMPULSES:
-        above = int(np.count_nonzero(residuals[outliers] > middle))
-        p_value = 2.0 * min(binom.cdf(above, own.size, 0.5), binom.sf(above - 1, own.size, 0.5))
-        spread = np.quantile(own, 0.9) > SPREAD_SIZES * np.quantile(own, 0.1)
-        near = np.corrcoef(residuals[outliers], predicted[outliers])[0, 1]
-        result[:] = spread and p_value > ONE_SIDED and abs(near) < SPREAD_SIZES / np.sqrt(own.size)
+    elif far.size >= FEWEST_IMPULSES:
+        above = int(np.count_nonzero(residuals[far] > middle))
+        p_value = 2.0 * min(binom.cdf(above, far.size, 0.5), binom.sf(above - 1, far.size, 0.5))
+        spread = np.quantile(distance[far], 0.9) > SPREAD_SIZES * np.quantile(distance[far], 0.1)
+        replaced = abs(np.corrcoef(residuals[far], predicted[far])[0, 1]) > REPLACED / np.sqrt(far.size)
+        result[:] = spread and p_value > ONE_SIDED and not replaced
     return result
 
 

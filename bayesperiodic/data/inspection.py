@@ -150,8 +150,8 @@ def _describe(faults: list[ChannelFaults], used: Signals, fit: HarmonicFit, star
             fault.noisy = scatter > max(EXACT_SERIES * float(values.std()), 0.5 * fault.step)
         means = means_of(bins, rest[here], fit.amplitudes[i], fault.step)
         fault.saturation = saturation_of(means)
-        if fault.saturation is not None:
-            fault.saturated = np.flatnonzero(fault.saturation.holds(phase)) + start
+        if fault.saturation is not None and not (clipped.size and fault.noisy):
+            fault.saturated = clipped if clipped.size else np.flatnonzero(fault.saturation.holds(phase)) + start
             fault.saturation_bias = fault.saturation.bias(means.error)
 
 

@@ -185,7 +185,7 @@ def saturation_of(means: Means) -> Saturation | None:
 def _level(means: Means, inside: np.ndarray) -> bool:
     """Return whether the means of some intervals are equal up to noise, and a change about as large as ten of them."""
     count = np.count_nonzero(inside)
-    if count < 3:
+    if count < 2:
         return False
     values, weights = means.values[inside], means.weights[inside]
     return bool(weights @ (values - np.average(values, weights=weights)) ** 2 < 30.0 * count)
