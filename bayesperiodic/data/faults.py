@@ -17,8 +17,9 @@ FEWEST_BITS, MOST_BITS = 6, 32
 ROUNDING = 1e-12
 # A jump wraps if it is a whole range to this share of it; what is left must be smooth, and small beside the jumps.
 WRAP_TOLERANCE, LARGEST_UNWRAPPED_STEP, SMOOTH_UNWRAPPED = 0.35, 0.5, 0.5
-# Samples of one value in a row that may be a stuck sensor, and how many times longer than usual ones they are.
-FEWEST_STUCK, LONG_RUN = 10, 10.0
+# Samples of one value in a row that may be a stuck sensor, how many times longer than usual ones they are, and so many
+# runs at an end of the range that they are clipped.
+FEWEST_STUCK, LONG_RUN, SEVERAL = 10, 10.0, 3
 # Clipped samples: fewest, fewest in a row, and how many times more than at the next level.
 FEWEST_CLIPPED, CLIPPED_RUN, PILED_UP = 6, 3, 6.0
 # Distance of outliers from the mean period in standard deviations of the others, and how often they may return.
@@ -55,6 +56,7 @@ class ChannelFaults:
     stuck: list[slice] = field(default_factory=list)
     low: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # clipped samples
     high: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    beside: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # at the same phases as clipped ones
     outliers: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     tails: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # as large as outliers, but noise
     brief: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # of short runs of one value
@@ -104,6 +106,11 @@ def stuck_of(values: np.ndarray) -> list[slice]:
     usual = float(order[np.searchsorted(np.cumsum(order), 0.5 * order.sum())]) if order[-1] < 0.5 * values.size else 1.0
     usual = max(usual, float(np.quantile(length, 0.99)) if length.size > 100 else 1.0)
     long = np.flatnonzero(length >= max(FEWEST_STUCK, LONG_RUN * usual))
+    # Several runs at the largest or the smallest value are clipped.
+    level = values[first[long]]
+    for end in (values.max(), values.min()):
+        if np.count_nonzero(level == end) >= SEVERAL:
+            long, level = long[level != end], level[level != end]
     return [slice(int(first[i]), int(first[i] + length[i])) for i in long]
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.linalg import toeplitz
 
 from bayesperiodic import _fourier
 from bayesperiodic.data.faults import (
@@ -46,6 +47,11 @@ LARGEST_CHANGE = 0.1
 LEAST_MOVING = 0.1
 # Harmonics of the first mean period, from which outliers are left out.
 ROUGH_HARMONICS = 40
+# Harmonics that samples may show whose phases do not determine them, the largest condition number of their normal
+# equations, and the gain of the Bayesian information criterion by which they do.
+MOST_SHOWN, LARGEST_SHOWN_CONDITION, CLEAR_GAIN = 10, 1e5, 20.0
+# Share of clipped samples at a phase from which the others there are left out too.
+CLIPPED_SHARE = 0.02
 # Findings whose samples are those of another kind.
 SAMPLES_OF = {"held": "stuck", "saturated": "clipped"}
 
@@ -107,6 +113,8 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     used = signals.part(steady.samples)
     limit, inflation = determined_harmonics(used.time, tracked, resolved_harmonics(used.time, tracked, points))
     fit, pace = refine_frequency(used.time, used.values, tracked, limit)
+    if lost := _undetermined(used, fit, resolved_harmonics(used.time, tracked, points)):
+        return Inspection(signals, faults, worst_first(findings(tracked)), total, reason=lost)
     amplitudes, residuals = fit.amplitudes, fit.residuals
     here = sound[(sound >= steady.samples.start) & (sound < steady.samples.stop)]
     if here.size < used.time.size:
@@ -122,6 +130,44 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     return Inspection(
         signals, faults, worst_first(seen), total, steady, every.apart().sizes, fit, pace, limit, inflation
     )
+
+
+def _same_phases(phase: np.ndarray, clipped: np.ndarray) -> np.ndarray:
+    """Return the samples at phases at which some are clipped: the others are the smaller ones by noise."""
+    bins = phase_bins(phase)
+    number = bins.centre.size
+    place = bins.place % number
+    share = np.bincount(place[clipped], minlength=number) / np.maximum(bins.count.sum(axis=0), 1)
+    return np.flatnonzero(share[place] > CLIPPED_SHARE)
+
+
+def _undetermined(used: Signals, fit: HarmonicFit, resolved: int) -> str:
+    """Return a message if the samples show more harmonics than their phases determine; else an empty one.
+
+    With the amplitudes of these harmonics the fit is clearly better, by the Bayesian information criterion.
+    """
+    order = fit.amplitudes.shape[1] - 1
+    if order >= min(resolved, MOST_SHOWN):
+        return ""
+    for more in range(order + 1, min(resolved, MOST_SHOWN) + 1):
+        moments = _fourier.sums(np.ones((1, used.time.size)), fit.frequency * used.time, 2 * more)[0]
+        size = np.linalg.eigvalsh(toeplitz(moments))
+        if not size[0] * LARGEST_SHOWN_CONDITION > size[-1]:
+            break
+        other = fit_harmonics(used.time, used.values, fit.frequency, more)
+        floor = 1e-24 * np.var(used.values, axis=1)
+        gain = used.time.size * np.log((fit.variances + floor) / (other.variances + floor))
+        worst = int(np.argmax(gain))
+        if gain[worst] > 2.0 * (more - order) * np.log(used.time.size) + CLEAR_GAIN:
+            bins = 2 * (resolved + 1)
+            count = np.bincount((fit.frequency * used.time % 1.0 * bins).astype(int), minlength=bins)
+            return (
+                f"recording: must have samples at all phases of its period, got {used.name!r}, in which none are at "
+                f"{np.mean(count == 0):.0%} of each period of {1.0 / fit.frequency:.6g} s: the others determine "
+                f"{order} harmonic{'s'[: order > 1]}, and {used.channels[worst]!r} has {more} at least. Record again "
+                "without the fault for which samples were left out, such as clipping by a small range."
+            )
+    return ""
 
 
 def _describe(faults: list[ChannelFaults], used: Signals, fit: HarmonicFit, start: int) -> None:
@@ -148,6 +194,8 @@ def _describe(faults: list[ChannelFaults], used: Signals, fit: HarmonicFit, star
         if clipped.size:
             scatter = repeat_noise(phase, values, clipped - start)
             fault.noisy = scatter > max(EXACT_SERIES * float(values.std()), 0.5 * fault.step)
+            fault.tails = fault.tails[:0]
+            fault.beside = _same_phases(phase, clipped[(clipped >= start) & (clipped < stop)] - start) + start
         means = means_of(bins, rest[here], fit.amplitudes[i], fault.step)
         fault.saturation = saturation_of(means)
         if fault.saturation is not None and not (clipped.size and fault.noisy):
@@ -236,7 +284,7 @@ def summary(name: str, seen: Inspection, still: Mapping[str, float]) -> Recordin
         channel: {
             "outliers": fault.outliers,
             "stuck": _union(fault.held, fault.brief, *(np.arange(s.start, s.stop) for s in fault.stuck)),
-            "clipped": _union(fault.low, fault.high, fault.saturated),
+            "clipped": _union(fault.low, fault.high, fault.beside, fault.saturated),
         }
         for channel, fault in zip(seen.signals.channels, seen.faults, strict=True)
     }
