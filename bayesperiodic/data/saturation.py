@@ -20,7 +20,7 @@ BETTER, GOODNESS = 25.0, 4.0
 # Harmonics of the noise that is slower than a cycle's details.
 SLOW_HARMONICS = 8
 # Range of the series relative to that of the values beyond which a force is more likely than a sensor.
-LARGEST_OVERLOAD = 3.0
+LARGEST_OVERLOAD = 5.0
 # Harmonics of a series that a sensor may limit, and the largest ratio of the slopes at both ends of its flat tops.
 MOST_OF_SENSOR, LARGEST_SKEW = 5, 2.5
 # Level of a force of one sign, relative to the range.
@@ -86,8 +86,10 @@ def means_of(bins: PhaseBins, residuals: np.ndarray, amplitudes: np.ndarray, ste
     left = np.concatenate([np.cumsum(power[::-1] - 2.0)[::-1], [0.0]])
     score = left + 2.0 * np.arange(left.size) * np.log(weights.size)
     best = int(np.argmin(score))
+    rest = values - _fourier.at_times(amplitudes[None, : best + 1], phase)[0]
+    misfit = float(weights @ rest**2) + (2.0 * best + 1.0) * np.log(weights.size)
     error = 1.0 / np.sqrt(float(weights.sum()))
-    return Means(phase, values, weights, error, best, float(score[best]))
+    return Means(phase, values, weights, error, best, misfit)
 
 
 @dataclass(frozen=True)
@@ -220,5 +222,5 @@ def _saturated(means: Means, basis: np.ndarray, ends: np.ndarray) -> Saturation 
     freedom = values.size - parameters
     if freedom < 1 or square > freedom + GOODNESS * np.sqrt(2.0 * freedom):
         return None
-    misfit = square - freedom + parameters * np.log(values.size)
+    misfit = square + parameters * np.log(values.size)
     return Saturation(float(low), float(high), ends, means.phase, series, series - model, misfit, basis.shape[1] // 2)
