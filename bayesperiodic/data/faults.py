@@ -3,8 +3,11 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import erf, erfc, pdtrc
+from scipy.stats import binom
 
 from bayesperiodic.data.quantisation import step_of
+from bayesperiodic.data.saturation import Saturation
 
 # Ranges at which sensors wrap: radians, degrees, turns; and powers of two of a quantised sensor's steps.
 SENSOR_TURNS = (2.0 * np.pi, 360.0, 1.0)
@@ -13,8 +16,9 @@ FEWEST_BITS, MOST_BITS = 6, 32
 ROUNDING = 1e-12
 # A jump wraps if it is a whole range to this share of it; what is left must be smooth, and small beside the jumps.
 WRAP_TOLERANCE, LARGEST_UNWRAPPED_STEP, SMOOTH_UNWRAPPED = 0.35, 0.5, 0.5
-# Samples of one value in a row that may be a stuck sensor, and how many times longer than usual ones they are.
-FEWEST_STUCK, LONG_RUN = 10, 10.0
+# Samples of one value in a row that may be a stuck sensor, how many times longer than usual ones they are, and so many
+# runs at an end of the range that they are clipped.
+FEWEST_STUCK, LONG_RUN, SEVERAL = 10, 10.0, 3
 # Clipped samples: fewest, fewest in a row, and how many times more than at the next level.
 FEWEST_CLIPPED, CLIPPED_RUN, PILED_UP = 6, 3, 6.0
 # Distance of outliers from the mean period in standard deviations of the others, and how often they may return.
@@ -30,6 +34,15 @@ MOST_DROPPED, FEWEST_VALUES = 0.45, 18
 ALL_DROPPED = 0.4
 # Repeated values of a slower logger: share of the runs that have the usual length.
 HELD = 0.9
+# Short runs of one value: fewest samples, p-value of as many by noise, and largest share of these; standard deviation of
+# the noise relative to the range below which there is none, and samples from which that is taken.
+FEWEST_HELD, CHANCE_RUNS, CHANCE_SHARE, EXACT, NOISE_SAMPLES = 3, 1e-3, 0.05, 1e-9, 20_000
+# Heavy tails: distance from which residuals belong to them [standard deviations of the others], expected number of
+# larger ones beyond which one is an outlier, and fewest samples between the two distances.
+TAIL, RARE, FEWEST_IN_TAIL = 4.0, 0.01, 3
+# Impulses of random size and sign: fewest, ratio of large sizes to small ones, the p-value from which they are not
+# one-sided, and standard errors of their correlation with the signal from which they replace it.
+FEWEST_IMPULSES, SPREAD_SIZES, ONE_SIDED, REPLACED = 10, 2.5, 0.01, 3.0
 
 
 @dataclass
@@ -42,7 +55,14 @@ class ChannelFaults:
     stuck: list[slice] = field(default_factory=list)
     low: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # clipped samples
     high: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    beside: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # at the same phases as clipped ones
     outliers: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    tails: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # as large as outliers, but noise
+    brief: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # of short runs of one value
+    saturation: Saturation | None = None  # flat tops of the mean period
+    saturated: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # samples of the flat tops
+    saturation_bias: float = 0.0  # if these are wrong [standard errors of all amplitudes]
+    noisy: bool = True  # beside the clipped samples, so that no signal without noise rests there
     held: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # that repeat the one before
     repeats: int = 1  # samples of each value, of a slower logger
 
@@ -85,7 +105,104 @@ def stuck_of(values: np.ndarray) -> list[slice]:
     usual = float(order[np.searchsorted(np.cumsum(order), 0.5 * order.sum())]) if order[-1] < 0.5 * values.size else 1.0
     usual = max(usual, float(np.quantile(length, 0.99)) if length.size > 100 else 1.0)
     long = np.flatnonzero(length >= max(FEWEST_STUCK, LONG_RUN * usual))
+    # Several runs at the largest or the smallest value are clipped.
+    level = values[first[long]]
+    for end in (values.max(), values.min()):
+        if np.count_nonzero(level == end) >= SEVERAL:
+            long, level = long[level != end], level[level != end]
     return [slice(int(first[i]), int(first[i] + length[i])) for i in long]
+
+
+def brief_of(values: np.ndarray, step: float) -> np.ndarray:
+    """Return the samples of runs of one value that are too long for noise of the size that the values have.
+
+    The next value of normal noise is the same one with a probability of erf(step/√8σ) at most, and with that of chance
+    pairs. Runs at the largest and smallest value are clipped, if anything. Signals without noise have none.
+    """
+    first, length = runs(values)
+    if length.size < 2 or length.max() < FEWEST_HELD:
+        return np.zeros(0, dtype=int)
+    noise = fast_noise(values)
+    if not noise > max(EXACT * float(np.ptp(values)), 0.5 * step):
+        return np.zeros(0, dtype=int)
+    # Runs of two count as chance: a hold of two samples is not told from it.
+    pairs = (np.count_nonzero(length == 2) + 1.0) / values.size
+    same = min(max(float(erf(step / (np.sqrt(8.0) * noise))), pairs), 1.0 - 1e-12)
+    size = np.arange(FEWEST_HELD, length.max() + 1)
+    found = np.cumsum(np.bincount(length)[::-1])[::-1][size]  # runs of that size or longer
+    chance = values.size * same ** (size - 1.0)
+    held = (chance < CHANCE_SHARE * found) & (pdtrc(found - 1, chance) < CHANCE_RUNS)
+    if not held.any():
+        return np.zeros(0, dtype=int)
+    level = values[first]
+    long = (length >= size[np.argmax(held)]) & (level != values.max()) & (level != values.min())
+    return np.flatnonzero(np.repeat(long, length))
+
+
+def fast_noise(values: np.ndarray) -> float:
+    """Return the standard deviation of white noise, by fourth differences, to which smooth signals add little."""
+    start = (values.size - min(values.size, NOISE_SAMPLES)) // 2
+    change = np.abs(np.diff(values[start : start + NOISE_SAMPLES], 4))
+    # Differences over repeated values are none of noise.
+    change = change[change > 0.0]
+    return MEDIAN_TO_SD * float(np.median(change)) / np.sqrt(70.0) if change.size else 0.0
+
+
+def single(samples: np.ndarray, phase: np.ndarray) -> np.ndarray:
+    """Return samples of runs that are not at the same phases [cycles] of most cycles, as those of a rest are."""
+    if not samples.size:
+        return samples
+    first = np.flatnonzero(np.diff(samples, prepend=-2) > 1)
+    often = _often(phase, samples[first])
+    keep = often < RETURNING * np.maximum(1.0, 3.0 * _expected(first.size, max(float(np.ptp(phase)), 1.0)))
+    return samples[np.repeat(keep, np.diff(np.append(first, samples.size)))]
+
+
+def repeat_noise(phase: np.ndarray, values: np.ndarray, left_out: np.ndarray) -> float:
+    """Return the standard deviation of values at the same phase of several cycles, without some of them.
+
+    It is that of values from the line between their neighbours in phase.
+    """
+    some = np.setdiff1d(np.arange(min(values.size, SCREENED)), left_out)
+    if some.size < FEWEST_CLIPPED:
+        return 0.0
+    place = phase[some] % 1.0
+    order = np.argsort(place)
+    place, signal = place[order], values[some][order]
+    width = np.maximum(place[2:] - place[:-2], np.finfo(float).tiny)
+    weight = np.clip((place[1:-1] - place[:-2]) / width, 0.0, 1.0)
+    rest = signal[1:-1] - (1.0 - weight) * signal[:-2] - weight * signal[2:]
+    return MEDIAN_TO_SD * float(np.median(np.abs(rest) / np.sqrt(1.0 + weight**2 + (1.0 - weight) ** 2)))
+
+
+def heavy_tails(residuals: np.ndarray, outliers: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """Return which of the outliers are noise: of heavy tails, or impulses of random size and sign.
+
+    The tails between four and eight standard deviations of the others are continued by a power law (median of the
+    logarithms of sizes; B. M. Hill, Ann. Stat. 3 (1975) 1163-1174). Faults have one size or sign, or replace the signal
+    by a value, and leave a gap in the sizes.
+    """
+    middle = float(np.median(residuals))
+    distance = np.abs(residuals - middle)
+    scale = MEDIAN_TO_SD * float(np.median(distance))
+    result = np.zeros(outliers.size, dtype=bool)
+    if not outliers.size or not scale > 0.0:
+        return result
+    sizes = distance[distance > TAIL * scale] / (TAIL * scale)
+    between = np.count_nonzero(sizes < FAR / TAIL)
+    chance = float(erfc(TAIL / np.sqrt(2.0))) * residuals.size
+    own = distance[outliers] / (TAIL * scale)
+    far = np.flatnonzero(distance > FAR * scale)
+    if between >= 2.0 * chance + FEWEST_IN_TAIL and between - chance >= far.size:
+        index = np.log(2.0) / float(np.median(np.log(sizes)))
+        result = sizes.size * np.maximum(own, 1.0) ** -index > RARE
+    elif far.size >= FEWEST_IMPULSES:
+        above = int(np.count_nonzero(residuals[far] > middle))
+        p_value = 2.0 * min(binom.cdf(above, far.size, 0.5), binom.sf(above - 1, far.size, 0.5))
+        spread = np.quantile(distance[far], 0.9) > SPREAD_SIZES * np.quantile(distance[far], 0.1)
+        replaced = abs(np.corrcoef(residuals[far], predicted[far])[0, 1]) > REPLACED / np.sqrt(far.size)
+        result[:] = spread and p_value > ONE_SIDED and not replaced
+    return result
 
 
 def clipped_of(values: np.ndarray, stuck: list[slice]) -> tuple[np.ndarray, np.ndarray]:
@@ -186,20 +303,25 @@ def _lone(far: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -
     after = np.where(last < values.size - 1, change[np.minimum(last, change.size - 1)], np.inf)
     lone = np.minimum(before, after) > 2.0 * usual + step
     cycles = max(float(np.ptp(phase)), 1.0)
-    bins = np.minimum((phase[first] % 1.0 * 64).astype(int), 63)
-    cycle = np.floor(phase[first] - phase[0]).astype(int)
-    often = np.zeros(64)
-    for k in range(64):
-        often[k] = np.unique(cycle[bins == k]).size / cycles
-    every = often + np.roll(often, 1) + np.roll(often, -1)
     if far.mean() < 0.2:
-        lone &= every[bins] < RETURNING * np.maximum(1.0, 3.0 * _expected(first.size, cycles))
+        lone &= _often(phase, first) < RETURNING * np.maximum(1.0, 3.0 * _expected(first.size, cycles))
     result = np.zeros(values.size, dtype=bool)
     for a, n in zip(first[lone], length[lone], strict=True):
         result[a : a + n] = True
     if value is not None and result[values == value].mean() > ALL_DROPPED:
         result |= values == value
     return np.flatnonzero(result)
+
+
+def _often(phase: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Return the share of the cycles with a run at about the phase of each run, by their first samples."""
+    bins = np.minimum((phase[first] % 1.0 * 64).astype(int), 63)
+    cycle = np.floor(phase[first] - phase[0]).astype(int)
+    often = np.zeros(64)
+    for k in range(64):
+        often[k] = np.unique(cycle[bins == k]).size / max(float(np.ptp(phase)), 1.0)
+    every = often + np.roll(often, 1) + np.roll(often, -1)
+    return np.asarray(every[bins])
 
 
 def _expected(runs: int, cycles: float) -> float:

@@ -8,13 +8,15 @@ import numpy as np
 from bayesperiodic import _fourier
 from bayesperiodic.data import clocks
 from bayesperiodic.data.coverage import determined_harmonics, resolved_harmonics
-from bayesperiodic.data.faults import ChannelFaults, dropped_value, jumps, outliers_of
+from bayesperiodic.data.faults import ChannelFaults, dropped_value, jumps, outliers_of, single
 from bayesperiodic.data.groups import CommonFit, Windowed, common_span, common_windows, leading, refine_groups, within
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
+    HarmonicFit,
     Pace,
     fit_harmonics,
 )
+from bayesperiodic.data.mean_period_faults import LEAST_MOVING, describe, undetermined
 from bayesperiodic.data.recording_check import (
     RUINOUS,
     SEVERITIES,
@@ -32,10 +34,10 @@ from bayesperiodic.data.steadiness import Steady, Windows, steady_part
 
 # Largest relative change of an amplitude within half of a steady part.
 LARGEST_CHANGE = 0.1
-# Least share of samples at which no channel is stuck.
-LEAST_MOVING = 0.1
 # Harmonics of the first mean period, from which outliers are left out.
 ROUGH_HARMONICS = 40
+# Findings whose samples are those of another kind.
+SAMPLES_OF = {"held": "stuck", "saturated": "clipped"}
 
 
 @dataclass(frozen=True)
@@ -140,13 +142,17 @@ def inspect(
     determined = [determined_harmonics(part.time, tracked, limit) for part, limit in zip(parts, highest, strict=True)]
     limits, inflation = [limit for limit, _ in determined], [factors for _, factors in determined]
     fit, pace = refine_groups(parts, tracked, limits, other)
+    if lost := next(filter(None, map(undetermined, parts, fit.each, highest)), ""):
+        return Inspection(groups, faults, worst_first(findings(tracked)), total, reason=lost)
     for i, (group, part) in enumerate(zip(groups, used, strict=True)):
-        residuals = fit.each[i].residuals
+        amplitudes, residuals = fit.each[i].amplitudes, fit.each[i].residuals
         here = sound[i][(sound[i] >= part.start) & (sound[i] < part.stop)]
         if here.size < parts[i].time.size:
-            near = fit_harmonics(group.time[here], group.values[:, here], tracked, limits[i]).amplitudes
-            residuals = parts[i].values - _fourier.at_times(near, tracked * parts[i].time)
+            near = fit_harmonics(group.time[here], group.values[:, here], fit.frequency, limits[i])
+            amplitudes = near.amplitudes
+            residuals = parts[i].values - _fourier.at_times(amplitudes, fit.frequency * parts[i].time)
         _set_outliers(faults[i], parts[i], residuals, fit.frequency, part, moving[i])
+        describe(faults[i], parts[i], HarmonicFit(fit.frequency, amplitudes, residuals), part.start)
     seen = findings(fit.frequency, limits, used)
     channels = [channel for group in groups for channel in group.channels]
     ends = (max(group.time[0] for group in groups), min(group.time[-1] for group in groups))
@@ -261,6 +267,11 @@ def _sound(
 
     These outliers become those of the channels.
     """
+    for fault in faults:
+        fault.brief = single(fault.brief, signals.time * fundamental)
+        if fault.brief.size:
+            moving = np.setdiff1d(moving, fault.brief)
+            calm = replace(signals, values=bounded(signals.values)).part(moving)
     if not jumps(signals.values) and all(dropped_value(values) is None for values in signals.values):
         return moving
     limit = min(resolved_harmonics(calm.time, fundamental, points), ROUGH_HARMONICS)
@@ -288,19 +299,24 @@ def _unsteady(groups: list[Signals], every: Windows) -> str:
     )
 
 
+def _union(*samples: np.ndarray) -> np.ndarray:
+    """Return the numbers of samples that are in one of several arrays."""
+    return np.unique(np.concatenate(samples))
+
+
 def summary(name: str, channels: Iterable[str], seen: Inspection, still: Mapping[str, float]) -> RecordingCheck:
     """Return what was seen, and channels with one value, as the result of `Recording.check`."""
     import pandas as pd
 
     bad: dict[str, dict[str, np.ndarray]] = {}
     rows: dict[str, dict[str, float]] = {}
-    named = {(f.channel, "stuck" if f.kind == "held" else f.kind) for f in seen.findings}
+    named = {(f.channel, SAMPLES_OF.get(f.kind, f.kind)) for f in seen.findings}
     for group, faults in zip(seen.groups, seen.faults, strict=True):
         for channel, values, fault in zip(group.channels, group.values, faults, strict=True):
             places = {
                 "outliers": fault.outliers,
-                "stuck": np.concatenate([fault.held, *(np.arange(s.start, s.stop) for s in fault.stuck)]),
-                "clipped": np.concatenate([fault.low, fault.high]),
+                "stuck": _union(fault.held, fault.brief, *(np.arange(s.start, s.stop) for s in fault.stuck)),
+                "clipped": _union(fault.low, fault.high, fault.beside, fault.saturated),
             }
             bad[channel] = {kind: v if (channel, kind) in named else v[:0] for kind, v in places.items()}
             rows[channel] = {

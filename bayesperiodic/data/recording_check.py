@@ -48,9 +48,9 @@ class Finding(Storable):
     Attributes
     ----------
     kind : str
-        "constant", "wraps", "stuck", "held" (a slower logger), "clipped", "outliers", "gaps", "ramp", "transient",
-        "drift", "beating", "amplitude step", "phase step" or "clock" (the phase of a channel drifts steadily against
-        the first one).
+        "constant", "wraps", "stuck", "held" (a slower logger), "clipped", "saturated" (flat tops of the mean period),
+        "outliers", "heavy tails", "gaps", "ramp", "transient", "drift", "beating", "amplitude step", "phase step" or
+        "clock" (the phase of a channel drifts steadily against the first one).
     channel : str
         Empty for all channels together.
     severity : str
@@ -102,7 +102,8 @@ def signal_faults(values: np.ndarray, *, drive: bool = False) -> ChannelFaults:
     stuck = faults.stuck_of(values)
     low, high = (np.zeros(0, dtype=int),) * 2 if wrap else faults.clipped_of(values, stuck)
     repeats, held = faults.held_of(values)
-    return ChannelFaults(step, wrap, jumps, stuck, low, high, held=held, repeats=repeats)
+    brief = faults.brief_of(values, step) if repeats == 1 else held[:0]
+    return ChannelFaults(step, wrap, jumps, stuck, low, high, brief=brief, held=held, repeats=repeats)
 
 
 def bounded(values: np.ndarray) -> np.ndarray:
@@ -232,7 +233,11 @@ def sample_findings(
     bad = np.zeros(total, dtype=bool)
     for part in fault.stuck:
         bad[part] = True
-    bad[np.concatenate([fault.low, fault.high, fault.outliers])] = True
+    bad[np.concatenate([fault.brief, fault.low, fault.high, fault.outliers])] = True
+    if fault.tails.size:
+        yield _tails(channel, time, fault.tails)
+    if fault.saturation is not None and not fault.low.size and not fault.high.size:
+        yield _saturated(channel, time, fault.saturated, fault)
     if not bad.any():
         return
     every = effect_of(time[used], values[used], bad[used], frequency, harmonics) if frequency else UNKNOWN
@@ -249,10 +254,14 @@ def sample_findings(
             effect = effect_of(time[used], kept[used], only[used], frequency or 1.0, harmonics)
         return _finding(channel, kind, time, samples, what, effect, frequency, bool(only[used].any()))
 
-    stuck = [part for part in fault.stuck if _moves(every, part, fault.step, used)]
-    if stuck:
-        samples = np.concatenate([np.arange(part.start, part.stop) for part in stuck])
-        level = ", ".join(f"{values[part.start]:.6g}" for part in stuck[:3])
+    still = np.zeros(total, dtype=bool)
+    still[fault.brief] = True
+    for part in fault.stuck:
+        still[part] = _moves(every, part, fault.step, used)
+    samples = np.flatnonzero(still)
+    if samples.size:
+        first = samples[np.diff(samples, prepend=-2) > 1]
+        level = ", ".join(f"{values[i]:.6g}" for i in first[:3]) + (", …" if first.size > 3 else "")
         yield finding("stuck", samples, f"is stuck at {level}")
     clipped = [
         (end, sign)
@@ -262,11 +271,44 @@ def sample_findings(
     if clipped:
         samples = np.sort(np.concatenate([end for end, _ in clipped]))
         level = " and ".join(f"{values[end[0]]:.6g}" for end, _ in clipped)
-        yield finding("clipped", samples, f"is clipped at {level}")
+        if fault.noisy:
+            yield finding("clipped", samples, f"is clipped at {level}")
+        else:
+            yield _saturated(channel, time, samples, fault, level)
     if fault.outliers.size:
         low, high = values[fault.outliers].min(), values[fault.outliers].max()
         which = f"reads {low:.6g}" if low == high else f"has outliers between {low:.6g} and {high:.6g}"
         yield finding("outliers", fault.outliers, which)
+
+
+def _tails(channel: str, time: np.ndarray, samples: np.ndarray) -> Finding:
+    """Return the finding of heavy tails."""
+    share = samples.size / time.size
+    return Finding(
+        "heavy tails", channel, HARMLESS, times_of(time, samples), samples.size, share, 0.0,
+        f"{channel} has noise of heavy tails: {samples.size} samples ({share:.2g} of all) are more than "
+        f"{faults.FAR:g} standard deviations of the others from the mean period. It biases nothing, and is in the "
+        "standard errors",
+    )  # fmt: skip
+
+
+def _saturated(channel: str, time: np.ndarray, samples: np.ndarray, fault: ChannelFaults, level: str = "") -> Finding:
+    """Return the finding of flat tops of a mean period, which are those of a sensor or of the motion itself."""
+    found, bias = fault.saturation, np.nan
+    if found is not None:
+        level = level or " and ".join(f"{v:.6g}" for v in (found.low, found.high) if np.isfinite(v))
+        bias = fault.saturation_bias
+    sensor = found is not None and found.like_a_sensor and bias > SERIOUS_BIAS
+    share, times = samples.size / time.size, times_of(time, samples)
+    size = "" if np.isnan(bias) else f", with a bias of {bias:.3g} standard errors"
+    return Finding(
+        "saturated", channel, SERIOUS if sensor else HARMLESS, times, samples.size, share, bias,
+        f"{channel} stays at {level} {_when(times)} ({samples.size} samples, {share:.2g} of all), where a smooth "
+        f"continuation of the others goes beyond. Either a sensor or a stop limits it{size}, or it is limited itself, "
+        "as a force of friction or contact",
+        f"if it is the sensor: record again with a larger range, or recording.without(clipped=True, "
+        f"channel={channel!r})",
+    )  # fmt: skip
 
 
 def _moves(effect: Effect, part: slice, step: float, used: slice) -> bool:
