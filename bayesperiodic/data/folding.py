@@ -125,9 +125,9 @@ def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, 
     drive = first_guess(signals, frequency, 1)
     time, values = signals.time, signals.values
     if frequency is None:
-        driven = replace(signals, values=values[: signals.inputs])
-        part, tracked = counted_cycles(driven, drive, given=False)
-        time, values, driven = time[part], values[:, part], driven.values[:, part]
+        part, tracked = counted_cycles(signals.drive(), drive, given=False)
+        time, values = time[part], values[:, part]
+        driven = values[: signals.inputs]
         time = even_times(time, driven, tracked)
         drive = refine_frequency(time, driven, tracked, resolved_harmonics(time, tracked, time.size))[0].frequency
     time = even_times(time, values, drive)
