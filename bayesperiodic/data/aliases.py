@@ -3,14 +3,14 @@
 import numpy as np
 
 from bayesperiodic.data.coverage import covered_harmonics
-from bayesperiodic.data.harmonics import MINIMUM_CYCLES, HarmonicFit, refine_frequency
+from bayesperiodic.data.harmonics import MINIMUM_CYCLES, HarmonicFit, nearby_fit
 
 # Samples that are searched, points of a grid of time for the shortest period, and the highest frequency in mean
 # sampling rates.
 SEARCHED, POINTS_PER_PERIOD, HIGHEST_RATE = 4000, 8, 30.0
 # Largest spectral lines whose frequencies, and parts of them, may be the fundamental, and harmonics that are compared.
 PEAKS, DIVISORS, COMPARED_HARMONICS = 8, (1, 2, 3), 5
-# Least height of the spectral window where frequencies may be confused, most of its peaks that are compared, and the
+# Least height of the spectral window where frequencies may be confused, so many peaks that are compared, and the
 # difference of the deviances of two frequencies that tells them.
 CONFUSED, WINDOW_PEAKS, DECISIVE = 0.7, 12, 25.0
 # Least share of the variance that a frequency explains.
@@ -36,8 +36,11 @@ def search_frequency(time: np.ndarray, values: np.ndarray, guess: float | None) 
     Candidates are a guess, the largest lines of the spectrum, and parts of them; None explains half of the variance.
     """
     scaled = (values - values.mean(axis=1, keepdims=True)) / values.std(axis=1, keepdims=True)
-    frequency, power = spectral_lines(time, scaled)
-    peaks = _peaks(power.sum(axis=0), MINIMUM_CYCLES / np.ptp(time), frequency)[:PEAKS]
+    frequency, power = spectral_lines(time, np.concatenate([scaled, np.ones((1, time.size))]))
+    slow = 4 * MINIMUM_CYCLES
+    # Drifts and their aliases are no lines.
+    slowly = np.convolve(power[-1] > CONFUSED**2, np.ones(2 * slow + 1), "same") > 0.5
+    peaks = _peaks(np.where(slowly, 0.0, power[:-1].sum(axis=0)), MINIMUM_CYCLES / np.ptp(time), frequency)[:PEAKS]
     candidates = [line / k for line in frequency[peaks] for k in DIVISORS] + ([guess] if guess else [])
     found: dict[float, float] = {}
     for candidate in candidates:
@@ -56,6 +59,13 @@ def search_frequency(time: np.ndarray, values: np.ndarray, guess: float | None) 
     return near[0]
 
 
+def explains(time: np.ndarray, values: np.ndarray, frequency: float) -> bool:
+    """Return whether a frequency explains half of the variance of all signals (channels, samples), by some samples."""
+    some = slice(None, None, 1 + time.size // SEARCHED)
+    fit = _fitted(time[some], values[:, some], frequency)
+    return fit is not None and bool((fit.variances < (1.0 - LEAST_EXPLAINED) * values[:, some].var(axis=1)).all())
+
+
 def aliases(time: np.ndarray, values: np.ndarray, frequency: float) -> list[float]:
     """Return other frequencies that explain signals (channels, samples) as well as this one, the lowest first.
 
@@ -64,7 +74,7 @@ def aliases(time: np.ndarray, values: np.ndarray, frequency: float) -> list[floa
     lines, power = spectral_lines(time, np.ones((1, time.size)))
     window = np.sqrt(power[0])
     peaks = _peaks(window, MINIMUM_CYCLES / np.ptp(time), lines)
-    peaks = peaks[window[peaks] > CONFUSED][:WINDOW_PEAKS]
+    peaks = np.sort(peaks[window[peaks] > CONFUSED])[:WINDOW_PEAKS]
     own = _fitted(time, values, frequency)
     if own is None:
         return []
@@ -96,7 +106,7 @@ def _peaks(height: np.ndarray, lowest: float, frequency: np.ndarray) -> np.ndarr
 def _fitted(time: np.ndarray, values: np.ndarray, frequency: float) -> HarmonicFit | None:
     """Return the fit at the best frequency near this one; None if its phases are not covered."""
     few = min(COMPARED_HARMONICS, covered_harmonics(time, frequency, time.size))
-    return None if few < 1 else refine_frequency(time, values, frequency, few)[0]
+    return None if few < 1 else nearby_fit(time, values, frequency, few)
 
 
 def _deviance(fit: HarmonicFit) -> float:

@@ -183,13 +183,12 @@ def automatic_periods(groups: list[Signals], frequency: float | None) -> "tuple[
         )
     drive = first_guess(first, frequency, 1)
     if frequency is None:
-        driven = replace(first, values=first.values[: first.inputs])
-        part, tracked = counted_cycles(driven, drive, given=False)
-        driven = driven.part(part)
+        part, tracked = counted_cycles(first.drive(), drive, given=False)
+        driven = first.drive().part(part)
         groups = [group.part(within(group.time, driven.time)) for group in groups]
-        time, driven = driven.time, driven.values
-        time = even_times(time, driven, tracked)
-        drive = refine_frequency(time, driven, tracked, resolved_harmonics(time, tracked, time.size))[0].frequency
+        time = even_times(driven.time, driven.values, tracked)
+        highest = resolved_harmonics(time, tracked, time.size)
+        drive = refine_frequency(time, driven.values, tracked, highest)[0].frequency
     each = [_response_period(group, drive) for group in groups]
     for chosen, evidence in each:
         if chosen is None:
@@ -238,7 +237,7 @@ def _warn(name: str, pace: Pace, cycles: int, seen: Inspection, estimated: bool)
             stacklevel=4,
         )
     elif pace.wander:
-        followed = estimated and pace.diffusion > 0.0 and not seen.signals.inputs
+        followed = estimated and pace.diffusion > 0.0 and not any(group.inputs for group in seen.groups)
         warnings.warn(
             f"{name}: the phase wanders irregularly by {360.0 * pace.wander:.2g}° of the response period over the "
             f"{cycles} cycles used, while the amplitude is steadier. "

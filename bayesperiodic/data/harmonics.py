@@ -91,6 +91,13 @@ def refine_frequency(
     return refined[0], _pace(time, *refined)
 
 
+def nearby_fit(time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int) -> HarmonicFit | None:
+    """Return the fit at the best frequency near this one; None if it moves to another number of cycles."""
+    fit, *_, information = _refined(time, channels, frequency, harmonics)
+    near = abs(fit.frequency - frequency) * np.ptp(time) < 1.0
+    return fit if near and information > 0.0 and np.isfinite(fit.amplitudes).all() else None
+
+
 def _refined(
     time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int, iterations: int = 20
 ) -> tuple[HarmonicFit, np.ndarray, np.ndarray, float]:
@@ -106,8 +113,8 @@ def _refined(
 
 def next_step(gradient: float, information: float, frequency: float, duration: float) -> float:
     """Return the Gauss-Newton step of a frequency, 0 where it is small compared with the standard error."""
-    step = gradient / information
-    if abs(step) < max(1e-3 / np.sqrt(information), np.finfo(float).eps * frequency):
+    step = gradient / information if information > 0.0 else 0.0
+    if abs(step) < max(1e-3 / np.sqrt(information or np.inf), np.finfo(float).eps * frequency):
         return 0.0
     return float(np.clip(step, -0.25 / duration, 0.25 / duration))
 
@@ -291,9 +298,8 @@ def track_frequency(time: np.ndarray, channels: np.ndarray, fundamental: float) 
                 part, values = time[window][used], channels[:, window][:, used]
             else:
                 part, values = time[window], channels[:, window]
-            found = _refined(part, values, fundamental, few)[0].frequency
-            # A frequency that is further away has another number of cycles.
-            fundamental = found if abs(found - fundamental) * np.ptp(part) < 1.0 else fundamental
+            found = nearby_fit(part, values, fundamental, few)
+            fundamental = fundamental if found is None else found.frequency
         if cycles >= total / 2:
             return fundamental
         cycles = min(2 * cycles, total / 2)

@@ -106,8 +106,8 @@ def inspect(
             for group, these in zip(groups, moving, strict=True)
         ]
         first = calm[leading(groups)]
-        counted, tracked = counted_cycles(first, first_guess(first, frequency, periods), frequency is not None)
-        counted = first.time[counted]
+        part, tracked = counted_cycles(first, first_guess(first, frequency, periods), frequency is not None)
+        counted = first.time[part]
         for group in calm:
             resolved_harmonics(group.time[within(group.time, counted)], tracked, points)
         span = common_span(groups, tracked)

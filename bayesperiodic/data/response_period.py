@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.special import fdtrc
 
-from bayesperiodic.data.coverage import resolved_harmonics
+from bayesperiodic.data.coverage import per_cycle, resolved_harmonics
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES, fit_harmonics
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
 
@@ -159,7 +159,12 @@ def _lines(time: np.ndarray, values: np.ndarray, frequency: float, periods: int,
 
 
 def _highest(time: np.ndarray, frequency: float, periods: int) -> int:
-    limit = resolved_harmonics(time, frequency / periods, time.size)
+    limit = min(int((per_cycle(time, frequency / periods) - 1.0) / 2.0), (time.size - 2) // 2)
+    if limit < 1:
+        raise ValueError(
+            f"periods: must be given for at least 3 samples per period of {1.0 / frequency:.6g} s, got 'auto' and "
+            f"{per_cycle(time, frequency):.3g}; give their number."
+        )
     return min(limit, max(TESTED_HARMONICS * periods, 1))
 
 

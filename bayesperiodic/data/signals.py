@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from bayesperiodic import _checks
-from bayesperiodic.data.aliases import SEARCHED, aliases, samples_per_cycle, search_frequency
+from bayesperiodic.data.aliases import SEARCHED, aliases, explains, samples_per_cycle, search_frequency
 from bayesperiodic.data.coverage import SLOW, covered_harmonics, per_cycle, resolved_harmonics
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
@@ -26,6 +26,8 @@ SMALLEST_PERIOD_STEP, SIGNIFICANT_PERIOD_STEP = 1e-3, 8.0
 # Fewest samples of which a frequency is guessed, and fewest in a cycle of the strongest harmonic at a regular rate; aliases
 # that are listed.
 FEWEST_SAMPLES, FEWEST_PER_CYCLE, LISTED_ALIASES = 8, 4.0, 4
+# Cycles that are searched for the frequency if there are many samples in each.
+SEARCHED_CYCLES = 50.0
 # Standard error of the phase [cycles] behind a gap with which cycles can be counted: five of them are less than a
 # quarter of a cycle.
 COUNTED = 0.05
@@ -66,6 +68,10 @@ class Signals:
         """Return the signals at the selected samples."""
         return replace(self, time=self.time[samples], values=self.values[:, samples])
 
+    def drive(self) -> "Signals":
+        """Return the inputs alone."""
+        return replace(self, channels=self.channels[: self.inputs], values=self.values[: self.inputs])
+
 
 def first_guess(signals: Signals, frequency: float | None, periods: int) -> float:
     """Return a first estimate of the fundamental frequency; raise a ValueError for fewer than three cycles."""
@@ -74,7 +80,7 @@ def first_guess(signals: Signals, frequency: float | None, periods: int) -> floa
         fundamental: float | None = _checks.positive("frequency", frequency) / periods
         remedy = f"check frequency = {frequency!r} Hz and periods = {periods}"
     else:
-        guess = _estimate(replace(signals, values=signals.values[: signals.inputs or None]))
+        guess = _estimate(signals.drive() if signals.inputs else signals)
         fundamental = guess / (periods if signals.inputs else 1) if guess else None
     if fundamental is None or cycles_of(signals.time, fundamental) < MINIMUM_CYCLES:
         period = "no period" if fundamental is None else f"{cycles_of(signals.time, fundamental):.2f} cycles"
@@ -89,12 +95,15 @@ def _estimate(signals: Signals) -> float | None:
     """Return a frequency from the longest stretch, or else from spectral lines; refuse one that has aliases."""
     time, values = _longest_stretch(signals)
     guess = guess_frequency(time, values) if time.size > FEWEST_SAMPLES else None
-    if guess is not None and per_cycle(time, guess) >= SLOW and cycles_of(time, guess) >= MINIMUM_CYCLES:
+    fast = guess is not None and per_cycle(time, guess) >= SLOW and cycles_of(time, guess) >= MINIMUM_CYCLES
+    step = np.diff(time)
+    even = bool(step.max() <= USUAL_STEPS * np.median(step))
+    if guess is not None and fast and even and explains(time, values, guess):
         return guess
-    some = slice(0, SEARCHED)
+    some = _searched(signals.time, guess if fast else None)
     time, values = signals.time[some], signals.values[:, some]
     found = search_frequency(time, values, guess)
-    if found is None:
+    if found is None or (fast and even or guess is None) and per_cycle(time, found) >= SLOW:
         return guess
     others = aliases(time, values, found)
     if (many := samples_per_cycle(time, values, found, others)) < FEWEST_PER_CYCLE:
@@ -104,6 +113,12 @@ def _estimate(signals: Signals) -> float | None:
             "`frequency=`, or sample faster or at irregular times."
         )
     return found
+
+
+def _searched(time: np.ndarray, guess: float | None) -> slice:
+    """Return the last samples, or every so many in the last cycles of a frequency."""
+    count = SEARCHED if guess is None else int(np.count_nonzero(time > time[-1] - SEARCHED_CYCLES / guess))
+    return slice(-max(count, SEARCHED), None, 1 + count // (SEARCHED + 1))
 
 
 def _longest_stretch(signals: Signals) -> tuple[np.ndarray, np.ndarray]:

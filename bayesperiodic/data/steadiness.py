@@ -20,7 +20,7 @@ ENOUGH, LARGEST_WINDOW_CONDITION = 0.5, 30.0
 # Share of the windows with samples that have enough of them; longer windows are tried otherwise.
 MOST_COVERED = 0.75
 # Samples for each unknown in a window of slow sampling.
-SLOW_SAMPLES = 2.0
+SLOW_SAMPLES = 3.0
 # Range of an amplitude in a steady part, relative to the amplitude and in standard deviations of a cycle's noise.
 SMALL_RANGE, NOISE_RANGE = 0.08, 14.0
 # Least level of a steady part relative to the largest amplitudes: a part at rest is steady too.

@@ -9,7 +9,7 @@ from scipy import stats
 
 import bayesperiodic as bp
 from bayesperiodic import _fourier
-from bayesperiodic.data import folding, harmonics
+from bayesperiodic.data import folding, harmonics, lines
 from tests.known import NOISES, autoregressive, grid
 
 FREQUENCY = 2.317
@@ -151,13 +151,13 @@ def test_freedom_of_the_variance_is_twice_the_number_of_lines(cycles, freedom):
 def test_slow_noise_is_extrapolated_to_the_mean_with_few_degrees_of_freedom():
     """Expected powers of lines 1, 2, … of a random walk fall as 1/j²; those of white noise are equal."""
     line = np.arange(1.0, 41.0)
-    slow, freedom = folding._at_zero(line**-2)
+    slow, freedom = lines._at_zero(line**-2)
     assert slow > 3.0
     assert freedom == pytest.approx(2.0, abs=0.1)
-    white, freedom = folding._at_zero(np.ones(40))
+    white, freedom = lines._at_zero(np.ones(40))
     assert white == pytest.approx(1.0, rel=0.1)
     assert freedom > 10.0
-    assert folding._at_zero(np.zeros(40))[0] == 0.0
+    assert lines._at_zero(np.zeros(40))[0] == 0.0
 
 
 @pytest.mark.slow
@@ -425,9 +425,12 @@ def test_noise_is_no_irregular_phase(coefficient):
 def test_lines_between_harmonics_are_those_of_the_fourier_transform(cycles, points):
     signal = np.random.default_rng(1).standard_normal((cycles, points))
     power = np.abs(np.fft.fft(signal.ravel())) ** 2
-    found = np.abs(folding._between(signal)) ** 2
+    time = np.arange(cycles * points) / points
+    sampling = lines.Sampling.of(time, 1.0, 1, cycles)
+    assert sampling.points == 4 * points
+    found = np.abs(sampling.between(sampling.on_grid(signal.ravel()))) ** 2 * signal.size**2
     for side in range(1, len(found) + 1):
-        np.testing.assert_allclose(found[side - 1], power[side::cycles], rtol=1e-9)
+        np.testing.assert_allclose(found[side - 1, :points], power[side::cycles], rtol=1e-9)
 
 
 def test_constant_period_has_no_drift():

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import quad
 
 from bayesperiodic import _fourier
-from bayesperiodic.data import folding, harmonics
+from bayesperiodic.data import folding, harmonics, lines
 from bayesperiodic.data.signals import Signals
 
 
@@ -30,7 +30,7 @@ def test_noise_of_a_harmonic_is_the_mean_power_of_the_lines_beside_it(row):
     values = np.cos(2 * np.pi * 0.3 * time) + 0.1 * np.random.default_rng(1).standard_normal((2, time.size))
     values[1] *= 3.0
     fit = harmonics.fit_harmonics(time, values, 0.3, 3)
-    one_cycle, noise = folding._noise(signals(time, *values), fit, row, cycles)
+    one_cycle, noise = folding._noise(signals(time, *values), fit, row, cycles, lines.Sampling.of(time, 0.3, 3, cycles))
     basis = design(0.3 * time, 3)
     residual = values[row] - basis @ np.linalg.lstsq(basis, values[row], rcond=None)[0]
     power = np.abs(np.fft.fft(residual) / time.size) ** 2
@@ -41,7 +41,7 @@ def test_noise_of_a_harmonic_is_the_mean_power_of_the_lines_beside_it(row):
         assert noise.freedom[h] == pytest.approx(36.0)
         assert one_cycle[h] == pytest.approx(4.0 * np.sum(np.abs(each[:, h]) ** 2) / (cycles - 1))
     between = [power[j] for j in range(1, 60) if j % cycles]
-    assert (noise.variance[0], noise.freedom[0]) == pytest.approx(folding._at_zero(np.array(between[:40])))
+    assert (noise.variance[0], noise.freedom[0]) == pytest.approx(lines._at_zero(np.array(between[:40])))
     assert noise.lines[1:] == pytest.approx(36.0)
     assert one_cycle[0] == pytest.approx(np.sum(np.abs(each[:, 0]) ** 2) / (cycles - 1))
 
@@ -50,7 +50,7 @@ def test_noise_of_a_harmonic_is_the_mean_power_of_the_lines_beside_it(row):
 @pytest.mark.parametrize("line", [0, 1, 7])
 def test_power_of_noise_with_exponential_correlation_is_that_of_quadrature(time, line):
     expected = quad(lambda u: (1 - u) * np.exp(-u / time) * np.cos(2 * np.pi * line * u), 0, 1, epsabs=1e-13)[0]
-    assert folding._exponential(time, 7)[line] == pytest.approx(expected, abs=1e-12)
+    assert lines._exponential(time, 7)[line] == pytest.approx(expected, abs=1e-12)
 
 
 def test_power_at_zero_is_the_mean_over_the_spectra_by_their_likelihoods():
@@ -76,14 +76,14 @@ def test_power_at_zero_is_the_mean_over_the_spectra_by_their_likelihoods():
         count = 8 if number == 0 else 2
         values.append(shape[0] * power[:count].sum() / shape[1 : count + 1].sum())
     share = np.array(weights) / np.sum(weights)
-    expected, freedom = folding._at_zero(power)
+    expected, freedom = lines._at_zero(power)
     assert 0.02 < share[0] < 0.98
     assert expected == pytest.approx(np.exp(share @ np.log(values)), rel=1e-6)
     assert freedom == pytest.approx(1.0 / (share[0] / 16.0 + (1.0 - share[0]) / 2.0), rel=1e-6)
 
 
 def test_lines_without_power_say_nothing_of_the_mean():
-    assert folding._at_zero(np.zeros(5)) == (0.0, 16.0)
+    assert lines._at_zero(np.zeros(5)) == (0.0, 16.0)
 
 
 @pytest.mark.parametrize(("factor", "kept"), [(1.001, 4), (0.999, 2)])
@@ -113,7 +113,9 @@ def test_power_of_a_signal_is_that_of_its_amplitudes():
 def test_exact_data_have_no_noise_and_the_degrees_of_freedom_of_the_lines():
     time = np.arange(64) / 8.0
     fit = harmonics.HarmonicFit(1.0, np.array([[0.5, 1.0, 0.0]], dtype=complex), np.zeros((1, 64)))
-    one_cycle, noise = folding._noise(signals(time, np.round(np.cos(2 * np.pi * time), 9)), fit, 0, 8)
+    one_cycle, noise = folding._noise(
+        signals(time, np.round(np.cos(2 * np.pi * time), 9)), fit, 0, 8, lines.Sampling.of(time, 1.0, 2, 8)
+    )
     assert one_cycle.tolist() == noise.variance.tolist() == [0.0, 0.0, 0.0]
     assert noise.freedom.tolist() == noise.lines.tolist() == [16.0, 16.0, 16.0]
 
@@ -127,7 +129,7 @@ def test_repeated_quantisation_errors_count_with_three_degrees_of_freedom():
     clean = 3.0 * np.cos(2 * np.pi * time) + np.sin(4 * np.pi * time)
     values = 0.25 * np.round((clean + 0.013) / 0.25)
     fit = harmonics.fit_harmonics(time, values[None], 1.0, 3)
-    _, noise = folding._noise(signals(time, values), fit, 0, 20)
+    _, noise = folding._noise(signals(time, values), fit, 0, 20, lines.Sampling.of(time, 1.0, 3, 20))
     repeated = 0.25**2 / 12 / 16
     assert noise.variance == pytest.approx(repeated * np.array([1.0, 4.0, 4.0, 4.0]), rel=1e-3)
     assert noise.freedom == pytest.approx(np.full(4, 3.0))
