@@ -157,7 +157,10 @@ class Observation:
     @cached_property
     def measured_rate(self) -> np.ndarray:
         """Derivative (points, channels) of the measured outputs by their phase [per response period]."""
-        return self._rate(self.data)
+        trend = self._trend(self.data)
+        spectrum = np.fft.rfft(self.data - trend * self._ramp, axis=0)
+        spectrum *= self._at_nyquist(2j * np.pi * self._harmonic[:, None])
+        return np.fft.irfft(spectrum, n=self._points, axis=0) + trend
 
     def errors(self, values: np.ndarray) -> list[np.ndarray]:
         """Return the components (…, size) of errors of the measured values (…, points, channels), an array a block."""
