@@ -45,8 +45,8 @@ def expand_priors(
 
 def plain_names(names: Iterable[str], local: Iterable[str], experiments: Iterable[str]) -> dict[str, str]:
     """Return the plain names of parameters by their full names: k by k, and theta16 by ``theta16[run 7]``."""
-    own = {local_name(plain, run): plain for plain in local for run in experiments}
-    return {name: own.get(name, name) for name in names}
+    plain_by_name = {local_name(plain, run): plain for plain in local for run in experiments}
+    return {name: plain_by_name.get(name, name) for name in names}
 
 
 def free_names(parameters: Iterable[str], local: Iterable[str], experiments: Iterable[str]) -> list[str]:
@@ -75,13 +75,14 @@ class ParameterMap:
     def of(
         cls,
         parameters: tuple[str, ...],
+        sensors: tuple[str, ...],
         names: tuple[str, ...],
         experiment: str,
-        fixed: Mapping[str, float],
+        fixed_by_run: Mapping[str, Mapping[str, float]],
         tied: Mapping[str, Any],
-        sensors: tuple[str, ...] = (),
     ) -> "ParameterMap":
         """Return the checked map of an experiment; `names` are those of θ, `sensors` parameters of sensors."""
+        fixed = {name: values[experiment] for name, values in fixed_by_run.items() if experiment in values}
         every = (*parameters, *sensors, SHIFT)
         columns = {name: names.index(n) for name in every for n in (name, local_name(name, experiment)) if n in names}
         for name in tied:
