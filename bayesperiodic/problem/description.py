@@ -99,8 +99,8 @@ class Description:
         self.plain_names = plain_names(self.names, self.local, runs)
         self._check_widths()
         self._check_free(fixed)
-        given = model.parameters, self.sensors.names, self.names
-        self.parameter_maps = {run: ParameterMap.of(*given, run, self.fixed, tied) for run in runs}
+        kinds = model.parameters, self.sensors.names, self.names
+        self.parameter_maps = {run: ParameterMap.of(*kinds, run, self.fixed, tied) for run in runs}
         self.ties = self._ties()
         self.input_errors = self._checked_input_errors(input_errors or {})
         self.anchors = dict(anchors or {})
@@ -123,9 +123,7 @@ class Description:
         self.__setattr__(name, None)
 
     def delay_parameters(self, experiment: str) -> dict[str, tuple[str, ...]]:
-        """Return the full names of the free parameters that delay each channel in an experiment.
-
-        The time between two channels is unknown if they are not delayed by the same ones.
+        """Return the free parameters that delay each channel; the time between channels of the same ones is known.
 
         Parameters
         ----------
@@ -134,7 +132,7 @@ class Description:
         Returns
         -------
         dict of str to tuple of str
-            By channel, outputs and inputs.
+            Full names by channel, outputs and inputs.
 
         Raises
         ------
@@ -432,9 +430,7 @@ class Description:
         return {name: inputs for name, inputs in every.items() if inputs}
 
     def true_inputs(self, experiment: Experiment, errors: InputErrors | None = None) -> dict[str, np.ndarray]:
-        """Return the inputs of the model in an experiment: the measured ones less their expected errors.
-
-        They are corrected by what is known of their sensors.
+        """Return the inputs of the model in an experiment: the measured ones less their errors, by known sensors.
 
         Parameters
         ----------
