@@ -41,8 +41,8 @@ class Problem(Description):
     experiments : sequence of Experiment
     priors : mapping of str or tuple of str to prior
         Makes a parameter free; a tuple of names takes a `MultivariateNormal`. A frozen continuous distribution of
-        scipy.stats is a prior too. The name "shift" makes the delay [s] of the measured outputs a parameter of each
-        experiment; an autonomous model, whose phase is free, always has it.
+        scipy.stats is a prior too. The name "shift" makes the delay [s] of all measured outputs a parameter of each
+        experiment, beside those of `sensors`; an autonomous model, whose phase is free, always has it.
     fixed : mapping of str to float or to mapping of str to float, optional
         Values of other parameters, for all experiments or by experiment; a name such as ``"variance[force]"`` fixes a
         noise parameter.
@@ -63,6 +63,10 @@ class Problem(Description):
         harmonics kept, as many amplitudes as these. The true inputs, with a flat prior, are integrated out, linearised
         about the estimate; see `MapEstimate.input_errors`. "joint": as "measured", but the amplitudes of the errors are
         parameters of each experiment, ``force_mean``, ``force_cos1``, ``force_sin1``, …, in the unit of the input.
+    sensors : mapping of str to Sensor, optional
+        Gain, offset, delay and filter of measured outputs and inputs, numbers or priors. The model's outputs are
+        compared as their sensors show them, and its inputs are the measured ones, corrected. The parameters are called
+        ``gain[force]``, those of `local` ones ``gain[force, run 7]``; `priors` and `fixed` may name them.
     input_errors : mapping of str to InputErrors, optional
         Errors of the inputs by experiment, linearised about an estimate, see `with_input_errors`.
     anchors : mapping of str to InitialOrbit, optional
@@ -74,7 +78,8 @@ class Problem(Description):
     ValueError
         For a parameter that is not just one of free, fixed and tied, or is in two priors, an expression that is not
         allowed or circular, a value that is no prior or does not fit its tuple of names, an unknown name, an experiment
-        without the model's inputs or with outputs that the model lacks or that are constant, no more independent values
+        without the model's inputs or with outputs that the model lacks or that are constant, a sensor of something else
+        or one that cannot be corrected, no more independent values
         than free parameters behind a variance whose prior is improper, an autonomous model whose measured frequency has
         no standard error.
 

@@ -19,6 +19,7 @@ from bayesperiodic.periodic.floquet import first_order_matrix, leading_multiplie
 from bayesperiodic.periodic.solution import PeriodicSolution, describe, logarithmic_jacobian
 from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.problem.description import Description
+from bayesperiodic.problem.model_inputs import without_sensors
 from bayesperiodic.problem.parameters import ParameterMaps
 
 NO_HISTORY = np.empty((0, 3))
@@ -170,7 +171,7 @@ class ResponseSolver:
         simulation, solutions = self.solve(theta[None], keep=True, polish=True), {}
         for e in self.problem.experiments:
             (here, z), code = self._solved(simulation, e.name), int(simulation.statuses(e.name)[0])
-            here, parameters = self.problem.without_sensors(here, e, theta)
+            here, parameters = without_sensors(self.problem, here, e, theta)
             solutions[e.name] = describe(here, parameters, Solved(z, code, NO_HISTORY))
         return solutions
 

@@ -29,6 +29,7 @@ from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, input_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 from bayesperiodic.periodic.solve import solve_driven, solve_free
+from bayesperiodic.problem.model_inputs import sensor_values
 
 # Correlation lengths tried, in response periods, and the prior probability of white noise, the alternative to them.
 LENGTHSCALES = np.geomspace(1e-3, 3.0, 40)
@@ -561,6 +562,6 @@ def estimated_inputs(
         measured = _fourier.on_grid(waves, e.samples * e.periods)
         for name in set(where):
             mine = np.flatnonzero([owner == name for owner in where])
-            signals = problem.sensors.corrected_changes(e, name, measured, problem.sensor_values(e, estimate.theta))
+            signals = problem.sensors.corrected_changes(e, name, measured, sensor_values(problem, e, estimate.theta))
             sd[e.name][name] = np.sqrt(np.sum((covariance[np.ix_(mine, mine)] @ signals[mine]) * signals[mine], axis=0))
     return InputEstimate(errors, covariances, sd, residuals)

@@ -40,6 +40,7 @@ from bayesperiodic.estimation.result import MapEstimate, NoiseEstimate, Search, 
 from bayesperiodic.estimation.units import compared_with_data, unit_error
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.problem.fingerprint import fingerprint
+from bayesperiodic.problem.model_inputs import model_inputs
 
 MOST_SHOWN_MODES = 3
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
@@ -341,7 +342,7 @@ def _describe(
         rms={c: _pooled(problem, c, residuals) for c in problem.channels},
         fvu=_fractions_left(problem, residuals),
         true_inputs=TrueInputs(
-            {e.name: problem.model_inputs(e, best.theta) for e in problem.experiments},
+            {e.name: model_inputs(problem, e, best.theta) for e in problem.experiments},
             estimated_inputs(problem, best).sd,
             problem.input_errors,
         ),

@@ -11,7 +11,7 @@ import numpy as np
 from bayesperiodic import _fourier
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.block import Block, ComparedSignals, Timed, common, measured_channels
-from bayesperiodic.likelihood.sensing import NO_PLACE, Factors, Sensing
+from bayesperiodic.likelihood.sensing import NO_PLACE, ComplexFactors, Sensing
 from bayesperiodic.models.model import Model
 
 LARGEST_TRANSFORM = 16_384
@@ -118,7 +118,7 @@ class MeanPeriod(Timed):
             by_values[..., place] += weights[..., 0] * math.sqrt(self.size)
         if factors is None:
             return weights, by_values
-        products = Factors(*self._products(self.transform(signals[..., c]), weights))
+        products = ComplexFactors(*self._products(self.transform(signals[..., c]), weights))
         for relative, by in sensing.slopes(c, values, frequency, self._waves):
             slope = factors if relative is None else factors.times(relative)
             total = np.add.reduce(slope.real * products.real - slope.imag * products.imag, axis=-1)
@@ -137,7 +137,7 @@ class MeanPeriod(Timed):
         total[..., cosine] += real[..., sine]
         return total, imag
 
-    def _multiplied(self, components: np.ndarray, factors: Factors) -> np.ndarray:
+    def _multiplied(self, components: np.ndarray, factors: ComplexFactors) -> np.ndarray:
         """Return components (…, size) whose harmonics are multiplied by factors, by their real part at Nyquist."""
         highest = (self.size - 1) // 2
         real, imag = factors.real, factors.imag[..., 1 : highest + 1]

@@ -15,21 +15,21 @@ NO_PLACE = -1
 Slopes = list[tuple[int, Any]]
 
 
-class Factors(NamedTuple):
+class ComplexFactors(NamedTuple):
     """Complex factors in real numbers: the rounding of NumPy's complex products depends on how many there are."""
 
     real: np.ndarray
     imag: np.ndarray
 
-    def times(self, other: "Factors") -> "Factors":
+    def times(self, other: "ComplexFactors") -> "ComplexFactors":
         """Return the product."""
         real, imag = self.real * other.real - self.imag * other.imag, self.real * other.imag + self.imag * other.real
-        return Factors(real, imag)
+        return ComplexFactors(real, imag)
 
     @property
-    def conjugate(self) -> "Factors":
+    def conjugate(self) -> "ComplexFactors":
         """The complex conjugates."""
-        return Factors(self.real, -self.imag)
+        return ComplexFactors(self.real, -self.imag)
 
     @property
     def complex(self) -> np.ndarray:
@@ -46,7 +46,7 @@ class SensorNames(NamedTuple):
     delayed: bool  # whether all outputs may be late
 
 
-def _denominator(ratio: np.ndarray, order: int, slope: int = 0) -> Factors:
+def _denominator(ratio: np.ndarray, order: int, slope: int = 0) -> ComplexFactors:
     """Return B(i·ratio), or its derivative by ln(ratio) if `slope` is 1."""
     coefficients = [b * k**slope for k, b in enumerate(butterworth(order))]
     square = -ratio * ratio
@@ -56,14 +56,14 @@ def _denominator(ratio: np.ndarray, order: int, slope: int = 0) -> Factors:
         for b in some[-2::-1]:
             total = total * square + b
         parts.append(total)
-    return Factors(parts[0], parts[1] * ratio)
+    return ComplexFactors(parts[0], parts[1] * ratio)
 
 
-def lowpass(ratio: np.ndarray, order: int) -> Factors:
+def lowpass(ratio: np.ndarray, order: int) -> ComplexFactors:
     """Return the response of a Butterworth filter at frequencies in units of its cutoff."""
     below = _denominator(ratio, order)
     inverse = 1.0 / (1.0 + ratio ** (2 * order))
-    return Factors(below.real * inverse, -below.imag * inverse)
+    return ComplexFactors(below.real * inverse, -below.imag * inverse)
 
 
 class Sensing:
@@ -87,8 +87,8 @@ class Sensing:
         # A late input is as good as outputs that are too early.
         common = [(place(DELAY, name), -1.0) for name in sensors.late_inputs]
         common += [(len(names) - 1, 1.0)] * (sensors.delayed or delayed)
-        own = [[(i, 1.0)] * (i != NO_PLACE) for i in (place(DELAY, channel) for channel in channels)]
-        self._delay = tuple(tuple(one + common) for one in own)
+        alone = [[(i, 1.0)] * (i != NO_PLACE) for i in (place(DELAY, channel) for channel in channels)]
+        self._delay = tuple(tuple(one + common) for one in alone)
         self.frequency_place = len(names)
         places = (*self._gain, *self.offset_place, *self._cutoff)
         self.active = any(self._delay) or any(i != NO_PLACE for i in places)
@@ -127,7 +127,7 @@ class Sensing:
         harmonic: np.ndarray,
         *,
         phase: np.ndarray | None = None,
-    ) -> Factors | None:
+    ) -> ComplexFactors | None:
         """Return what multiplies the harmonics (…, size) of a channel; None if it is 1.
 
         With `phase` (…,) the channel comes these response periods later too.
@@ -137,16 +137,16 @@ class Sensing:
             lag = phase if late is None else late * (frequency / self._periods)
             lag = lag + phase if late is not None and phase is not None else lag
             angle = (-2.0 * np.pi * np.asarray(lag))[..., None] * harmonic
-            result = Factors(np.cos(angle), np.sin(angle))
+            result = ComplexFactors(np.cos(angle), np.sin(angle))
         if self._cutoff[c] != NO_PLACE:
             filtered = lowpass(self._ratio(c, values, frequency, harmonic), self._orders[c])
             result = filtered if result is None else result.times(filtered)
         if self._gain[c] != NO_PLACE:
             gain = values[..., self._gain[c], None]
             if result is not None:
-                return Factors(result.real * gain, result.imag * gain)
+                return ComplexFactors(result.real * gain, result.imag * gain)
             ones = np.ones(harmonic.size)
-            return Factors(gain * ones, 0.0 * ones)
+            return ComplexFactors(gain * ones, 0.0 * ones)
         return result
 
     def _ratio(self, c: int, values: np.ndarray, frequency: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
@@ -155,7 +155,7 @@ class Sensing:
 
     def slopes(
         self, c: int, values: np.ndarray, frequency: np.ndarray, harmonic: np.ndarray
-    ) -> Iterator[tuple[Factors | None, Slopes]]:
+    ) -> Iterator[tuple[ComplexFactors | None, Slopes]]:
         """Yield relative derivatives of the factors, and what they are by each parameter times a number (…,).
 
         None stands for the derivative 1. The place of the frequency is `frequency_place`.
@@ -163,7 +163,7 @@ class Sensing:
         if self._gain[c] != NO_PLACE:
             yield None, [(self._gain[c], 1.0 / values[..., self._gain[c]])]
         if by_lag := self.lag_slopes(c, values, frequency):
-            yield Factors(np.zeros(harmonic.size), -2.0 * np.pi * harmonic), by_lag
+            yield ComplexFactors(np.zeros(harmonic.size), -2.0 * np.pi * harmonic), by_lag
         if (place := self._cutoff[c]) != NO_PLACE:
             ratio = self._ratio(c, values, frequency, harmonic)
             relative = lowpass(ratio, self._orders[c]).times(_denominator(ratio, self._orders[c], slope=1))

@@ -10,7 +10,7 @@ import sympy as sp
 from bayesperiodic.models.model import DERIVATIVES, Model
 
 GAIN, OFFSET, DELAY, CUTOFF = "gain", "offset", "delay", "cutoff"
-KINDS = (GAIN, OFFSET, DELAY, CUTOFF)
+SENSOR_KINDS = (GAIN, OFFSET, DELAY, CUTOFF)
 # The delay of all outputs of an experiment.
 SHIFT = "shift"
 

@@ -78,18 +78,17 @@ class Description:
             "model": model, "experiments": self.experiments, "priors": dict(priors), "fixed": dict(fixed or {}),
             "tied": dict(tied or {}), "local": local, "noise": noise, "scheme": scheme,
             "input_noise": input_noise if isinstance(input_noise, str) else self.input_noise,
-            "sensors": dict(sensors or {}), "input_errors": dict(input_errors or {}), "anchors": dict(anchors or {}),
+            "sensors": dict(sensors) if isinstance(sensors, Mapping) else sensors,
+            "input_errors": dict(input_errors or {}), "anchors": dict(anchors or {}),
         }  # fmt: skip
         if self.input_noise == JOINT:
             model, errors, none = with_errors_as_parameters(model, self.experiments)
             priors, fixed = {**priors, **errors}, {**(fixed or {}), **none}
             plain = self._settings["model"].parameters
             local = (*local,) + tuple(name for name in model.parameters if name not in plain)
-        self.sensors = Sensors(sensors, model, self.experiments)
-        if self.input_noise == JOINT and self.sensors.of_inputs:
-            raise ValueError("input_noise: must be 'measured' or 'exact' where inputs have sensors, got 'joint'.")
-        model = self.sensors.model
-        self.model, self.scheme = model, scheme or default_scheme(model)
+        self.sensors = Sensors(sensors, model, self.experiments, joint=self.input_noise == JOINT)
+        self.model = model = self.sensors.model
+        self.scheme = scheme or default_scheme(model)
         find_scheme(self.scheme)
         if any(b.is_dense(self.noise) for e in self.experiments for b in blocks_of(e, model)):
             if isinstance(self.input_noise, Mapping):
@@ -98,17 +97,9 @@ class Description:
                     f"{_checks.shortened(input_noise)}; take noise='independent' or 'measured', or whole periods."
                 )
             self.input_noise = EXACT if self.input_noise == FROM_CYCLES else self.input_noise
-        for e in self.experiments:
-            if e.name in self.sensors.given:
-                raise ValueError(
-                    f"experiments: must have other names than channels with sensors, got {e.name!r}. Name it with "
-                    "fold(name=…)."
-                )
-        measured = {channel for experiment in self.experiments for channel in experiment.outputs}
-        self.channels = tuple(channel for channel in model.outputs if channel in measured)
-        runs = [e.name for e in self.experiments]
-        every = (*model.parameters, *self.sensors.names, SHIFT)
-        priors, fixed, tied = self._with_sensors(priors, dict(fixed or {})) + (dict(tied or {}),)
+        self.channels, runs = self.sensors.channels, [e.name for e in self.experiments]
+        tied, every = dict(tied or {}), (*model.parameters, *self.sensors.names, SHIFT)
+        priors, fixed = self.sensors.with_entries(priors, fixed or {})
         self.local = _checked_local(local, every, priors, tied)
         self.fixed = {n: _constant(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
         given = expand_priors(priors, self.local, runs, self.fixed) | self._free_phases(priors, fixed, tied)
@@ -118,17 +109,8 @@ class Description:
         self._check_widths()
         self._check_free(fixed)
         check_delays(self.experiments, (*self.names, *fixed, *tied, *self.sensors.known_delays))
-        self.parameter_maps = {
-            run: ParameterMap.of(
-                model.parameters,
-                self.names,
-                run,
-                {n: v[run] for n, v in self.fixed.items() if run in v},
-                tied,
-                self.sensors.names,
-            )  # fmt: skip
-            for run in runs
-        }
+        kinds = model.parameters, self.sensors.names, self.names
+        self.parameter_maps = {run: ParameterMap.of(*kinds, run, self.fixed, tied) for run in runs}
         self.ties = self._ties()
         errors = {e.name: FrequencyError.of(e, self.model) for e in self.experiments}
         self.frequency_errors = {name: error for name, error in errors.items() if error is not None}
@@ -152,17 +134,8 @@ class Description:
     def __delattr__(self, name: str) -> None:
         self.__setattr__(name, None)
 
-    def _with_sensors(self, priors: Mapping[Any, Any], fixed: dict[str, Any]) -> tuple[dict[Any, Any], dict[str, Any]]:
-        """Return the priors and values with those of the sensors, unless a name has one of its own."""
-        taken = {*fixed}.union(*(key if isinstance(key, tuple) else (key,) for key in priors))
-        free = {name: prior for name, prior in self.sensors.priors.items() if name not in taken}
-        known = {name: value for name, value in self.sensors.fixed.items() if name not in taken}
-        return {**free, **priors}, fixed | known
-
     def delay_parameters(self, experiment: str) -> dict[str, tuple[str, ...]]:
-        """Return the free parameters that delay each channel in an experiment.
-
-        The time between two channels is unknown if they are not delayed by the same ones.
+        """Return the free parameters that delay each channel; the time between channels of the same ones is known.
 
         Parameters
         ----------
@@ -171,7 +144,7 @@ class Description:
         Returns
         -------
         dict of str to tuple of str
-            Full names by channel, outputs and inputs; empty for a channel without a free delay.
+            Full names by channel, outputs and inputs.
 
         Raises
         ------
@@ -185,15 +158,11 @@ class Description:
         {'displacement': ('delay[displacement]',), 'force': ()}
         """
         _checks.one_of("experiment", experiment, self.parameter_maps)
+        columns, result = self.parameter_maps[experiment].columns, {}
         measured = next(e for e in self.experiments if e.name == experiment)
-        columns = self.parameter_maps[experiment].columns
-        common = {*measured.outputs} if SHIFT in columns else set()
-        result = {}
         for channel in (*measured.outputs, *measured.inputs):
-            own = [n for n in (SHIFT,) if channel in common] + [
-                n for n in (sensor_name(DELAY, channel),) if n in columns
-            ]
-            result[channel] = tuple(self.names[columns[name]] for name in own)
+            plain = (SHIFT,) * (channel in measured.outputs) + (sensor_name(DELAY, channel),)
+            result[channel] = tuple(self.names[columns[name]] for name in plain if name in columns)
         return result
 
     def _free_phases(self, priors: Any, fixed: Mapping[str, Any], tied: Mapping[str, Any]) -> dict[str, Uniform]:
@@ -473,9 +442,7 @@ class Description:
         return {name: inputs for name, inputs in every.items() if inputs}
 
     def true_inputs(self, experiment: Experiment, errors: InputErrors | None = None) -> dict[str, np.ndarray]:
-        """Return the inputs of the model in an experiment: the measured ones less their expected errors.
-
-        They are corrected by what is known of their sensors.
+        """Return the inputs of the model in an experiment: the measured ones less their errors, by known sensors.
 
         Parameters
         ----------
@@ -545,51 +512,6 @@ class Description:
         """
         parameter_map = self.parameter_maps[experiment]
         return np.ascontiguousarray(parameter_map.values(theta)[:, : parameter_map.count])
-
-    def sensor_values(self, experiment: Experiment, theta: np.ndarray) -> dict[str, float]:
-        """Return the parameters of the sensors of inputs at one θ (names,), without the delays, by plain name."""
-        if not self.sensors.of_inputs:
-            return {}
-        parameter_map = self.parameter_maps[experiment.name]
-        every = zip(parameter_map.parameters, parameter_map.values(theta[None])[0].tolist(), strict=True)
-        return {name: value for name, value in every if name.endswith("]") and not name.startswith(f"{DELAY}[")}
-
-    def model_inputs(self, experiment: Experiment, theta: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the measured inputs of an experiment less their expected errors, corrected by their sensors.
-
-        The time is that of the input: an unknown delay is not removed, but added to the outputs with the other sign.
-
-        Parameters
-        ----------
-        experiment : Experiment
-        theta : array (names,)
-            With the unknown entries of the sensors.
-
-        Returns
-        -------
-        dict of str to array (points,)
-            In the inputs' units.
-        """
-        measured = true_inputs(experiment, self.input_noise, self.input_errors.get(experiment.name))
-        return self.sensors.corrected(experiment, measured, self.sensor_values(experiment, theta))
-
-    def without_sensors(
-        self, equations: PeriodicEquations, experiment: Experiment, theta: np.ndarray
-    ) -> tuple[PeriodicEquations, np.ndarray]:
-        """Return equations at one θ (names,) as those of the model driven by corrected inputs, and its parameters."""
-        parameters, count = self.parameters(theta[None], experiment.name)[0], len(self.sensors.plain_model.parameters)
-        if self.sensors.model is self.sensors.plain_model:
-            return equations, parameters
-        plain = PeriodicEquations.build(
-            self.sensors.plain_model,
-            self.model_inputs(experiment, theta),
-            frequency=equations.frequency,
-            samples=experiment.samples,
-            scheme=self.scheme,
-            periods=experiment.periods,
-            winding=experiment.winding,
-        )
-        return plain, parameters[:count]
 
     def sample_prior(self, size: int, seed: int) -> dict[str, np.ndarray]:
         """Return independent draws of every free parameter from its prior.

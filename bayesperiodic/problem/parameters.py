@@ -46,8 +46,8 @@ def expand_priors(
 
 def plain_names(names: Iterable[str], local: Iterable[str], experiments: Iterable[str]) -> dict[str, str]:
     """Return the plain names of parameters by their full names: k by k, and theta16 by ``theta16[run 7]``."""
-    own = {local_name(plain, run): plain for plain in local for run in experiments}
-    return {name: own.get(name, name) for name in names}
+    plain_by_name = {local_name(plain, run): plain for plain in local for run in experiments}
+    return {name: plain_by_name.get(name, name) for name in names}
 
 
 def check_delays(experiments: Iterable[Experiment], known: Iterable[str]) -> None:
@@ -62,7 +62,7 @@ def check_delays(experiments: Iterable[Experiment], known: Iterable[str]) -> Non
         if whole and (SHIFT in names or local_name(SHIFT, e.name) in names):
             continue
         for channel in clock:
-            if not any(name == f"delay[{channel}]" or name.startswith(f"delay[{channel}][") for name in names):
+            if not any(name == f"delay[{channel}]" or name.startswith(f"delay[{channel}, ") for name in names):
                 all_late = f"priors={{{SHIFT!r}: bp.Uniform(…)}} for all outputs or " if whole else ""
                 raise ValueError(
                     f"experiments: must have known delays or free ones, got {e.name!r}, in which {channel!r} has "
@@ -98,13 +98,14 @@ class ParameterMap:
     def of(
         cls,
         parameters: tuple[str, ...],
+        sensors: tuple[str, ...],
         names: tuple[str, ...],
         experiment: str,
-        fixed: Mapping[str, float],
+        fixed_by_run: Mapping[str, Mapping[str, float]],
         tied: Mapping[str, Any],
-        sensors: tuple[str, ...] = (),
     ) -> "ParameterMap":
         """Return the checked map of an experiment; `names` are those of θ, `sensors` parameters of sensors."""
+        fixed = {name: values[experiment] for name, values in fixed_by_run.items() if experiment in values}
         every = (*parameters, *sensors, SHIFT)
         columns = {name: names.index(n) for name in every for n in (name, local_name(name, experiment)) if n in names}
         for name in tied:

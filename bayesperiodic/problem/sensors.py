@@ -17,7 +17,16 @@ from bayesperiodic._io import Storable
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.sensing import SensorNames, lowpass
 from bayesperiodic.models.model import Model
-from bayesperiodic.models.sensed import CUTOFF, DELAY, GAIN, KINDS, OFFSET, SHIFT, sensor_name, with_sensed_inputs
+from bayesperiodic.models.sensed import (
+    CUTOFF,
+    DELAY,
+    GAIN,
+    OFFSET,
+    SENSOR_KINDS,
+    SHIFT,
+    sensor_name,
+    with_sensed_inputs,
+)
 from bayesperiodic.priors.joint import as_prior
 
 HIGHEST_ORDER = 10
@@ -94,11 +103,23 @@ class Sensor(Storable):
             raise ValueError(f"order: must be at most {HIGHEST_ORDER}, got {self.order}.")
 
     def entries(self) -> Iterator[tuple[str, Any]]:
-        """Yield the kinds of the entries but the order, with their values."""
-        return ((kind, getattr(self, kind)) for kind in KINDS)
+        """Return all entries but the order.
+
+        Returns
+        -------
+        iterator of (str, float or prior or None)
+            Kinds and values.
+        """
+        return ((kind, getattr(self, kind)) for kind in SENSOR_KINDS)
 
     def acting(self) -> Iterator[tuple[str, Any]]:
-        """Yield the kinds of the entries that change the signal, with their values."""
+        """Return the entries that change the signal.
+
+        Returns
+        -------
+        iterator of (str, float or prior)
+            Kinds and values.
+        """
         return ((kind, value) for kind, value in self.entries() if not _is_plain(kind, value))
 
     def __repr__(self) -> str:
@@ -117,6 +138,8 @@ class Sensors:
 
     Attributes
     ----------
+    channels : tuple of str
+        The measured outputs, in the order of the model.
     given : dict of str to Sensor
     plain_model, model : Model
         Of the true inputs, and of the measured ones with the known entries corrected.
@@ -127,10 +150,14 @@ class Sensors:
     units : dict of str to str
     """
 
-    def __init__(self, sensors: Mapping[str, Sensor] | None, model: Model, experiments: Sequence[Experiment]):
-        measured = [channel for channel in model.outputs if any(channel in e.outputs for e in experiments)]
-        self.given = _checked(sensors or {}, model, measured)
+    def __init__(
+        self, sensors: Mapping[str, Sensor] | None, model: Model, experiments: Sequence[Experiment], *, joint: bool
+    ):
+        self.channels = tuple(c for c in model.outputs if any(c in e.outputs for e in experiments))
+        self.given = _checked({} if sensors is None else sensors, model, self.channels)
         self._inputs = {name: self.given[name] for name in model.inputs if name in self.given}
+        if joint and self._inputs:
+            raise ValueError("input_noise: must be 'measured' or 'exact' where inputs have sensors, got 'joint'.")
         acting = [(c, kind, value) for c, sensor in self.given.items() for kind, value in sensor.acting()]
         unknown = {sensor_name(kind, c): value for c, kind, value in acting if not isinstance(value, float)}
         outputs = [(sensor_name(kind, c), value) for c, kind, value in acting if c not in model.inputs]
@@ -145,6 +172,11 @@ class Sensors:
         }  # fmt: skip
         self.plain_model, self.model = model, self._with_unknown_inputs(model)
         for e in experiments:
+            if e.name in self.given:
+                raise ValueError(
+                    f"experiments: must have other names than channels with sensors, got {e.name!r}. Name it with "
+                    "fold(name=…)."
+                )
             for name, sensor in self._inputs.items():
                 _check_passed(e, name, sensor)
 
@@ -161,6 +193,15 @@ class Sensors:
             for c, sensor in self.given.items()
             if isinstance(sensor.delay, float) and sensor.delay
         ]
+
+    def with_entries(
+        self, priors: Mapping[Any, Any], fixed: Mapping[str, Any]
+    ) -> tuple[dict[Any, Any], dict[str, Any]]:
+        """Return priors and values with those of the sensors, unless a name has one of its own."""
+        taken = {*fixed}.union(*(key if isinstance(key, tuple) else (key,) for key in priors))
+        free = {name: prior for name, prior in self.priors.items() if name not in taken}
+        known = {name: value for name, value in self.fixed.items() if name not in taken}
+        return {**free, **priors}, {**fixed, **known}
 
     def parameters(self, delayed: bool) -> SensorNames:
         """Return the parameters that act on the outputs, the delay of all of them last."""

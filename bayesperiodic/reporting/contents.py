@@ -248,7 +248,7 @@ def parameters(given: ReportInputs) -> Rows:
 def _roles(problem: Problem, plain: str) -> Iterator[tuple[str, str, str]]:
     """Yield the full names of a parameter with its role and its prior, value or expression."""
     partners = {name: key for key in problem.priors if isinstance(key, tuple) for name in key}
-    for name in (n for n, own in problem.plain_names.items() if own == plain):
+    for name in (n for n, known in problem.plain_names.items() if known == plain):
         prior = repr(problem.joint_prior.marginals[name])
         prior = prior if len(prior) <= LONGEST_PRIOR else f"{prior[:LONGEST_PRIOR]}…"
         others = ", ".join(other for other in partners.get(name, ()) if other != name)

@@ -11,7 +11,7 @@ from bayesperiodic.models.sensed import CUTOFF, DELAY, GAIN, OFFSET, SHIFT, sens
 from bayesperiodic.symmetry.determining import System
 
 DELAY_OF = "delay of "
-MOST_PARTS = 1000
+DAMPING_DENOMINATOR = 1000
 
 
 def with_sensors(
@@ -59,5 +59,5 @@ def with_sensors(
 def _dampings(order: int) -> list[sp.Rational | None]:
     """Return twice the damping ratio of each pair of poles of a Butterworth filter, None for a single pole."""
     angles = np.pi * (2 * np.arange(order // 2) + 1) / (2 * order)
-    pairs = [Fraction(2.0 * float(np.sin(a))).limit_denominator(MOST_PARTS) for a in angles]
+    pairs = [Fraction(2.0 * float(np.sin(a))).limit_denominator(DAMPING_DENOMINATOR) for a in angles]
     return [sp.Rational(p.numerator, p.denominator) for p in pairs] + [None] * (order % 2)

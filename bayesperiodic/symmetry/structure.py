@@ -316,7 +316,7 @@ def _unknown_entries(
     model: Model, measured: Sequence[str], sensors: Mapping[str, SensorEntries]
 ) -> dict[str, tuple[str, ...]]:
     """Return the kinds of the unknown entries of sensors by channel."""
-    result = {}
+    result: dict[str, tuple[str, ...]] = {}
     for channel, sensor in sensors.items():
         _checks.one_of("sensors", channel, (*measured, *model.inputs))
         if not isinstance(sensor, SensorEntries):
