@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,7 +26,7 @@ from bayesperiodic.estimation.covariance import (
     robust_covariance,
     uncertainty,
 )
-from bayesperiodic.estimation.gauss_newton import Iterate, Objective, bias_correction
+from bayesperiodic.estimation.gauss_newton import Iterate, Objective, at_ends, bias_correction
 from bayesperiodic.estimation.laplace import IN_COMBINATION, SILENT, joint_laplace, undetermined
 from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit, Whiteness, sds, written
 from bayesperiodic.estimation.unexplained import Unexplained, testable, used
@@ -80,9 +81,9 @@ def check(problem: Problem, fit: MapEstimate) -> FitCheck:
     _checks.instance("problem", problem, Problem)
     problem = check_results(problem, fit=fit)
     objective, peak = at_estimate(problem, fit)
-    factor = objective.log_variance_factor
     estimate = replace(peak, noise=np.array([fit.noise[name] for name in problem.noise_names]))
-    checks = checked(problem, estimate, uncertainty(problem, estimate, factor), factor, fit.solutions)
+    uncertain = uncertainty(problem, estimate, objective.log_variance_factor)
+    checks = checked(objective, estimate, uncertain, fit.solutions)
     for text in check_warnings(problem, replace(fit, checks=checks)):
         warnings.warn(text, UserWarning, stacklevel=3)
     return checks
@@ -116,21 +117,18 @@ def with_joint(problem: Problem, fit: MapEstimate) -> MapEstimate:
 
 
 def checked(
-    problem: Problem,
-    estimate: Iterate,
-    uncertain: Uncertainty,
-    log_variance_factor: float | np.ndarray,
-    solutions: Mapping[str, PeriodicSolution],
+    objective: Objective, estimate: Iterate, uncertain: Uncertainty, solutions: Mapping[str, PeriodicSolution]
 ) -> FitCheck:
-    """Return the checks of an estimate; the factor is what `bias_correction` returns."""
+    """Return the checks of an estimate."""
+    problem: Any = objective.density.problem
     names, lost, inverse, covariance = list(problem.names), uncertain.lost, uncertain.inverse, uncertain.covariance
     shift = doubling_shift(problem, estimate, solutions, covariance)
     shift[lost] = np.nan
-    robust = robust_covariance(problem, estimate, inverse)
+    robust = robust_covariance(problem, estimate, inverse, at_ends(objective, estimate) != 0.0)
     robust[lost, lost] = np.inf
     robust_table = pd.DataFrame(robust, index=names, columns=names)
     conflict, alone = prior_conflict(problem, estimate)
-    split = noise_split(problem, estimated_inputs(problem, estimate).residuals, log_variance_factor)
+    split = noise_split(problem, estimated_inputs(problem, estimate).residuals, objective.log_variance_factor)
     loadings = problem.likelihood.loadings
     if not (problem.noisy_inputs and loadings):
         loadings = input_loadings(problem, estimate.theta, solutions, ROUGH)

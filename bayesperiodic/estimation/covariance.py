@@ -45,7 +45,9 @@ INPUT_PROBES = 8
 VARIANCE_STEP = 1e-4
 
 
-def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarray) -> np.ndarray:
+def robust_covariance(
+    problem: Problem, estimate: Iterate, covariance: np.ndarray, held: np.ndarray | None = None
+) -> np.ndarray:
     """Return C (J + P) C, with C the inverse of H of eq. (8), P the prior's curvature and J the scores' variance.
 
     J takes the variance of each Fourier component from the residual: a first-order autoregressive spectrum, or white
@@ -54,7 +56,9 @@ def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarra
     depend on the low harmonics, which the fit removes from the residual. Therefore the spectrum is fitted by restricted
     likelihood (see `bias_correction`), with the parameters integrated out, J is averaged over the posterior of the
     correlation length, and raised for the few values behind each smoothed one. It is at least what the known noise of
-    the inputs causes. Components that are no Fourier components keep the variance of the noise model.
+    the inputs causes. Components that are no Fourier components keep the variance of the noise model. Parameters that
+    are held at an end of their support, `held` (names,), take up nothing of the residual, whose spectrum contains what
+    the end prevents them from fitting.
     """
     likelihood, prior = problem.likelihood, problem.joint_prior.curvature(estimate.theta)
     changes, residuals = (
@@ -63,7 +67,9 @@ def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarra
     information = prior + sum(s @ s.T for s in changes)
     if not np.isfinite(information).all():
         return np.full_like(covariance, np.nan)
-    variances = residual_variances(likelihood, changes, residuals, estimate.noise, information)
+    free = np.flatnonzero(~held) if held is not None else np.arange(len(information))
+    fitted, own = [s[free] for s in changes], information[np.ix_(free, free)]
+    variances = residual_variances(likelihood, fitted, residuals, estimate.noise, own)
     middle = prior + sum((s * variance) @ s.T for s, variance in zip(changes, variances, strict=True))
     return covariance @ middle @ covariance
 

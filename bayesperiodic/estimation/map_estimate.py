@@ -352,12 +352,13 @@ def _describe(
             tuple(np.array(names)[acting & (at_ends(objective, best) != 0.0)].tolist()),
             best.here.other_orbits,
             weighed(problem, modes, joints) if len(modes) > 1 else (),
+            dict(problem.joint_prior.supports),
         ),
         tied=_tied_slopes(problem, best.theta),
         fingerprint=fingerprint(problem),
         frequencies=updated_frequencies(problem, best, solutions, covariance),
     )
-    return replace(fit, checks=checked(problem, best, uncertain, factor, fit.solutions)) if checks else fit
+    return replace(fit, checks=checked(objective, best, uncertain, fit.solutions)) if checks else fit
 
 
 def _by_name(problem: Problem, values: np.ndarray) -> dict[str, float]:

@@ -2,13 +2,13 @@
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import stdtrit
+from scipy.special import stdtr, stdtrit
 
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse_all
@@ -29,6 +29,8 @@ ROBUST_TAKEN = (
     "Intervals are those of the robust sd: the model is misspecified, and the Laplace sd takes its error for noise "
     "that is independent from value to value."
 )
+# Degrees of freedom from which Student's t is the normal distribution.
+MOST_FREEDOM = 1e9
 
 
 @dataclass(frozen=True)
@@ -164,6 +166,7 @@ class Search(Storable):
     at_ends: tuple[str, ...]
     other_orbits: dict[str, str]
     other_modes: tuple[Mode, ...]
+    supports: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def _part(group: str, name: str) -> Any:
@@ -222,7 +225,7 @@ class MapEstimate(Result):
         reached (−inf: none) and the estimates; `at_ends`, parameters that the data act upon and whose estimate lies at
         the end of their support; `other_orbits`, experiments whose fitted orbit is not the measured one (prime period,
         turns of angles, or order of the forcing periods), with the reason in words; and `other_modes`, separate optima
-        whose objective is lower by less than 30, see `modes`.
+        whose objective is lower by less than 30, see `modes`; `supports`, the ends of the support of each prior.
     tied : dict of str to dict of str to float
         Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
     fingerprint : str
@@ -270,9 +273,11 @@ class MapEstimate(Result):
     independent = _part("noise_estimate", "independent")
     inputs, input_sd = _part("true_inputs", "values"), _part("true_inputs", "sd")
     input_errors = _part("true_inputs", "errors")
-    history, starts, at_ends, other_orbits, other_modes = (_part("search", field.name) for field in fields(Search))
+    history, starts, at_ends, other_orbits, other_modes, supports = (
+        _part("search", part.name) for part in fields(Search)
+    )
     robust_sd, whiteness, noise_split, input_noise, input_nonlinearity, doubling_shift, prior_conflict, undetermined = (
-        _part("checks", field.name) for field in fields(FitCheck)[:8]
+        _part("checks", part.name) for part in fields(FitCheck)[:8]
     )
     robust_covariance, misfit = _part("checks", "robust_covariance"), _part("checks", "misfit")
 
@@ -328,7 +333,10 @@ class MapEstimate(Result):
         return bool(self.checks and self.checks.misfit)
 
     def interval(self, probability: float = 0.9, *, robust: bool | None = None) -> dict[str, tuple[float, float]]:
-        """Return the equal-tailed interval of each parameter, by Student's t with `degrees_of_freedom`.
+        """Return the interval of each parameter, by Student's t with `degrees_of_freedom`, within its prior's support.
+
+        It is symmetric about the estimate. Near an end of the support Student's t is restricted to the support, and
+        where the symmetric interval would leave it, the interval ends there and is one-sided.
 
         Parameters
         ----------
@@ -340,7 +348,7 @@ class MapEstimate(Result):
         Returns
         -------
         dict of str to (float, float)
-            In the parameters' units.
+            In the parameters' units; the support where the standard deviation is infinite.
 
         Raises
         ------
@@ -349,10 +357,15 @@ class MapEstimate(Result):
         """
         if not 0.0 < _checks.finite_number("probability", probability) < 1.0:
             raise ValueError(f"probability: must be between 0 and 1, got {probability!r}.")
-        sd, result = self.robust_sd if (self.misspecified if robust is None else robust) else self.sd, {}
+        sds, result = self.robust_sd if (self.misspecified if robust is None else robust) else self.sd, {}
         for name, value in self.theta.items():
-            half = float(stdtrit(min(self.degrees_of_freedom[name], 1e9), 0.5 + 0.5 * probability)) * sd[name]
-            result[name] = value - half, value + half
+            freedom, sd = min(self.degrees_of_freedom[name], MOST_FREEDOM), sds[name]
+            low, high = self.supports.get(name, (-np.inf, np.inf))
+            if not np.isfinite(sd):
+                result[name] = (low, high) if sd == np.inf else (np.nan, np.nan)
+                continue
+            ends = _shortest(freedom, probability, (low - value) / sd, (high - value) / sd)
+            result[name] = max(value + sd * ends[0], low), min(value + sd * ends[1], high)
         return result
 
     def derive(self, expressions: Mapping[str, str], *, experiment: str | None = None) -> pd.DataFrame:
@@ -531,6 +544,19 @@ class MapEstimate(Result):
         lines += self.checks.remarks() if self.checks else ["Not checked, see bp.check(problem, fit)."]
         lines += [f"Another optimum: {mode!r}." for mode in notable(self.other_modes)]
         return "\n".join(lines)
+
+
+def _shortest(freedom: float, probability: float, low: float, high: float) -> tuple[float, float]:
+    """Return the shortest interval of Student's t between two ends, low ≤ 0 ≤ high."""
+    below, inside = float(stdtr(freedom, low)), probability
+    if low > -np.inf or high < np.inf:
+        inside *= float(stdtr(freedom, high)) - below
+    half = float(stdtrit(freedom, 0.5 + 0.5 * inside))
+    if half <= min(-low, high):
+        return -half, half
+    if -low <= high:
+        return low, float(stdtrit(freedom, below + inside))
+    return -_shortest(freedom, probability, -high, -low)[1], high
 
 
 def sds(covariance: pd.DataFrame) -> dict[str, float]:
