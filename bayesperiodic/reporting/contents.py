@@ -20,6 +20,7 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.comparison import Comparison, compare
 from bayesperiodic.diagnostics.identifiability import identifiability
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
+from bayesperiodic.diagnostics.model_error import MODEL_ERROR
 from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction, predict
 from bayesperiodic.estimation.adequacy import ADEQUACY_TESTS
 from bayesperiodic.estimation.map_estimate import estimation_warnings
@@ -444,7 +445,11 @@ def adequacy(prediction: Prediction) -> Rows:
     """Return the table of the tests of the model."""
     columns: dict[str, Any] = {"label": ("Experiment and channel", str), "verdict": ("Verdict", badge)}
     columns |= {test: (f"p-values: {test}", html.p_value) for test in ADEQUACY_TESTS}
-    return _formatted(prediction.table, **columns, model_error_share=("Fraction of model error", html.percent))
+    columns["model_error_share"] = ("Fraction of model error", html.percent)
+    for name, title in zip(MODEL_ERROR, ("estimate", "5 %", "95 %"), strict=True):
+        if name in prediction.table:
+            columns[name] = (f"Model error over rms: {title}", html.percent)
+    return _formatted(prediction.table, **columns)
 
 
 def missing_terms(search: MissingTerms) -> Rows:
