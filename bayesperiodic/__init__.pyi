@@ -25,6 +25,8 @@ from .diagnostics.predictive import Prediction as Prediction
 from .diagnostics.predictive import PriorPredictive as PriorPredictive
 from .diagnostics.predictive import predict as predict
 from .diagnostics.predictive import prior_predictive as prior_predictive
+from .diagnostics.split import SplitCheck as SplitCheck
+from .diagnostics.split import split_check as split_check
 from .estimation.check import check as check
 from .estimation.map_estimate import map_estimate as map_estimate
 from .estimation.profile import Profile as Profile

@@ -13,10 +13,12 @@ from tqdm import tqdm
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
+from bayesperiodic._verdicts import GOOD, with_tone
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.density.log_posterior import NATURAL
 from bayesperiodic.density.problem import Problem
+from bayesperiodic.diagnostics.model_error import MODEL_ERROR, in_words, model_errors, with_model_error
 from bayesperiodic.estimation.adequacy import (
     ADEQUACY_LEVEL,
     ALL,
@@ -26,6 +28,7 @@ from bayesperiodic.estimation.adequacy import (
     UNTESTED,
     adequacy,
     concerns_noise,
+    faulty,
     rejections,
 )
 from bayesperiodic.estimation.conflict import prior_conflict
@@ -169,7 +172,10 @@ def _experiment_of(problem: Problem, experiment: str | None) -> str:
 
 
 # What the verdicts that are neither for nor against the model mean.
+# In place of "misspecified" where the error of the model is shown to be smaller than the user tolerates.
+TOLERATED = with_tone("adequate within tolerance", GOOD)
 SENTENCES = {
+    TOLERATED: "In the harmonics kept, the error of the model is below the tolerance, whatever the other tests find.",
     UNTESTED: "There are too few values to test the model.",
     UNSOUND: "No test contradicts the model, but a recording is not sound (see the findings of its experiment), and "
     "its faults count as noise in these tests.",
@@ -205,7 +211,14 @@ class Prediction(Bands):
         between the harmonics, "assumed" if in those of the noise model. ``p``: the smallest of the row, adjusted by
         Holm's method for all tests of the table; ``verdict``: "misspecified" if it is below 1 %, "adequate", "not
         tested", or "recording not sound" in place of "adequate" where ``Experiment.findings`` has more than harmless
-        ones, which count as noise.
+        ones, which count as noise. ``model_error``, ``model_error_low`` and ``model_error_high``: the rms error of the
+        model with the parameters that fit all experiments best, relative to the rms of the measured period about its
+        mean, and the ends of its 90 % interval; it concerns the harmonics that the experiment keeps. Where the noise is
+        unknown there is only the upper end, as if all of the residual were error of the model; in the row "all" the
+        largest. With a `tolerance`, "adequate within tolerance" is the verdict in place of "misspecified" and "not
+        tested" where the upper end is below it, if there is neither another orbit nor a conflict of the prior.
+    tolerance : float, optional
+        That of `predict`.
     transient : Transient or None
         Bands of the recordings of `run`.
     prior_conflict : str
@@ -230,6 +243,15 @@ class Prediction(Bands):
     note: str
     other_orbits: dict[str, str]
     prior_conflict: str
+    tolerance: float | None = None
+
+    @property
+    def model_errors(self) -> dict[str, str]:
+        """Error of the model in words, and how it compares with the tolerance, by row of the table."""
+        if MODEL_ERROR[0] not in self.table:
+            return {}
+        rows = self.table.loc[self.table[MODEL_ERROR[2]].notna(), [*MODEL_ERROR]].drop(ALL, errors="ignore")
+        return {str(label): in_words(*row.tolist(), self.tolerance) for label, row in rows.iterrows()}
 
     @property
     def verdict(self) -> str:
@@ -256,11 +278,14 @@ class Prediction(Bands):
     def __repr__(self) -> str:
         subject = "model or the noise model" if self.concerns_noise else "model"
         verdict = f"The {subject} is {self.verdict} (overall false alarm rate {ADEQUACY_LEVEL:.0%})."
+        shown = {} if self.tolerance is None and self.verdict != MISSPECIFIED else self.model_errors
+        tests = self.table.drop(columns=[*MODEL_ERROR], errors="ignore")
         lines = [
             f"Tests of the model from {self.draws} draws, {self.failed} without a periodic solution",
-            self.table.to_string(float_format="{:.2g}".format, na_rep="-"),
+            tests.to_string(float_format="{:.2g}".format, na_rep="-"),
             SENTENCES.get(self.verdict, verdict),
             *(f"{label}: {text}." for label, text in self.findings.items()),
+            *(f"{label}: {text}." for label, text in shown.items()),
             self.remedy,
             self.note,
             repr(self.transient) if self.transient else "",
@@ -270,7 +295,13 @@ class Prediction(Bands):
 
 @in_one_thread
 def predict(
-    problem: Problem, posterior: Posterior, *, draws: int = 200, run: Run | None = None, experiment: str | None = None
+    problem: Problem,
+    posterior: Posterior,
+    *,
+    draws: int = 200,
+    run: Run | None = None,
+    experiment: str | None = None,
+    tolerance: float | None = None,
 ) -> Prediction:
     """Predict the mean period of every experiment, and test the model against the measured one.
 
@@ -303,6 +334,9 @@ def predict(
         all recordings must have the same times and outputs. Sensors are not applied to them.
     experiment : str, optional
         The experiment whose parameters `run` gets; required if experiments differ in some.
+    tolerance : float, optional
+        Error of the model that is small enough for its use, as a fraction of the rms of a measured period about its
+        mean: 0.02 for 2 %.
 
     Returns
     -------
@@ -312,7 +346,7 @@ def predict(
     ------
     ValueError
         For too few draws, a posterior of another problem, an `experiment` that is missing, unknown or given without
-        `run`, or recordings that differ in their times or outputs.
+        `run`, recordings that differ in their times or outputs, or a tolerance that is not between 0 and 1.
     RuntimeError
         If no draw or not the one with the highest density has a periodic solution, or if all runs fail.
 
@@ -324,8 +358,12 @@ def predict(
     >>> draws = bp.sample(linear, bp.map_estimate(linear, progress=False), seed=1, max_steps=250, progress=False)
     >>> bp.predict(linear, draws, draws=50).verdict
     'misspecified'
+    >>> bp.predict(linear, draws, draws=50, tolerance=0.3).verdict
+    'adequate within tolerance'
     """
     _checks.instance("problem", problem, Problem)
+    if tolerance is not None and not 0.0 < _checks.finite_number("tolerance", tolerance) < 1.0:
+        raise ValueError(f"tolerance: must be between 0 and 1, got {tolerance!r}; give 0.02 for 2 % of the rms.")
     count = _checks.integer("draws", draws, 20)
     if experiment is not None and run is None:
         raise ValueError(f"experiment: must be given together with `run`, got {experiment!r} without `run`.")
@@ -367,11 +405,32 @@ def predict(
     table = adequacy(problem, here, noise, replicates)
     others = here.other_orbits
     table.loc[table["experiment"].isin([*others, *([ALL] if others else [])]), "verdict"] = MISSPECIFIED
+    table = with_model_error(table, model_errors(problem, here, np.median(noise, axis=0)))
+    if tolerance is not None and not others and not conflict:
+        table["verdict"] = tolerated(table, tolerance, faulty(problem))
     recorded = None if run is None else _transient(problem, points, run, experiment)
     note = _note(problem, posterior, table)
     return Prediction(
-        **vars(predicted), table=table, transient=recorded, note=note, other_orbits=others, prior_conflict=conflict
+        **vars(predicted),
+        table=table,
+        transient=recorded,
+        note=note,
+        other_orbits=others,
+        prior_conflict=conflict,
+        tolerance=tolerance,
     )
+
+
+def tolerated(table: pd.DataFrame, tolerance: float, unsound: set[str]) -> pd.Series:
+    """Return the verdicts of a table where errors of the model below a tolerance are accepted."""
+    below, verdict = table[MODEL_ERROR[2]] < tolerance, table["verdict"].copy()
+    accepted = below & verdict.isin([MISSPECIFIED, UNTESTED]) & (table.index != ALL)
+    faults = table["experiment"].isin(unsound)
+    verdict[accepted] = np.where(faults[accepted], UNSOUND, TOLERATED)
+    rest = verdict.drop(ALL)
+    if below[ALL] and verdict[ALL] in (MISSPECIFIED, UNTESTED) and not rest.isin([MISSPECIFIED]).any():
+        verdict[ALL] = UNSOUND if unsound else TOLERATED
+    return verdict
 
 
 def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:

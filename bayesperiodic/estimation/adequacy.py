@@ -111,11 +111,16 @@ def adequacy(
     smallest = np.min(np.where(np.isnan(adjusted), np.inf, adjusted), axis=1)
     smallest[-1] = min(smallest)
     table["p"] = np.where(np.isinf(smallest), np.nan, smallest)
-    faulty = {e.name for e in problem.experiments if any(finding.severity != HARMLESS for finding in e.findings)}
-    unsound = table["experiment"].isin(faulty | {ALL} if faulty else set())
+    faults = faulty(problem)
+    unsound = table["experiment"].isin(faults | {ALL} if faults else set())
     verdicts = [UNTESTED, MISSPECIFIED, UNSOUND]
     table["verdict"] = np.select([np.isinf(smallest), smallest < ADEQUACY_LEVEL, unsound], verdicts, ADEQUATE)
     return table
+
+
+def faulty(problem: Problem) -> set[str]:
+    """Return the experiments whose recordings have faults that are not harmless."""
+    return {e.name for e in problem.experiments if any(finding.severity != HARMLESS for finding in e.findings)}
 
 
 REJECTIONS = {

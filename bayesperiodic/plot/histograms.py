@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from bayesperiodic.plot.grid import TITLE_QUANTILES, arrange, interval_title, write_labels, write_legend
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, caveats_of, legend_entries
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, caveats_of, kind_of, legend_entries
 from bayesperiodic.sampling.convergence import arviz
 from bayesperiodic.sampling.draws import Posterior
 
@@ -40,7 +40,7 @@ def draw_histograms(
     from corner import corner
 
     names = tuple(labels)
-    draws = np.stack([posterior.draws(name) for name in names], axis=-1)
+    draws = np.stack([posterior.headline.draws(name) for name in names], axis=-1)
     if len(figure.axes) not in (0, len(names) ** 2):
         raise ValueError(f"figure: must have no axes or {len(names) ** 2}, got {len(figure.axes)}.")
     constant = [name for name, values in zip(names, draws.T, strict=True) if np.ptp(values) == 0.0]
@@ -52,7 +52,7 @@ def draw_histograms(
     defaults["title_quantiles"] = TITLE_QUANTILES
     if not any(name in options for name in TITLE_OPTIONS):
         defaults |= {"titles": [interval_title(values) for values in draws.T], "title_fmt": None}
-    histogram = {"label": f"MCMC {len(before) + 1}" if before else "MCMC", "lw": 1.4}
+    histogram = {"label": f"{kind_of(posterior)} {len(before) + 1}" if before else kind_of(posterior), "lw": 1.4}
     histogram |= {"density": True} if options.get("smooth1d") is None else {}  # a line otherwise
     settings = defaults | options | {"hist_kwargs": histogram | dict(options.get("hist_kwargs") or {})}
     marks = [truths.get(name) for name in names]

@@ -29,6 +29,7 @@ from bayesperiodic.plot.style import (
     chosen,
     draw_marginal,
     draws_label,
+    kind_of,
     panel_grid,
     panels,
     styled,
@@ -46,6 +47,8 @@ SHORT_LABEL_LENGTH = 18
 PANEL_QUANTILES, PANEL_MARGIN = (0.003, 0.997), 0.06
 BINS, HISTOGRAM_QUANTILES = 40, (0.0005, 0.9995)
 TALLEST_LAPLACE = 2.5
+PALE = 0.5
+PALE_STYLE: dict[str, Any] = {"color": COLOURS["map"], "lw": 0.9, "alpha": PALE}
 TRUTH_STYLE: dict[str, Any] = {"color": COLOURS["measured"], "lw": 1.1}
 PRIOR_STYLE: dict[str, Any] = {"color": "0.35", "lw": 0.8, "ls": ":"}
 ZERO_STYLE: dict[str, Any] = {"color": "0.75", "lw": 0.8, "zorder": 0.5}
@@ -74,6 +77,10 @@ def corner(
     parameters are v ± v·sd(ln v) around the mode in sampling coordinates, independent of the parameters. Quantities
     without a Laplace approximation have no ellipse. Where the draws belong to several optima, see `Posterior.modes`,
     each has its own regions and colour, and its number at the mean. A grey line marks zero where a panel contains it.
+
+    If the model is misspecified at the estimate from which was sampled, regions and densities are those of the robust
+    draws (`Posterior.headline`); those of the draws, which take the error of the model for independent noise,
+    are pale lines beside them, and so is the Laplace approximation.
 
     With style="corner" the package corner (Foreman-Mackey, J. Open Source Softw. 1 (2016) 24) draws histograms of all
     draws and contours of two-dimensional histograms, by default at its levels of 12, 39, 68 and 86 %. Several
@@ -155,8 +162,11 @@ def corner(
         return figure
     drawn = _Panels.of(figure, posterior, names, dict(truths or {}))
     handles = [*drawn.draw_draws(quantiles, show_titles)]
+    if posterior.headline is not posterior:
+        handles += drawn.draw_pale(np.stack([posterior.draws(name) for name in names], axis=-1))
     if laplace is not None:
-        handles += drawn.draw_laplace(*normal_approximation(posterior, names, laplace))
+        look = LAPLACE_STYLE | ({"alpha": PALE} if laplace.misspecified else {})
+        handles += drawn.draw_laplace(*normal_approximation(posterior, names, laplace), look)
     if problem is not None:
         handles += drawn.draw_priors(problem)
     handles += drawn.draw_lines()
@@ -202,7 +212,7 @@ class _Panels:
     @classmethod
     def of(cls, figure: Figure, posterior: Posterior, names: tuple[str, ...], truths: dict[str, float]) -> "_Panels":
         """Return the empty panels, with their limits."""
-        draws = np.stack([posterior.draws(name) for name in names], axis=-1)
+        draws = np.stack([posterior.headline.draws(name) for name in names], axis=-1)
         ends = np.quantile(draws, PANEL_QUANTILES, axis=0).T
         for i, name in enumerate(names):
             if name in truths:
@@ -250,20 +260,33 @@ class _Panels:
             if show_titles:
                 axes.set_title(interval_title(self.draws[:, k]))
 
-    def draw_laplace(self, mean: np.ndarray, covariance: np.ndarray) -> Iterator[Any]:
+    def draw_pale(self, draws: np.ndarray) -> Iterator[Any]:
+        """Draw outlines of the regions of draws whose intervals are not valid, and yield the entry of the legend."""
+        for axes, pair in self.pairs():
+            estimate = regions.density(draws[:, pair], [self.supports[k] for k in pair])
+            half, most = estimate.levels(REGION_LEVELS)
+            look = {"colors": [PALE_STYLE["color"]], "linewidths": PALE_STYLE["lw"], "alpha": PALE, "zorder": 4}
+            axes.contour(*estimate.nodes, estimate.values, levels=[most, max(half, np.nextafter(most, np.inf))], **look)
+        for k, axes in enumerate(np.diag(self.grid)):
+            estimate, highest = regions.density(draws[:, k][:, None], [self.supports[k]]), axes.get_ylim()[1]
+            axes.plot(estimate.nodes[0], estimate.values, **PALE_STYLE)
+            axes.set_ylim(0.0, min(max(highest, 1.08 * estimate.values.max()), TALLEST_LAPLACE * highest))
+        yield plt.Line2D([], [], label="MCMC, model taken for right", **PALE_STYLE)
+
+    def draw_laplace(self, mean: np.ndarray, covariance: np.ndarray, look: Mapping[str, Any]) -> Iterator[Any]:
         """Draw ellipses and densities of the normal distribution, and yield the entry of the legend."""
         variances = np.diag(covariance)
         known = np.isfinite(mean) & np.isfinite(variances) & (variances > 0.0)
         for k in np.flatnonzero(known).tolist():
             axes, sd = self.grid[k, k], np.sqrt(variances[k])
             x = np.union1d(self._across(k), np.linspace(mean[k] - 4.0 * sd, mean[k] + 4.0 * sd, 200))
-            axes.plot(x, norm.pdf(x, mean[k], sd), **LAPLACE_STYLE)
+            axes.plot(x, norm.pdf(x, mean[k], sd), **look)
             highest = axes.get_ylim()[1]
             axes.set_ylim(0.0, min(max(highest, 1.08 * norm.pdf(0.0) / sd), TALLEST_LAPLACE * highest))
         for axes, pair in self.pairs():
             if known[pair].all():
-                draw_ellipses(axes, mean[pair], covariance[np.ix_(pair, pair)])
-        yield plt.Line2D([], [], label=f"Laplace, {LEVELS_TEXT}", **LAPLACE_STYLE)
+                draw_ellipses(axes, mean[pair], covariance[np.ix_(pair, pair)], look)
+        yield plt.Line2D([], [], label=f"Laplace, {LEVELS_TEXT}", **look)
 
     def draw_priors(self, problem: Problem) -> Iterator[Any]:
         """Draw the priors on the diagonal, and yield the entry of the legend."""
@@ -295,7 +318,7 @@ def _groups(posterior: Posterior) -> list[_Group]:
     table = posterior.modes
     if len(table) < 2:
         every = np.ones(posterior.draws(posterior.names[0]).size, dtype=bool)
-        return [_Group(f"MCMC, {LEVELS_TEXT}", COLOURS["mcmc"], every)]
+        return [_Group(f"{kind_of(posterior)}, {LEVELS_TEXT}", COLOURS["mcmc"], every)]
     mode = posterior.tree["sample_stats"].to_dataset()[MODE].to_numpy().ravel()
     label = "optimum {}: {:.1f} ± {:.1g} %"
     return [
@@ -319,7 +342,9 @@ def draw_regions(axes: Axes, draws: np.ndarray, supports: list[regions.Support],
     axes.contour(*mesh, levels=[most, max(half, np.nextafter(most, np.inf))], colors=[colour], linewidths=0.9)
 
 
-def draw_ellipses(axes: Axes, mean: np.ndarray, covariance: np.ndarray) -> None:
+def draw_ellipses(
+    axes: Axes, mean: np.ndarray, covariance: np.ndarray, look: Mapping[str, Any] = LAPLACE_STYLE
+) -> None:
     """Draw the ellipses of the probability levels of a bivariate normal distribution."""
     sds = np.sqrt(np.diag(covariance))
     correlation = covariance[0, 1] / np.prod(sds)
@@ -327,7 +352,7 @@ def draw_ellipses(axes: Axes, mean: np.ndarray, covariance: np.ndarray) -> None:
     up = correlation * np.cos(turn) + np.sqrt(max(1.0 - correlation**2, 0.0)) * np.sin(turn)
     circle = sds * np.column_stack([np.cos(turn), up])
     for level in REGION_LEVELS:
-        axes.plot(*(mean + np.sqrt(-2.0 * np.log(1.0 - level)) * circle).T, zorder=5, **LAPLACE_STYLE | {"lw": 1.2})
+        axes.plot(*(mean + np.sqrt(-2.0 * np.log(1.0 - level)) * circle).T, zorder=5, **{**look, "lw": 1.2})
 
 
 def normal_approximation(

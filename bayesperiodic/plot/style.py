@@ -55,7 +55,13 @@ def styled(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
 
 def caveats_of(posterior: Posterior) -> str:
     """Return the caveats on draws, for the title of a figure."""
-    return caveats(bool(posterior.tree.attrs.get("synthetic")), posterior.converged)
+    text = caveats(bool(posterior.tree.attrs.get("synthetic")), posterior.converged)
+    return ", ".join(filter(None, [text, "model misspecified" if posterior.misfit else ""]))
+
+
+def kind_of(posterior: Posterior) -> str:
+    """Return what the draws of `Posterior.headline` are, for the legend of a figure."""
+    return "robust" if posterior.headline.is_robust else "MCMC"
 
 
 def caveats(synthetic: bool, converged: bool) -> str:

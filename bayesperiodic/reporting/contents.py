@@ -20,6 +20,7 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.comparison import Comparison, compare
 from bayesperiodic.diagnostics.identifiability import identifiability
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
+from bayesperiodic.diagnostics.model_error import MODEL_ERROR
 from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction, predict
 from bayesperiodic.estimation.adequacy import ADEQUACY_TESTS
 from bayesperiodic.estimation.map_estimate import estimation_warnings
@@ -91,7 +92,20 @@ class ReportInputs:
     @cached_property
     def summary(self) -> pd.DataFrame:
         """Mean, sd, interval and diagnostics of the draws by name; empty without draws."""
-        return pd.DataFrame() if self.posterior is None else self.posterior.summary()
+        return pd.DataFrame() if self.posterior is None else self.posterior.summary(robust=False)
+
+    @property
+    def misfit(self) -> str:
+        """Why the model is misspecified and robust intervals come first, in a sentence; "" if it is not."""
+        return f"{self.fit.misfit}." if self.fit.misspecified else ""
+
+    @cached_property
+    def headline(self) -> dict[str, tuple[float, float]]:
+        """The 90 % interval of each parameter that comes first: robust where the model is misspecified."""
+        if self.posterior is None or (self.misfit and self.posterior.headline is self.posterior):
+            return self.fit.interval(PROBABILITY)
+        table = self.posterior.summary()
+        return {name: (float(table.loc[name, "q05"]), float(table.loc[name, "q95"])) for name in self.fit.theta}
 
     @property
     def coloured(self) -> list[str]:
@@ -100,9 +114,10 @@ class ReportInputs:
 
     @property
     def robust_ratios(self) -> dict[str, float]:
-        """Robust over Laplace standard deviation where it exceeds 1.5 although some residual is not white."""
+        """Robust over Laplace sd where it exceeds 1.5: some residual is not white, though the model is not rejected."""
         ratios = {name: self.fit.robust_sd[name] / sd for name, sd in self.fit.sd.items() if sd > 0.0}
-        return {name: ratio for name, ratio in ratios.items() if self.coloured and LARGE_RATIO < ratio < np.inf}
+        doubtful = self.coloured and not self.misfit
+        return {name: ratio for name, ratio in ratios.items() if doubtful and LARGE_RATIO < ratio < np.inf}
 
     @property
     def warnings(self) -> Iterator[str]:
@@ -269,7 +284,7 @@ def summary(given: ReportInputs) -> Rows:
     return [
         {
             **{title: full[title] for title in ("Parameter", "Unit", "MAP")},
-            "90 % interval": full.get("MCMC: 90 % interval", full["Laplace: 90 % interval"]),
+            **_headline_cells(given, name, rounding, full),
             **({"Robust 90 % interval": rounding.interval(*robust[name])} if robust else {}),
             "Identifiability": badge(given.identifiability.verdicts[name]),
             **({"Laplace approximation": badge(laplace[name])} if laplace else {}),
@@ -278,13 +293,23 @@ def summary(given: ReportInputs) -> Rows:
     ]
 
 
+def _headline_cells(
+    given: ReportInputs, name: str, rounding: html.Rounding, full: Mapping[str, Any]
+) -> dict[str, html.Number]:
+    """Return the interval that comes first, and beside a robust one that which takes the model for right."""
+    usual = full.get("MCMC: 90 % interval", full["Laplace: 90 % interval"])
+    if not given.misfit:
+        return {"90 % interval": usual}
+    return {"Robust 90 % interval": rounding.interval(*given.headline[name]), "If the model were right": usual}
+
+
 def _roundings(fit: MapEstimate) -> dict[str, html.Rounding]:
     return {name: html.Rounding.of(value, fit.sd[name]) for name, value in fit.theta.items()}
 
 
 def estimates(given: ReportInputs) -> Rows:
     """Return the table of the estimates of the free parameters."""
-    fit, intervals = given.fit, given.fit.interval(PROBABILITY)
+    fit, intervals = given.fit, given.fit.interval(PROBABILITY, robust=False)
     return [
         {
             "Parameter": code(name),
@@ -419,7 +444,11 @@ def adequacy(prediction: Prediction) -> Rows:
     """Return the table of the tests of the model."""
     columns: dict[str, Any] = {"label": ("Experiment and channel", str), "verdict": ("Verdict", badge)}
     columns |= {test: (f"p-values: {test}", html.p_value) for test in ADEQUACY_TESTS}
-    return _formatted(prediction.table, **columns, model_error_share=("Fraction of model error", html.percent))
+    columns["model_error_share"] = ("Fraction of model error", html.percent)
+    for name, title in zip(MODEL_ERROR, ("estimate", "5 %", "95 %"), strict=True):
+        if name in prediction.table:
+            columns[name] = (f"Model error over rms: {title}", html.percent)
+    return _formatted(prediction.table, **columns)
 
 
 def missing_terms(search: MissingTerms) -> Rows:

@@ -235,7 +235,7 @@ def campaign(task: tuple[int]) -> dict[str, Any]:
             fitted = rig.estimate(experiments, speeds, start=rig.TRUE, known=known, noise=bp.noise.Measured())
         except ValueError as error:
             return {"seed": task[0], "source": source(), "refused": refused, "failure": str(error)}
-    fit, intervals = fitted.fit, fitted.fit.interval(LEVEL)
+    fit, intervals = fitted.fit, fitted.fit.interval(LEVEL, robust=False)
     return {
         "seed": task[0],
         "source": source(),

@@ -86,7 +86,7 @@ def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict
         judged = [by_run[run.name] for run in runs]
         at = np.arange(len(judged))
         low, high = np.array([np.quantile(v.identified.posterior.draws(CONDUCTION), [0.05, 0.95]) for v in judged]).T
-        laplace = np.array([v.identified.fit.interval(0.9)[CONDUCTION] for v in judged]).T
+        laplace = np.array([v.identified.fit.interval(0.9, robust=False)[CONDUCTION] for v in judged]).T
         axes.vlines(at - 0.1, low, high, color=bp.plot.COLOURS["mcmc"], lw=5, label="draws, 90 %")
         axes.vlines(at + 0.1, *laplace, color=bp.plot.COLOURS["laplace"], lw=2, label="Laplace, 90 %")
         axes.axhline(GEAR[CONDUCTION], color="black", lw=0.9, ls="--", label="true value 2 W/K")

@@ -293,7 +293,9 @@ def _examine(run: Run, truth: str, seed: int) -> dict[str, Any]:
     mcmc = {name: np.quantile(posterior.draws(name), ends) for name in stated.names}
     return {
         "mcmc_covers": {name: bool(low < GEAR[name] < high) for name, (low, high) in mcmc.items()},
-        "laplace_covers": {name: bool(low < GEAR[name] < high) for name, (low, high) in fit.interval(LEVEL).items()},
+        "laplace_covers": {
+            name: bool(low < GEAR[name] < high) for name, (low, high) in fit.interval(LEVEL, robust=False).items()
+        },
         "sd": {name: float(posterior.draws(name).std()) for name in stated.names},
         "sign": verdict.sign,
         "misspecified": verdict.misspecified,

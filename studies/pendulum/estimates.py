@@ -121,7 +121,9 @@ def errors(fit: bp.MapEstimate) -> dict[str, float]:
 
 def covers(fit: bp.MapEstimate, probability: float = 0.9) -> dict[str, bool]:
     """Return whether the intervals of an estimate contain the truth."""
-    return {name: bool(low <= TRUTH[name] <= high) for name, (low, high) in fit.interval(probability).items()}
+    return {
+        name: bool(low <= TRUTH[name] <= high) for name, (low, high) in fit.interval(probability, robust=False).items()
+    }
 
 
 NATURAL = ("m", "l", "k1", "k2", "k3")

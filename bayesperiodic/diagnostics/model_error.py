@@ -1,0 +1,194 @@
+"""Size of the error of a model: how far its predicted periods are from the true ones, with an interval."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+from scipy.optimize import brentq
+
+from bayesperiodic._linalg import TINY, column_space
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.log_posterior import Linearisation
+from bayesperiodic.density.problem import Problem
+from bayesperiodic.estimation.adequacy import ALL, Whitened, measured_freedom
+from bayesperiodic.likelihood.block import Block
+
+MODEL_ERROR = ("model_error", "model_error_low", "model_error_high")
+# Probability beyond each end of the interval.
+TAIL = 0.05
+# Values tried of a noise variance that is itself estimated.
+NOISE_SCALES = 25
+
+
+class ErrorPart(NamedTuple):
+    """Sum of squares of the residual components of a block, and the noise in it.
+
+    `noise` is the part of the sum that is expected of the noise, known to a factor with `freedom` degrees of freedom,
+    `variance` the variance of that part; `along` is the variance of the noise in the direction of the residual.
+    """
+
+    square: float
+    noise: float
+    variance: float
+    along: float
+    freedom: float
+
+    def below(self, error: float, square: float) -> float:
+        """Return the probability of a sum of squares below a value, for an error of the model of this sum of squares.
+
+        The sum of squares of error and noise is noncentral χ², here by two moments (P. B. Patnaik, Biometrika 36 (1949)
+        202-232), averaged over the unknown size of the noise.
+        """
+        levels = (np.arange(NOISE_SCALES) + 0.5) / NOISE_SCALES
+        scale = np.ones(1) if np.isinf(self.freedom) else self.freedom / stats.chi2.ppf(levels, self.freedom)
+        mean = error + scale * self.noise
+        freedom = 2.0 * mean**2 / (scale**2 * self.variance + 4.0 * error * scale * self.along)
+        return float(np.mean(stats.chi2.cdf(freedom * square / mean, freedom)))
+
+    def error(self) -> tuple[float, float, float]:
+        """Return the sum of squares of the error of the model, and the ends of its 90 % interval.
+
+        A residual that is smaller than the noise says no more than one of the size of the noise.
+        """
+        if self.noise == 0.0:
+            return self.square, self.square, self.square
+        most = max(self.square, self.noise)
+        return (
+            max(self.square - self.noise, 0.0),
+            _root(lambda error: self.below(error, self.square) - (1.0 - TAIL), self.square),
+            _root(lambda error: self.below(error, most) - TAIL, most),
+        )
+
+
+def _root(falling: Callable[[float], float], scale: float) -> float:
+    """Return where a falling function of a positive number is zero; 0 if it is negative there."""
+    if falling(0.0) <= 0.0:
+        return 0.0
+    high = scale
+    while falling(high) > 0.0:
+        high *= 2.0
+    return float(brentq(falling, 0.0, high, xtol=1e-9 * scale))
+
+
+def model_errors(problem: Problem, here: Linearisation, noise: np.ndarray) -> pd.DataFrame:
+    """Return the error of the model in units of the measured rms and its 90 % interval, by experiment and channel.
+
+    It is the rms of the difference between the true period and that of the model with the parameters that fit all
+    experiments best, relative to the rms of the measured period about its mean. The noise is the one measured between
+    cycles, or a given one, that of the inputs included; if it is unknown, there is only an upper end, for which all of
+    the residual may be error of the model. `noise` are parameters of the noise model (noise_names,).
+    """
+    white, likelihood = Whitened(problem, here, noise), problem.likelihood
+    experiments = {e.name: e for e in problem.experiments}
+    blocks = likelihood.blocks
+    weights = [
+        np.broadcast_to(one, (block.size,))
+        for one, block in zip(likelihood.precisions(range(len(blocks)), noise), blocks, strict=True)
+    ]
+    root = np.sqrt(np.concatenate(weights))
+    jacobian, residual = (np.concatenate(parts, axis=-1) for parts in (here.jacobian, here.residuals))
+    if not (np.isfinite(jacobian).all() and np.isfinite(residual).all()):
+        return pd.DataFrame(columns=[*MODEL_ERROR])
+    basis = column_space(jacobian * root)
+    left = residual - basis @ (basis.T @ (residual * root)) / root
+    sources = [_noise_variances(white, i, weights[i], experiments[block.experiment]) for i, block in enumerate(blocks)]
+    spread = np.concatenate([variances for variances, *_ in sources])
+    after = _after_projection(basis, spread * root**2) / root**2 + _of_inputs(likelihood, blocks, basis, root)
+    ends = np.cumsum([block.size for block in blocks])
+    rows: dict[str, Any] = {}
+    for block, (_, freedom, each), end in zip(blocks, sources, ends, strict=True):
+        if block.counted and block.timed:
+            place = slice(end - block.size, end)
+            error = _error(block, left[place], after[place], basis[place], freedom, each)
+            rms = float(np.std(experiments[block.experiment].outputs[block.channel][_measured(experiments, block)]))
+            relative = np.sqrt(np.array(error) / block.size) / rms if rms > 0.0 else np.full(3, np.nan)
+            rows[f"{block.experiment} {block.channel}"] = dict(zip(MODEL_ERROR, relative.tolist(), strict=True))
+    return pd.DataFrame.from_dict(rows, orient="index", columns=[*MODEL_ERROR])
+
+
+def with_model_error(table: pd.DataFrame, errors: pd.DataFrame) -> pd.DataFrame:
+    """Return the table of `Prediction` with the columns of `model_errors`, the largest in the row "all"."""
+    if errors.empty or not np.isfinite(errors[MODEL_ERROR[2]]).all():
+        return table.join(errors)
+    errors = errors.astype(float)
+    errors.loc[ALL] = errors.loc[errors[MODEL_ERROR[2]].idxmax()]
+    return table.join(errors)
+
+
+def in_words(error: float, low: float, high: float, tolerance: float | None) -> str:
+    """Return an error of the model, the ends of its interval and how it compares with a tolerance, in words."""
+    if np.isnan(error):
+        size = f"the model is wrong by at most {high:.2%} of the rms (95 %), if all of the residual is its error"
+    else:
+        size = f"the model is wrong by {error:.2%} of the rms in the harmonics kept (90 %: {100 * low:.3g} to {100 * high:.3g} %)"
+    if tolerance is None:
+        return size
+    relation = "below" if high < tolerance else "above" if low > tolerance else "not shown to be below"
+    return f"{size}, {relation} the tolerance of {100 * tolerance:.3g} %"
+
+
+def _measured(experiments: dict[str, Experiment], block: Block) -> np.ndarray:
+    return experiments[block.experiment].measured_points
+
+
+def _error(
+    block: Block, left: np.ndarray, variances: np.ndarray, basis: np.ndarray, freedom: float, each: np.ndarray
+) -> tuple[float, float, float]:
+    """Return the sum of squares of the error of the model in a block and the ends of its interval.
+
+    `freedom` and `each` (size,) are the degrees of freedom of the variances of all components and of single ones.
+    """
+    square = float(left @ left)
+    if freedom > 0.0:
+        # Fewer independent values than components make sums of squares more variable.
+        dependent = max(block.size / block.count, 1.0)
+        parts = variances * left**2
+        along = dependent * float(parts.sum()) / max(square, TINY)
+        # A few harmonics may hold all of the error, whose noise is known less well than that of all.
+        few = float(parts.sum()) ** 2 / max(float(np.sum(parts**2 / each)), TINY)
+        return ErrorPart(
+            square, float(variances.sum()), 2.0 * dependent * float(variances @ variances), along, min(freedom, few)
+        ).error()
+    values = min(block.count, block.size) - float(np.sum(basis**2))
+    return np.nan, 0.0, square * values / stats.chi2.ppf(TAIL, values) if values >= 1.0 else np.inf
+
+
+def _noise_variances(
+    white: Whitened, index: int, weights: np.ndarray, experiment: Experiment
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Return the variances of the noise in the components of a block (size,), and degrees of freedom, 0 if unknown.
+
+    Degrees of freedom are those of all together and of each (size,).
+
+    They are those measured between cycles, harmonic by harmonic where possible, or those of the noise model if given.
+    """
+    block = white.blocks[index]
+    freedom = measured_freedom(experiment, block.channel)
+    if (spectrum := white.spectrum(index)) is not None:
+        pairs = np.bincount(block.harmonic)[block.harmonic]
+        return spectrum[0][block.harmonic], freedom, spectrum[1][block.harmonic] * pairs
+    if block.measured > 0.0:
+        return np.full(block.size, block.measured), freedom, np.full(block.size, freedom)
+    if white.groups[index] in white.known:
+        return block.weight / weights, np.inf, np.full(block.size, np.inf)
+    return np.zeros(block.size), 0.0, np.zeros(block.size)
+
+
+def _after_projection(basis: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    """Return the variances (size,) of independent components less their part along an orthonormal basis."""
+    taken = np.sum(basis**2, axis=1)
+    moved = basis @ (basis.T @ (variances[:, None] * basis))
+    return np.maximum(variances * (1.0 - 2.0 * taken) + np.sum(moved * basis, axis=1), 0.0)
+
+
+def _of_inputs(likelihood: Any, blocks: Any, basis: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """Return the variances (size,) that the noise of the inputs leaves in all components."""
+    ends, result = np.cumsum([block.size for block in blocks]), np.zeros(root.size)
+    for shared in likelihood.shared:
+        moved = np.zeros((root.size, shared.parts[0].shape[1]))
+        for b, part in zip(shared.members, shared.parts, strict=True):
+            moved[ends[b] - blocks[b].size : ends[b]] = part * root[ends[b] - blocks[b].size : ends[b], None]
+        result += np.sum((moved - basis @ (basis.T @ moved)) ** 2, axis=1) / root**2
+    return result
