@@ -382,7 +382,9 @@ def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:
         names = ["noise of the inputs"] * bool(problem.noisy_inputs) + ["error of the frequency"] * bool(
             problem.frequency_errors
         )
-        notes.append(f"What the {' and the '.join(names)} can cause is part of the covariance of the residual, and no misfit.")
+        notes.append(
+            f"What the {' and the '.join(names)} can cause is part of the covariance of the residual, and no misfit."
+        )
     if not problem.likelihood.white and table["size"].drop(ALL).isna().any():
         notes.append(
             f"{problem.noise.name.capitalize()} noise takes a correlated misfit as noise; only the scatter of the "

@@ -200,7 +200,9 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
             return problem, resumed(objective, end) or end
     if problem.noisy_inputs or problem.frequency_errors:
         names = " and ".join(["inputs"] * bool(problem.noisy_inputs) + ["frequencies"] * bool(problem.frequency_errors))
-        joint = ", or take input_noise='joint', in which those of the inputs are parameters" * bool(problem.noisy_inputs)
+        joint = ", or take input_noise='joint', in which those of the inputs are parameters" * bool(
+            problem.noisy_inputs
+        )
         warnings.warn(
             f"The errors of the {names} could not be linearised: estimate or {names} still move when this is repeated, "
             f"by more than {SETTLED_INPUTS:g} of their standard deviations. Average more cycles{joint}.",
