@@ -435,8 +435,8 @@ class Experiment(Result):
             text += f"; other clocks: {', '.join(f'{name} {list(own)}' for name, own in self.clocks.items())}"
         return (
             f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz{error}, {self.samples} "
-            f"samples per period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
-            f"{text}{''.join(f'; {finding}' for finding in self.findings)})"
+            f"samples per period, outputs {counts}, periodicity {self.periodicity:.4f}"
+            f"{', synthetic' if self.synthetic else ''}{text}{''.join(f'; {finding}' for finding in self.findings)})"
         )
 
 

@@ -25,9 +25,9 @@ def phase_diffusion(phase: np.ndarray, basis: np.ndarray, least: float) -> Diffu
 
     The differences of successive phases have a tridiagonal covariance, which the discrete sine transform diagonalises:
     with the step's variance q and the noise's v, its eigenvalues are q (2 + cos ω)/3 + 2 v (1 − cos ω). The likelihood
-    is that of the differences without their mean and linear trend (restricted likelihood), v is its maximum and at
-    least `least`, and the result the mean over q/v with a prior flat in its logarithm. `basis` (orders, cycles) are the
-    polynomials.
+    is that of the differences without their mean and linear trend (restricted likelihood). With equal probabilities v
+    is `least`, that of the samples' white noise, or its maximum above; the result is the mean over q/v, with a prior
+    flat in its logarithm. `basis` (orders, cycles) are the polynomials.
     """
     differences = np.diff(phase)
     count = differences.size
@@ -45,10 +45,11 @@ def phase_diffusion(phase: np.ndarray, basis: np.ndarray, least: float) -> Diffu
     pull = (moved / size) @ known.T
     square = np.sum(moved**2 / size, axis=1) - np.sum(pull * np.linalg.solve(gram, pull[..., None])[..., 0], axis=1)
     freedom = count - len(known)
-    noise = np.maximum(square / freedom, least)
+    noise = np.stack([np.maximum(square / freedom, least), np.full(ratios.size, least)])
     logarithm = freedom * np.log(noise) + square / noise + np.sum(np.log(size), axis=1) + np.linalg.slogdet(gram)[1]
-    gain = -0.5 * (logarithm - logarithm[0])
+    gain = -0.5 * (logarithm - logarithm[0, 0])[:, 1:]
     if gain.max() < GAIN:
         return None
-    share, step = softmax(gain[1:]), ratios[1:] * noise[1:]
-    return Diffusion(float(share @ step), share @ noise[1:] + (share @ step) * spread)
+    share = softmax(gain)
+    step = float(np.sum(share * noise[:, 1:] * ratios[1:]))
+    return Diffusion(step, np.sum(share * noise[:, 1:]) + step * spread)

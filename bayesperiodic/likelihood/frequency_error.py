@@ -1,11 +1,12 @@
 """Error of the measured frequency of a driven experiment, and what it does to the measured periods.
 
-The frequency of a recording is estimated with a standard error s. A period that is folded at the frequency f + δ instead
-of f has the harmonics h of all channels turned by −2π h δ t, where t is the time from τ = 0 to the middle of the samples:
-the least-squares fit keeps the phase there. The error δ/s is one more independent standard normal error of the
-experiment, beside those of its inputs, see `input_noise`. If time is not explicit in the model, a common shift of all
-channels does not matter, and only the differences of t between channels are kept. The frequency of the orbit of an
-autonomous model is data, see `orbit_frequency`.
+The frequency of a recording is estimated with a standard error s. A period that is folded at the frequency f + δ
+instead of f has the harmonics h of all channels turned by −2π h δ t, where t is the time from τ = 0 to the middle of
+the samples: the least-squares fit keeps the phase there. What it mixes into other harmonics is less than 1/cycles of
+their noise. The error δ/s is one more independent standard normal error of the experiment, beside those of its inputs,
+see `input_noise`. If time is not explicit in the model, a common shift of all channels does not matter, and only the
+differences of t between channels are kept. The frequency of the orbit of an autonomous model is data, see
+`orbit_frequency`.
 """
 
 from collections.abc import Mapping, Sequence

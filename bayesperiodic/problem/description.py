@@ -112,8 +112,7 @@ class Description:
         kinds = model.parameters, self.sensors.names, self.names
         self.parameter_maps = {run: ParameterMap.of(*kinds, run, self.fixed, tied) for run in runs}
         self.ties = self._ties()
-        errors = {e.name: FrequencyError.of(e, self.model) for e in self.experiments}
-        self.frequency_errors = {name: error for name, error in errors.items() if error is not None}
+        self.frequency_errors = self._known_frequency_errors()
         self.input_errors = self._checked_input_errors(input_errors or {})
         self.anchors = dict(anchors or {})
         if anchors:
@@ -174,6 +173,20 @@ class Description:
             for e in self.experiments
             if f"{SHIFT}[{e.name}]" not in priors
         }
+
+    def _known_frequency_errors(self) -> dict[str, FrequencyError]:
+        """Return the errors of frequencies by experiment; raise a ValueError where they cannot be integrated out."""
+        errors = {}
+        for e in self.experiments:
+            if (error := FrequencyError.of(e, self.model)) is None:
+                continue
+            if any(block.is_dense(self.noise) for block in blocks_of(e, self.model)):
+                raise ValueError(
+                    f"frequency_se of experiment {e.name!r}: must be 0 for points of a mask with {self.noise.name!r} "
+                    f"noise, got {e.frequency_se:g}; take noise='independent' or 'measured', or whole periods."
+                )
+            errors[e.name] = error
+        return errors
 
     def _checked_input_errors(self, errors: Mapping[str, InputErrors]) -> dict[str, InputErrors]:
         """Return the errors of inputs and frequencies; raise a ValueError unless they are of these experiments."""

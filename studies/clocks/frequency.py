@@ -1,4 +1,4 @@
-"""Coverage where the frequency is estimated: oscillators at resonance, and a limit cycle whose phase walks at random."""
+"""Coverage where the frequency is estimated: oscillators at resonance, and a limit cycle of wandering phase."""
 
 import warnings
 from collections.abc import Sequence
