@@ -44,8 +44,8 @@ def resolved_harmonics(time: np.ndarray, fundamental: float, points: int, asked:
         raise ValueError(
             f"recording: must have samples at three phases of its period at least, to determine the fundamental, got "
             f"{per_cycle(time, fundamental):.3g} samples per cycle of {fundamental:.6g} Hz, with "
-            f"{missing_phases(time, fundamental)}; sample faster, or at a rate that is no multiple of the frequency, or "
-            "check the frequency."
+            f"{missing_phases(time, fundamental)}; sample faster, or out of step with the period, or check the "
+            "frequency."
         )
     return highest
 
@@ -78,7 +78,9 @@ def missing_phases(time: np.ndarray, fundamental: float) -> str:
     step = np.diff(phase, append=phase[0] + 1.0)
     far = np.flatnonzero(step > SAME_PHASE)
     if far.size <= LISTED_PHASES:
-        return f"all samples at the phases {', '.join(f'{p:.3g}' for p in np.sort(phase[far]))} [cycles after the first]"
+        return (
+            f"all samples at the phases {', '.join(f'{p:.3g}' for p in np.sort(phase[far]))} [cycles after the first]"
+        )
     order = far[np.argsort(-step[far])]
     long = [k for k in order[:3] if step[k] > LISTED_INTERVAL] or [order[0]]
     parts = ", ".join(f"{phase[k]:.3g} to {phase[k] + step[k]:.3g}" for k in sorted(long))

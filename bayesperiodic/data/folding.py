@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic.data.coverage import resolved_harmonics
+from bayesperiodic.data.coverage import missing_phases, resolved_harmonics
 from bayesperiodic.data.harmonics import (
     NEGLIGIBLE_PHASE,
     HarmonicFit,
@@ -18,9 +18,9 @@ from bayesperiodic.data.harmonics import (
     refine_frequency,
 )
 from bayesperiodic.data.inspection import Inspection, inspect
+from bayesperiodic.data.lines import LEAST_LEFT, Sampling
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
 from bayesperiodic.data.recording_check import refuse
-from bayesperiodic.data.lines import Sampling
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, aperiodic, even_times, response_period
 from bayesperiodic.data.signals import Signals, counted_cycles, cycles_of, explains_more, first_guess
 
@@ -57,7 +57,8 @@ def fold_signals(
     if isinstance(origin, str) and origin != CROSSING:
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
-    seen = inspect(replace(signals, time=signals.time - start), periods, frequency, points)
+    asked = max(_chosen(harmonics, signals.channels).values(), default=0)
+    seen = inspect(replace(signals, time=signals.time - start), periods, frequency, points, asked)
     if seen.steady is None or seen.fit is None or seen.sizes is None:
         raise ValueError(seen.reason)
     fit, pace, limit = seen.fit, seen.pace, seen.limit
@@ -78,7 +79,7 @@ def fold_signals(
         noise[row].variance[:] *= seen.inflation
         noise[row].variance[:order] += (squares * np.var(seen.signals.values[row]))[:order]
     significant = [_last_significant(a, part) for a, part in zip(fit.amplitudes, noise, strict=True)]
-    kept = dict(zip(signals.channels, significant, strict=True)) | _chosen(harmonics, signals.channels, limit)
+    kept = dict(zip(signals.channels, significant, strict=True)) | _determined(harmonics, steady, fit, limit)
     amplitudes = fit.amplitudes
     if origin == CROSSING:
         # The first time ≥ 0 at which the fundamental of the first output crosses zero upwards.
@@ -253,7 +254,7 @@ def _noise(
     amplitude = sampling.between(signal)
     sides = len(sampling.left) // 2
     beside = np.concatenate([amplitude[:sides, harmonic], np.conj(amplitude[:sides, -harmonic])])
-    near = np.sum(np.abs(beside) ** 2, axis=0) / sampling.left.sum(axis=0)
+    near = np.sum(np.abs(beside) ** 2, axis=0) / np.maximum(sampling.left.sum(axis=0), LEAST_LEFT)
     freedom = sampling.freedom.copy()
     near[0], freedom[0] = sampling.at_zero(amplitude)
     repeated = _repeated_error(signals.values[row], residuals, fit.amplitudes[row], sampling.phase, sampling.grid)
@@ -320,17 +321,29 @@ def _last_significant(amplitudes: np.ndarray, noise: AmplitudeNoise) -> int:
     return int(np.flatnonzero(significant)[-1]) + 1 if significant.any() else 1
 
 
-def _chosen(harmonics: int | Mapping[str, int] | None, names: tuple[str, ...], limit: int) -> dict[str, int]:
+def _chosen(harmonics: int | Mapping[str, int] | None, names: tuple[str, ...]) -> dict[str, int]:
+    """Return the harmonics that are asked for, by channel."""
     if harmonics is None:
         return {}
     given = harmonics if isinstance(harmonics, Mapping) else dict.fromkeys(names, harmonics)
     for channel, count in given.items():
         _checks.one_of("harmonics", channel, names)
-        if _checks.integer(f"harmonics[{channel!r}]", count, 1) > limit:
-            raise ValueError(
-                f"harmonics[{channel!r}]: must be at most {limit}, which the samples and the grid resolve, got {count}."
-            )
+        _checks.integer(f"harmonics[{channel!r}]", count, 1)
     return {channel: int(count) for channel, count in given.items()}
+
+
+def _determined(
+    harmonics: int | Mapping[str, int] | None, steady: Signals, fit: HarmonicFit, limit: int
+) -> dict[str, int]:
+    """Return the harmonics that are asked for; raise a ValueError if the samples do not determine them."""
+    chosen = _chosen(harmonics, steady.channels)
+    for channel, count in chosen.items():
+        if count > limit:
+            raise ValueError(
+                f"harmonics[{channel!r}]: must be at most {limit}, which the samples and the grid resolve, got {count} "
+                f"(with {missing_phases(steady.time, fit.frequency)})."
+            )
+    return chosen
 
 
 def _power(variance: np.ndarray) -> float:

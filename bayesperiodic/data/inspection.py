@@ -25,6 +25,7 @@ from bayesperiodic.data.recording_check import (
     clock_findings,
     cycle_findings,
     sample_findings,
+    sampling_findings,
     signal_faults,
 )
 from bayesperiodic.data.signals import USUAL_STEPS, Signals, counted_cycles, cycles_of, first_guess
@@ -104,6 +105,8 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
         return Inspection(signals, faults, worst_first(findings(tracked)), total, reason=str(error))
     limit, inflation = determined_harmonics(used.time, tracked, limit)
     fit, pace = refine_frequency(used.time, used.values, tracked, limit)
+    if np.ptp(used.time) * fit.frequency < MINIMUM_CYCLES - 1:
+        return Inspection(signals, faults, worst_first(findings(tracked)), total, reason=_unsteady(signals, every))
     residuals = fit.residuals
     here = sound[(sound >= steady.samples.start) & (sound < steady.samples.stop)]
     if here.size < used.time.size:
@@ -115,6 +118,7 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
         fault.outliers = np.concatenate([fault.outliers[before], inside[moving[inside]], fault.outliers[after]])
     seen = findings(fit.frequency, limit, steady.samples)
     seen += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
+    seen += sampling_findings(used.time, used.values, fit.frequency, signals.time, part) if frequency is None else []
     return Inspection(
         signals, faults, worst_first(seen), total, steady, every.apart().sizes, fit, pace, limit, inflation
     )

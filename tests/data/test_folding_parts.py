@@ -113,7 +113,9 @@ def test_power_of_a_signal_is_that_of_its_amplitudes():
 def test_exact_data_have_no_noise_and_the_degrees_of_freedom_of_the_lines():
     time = np.arange(64) / 8.0
     fit = harmonics.HarmonicFit(1.0, np.array([[0.5, 1.0, 0.0]], dtype=complex), np.zeros((1, 64)))
-    one_cycle, noise = folding._noise(signals(time, np.round(np.cos(2 * np.pi * time), 9)), fit, 0, 8, lines.Sampling.of(time, 1.0, 2, 8))
+    one_cycle, noise = folding._noise(
+        signals(time, np.round(np.cos(2 * np.pi * time), 9)), fit, 0, 8, lines.Sampling.of(time, 1.0, 2, 8)
+    )
     assert one_cycle.tolist() == noise.variance.tolist() == [0.0, 0.0, 0.0]
     assert noise.freedom.tolist() == noise.lines.tolist() == [16.0, 16.0, 16.0]
 
