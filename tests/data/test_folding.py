@@ -250,7 +250,7 @@ def test_random_walks_are_refused(seed):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"harmonics": 80}, r"harmonics\['x'\]: must be at most 59, .*got 80"),
+        ({"harmonics": 800}, r"harmonics\['x'\]: must be at most \d+, .*got 800"),
         ({"harmonics": {"z": 3}}, "harmonics: must be one of 'x', 'y', got 'z'"),
         ({"harmonics": 0}, "must be an integer >= 1, got 0"),
         ({"samples": 2}, "samples: must be .*got 2"),
