@@ -13,6 +13,10 @@ PEAKS, DIVISORS, COMPARED_HARMONICS = 8, (1, 2, 3), 5
 # Least height of the spectral window where frequencies may be confused, so many peaks that are compared, and the
 # difference of the deviances of two frequencies that tells them.
 CONFUSED, WINDOW_PEAKS, DECISIVE = 0.7, 12, 25.0
+# Least height of the window at the rate of regular times.
+REGULAR = 0.99
+# Points between lines at which a peak of the window is searched; residuals of exact signals, relative to them.
+FINE_LINES, EXACT = 17, 1e-6
 # Least share of the variance that a frequency explains.
 LEAST_EXPLAINED = 0.5
 
@@ -39,12 +43,15 @@ def search_frequency(time: np.ndarray, values: np.ndarray, guess: float | None) 
     frequency, power = spectral_lines(time, np.concatenate([scaled, np.ones((1, time.size))]))
     slow = 4 * MINIMUM_CYCLES
     # Drifts and their aliases are no lines.
-    slowly = np.convolve(power[-1] > CONFUSED**2, np.ones(2 * slow + 1), "same") > 0.5
-    peaks = _peaks(np.where(slowly, 0.0, power[:-1].sum(axis=0)), MINIMUM_CYCLES / np.ptp(time), frequency)[:PEAKS]
+    window = np.where(frequency * np.median(np.diff(time)) > 0.5, power[-1], 0.0)
+    slowly = np.convolve(window > CONFUSED**2, np.ones(2 * slow + 1), "same") > 0.5
+    highest = _half_rate(time, *_window_peaks(time, frequency, power[-1]))
+    height = np.where(slowly | (frequency > highest), 0.0, power[:-1].sum(axis=0))
+    peaks = _peaks(height, MINIMUM_CYCLES / np.ptp(time), frequency)[:PEAKS]
     candidates = [line / k for line in frequency[peaks] for k in DIVISORS] + ([guess] if guess else [])
     found: dict[float, float] = {}
     for candidate in candidates:
-        fit = _fitted(time, scaled, candidate)
+        fit = _fitted(time, scaled, candidate, max(int(highest / candidate), 1) if highest < np.inf else None)
         if fit is not None and np.max(fit.variances) < 1.0 - LEAST_EXPLAINED:
             found[fit.frequency] = _deviance(fit)
     if not found:
@@ -72,15 +79,15 @@ def aliases(time: np.ndarray, values: np.ndarray, frequency: float) -> list[floa
     They are its sums and differences with frequencies at which the times of the samples are in step.
     """
     lines, power = spectral_lines(time, np.ones((1, time.size)))
-    window = np.sqrt(power[0])
-    peaks = _peaks(window, MINIMUM_CYCLES / np.ptp(time), lines)
-    peaks = np.sort(peaks[window[peaks] > CONFUSED])[:WINDOW_PEAKS]
-    own = _fitted(time, values, frequency)
+    peaks, height = _window_peaks(time, lines, power[0])
+    highest = _half_rate(time, peaks, height)
+    own = _fitted(time, values, frequency, max(int(highest / frequency), 1) if highest < np.inf else None)
     if own is None:
         return []
+    harmonics = own.amplitudes.shape[1] - 1
     found: list[float] = []
-    for candidate in sorted({abs(rate + sign * frequency) for rate in lines[peaks] for sign in (-1, 1)}):
-        fit = _fitted(time, values, candidate) if candidate * np.ptp(time) > MINIMUM_CYCLES else None
+    for candidate in sorted({abs(rate + sign * frequency) for rate in peaks for sign in (-1, 1)}):
+        fit = _fitted(time, values, candidate, harmonics) if candidate * np.ptp(time) > MINIMUM_CYCLES else None
         near = fit is not None and min(abs(fit.frequency - f) for f in [frequency, *found]) * np.ptp(time) < 1.0
         if fit is not None and not near and _deviance(fit) < _deviance(own) + DECISIVE:
             found.append(fit.frequency)
@@ -103,9 +110,28 @@ def _peaks(height: np.ndarray, lowest: float, frequency: np.ndarray) -> np.ndarr
     return places[np.argsort(-height[places])]
 
 
-def _fitted(time: np.ndarray, values: np.ndarray, frequency: float) -> HarmonicFit | None:
+def _window_peaks(time: np.ndarray, frequency: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest frequencies at which the times of samples are nearly in step, and the window's height there."""
+    places = np.sort(_peaks(power, MINIMUM_CYCLES / np.ptp(time), frequency))
+    places = places[power[places] > CONFUSED**2]
+    near = frequency[places][:WINDOW_PEAKS, None] + np.linspace(-1.0, 1.0, FINE_LINES) * frequency[1]
+    height = np.abs(np.exp(-2j * np.pi * near[:, :, None] * (time - time[0])).mean(axis=2))
+    best = height.argmax(axis=1)
+    return near[np.arange(len(near)), best], height.max(axis=1, initial=0.0)
+
+
+def _half_rate(time: np.ndarray, peaks: np.ndarray, height: np.ndarray) -> float:
+    """Return half of the rate of regular times, by the peaks of their spectral window; infinity for others.
+
+    Samples may be missing. Lower frequencies are those at which groups of samples return.
+    """
+    regular = peaks[(height > REGULAR) & (peaks * np.median(np.diff(time)) > 0.5)]
+    return float(0.5 * regular[0]) if regular.size else np.inf
+
+
+def _fitted(time: np.ndarray, values: np.ndarray, frequency: float, most: int | None = None) -> HarmonicFit | None:
     """Return the fit at the best frequency near this one; None if its phases are not covered."""
-    few = min(COMPARED_HARMONICS, covered_harmonics(time, frequency, time.size))
+    few = min(most or COMPARED_HARMONICS, COMPARED_HARMONICS, covered_harmonics(time, frequency, time.size))
     return None if few < 1 else nearby_fit(time, values, frequency, few)
 
 
@@ -113,6 +139,6 @@ def _deviance(fit: HarmonicFit) -> float:
     """Return −2·log-likelihood of normal noise, up to a constant, with the penalty of the harmonics (BIC)."""
     channels, samples = fit.residuals.shape
     unknowns = channels * (2 * fit.amplitudes.shape[1] - 1)
-    least = np.finfo(float).eps ** 2 * np.sum(np.abs(fit.amplitudes) ** 2, axis=1)
+    least = EXACT**2 * np.sum(np.abs(fit.amplitudes) ** 2, axis=1)
     power = np.mean(fit.residuals**2, axis=1)
     return float(samples * np.sum(np.log(np.maximum(power, least))) + unknowns * np.log(samples))

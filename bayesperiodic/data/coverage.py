@@ -44,8 +44,8 @@ def resolved_harmonics(time: np.ndarray, fundamental: float, points: int, asked:
         raise ValueError(
             f"recording: must have samples at three phases of its period at least, to determine the fundamental, got "
             f"{per_cycle(time, fundamental):.3g} samples per cycle of {fundamental:.6g} Hz, with "
-            f"{missing_phases(time, fundamental)}; sample faster, or at a rate that is no multiple of the frequency, or "
-            "check the frequency."
+            f"{missing_phases(time, fundamental)}; sample faster, or out of step with the period, or check the "
+            "frequency."
         )
     return highest
 

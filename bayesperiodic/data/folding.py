@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic.data.coverage import resolved_harmonics
+from bayesperiodic.data.coverage import missing_phases, resolved_harmonics
 from bayesperiodic.data.groups import CommonFit, fit_groups, leading, within
 from bayesperiodic.data.harmonics import (
     NEGLIGIBLE_PHASE,
@@ -20,7 +20,7 @@ from bayesperiodic.data.harmonics import (
     refine_frequency,
 )
 from bayesperiodic.data.inspection import Inspection
-from bayesperiodic.data.lines import Sampling
+from bayesperiodic.data.lines import LEAST_LEFT, Sampling
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
 from bayesperiodic.data.recording_check import refuse
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, aperiodic, even_times, response_period
@@ -69,7 +69,9 @@ def fold_signals(
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
     frequency = None if given is None else given[0]
     groups = [replace(group, time=group.time - start) for group in groups]
-    seen, others = inspect_clocks(groups, clocks, periods, frequency, points)
+    chosen = _chosen(harmonics, [channel for group in groups for channel in group.channels])
+    asked = max(chosen.values(), default=0)
+    seen, others = inspect_clocks(groups, clocks, periods, frequency, points, asked)
     if seen.steady is None or seen.fit is None or seen.sizes is None:
         raise ValueError(seen.reason)
     fit, pace, parts, name = seen.fit, seen.pace, seen.parts, groups[0].name
@@ -89,8 +91,9 @@ def fold_signals(
     cycles = round(max(np.ptp(part.time) for part in parts) * fit.frequency)
     _warn(name, pace, cycles, seen, given is None)
     one_cycle, noise = _noises(seen, parts, fit, cycles)
-    amplitudes, limits, size = _by_channel(parts, seen.limits, fit)
-    kept = {c: _last_significant(a, noise[c]) for c, a in amplitudes.items()} | _chosen(harmonics, limits)
+    amplitudes, size = _by_channel(parts, fit)
+    _refuse_undetermined(chosen, parts, seen.limits, fit.frequency)
+    kept = {c: _last_significant(a, noise[c]) for c, a in amplitudes.items()} | chosen
     outputs = [channel for channel in amplitudes if channel not in inputs]
     if origin == CROSSING:
         # The first time ≥ 0 at which the fundamental of the first output crosses zero upwards.
@@ -127,15 +130,13 @@ def fold_signals(
     }
 
 
-def _by_channel(
-    parts: list[Signals], highest: list[int], fit: CommonFit
-) -> tuple[dict[str, np.ndarray], dict[str, int], dict[str, int]]:
-    """Return by channel the amplitudes, the highest harmonic that its samples resolve, and their number."""
-    amplitudes, limits, sizes = {}, {}, {}
-    for part, one, limit in zip(parts, fit.each, highest, strict=True):
+def _by_channel(parts: list[Signals], fit: CommonFit) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Return by channel the amplitudes, and the number of samples."""
+    amplitudes, sizes = {}, {}
+    for part, one in zip(parts, fit.each, strict=True):
         for channel, values in zip(part.channels, one.amplitudes, strict=True):
-            amplitudes[channel], limits[channel], sizes[channel] = values, limit, part.time.size
-    return amplitudes, limits, sizes
+            amplitudes[channel], sizes[channel] = values, part.time.size
+    return amplitudes, sizes
 
 
 def _noises(
@@ -329,7 +330,7 @@ def _noise(
     amplitude = sampling.between(signal)
     sides = len(sampling.left) // 2
     beside = np.concatenate([amplitude[:sides, harmonic], np.conj(amplitude[:sides, -harmonic])])
-    near = np.sum(np.abs(beside) ** 2, axis=0) / sampling.left.sum(axis=0)
+    near = np.sum(np.abs(beside) ** 2, axis=0) / np.maximum(sampling.left.sum(axis=0), LEAST_LEFT)
     freedom = sampling.freedom.copy()
     near[0], freedom[0] = sampling.at_zero(amplitude)
     repeated = _repeated_error(signals.values[row], residuals, fit.amplitudes[row], sampling.phase, sampling.grid)
@@ -396,18 +397,26 @@ def _last_significant(amplitudes: np.ndarray, noise: AmplitudeNoise) -> int:
     return int(np.flatnonzero(significant)[-1]) + 1 if significant.any() else 1
 
 
-def _chosen(harmonics: int | Mapping[str, int] | None, limits: Mapping[str, int]) -> dict[str, int]:
+def _chosen(harmonics: int | Mapping[str, int] | None, names: Sequence[str]) -> dict[str, int]:
+    """Return the harmonics that are asked for, by channel."""
     if harmonics is None:
         return {}
-    given = harmonics if isinstance(harmonics, Mapping) else dict.fromkeys(limits, harmonics)
+    given = harmonics if isinstance(harmonics, Mapping) else dict.fromkeys(names, harmonics)
     for channel, count in given.items():
-        _checks.one_of("harmonics", channel, limits)
-        if _checks.integer(f"harmonics[{channel!r}]", count, 1) > limits[channel]:
-            raise ValueError(
-                f"harmonics[{channel!r}]: must be at most {limits[channel]}, which the samples and the grid resolve, "
-                f"got {count}."
-            )
+        _checks.one_of("harmonics", channel, names)
+        _checks.integer(f"harmonics[{channel!r}]", count, 1)
     return {channel: int(count) for channel, count in given.items()}
+
+
+def _refuse_undetermined(chosen: Mapping[str, int], parts: list[Signals], limits: list[int], frequency: float) -> None:
+    """Raise a ValueError if the samples do not determine the harmonics that are asked for."""
+    for part, limit in zip(parts, limits, strict=True):
+        for channel in part.channels:
+            if (count := chosen.get(channel, 0)) > limit:
+                raise ValueError(
+                    f"harmonics[{channel!r}]: must be at most {limit}, which the samples and the grid resolve, got "
+                    f"{count} (with {missing_phases(part.time, frequency)})."
+                )
 
 
 def _power(variance: np.ndarray) -> float:

@@ -27,6 +27,7 @@ from bayesperiodic.data.recording_check import (
     clock_findings,
     cycle_findings,
     sample_findings,
+    sampling_findings,
     signal_faults,
 )
 from bayesperiodic.data.signals import USUAL_STEPS, Signals, counted_cycles, cycles_of, first_guess
@@ -106,8 +107,8 @@ def inspect(
             for group, these in zip(groups, moving, strict=True)
         ]
         first = calm[leading(groups)]
-        part, tracked = counted_cycles(first, first_guess(first, frequency, periods), frequency is not None)
-        counted = first.time[part]
+        behind, tracked = counted_cycles(first, first_guess(first, frequency, periods), frequency is not None)
+        counted = first.time[behind]
         for group in calm:
             resolved_harmonics(group.time[within(group.time, counted)], tracked, points)
         span = common_span(groups, tracked)
@@ -142,6 +143,8 @@ def inspect(
     determined = [determined_harmonics(part.time, tracked, limit) for part, limit in zip(parts, highest, strict=True)]
     limits, inflation = [limit for limit, _ in determined], [factors for _, factors in determined]
     fit, pace = refine_groups(parts, tracked, limits, other)
+    if np.ptp(parts[0].time) * fit.frequency < MINIMUM_CYCLES - 1:
+        return Inspection(groups, faults, worst_first(findings(tracked)), total, reason=_unsteady(groups, every.all))
     if lost := next(filter(None, map(undetermined, parts, fit.each, highest)), ""):
         return Inspection(groups, faults, worst_first(findings(tracked)), total, reason=lost)
     for i, (group, part) in enumerate(zip(groups, used, strict=True)):
@@ -157,6 +160,9 @@ def inspect(
     channels = [channel for group in groups for channel in group.channels]
     ends = (max(group.time[0] for group in groups), min(group.time[-1] for group in groups))
     seen += cycle_findings(channels, groups[0].time, steady, fit.frequency, total, ends)
+    if frequency is None:
+        lead = parts[leading(groups)]
+        seen += sampling_findings(lead.time, lead.values, fit.frequency, first.time, behind)
     varies = pace.drifts or pace.wander > 0.0
     of_clocks, drifts = _clock_findings(groups, every, some[0].time, used[0], fit.frequency, total, varies)
     sizes = every.all.apart().sizes

@@ -21,10 +21,10 @@ LEAST_LEFT = 0.05
 
 @dataclass(frozen=True)
 class Sampling:
-    """Samples on a grid in phase, finer than the samples or the harmonics, so that lines are those of a discrete transform.
+    """Samples on a grid in phase, finer than the samples or the harmonics, with the lines of a discrete transform.
 
-    Lines beside the harmonics are apart by one cycle in all those that have samples. Of white noise the fitted harmonics
-    take the more from them, the less samples tell them apart.
+    Lines beside the harmonics are apart by one cycle in all those that have samples. Where samples are missing, the
+    fitted harmonics take a part of the noise at these lines.
     """
 
     phase: np.ndarray  # (samples,) [cycles] after the first
@@ -34,9 +34,7 @@ class Sampling:
     number: np.ndarray  # (covered,) of these cycles
     samples: np.ndarray  # (covered,) in each of them
     side: np.ndarray  # (lines,) distances of lines above harmonics [harmonics]
-    left: (
-        np.ndarray
-    )  # (lines beside a harmonic, harmonics + 1) share of white noise left there, above it and then below
+    left: np.ndarray  # (lines beside a harmonic, harmonics + 1) share of white noise left, above and then below it
     left_near_zero: np.ndarray  # (lines,) the same of the first lines
     freedom: np.ndarray  # (harmonics + 1,) of the mean over the sides
 
@@ -96,7 +94,7 @@ class Sampling:
         return np.asarray(np.fft.fft(total, axis=1)) / self.phase.size
 
     def at_zero(self, lines: np.ndarray) -> tuple[float, float]:
-        """Return the expected power of the noise at frequency zero, and its degrees of freedom, from lines `between`."""
+        """Return the expected power of the noise at frequency zero, and its freedom, from the lines `between`."""
         power = np.abs(lines[:, : self.points // 2].T.ravel()[:LINES_NEAR_ZERO]) ** 2
         left = self.left_near_zero[: power.size]
         return _at_zero((power / np.maximum(left, LEAST_LEFT))[left > LEAST_LEFT])

@@ -12,9 +12,11 @@ from bayesperiodic import _fourier
 from bayesperiodic._io import Result, Storable
 from bayesperiodic._verdicts import BAD, CAUTION, GOOD, with_tone
 from bayesperiodic.data import faults
+from bayesperiodic.data.aliases import SEARCHED, aliases, samples_per_cycle
+from bayesperiodic.data.coverage import per_cycle
 from bayesperiodic.data.faults import ChannelFaults
 from bayesperiodic.data.harmonics import fit_harmonics
-from bayesperiodic.data.signals import GAP, USUAL_STEPS
+from bayesperiodic.data.signals import GAP, LISTED_ALIASES, USUAL_STEPS
 from bayesperiodic.data.steadiness import ALLOWED_BIAS, Steady, Windows
 
 if TYPE_CHECKING:
@@ -37,6 +39,8 @@ HARMLESS_DRIFT, HARMLESS_STEP, HARMLESS_PHASE = 0.05, 0.02, 1.0 / 180.0
 # Change between neighbouring cycles that is a step, in standard deviations of the other changes, and cycles needed;
 # the standard deviation is uncertain if there are fewer cycles than this.
 STEP_FROM_CYCLE, FEWEST_FOR_STEPS, ENOUGH_FOR_STEPS = 8.0, 10, 20
+# Samples in a cycle of the strongest harmonic below which an estimated frequency is named with its aliases.
+FEW_PER_CYCLE = 10.0
 # Amplitude of a beat relative to the mean one, its false-alarm rate, and the cycles needed.
 HARMLESS_BEAT, BEAT_FALSE_ALARM, FEWEST_FOR_BEATS = 0.01, 1e-4, 24
 
@@ -49,8 +53,8 @@ class Finding(Storable):
     ----------
     kind : str
         "constant", "wraps", "stuck", "held" (a slower logger), "clipped", "saturated" (flat tops of the mean period),
-        "outliers", "heavy tails", "gaps", "ramp", "transient", "drift", "beating", "amplitude step", "phase step" or
-        "clock" (the phase of a channel drifts steadily against the first one).
+        "outliers", "heavy tails", "gaps", "aliases", "ramp", "transient", "drift", "beating", "amplitude step", "phase
+        step" or "clock" (the phase of a channel drifts steadily against the first one).
     channel : str
         Empty for all channels together.
     severity : str
@@ -76,7 +80,7 @@ class Finding(Storable):
     >>> finding.kind, finding.severity, finding.count, finding.times.round(2).tolist()
     ('stuck', 'ruinous', 201, [[10.0, 12.0]])
     >>> finding.cure
-    "recording.without(stuck=True, channel='force') leaves them out, and its parts `split` are folded"
+    "recording.without(stuck=True, channel='force') leaves them out"
     """
 
     kind: str
@@ -193,9 +197,8 @@ def _finding(
     size = "" if np.isnan(effect.bias) else f", a bias of {effect.bias:.3g} standard errors"
     size = size if inside else ", not used"
     cure = f"recording.without({kind}=True, channel={channel!r}) leaves them out"
-    if frequency and times.size and np.diff(times).max() * frequency > GAP:
-        cure += ", and its parts `split` are folded" if kind == "stuck" else ""
-        cure = "record again with a larger range" if kind == "clipped" else cure
+    if kind == "clipped" and frequency and times.size and np.diff(times).max() * frequency > GAP:
+        cure = "record again with a larger range"
     text = f"{channel} {what} {_when(times)} ({samples.size} samples, {share:.2g} of all{size})"
     return Finding(kind, channel, severity, times, samples.size, share, effect.bias, text, cure)
 
@@ -440,6 +443,35 @@ def clock_findings(time: np.ndarray) -> Iterator[Finding]:
             lost / (lost + time.size), np.nan,
             f"{lost} samples are missing in {ends.size} gaps, the longest of {step.max():.3g} s",
         )  # fmt: skip
+
+
+def sampling_findings(
+    time: np.ndarray, values: np.ndarray, frequency: float, whole: np.ndarray, counted: slice
+) -> list[Finding]:
+    """Return aliases of an estimated frequency, and the parts over whose gaps its cycles cannot be counted."""
+    findings, some = [], slice(-SEARCHED, None)
+    if per_cycle(time, frequency) < FEW_PER_CYCLE:
+        others = aliases(time[some], values[:, some], frequency)
+        if (many := samples_per_cycle(time[some], values[:, some], frequency, others)) < FEW_PER_CYCLE:
+            listed = ", ".join(f"{other:.6g}" for other in others[:LISTED_ALIASES])
+            findings.append(
+                Finding(
+                    "aliases", "", SERIOUS, np.array([[time[0], time[-1]]]), time.size, 1.0, np.nan,
+                    f"{frequency:.6g} Hz has {many:.3g} samples per cycle, and {listed} Hz (aliases) explain them as "
+                    "well", "give `frequency=`, or sample faster or at irregular times",
+                )
+            )  # fmt: skip
+    lost = np.array([[whole[0], time[0]], [time[-1], whole[-1]]])
+    lost = lost[[counted.start > 0, counted.stop < whole.size]]
+    if len(lost):
+        findings.append(
+            Finding(
+                "gaps", "", HARMLESS, lost, 1, float(np.ptp(lost, axis=1).sum() / np.ptp(whole)), np.nan,
+                f"the cycles in gaps cannot be counted with the error of the frequency; only {time[0]:.6g} to "
+                f"{time[-1]:.6g} s are used", "give `frequency=`",
+            )
+        )  # fmt: skip
+    return findings
 
 
 def refuse(name: str, findings: Iterable[Finding]) -> None:

@@ -18,7 +18,7 @@ Clocks = str | Mapping[str, Sequence[str]]
 
 
 def inspect_clocks(
-    groups: list[Signals], clocks: Clocks, periods: int, frequency: float | None, points: int
+    groups: list[Signals], clocks: Clocks, periods: int, frequency: float | None, points: int, asked: int = 0
 ) -> tuple[Inspection, dict[str, tuple[str, ...]]]:
     """Return what signals are like on the first clock, and the channels of the other clocks.
 
@@ -28,7 +28,7 @@ def inspect_clocks(
     channels = [channel for group in groups for channel in group.channels]
     if isinstance(clocks, str):
         _checks.one_of("clocks", clocks, (ONE, AUTO))
-        seen = inspect(groups, periods, frequency, points)
+        seen = inspect(groups, periods, frequency, points, asked=asked)
         others = _found(seen) if clocks == AUTO else {}
         if not others:
             return seen, {}
@@ -48,7 +48,7 @@ def inspect_clocks(
             part = _only([group], [channel for channel in group.channels if scale[channel] == factor])
             scaled += [replace(one, time=one.time * factor) for one in part]
     other = [channel for named in others.values() for channel in named]
-    return inspect(scaled, periods, frequency, points, other), others
+    return inspect(scaled, periods, frequency, points, other, asked), others
 
 
 def _given(clocks: Mapping[str, Sequence[str]], channels: list[str]) -> dict[str, tuple[str, ...]]:

@@ -23,8 +23,8 @@ GAP, USUAL_STEPS, MANY_STEPS = 0.25, 3.0, 30.0
 HYSTERESIS = 0.25
 # Smallest relative step of the period, in itself and in standard errors.
 SMALLEST_PERIOD_STEP, SIGNIFICANT_PERIOD_STEP = 1e-3, 8.0
-# Fewest samples of which a frequency is guessed, and fewest in a cycle of the strongest harmonic at a regular rate; aliases
-# that are listed.
+# Fewest samples of which a frequency is guessed, and fewest in a cycle of the strongest harmonic at a regular rate;
+# aliases that are listed.
 FEWEST_SAMPLES, FEWEST_PER_CYCLE, LISTED_ALIASES = 8, 4.0, 4
 # Cycles that are searched for the frequency if there are many samples in each.
 SEARCHED_CYCLES = 50.0
@@ -109,8 +109,8 @@ def _estimate(signals: Signals) -> float | None:
     if (many := samples_per_cycle(time, values, found, others)) < FEWEST_PER_CYCLE:
         raise ValueError(
             f"frequency: must be given for {signals.name!r}, in which {many:.3g} samples per cycle do not tell "
-            f"{found:.6g} Hz from {', '.join(f'{f:.6g}' for f in others[:LISTED_ALIASES])} Hz (aliases), got None; give "
-            "`frequency=`, or sample faster or at irregular times."
+            f"{found:.6g} Hz from {', '.join(f'{f:.6g}' for f in others[:LISTED_ALIASES])} Hz (aliases), got None; "
+            "give it, or sample faster or at irregular times."
         )
     return found
 

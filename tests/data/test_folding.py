@@ -250,7 +250,7 @@ def test_random_walks_are_refused(seed):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"harmonics": 80}, r"harmonics\['x'\]: must be at most 59, .*got 80"),
+        ({"harmonics": 800}, r"harmonics\['x'\]: must be at most \d+, .*got 800"),
         ({"harmonics": {"z": 3}}, "harmonics: must be one of 'x', 'y', got 'z'"),
         ({"harmonics": 0}, "must be an integer >= 1, got 0"),
         ({"samples": 2}, "samples: must be .*got 2"),
@@ -448,15 +448,13 @@ def test_warning_if_not_more_than_half_of_a_recording_is_used():
 
 
 @pytest.mark.parametrize(("first", "last"), [(300, 500), (1000, 1400), (2050, 2380), (2399, 2700)])
-def test_gap_is_refused_with_its_place(first, last):
+def test_cycles_are_counted_over_a_gap(first, last):
     time = np.arange(3000) / 100.0
     keep = (np.arange(3000) < first) | (np.arange(3000) >= last)
     recording = bp.Recording.from_arrays(time[keep], {"y": np.cos(4 * np.pi * time[keep])}, name="run")
-    message = (
-        rf"no gap longer than 0\.25 periods, got 'run' without samples from {time[first - 1]:g} to {time[last]:g} s"
-    )
-    with pytest.raises(ValueError, match=message):
-        recording.fold(64)
+    e = recording.fold(64)
+    assert e.frequency == pytest.approx(2.0, rel=1e-9)
+    assert e.outputs["y"] == pytest.approx(np.cos(2 * np.pi * grid(64)), abs=1e-8)
     assert [round(part.fold(64).frequency, 6) for part in recording.split()] == [2.0] * len(recording.split())
 
 
