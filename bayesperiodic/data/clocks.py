@@ -93,7 +93,7 @@ def steps_of(series: np.ndarray, cycle: np.ndarray, least: float) -> list[tuple[
     A straight line and a step are fitted to as many windows before and after each window, which may contain the step;
     the step is compared with those elsewhere. Slopes and slow curves, as of a transient, are no steps.
     """
-    rest, found = series.copy(), []
+    rest, found = series.copy(), list[tuple[int, float]]()
     if series.size < FEWEST_WINDOWS:
         return found
     length, next_ones = float(np.median(np.diff(cycle))), np.diff(series)

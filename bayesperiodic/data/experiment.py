@@ -188,8 +188,8 @@ class Experiment(Result):
             for key in given:
                 _checks.one_of(argument, key, (*self.inputs, *self.outputs))
         object.__setattr__(self, "clocks", {name: tuple(channels) for name, channels in self.clocks.items()})
-        for name, channels in self.clocks.items():
-            for channel in channels:
+        for name, named in self.clocks.items():
+            for channel in named:
                 _checks.one_of(f"clocks[{name!r}]", channel, (*self.inputs, *self.outputs))
         for name, slopes in self.error_slopes.items():
             _checks.one_of("error_slopes", name, self.inputs)

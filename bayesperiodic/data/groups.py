@@ -137,5 +137,5 @@ def refine_groups(
         cycle_scores(group.time, number, count, term[0], term[1], term[2])
         for group, number, term in zip(groups, cycle, terms, strict=True)
     ]
-    score, quadrature, power = (sum(part) for part in zip(*scores, strict=True))
-    return fit, pace_of(score, quadrature, power, information)
+    score, quadrature = sum(each[0] for each in scores), sum(each[1] for each in scores)
+    return fit, pace_of(np.asarray(score), np.asarray(quadrature), sum(each[2] for each in scores), information)

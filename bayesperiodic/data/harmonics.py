@@ -127,7 +127,8 @@ def normal_equation(
     Weights are zero for channels that are not `counted` (1 or 0).
     """
     fit = fit_harmonics(time, channels, frequency, harmonics)
-    clear, weights = _clear(fit), counted / np.maximum(fit.variances, 1e-24 * np.var(channels, axis=1))
+    power = 0.5 * np.sum(np.abs(fit.amplitudes[:, 1:]) ** 2, axis=1)
+    clear, weights = _clear(fit), counted / np.maximum(fit.variances, 1e-24 * power)
     slope = _fourier.at_times(_fourier.derivative(clear, 1.0), frequency * time)
     slope *= time - time.mean()
     information = _information(frequency * time, slope, weights, harmonics)

@@ -121,7 +121,7 @@ def inspect(
     moving = [these[part] for these, part in zip(moving, among, strict=True)]
     sound = [_sound(*each, tracked, points) for each in zip(groups, calm, faults, moving, strict=True)]
     whole = all(these.size == group.time.size for these, group in zip(sound, groups, strict=True))
-    sound = [these[(these >= part.start) & (these < part.stop)] for these, part in zip(sound, span, strict=True)]
+    sound = [_inside(these, part) for these, part in zip(sound, span, strict=True)]
     some = [
         group if these.size == group.time.size else group.part(these)
         for group, these in zip(groups, sound, strict=True)
@@ -149,7 +149,7 @@ def inspect(
         return Inspection(groups, faults, worst_first(findings(tracked)), total, reason=lost)
     for i, (group, part) in enumerate(zip(groups, used, strict=True)):
         amplitudes, residuals = fit.each[i].amplitudes, fit.each[i].residuals
-        here = sound[i][(sound[i] >= part.start) & (sound[i] < part.stop)]
+        here = _inside(sound[i], part)
         if here.size < parts[i].time.size:
             near = fit_harmonics(group.time[here], group.values[:, here], fit.frequency, limits[i])
             amplitudes = near.amplitudes
@@ -196,6 +196,11 @@ def _clock_findings(
         drifts = clocks.clock_drifts(phases, inside, places)
         found += clocks.drift_findings(drifts, channels, phases, (start, stop), cycles, total)
     return found, drifts
+
+
+def _inside(numbers: np.ndarray, part: slice) -> np.ndarray:
+    """Return increasing numbers of samples that are in a part."""
+    return numbers[slice(*np.searchsorted(numbers, [part.start, part.stop]))]
 
 
 def _moving(group: Signals, faults: list[ChannelFaults]) -> np.ndarray:

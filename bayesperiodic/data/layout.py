@@ -79,6 +79,7 @@ class Layout:
         at = label("time", self.time or NO_COLUMN)
         given = {label(key, column): columns[column] for key, column in sources.items()}
         times, present = without_missing(at, columns[self.time or NO_COLUMN], given, self.missing)
+        timed: Times
         if isinstance(times, dict):
             timed = {key: converted(at, "time", time) for key, time in zip(sources, times.values(), strict=True)}
         else:
@@ -117,9 +118,9 @@ def without_missing(
     if missing == INTERPOLATE and not isinstance(time, dict):  # of the ends, in all channels
         keep = dict.fromkeys(keep, np.all([*keep.values()], axis=0))
     kept = {key: values[keep[key]] for key, values in channels.items()}
-    first = next(iter(keep.values()), None)
+    first = next(iter(keep.values()), np.ones(np.shape(time), dtype=bool))
     if not isinstance(time, dict) and all(np.array_equal(first, mask) for mask in keep.values()):
-        return (time if first is None else time[first]), kept
+        return time[first], kept
     return {key: each[key][keep[key]] for key in channels}, kept
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, overload
 
@@ -153,12 +154,10 @@ class Recording(Channels):
         if not recordings:
             raise ValueError("recordings: must be one or more, got none.")
         _checks.identifiers("channels", [channel for one in recordings for channel in one.times])
-        kinds = [
-            {channel: values for one in recordings for channel, values in getattr(one, kind).items()}
-            for kind in ("outputs", "inputs")
-        ]
+        outputs = {channel: values for one in recordings for channel, values in one.outputs.items()}
+        inputs = {channel: values for one in recordings for channel, values in one.inputs.items()}
         times = {channel: time for one in recordings for channel, time in one.times.items()}
-        return cls(times, *kinds, name or recordings[0].name, any(one.synthetic for one in recordings))
+        return cls(times, outputs, inputs, name or recordings[0].name, any(one.synthetic for one in recordings))
 
     @overload
     @classmethod
@@ -458,14 +457,13 @@ class Recording(Channels):
             raise ValueError(f"recording: must have a part of at least three cycles, got none in {self.name!r}.")
         if len(pieces) == 1 and pieces[0] == slice(0, time.size):
             return [self]
-        divided = []
-        for i, piece in enumerate(pieces, 1):
-            # Other times are divided where those of this channel are.
-            first = time[piece.start] if piece.start else -np.inf
-            stop = time[piece.stop] if piece.stop < time.size else np.inf
-            samples = self._by_time(lambda own, ends=(first, stop): slice(*np.searchsorted(own, ends).tolist()))
-            divided.append(self._part(samples, self.name if len(pieces) == 1 else f"{self.name} {i}"))
-        return divided
+        # Other times are divided where those of this channel are.
+        edges = [(time[p.start] if p.start else -np.inf, np.append(time, np.inf)[p.stop]) for p in pieces]
+        names = [f"{self.name} {i}" for i in range(1, len(pieces) + 1)] if len(pieces) > 1 else [self.name]
+        return [
+            self._part(self._by_time(partial(_between, first=first, stop=stop)), name)
+            for (first, stop), name in zip(edges, names, strict=True)
+        ]
 
     def fold(
         self,
@@ -586,3 +584,7 @@ class Recording(Channels):
         return Experiment(
             name or self.name, synthetic=self.synthetic, period_test=evidence, guess=guess or {}, **folded
         )
+
+
+def _between(time: np.ndarray, first: float, stop: float) -> slice:
+    return slice(*np.searchsorted(time, [first, stop]).tolist())
