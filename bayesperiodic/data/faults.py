@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-
 from scipy.special import erf, erfc, pdtrc
 from scipy.stats import binom
 
@@ -37,7 +36,9 @@ ALL_DROPPED = 0.4
 HELD = 0.9
 # Short runs of one value: fewest samples, p-value of as many by noise, and largest share of these; standard deviation of
 # the noise relative to the range below which there is none, and samples from which that is taken.
-FEWEST_HELD, CHANCE_RUNS, CHANCE_SHARE, EXACT, NOISE_SAMPLES = 3, 1e-3, 0.05, 1e-9, 20_000
+FEWEST_HELD, CHANCE_RUNS, CHANCE_SHARE, NO_NOISE, NOISE_SAMPLES = 3, 1e-3, 0.05, 1e-9, 20_000
+# Largest share of different values among those of a quantised sensor.
+RETURN = 0.98
 # Heavy tails: distance from which residuals belong to them [standard deviations of the others], expected number of
 # larger ones beyond which one is an outlier, and fewest samples between the two distances.
 TAIL, RARE, FEWEST_IN_TAIL = 4.0, 0.01, 3
@@ -123,21 +124,28 @@ def brief_of(values: np.ndarray, step: float) -> np.ndarray:
     first, length = runs(values)
     if length.size < 2 or length.max() < FEWEST_HELD:
         return np.zeros(0, dtype=int)
-    noise = fast_noise(values)
-    if not noise > max(EXACT * float(np.ptp(values)), 0.5 * step):
+    noise, step = fast_noise(values), step or _spacing(values[first])
+    if not noise > max(NO_NOISE * float(np.ptp(values)), 0.5 * step):
         return np.zeros(0, dtype=int)
     # Runs of two count as chance: a hold of two samples is not told from it.
     pairs = (np.count_nonzero(length == 2) + 1.0) / values.size
     same = min(max(float(erf(step / (np.sqrt(8.0) * noise))), pairs), 1.0 - 1e-12)
     size = np.arange(FEWEST_HELD, length.max() + 1)
-    found = np.cumsum(np.bincount(length)[::-1])[::-1][size]  # runs of that size or longer
+    count = np.cumsum(np.bincount(length)[::-1])[::-1][size]  # runs of that size or longer
     chance = values.size * same ** (size - 1.0)
-    held = (chance < CHANCE_SHARE * found) & (pdtrc(found - 1, chance) < CHANCE_RUNS)
+    held = (chance < CHANCE_SHARE * count) & (pdtrc(count - 1, chance) < CHANCE_RUNS)
     if not held.any():
         return np.zeros(0, dtype=int)
     level = values[first]
     long = (length >= size[np.argmax(held)]) & (level != values.max()) & (level != values.min())
     return np.flatnonzero(np.repeat(long, length))
+
+
+def _spacing(values: np.ndarray) -> float:
+    """Return the usual distance of values if many of them return, as those of a quantised sensor do; else 0."""
+    some = values[:NOISE_SAMPLES]
+    levels = np.unique(some)
+    return float(np.median(np.diff(levels))) if levels.size < RETURN * some.size else 0.0
 
 
 def fast_noise(values: np.ndarray) -> float:
@@ -192,11 +200,11 @@ def heavy_tails(residuals: np.ndarray, outliers: np.ndarray, predicted: np.ndarr
     sizes = distance[distance > TAIL * scale] / (TAIL * scale)
     between = np.count_nonzero(sizes < FAR / TAIL)
     chance = float(erfc(TAIL / np.sqrt(2.0))) * residuals.size
-    own = distance[outliers] / (TAIL * scale)
+    relative = distance[outliers] / (TAIL * scale)
     far = np.flatnonzero(distance > FAR * scale)
     if between >= 2.0 * chance + FEWEST_IN_TAIL and between - chance >= far.size:
         index = np.log(2.0) / float(np.median(np.log(sizes)))
-        result = sizes.size * np.maximum(own, 1.0) ** -index > RARE
+        result = sizes.size * np.maximum(relative, 1.0) ** -index > RARE
     elif far.size >= FEWEST_IMPULSES:
         above = int(np.count_nonzero(residuals[far] > middle))
         p_value = 2.0 * min(binom.cdf(above, far.size, 0.5), binom.sf(above - 1, far.size, 0.5))

@@ -222,13 +222,7 @@ def sample_findings(
         )  # fmt: skip
         return
     if fault.repeats > 1:
-        delay = 0.5 * (fault.repeats - 1)
-        yield Finding(
-            "held", channel, SERIOUS, np.array([[time[0], time[-1]]]), fault.held.size, fault.held.size / total, np.nan,
-            f"{channel} repeats each value {fault.repeats} times: a slower logger or a hold, which delays it by "
-            f"{delay:g} samples ({delay * float(np.median(np.diff(time))):.3g} s) and weakens its harmonics",
-            f"recording.without(stuck=True, channel={channel!r}) keeps one sample of each value",
-        )  # fmt: skip
+        yield _held(channel, time, fault)
     bad = np.zeros(total, dtype=bool)
     for part in fault.stuck:
         bad[part] = True
@@ -237,8 +231,22 @@ def sample_findings(
         yield _tails(channel, time, fault.tails)
     if fault.saturation is not None and not fault.low.size and not fault.high.size:
         yield _saturated(channel, time, fault.saturated, fault)
-    if not bad.any():
-        return
+    if bad.any():
+        yield from _bad_findings(channel, time, values, fault, bad, frequency, harmonics, used)
+
+
+def _bad_findings(
+    channel: str,
+    time: np.ndarray,
+    values: np.ndarray,
+    fault: ChannelFaults,
+    bad: np.ndarray,
+    frequency: float | None,
+    harmonics: int,
+    used: slice,
+) -> Iterator[Finding]:
+    """Return the findings of stuck and clipped samples and outliers, which are the bad ones (bool)."""
+    total = values.size
     every = effect_of(time[used], values[used], bad[used], frequency, harmonics) if frequency else UNKNOWN
     if every.predicted.size:  # at the other samples too
         predicted = values.astype(float)
@@ -280,6 +288,17 @@ def sample_findings(
         yield finding("outliers", fault.outliers, which)
 
 
+def _held(channel: str, time: np.ndarray, fault: ChannelFaults) -> Finding:
+    """Return the finding of a slower logger."""
+    delay = 0.5 * (fault.repeats - 1)
+    return Finding(
+        "held", channel, SERIOUS, np.array([[time[0], time[-1]]]), fault.held.size, fault.held.size / time.size, np.nan,
+        f"{channel} repeats each value {fault.repeats} times: a slower logger or a hold, which delays it by "
+        f"{delay:g} samples ({delay * float(np.median(np.diff(time))):.3g} s) and weakens its harmonics",
+        f"recording.without(stuck=True, channel={channel!r}) keeps one sample of each value",
+    )  # fmt: skip
+
+
 def _tails(channel: str, time: np.ndarray, samples: np.ndarray) -> Finding:
     """Return the finding of heavy tails."""
     share = samples.size / time.size
@@ -291,15 +310,13 @@ def _tails(channel: str, time: np.ndarray, samples: np.ndarray) -> Finding:
     )  # fmt: skip
 
 
-def _saturated(
-    channel: str, time: np.ndarray, samples: np.ndarray, fault: ChannelFaults, level: str = ""
-) -> Finding:
+def _saturated(channel: str, time: np.ndarray, samples: np.ndarray, fault: ChannelFaults, level: str = "") -> Finding:
     """Return the finding of flat tops of a mean period, which are those of a sensor or of the motion itself."""
-    found, bias = fault.saturation, np.nan
-    if found is not None:
-        level = level or " and ".join(f"{v:.6g}" for v in (found.low, found.high) if np.isfinite(v))
+    saturation, bias = fault.saturation, np.nan
+    if saturation is not None:
+        level = level or " and ".join(f"{v:.6g}" for v in (saturation.low, saturation.high) if np.isfinite(v))
         bias = fault.saturation_bias
-    sensor = found is not None and found.like_a_sensor and bias > SERIOUS_BIAS
+    sensor = saturation is not None and saturation.like_a_sensor and bias > SERIOUS_BIAS
     share, times = samples.size / time.size, times_of(time, samples)
     size = "" if np.isnan(bias) else f", with a bias of {bias:.3g} standard errors"
     return Finding(

@@ -1,4 +1,4 @@
-"""Flat tops of a mean period beyond which a Fourier series of the other samples goes: saturation, or a limited force."""
+"""Flat tops of a mean period beyond which a Fourier series of the other samples goes: saturated or limited."""
 
 from dataclasses import dataclass
 
@@ -69,8 +69,8 @@ def means_of(bins: PhaseBins, residuals: np.ndarray, amplitudes: np.ndarray, ste
     count = bins.count.sum(axis=0)
     known = count > 0
     rest = sums.sum(axis=0)[known] / count[known]
-    freedom = residuals.size - np.count_nonzero(known)
-    variance = max(float(residuals @ residuals - count[known] @ rest**2), 0.0) / max(freedom, 1)
+    freedom = max(residuals.size - int(np.count_nonzero(known)), 1)
+    variance = max(float(residuals @ residuals - count[known] @ rest**2), 0.0) / freedom
     phase = bins.centre[known]
     values = _fourier.at_times(amplitudes[None], phase)[0] + rest
     both = (bins.count > 0).all(axis=0)
@@ -78,9 +78,9 @@ def means_of(bins: PhaseBins, residuals: np.ndarray, amplitudes: np.ndarray, ste
     each = 0.25 * variance * np.sum(1.0 / bins.count[:, both])
     order = np.arange(1, SLOW_HARMONICS + 1)
     slow = np.exp(-2j * np.pi * np.outer(order, bins.centre[both])) @ half
-    slower = float(np.mean(np.abs(slow) ** 2)) / each if each > 0.0 else 1.0
+    slower = max(float(np.mean(np.abs(slow) ** 2)) / each, 1.0) if each > 0.0 else 1.0
     exact = (EXACT_SERIES * float(values.std())) ** 2 + step**2 / 12.0
-    weights = 1.0 / (max(slower, 1.0) * variance / count[known] + exact)
+    weights = 1.0 / (slower * variance / count[known] + exact)
     # A series of the first harmonics leaves the power of the others.
     power = 0.5 * np.abs(amplitudes[1:]) ** 2 * weights.sum()
     left = np.concatenate([np.cumsum(power[::-1] - 2.0)[::-1], [0.0]])
@@ -108,7 +108,7 @@ class Saturation:
     @property
     def overload(self) -> float:
         """Range of the series relative to that of the mean period."""
-        return float(np.ptp(self.beyond) / np.ptp(self.beyond - self.excess))
+        return float(np.ptp(self.beyond)) / float(np.ptp(self.beyond - self.excess))
 
     @property
     def skew(self) -> float:
@@ -155,7 +155,7 @@ class Saturation:
         grid = self.phase[order]
         middle = 0.5 * (grid + np.append(grid[1:], grid[0] + 1.0))
         place = np.searchsorted(middle, (phase - middle[-1] + 1.0) % 1.0 + middle[-1] - 1.0) % grid.size
-        return np.asarray(self.flat.any(axis=0)[order][place])
+        return np.asarray(self.flat[:, order].any(axis=0))[place]
 
 
 def saturation_of(means: Means) -> Saturation | None:
