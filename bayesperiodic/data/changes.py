@@ -14,12 +14,12 @@ from scipy.special import logsumexp
 
 # Probabilities before the data: of a transient where the start was left out or not, of a drift and of a step; and that
 # a change is in any one component.
-PROBABLE, POSSIBLE, DRIFTING, STEPPING, SHARED = 0.9, 0.7, 0.5, 0.1, 0.3
+PROBABLE, POSSIBLE, DRIFTING, STEPPING, SHARED = 0.9, 0.6, 0.4, 0.1, 0.2
 # Sizes of a change in standard deviations of its estimate.
 SIZES, FREQUENT = np.array([3.0, 10.0, 100.0]), np.array([0.7, 0.2, 0.1])
 # Correlation from one window to the next, and share of the variance, of noise that lasts; white noise is as probable
 # as all others together.
-MEMORIES, LASTING_SHARES, LASTING = (0.5, 0.8), (0.3, 0.8, 1.0), 0.2
+MEMORIES, LASTING_SHARES, LASTING = (0.5, 0.8), (0.3, 0.8, 1.0), 0.1
 # Decay times of transients, in cycles and relative to the recording, their number, and the number of frequencies.
 SHORTEST_DECAY, LONGEST_DECAY, DECAYS, FREQUENCIES = 0.3, 0.5, 12, 13
 # Frequencies of slow transients near those of the harmonics, relative to 1/decay time, and places of steps.
@@ -51,10 +51,16 @@ class Changes:
     squares: np.ndarray  # (cycles, components) expected squares of it
     lasting: np.ndarray  # (cycles, components) expected squares of the bias by a drift or step
     probability: dict[str, float]  # of the kinds of changes
-    moving: np.ndarray  # (components,) probability of a drift or step
-    size: np.ndarray  # (components,) expected change by it
+    moving: np.ndarray  # (components,) probability of any of them
+    size: np.ndarray  # (components,) expected change by a drift or step
     error: np.ndarray  # (cycles, components) standard errors of the means by noise
     place: int  # most probable first cycle after a step
+    wander: np.ndarray  # (components,) variance of the means by noise that lasts, beyond that of white noise
+
+    @property
+    def slow(self) -> bool:
+        """Whether a drift or step is more probable than all else."""
+        return self.probability[DRIFT] + self.probability[STEP] > 0.5
 
     @property
     def bias(self) -> np.ndarray:
@@ -101,7 +107,7 @@ def _covariances(count: int) -> list[tuple[float, np.ndarray]]:
 
 def changes(shape: np.ndarray, transient: float) -> Changes:
     """Return the expected changes of components (cycles, components), with this probability of a transient before."""
-    count, components = shape.shape
+    count = len(shape)
     every, covariances = courses(count, transient), _covariances(count)
     scaled = shape - shape.mean(axis=0)
     floor = count * SMALLEST_NOISE**2
@@ -136,9 +142,10 @@ def changes(shape: np.ndarray, transient: float) -> Changes:
     none = np.array(nothing)  # (noises, components)
     some = np.array(something)  # (noises, sizes, courses, components)
     clear = logsumexp(some, axis=0) - logsumexp(none, axis=0)  # (sizes, courses, components)
-    share = _independent(np.diff(shape, axis=0) / np.maximum(np.sqrt(np.array(white[0]) * count), SMALLEST_NOISE))
-    share /= components
-    total_gain = share * np.logaddexp(np.log1p(-SHARED), np.log(SHARED) + clear).sum(axis=2)
+    noise = np.sqrt(np.array(white[0]) * count)
+    noisy = noise > 2.0 * SMALLEST_NOISE
+    share = _independent((np.diff(shape, axis=0) / noise)[:, noisy]) / noisy.sum() if noisy.any() else 1.0
+    total_gain = share * np.logaddexp(np.log1p(-SHARED), np.log(SHARED) + clear)[:, :, noisy].sum(axis=2)
     weight = total_gain + every.prior + np.log(FREQUENT)[:, None]
     constant = np.log((1.0 - transient) * (1.0 - DRIFTING - STEPPING))
     weight = np.exp(weight - np.logaddexp(logsumexp(weight), constant))  # (sizes, courses)
@@ -147,16 +154,18 @@ def changes(shape: np.ndarray, transient: float) -> Changes:
     first = np.einsum("jsmd,s,jmad->mad", each, kept, np.array(coefficients))
     second = np.einsum("jsmd,s,jmad,jmbd->mabd", each, kept**2, np.array(coefficients), np.array(coefficients), optimize=True)
     second += np.einsum("jsmd,s,jsmd,jmab->mabd", each, kept, np.array(levels), np.array(inverses), optimize=True)
-    scale = np.array(means)
-    square = np.einsum("jsmd,jsmd,j->d", each, np.array(levels), scale)
-    square += (1.0 - each.sum(axis=(0, 1, 2))) * np.einsum("jd,jd->d", np.exp(none - logsumexp(none, axis=0)), np.array(white))
-    lasting = every.kind != TRANSIENT
-    moving = each.sum(axis=(0, 1))[lasting].sum(axis=0)
-    return _effects(every, first, second, weight.sum(axis=0), np.sqrt(square), moving)
+    constant_part = (1.0 - each.sum(axis=(0, 1, 2))) * np.exp(none - logsumexp(none, axis=0))  # (noises, components)
+    variances = np.einsum("jsmd,jsmd,j->jd", each, np.array(levels), np.array(means)) + constant_part * np.array(white)
+    square, lasting = variances.sum(axis=0), each[1:].sum(axis=(0, 1, 2)) + constant_part[1:].sum(axis=0)
+    # As far as it is more probable than before the data.
+    evident = np.clip((lasting - LASTING) / (1.0 - LASTING), 0.0, 1.0) / lasting
+    wander = evident * np.maximum(variances[1:].sum(axis=0) - lasting * white[0], 0.0)
+    return _effects(every, first, second, weight.sum(axis=0), np.sqrt(square), each.sum(axis=(0, 1, 2)), wander)
 
 
 def _effects(
-    every: Courses, first: np.ndarray, second: np.ndarray, weight: np.ndarray, error: np.ndarray, moving: np.ndarray
+    every: Courses, first: np.ndarray, second: np.ndarray, weight: np.ndarray, error: np.ndarray,
+    moving: np.ndarray, wander: np.ndarray,
 ) -> Changes:
     """Return the effects of changes by the first and second moments of their sizes."""
     count = every.values.shape[1]
@@ -175,6 +184,7 @@ def _effects(
         mean, squares, lasting, probability, moving, np.einsum("ma,mad->d", every.values[slow, -1] - every.values[slow, 0], first[slow]),
         np.maximum(error, SMALLEST_NOISE / np.sqrt(count)) * np.sqrt(count / remaining)[:, None],
         int(every.place[steps[np.argmax(weight[steps])]]),
+        wander,
     )  # fmt: skip
 
 

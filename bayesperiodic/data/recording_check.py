@@ -37,6 +37,8 @@ EXTREMES = 0.1
 MOST_TIMES_LISTED = 200
 # Beat relative to the amplitude that is serious, and step of the phase [cycles] that is harmless.
 LARGE_BEAT, HARMLESS_PHASE = 0.05, 1.0 / 180.0
+# Drift and step relative to the amplitude whose effect is in the errors stated, and that are no fault.
+HARMLESS_DRIFT, HARMLESS_STEP = 0.015, 0.005
 # Change between neighbouring cycles that is a step, in standard deviations of the other changes, and cycles needed;
 # the standard deviation is uncertain if there are fewer cycles than this.
 STEP_FROM_CYCLE, FEWEST_FOR_STEPS, ENOUGH_FOR_STEPS = 8.0, 10, 20
@@ -327,6 +329,8 @@ def _changes(channels: list[str], time: np.ndarray, steady: Steady) -> Iterator[
             steady.bias, f"a rest of the transient is in the part used, {start:.6g} to {stop:.6g} s, and biases the "
             f"amplitudes by {steady.bias:.2g} standard errors", "record longer, or begin later with recording.between",
         )  # fmt: skip
+    if not found.slow:
+        return
     shape = (len(channels), -1)
     moving, size = found.moving.reshape(shape), found.size.reshape(shape)
     bias = np.sqrt(found.lasting[0]).reshape(shape) / found.error[0].reshape(shape)
@@ -340,13 +344,15 @@ def _changes(channels: list[str], time: np.ndarray, steady: Steady) -> Iterator[
             if moving[i, worst] < 1.0 - CHANGE_FALSE_ALARM or np.abs(size[i, worst]) <= part.slip[i]:
                 continue
             effect = float(np.sqrt(np.sum(bias[i, harmonics] ** 2)))
-            change = f"{size[i, worst] / level[i, worst or strongest]:+.2%}"
+            relative = float(size[i, worst] / level[i, worst or strongest])
+            small = abs(relative) < (HARMLESS_STEP if step else HARMLESS_DRIFT)
+            change = f"{relative:+.2%}"
             which = f"the {what} of {channel}" + (f" at harmonic {worst}" if worst not in (0, strongest) else "")
             which += f" {'steps' if step else 'changes'} by {change}{'' if worst else ' of the amplitude'}"
             which += f" at about {at:.6g} s" if step else " over the part used"
             yield Finding(
                 f"{what.split()[0]} step" if step else "drift", channel,
-                SERIOUS if effect > SERIOUS_BIAS else HARMLESS, np.array([[at, at]]) if step else every,
+                HARMLESS if small or effect <= SERIOUS_BIAS else SERIOUS, np.array([[at, at]]) if step else every,
                 1 if step else cycles, 1.0 / len(part.first) if step else 1.0, effect,
                 f"{which}: {effect:.2g} standard errors of its mean amplitudes, which are added to their errors",
                 "fold the parts before and after it: recording.between(start, stop)" if step else

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
-from bayesperiodic.data.changes import POSSIBLE, PROBABLE, TRANSIENT, Changes, changes
+from bayesperiodic.data.changes import POSSIBLE, PROBABLE, Changes, changes
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES, determined_harmonics, resolved_harmonics
 
 # Parts of a cycle in which ramps begin or end, in recordings of so many cycles; most windows of long recordings.
@@ -28,6 +28,8 @@ FEWEST_FOR_MEDIAN = 9
 FEWEST_FOR_CHANGES, SLOPE_FALSE_ALARM = 5, 1e-4
 # Largest correlation of the noise of neighbouring windows.
 LONGEST_MEMORY = 0.8
+# Second differences of smooth signals and noise, relative to their median.
+SMOOTH_OR_NOISE = 6.0
 # Share of a channel's standard deviation below which distances do not count.
 SMALLEST_DISTANCE = 1e-9
 
@@ -113,12 +115,16 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
 def _slip(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return twice the median of the largest second differences in parts of signals (channels, samples).
 
-    Samples that are not at the same phases of every cycle see jumps and narrow peaks earlier or later.
+    Samples that are not at the same phases of every cycle see jumps and narrow peaks earlier or later. What smooth
+    signals and noise have, a multiple of the median, does not count.
     """
     edges = edges[: max(np.searchsorted(edges, values.shape[1] - 2), 1)]
     edges = edges[np.r_[True, np.diff(edges) > 0]]
-    largest = [np.median(np.maximum.reduceat(np.abs(np.diff(v, 2)), edges)) for v in values if v.size > 2]
-    return 2.0 * np.array(largest if largest else np.zeros(len(values)))
+    if values.shape[1] < 3:
+        return np.zeros(len(values))
+    bends = [np.abs(np.diff(v, 2)) for v in values]
+    largest = np.array([np.median(np.maximum.reduceat(bend, edges)) for bend in bends])
+    return 2.0 * np.maximum(largest - SMOOTH_OR_NOISE * np.array([np.median(bend) for bend in bends]), 0.0)
 
 
 @dataclass(frozen=True)
@@ -166,10 +172,12 @@ def steady_part(every: Windows) -> Steady | None:
     squares = found.squares[first] + (later.lasting[0] if enough else found.lasting[first])
     by_part = squares.reshape(change.shape[1], -1)
     count = part.amplitudes.shape[2]
+    # Slow noise of the mean value is extrapolated from its own spectrum.
+    by_part[:, 1:] += later.wander.reshape(by_part.shape)[:, 1:] * len(components) / len(part.first)
     by_harmonic = by_part[:, :count].copy()
     by_harmonic[:, 1:] += by_part[:, count:]
     change = np.array([_change(half) for half in np.array_split(part.sizes, 2)])
-    transient = found.probability[TRANSIENT]
+    transient = 0.0 if found.slow else float(found.moving.max())
     return Steady(part, _samples(part), level, by_harmonic, change, float(found.bias[first]), transient, later if enough else None)
 
 
