@@ -133,7 +133,9 @@ def changes(shape: np.ndarray, transient: float) -> Changes:
         remaining = np.maximum(total - kept[:, None, None] * power, 0.0) + 0.0  # (sizes, courses, components)
         determinant = -np.log(np.diag(factor)).sum() - np.log(np.linalg.norm(z[:, 0]))
         nothing.append(prior + determinant - 0.5 * degrees * np.log(total))
-        something.append(prior + determinant - 0.5 * degrees * np.log(np.maximum(remaining, floor)) + penalty.T[:, :, None])
+        something.append(
+            prior + determinant - 0.5 * degrees * np.log(np.maximum(remaining, floor)) + penalty.T[:, :, None]
+        )
         coefficients.append(coefficient)
         inverses.append(inverse)
         levels.append(np.maximum(remaining, floor) / degrees)
@@ -150,9 +152,13 @@ def changes(shape: np.ndarray, transient: float) -> Changes:
     constant = np.log((1.0 - transient) * (1.0 - DRIFTING - STEPPING))
     weight = np.exp(weight - np.logaddexp(logsumexp(weight), constant))  # (sizes, courses)
     member = 1.0 / (1.0 + (1.0 / SHARED - 1.0) * np.exp(-np.clip(clear, -500, 500)))
-    each = np.exp(some - logsumexp(some, axis=0)) * (weight[:, :, None] * member)  # (noises, sizes, courses, components)
+    each = np.exp(some - logsumexp(some, axis=0)) * (
+        weight[:, :, None] * member
+    )  # (noises, sizes, courses, components)
     first = np.einsum("jsmd,s,jmad->mad", each, kept, np.array(coefficients))
-    second = np.einsum("jsmd,s,jmad,jmbd->mabd", each, kept**2, np.array(coefficients), np.array(coefficients), optimize=True)
+    second = np.einsum(
+        "jsmd,s,jmad,jmbd->mabd", each, kept**2, np.array(coefficients), np.array(coefficients), optimize=True
+    )
     second += np.einsum("jsmd,s,jsmd,jmab->mabd", each, kept, np.array(levels), np.array(inverses), optimize=True)
     constant_part = (1.0 - each.sum(axis=(0, 1, 2))) * np.exp(none - logsumexp(none, axis=0))  # (noises, components)
     variances = np.einsum("jsmd,jsmd,j->jd", each, np.array(levels), np.array(means)) + constant_part * np.array(white)
@@ -164,8 +170,13 @@ def changes(shape: np.ndarray, transient: float) -> Changes:
 
 
 def _effects(
-    every: Courses, first: np.ndarray, second: np.ndarray, weight: np.ndarray, error: np.ndarray,
-    moving: np.ndarray, wander: np.ndarray,
+    every: Courses,
+    first: np.ndarray,
+    second: np.ndarray,
+    weight: np.ndarray,
+    error: np.ndarray,
+    moving: np.ndarray,
+    wander: np.ndarray,
 ) -> Changes:
     """Return the effects of changes by the first and second moments of their sizes."""
     count = every.values.shape[1]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from bayesperiodic import _fourier
+from bayesperiodic.data.cycle_findings import cycle_findings, slow_beats
 from bayesperiodic.data.faults import ChannelFaults, dropped_value, jumps, outliers_of
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
@@ -24,7 +25,6 @@ from bayesperiodic.data.recording_check import (
     RecordingCheck,
     bounded,
     clock_findings,
-    cycle_findings,
     sample_findings,
     signal_faults,
 )
@@ -91,8 +91,10 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     refined = frequency is None
     every, steady, tracked = _steady_of(some, tracked, points, refined, refined and some is not signals)
     if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
-        return Inspection(signals, faults, worst_first(findings(tracked)), total, reason=_unsteady(signals, every))
-    steady = steady.among(sound)
+        return Inspection(
+            signals, faults, worst_first(findings(tracked)), total, reason=_unsteady(signals, every, tracked)
+        )
+    steady, outer = steady.among(sound), every.among(sound)
     used = signals.part(steady.samples)
     limit, inflation = determined_harmonics(used.time, tracked, resolved_harmonics(used.time, tracked, points))
     fit, pace = refine_frequency(used.time, used.values, tracked, limit)
@@ -106,7 +108,7 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
         before, after = (fault.outliers < steady.samples.start), (fault.outliers >= steady.samples.stop)
         fault.outliers = np.concatenate([fault.outliers[before], inside[moving[inside]], fault.outliers[after]])
     seen = findings(fit.frequency, limit, steady.samples)
-    seen += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
+    seen += cycle_findings(signals.channels, signals.time, outer, steady, fit.frequency, total)
     return Inspection(
         signals, faults, worst_first(seen), total, steady, every.apart().sizes, fit, pace, limit, inflation
     )
@@ -158,11 +160,16 @@ def _sound(
     return np.setdiff1d(moving, np.concatenate([fault.outliers for fault in faults]))
 
 
-def _unsteady(signals: Signals, every: Windows) -> str:
+def _unsteady(signals: Signals, every: Windows, frequency: float) -> str:
     if not every.first.size:
         return (
             f"recording: must have samples in all parts of its periods, got {signals.name!r}, which has too few; check "
             "the frequency and the gaps, or fold a part by `between` or `split`."
+        )
+    if beats := [*slow_beats(signals.channels, signals.time, every, frequency)]:
+        return (
+            f"recording: must have a steady part of {MINIMUM_CYCLES} cycles, got {signals.name!r}, in which "
+            f"{'. '.join(map(str, beats))}."
         )
     size = every.sizes
     worst = int(np.argmax(np.ptp(size, axis=0) / size.mean(axis=0)))

@@ -12,38 +12,25 @@ from bayesperiodic import _fourier
 from bayesperiodic._io import Result, Storable
 from bayesperiodic._verdicts import BAD, CAUTION, GOOD, with_tone
 from bayesperiodic.data import faults
-from bayesperiodic.data.changes import DRIFT, STEP
 from bayesperiodic.data.faults import ChannelFaults
 from bayesperiodic.data.harmonics import fit_harmonics
 from bayesperiodic.data.signals import GAP, USUAL_STEPS
-from bayesperiodic.data.steadiness import Steady, Windows
 
 if TYPE_CHECKING:
     import pandas as pd
 
 #: Severities of findings: without effect, a bias that counts, and a result that is wrong.
 HARMLESS, SERIOUS, RUINOUS = with_tone("harmless", GOOD), with_tone("serious", CAUTION), with_tone("ruinous", BAD)
-WRAPS, PHASE_STEP = "wraps", "phase step"
+WRAPS = "wraps"
 SEVERITIES = (HARMLESS, SERIOUS, RUINOUS)
 # Bias in standard errors of all amplitudes together that is serious, and relative to the signal that is ruinous.
 SERIOUS_BIAS, RUINOUS_BIAS = 0.5, 0.05
-# Bias by a transient that is listed, in standard errors, and probability that there is no change where one is.
-ALLOWED_BIAS, CHANGE_FALSE_ALARM = 0.3, 0.01
 # Harmonics of a fit without the faulty samples, as many of them as these show: with this largest condition number.
 FITTED_HARMONICS, LARGEST_FIT_CONDITION = (10, 5, 3, 2, 1), 1e3
 # Share of the samples at each end that may be outliers where a signal is bounded by its range without them.
 EXTREMES = 0.1
 # Times of each finding that are listed.
 MOST_TIMES_LISTED = 200
-# Beat relative to the amplitude that is serious, and step of the phase [cycles] that is harmless.
-LARGE_BEAT, HARMLESS_PHASE = 0.05, 1.0 / 180.0
-# Drift and step relative to the amplitude whose effect is in the errors stated, and that are no fault.
-HARMLESS_DRIFT, HARMLESS_STEP = 0.015, 0.005
-# Change between neighbouring cycles that is a step, in standard deviations of the other changes, and cycles needed;
-# the standard deviation is uncertain if there are fewer cycles than this.
-STEP_FROM_CYCLE, FEWEST_FOR_STEPS, ENOUGH_FOR_STEPS = 8.0, 10, 20
-# Amplitude of a beat relative to the mean one, its false-alarm rate, and the cycles needed.
-HARMLESS_BEAT, BEAT_FALSE_ALARM, FEWEST_FOR_BEATS = 0.01, 1e-4, 24
 
 
 @dataclass(frozen=True)
@@ -286,150 +273,6 @@ def _beyond(effect: Effect, values: np.ndarray, samples: np.ndarray, sign: float
         return True
     excess = sign * (effect.predicted[samples] - values[samples])
     return bool(np.median(excess) > max(effect.noise, 1e-6 * float(np.ptp(values))))
-
-
-def cycle_findings(
-    channels: Iterable[str], time: np.ndarray, steady: Steady, frequency: float, total: int
-) -> Iterator[Finding]:
-    """Return the findings about the cycles: what was left out, and what changes in the part that is used."""
-    part, step = steady.part, steady.part.cycles
-    channels = [*channels]
-    start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
-    cycles = len(part.first) * step
-    level = [float(time[i]) for i in (steady.level[0], steady.level[1] - 1)]
-    end = float(time[-1])
-    for kind, a, b, what in (
-        ("ramp", float(time[0]), level[0], "the signals change until"),
-        ("ramp", level[1], end, "the signals change from"),
-        ("transient", level[0], start, "a rest of the transient is in the amplitudes until"),
-    ):
-        if (b - a) * frequency < 1.0:
-            continue
-        count = int((b - a) * frequency)
-        place = b if what.endswith("until") else a
-        yield Finding(
-            kind, "", HARMLESS, np.array([[a, b]]), count, count / total, np.nan,
-            f"{what} {place:.6g} s; {start:.6g} to {stop:.6g} s are used ({cycles} of {total} cycles)",
-        )  # fmt: skip
-    yield from _changes(channels, time, steady)
-    yield from _phase_steps(channels, time, part, frequency)
-    yield from _beats(channels, time, part, frequency)
-
-
-def _changes(channels: list[str], time: np.ndarray, steady: Steady) -> Iterator[Finding]:
-    """Return what is clearly not steady in the part used: the rest of a transient, drifts and steps."""
-    part, found = steady.part, steady.changes
-    if found is None:
-        return
-    start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
-    every, cycles = np.array([[start, stop]]), len(part.first) * part.cycles
-    if steady.transient > 1.0 - CHANGE_FALSE_ALARM and steady.bias > ALLOWED_BIAS:
-        yield Finding(
-            "transient", "", SERIOUS if steady.bias > SERIOUS_BIAS else HARMLESS, every, cycles, 1.0,
-            steady.bias, f"a rest of the transient is in the part used, {start:.6g} to {stop:.6g} s, and biases the "
-            f"amplitudes by {steady.bias:.2g} standard errors", "record longer, or begin later with recording.between",
-        )  # fmt: skip
-    if not found.slow:
-        return
-    shape = (len(channels), -1)
-    moving, size = found.moving.reshape(shape), found.size.reshape(shape)
-    bias = np.sqrt(found.lasting[0]).reshape(shape) / found.error[0].reshape(shape)
-    level = np.abs(part.amplitudes.mean(axis=0))
-    step = found.probability[STEP] > found.probability[DRIFT]
-    at = float(time[part.first[found.place]])
-    for i, channel in enumerate(channels):
-        strongest = 1 + int(np.argmax(level[i, 1:]))
-        for what, harmonics in (("amplitude", np.arange(1, level.shape[1])), ("mean value", np.zeros(1, dtype=int))):
-            worst = int(harmonics[np.argmax(moving[i, harmonics] * bias[i, harmonics])])
-            if moving[i, worst] < 1.0 - CHANGE_FALSE_ALARM or np.abs(size[i, worst]) <= part.slip[i]:
-                continue
-            effect = float(np.sqrt(np.sum(bias[i, harmonics] ** 2)))
-            relative = float(size[i, worst] / level[i, worst or strongest])
-            small = abs(relative) < (HARMLESS_STEP if step else HARMLESS_DRIFT)
-            change = f"{relative:+.2%}"
-            which = f"the {what} of {channel}" + (f" at harmonic {worst}" if worst not in (0, strongest) else "")
-            which += f" {'steps' if step else 'changes'} by {change}{'' if worst else ' of the amplitude'}"
-            which += f" at about {at:.6g} s" if step else " over the part used"
-            yield Finding(
-                f"{what.split()[0]} step" if step else "drift", channel,
-                HARMLESS if small or effect <= SERIOUS_BIAS else SERIOUS, np.array([[at, at]]) if step else every,
-                1 if step else cycles, 1.0 / len(part.first) if step else 1.0, effect,
-                f"{which}: {effect:.2g} standard errors of its mean amplitudes, which are added to their errors",
-                "fold the parts before and after it: recording.between(start, stop)" if step else
-                "select a steadier part with recording.between(start, stop)",
-            )  # fmt: skip
-
-
-def _phase_steps(channels: list[str], time: np.ndarray, part: Windows, frequency: float) -> Iterator[Finding]:
-    """Return steps of the phase between neighbouring cycles."""
-    if len(part.first) < FEWEST_FOR_STEPS:
-        return
-    turns, size = phases(part)
-    limit = STEP_FROM_CYCLE * max(1.0, (ENOUGH_FOR_STEPS / len(turns)) ** 2)
-    mean = 0.5 * (turns[1:] + turns[:-1])
-    jump = mean[2:] - mean[:-2]  # of two cycles after a boundary from the two before it
-    spread = np.median(np.abs(jump - np.median(jump, axis=0)), axis=0) / 0.6745
-    large = (np.abs(jump) > limit * spread) & (np.abs(jump) > HARMLESS_PHASE + part.slip / size / (2.0 * np.pi))
-    together = large.all(axis=1)
-    stepping = [(c, large[:, i], jump[:, i]) for i, c in enumerate(channels) if large[:, i].any()]
-    if len(channels) > 1 and together.any():
-        stepping = [("", together, jump.mean(axis=1))]
-    for channel, where, change in stepping:
-        k = int(np.argmax(np.where(where, np.abs(change), 0.0)))
-        at = float(time[part.first[k + 2]])
-        yield Finding(
-            PHASE_STEP, channel, SERIOUS, np.array([[at, at]]), 1, 1.0 / len(turns), np.nan,
-            stepped(channel, float(change[k]), at, time, frequency),
-            "fold the parts before and after it: recording.between(start, stop)",
-        )  # fmt: skip
-
-
-def phases(part: Windows) -> tuple[np.ndarray, np.ndarray]:
-    """Return phases [cycles] of the strongest harmonics (windows, channels), and the median of their amplitudes."""
-    every = np.abs(part.amplitudes[:, :, 1:])
-    strongest = 1 + every.mean(axis=0).argmax(axis=1)
-    lines = np.take_along_axis(part.amplitudes, strongest[None, :, None], axis=2)[:, :, 0]
-    turns = np.unwrap(np.angle(lines), axis=0) / (2.0 * np.pi) / strongest
-    return turns, np.maximum(np.median(np.abs(lines), axis=0), np.finfo(float).tiny)
-
-
-def stepped(channel: str, turn: float, at: float, time: np.ndarray, frequency: float) -> str:
-    """Return a step of the phase [cycles] in words."""
-    delay = turn / frequency
-    samples = abs(delay) * (time.size - 1) / float(np.ptp(time))
-    return (
-        f"the phase of {channel or 'all channels'} steps by {360.0 * turn:.3g}° ({delay:.3g} s, {samples:.3g} samples) "
-        f"at about {at:.6g} s: samples were lost, or the clock or the drive stepped"
-    )
-
-
-def _beats(channels: list[str], time: np.ndarray, part: Windows, frequency: float) -> Iterator[Finding]:
-    """Return periodic modulations of the amplitudes, by Fisher's test of the largest line of their spectrum."""
-    sizes = part.sizes
-    count = len(sizes)
-    if count < FEWEST_FOR_BEATS:
-        return
-    place = np.linspace(-1.0, 1.0, count)
-    trend = np.polynomial.polynomial.polyfit(place, sizes, 2)
-    rest = sizes - np.polynomial.polynomial.polyval(place, trend).T
-    spectrum = np.abs(np.fft.rfft(rest * np.hanning(count)[:, None], axis=0))[2:] ** 2
-    for i, channel in enumerate(channels):
-        power = spectrum[:, i]
-        line = int(np.argmax(power))
-        # Against the lines about it, so that slow noise is no beat.
-        near = np.r_[power[max(line - 12, 0) : max(line - 2, 0)], power[line + 3 : line + 13]]
-        if near.size < 6 or power[line] < np.mean(near) * -np.log(BEAT_FALSE_ALARM / spectrum.shape[0]) * 3.0:
-            continue
-        amplitude = float(np.sqrt(2.0 * rest[:, i].var()) / sizes[:, i].mean())
-        slip = float(part.slip[i] / sizes[:, i].mean())
-        if amplitude > HARMLESS_BEAT + slip:
-            beat = (line + 2) * frequency / (count * part.cycles)
-            yield Finding(
-                "beating", channel, SERIOUS if amplitude > LARGE_BEAT + slip else HARMLESS,
-                np.array([[time[part.first[0]], time[part.last[-1] - 1]]]),
-                count, 1.0, np.nan, f"the amplitude of {channel} beats at {beat:.4g} Hz by {amplitude:.1%}",
-                "a second frequency is in the signals: remove its source, or average whole beats",
-            )  # fmt: skip
 
 
 def clock_findings(time: np.ndarray) -> Iterator[Finding]:

@@ -51,6 +51,10 @@ class Windows:
         first, last, place = (array[used] for array in (self.first, self.last, self.place))
         return Windows(first, last, place, self.overlap, self.cycles, self.amplitudes[used], self.slip)
 
+    def among(self, numbers: np.ndarray) -> "Windows":
+        """Return the same windows of all samples, of which they have those with these numbers."""
+        return replace(self, first=numbers[self.first], last=numbers[self.last - 1] + 1)
+
     def apart(self) -> "Windows":
         """Return windows that do not overlap, the last one among them."""
         used = [len(self.place) - 1]
@@ -60,11 +64,19 @@ class Windows:
         return self.chosen(used[::-1])
 
     @cached_property
+    def strongest(self) -> np.ndarray:
+        """The strongest harmonic of each channel."""
+        return 1 + np.abs(self.amplitudes[:, :, 1:]).mean(axis=0).argmax(axis=1)
+
+    @cached_property
+    def lines(self) -> np.ndarray:
+        """Complex amplitudes of the strongest harmonic of each channel, (windows, channels)."""
+        return np.take_along_axis(self.amplitudes, self.strongest[None, :, None], axis=2)[:, :, 0]
+
+    @cached_property
     def sizes(self) -> np.ndarray:
         """Amplitudes of the strongest harmonic of each channel, (windows, channels)."""
-        every = np.abs(self.amplitudes[:, :, 1:])
-        strongest = every.mean(axis=0).argmax(axis=1)
-        return np.take_along_axis(every, strongest[None, :, None], axis=2)[:, :, 0]
+        return np.abs(self.lines)
 
 
 def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows:
@@ -142,7 +154,7 @@ class Steady:
 
     def among(self, numbers: np.ndarray) -> "Steady":
         """Return the same part of all samples, of which it was found by those with these numbers."""
-        part = replace(self.part, first=numbers[self.part.first], last=numbers[self.part.last - 1] + 1)
+        part = self.part.among(numbers)
         level = (int(numbers[self.level[0]]), int(numbers[self.level[1] - 1]) + 1)
         return replace(self, part=part, samples=slice(int(part.first[0]), int(part.last[-1])), level=level)
 
@@ -178,7 +190,9 @@ def steady_part(every: Windows) -> Steady | None:
     by_harmonic[:, 1:] += by_part[:, count:]
     change = np.array([_change(half) for half in np.array_split(part.sizes, 2)])
     transient = 0.0 if found.slow else float(found.moving.max())
-    return Steady(part, _samples(part), level, by_harmonic, change, float(found.bias[first]), transient, later if enough else None)
+    return Steady(
+        part, _samples(part), level, by_harmonic, change, float(found.bias[first]), transient, later if enough else None
+    )
 
 
 def _samples(part: Windows) -> slice:
