@@ -112,8 +112,8 @@ def _outer_steps(
     harmonic, inside = every.strongest, steady.part.lines
     mean = inside.mean(axis=0)
     ratio, scatter = every.lines[outside] / mean, np.std(inside / mean, axis=0)
-    turns = np.angle(ratio / np.exp(1j * np.angle(np.median(ratio.real, axis=0) + 1j * np.median(ratio.imag, axis=0))))
     typical = np.angle(np.median(ratio.real, axis=0) + 1j * np.median(ratio.imag, axis=0))
+    turns = np.angle(ratio * np.exp(-1j * typical))
     turn = (typical + np.median(turns, axis=0)) / (2.0 * np.pi) / harmonic
     noise = scatter / (2.0 * np.pi) / harmonic
     same = np.median(np.abs(np.log(np.abs(ratio))), axis=0) < SAME_SIZE + SAME_IN_NOISE * scatter

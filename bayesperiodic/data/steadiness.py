@@ -98,7 +98,7 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     used = slice(edges[0], None)
     wave, power = np.exp(-2j * np.pi * (fundamental * time[used] % 1.0)), np.ones(time[used].size, dtype=complex)
     scaled = values[:, used] / values.std(axis=1)[:, None]
-    sums = np.empty((order.size, len(values) + 1, count), dtype=complex)
+    sums = np.zeros((order.size, len(values) + 1, count), dtype=complex)
     for h in order:
         for row, signal in zip(sums[h], [1.0, *(scaled if h < harmonics.size else ())], strict=False):
             row[:] = np.add.reduceat(signal * power, edges - edges[0])
