@@ -23,6 +23,7 @@ from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
 from bayesperiodic.data.recording_check import refuse
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, FINENESS, aperiodic, even_times, response_period
 from bayesperiodic.data.signals import Signals, cycles_of, explains_more, first_guess, refuse_gaps
+from bayesperiodic.data.steadiness import steady_part, windows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -122,7 +123,7 @@ def fold_signals(
 
 
 def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, pd.DataFrame]":
-    """Return the response period in drive periods, and its evidence, of the signals or else of their later half."""
+    """Return the response period in drive periods, and its evidence, of the steady part or else of its later half."""
     if frequency is None and not signals.inputs:
         raise ValueError(
             f"frequency: must be given for periods={AUTO!r}, because {signals.name!r} has no input that shows the "
@@ -137,6 +138,10 @@ def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, 
         time = even_times(time, driven, tracked)
         drive = refine_frequency(time, driven, tracked, resolved_harmonics(time, tracked, time.size))[0].frequency
     time = even_times(time, values, drive)
+    # Of the cycles of the drive, those that ramp or contain a transient have lines of their own.
+    steady = steady_part(windows(time, values, drive))
+    if steady is not None:
+        time, values = time[steady.samples], values[:, steady.samples]
     chosen, evidence = response_period(time, values, signals.channels, drive)
     later = time >= 0.5 * (time[0] + time[-1])
     if chosen is None and cycles_of(time[later], drive) >= LATER_CYCLES:

@@ -4,18 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import toeplitz
 
 from bayesperiodic import _fourier
-from bayesperiodic.data.faults import (
-    ChannelFaults,
-    dropped_value,
-    heavy_tails,
-    jumps,
-    outliers_of,
-    repeat_noise,
-    single,
-)
+from bayesperiodic.data.cycle_findings import cycle_findings, slow_beats
+from bayesperiodic.data.faults import ChannelFaults, dropped_value, jumps, outliers_of, single
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
     HarmonicFit,
@@ -33,25 +25,17 @@ from bayesperiodic.data.recording_check import (
     RecordingCheck,
     bounded,
     clock_findings,
-    cycle_findings,
     sample_findings,
     signal_faults,
 )
-from bayesperiodic.data.saturation import EXACT_SERIES, means_of, phase_bins, saturation_of
+from bayesperiodic.data.sensors import LEAST_MOVING, describe, undetermined
 from bayesperiodic.data.signals import USUAL_STEPS, Signals, cycles_of, first_guess, refuse_gaps, tracked_frequency
 from bayesperiodic.data.steadiness import Steady, Windows, steady_part, windows
 
 # Largest relative change of an amplitude within half of a steady part.
 LARGEST_CHANGE = 0.1
-# Least share of samples at which no channel is stuck.
-LEAST_MOVING = 0.1
 # Harmonics of the first mean period, from which outliers are left out.
 ROUGH_HARMONICS = 40
-# Harmonics that samples may show whose phases do not determine them, the largest condition number of their normal
-# equations, and the gain of the Bayesian information criterion by which they do.
-MOST_SHOWN, LARGEST_SHOWN_CONDITION, CLEAR_GAIN = 10, 1e5, 20.0
-# Share of clipped samples at a phase from which the others there are left out too.
-CLIPPED_SHARE = 0.02
 # Findings whose samples are those of another kind.
 SAMPLES_OF = {"held": "stuck", "saturated": "clipped"}
 
@@ -108,12 +92,14 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
     refined = frequency is None
     every, steady, tracked = _steady_of(some, tracked, points, refined, refined and some is not signals)
     if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
-        return Inspection(signals, faults, worst_first(findings(tracked)), total, reason=_unsteady(signals, every))
-    steady = steady.among(sound)
+        return Inspection(
+            signals, faults, worst_first(findings(tracked)), total, reason=_unsteady(signals, every, tracked)
+        )
+    steady, outer = steady.among(sound), every.among(sound)
     used = signals.part(steady.samples)
     limit, inflation = determined_harmonics(used.time, tracked, resolved_harmonics(used.time, tracked, points))
     fit, pace = refine_frequency(used.time, used.values, tracked, limit)
-    if lost := _undetermined(used, fit, resolved_harmonics(used.time, tracked, points)):
+    if lost := undetermined(used, fit, resolved_harmonics(used.time, tracked, points)):
         return Inspection(signals, faults, worst_first(findings(tracked)), total, reason=lost)
     amplitudes, residuals = fit.amplitudes, fit.residuals
     here = sound[(sound >= steady.samples.start) & (sound < steady.samples.stop)]
@@ -124,83 +110,12 @@ def inspect(signals: Signals, periods: int, frequency: float | None, points: int
         inside = outliers_of(rest, used.time * fit.frequency, values, fault.step) + steady.samples.start
         before, after = (fault.outliers < steady.samples.start), (fault.outliers >= steady.samples.stop)
         fault.outliers = np.concatenate([fault.outliers[before], inside[moving[inside]], fault.outliers[after]])
-    _describe(faults, used, HarmonicFit(fit.frequency, amplitudes, residuals), steady.samples.start)
+    describe(faults, used, HarmonicFit(fit.frequency, amplitudes, residuals), steady.samples.start)
     seen = findings(fit.frequency, limit, steady.samples)
-    seen += cycle_findings(signals.channels, signals.time, steady, fit.frequency, total)
+    seen += cycle_findings(signals.channels, signals.time, outer, steady, fit.frequency, total)
     return Inspection(
         signals, faults, worst_first(seen), total, steady, every.apart().sizes, fit, pace, limit, inflation
     )
-
-
-def _same_phases(phase: np.ndarray, clipped: np.ndarray) -> np.ndarray:
-    """Return the samples at phases at which some are clipped: the others are the smaller ones by noise."""
-    bins = phase_bins(phase)
-    number = bins.centre.size
-    place = bins.place % number
-    share = np.bincount(place[clipped], minlength=number) / np.maximum(bins.count.sum(axis=0), 1)
-    return np.flatnonzero(share[place] > CLIPPED_SHARE)
-
-
-def _undetermined(used: Signals, fit: HarmonicFit, resolved: int) -> str:
-    """Return a message if the samples show more harmonics than their phases determine; else an empty one.
-
-    With the amplitudes of these harmonics the fit is clearly better, by the Bayesian information criterion.
-    """
-    order = fit.amplitudes.shape[1] - 1
-    if order >= min(resolved, MOST_SHOWN):
-        return ""
-    for more in range(order + 1, min(resolved, MOST_SHOWN) + 1):
-        moments = _fourier.sums(np.ones((1, used.time.size)), fit.frequency * used.time, 2 * more)[0]
-        size = np.linalg.eigvalsh(toeplitz(moments))
-        if not size[0] * LARGEST_SHOWN_CONDITION > size[-1]:
-            break
-        other = fit_harmonics(used.time, used.values, fit.frequency, more)
-        floor = 1e-24 * np.var(used.values, axis=1)
-        gain = used.time.size * np.log((fit.variances + floor) / (other.variances + floor))
-        worst = int(np.argmax(gain))
-        if gain[worst] > 2.0 * (more - order) * np.log(used.time.size) + CLEAR_GAIN:
-            bins = 2 * (resolved + 1)
-            count = np.bincount((fit.frequency * used.time % 1.0 * bins).astype(int), minlength=bins)
-            return (
-                f"recording: must have samples at all phases of its period, got {used.name!r}, in which none are at "
-                f"{np.mean(count == 0):.0%} of each period of {1.0 / fit.frequency:.6g} s: the others determine "
-                f"{order} harmonic{'s'[: order > 1]}, and {used.channels[worst]!r} has {more} at least. Record again "
-                "without the fault for which samples were left out, such as clipping by a small range."
-            )
-    return ""
-
-
-def _describe(faults: list[ChannelFaults], used: Signals, fit: HarmonicFit, start: int) -> None:
-    """Tell heavy tails from outliers, and channels that a sensor limits from those that rest.
-
-    Of the part used, which begins at the sample `start`, by a fit without the faulty samples.
-    """
-    phase, stop = used.time * fit.frequency, start + used.time.size
-    sound = np.ones(used.time.size, dtype=bool)
-    for fault in faults:
-        for part in fault.stuck:
-            sound[max(part.start - start, 0) : max(part.stop - start, 0)] = False
-        some = np.concatenate([fault.brief, fault.outliers])
-        sound[some[(some >= start) & (some < stop)] - start] = False
-    here = slice(None) if sound.all() or np.mean(sound) < LEAST_MOVING else sound
-    bins = phase_bins(phase[here])
-    for i, (fault, values) in enumerate(zip(faults, used.values, strict=True)):
-        rest = fit.residuals[i]
-        far = fault.outliers[(fault.outliers >= start) & (fault.outliers < stop)]
-        if far.size:
-            fault.tails = far[heavy_tails(rest, far - start, values - rest)]
-            fault.outliers = np.setdiff1d(fault.outliers, fault.tails)
-        clipped = np.concatenate([fault.low, fault.high])
-        if clipped.size:
-            scatter = repeat_noise(phase, values, clipped - start)
-            fault.noisy = scatter > max(EXACT_SERIES * float(values.std()), 0.5 * fault.step)
-            fault.tails = fault.tails[:0]
-            fault.beside = _same_phases(phase, clipped[(clipped >= start) & (clipped < stop)] - start) + start
-        means = means_of(bins, rest[here], fit.amplitudes[i], fault.step)
-        fault.saturation = saturation_of(means)
-        if fault.saturation is not None and not (clipped.size and fault.noisy):
-            fault.saturated = clipped if clipped.size else np.flatnonzero(fault.saturation.holds(phase)) + start
-            fault.saturation_bias = fault.saturation.bias(means.error)
 
 
 def _steady_of(
@@ -254,11 +169,16 @@ def _sound(
     return np.setdiff1d(moving, np.concatenate([fault.outliers for fault in faults]))
 
 
-def _unsteady(signals: Signals, every: Windows) -> str:
+def _unsteady(signals: Signals, every: Windows, frequency: float) -> str:
     if not every.first.size:
         return (
             f"recording: must have samples in all parts of its periods, got {signals.name!r}, which has too few; check "
             "the frequency and the gaps, or fold a part by `between` or `split`."
+        )
+    if beats := [*slow_beats(signals.channels, signals.time, every, frequency)]:
+        return (
+            f"recording: must have a steady part of {MINIMUM_CYCLES} cycles, got {signals.name!r}, in which "
+            f"{'. '.join(map(str, beats))}."
         )
     size = every.sizes
     worst = int(np.argmax(np.ptp(size, axis=0) / size.mean(axis=0)))

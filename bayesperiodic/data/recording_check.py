@@ -15,7 +15,6 @@ from bayesperiodic.data import faults
 from bayesperiodic.data.faults import ChannelFaults
 from bayesperiodic.data.harmonics import fit_harmonics
 from bayesperiodic.data.signals import GAP, USUAL_STEPS
-from bayesperiodic.data.steadiness import ALLOWED_BIAS, Steady, Windows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,13 +31,6 @@ FITTED_HARMONICS, LARGEST_FIT_CONDITION = (10, 5, 3, 2, 1), 1e3
 EXTREMES = 0.1
 # Times of each finding that are listed.
 MOST_TIMES_LISTED = 200
-# Relative changes over the part used: of an amplitude, and of the mean value in amplitudes.
-HARMLESS_DRIFT, HARMLESS_STEP, HARMLESS_PHASE = 0.05, 0.02, 1.0 / 180.0
-# Change between neighbouring cycles that is a step, in standard deviations of the other changes, and cycles needed;
-# the standard deviation is uncertain if there are fewer cycles than this.
-STEP_FROM_CYCLE, FEWEST_FOR_STEPS, ENOUGH_FOR_STEPS = 8.0, 10, 20
-# Amplitude of a beat relative to the mean one, its false-alarm rate, and the cycles needed.
-HARMLESS_BEAT, BEAT_FALSE_ALARM, FEWEST_FOR_BEATS = 0.01, 1e-4, 24
 
 
 @dataclass(frozen=True)
@@ -342,119 +334,6 @@ def _beyond(effect: Effect, values: np.ndarray, samples: np.ndarray, sign: float
         return True
     excess = sign * (effect.predicted[samples] - values[samples])
     return bool(np.median(excess) > max(effect.noise, 1e-6 * float(np.ptp(values))))
-
-
-def cycle_findings(
-    channels: Iterable[str], time: np.ndarray, steady: Steady, frequency: float, total: int
-) -> Iterator[Finding]:
-    """Return the findings about the cycles: what was left out, and what changes in the part that is used."""
-    part, step = steady.part, steady.part.cycles
-    channels = [*channels]
-    start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
-    cycles = len(part.first) * step
-    level = [float(time[i]) for i in (steady.level[0], steady.level[1] - 1)]
-    end = float(time[-1])
-    for kind, a, b, what in (
-        ("ramp", float(time[0]), level[0], "the signals change until"),
-        ("ramp", level[1], end, "the signals change from"),
-        ("transient", level[0], start, "a rest of the transient is in the amplitudes until"),
-    ):
-        if (b - a) * frequency < 1.0:
-            continue
-        count = int((b - a) * frequency)
-        place = b if what.endswith("until") else a
-        yield Finding(
-            kind, "", HARMLESS, np.array([[a, b]]), count, count / total, np.nan,
-            f"{what} {place:.6g} s; {start:.6g} to {stop:.6g} s are used ({cycles} of {total} cycles)",
-        )  # fmt: skip
-    if steady.bias > ALLOWED_BIAS:
-        severity = SERIOUS if steady.bias > SERIOUS_BIAS else HARMLESS
-        yield Finding(
-            "transient", "", severity, np.array([[start, stop]]), cycles, 1.0,
-            steady.bias, f"a rest of the transient is in the part used, {start:.6g} to {stop:.6g} s, and biases the "
-            f"amplitudes by {steady.bias:.2g} standard errors", "record longer, or begin later with recording.between",
-        )  # fmt: skip
-    changes = steady.change[np.argmax(np.abs(steady.change), axis=0), np.arange(len(channels))]
-    for channel, change in zip(channels, changes, strict=True):
-        if abs(change) > HARMLESS_DRIFT:
-            yield Finding(
-                "drift", channel, SERIOUS, np.array([[start, stop]]), cycles, 1.0, np.nan,
-                f"the amplitude of {channel} changes by {change:+.1%} within half of the part used",
-                "select a steadier part with recording.between(start, stop)",
-            )  # fmt: skip
-    yield from _steps(channels, time, part, frequency)
-    yield from _beats(channels, time, part, frequency)
-
-
-def _steps(channels: list[str], time: np.ndarray, part: Windows, frequency: float) -> Iterator[Finding]:
-    """Return steps of amplitude and of phase between neighbouring cycles."""
-    shape, first = part.amplitudes, part.first
-    if len(shape) < FEWEST_FOR_STEPS:
-        return
-    every = np.abs(shape[:, :, 1:])
-    strongest = 1 + every.mean(axis=0).argmax(axis=1)
-    lines = np.take_along_axis(shape, strongest[None, :, None], axis=2)[:, :, 0]
-    turns = np.unwrap(np.angle(lines), axis=0) / (2.0 * np.pi) / strongest
-    sizes = np.log(np.maximum(np.abs(lines), np.finfo(float).tiny))
-    limit = STEP_FROM_CYCLE * max(1.0, (ENOUGH_FOR_STEPS / len(shape)) ** 2)
-    slip = part.slip / np.exp(np.median(sizes, axis=0))
-    for kind, series, least in (
-        ("amplitude step", sizes, HARMLESS_STEP + slip),
-        ("phase step", turns, HARMLESS_PHASE + slip / (2.0 * np.pi)),
-    ):
-        mean = 0.5 * (series[1:] + series[:-1])
-        jump = mean[2:] - mean[:-2]  # of two cycles after a boundary from the two before it
-        spread = np.median(np.abs(jump - np.median(jump, axis=0)), axis=0) / 0.6745
-        large = (np.abs(jump) > limit * spread) & (np.abs(jump) > least)
-        together = large.all(axis=1)
-        stepping = [(c, large[:, i], jump[:, i]) for i, c in enumerate(channels) if large[:, i].any()]
-        if kind == "phase step" and len(channels) > 1 and together.any():
-            stepping = [("all channels", together, jump.mean(axis=1))]
-        for channel, where, size in stepping:
-            k = int(np.argmax(np.where(where, np.abs(size), 0.0)))
-            at = float(time[first[k + 2]])
-            if kind == "phase step":
-                delay = float(size[k]) / frequency
-                samples = delay * (time.size - 1) / float(np.ptp(time))
-                text = (
-                    f"the phase of {channel} steps by {360.0 * size[k]:.3g}° ({delay:.3g} s, {abs(samples):.3g} "
-                    f"samples) at about {at:.6g} s: samples were lost, or the clock or the drive stepped"
-                )
-            else:
-                text = f"the amplitude of {channel} steps by {np.expm1(size[k]):+.1%} at about {at:.6g} s"
-            yield Finding(
-                kind, "" if channel == "all channels" else channel, SERIOUS, np.array([[at, at]]), 1, 1.0 / len(shape),
-                np.nan, text, "fold the parts before and after it: recording.between(start, stop)",
-            )  # fmt: skip
-
-
-def _beats(channels: list[str], time: np.ndarray, part: Windows, frequency: float) -> Iterator[Finding]:
-    """Return periodic modulations of the amplitudes, by Fisher's test of the largest line of their spectrum."""
-    sizes = part.sizes
-    count = len(sizes)
-    if count < FEWEST_FOR_BEATS:
-        return
-    place = np.linspace(-1.0, 1.0, count)
-    trend = np.polynomial.polynomial.polyfit(place, sizes, 2)
-    rest = sizes - np.polynomial.polynomial.polyval(place, trend).T
-    spectrum = np.abs(np.fft.rfft(rest * np.hanning(count)[:, None], axis=0))[2:] ** 2
-    for i, channel in enumerate(channels):
-        power = spectrum[:, i]
-        line = int(np.argmax(power))
-        # Against the lines about it, so that slow noise is no beat.
-        near = np.r_[power[max(line - 12, 0) : max(line - 2, 0)], power[line + 3 : line + 13]]
-        if near.size < 6 or power[line] < np.mean(near) * -np.log(BEAT_FALSE_ALARM / spectrum.shape[0]) * 3.0:
-            continue
-        amplitude = float(np.sqrt(2.0 * rest[:, i].var()) / sizes[:, i].mean())
-        slip = float(part.slip[i] / sizes[:, i].mean())
-        if amplitude > HARMLESS_BEAT + slip:
-            beat = (line + 2) * frequency / (count * part.cycles)
-            yield Finding(
-                "beating", channel, SERIOUS if amplitude > HARMLESS_DRIFT + slip else HARMLESS,
-                np.array([[time[part.first[0]], time[part.last[-1] - 1]]]),
-                count, 1.0, np.nan, f"the amplitude of {channel} beats at {beat:.4g} Hz by {amplitude:.1%}",
-                "a second frequency is in the signals: remove its source, or average whole beats",
-            )  # fmt: skip
 
 
 def clock_findings(time: np.ndarray) -> Iterator[Finding]:
