@@ -41,7 +41,7 @@ FEWEST_HELD, CHANCE_RUNS, CHANCE_SHARE, NO_NOISE, DIFFERENCED = 3, 1e-3, 0.05, 1
 MOST_DIFFERENT = 0.98
 # Heavy tails: distance from which residuals belong to them [standard deviations of the others], expected number of
 # larger ones beyond which one is an outlier, and fewest samples between the two distances.
-TAIL, RARE_IN_TAIL, FEWEST_IN_TAIL = 4.0, 0.01, 3
+TAIL, RARE_IN_TAIL, FEWEST_IN_TAIL = 4.0, 1e-3, 3
 # Impulses of random size and sign: fewest, ratio of large sizes to small ones, the p-value from which they are not
 # one-sided, and standard errors of their correlation with the signal from which they replace it.
 FEWEST_IMPULSES, SPREAD_SIZES, BOTH_SIDES, REPLACED = 10, 2.5, 0.01, 3.0
