@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import t as student
 
-from bayesperiodic.data.recording_check import HARMLESS_DRIFT, HARMLESS_PHASE, RUINOUS, RUINOUS_BIAS, SERIOUS, Finding
+from bayesperiodic.data.cycle_findings import HARMLESS_PHASE
+from bayesperiodic.data.recording_check import RUINOUS, RUINOUS_BIAS, SERIOUS, Finding
 from bayesperiodic.data.steadiness import SMALL_RANGE, Windows
 
 # Windows on each side of a step, shortest and as a share of all, and the size of a step in robust standard deviations.
@@ -19,8 +20,9 @@ ALIKE = 6.0
 ROUNDING_PHASE = 1e-4
 # False-alarm rate of a drift over all channels, fewest windows, and orders of polynomials that measure the noise.
 DRIFT_FALSE_ALARM, FEWEST_WINDOWS, FEWEST_ORDERS, MOST_ORDERS = 1e-4, 10, 4, 16
-# Drift of the phase [rad] that a relative change of amplitudes explains; curvature of a clock's drift.
-BY_AMPLITUDE, CURVED = 2.0, 0.1
+# Drift of the phase [rad] that a relative change of amplitudes explains, and up to which it is harmless then; curvature
+# of a clock's drift.
+BY_AMPLITUDE, HARMLESS_TURN, CURVED = 2.0, 0.05, 0.1
 # Quantile of the differences of means that are no steps although there may be many, and that of a normal distribution.
 FEW, FEW_TO_SD, MEDIAN_TO_SD = 0.15, 0.189, 1.4826
 CLOCK = "clock"
@@ -189,7 +191,7 @@ def drifts(phases: Phases, used: np.ndarray, steps: Sequence[np.ndarray]) -> Ite
             continue
         growth = float(np.abs(basis[1] @ phases.sizes[numbers][:, [0, row]]).max())
         by_amplitude = 2.0 * np.pi * phases.order[row] * size <= BY_AMPLITUDE * growth
-        if by_amplitude and 2.0 * np.pi * phases.order[row] * abs(turns) < HARMLESS_DRIFT:
+        if by_amplitude and 2.0 * np.pi * phases.order[row] * abs(turns) < HARMLESS_TURN:
             continue
         steady = not by_amplitude and abs(component[2]) <= CURVED * size + limit
         yield Drift(row, float(component[1]) / per_cycle, noise / abs(per_cycle), turns, steady)

@@ -18,7 +18,7 @@ ROUNDING = 1e-12
 WRAP_TOLERANCE, LARGEST_UNWRAPPED_STEP, SMOOTH_UNWRAPPED = 0.35, 0.5, 0.5
 # Samples of one value in a row that may be a stuck sensor, how many times longer than usual ones they are, and so many
 # runs at an end of the range that they are clipped.
-FEWEST_STUCK, LONG_RUN, SEVERAL = 10, 10.0, 3
+FEWEST_STUCK, LONG_RUN, RUNS_AT_END = 10, 10.0, 3
 # Clipped samples: fewest, fewest in a row, and how many times more than at the next level.
 FEWEST_CLIPPED, CLIPPED_RUN, PILED_UP = 6, 3, 6.0
 # Distance of outliers from the mean period in standard deviations of the others, and how often they may return.
@@ -34,15 +34,17 @@ MOST_DROPPED, FEWEST_VALUES = 0.45, 18
 ALL_DROPPED = 0.4
 # Repeated values of a slower logger: share of the runs that have the usual length.
 HELD = 0.9
-# Short runs of one value: fewest samples, p-value of as many by noise, and largest share of these; standard deviation of
-# the noise relative to the range below which there is none, and samples from which that is taken.
-FEWEST_HELD, CHANCE_RUNS, CHANCE_SHARE, EXACT, NOISE_SAMPLES = 3, 1e-3, 0.05, 1e-9, 20_000
+# Short runs of one value: fewest samples, p-value of as many by noise, and largest share of these; size of the noise
+# relative to the range below which there is none, and samples from which that is taken.
+FEWEST_HELD, CHANCE_RUNS, CHANCE_SHARE, NO_NOISE, DIFFERENCED = 3, 1e-3, 0.05, 1e-9, 20_000
+# Largest share of different values among those of a quantised sensor.
+MOST_DIFFERENT = 0.98
 # Heavy tails: distance from which residuals belong to them [standard deviations of the others], expected number of
 # larger ones beyond which one is an outlier, and fewest samples between the two distances.
-TAIL, RARE, FEWEST_IN_TAIL = 4.0, 0.01, 3
+TAIL, RARE_IN_TAIL, FEWEST_IN_TAIL = 4.0, 1e-3, 3
 # Impulses of random size and sign: fewest, ratio of large sizes to small ones, the p-value from which they are not
 # one-sided, and standard errors of their correlation with the signal from which they replace it.
-FEWEST_IMPULSES, SPREAD_SIZES, ONE_SIDED, REPLACED = 10, 2.5, 0.01, 3.0
+FEWEST_IMPULSES, SPREAD_SIZES, BOTH_SIDES, REPLACED = 10, 2.5, 0.01, 3.0
 
 
 @dataclass
@@ -108,7 +110,7 @@ def stuck_of(values: np.ndarray) -> list[slice]:
     # Several runs at the largest or the smallest value are clipped.
     level = values[first[long]]
     for end in (values.max(), values.min()):
-        if np.count_nonzero(level == end) >= SEVERAL:
+        if np.count_nonzero(level == end) >= RUNS_AT_END:
             long, level = long[level != end], level[level != end]
     return [slice(int(first[i]), int(first[i] + length[i])) for i in long]
 
@@ -122,16 +124,16 @@ def brief_of(values: np.ndarray, step: float) -> np.ndarray:
     first, length = runs(values)
     if length.size < 2 or length.max() < FEWEST_HELD:
         return np.zeros(0, dtype=int)
-    noise = fast_noise(values)
-    if not noise > max(EXACT * float(np.ptp(values)), 0.5 * step):
+    noise, step = fast_noise(values), step or _spacing(values[first])
+    if not noise > max(NO_NOISE * float(np.ptp(values)), 0.5 * step):
         return np.zeros(0, dtype=int)
     # Runs of two count as chance: a hold of two samples is not told from it.
     pairs = (np.count_nonzero(length == 2) + 1.0) / values.size
     same = min(max(float(erf(step / (np.sqrt(8.0) * noise))), pairs), 1.0 - 1e-12)
     size = np.arange(FEWEST_HELD, length.max() + 1)
-    found = np.cumsum(np.bincount(length)[::-1])[::-1][size]  # runs of that size or longer
+    count = np.cumsum(np.bincount(length)[::-1])[::-1][size]  # runs of that size or longer
     chance = values.size * same ** (size - 1.0)
-    held = (chance < CHANCE_SHARE * found) & (pdtrc(found - 1, chance) < CHANCE_RUNS)
+    held = (chance < CHANCE_SHARE * count) & (pdtrc(count - 1, chance) < CHANCE_RUNS)
     if not held.any():
         return np.zeros(0, dtype=int)
     level = values[first]
@@ -139,10 +141,17 @@ def brief_of(values: np.ndarray, step: float) -> np.ndarray:
     return np.flatnonzero(np.repeat(long, length))
 
 
+def _spacing(values: np.ndarray) -> float:
+    """Return the usual distance of values if many of them return, as those of a quantised sensor do; else 0."""
+    some = values[:DIFFERENCED]
+    levels = np.unique(some)
+    return float(np.median(np.diff(levels))) if levels.size < MOST_DIFFERENT * some.size else 0.0
+
+
 def fast_noise(values: np.ndarray) -> float:
     """Return the standard deviation of white noise, by fourth differences, to which smooth signals add little."""
-    start = (values.size - min(values.size, NOISE_SAMPLES)) // 2
-    change = np.abs(np.diff(values[start : start + NOISE_SAMPLES], 4))
+    start = (values.size - min(values.size, DIFFERENCED)) // 2
+    change = np.abs(np.diff(values[start : start + DIFFERENCED], 4))
     # Differences over repeated values are none of noise.
     change = change[change > 0.0]
     return MEDIAN_TO_SD * float(np.median(change)) / np.sqrt(70.0) if change.size else 0.0
@@ -191,17 +200,17 @@ def heavy_tails(residuals: np.ndarray, outliers: np.ndarray, predicted: np.ndarr
     sizes = distance[distance > TAIL * scale] / (TAIL * scale)
     between = np.count_nonzero(sizes < FAR / TAIL)
     chance = float(erfc(TAIL / np.sqrt(2.0))) * residuals.size
-    own = distance[outliers] / (TAIL * scale)
+    relative = distance[outliers] / (TAIL * scale)
     far = np.flatnonzero(distance > FAR * scale)
     if between >= 2.0 * chance + FEWEST_IN_TAIL and between - chance >= far.size:
         index = np.log(2.0) / float(np.median(np.log(sizes)))
-        result = sizes.size * np.maximum(own, 1.0) ** -index > RARE
+        result = sizes.size * np.maximum(relative, 1.0) ** -index > RARE_IN_TAIL
     elif far.size >= FEWEST_IMPULSES:
         above = int(np.count_nonzero(residuals[far] > middle))
         p_value = 2.0 * min(binom.cdf(above, far.size, 0.5), binom.sf(above - 1, far.size, 0.5))
         spread = np.quantile(distance[far], 0.9) > SPREAD_SIZES * np.quantile(distance[far], 0.1)
         replaced = abs(np.corrcoef(residuals[far], predicted[far])[0, 1]) > REPLACED / np.sqrt(far.size)
-        result[:] = spread and p_value > ONE_SIDED and not replaced
+        result[:] = spread and p_value > BOTH_SIDES and not replaced
     return result
 
 

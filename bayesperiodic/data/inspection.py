@@ -8,6 +8,7 @@ import numpy as np
 from bayesperiodic import _fourier
 from bayesperiodic.data import clocks
 from bayesperiodic.data.coverage import determined_harmonics, resolved_harmonics
+from bayesperiodic.data.cycle_findings import cycle_findings, slow_beats
 from bayesperiodic.data.faults import ChannelFaults, dropped_value, jumps, outliers_of, single
 from bayesperiodic.data.groups import CommonFit, Windowed, common_span, common_windows, leading, refine_groups, within
 from bayesperiodic.data.harmonics import (
@@ -16,7 +17,6 @@ from bayesperiodic.data.harmonics import (
     Pace,
     fit_harmonics,
 )
-from bayesperiodic.data.mean_period_faults import LEAST_MOVING, describe, undetermined
 from bayesperiodic.data.recording_check import (
     RUINOUS,
     SEVERITIES,
@@ -25,11 +25,11 @@ from bayesperiodic.data.recording_check import (
     RecordingCheck,
     bounded,
     clock_findings,
-    cycle_findings,
     sample_findings,
     sampling_findings,
     signal_faults,
 )
+from bayesperiodic.data.sensors import LEAST_MOVING, describe, undetermined
 from bayesperiodic.data.signals import USUAL_STEPS, Signals, counted_cycles, cycles_of, first_guess
 from bayesperiodic.data.steadiness import Steady, Windows, steady_part
 
@@ -129,12 +129,14 @@ def inspect(
     refined = frequency is None
     every, steady, tracked = _steady_of(some, tracked, points, refined, refined and not whole, other)
     if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
-        return Inspection(groups, faults, worst_first(findings(tracked)), total, reason=_unsteady(groups, every.all))
+        return Inspection(
+            groups, faults, worst_first(findings(tracked)), total, reason=_unsteady(groups, every.all, tracked)
+        )
     used = [
         slice(int(these[part.start]), int(these[part.stop - 1]) + 1)
         for these, part in zip(sound, every.samples(steady.part), strict=True)
     ]
-    steady = steady.among(sound[0])
+    steady, outer = steady.among(sound[0]), every.all.among(sound[0])
     parts = [group.part(part) for group, part in zip(groups, used, strict=True)]
     try:
         highest = [resolved_harmonics(part.time, tracked, points, asked) for part in parts]
@@ -144,7 +146,9 @@ def inspect(
     limits, inflation = [limit for limit, _ in determined], [factors for _, factors in determined]
     fit, pace = refine_groups(parts, tracked, limits, other)
     if np.ptp(parts[0].time) * fit.frequency < MINIMUM_CYCLES - 1:
-        return Inspection(groups, faults, worst_first(findings(tracked)), total, reason=_unsteady(groups, every.all))
+        return Inspection(
+            groups, faults, worst_first(findings(tracked)), total, reason=_unsteady(groups, every.all, tracked)
+        )
     if lost := next(filter(None, map(undetermined, parts, fit.each, highest)), ""):
         return Inspection(groups, faults, worst_first(findings(tracked)), total, reason=lost)
     for i, (group, part) in enumerate(zip(groups, used, strict=True)):
@@ -159,7 +163,7 @@ def inspect(
     seen = findings(fit.frequency, limits, used)
     channels = [channel for group in groups for channel in group.channels]
     ends = (max(group.time[0] for group in groups), min(group.time[-1] for group in groups))
-    seen += cycle_findings(channels, groups[0].time, steady, fit.frequency, total, ends)
+    seen += cycle_findings(channels, groups[0].time, outer, steady, fit.frequency, total, ends)
     if frequency is None:
         lead = parts[leading(groups)]
         seen += sampling_findings(lead.time, lead.values, fit.frequency, first.time, behind)
@@ -292,17 +296,22 @@ def _sound(
     return np.setdiff1d(moving, np.concatenate([fault.outliers for fault in faults]))
 
 
-def _unsteady(groups: list[Signals], every: Windows) -> str:
-    name = groups[0].name
+def _unsteady(groups: list[Signals], every: Windows, frequency: float) -> str:
+    name, channels = groups[0].name, [channel for group in groups for channel in group.channels]
     if not every.first.size:
         return (
             f"recording: must have samples in all parts of its periods, got {name!r}, which has too few; check "
             "the frequency and the gaps, or fold a part by `between` or `split`."
         )
+    if beats := [*slow_beats(channels, groups[0].time, every, frequency)]:
+        return (
+            f"recording: must have a steady part of {MINIMUM_CYCLES} cycles, got {name!r}, in which "
+            f"{'. '.join(map(str, beats))}."
+        )
     size = every.sizes
     worst = int(np.argmax(np.ptp(size, axis=0) / size.mean(axis=0)))
     low, high = size[:, worst].min(), size[:, worst].max()
-    channel = [channel for group in groups for channel in group.channels][worst]
+    channel = channels[worst]
     return (
         f"recording: must have a steady part of {MINIMUM_CYCLES} cycles, got {name!r}, in which the amplitude "
         f"of {channel!r} changes throughout, from {low / high:.0%} of its largest value on; record at "

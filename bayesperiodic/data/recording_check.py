@@ -17,7 +17,6 @@ from bayesperiodic.data.coverage import per_cycle
 from bayesperiodic.data.faults import ChannelFaults
 from bayesperiodic.data.harmonics import fit_harmonics
 from bayesperiodic.data.signals import GAP, LISTED_ALIASES, USUAL_STEPS
-from bayesperiodic.data.steadiness import ALLOWED_BIAS, Steady, Windows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,15 +33,8 @@ FITTED_HARMONICS, LARGEST_FIT_CONDITION = (10, 5, 3, 2, 1), 1e3
 EXTREMES = 0.1
 # Times of each finding that are listed.
 MOST_TIMES_LISTED = 200
-# Relative changes over the part used: of an amplitude, and of the mean value in amplitudes.
-HARMLESS_DRIFT, HARMLESS_STEP, HARMLESS_PHASE = 0.05, 0.02, 1.0 / 180.0
-# Change between neighbouring cycles that is a step, in standard deviations of the other changes, and cycles needed;
-# the standard deviation is uncertain if there are fewer cycles than this.
-STEP_FROM_CYCLE, FEWEST_FOR_STEPS, ENOUGH_FOR_STEPS = 8.0, 10, 20
 # Samples in a cycle of the strongest harmonic below which an estimated frequency is named with its aliases.
 FEW_PER_CYCLE = 10.0
-# Amplitude of a beat relative to the mean one, its false-alarm rate, and the cycles needed.
-HARMLESS_BEAT, BEAT_FALSE_ALARM, FEWEST_FOR_BEATS = 0.01, 1e-4, 24
 
 
 @dataclass(frozen=True)
@@ -226,13 +218,7 @@ def sample_findings(
         )  # fmt: skip
         return
     if fault.repeats > 1:
-        delay = 0.5 * (fault.repeats - 1)
-        yield Finding(
-            "held", channel, SERIOUS, np.array([[time[0], time[-1]]]), fault.held.size, fault.held.size / total, np.nan,
-            f"{channel} repeats each value {fault.repeats} times: a slower logger or a hold, which delays it by "
-            f"{delay:g} samples ({delay * float(np.median(np.diff(time))):.3g} s) and weakens its harmonics",
-            f"recording.without(stuck=True, channel={channel!r}) keeps one sample of each value",
-        )  # fmt: skip
+        yield _held(channel, time, fault)
     bad = np.zeros(total, dtype=bool)
     for part in fault.stuck:
         bad[part] = True
@@ -241,8 +227,22 @@ def sample_findings(
         yield _tails(channel, time, fault.tails)
     if fault.saturation is not None and not fault.low.size and not fault.high.size:
         yield _saturated(channel, time, fault.saturated, fault)
-    if not bad.any():
-        return
+    if bad.any():
+        yield from _bad_findings(channel, time, values, fault, bad, frequency, harmonics, used)
+
+
+def _bad_findings(
+    channel: str,
+    time: np.ndarray,
+    values: np.ndarray,
+    fault: ChannelFaults,
+    bad: np.ndarray,
+    frequency: float | None,
+    harmonics: int,
+    used: slice,
+) -> Iterator[Finding]:
+    """Return the findings of stuck and clipped samples and outliers, which are the bad ones (bool)."""
+    total = values.size
     every = effect_of(time[used], values[used], bad[used], frequency, harmonics) if frequency else UNKNOWN
     if every.predicted.size:  # at the other samples too
         predicted = values.astype(float)
@@ -284,6 +284,17 @@ def sample_findings(
         yield finding("outliers", fault.outliers, which)
 
 
+def _held(channel: str, time: np.ndarray, fault: ChannelFaults) -> Finding:
+    """Return the finding of a slower logger."""
+    delay = 0.5 * (fault.repeats - 1)
+    return Finding(
+        "held", channel, SERIOUS, np.array([[time[0], time[-1]]]), fault.held.size, fault.held.size / time.size, np.nan,
+        f"{channel} repeats each value {fault.repeats} times: a slower logger or a hold, which delays it by "
+        f"{delay:g} samples ({delay * float(np.median(np.diff(time))):.3g} s) and weakens its harmonics",
+        f"recording.without(stuck=True, channel={channel!r}) keeps one sample of each value",
+    )  # fmt: skip
+
+
 def _tails(channel: str, time: np.ndarray, samples: np.ndarray) -> Finding:
     """Return the finding of heavy tails."""
     share = samples.size / time.size
@@ -297,11 +308,11 @@ def _tails(channel: str, time: np.ndarray, samples: np.ndarray) -> Finding:
 
 def _saturated(channel: str, time: np.ndarray, samples: np.ndarray, fault: ChannelFaults, level: str = "") -> Finding:
     """Return the finding of flat tops of a mean period, which are those of a sensor or of the motion itself."""
-    found, bias = fault.saturation, np.nan
-    if found is not None:
-        level = level or " and ".join(f"{v:.6g}" for v in (found.low, found.high) if np.isfinite(v))
+    saturation, bias = fault.saturation, np.nan
+    if saturation is not None:
+        level = level or " and ".join(f"{v:.6g}" for v in (saturation.low, saturation.high) if np.isfinite(v))
         bias = fault.saturation_bias
-    sensor = found is not None and found.like_a_sensor and bias > SERIOUS_BIAS
+    sensor = saturation is not None and saturation.like_a_sensor and bias > SERIOUS_BIAS
     share, times = samples.size / time.size, times_of(time, samples)
     size = "" if np.isnan(bias) else f", with a bias of {bias:.3g} standard errors"
     return Finding(
@@ -327,108 +338,6 @@ def _beyond(effect: Effect, values: np.ndarray, samples: np.ndarray, sign: float
         return True
     excess = sign * (effect.predicted[samples] - values[samples])
     return bool(np.median(excess) > max(effect.noise, 1e-6 * float(np.ptp(values))))
-
-
-def cycle_findings(
-    channels: Iterable[str],
-    time: np.ndarray,
-    steady: Steady,
-    frequency: float,
-    total: int,
-    ends: tuple[float, float],
-) -> Iterator[Finding]:
-    """Return the findings about the cycles: what was left out, and what changes in the part that is used.
-
-    `ends` are the first and the last time that all channels have in common.
-    """
-    part, step = steady.part, steady.part.cycles
-    channels = [*channels]
-    start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
-    cycles = len(part.first) * step
-    level = [float(time[i]) for i in (steady.level[0], steady.level[1] - 1)]
-    first, end = ends
-    for kind, a, b, what in (
-        ("ramp", first, level[0], "the signals change until"),
-        ("ramp", level[1], end, "the signals change from"),
-        ("transient", level[0], start, "a rest of the transient is in the amplitudes until"),
-    ):
-        if (b - a) * frequency < 1.0:
-            continue
-        count = int((b - a) * frequency)
-        place = b if what.endswith("until") else a
-        yield Finding(
-            kind, "", HARMLESS, np.array([[a, b]]), count, count / total, np.nan,
-            f"{what} {place:.6g} s; {start:.6g} to {stop:.6g} s are used ({cycles} of {total} cycles)",
-        )  # fmt: skip
-    if steady.bias > ALLOWED_BIAS:
-        severity = SERIOUS if steady.bias > SERIOUS_BIAS else HARMLESS
-        yield Finding(
-            "transient", "", severity, np.array([[start, stop]]), cycles, 1.0,
-            steady.bias, f"a rest of the transient is in the part used, {start:.6g} to {stop:.6g} s, and biases the "
-            f"amplitudes by {steady.bias:.2g} standard errors", "record longer, or begin later with recording.between",
-        )  # fmt: skip
-    changes = steady.change[np.argmax(np.abs(steady.change), axis=0), np.arange(len(channels))]
-    for channel, change in zip(channels, changes, strict=True):
-        if abs(change) > HARMLESS_DRIFT:
-            yield Finding(
-                "drift", channel, SERIOUS, np.array([[start, stop]]), cycles, 1.0, np.nan,
-                f"the amplitude of {channel} changes by {change:+.1%} within half of the part used",
-                "select a steadier part with recording.between(start, stop)",
-            )  # fmt: skip
-    yield from _steps(channels, time, part)
-    yield from _beats(channels, time, part, frequency)
-
-
-def _steps(channels: list[str], time: np.ndarray, part: Windows) -> Iterator[Finding]:
-    """Return steps of amplitude between neighbouring cycles."""
-    shape, first = part.amplitudes, part.first
-    if len(shape) < FEWEST_FOR_STEPS:
-        return
-    sizes = np.log(np.maximum(part.sizes, np.finfo(float).tiny))
-    limit = STEP_FROM_CYCLE * max(1.0, (ENOUGH_FOR_STEPS / len(shape)) ** 2)
-    least = HARMLESS_STEP + part.slip / np.exp(np.median(sizes, axis=0))
-    mean = 0.5 * (sizes[1:] + sizes[:-1])
-    jump = mean[2:] - mean[:-2]  # of two cycles after a boundary from the two before it
-    spread = np.median(np.abs(jump - np.median(jump, axis=0)), axis=0) / 0.6745
-    large = (np.abs(jump) > limit * spread) & (np.abs(jump) > least)
-    for i, channel in enumerate(channels):
-        if large[:, i].any():
-            k = int(np.argmax(np.where(large[:, i], np.abs(jump[:, i]), 0.0)))
-            at = float(time[first[k + 2]])
-            yield Finding(
-                "amplitude step", channel, SERIOUS, np.array([[at, at]]), 1, 1.0 / len(shape), np.nan,
-                f"the amplitude of {channel} steps by {np.expm1(jump[k, i]):+.1%} at about {at:.6g} s",
-                "fold the parts before and after it: recording.between(start, stop)",
-            )  # fmt: skip
-
-
-def _beats(channels: list[str], time: np.ndarray, part: Windows, frequency: float) -> Iterator[Finding]:
-    """Return periodic modulations of the amplitudes, by Fisher's test of the largest line of their spectrum."""
-    sizes = part.sizes
-    count = len(sizes)
-    if count < FEWEST_FOR_BEATS:
-        return
-    place = np.linspace(-1.0, 1.0, count)
-    trend = np.polynomial.polynomial.polyfit(place, sizes, 2)
-    rest = sizes - np.polynomial.polynomial.polyval(place, trend).T
-    spectrum = np.abs(np.fft.rfft(rest * np.hanning(count)[:, None], axis=0))[2:] ** 2
-    for i, channel in enumerate(channels):
-        power = spectrum[:, i]
-        line = int(np.argmax(power))
-        # Against the lines about it, so that slow noise is no beat.
-        near = np.r_[power[max(line - 12, 0) : max(line - 2, 0)], power[line + 3 : line + 13]]
-        if near.size < 6 or power[line] < np.mean(near) * -np.log(BEAT_FALSE_ALARM / spectrum.shape[0]) * 3.0:
-            continue
-        amplitude = float(np.sqrt(2.0 * rest[:, i].var()) / sizes[:, i].mean())
-        slip = float(part.slip[i] / sizes[:, i].mean())
-        if amplitude > HARMLESS_BEAT + slip:
-            beat = (line + 2) * frequency / (count * part.cycles)
-            yield Finding(
-                "beating", channel, SERIOUS if amplitude > HARMLESS_DRIFT + slip else HARMLESS,
-                np.array([[time[part.first[0]], time[part.last[-1] - 1]]]),
-                count, 1.0, np.nan, f"the amplitude of {channel} beats at {beat:.4g} Hz by {amplitude:.1%}",
-                "a second frequency is in the signals: remove its source, or average whole beats",
-            )  # fmt: skip
 
 
 def clock_findings(time: np.ndarray) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Flat tops of a mean period beyond which a Fourier series of the other samples goes: saturation, or a limited force."""
+"""Flat tops of a mean period beyond which a Fourier series of the other samples goes: saturated or limited."""
 
 from dataclasses import dataclass
 
@@ -7,18 +7,20 @@ import numpy as np
 from bayesperiodic import _fourier
 
 # Intervals of the cycle: so many for each sample of a cycle, at most so many, and samples in each of them.
-BINS_OF_SAMPLE, MOST_BINS, SAMPLES_OF_BIN = 4, 512, 4
+INTERVALS_OF_SAMPLE, MOST_INTERVALS, SAMPLES_OF_INTERVAL = 4, 512, 4
 # Harmonics of a series that saturates, and the largest condition number of its normal equations without the flat tops.
 SERIES, LARGEST_SERIES_CONDITION = (1, 2, 3, 5, 8), 1e4
 # Shares of the cycle at each end with which the search for flat tops begins, and its largest number of steps.
-FIRST_SHARES, MOST_STEPS = (0.5, 0.35, 0.2, 0.1, 0.05), 30
+FIRST_SHARES, MOST_SEARCHES = (0.5, 0.35, 0.2, 0.1, 0.05), 30
 # Error of the mean period relative to its standard deviation below which a series is exact.
 EXACT_SERIES = 1e-3
+# Rounding errors relative to the largest value.
+ROUNDED = 1e-9
 # Difference of χ² by which the saturated series is better than any other one, and standard deviations of a χ² that
 # a good model exceeds it by.
-BETTER, GOODNESS = 25.0, 4.0
+CLEARLY_SATURATED, GOODNESS = 25.0, 4.0
 # Harmonics of the noise that is slower than a cycle's details.
-SLOW_HARMONICS = 8
+SLOW_ORDERS = 8
 # Range of the series relative to that of the values beyond which a force is more likely than a sensor.
 LARGEST_OVERLOAD = 5.0
 # Harmonics of a series that a sensor may limit, and the largest ratio of the slopes at both ends of its flat tops.
@@ -39,7 +41,13 @@ class PhaseBins:
 def phase_bins(phase: np.ndarray) -> PhaseBins:
     """Return the intervals of samples whose phase is given in cycles."""
     cycles = max(float(np.ptp(phase)), 1.0)
-    number = int(min(BINS_OF_SAMPLE * np.ceil(phase.size / cycles), MOST_BINS, max(phase.size // SAMPLES_OF_BIN, 1)))
+    number = int(
+        min(
+            INTERVALS_OF_SAMPLE * np.ceil(phase.size / cycles),
+            MOST_INTERVALS,
+            max(phase.size // SAMPLES_OF_INTERVAL, 1),
+        )
+    )
     shifted = phase + 0.5 / number
     cycle = np.floor(shifted)
     rest = shifted - cycle
@@ -69,18 +77,18 @@ def means_of(bins: PhaseBins, residuals: np.ndarray, amplitudes: np.ndarray, ste
     count = bins.count.sum(axis=0)
     known = count > 0
     rest = sums.sum(axis=0)[known] / count[known]
-    freedom = residuals.size - np.count_nonzero(known)
-    variance = max(float(residuals @ residuals - count[known] @ rest**2), 0.0) / max(freedom, 1)
+    freedom = max(residuals.size - int(np.count_nonzero(known)), 1)
+    variance = max(float(residuals @ residuals - count[known] @ rest**2), 0.0) / freedom
     phase = bins.centre[known]
     values = _fourier.at_times(amplitudes[None], phase)[0] + rest
     both = (bins.count > 0).all(axis=0)
     half = 0.5 * np.diff(sums[:, both] / bins.count[:, both], axis=0)[0]
     each = 0.25 * variance * np.sum(1.0 / bins.count[:, both])
-    order = np.arange(1, SLOW_HARMONICS + 1)
+    order = np.arange(1, SLOW_ORDERS + 1)
     slow = np.exp(-2j * np.pi * np.outer(order, bins.centre[both])) @ half
-    slower = float(np.mean(np.abs(slow) ** 2)) / each if each > 0.0 else 1.0
+    slower = max(float(np.mean(np.abs(slow) ** 2)) / each, 1.0) if each > 0.0 else 1.0
     exact = (EXACT_SERIES * float(values.std())) ** 2 + step**2 / 12.0
-    weights = 1.0 / (max(slower, 1.0) * variance / count[known] + exact)
+    weights = 1.0 / (slower * variance / count[known] + exact)
     # A series of the first harmonics leaves the power of the others.
     power = 0.5 * np.abs(amplitudes[1:]) ** 2 * weights.sum()
     left = np.concatenate([np.cumsum(power[::-1] - 2.0)[::-1], [0.0]])
@@ -88,7 +96,7 @@ def means_of(bins: PhaseBins, residuals: np.ndarray, amplitudes: np.ndarray, ste
     best = int(np.argmin(score))
     rest = values - _fourier.at_times(amplitudes[None, : best + 1], phase)[0]
     misfit = float(weights @ rest**2) + (2.0 * best + 1.0) * np.log(weights.size)
-    error = 1.0 / np.sqrt(float(weights.sum()))
+    error = float(np.sqrt(max(variance, (ROUNDED * float(np.abs(values).max())) ** 2) / residuals.size))
     return Means(phase, values, weights, error, best, misfit)
 
 
@@ -108,7 +116,7 @@ class Saturation:
     @property
     def overload(self) -> float:
         """Range of the series relative to that of the mean period."""
-        return float(np.ptp(self.beyond) / np.ptp(self.beyond - self.excess))
+        return float(np.ptp(self.beyond)) / float(np.ptp(self.beyond - self.excess))
 
     @property
     def skew(self) -> float:
@@ -155,7 +163,7 @@ class Saturation:
         grid = self.phase[order]
         middle = 0.5 * (grid + np.append(grid[1:], grid[0] + 1.0))
         place = np.searchsorted(middle, (phase - middle[-1] + 1.0) % 1.0 + middle[-1] - 1.0) % grid.size
-        return np.asarray(self.flat.any(axis=0)[order][place])
+        return np.asarray(self.flat[:, order].any(axis=0))[place]
 
 
 def saturation_of(means: Means) -> Saturation | None:
@@ -181,7 +189,7 @@ def saturation_of(means: Means) -> Saturation | None:
                 trial = _saturated(means, basis[:, : 2 * harmonics + 1], ends)
                 if trial is not None and (best is None or trial.misfit < best.misfit):
                     best = trial
-    return best if best is not None and best.misfit + BETTER < means.misfit else None
+    return best if best is not None and best.misfit + CLEARLY_SATURATED < means.misfit else None
 
 
 def _level(means: Means, inside: np.ndarray) -> bool:
@@ -196,7 +204,7 @@ def _level(means: Means, inside: np.ndarray) -> bool:
 def _saturated(means: Means, basis: np.ndarray, ends: np.ndarray) -> Saturation | None:
     """Return the saturated series with the basis' harmonics by a search from first flat tops (2, points)."""
     values, weights = means.values, means.weights
-    for _ in range(MOST_STEPS):
+    for _ in range(MOST_SEARCHES):
         free = ~ends.any(axis=0)
         if np.count_nonzero(free) < 2 * basis.shape[1]:
             return None

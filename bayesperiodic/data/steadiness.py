@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from bayesperiodic import _fourier
+from bayesperiodic.data.changes import POSSIBLE, PROBABLE, Changes, changes
 from bayesperiodic.data.coverage import SLOW, determined_harmonics, per_cycle, resolved_harmonics
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES, fit_harmonics
 
@@ -29,21 +30,14 @@ LEAST_LEVEL = 0.5
 DISTANT, DISTANT_MEAN = 3.0, 12.0
 # Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
 FEWEST_FOR_MEDIAN = 9
-# Windows from which a transient is searched for, and false-alarm rate of a significant slope.
-FEWEST_FOR_TRANSIENT, SLOPE_FALSE_ALARM = 6, 1e-4
+# Windows from which changes are searched for, and false-alarm rate of a significant slope.
+FEWEST_FOR_CHANGES, SLOPE_FALSE_ALARM = 5, 1e-4
 # Largest correlation of the noise of neighbouring windows.
 LONGEST_MEMORY = 0.8
-# Shares of a channel's standard deviation below which distances and noise do not count.
-SMALLEST_DISTANCE, SMALLEST_NOISE = 1e-9, 1e-6
-# Bias of the mean amplitudes by a transient that is allowed, in standard errors of all together.
-ALLOWED_BIAS = 0.3
-# Probability of a rest of a transient before the data, where the start was left out, and where it was not; with few
-# windows, in which noise looks like one more often, it has to be clear.
-PROBABLE, IMPROBABLE, IMPROBABLE_IN_FEW, FEW_WINDOWS = 0.9, 0.1, 1e-4, 10
-# Decay times of transients, in cycles and relative to the recording, their number, and the number of frequencies.
-SHORTEST_DECAY, LONGEST_DECAY, DECAYS, FREQUENCIES = 0.3, 1.0 / 6.0, 12, 13
-# Decay times in which a transient is compared with noise, and most places of the recording with which it is compared.
-LENGTH, CONTROLS = 6.0, 8
+# Second differences of smooth signals and noise, relative to their median.
+SMOOTH_OR_NOISE = 6.0
+# Share of a channel's standard deviation below which distances do not count.
+SMALLEST_DISTANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -63,6 +57,10 @@ class Windows:
         first, last, place = (array[used] for array in (self.first, self.last, self.place))
         return Windows(first, last, place, self.overlap, self.cycles, self.amplitudes[used], self.slip)
 
+    def among(self, numbers: np.ndarray) -> "Windows":
+        """Return the same windows of all samples, of which they have those with these numbers."""
+        return replace(self, first=numbers[self.first], last=numbers[self.last - 1] + 1)
+
     def apart(self) -> "Windows":
         """Return windows that do not overlap, the last one among them."""
         used = [len(self.place) - 1]
@@ -72,11 +70,19 @@ class Windows:
         return self.chosen(used[::-1])
 
     @cached_property
+    def strongest(self) -> np.ndarray:
+        """The strongest harmonic of each channel."""
+        return 1 + np.abs(self.amplitudes[:, :, 1:]).mean(axis=0).argmax(axis=1)
+
+    @cached_property
+    def lines(self) -> np.ndarray:
+        """Complex amplitudes of the strongest harmonic of each channel, (windows, channels)."""
+        return np.take_along_axis(self.amplitudes, self.strongest[None, :, None], axis=2)[:, :, 0]
+
+    @cached_property
     def sizes(self) -> np.ndarray:
         """Amplitudes of the strongest harmonic of each channel, (windows, channels)."""
-        every = np.abs(self.amplitudes[:, :, 1:])
-        strongest = every.mean(axis=0).argmax(axis=1)
-        return np.take_along_axis(every, strongest[None, :, None], axis=2)[:, :, 0]
+        return np.abs(self.lines)
 
 
 def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows:
@@ -120,7 +126,7 @@ def _windows_of(
     used = slice(edges[0], None)
     wave, power = np.exp(-2j * np.pi * (fundamental * time[used] % 1.0)), np.ones(time[used].size, dtype=complex)
     scaled = values[:, used] / values.std(axis=1)[:, None]
-    sums = np.empty((order.size, len(values) + 1, count), dtype=complex)
+    sums = np.zeros((order.size, len(values) + 1, count), dtype=complex)
     for h in order:
         for row, signal in zip(sums[h], [1.0, *(scaled if h < harmonics.size else ())], strict=False):
             row[:] = np.add.reduceat(signal * power, edges - edges[0])
@@ -154,12 +160,16 @@ def _windows_of(
 def _slip(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return twice the median of the largest second differences in parts of signals (channels, samples).
 
-    Samples that are not at the same phases of every cycle see jumps and narrow peaks earlier or later.
+    Samples that are not at the same phases of every cycle see jumps and narrow peaks earlier or later. What smooth
+    signals and noise have, a multiple of the median, does not count.
     """
     edges = edges[: max(np.searchsorted(edges, values.shape[1] - 2), 1)]
     edges = edges[np.r_[True, np.diff(edges) > 0]]
-    largest = [np.median(np.maximum.reduceat(np.abs(np.diff(v, 2)), edges)) for v in values if v.size > 2]
-    return 2.0 * np.array(largest if largest else np.zeros(len(values)))
+    if values.shape[1] < 3:
+        return np.zeros(len(values))
+    bends = [np.abs(np.diff(v, 2)) for v in values]
+    largest = np.array([np.median(np.maximum.reduceat(bend, edges)) for bend in bends])
+    return 2.0 * np.maximum(largest - SMOOTH_OR_NOISE * np.array([np.median(bend) for bend in bends]), 0.0)
 
 
 @dataclass(frozen=True)
@@ -169,13 +179,15 @@ class Steady:
     part: Windows  # that do not overlap
     samples: slice
     level: tuple[int, int]  # samples of the part of one level, before the rest of the transient is left out
-    bias: float  # of all mean amplitudes together by the rest of the transient, in standard errors
-    squares: np.ndarray  # expected squares of this bias (channels, harmonics + 1), relative to the channel's variance
+    squares: np.ndarray  # expected squared bias of the means (channels, harmonics + 1), relative to the variance
     change: np.ndarray  # relative changes of the amplitudes within each half, where they are significant (2, channels)
+    bias: float = 0.0  # of all mean amplitudes together by the rest of the transient, in standard errors
+    transient: float = 0.0  # probability of it
+    changes: Changes | None = None  # in the part
 
     def among(self, numbers: np.ndarray) -> "Steady":
         """Return the same part of all samples, of which it was found by those with these numbers."""
-        part = replace(self.part, first=numbers[self.part.first], last=numbers[self.part.last - 1] + 1)
+        part = self.part.among(numbers)
         level = (int(numbers[self.level[0]]), int(numbers[self.level[1] - 1]) + 1)
         return replace(self, part=part, samples=slice(int(part.first[0]), int(part.last[-1])), level=level)
 
@@ -190,15 +202,51 @@ def steady_part(every: Windows) -> Steady | None:
         part = part.chosen(slice(*_trimmed(part, usual)))
     part = part.apart()
     level = (int(part.first[0]), int(part.last[-1]))
-    first, bias, squares = 0, 0.0, np.zeros(part.amplitudes.shape[1:])
-    if len(part.first) >= FEWEST_FOR_TRANSIENT:
-        probability = IMPROBABLE if len(part.first) >= FEW_WINDOWS else IMPROBABLE_IN_FEW
-        if part.place[0] - every.place[0] >= part.overlap:
-            probability = PROBABLE
-        first, bias, squares = _after_transient(part, probability)
+    change = np.zeros((2, part.amplitudes.shape[1]))
+    if len(part.first) < FEWEST_FOR_CHANGES:
+        return Steady(part, _samples(part), level, np.zeros(part.amplitudes.shape[1:]), change)
+    began = part.place[0] - every.place[0] >= part.overlap
+    components = _components(part.amplitudes)
+    found = changes(components, PROBABLE if began else POSSIBLE)
+    # The mean square error of what is biased is least.
+    error = (1.0 + found.bias**2) / np.arange(len(components), 0, -1)
+    first = int(np.argmin(error[: len(error) - MINIMUM_CYCLES + 1]))
     part = part.chosen(slice(first, None))
+    enough = len(part.first) >= FEWEST_FOR_CHANGES
+    later = changes(components[first:], POSSIBLE) if first and enough else found
+    squares = found.squares[first] + (later.lasting[0] if enough else found.lasting[first])
+    by_part = squares.reshape(change.shape[1], -1)
+    count = part.amplitudes.shape[2]
+    # Slow noise of the mean value is extrapolated from its own spectrum.
+    by_part[:, 1:] += later.wander.reshape(by_part.shape)[:, 1:] * len(components) / len(part.first)
+    by_harmonic = by_part[:, :count].copy()
+    by_harmonic[:, 1:] += by_part[:, count:]
     change = np.array([_change(half) for half in np.array_split(part.sizes, 2)])
-    return Steady(part, slice(int(part.first[0]), int(part.last[-1])), level, bias, squares, change)
+    transient = 0.0 if found.slow else float(found.moving.max())
+    return Steady(
+        part, _samples(part), level, by_harmonic, change, float(found.bias[first]), transient, later if enough else None
+    )
+
+
+def _samples(part: Windows) -> slice:
+    return slice(int(part.first[0]), int(part.last[-1]))
+
+
+def _components(shape: np.ndarray) -> np.ndarray:
+    """Return real components of amplitudes (windows, channels, harmonics + 1) without the common drift of the phase.
+
+    Of each channel they are the mean value, the parts along the mean amplitudes, and those across.
+    """
+    harmonic, place = np.arange(shape.shape[2]), np.arange(len(shape)) - 0.5 * (len(shape) - 1)
+    mean = shape.mean(axis=0)
+    size = np.abs(mean)
+    turned = shape * np.divide(np.conj(mean), size, out=np.ones(mean.shape, dtype=complex), where=size > 0.0)
+    noise = np.mean(np.abs(np.diff(turned, axis=0)) ** 2, axis=0) + SMALLEST_DISTANCE
+    slope = np.einsum("k,kch->ch", place, turned.imag) / (place @ place)
+    weight = harmonic * size / noise
+    turn = np.sum(weight * slope) / max(np.sum(weight * harmonic * size), np.finfo(float).tiny)
+    turned = turned * np.exp(-1j * turn * place[:, None, None] * harmonic)
+    return np.concatenate([turned.real, turned.imag[:, :, 1:]], axis=2).reshape(len(shape), -1)
 
 
 def _change(sizes: np.ndarray) -> np.ndarray:
@@ -258,82 +306,3 @@ def _trimmed(part: Windows, usual: Callable[..., Any] | None = None) -> tuple[in
     while last - first > least and not near[last - span : last].all():
         last -= 1
     return first, last
-
-
-def transient_bias(shape: np.ndarray, probability: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bias of means over cycles k, k + 1, … by a transient, in standard errors, and its expected squares.
-
-    They are (cycles,) and (cycles, components), for the components (cycles, components) of the amplitudes. A transient
-    of linear decay is exp(−t/T) times a cosine and a sine, with unknown T and frequency, in all components; its sizes
-    have a normal prior of that variance which makes the data most probable. What noise does at the other end of the
-    recording is no transient. The averages are over all T and frequencies by their probabilities, and over no
-    transient; before the data, one has this probability.
-    """
-    count = len(shape)
-    step = np.diff(shape, axis=0)
-    noise = np.maximum(np.sqrt(np.mean(step[count // 3 :] ** 2, axis=0) / 2.0), SMALLEST_NOISE)
-    # Components without noise, as of a computed input, tell nothing about the others.
-    noisy = noise > SMALLEST_NOISE if (noise > SMALLEST_NOISE).any() else np.ones(noise.size, dtype=bool)
-    scaled = ((shape - shape.mean(axis=0)) / noise)[:, noisy]
-    share = _independent((step / noise)[:, noisy]) / scaled.shape[1]
-    cycle, remaining = np.arange(count, dtype=float), np.arange(count, 0, -1.0)
-    gains, means, variances = [], [], []
-    for decay in np.geomspace(SHORTEST_DECAY, max(LONGEST_DECAY * count, 2.0 * SHORTEST_DECAY), DECAYS):
-        length = min(int(np.ceil(LENGTH * decay)) + 2, count)
-        ends = np.unique(np.linspace(0, max(count - length - int(LENGTH * decay / 2), 0), CONTROLS).astype(int))
-        starts = ends[ends > 0] + int(LENGTH * decay / 2)
-        elsewhere = [scaled[::-1][k : k + length] for k in ends] + [scaled[k : k + length] for k in starts]
-        others = np.concatenate([part for part in elsewhere if len(part) == length], axis=1)
-        for angle in np.linspace(0.0, np.pi, FREQUENCIES):
-            course = np.exp(-cycle[:, None] / decay + 1j * angle * cycle[:, None])
-            course = np.hstack([course.real, course.imag][: 1 if angle in (0.0, np.pi) else 2])
-            basis, root = np.linalg.qr(course[:length] - course[:length].mean(axis=0))
-            ahead, behind = basis.T @ scaled[:length], basis.T @ others
-            usual = max(float(np.mean(behind**2)), 1.0)
-            ratio = max(float(np.mean(ahead**2)) / usual, 1.0)
-            free, known = ahead.size * share, behind.size * share
-            gains.append(
-                0.5 * ((free + known) * np.log((free * ratio + known) / (free + known)) - free * np.log(ratio))
-            )
-            # The transient ends at zero, so that its mean is the bias.
-            later = np.cumsum(course[::-1], axis=0)[::-1] / remaining[:, None] @ np.linalg.pinv(root)
-            kept = 1.0 - 1.0 / ratio
-            means.append(kept * later @ ahead)
-            variances.append(kept * usual * np.sum(later**2, axis=1))
-    weight = np.exp(np.array(gains) - max(gains))
-    weight /= weight.sum() + (1.0 / probability - 1.0) * len(gains) * np.exp(-max(gains))
-    mean = np.einsum("m,mkd->kd", weight, np.array(means))
-    spread = np.einsum("m,mkd->kd", weight, np.array(means) ** 2) - mean**2 + (weight @ np.array(variances))[:, None]
-    # The mean in the worst direction of all components, and its uncertainty in any one of them.
-    total = (np.sum(mean**2, axis=1) + np.mean(spread, axis=1)) * remaining
-    squares = np.zeros(shape.shape)
-    squares[:, noisy] = (mean**2 + spread) * noise[noisy] ** 2
-    return np.sqrt(total), squares
-
-
-def _independent(steps: np.ndarray) -> float:
-    """Return the effective number of independent components of noise, by the products of different cycles' steps."""
-    products = steps @ steps.T
-    number = np.arange(len(steps))
-    apart = np.abs(number[:, None] - number) > 1
-    square = float(np.mean(products[apart] ** 2)) if apart.any() else 0.0
-    if not square > 0.0:
-        return 1.0
-    return float(np.clip(np.median(np.diag(products)) ** 2 / square, 1.0, steps.shape[1]))
-
-
-def _after_transient(part: Windows, probability: float) -> tuple[int, float, np.ndarray]:
-    """Return the first window to use, the bias [standard errors] then, and its expected squares by amplitude."""
-    shape = part.amplitudes
-    count, channels, harmonics = shape.shape
-    components = np.concatenate([shape.real, shape.imag[:, :, 1:]], axis=2)
-    bias, squares = transient_bias(components.reshape(count, -1), probability)
-    bias = bias[: count - MINIMUM_CYCLES + 1]
-    allowed = np.flatnonzero(bias[: count // 2 + 1] <= ALLOWED_BIAS)
-    # If half of the cycles has more bias, the mean square error of what is biased is least.
-    error = (1.0 + bias**2) / np.arange(count, MINIMUM_CYCLES - 1, -1)
-    first = int(allowed[0]) if allowed.size else int(np.argmin(error))
-    by_part = squares[first].reshape(channels, -1)
-    by_harmonic = by_part[:, :harmonics].copy()
-    by_harmonic[:, 1:] += by_part[:, harmonics:]
-    return first, float(bias[first]), by_harmonic

@@ -130,6 +130,19 @@ def _clipped(x: np.ndarray, time: np.ndarray, size: float, rng: np.random.Genera
     return np.minimum(x, np.quantile(x, 1.0 - size))
 
 
+def _saturated(x: np.ndarray, time: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
+    """Limit the signal, without its noise."""
+    clean = signal(time)
+    return x + np.minimum(clean, np.quantile(clean, 1.0 - size)) - clean
+
+
+def _held(x: np.ndarray, time: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
+    """Hold values for five samples."""
+    for first in rng.choice(x.size // 8 - 1, round(size), replace=False) * 8:
+        x[first : first + 5] = x[first]
+    return x
+
+
 def _wrapped(x: np.ndarray, time: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
     return (2.0 * x + 2.0 * np.pi - np.quantile(2.0 * x, 1.0 - size)) % (2.0 * np.pi)
 
@@ -156,6 +169,8 @@ FAULTS: dict[str, tuple[Callable[..., np.ndarray], np.ndarray, int, frozenset[st
     "dropouts [share]": (_dropouts, np.geomspace(3e-4, 0.3, 24), 1, frozenset({"outliers"})),
     "stuck [samples]": (_stuck, np.unique(np.geomspace(2, 100, 24).round()), 1, frozenset({"stuck"})),
     "clipped [share]": (_clipped, np.geomspace(3e-4, 0.3, 24), 1, frozenset({"clipped"})),
+    "saturated before the noise [share]": (_saturated, np.geomspace(3e-4, 0.3, 24), 1, frozenset({"saturated"})),
+    "holds of 5 samples [number]": (_held, np.unique(np.geomspace(1, 100, 24).round()), 1, frozenset({"stuck"})),
     "wrapped [share]": (_wrapped, np.geomspace(3e-4, 0.3, 24), 1, frozenset({"wraps"})),
     "phase step [degrees]": (_phase, np.geomspace(0.01, 30.0, 24), 1, CHANGES),
     "amplitude step": (_amplitude, np.geomspace(1e-4, 0.3, 24), 1, CHANGES),

@@ -1,4 +1,4 @@
-"""Faults that the mean period shows: phases without samples, heavy tails, and sensors that limit the signal."""
+"""Faults of sensors that their mean periods show: heavy tails, clipped and saturated channels, missing phases."""
 
 import numpy as np
 from scipy.linalg import toeplitz
@@ -16,6 +16,39 @@ LEAST_MOVING = 0.1
 MOST_SHOWN, LARGEST_SHOWN_CONDITION, CLEAR_GAIN = 10, 1e5, 20.0
 # Share of clipped samples at a phase from which the others there are left out too.
 CLIPPED_SHARE = 0.02
+
+
+def describe(faults: list[ChannelFaults], used: Signals, fit: HarmonicFit, start: int) -> None:
+    """Tell heavy tails from outliers, and channels that a sensor limits from those that rest.
+
+    Of the part used, which begins at the sample `start`, by a fit without the faulty samples.
+    """
+    phase, stop = used.time * fit.frequency, start + used.time.size
+    sound = np.ones(used.time.size, dtype=bool)
+    for fault in faults:
+        for part in fault.stuck:
+            sound[max(part.start - start, 0) : max(part.stop - start, 0)] = False
+        some = np.concatenate([fault.brief, fault.outliers])
+        sound[some[(some >= start) & (some < stop)] - start] = False
+    here = slice(None) if sound.all() or np.mean(sound) < LEAST_MOVING else sound
+    bins = phase_bins(phase[here])
+    for i, (fault, values) in enumerate(zip(faults, used.values, strict=True)):
+        rest = fit.residuals[i]
+        far = fault.outliers[(fault.outliers >= start) & (fault.outliers < stop)]
+        if far.size:
+            fault.tails = far[heavy_tails(rest, far - start, values - rest)]
+            fault.outliers = np.setdiff1d(fault.outliers, fault.tails)
+        clipped = np.concatenate([fault.low, fault.high])
+        if clipped.size:
+            scatter = repeat_noise(phase, values, clipped - start)
+            fault.noisy = scatter > max(EXACT_SERIES * float(values.std()), 0.5 * fault.step)
+            fault.tails = fault.tails[:0]
+            fault.beside = _same_phases(phase, clipped[(clipped >= start) & (clipped < stop)] - start) + start
+        means = means_of(bins, rest[here], fit.amplitudes[i], fault.step)
+        fault.saturation = saturation_of(means)
+        if fault.saturation is not None and not (clipped.size and fault.noisy):
+            fault.saturated = clipped if clipped.size else np.flatnonzero(fault.saturation.holds(phase)) + start
+            fault.saturation_bias = fault.saturation.bias(means.error)
 
 
 def _same_phases(phase: np.ndarray, clipped: np.ndarray) -> np.ndarray:
@@ -54,36 +87,3 @@ def undetermined(used: Signals, fit: HarmonicFit, resolved: int) -> str:
                 "without the fault for which samples were left out, such as clipping by a small range."
             )
     return ""
-
-
-def describe(faults: list[ChannelFaults], used: Signals, fit: HarmonicFit, start: int) -> None:
-    """Tell heavy tails from outliers, and channels that a sensor limits from those that rest.
-
-    Of the part used, which begins at the sample `start`, by a fit without the faulty samples.
-    """
-    phase, stop = used.time * fit.frequency, start + used.time.size
-    sound = np.ones(used.time.size, dtype=bool)
-    for fault in faults:
-        for part in fault.stuck:
-            sound[max(part.start - start, 0) : max(part.stop - start, 0)] = False
-        some = np.concatenate([fault.brief, fault.outliers])
-        sound[some[(some >= start) & (some < stop)] - start] = False
-    here = slice(None) if sound.all() or np.mean(sound) < LEAST_MOVING else sound
-    bins = phase_bins(phase[here])
-    for i, (fault, values) in enumerate(zip(faults, used.values, strict=True)):
-        rest = fit.residuals[i]
-        far = fault.outliers[(fault.outliers >= start) & (fault.outliers < stop)]
-        if far.size:
-            fault.tails = far[heavy_tails(rest, far - start, values - rest)]
-            fault.outliers = np.setdiff1d(fault.outliers, fault.tails)
-        clipped = np.concatenate([fault.low, fault.high])
-        if clipped.size:
-            scatter = repeat_noise(phase, values, clipped - start)
-            fault.noisy = scatter > max(EXACT_SERIES * float(values.std()), 0.5 * fault.step)
-            fault.tails = fault.tails[:0]
-            fault.beside = _same_phases(phase, clipped[(clipped >= start) & (clipped < stop)] - start) + start
-        means = means_of(bins, rest[here], fit.amplitudes[i], fault.step)
-        fault.saturation = saturation_of(means)
-        if fault.saturation is not None and not (clipped.size and fault.noisy):
-            fault.saturated = clipped if clipped.size else np.flatnonzero(fault.saturation.holds(phase)) + start
-            fault.saturation_bias = fault.saturation.bias(means.error)

@@ -1,0 +1,215 @@
+"""Changes of the amplitudes of cycles: decaying transients, drifts and steps, and their effects on the mean.
+
+What is too weak to be detected cannot be left out, but has an expected squared effect, which belongs into the variance
+of the mean. Each component of the amplitudes is a constant, noise, and at most one change of a given course, whose size
+has a normal prior. Courses, sizes, and the noise (white, or with a part that lasts for some cycles) are averaged by
+their posterior probabilities; levels of noise are integrated out, as with the g-prior of A. Zellner (1986).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular, toeplitz
+from scipy.special import logsumexp
+
+# Probabilities before the data: of a transient where the start was left out or not, of a drift and of a step; and that
+# a change is in any one component.
+PROBABLE, POSSIBLE, DRIFTING, STEPPING, SHARED = 0.9, 0.6, 0.4, 0.1, 0.2
+# Sizes of a change in standard deviations of its estimate.
+SIZES, FREQUENT = np.array([3.0, 10.0, 100.0]), np.array([0.7, 0.2, 0.1])
+# Correlation from one window to the next, and share of the variance, of noise that lasts; white noise is as probable
+# as all others together.
+MEMORIES, LASTING_SHARES, LASTING = (0.5, 0.8), (0.3, 0.8, 1.0), 0.1
+# Decay times of transients, in cycles and relative to the recording, their number, and the number of frequencies.
+SHORTEST_DECAY, LONGEST_DECAY, DECAYS, FREQUENCIES = 0.3, 0.5, 12, 13
+# Frequencies of slow transients near those of the harmonics, relative to 1/decay time, and places of steps.
+NEAR, NEARBY, MOST_STEPS, FIRST_STEP = (0.7, 1.5), 0.7, 64, 2
+# Share of a channel's standard deviation below which noise does not count.
+SMALLEST_NOISE = 1e-6
+# Longest decay time relative to the recording of a transient of which a part can be left out; slower ones are drifts.
+LONGEST_CUT = 0.25
+TRANSIENT, DRIFT, STEP = "transient", "drift", "step"
+
+
+@dataclass(frozen=True)
+class Courses:
+    """Courses of changes over the cycles."""
+
+    values: np.ndarray  # (courses, cycles, 2), the second column zero if there is one only
+    single: np.ndarray  # (courses,)
+    fades: np.ndarray  # (courses,) whether it ends at zero
+    kind: np.ndarray  # (courses,)
+    prior: np.ndarray  # (courses,) logarithms of probabilities
+    place: np.ndarray  # (courses,) decay time, or first cycle after a step
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Changes of components of the amplitudes, and their effects on the means over cycles k, k + 1, …."""
+
+    transient: np.ndarray  # (cycles, components) expected bias by a transient
+    squares: np.ndarray  # (cycles, components) expected squares of it
+    lasting: np.ndarray  # (cycles, components) expected squares of the bias by a drift or step
+    probability: dict[str, float]  # of the kinds of changes
+    moving: np.ndarray  # (components,) probability of any of them
+    size: np.ndarray  # (components,) expected change by a drift or step
+    error: np.ndarray  # (cycles, components) standard errors of the means by noise
+    place: int  # most probable first cycle after a step
+    wander: np.ndarray  # (components,) variance of the means by noise that lasts, beyond that of white noise
+
+    @property
+    def slow(self) -> bool:
+        """Whether a drift or step is more probable than all else."""
+        return self.probability[DRIFT] + self.probability[STEP] > 0.5
+
+    @property
+    def bias(self) -> np.ndarray:
+        """Bias of all means together by a transient (cycles,), in standard errors."""
+        return np.sqrt(np.sum((self.transient / self.error) ** 2, axis=1))
+
+
+def courses(count: int, transient: float) -> Courses:
+    """Return courses over so many cycles, with this probability of a transient."""
+    cycle = np.arange(count, dtype=float)
+    every: list[tuple[np.ndarray, str, float, float]] = []
+    decays = np.geomspace(SHORTEST_DECAY, max(LONGEST_DECAY * count, 2.0 * SHORTEST_DECAY), DECAYS)
+    for decay in decays:
+        linear = np.linspace(0.0, np.pi, FREQUENCIES)
+        near = [0.0, *(a for a in np.array(NEAR) / decay if a < linear[1] / 1.5)]
+        for angles, part in ((near, NEARBY), (linear[1:], 1.0 - NEARBY)):
+            for angle in angles:
+                course = np.exp(-cycle / decay + 1j * angle * cycle)
+                kind = TRANSIENT if decay <= LONGEST_CUT * count else DRIFT
+                every.append((course, kind, transient * part / decays.size / len(angles), decay))
+    rest = 1.0 - transient
+    fading = len(every)
+    every.append((cycle / (count - 1) + 0j, DRIFT, rest * DRIFTING, 0.0))
+    places = np.unique(np.linspace(FIRST_STEP, count - FIRST_STEP, MOST_STEPS).astype(int))
+    every += [((cycle >= k) + 0j, STEP, rest * STEPPING / places.size, float(k)) for k in places]
+    values = np.array([np.column_stack([course.real, course.imag]) for course, *_ in every])
+    # The sine of the highest frequency is rounding.
+    single = np.abs(values[:, :, 1]).max(axis=1) < 1e-9
+    values[single, :, 1] = 0.0
+    kind, place = np.array([k for _, k, _, _ in every]), np.array([p for *_, p in every])
+    return Courses(values, single, np.arange(len(every)) < fading, kind, np.log([p for _, _, p, _ in every]), place)
+
+
+def _covariances(count: int) -> list[tuple[float, np.ndarray]]:
+    """Return logarithms of probabilities and Cholesky factors of the covariances of noise of variance one."""
+    lasting = [
+        (1.0 - share) * np.eye(count) + share * toeplitz(memory ** np.arange(count))
+        for memory in MEMORIES
+        for share in LASTING_SHARES
+    ]
+    priors = [1.0 - LASTING, *np.full(len(lasting), LASTING / len(lasting))]
+    return [(float(np.log(p)), np.linalg.cholesky(c)) for p, c in zip(priors, [np.eye(count), *lasting], strict=True)]
+
+
+def changes(shape: np.ndarray, transient: float) -> Changes:
+    """Return the expected changes of components (cycles, components), with this probability of a transient before."""
+    count = len(shape)
+    every, covariances = courses(count, transient), _covariances(count)
+    scaled = shape - shape.mean(axis=0)
+    floor = count * SMALLEST_NOISE**2
+    kept = SIZES**2 / (1.0 + SIZES**2)
+    columns = np.where(every.single, 1, 2)
+    penalty = -0.5 * columns[:, None] * np.log1p(SIZES**2)  # (courses, sizes)
+    degrees = count - 1
+    nothing, something, coefficients, inverses, levels, white, means = [], [], [], [], [], [], []
+    for prior, factor in covariances:
+        z = solve_triangular(factor, np.column_stack([np.ones(count), scaled]), lower=True)
+        flat = z[:, 0] / np.linalg.norm(z[:, 0])
+        u = z[:, 1:] - flat[:, None] * (flat @ z[:, 1:])
+        s = solve_triangular(factor, every.values.transpose(1, 0, 2).reshape(count, -1), lower=True)
+        s = (s - flat[:, None] * (flat @ s)).reshape(count, -1, 2)
+        total = np.einsum("kd,kd->d", u, u) + floor  # (components,)
+        gram = np.einsum("kma,kmb->mab", s, s)
+        gram[every.single, 1, 1] = 1.0
+        gram += 1e-12 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(2)
+        inverse = np.linalg.inv(gram)
+        along = np.einsum("kma,kd->mad", s, u)
+        coefficient = np.einsum("mab,mbd->mad", inverse, along)
+        power = np.einsum("mad,mad->md", coefficient, along)
+        remaining = np.maximum(total - kept[:, None, None] * power, 0.0) + 0.0  # (sizes, courses, components)
+        determinant = -np.log(np.diag(factor)).sum() - np.log(np.linalg.norm(z[:, 0]))
+        nothing.append(prior + determinant - 0.5 * degrees * np.log(total))
+        something.append(
+            prior + determinant - 0.5 * degrees * np.log(np.maximum(remaining, floor)) + penalty.T[:, :, None]
+        )
+        coefficients.append(coefficient)
+        inverses.append(inverse)
+        levels.append(np.maximum(remaining, floor) / degrees)
+        means.append(1.0 / (z[:, 0] @ z[:, 0]))
+        white.append(total / degrees * means[-1])
+    none = np.array(nothing)  # (noises, components)
+    some = np.array(something)  # (noises, sizes, courses, components)
+    clear = logsumexp(some, axis=0) - logsumexp(none, axis=0)  # (sizes, courses, components)
+    noise = np.sqrt(np.array(white[0]) * count)
+    noisy = noise > 2.0 * SMALLEST_NOISE
+    share = _independent((np.diff(shape, axis=0) / noise)[:, noisy]) / noisy.sum() if noisy.any() else 1.0
+    total_gain = share * np.logaddexp(np.log1p(-SHARED), np.log(SHARED) + clear)[:, :, noisy].sum(axis=2)
+    weight = total_gain + every.prior + np.log(FREQUENT)[:, None]
+    constant = np.log((1.0 - transient) * (1.0 - DRIFTING - STEPPING))
+    weight = np.exp(weight - np.logaddexp(logsumexp(weight), constant))  # (sizes, courses)
+    member = 1.0 / (1.0 + (1.0 / SHARED - 1.0) * np.exp(-np.clip(clear, -500, 500)))
+    each = np.exp(some - logsumexp(some, axis=0)) * (
+        weight[:, :, None] * member
+    )  # (noises, sizes, courses, components)
+    first = np.einsum("jsmd,s,jmad->mad", each, kept, np.array(coefficients))
+    second = np.einsum(
+        "jsmd,s,jmad,jmbd->mabd", each, kept**2, np.array(coefficients), np.array(coefficients), optimize=True
+    )
+    second += np.einsum("jsmd,s,jsmd,jmab->mabd", each, kept, np.array(levels), np.array(inverses), optimize=True)
+    constant_part = (1.0 - each.sum(axis=(0, 1, 2))) * np.exp(none - logsumexp(none, axis=0))  # (noises, components)
+    variances = np.einsum("jsmd,jsmd,j->jd", each, np.array(levels), np.array(means)) + constant_part * np.array(white)
+    square, lasting = variances.sum(axis=0), each[1:].sum(axis=(0, 1, 2)) + constant_part[1:].sum(axis=0)
+    # As far as it is more probable than before the data.
+    evident = np.clip((lasting - LASTING) / (1.0 - LASTING), 0.0, 1.0) / lasting
+    wander = evident * np.maximum(variances[1:].sum(axis=0) - lasting * white[0], 0.0)
+    return _effects(every, first, second, weight.sum(axis=0), np.sqrt(square), each.sum(axis=(0, 1, 2)), wander)
+
+
+def _effects(
+    every: Courses,
+    first: np.ndarray,
+    second: np.ndarray,
+    weight: np.ndarray,
+    error: np.ndarray,
+    moving: np.ndarray,
+    wander: np.ndarray,
+) -> Changes:
+    """Return the effects of changes by the first and second moments of their sizes."""
+    count = every.values.shape[1]
+    remaining = np.arange(count, 0, -1.0)
+    later = np.cumsum(every.values[:, ::-1], axis=1)[:, ::-1] / remaining[:, None]
+    fading, slow = every.fades, every.kind != TRANSIENT
+    # A transient ends at zero, so that its mean is the bias; of other changes the begin or the end is the right one.
+    mean = np.einsum("mka,mad->kd", later[~slow], first[~slow])
+    squares = _squares(later[~slow], second[~slow])
+    lasting = _squares(later[fading & slow], second[fading & slow])
+    for side in (every.values[~fading], np.repeat(every.values[~fading, -1:], count, axis=1)):
+        lasting += 0.5 * _squares(later[~fading] - side, second[~fading])
+    probability = {kind: float(weight[every.kind == kind].sum()) for kind in (TRANSIENT, DRIFT, STEP)}
+    steps = np.flatnonzero(every.kind == STEP)
+    return Changes(
+        mean, squares, lasting, probability, moving, np.einsum("ma,mad->d", every.values[slow, -1] - every.values[slow, 0], first[slow]),
+        np.maximum(error, SMALLEST_NOISE / np.sqrt(count)) * np.sqrt(count / remaining)[:, None],
+        int(every.place[steps[np.argmax(weight[steps])]]),
+        wander,
+    )  # fmt: skip
+
+
+def _squares(effects: np.ndarray, moments: np.ndarray) -> np.ndarray:
+    """Return expected squares (cycles, components) of effects (courses, cycles, 2) by second moments of their sizes."""
+    return np.asarray(np.einsum("mka,mkb,mabd->kd", effects, effects, moments, optimize=True))
+
+
+def _independent(steps: np.ndarray) -> float:
+    """Return the effective number of independent components of noise, by the products of different cycles' steps."""
+    products = steps @ steps.T
+    number = np.arange(len(steps))
+    apart = np.abs(number[:, None] - number) > 1
+    square = float(np.mean(products[apart] ** 2)) if apart.any() else 0.0
+    if not square > 0.0:
+        return 1.0
+    return float(np.clip(np.median(np.diag(products)) ** 2 / square, 1.0, steps.shape[1]))
