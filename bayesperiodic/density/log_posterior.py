@@ -98,7 +98,7 @@ class Linearisation:
         instead of `jacobian`.
         """
         if adjoint:
-            by_response = self._comparisons.vjp(self._simulation, self.residuals.like(by_residual))
+            by_response = self._comparisons.vjp(self._simulation, self.residuals.like(by_residual), self.residuals)
             by_theta = self.solver.vjp(self.theta, self._simulation, *by_response)
             return {name: -gradient for name, gradient in by_theta.items()}
         products = (jacobian @ weights for jacobian, weights in zip(self.jacobian, by_residual, strict=True))

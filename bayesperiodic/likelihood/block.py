@@ -108,9 +108,9 @@ class Block(ABC):
         raise NotImplementedError
 
     def through_sensor_vjp(
-        self, sensing: Any, signals: np.ndarray, values: np.ndarray, frequency: np.ndarray, weights: np.ndarray
+        self, sensing: Any, shown: np.ndarray, values: np.ndarray, frequency: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivatives of Σ weights · `through_sensor` by the components of signals and by the values."""
+        """Return the derivatives of Σ weights · `through_sensor`, whose result is `shown`, by components and values."""
         raise NotImplementedError
 
     def parameter_names(self, noise: Any) -> tuple[str, ...]:

@@ -109,19 +109,20 @@ class MeanPeriod(Timed):
         return result
 
     def through_sensor_vjp(
-        self, sensing: Sensing, signals: np.ndarray, values: np.ndarray, frequency: np.ndarray, weights: np.ndarray
+        self, sensing: Sensing, shown: np.ndarray, values: np.ndarray, frequency: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivatives of Σ weights · `through_sensor` by the components of signals and by the values."""
+        """Return the derivatives of Σ weights · `through_sensor`, whose result is `shown`, by components and values."""
         by_values, c = np.zeros(values.shape), self.place
-        factors = sensing.factors(c, values, frequency, self._waves)
         if (place := sensing.offset_place[c]) != NO_PLACE:
             by_values[..., place] += weights[..., 0] * math.sqrt(self.size)
+            shown = np.array(shown)
+            shown[..., 0] -= values[..., place] * math.sqrt(self.size)
+        factors = sensing.factors(c, values, frequency, self._waves)
         if factors is None:
             return weights, by_values
-        products = ComplexFactors(*self._products(self.transform(signals[..., c]), weights))
+        real, imag = self._products(shown, weights)
         for relative, by in sensing.slopes(c, values, frequency, self._waves):
-            slope = factors if relative is None else factors.times(relative)
-            total = np.add.reduce(slope.real * products.real - slope.imag * products.imag, axis=-1)
+            total = np.add.reduce(real if relative is None else relative.real * real - relative.imag * imag, axis=-1)
             for place, factor in by:
                 if place < values.shape[-1]:
                     by_values[..., place] += total * factor

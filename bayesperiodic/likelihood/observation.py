@@ -184,18 +184,19 @@ class Observation:
         along = ComparedSignals(moved, directions.log_multipliers, directions.frequency)
         return [block.changes(predicted, along) for block in self.blocks]
 
-    def vjp(self, response: Response, weights: list[np.ndarray]) -> Response:
+    def vjp(self, response: Response, weights: list[np.ndarray], shown: Sequence[np.ndarray]) -> Response:
         """Return the derivatives of Σ weights · predicted components by everything in a forced model's response.
 
-        Where there is a `layout`, response and weights may be of several experiments, on the leading axis.
+        Where there is a `layout`, response and weights may be of several experiments, on the leading axis, and `shown`
+        are the predicted components.
         """
         outputs, sensors = np.zeros(response.outputs.shape), np.zeros(response.sensors.shape)
         by = ComparedSignals(outputs[..., self.picked], np.zeros(self.multipliers), np.zeros(()))
         if self.layout is not None:
-            signals, given = response.outputs[..., self.picked], (response.sensors, response.frequency)
-            for block, weight in zip(self.blocks, weights, strict=True):
+            given = response.sensors, response.frequency
+            for block, weight, components in zip(self.blocks, weights, shown, strict=True):
                 if self.sensing.active:
-                    weight, by_sensors = block.through_sensor_vjp(self.sensing, signals, *given, weight)
+                    weight, by_sensors = block.through_sensor_vjp(self.sensing, components, *given, weight)
                     sensors += by_sensors
                 block.add_vjp(None, weight, by)
             outputs[..., self.picked] = by.values
@@ -463,7 +464,7 @@ class Comparisons:
         return result
 
     def vjp(
-        self, simulation: Simulation, weights: Residuals
+        self, simulation: Simulation, weights: Residuals, residuals: Residuals
     ) -> tuple[list[np.ndarray], list[np.ndarray], dict[str, np.ndarray]]:
         """Return the derivatives of Σ weights · predicted components by the responses at one θ.
 
@@ -472,10 +473,12 @@ class Comparisons:
         """
         by_outputs = [np.empty((len(group.outputs), *group.outputs.shape[2:])) for group in simulation.groups]
         by_sensors, by_multipliers = [np.empty(group.sensors[:, 0].shape) for group in simulation.groups], {}
-        stacks = iter(weights.stacks)
+        stacks, left = iter(weights.stacks), iter(residuals.stacks)
         for group, members, first, data in self._parts:
             pulls = [next(stacks) if data else next(stacks)[0] for _ in first.blocks]
-            pulled = first.vjp(simulation.groups[group].response(members, 0), pulls)
+            rests = [next(left) for _ in first.blocks]
+            shown = [part[:, 0] - rest for part, rest in zip(data, rests, strict=True)] if data else []
+            pulled = first.vjp(simulation.groups[group].response(members, 0), pulls, shown)
             by_outputs[group][members], by_sensors[group][members] = pulled.outputs, pulled.sensors
             by_multipliers[first.experiment.name] = pulled.log_multipliers
         return by_outputs, by_sensors, by_multipliers

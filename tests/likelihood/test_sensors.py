@@ -338,7 +338,7 @@ def test_damping_and_delay_are_covered_as_often_as_stated():
         fit = bp.map_estimate(problem, progress=False, starts=1, checks=False)
         interval = fit.interval(0.9)
         for name, truth in (("c", TRUTH["c"]), ("delay[x]", 0.05)):
-            low, high = interval.loc[name]
+            low, high = interval[name]
             inside[name] += bool(low < truth < high)
     low, high = binom.ppf([0.005, 0.995], 60, 0.9)
     assert all(low <= count <= high for count in inside.values()), inside
