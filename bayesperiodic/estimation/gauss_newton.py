@@ -20,6 +20,8 @@ NEGLIGIBLE_STEP = 1e-3
 NO_CURVATURE = 1e-13
 MAX_ROUNDS, PRESSED, LONGEST_MOVE = 10, 1e-3, 3.0
 LOST_PART = 1e-6
+# Part of the prior's variance that is left of a parameter on which the data say nothing.
+UNINFORMED = 0.9
 # Residuals whose sum of squares is no finite number.
 OVERFLOWS = 1e150
 # Change of the factors that ends the correction, and the largest part of its values that parameters may take up.
@@ -199,6 +201,21 @@ def climb(
             break
         resting = wanted
     return End(now, status, np.array(history))
+
+
+def prior_only(problem: Description, theta: np.ndarray, hessian: np.ndarray) -> np.ndarray:
+    """Return which parameters have the variance of the prior at θ, bool (names,); H of eq. (8) is (names, names).
+
+    Priors without curvature at θ, such as uniform ones, have no variance to compare with.
+    """
+    curvature = problem.joint_prior.curvature(theta)
+    curved = np.flatnonzero(np.diag(curvature) > 0.0)
+    result = np.zeros(theta.size, dtype=bool)
+    if curved.size and np.isfinite(hessian).all():
+        inverse, lost = inverse_hessian(hessian)
+        prior, _ = inverse_hessian(curvature[np.ix_(curved, curved)])
+        result[curved] = (np.diag(inverse)[curved] > UNINFORMED * np.diag(prior)) & ~lost[curved]
+    return result
 
 
 def at_ends(objective: Objective, iterate: Iterate) -> np.ndarray:

@@ -10,7 +10,7 @@ from scipy.special import softmax
 
 from bayesperiodic._io import Storable
 from bayesperiodic._linalg import hessian_eigh
-from bayesperiodic.estimation.gauss_newton import NO_CURVATURE, End, Iterate, Objective, preference
+from bayesperiodic.estimation.gauss_newton import NO_CURVATURE, End, Iterate, Objective, preference, prior_only
 from bayesperiodic.estimation.laplace import JointLaplace
 from bayesperiodic.periodic.schemes import FourierScheme, find_scheme
 from bayesperiodic.problem.description import Description
@@ -101,9 +101,21 @@ def _is_separate(objective: Objective, theta: np.ndarray, optima: Sequence[End])
 
 
 def _distance(objective: Objective, theta: np.ndarray, mode: Iterate) -> float:
-    """Return the distance in standard deviations, directions without curvature left out."""
-    values, vectors, scale = hessian_eigh(objective.hessian_and_gradient(mode)[0])
-    along = vectors.T @ ((theta - mode.theta) / scale)
+    """Return the distance in standard deviations, directions without curvature left out.
+
+    Parameters that the data do not narrow are integrated out: where their estimate is depends on the prior alone, whose
+    density may be flat far from its maximum.
+    """
+    hessian = objective.hessian_and_gradient(mode)[0]
+    idle = prior_only(objective.density.problem, mode.theta, hessian)
+    if idle.all():
+        return 0.0
+    told = ~idle
+    if idle.any():
+        across = hessian[np.ix_(told, idle)]
+        hessian = hessian[np.ix_(told, told)] - across @ np.linalg.solve(hessian[np.ix_(idle, idle)], across.T)
+    values, vectors, scale = hessian_eigh(hessian)
+    along = vectors.T @ ((theta - mode.theta)[told] / scale)
     curved = np.abs(values) > NO_CURVATURE * np.abs(values).max()
     return float(np.sqrt(np.sum(np.abs(values[curved]) * along[curved] ** 2)))
 

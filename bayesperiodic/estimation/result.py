@@ -29,6 +29,8 @@ ROBUST_TAKEN = (
     "Intervals are those of the robust sd: the model is misspecified, and the Laplace sd takes its error for noise "
     "that is independent from value to value."
 )
+# Difference of the logarithms of two estimates, in standard deviations, up to which they are taken as the same value.
+SAME_VALUE = 0.5
 # Degrees of freedom from which Student's t is the normal distribution.
 MOST_FREEDOM = 1e9
 
@@ -187,6 +189,10 @@ def _part(group: str, name: str) -> Any:
 class MapEstimate(Result):
     """Maximum of the posterior density, and the normal approximation around it.
 
+    The density is that over natural values with the variances of eq. (7), whose maximum is not that over the logarithm:
+    of ``LogNormal(median, spread)`` alone it is median·exp(−spread²), the mode, and not the median. The two differ
+    little for parameters that the data determine; see `over_logarithm` for the others.
+
     Attributes
     ----------
     status : str
@@ -320,6 +326,21 @@ class MapEstimate(Result):
         """
         value, sd = self.theta[name], self.sd[name]
         return [mode.theta[name] for mode in notable(self.other_modes) if mode.differs(name, value, sd)]
+
+    @property
+    def over_logarithm(self) -> dict[str, float]:
+        """Values at `joint_mode` of positive parameters whose estimates differ by more than half a standard deviation.
+
+        The standard deviation is that of the logarithm. The data do not determine such a parameter to better than half
+        of its value; without `joint` there are none.
+        """
+        result = {}
+        for name, (low, high) in self.supports.items() if self.joint is not None else ():
+            if (low, high) == (0.0, np.inf) and self.theta[name] > 0.0:
+                other, variance = self.joint_mode[name], self.joint_covariance.loc[name, name]
+                if np.log(other / self.theta[name]) ** 2 > SAME_VALUE**2 * variance:
+                    result[name] = other
+        return result
 
     @property
     def correlations(self) -> pd.DataFrame:
@@ -542,6 +563,11 @@ class MapEstimate(Result):
             for name, text in self.other_orbits.items()
         ]
         lines += self.checks.remarks() if self.checks else ["Not checked, see bp.check(problem, fit)."]
+        lines += [
+            f"Not determined to a single value: {name}. The density has its maximum at {self.theta[name]:.4g} over the "
+            f"value and at {other:.4g} over the logarithm (fit.joint_mode); sample it."
+            for name, other in self.over_logarithm.items()
+        ]
         lines += [f"Another optimum: {mode!r}." for mode in notable(self.other_modes)]
         return "\n".join(lines)
 

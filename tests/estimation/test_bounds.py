@@ -82,3 +82,29 @@ def test_intervals_near_the_end_of_a_support_have_nominal_coverage():
         one_sided += low == 0.0
     assert one_sided > 100
     assert stats.binom.ppf(0.005, 300, 0.9) <= held <= stats.binom.ppf(0.995, 300, 0.95)
+
+
+IDLE = bp.Model(
+    "contact",
+    states=["w"],
+    inputs=["u"],
+    parameters=["a", "s"],
+    equations=["dw + w - u"],
+    outputs={"y": "a*u + w*s/(1 + s)"},
+)
+
+
+@pytest.mark.parametrize(("median", "spread", "named"), [(5000.0, 2.0, True), (1.0, 0.2, False)])
+def test_an_estimate_that_depends_on_the_coordinate_is_printed_as_such(median, spread, named):
+    """The data say only that s is large; the maximum over s is near the mode of its prior, median·exp(−spread²)."""
+    tau = np.arange(64) / 64
+    u, w = np.cos(2 * np.pi * tau), np.real(np.exp(2j * np.pi * tau) / (1 + 0.6j * np.pi))
+    noise = 0.03 * np.random.default_rng(0).standard_normal(64)
+    share = 1.0 if named else 0.5
+    run = bp.Experiment("run", 0.3, {"y": 1.2 * u + share * w + noise}, {"u": u}, samples=64, harmonics={"y": 5})
+    priors = {"a": bp.Normal(1.0, 10.0), "s": bp.LogNormal(median, spread)}
+    fit = bp.map_estimate(bp.Problem(IDLE, [run], priors=priors, scheme="fourier"), starts=8, progress=False)
+    assert ("Not determined to a single value: s. The density" in str(fit)) == named
+    assert list(fit.over_logarithm) == ["s"] * named and len(fit.modes) == 1
+    if named:
+        assert fit.theta["s"] < 200.0 and fit.over_logarithm["s"] == pytest.approx(median, rel=0.1)

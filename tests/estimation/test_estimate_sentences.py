@@ -23,7 +23,7 @@ def fitted(**changes):
         "doubling_shift": {"a": 0.0, "b": np.nan}, "at_ends": (), "theta": {"a": 1.25, "b": 3.0},
         "prior_conflict": SimpleNamespace(text=""), "fvu": {"y": 0.1}, "converged": True, "other_modes": (),
         "undetermined": (), "noise_split": {}, "input_errors": {}, "input_nonlinearity": {"a": 0.29, "b": 0.0},
-        "checks": True,
+        "checks": True, "over_logarithm": {},
     }  # fmt: skip
     return SimpleNamespace(**(given | changes))
 
