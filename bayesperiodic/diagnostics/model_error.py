@@ -1,6 +1,6 @@
 """Size of the error of a model: how far its predicted periods are from the true ones, with an interval."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +26,8 @@ class ErrorPart(NamedTuple):
     """Sum of squares of the residual components of a block, and the noise in it.
 
     `noise` is the part of the sum that is expected of the noise, known to a factor with `freedom` degrees of freedom,
-    `variance` the variance of that part; `along` is the variance of the noise in the direction of the residual.
+    `variance` the variance of that part; `along` is the variance of the noise in the direction of the residual, known
+    to a factor with `few` degrees of freedom.
     """
 
     square: float
@@ -34,6 +35,7 @@ class ErrorPart(NamedTuple):
     variance: float
     along: float
     freedom: float
+    few: float
 
     def below(self, error: float, square: float) -> float:
         """Return the probability of a sum of squares below a value, for an error of the model of this sum of squares.
@@ -42,9 +44,12 @@ class ErrorPart(NamedTuple):
         202-232), averaged over the unknown size of the noise.
         """
         levels = (np.arange(NOISE_SCALES) + 0.5) / NOISE_SCALES
-        scale = np.ones(1) if np.isinf(self.freedom) else self.freedom / stats.chi2.ppf(levels, self.freedom)
-        mean = error + scale * self.noise
-        freedom = 2.0 * mean**2 / (scale**2 * self.variance + 4.0 * error * scale * self.along)
+        scale, beside = (
+            np.ones(1) if np.isinf(freedom) else freedom / stats.chi2.ppf(levels, freedom)
+            for freedom in (self.freedom, self.few)
+        )
+        mean = error + scale[:, None] * self.noise
+        freedom = 2.0 * mean**2 / (scale[:, None] ** 2 * self.variance + 4.0 * error * beside * self.along)
         return float(np.mean(stats.chi2.cdf(freedom * square / mean, freedom)))
 
     def error(self) -> tuple[float, float, float]:
@@ -113,16 +118,18 @@ def with_model_error(table: pd.DataFrame, errors: pd.DataFrame) -> pd.DataFrame:
     if errors.empty or not np.isfinite(errors[MODEL_ERROR[2]]).all():
         return table.join(errors)
     errors = errors.astype(float)
-    errors.loc[ALL] = errors.loc[errors[MODEL_ERROR[2]].idxmax()]
-    return table.join(errors)
+    largest = errors.iloc[[int(np.argmax(errors[MODEL_ERROR[2]]))]].set_axis([ALL])
+    return table.join(pd.concat([errors, largest]))
 
 
-def in_words(error: float, low: float, high: float, tolerance: float | None) -> str:
+def in_words(sizes: Sequence[float], tolerance: float | None) -> str:
     """Return an error of the model, the ends of its interval and how it compares with a tolerance, in words."""
+    error, low, high = sizes
     if np.isnan(error):
         size = f"the model is wrong by at most {high:.2%} of the rms (95 %), if all of the residual is its error"
     else:
-        size = f"the model is wrong by {error:.2%} of the rms in the harmonics kept (90 %: {100 * low:.3g} to {100 * high:.3g} %)"
+        ends = f"{100 * low:.3g} to {100 * high:.3g} %"
+        size = f"the model is wrong by {error:.2%} of the rms in the harmonics kept (90 %: {ends})"
     if tolerance is None:
         return size
     relation = "below" if high < tolerance else "above" if low > tolerance else "not shown to be below"
@@ -149,7 +156,7 @@ def _error(
         # A few harmonics may hold all of the error, whose noise is known less well than that of all.
         few = float(parts.sum()) ** 2 / max(float(np.sum(parts**2 / each)), TINY)
         return ErrorPart(
-            square, float(variances.sum()), 2.0 * dependent * float(variances @ variances), along, min(freedom, few)
+            square, float(variances.sum()), 2.0 * dependent * float(variances @ variances), along, freedom, few
         ).error()
     values = min(block.count, block.size) - float(np.sum(basis**2))
     return np.nan, 0.0, square * values / stats.chi2.ppf(TAIL, values) if values >= 1.0 else np.inf
@@ -167,8 +174,8 @@ def _noise_variances(
     block = white.blocks[index]
     freedom = measured_freedom(experiment, block.channel)
     if (spectrum := white.spectrum(index)) is not None:
-        pairs = np.bincount(block.harmonic)[block.harmonic]
-        return spectrum[0][block.harmonic], freedom, spectrum[1][block.harmonic] * pairs
+        pairs = np.bincount(block.harmonic)[block.harmonic]  # components that share a variance
+        return spectrum[0][block.harmonic], freedom, spectrum[1][block.harmonic] / pairs
     if block.measured > 0.0:
         return np.full(block.size, block.measured), freedom, np.full(block.size, freedom)
     if white.groups[index] in white.known:

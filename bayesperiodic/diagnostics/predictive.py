@@ -251,7 +251,7 @@ class Prediction(Bands):
         if MODEL_ERROR[0] not in self.table:
             return {}
         rows = self.table.loc[self.table[MODEL_ERROR[2]].notna(), [*MODEL_ERROR]].drop(ALL, errors="ignore")
-        return {str(label): in_words(*row.tolist(), self.tolerance) for label, row in rows.iterrows()}
+        return {str(label): in_words(row.tolist(), self.tolerance) for label, row in rows.iterrows()}
 
     @property
     def verdict(self) -> str:

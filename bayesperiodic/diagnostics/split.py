@@ -70,8 +70,8 @@ class SplitCheck(Result):
         with_what = "" if self.by == "mapping" else f" with {self.by}"
         if self.moved:
             lines.append(
-                f"Moves{with_what} by more than the robust standard deviations explain: {', '.join(self.moved)}. No one "
-                "value is valid for all parts; look for a term that is missing, or give each part its own (local)."
+                f"Moves{with_what} by more than the robust standard deviations explain: {', '.join(self.moved)}. No "
+                "one value is valid for all parts; look for a term that is missing, or give each part its own (local)."
             )
         within = self.table.index[self.table["verdict"] == WITHIN_ROBUST]
         if len(within):

@@ -104,8 +104,8 @@ class ReportInputs:
         """The 90 % interval of each parameter that comes first: robust where the model is misspecified."""
         if self.posterior is None or (self.misfit and self.posterior.headline is self.posterior):
             return self.fit.interval(PROBABILITY)
-        table = self.posterior.summary()
-        return {name: (float(table.loc[name, "q05"]), float(table.loc[name, "q95"])) for name in self.fit.theta}
+        low, high = (self.posterior.summary()[end].to_dict() for end in ("q05", "q95"))
+        return {name: (low[name], high[name]) for name in self.fit.theta}
 
     @property
     def coloured(self) -> list[str]:
