@@ -35,7 +35,7 @@ MINIMUM_PERIODICITY, CLEARLY_PERIODIC = 0.5, 0.9
 # Ratio of residual variances from which the estimated frequency is right, and the given one wrong.
 CLEARLY = 4.0
 # Phase [cycles] by which a frequency that is given with an error drifts at most: more would shrink the harmonics.
-LARGEST_TURN = 0.05
+LARGEST_PHASE_DRIFT = 0.05
 # Response cycles of the later half of a recording that show a period which the whole has not.
 LATER_CYCLES = 6
 CROSSING, AUTO = "crossing", "auto"
@@ -56,35 +56,23 @@ def fold_signals(
     signals: Signals,
     samples: int,
     periods: int,
-    given: tuple[float, float] | None,
+    given: tuple[float, float] | None,  # frequency and standard error
     harmonics: int | Mapping[str, int] | None,
     origin: float | str,
     largest_drift: float | None,
 ) -> dict[str, Any]:
-    """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`.
-
-    `given` are the frequency and its standard error.
-    """
+    """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`."""
     points = samples * periods
     if points > MAXIMUM_POINTS:
         raise ValueError(f"samples: must be at most {MAXIMUM_POINTS // periods} for {periods} periods, got {samples}.")
     if isinstance(origin, str) and origin != CROSSING:
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
-    frequency = None if given is None else given[0]
-    seen = inspect(replace(signals, time=signals.time - start), periods, frequency, points)
+    seen = inspect(replace(signals, time=signals.time - start), periods, given and given[0], points)
     if seen.steady is None or seen.fit is None or seen.sizes is None:
         raise ValueError(seen.reason)
     fit, pace, limit = seen.fit, seen.pace, seen.limit
-    steady = seen.signals.part(seen.steady.samples)
-    if given is not None:
-        estimated, fit = fit, fit_harmonics(steady.time, steady.values, given[0] / periods, limit)
-        _refuse_frequency(estimated, fit, pace, float(np.ptp(steady.time)), periods, given[1] / periods)
-    elif pace.diffusion and not signals.inputs:
-        # The cycles of a free-running oscillation are compared at equal phases; others would smear its harmonics.
-        ahead = followed_phase(steady.time, steady.values, fit, pace.diffusion)
-        steady = replace(steady, time=steady.time + ahead / fit.frequency)
-        fit = fit_harmonics(steady.time, steady.values, fit.frequency, limit)
+    steady, fit = _at_phases(seen.signals.part(seen.steady.samples), fit, pace, periods, given)
     drift = dict(zip(signals.channels, _drift(seen.sizes), strict=True))
     _refuse_drift(signals.name, drift, largest_drift)
     refuse(signals.name, seen.findings)
@@ -130,7 +118,6 @@ def fold_signals(
         "periodicity": _periodicity(steady, fit),
         "drift": drift,
         "origin": start,
-        # The phase of a channel that defines τ = 0 is not turned.
         "middle": {} if origin == CROSSING else dict.fromkeys(signals.channels, float(steady.time.mean())),
         "findings": seen.findings,
     }
@@ -173,6 +160,23 @@ def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, 
     return chosen, evidence
 
 
+def _at_phases(
+    steady: Signals, fit: HarmonicFit, pace: Pace, periods: int, given: tuple[float, float] | None
+) -> tuple[Signals, HarmonicFit]:
+    """Return the steady part and its fit: at a given frequency, or as it is, or at times that follow its phase."""
+    limit = fit.amplitudes.shape[1] - 1
+    if given is not None:
+        other = fit_harmonics(steady.time, steady.values, given[0] / periods, limit)
+        _refuse_frequency(fit, other, pace, float(np.ptp(steady.time)), periods, given[1] / periods)
+        return steady, other
+    if not pace.diffusion or steady.inputs:
+        return steady, fit
+    # The cycles of a free-running oscillation are compared at equal phases; others would smear its harmonics.
+    ahead = followed_phase(steady.time, steady.values, fit, pace.diffusion)
+    steady = replace(steady, time=steady.time + ahead / fit.frequency)
+    return steady, fit_harmonics(steady.time, steady.values, fit.frequency, limit)
+
+
 def _refuse_frequency(
     estimated: HarmonicFit, given: HarmonicFit, pace: Pace, duration: float, periods: int, error: float
 ) -> None:
@@ -180,7 +184,7 @@ def _refuse_frequency(
     difference = given.frequency - estimated.frequency
     # Few cycles have too few degrees of freedom for a test, but noise of any kind would not shrink so much.
     shrinks = np.mean(np.log(given.variances / estimated.variances)) > np.log(CLEARLY)
-    clear = shrinks and abs(difference) * duration > (LARGEST_TURN if error else NEGLIGIBLE_PHASE)
+    clear = shrinks and abs(difference) * duration > (LARGEST_PHASE_DRIFT if error else NEGLIGIBLE_PHASE)
     if clear or (explains_more(estimated, given) and pace.differs(difference, duration, error)):
         raise ValueError(
             f"frequency: must be that of the recording, which is estimated as {estimated.frequency * periods:.9g} Hz "
