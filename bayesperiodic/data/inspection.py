@@ -127,6 +127,14 @@ def _steady_of(
         tracked = refine_frequency(part.time, part.values, tracked, few)[0].frequency
         every = windows(some.time, some.values, tracked)
         steady = steady_part(every)
+    if steady is not None and refined and not some.inputs and steady.level != (0, some.time.size):
+        fit, pace = refine_frequency(some.time, some.values, tracked, few)
+        if pace.diffusion:
+            # A phase that walks at random is no transient.
+            aligned = windows(some.time, some.values, fit.frequency).aligned()
+            longer = steady_part(aligned)
+            if longer is not None:
+                return aligned, longer, fit.frequency
     return every, steady, tracked
 
 

@@ -57,6 +57,13 @@ class Windows:
         first, last, place = (array[used] for array in (self.first, self.last, self.place))
         return Windows(first, last, place, self.overlap, self.cycles, self.amplitudes[used], self.slip)
 
+    def aligned(self) -> "Windows":
+        """Return the windows, each with its phase turned to the mean one."""
+        first = self.amplitudes[:, :, 1]
+        turn = np.angle(np.sum(first * np.conj(first.mean(axis=0)), axis=1))
+        order = np.arange(self.amplitudes.shape[2])
+        return replace(self, amplitudes=self.amplitudes * np.exp(-1j * turn[:, None, None] * order))
+
     def apart(self) -> "Windows":
         """Return windows that do not overlap, the last one among them."""
         used = [len(self.place) - 1]
