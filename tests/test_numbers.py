@@ -565,6 +565,35 @@ def noisy_inputs():
     yield f"{d['replicates']} recordings a point"
 
 
+@on("docs/explanation/frequency_error.md")
+def frequency_error():
+    d = results("clocks")
+    light, less = (
+        [100 * d["frequency"][f"Q = {q}, 20 cycles"][kind]["coverage"]["k"] for kind in ("ignored", "estimated")]
+        for q in (200, 50)
+    )
+    yield f"{light[0]:.0f} % of the recordings if the error is ignored, and in {light[1]:.0f} % if it is not"
+    yield f"and 20 cycles in {less[0]:.0f} % and {less[1]:.0f} %"
+    low, high = d["band"]
+    yield f"With {d['replicates']} recordings, a share from {100 * low:.0f} % to {100 * high:.0f} % is compatible"
+
+
+@on("docs/studies/clocks.md")
+def clocks():
+    d = results("clocks")
+    resonances = [one for case, one in d["frequency"].items() if case.startswith("Q")]
+    kept, ignored = ([100 * one[kind]["coverage"]["k"] for one in resonances] for kind in ("estimated", "ignored"))
+    yield f"Of 90 % intervals of the stiffness, {min(kept):.0f} to {max(kept):.0f} % contain the truth in all cases"
+    yield f"and {min(ignored):.0f} to {max(ignored):.0f} % if it is ignored. Each case has {d['replicates']} recordings"
+    limit = [
+        100 * s
+        for c, one in d["frequency"].items()
+        if c.startswith("van")
+        for s in one["estimated"]["coverage"].values()
+    ]
+    yield f"{min(limit):.0f} to {max(limit):.0f} % of the intervals of the van der Pol oscillator contain the truth"
+
+
 @on("docs/studies/missing_terms.md")
 def missing_terms():
     d = results("missing_terms")

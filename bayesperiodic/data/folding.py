@@ -38,7 +38,7 @@ MINIMUM_PERIODICITY, CLEARLY_PERIODIC = 0.5, 0.9
 # Ratio of residual variances from which the estimated frequency is right, and the given one wrong.
 CLEARLY = 4.0
 # Phase [cycles] by which a frequency that is given with an error drifts at most: more would shrink the harmonics.
-LARGEST_TURN = 0.05
+LARGEST_PHASE_DRIFT = 0.05
 # Response cycles of the later half of a recording that show a period which the whole has not.
 LATER_CYCLES = 6
 CROSSING, AUTO = "crossing", "auto"
@@ -51,7 +51,7 @@ def fold_signals(
     groups: list[Signals],
     samples: int,
     periods: int,
-    given: tuple[float, float] | None,
+    given: tuple[float, float] | None,  # frequency and standard error
     harmonics: int | Mapping[str, int] | None,
     origin: float | str,
     largest_drift: float | None,
@@ -59,8 +59,7 @@ def fold_signals(
 ) -> dict[str, Any]:
     """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`.
 
-    Each group of channels with common times is solved on its own samples, for one frequency and phase. `given` are the
-    frequency and its standard error.
+    Each group of channels with common times is solved on its own samples, for one frequency and phase.
     """
     points = samples * periods
     if points > MAXIMUM_POINTS:
@@ -77,15 +76,7 @@ def fold_signals(
         raise ValueError(seen.reason)
     fit, pace, parts, name = seen.fit, seen.pace, seen.parts, groups[0].name
     inputs = [channel for group in groups for channel in group.channels[: group.inputs]]
-    if given is not None:
-        duration = float(max(np.ptp(part.time) for part in parts))
-        fit = fit_groups(parts, given[0] / periods, seen.limits)
-        _refuse_frequency(seen.fit, fit, pace, duration, periods, given[1] / periods)
-    elif pace.diffusion and not inputs and len(parts) == 1:
-        # The cycles of a free-running oscillation are compared at equal phases; others would smear its harmonics.
-        ahead = followed_phase(parts[0].time, parts[0].values, fit.each[0], pace.diffusion)
-        parts = [replace(parts[0], time=parts[0].time + ahead / fit.frequency)]
-        fit = fit_groups(parts, fit.frequency, seen.limits)
+    parts, fit = _at_phases(parts, fit, pace, periods, given, seen.limits)
     drift = dict(zip(seen.channels, _drift(seen.sizes), strict=True))
     _refuse_drift(name, drift, largest_drift)
     refuse(name, seen.findings)
@@ -214,6 +205,28 @@ def _response_period(signals: Signals, drive: float) -> "tuple[int | None, pd.Da
     return chosen, evidence
 
 
+def _at_phases(
+    parts: list[Signals],
+    fit: CommonFit,
+    pace: Pace,
+    periods: int,
+    given: tuple[float, float] | None,
+    limits: list[int],
+) -> tuple[list[Signals], CommonFit]:
+    """Return the steady parts and their fit: at a given frequency, or as it is, or at times that follow its phase."""
+    if given is not None:
+        duration = float(max(np.ptp(part.time) for part in parts))
+        other = fit_groups(parts, given[0] / periods, limits)
+        _refuse_frequency(fit, other, pace, duration, periods, given[1] / periods)
+        return parts, other
+    if not pace.diffusion or len(parts) > 1 or parts[0].inputs:
+        return parts, fit
+    # The cycles of a free-running oscillation are compared at equal phases; others would smear its harmonics.
+    ahead = followed_phase(parts[0].time, parts[0].values, fit.each[0], pace.diffusion)
+    parts = [replace(parts[0], time=parts[0].time + ahead / fit.frequency)]
+    return parts, fit_groups(parts, fit.frequency, limits)
+
+
 def _refuse_frequency(
     estimated: CommonFit, given: CommonFit, pace: Pace, duration: float, periods: int, error: float
 ) -> None:
@@ -221,7 +234,7 @@ def _refuse_frequency(
     difference = given.frequency - estimated.frequency
     # Few cycles have too few degrees of freedom for a test, but noise of any kind would not shrink so much.
     shrinks = np.mean(np.log(given.variances / estimated.variances)) > np.log(CLEARLY)
-    clear = shrinks and abs(difference) * duration > (LARGEST_TURN if error else NEGLIGIBLE_PHASE)
+    clear = shrinks and abs(difference) * duration > (LARGEST_PHASE_DRIFT if error else NEGLIGIBLE_PHASE)
     if clear or (explains_more(estimated, given) and pace.differs(difference, duration, error)):
         raise ValueError(
             f"frequency: must be that of the recording, which is estimated as {estimated.frequency * periods:.9g} Hz "

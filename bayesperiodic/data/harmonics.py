@@ -21,7 +21,7 @@ TRACKED, FEWEST_TRACKED, FEWEST_REFINED = 48, 384, 12
 # Deviations of the phase [cycles] below this are of no consequence; others count if they are not explained by noise.
 NEGLIGIBLE_PHASE, PHASE_FALSE_ALARM = 1.0 / 360.0, 1e-4
 # Gauss-Newton steps towards a wandering phase.
-FOLLOWED = 4
+PHASE_ITERATIONS = 4
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,9 @@ def pace_of(score: np.ndarray, quadrature: np.ndarray, power: float, information
     irregular = float(np.ptp(phase[3:] @ basis[3:]))
     allowed = fdtri(orders, orders, 1.0 - PHASE_FALSE_ALARM) * max(float(np.sum(amplitude[3:] ** 2)), orders / power)
     wanders = orders >= 4 and irregular > NEGLIGIBLE_PHASE and float(np.sum(phase[3:] ** 2)) > allowed
-    walk = phase_diffusion(score / power, basis[:3], 1.0 / power)
+    # The residual that `power` rests on contains the wander, the amplitudes of the cycles do not.
+    least = min(1.0 / power, 0.5 * float(np.mean(np.diff(quadrature / power) ** 2)))
+    walk = phase_diffusion(score / power, basis[:3], max(least, np.finfo(float).tiny))
     slope, bent = (noise, noise) if walk is None else np.maximum(walk.slopes[1:], noise)
     curvature = phase[2] * basis[2]
     bend = float(np.ptp(curvature))
@@ -213,7 +215,7 @@ def followed_phase(time: np.ndarray, channels: np.ndarray, fit: HarmonicFit, ste
     frequency, harmonics = fit.frequency, fit.amplitudes.shape[1] - 1
     stiff = 1.0 / np.maximum(step * frequency * np.diff(time), np.finfo(float).tiny)
     ahead = np.zeros(time.size)
-    for _ in range(FOLLOWED):
+    for _ in range(PHASE_ITERATIONS):
         phase = frequency * time + ahead
         clear, weights = _clear(fit), 1.0 / fit.variances
         slope = _fourier.at_times(_fourier.derivative(clear, 1.0), phase)

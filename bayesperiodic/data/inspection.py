@@ -260,6 +260,16 @@ def _steady_of(
         tracked = refine_groups(parts, tracked, few, other)[0].frequency
         every = common_windows(some, tracked)
         steady = steady_part(every.all)
+    driven = any(group.inputs for group in some)
+    if steady is not None and refined and not driven and steady.level != (0, some[0].time.size):
+        fit, pace = refine_groups(some, tracked, few, other)
+        if pace.diffusion:
+            # A phase that walks at random is no transient.
+            again = common_windows(some, fit.frequency)
+            again = replace(again, all=again.all.aligned())
+            longer = steady_part(again.all)
+            if longer is not None:
+                return again, longer, fit.frequency
     return every, steady, tracked
 
 

@@ -61,6 +61,13 @@ class Windows:
         """Return the same windows of all samples, of which they have those with these numbers."""
         return replace(self, first=numbers[self.first], last=numbers[self.last - 1] + 1)
 
+    def aligned(self) -> "Windows":
+        """Return the windows, each with its phase turned to the mean one."""
+        first = self.amplitudes[:, :, 1]
+        turn = np.angle(np.sum(first * np.conj(first.mean(axis=0)), axis=1))
+        order = np.arange(self.amplitudes.shape[2])
+        return replace(self, amplitudes=self.amplitudes * np.exp(-1j * turn[:, None, None] * order))
+
     def apart(self) -> "Windows":
         """Return windows that do not overlap, the last one among them."""
         used = [len(self.place) - 1]
