@@ -34,9 +34,7 @@ class Sampling:
     number: np.ndarray  # (covered,) of these cycles
     samples: np.ndarray  # (covered,) in each of them
     side: np.ndarray  # (lines,) distances of lines above harmonics [harmonics]
-    left: (
-        np.ndarray
-    )  # (lines beside a harmonic, harmonics + 1) share of white noise left, above and then below it
+    left: np.ndarray  # (lines beside a harmonic, harmonics + 1) share of white noise left, above and then below it
     left_near_zero: np.ndarray  # (lines,) the same of the first lines
     freedom: np.ndarray  # (harmonics + 1,) of the mean over the sides
 

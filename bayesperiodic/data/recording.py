@@ -496,7 +496,8 @@ class Recording(Result):
         """Fold the steady part of the recording into its mean period on an equidistant grid.
 
         The whole cycles after the transient are used. The fundamental frequency is estimated by least squares over all
-        of them. The mean period is a least-squares Fourier series, so that the sampling rate may be arbitrary.
+        of them. The mean period is a least-squares Fourier series of the samples that are there: they may have gaps or be
+        slower than the period, if they cover its phases.
 
         The variance of the mean's amplitudes is measured harmonic by harmonic. The spectrum of K cycles has lines at
         multiples of 1/K of the fundamental, and those between the harmonics contain noise only; the variance at a
@@ -547,8 +548,8 @@ class Recording(Result):
         ------
         ValueError
             For fewer than three cycles, a constant channel, a signal that is not periodic, ``periods="auto"`` without
-            frequency and inputs, a gap of more than a quarter
-            of a period, a frequency that is not that of the recording, more harmonics than the samples resolve, an
+            frequency and inputs, samples at too few phases, an estimated frequency with less than four samples per
+            cycle and aliases, a frequency that is not that of the recording, more harmonics than the samples resolve, an
             unknown channel in `harmonics`, a drift beyond the limit.
 
         Warns
