@@ -496,8 +496,7 @@ class Recording(Result):
         """Fold the steady part of the recording into its mean period on an equidistant grid.
 
         The whole cycles after the transient are used. The fundamental frequency is estimated by least squares over all
-        of them. The mean period is a least-squares Fourier series of the samples that are there: they may have gaps or be
-        slower than the period, if they cover its phases.
+        of them. The mean period is a least-squares Fourier series of the samples, at any times that cover its phases.
 
         The variance of the mean's amplitudes is measured harmonic by harmonic. The spectrum of K cycles has lines at
         multiples of 1/K of the fundamental, and those between the harmonics contain noise only; the variance at a
@@ -548,9 +547,8 @@ class Recording(Result):
         ------
         ValueError
             For fewer than three cycles, a constant channel, a signal that is not periodic, ``periods="auto"`` without
-            frequency and inputs, samples at too few phases, an estimated frequency with less than four samples per
-            cycle and aliases, a frequency that is not that of the recording, more harmonics than the samples resolve, an
-            unknown channel in `harmonics`, a drift beyond the limit.
+            frequency and inputs, samples at too few phases, an estimated frequency that has aliases, a
+            frequency that is not that of the recording, more harmonics than the samples resolve, an unknown channel in `harmonics`, a drift beyond the limit.
 
         Warns
         -----

@@ -1,0 +1,1 @@
+"""Clocks, rates and delays: coverage of amplitudes and parameters."""
