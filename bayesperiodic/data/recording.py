@@ -548,7 +548,8 @@ class Recording(Result):
         ValueError
             For fewer than three cycles, a constant channel, a signal that is not periodic, ``periods="auto"`` without
             frequency and inputs, samples at too few phases, an estimated frequency that has aliases, a
-            frequency that is not that of the recording, more harmonics than the samples resolve, an unknown channel in `harmonics`, a drift beyond the limit.
+            frequency that is not that of the recording, more harmonics than the samples resolve, an unknown channel in
+            `harmonics`, a drift beyond the limit.
 
         Warns
         -----
