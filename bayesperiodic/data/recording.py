@@ -481,7 +481,7 @@ class Recording(Channels):
         """Fold the steady part of the recording into its mean period on an equidistant grid.
 
         The whole cycles after the transient are used. The fundamental frequency is estimated by least squares over all
-        of them. The mean period is a least-squares Fourier series, so that the sampling rate may be arbitrary.
+        of them. The mean period is a least-squares Fourier series of the samples, at any times that cover its phases.
 
         The variance of the mean's amplitudes is measured harmonic by harmonic. The spectrum of K cycles has lines at
         multiples of 1/K of the fundamental, and those between the harmonics contain noise only; the variance at a
@@ -538,10 +538,10 @@ class Recording(Channels):
         ------
         ValueError
             For fewer than three cycles, a constant channel, a signal that is not periodic, ``periods="auto"`` without
-            frequency and inputs, a gap of more than a quarter
-            of a period, a frequency that is not that of the recording, more harmonics than the samples resolve, an
-            unknown channel in `harmonics` or `clocks`, a drift beyond the limit, clocks that differ, or samples lost by
-            one of the channels, so far that its phase is wrong by more than 0.05 rad.
+            frequency and inputs, samples at too few phases, an estimated frequency that has aliases, a frequency that is
+            not that of the recording, more harmonics than the samples resolve, an unknown channel in `harmonics` or
+            `clocks`, a drift beyond the limit, clocks that differ, or samples lost by one of the channels, so far that
+            its phase is wrong by more than 0.05 rad.
 
         Warns
         -----
