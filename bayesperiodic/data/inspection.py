@@ -11,6 +11,7 @@ from bayesperiodic.data.faults import ChannelFaults, dropped_value, jumps, outli
 from bayesperiodic.data.groups import CommonFit, Windowed, common_span, common_windows, leading, refine_groups
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
+    HarmonicFit,
     Pace,
     determined_harmonics,
     fit_harmonics,
@@ -96,13 +97,7 @@ def inspect(
     try:
         if not any(group.channels for group in groups):
             raise ValueError(f"recording: must have a channel that varies, got {name!r} without one.")
-        for group, fault, these in zip(groups, faults, moving, strict=True):
-            if these.size < LEAST_MOVING * group.time.size:
-                raise ValueError(_still(group, fault))
-        calm = [
-            replace(group, values=bounded(group.values)).part(these)
-            for group, these in zip(groups, moving, strict=True)
-        ]
+        calm = [_calm(*each) for each in zip(groups, faults, moving, strict=True)]
         first = calm[leading(groups)]
         fundamental = first_guess(first, frequency, periods)
         for group in groups:
@@ -115,10 +110,7 @@ def inspect(
     sound = [_sound(*each, tracked, points) for each in zip(groups, calm, faults, moving, strict=True)]
     whole = all(these.size == group.time.size for these, group in zip(sound, groups, strict=True))
     sound = [_inside(these, part) for these, part in zip(sound, span, strict=True)]
-    some = [
-        group if these.size == group.time.size else group.part(these)
-        for group, these in zip(groups, sound, strict=True)
-    ]
+    some = [_selected(group, these) for group, these in zip(groups, sound, strict=True)]
     refined = frequency is None
     every, steady, tracked = _steady_of(some, tracked, points, refined, refined and not whole, other)
     if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
@@ -134,17 +126,12 @@ def inspect(
     ]
     limits, inflation = [limit for limit, _ in determined], [factors for _, factors in determined]
     fit, pace = refine_groups(parts, tracked, limits, other)
-    for i, (group, part) in enumerate(zip(groups, used, strict=True)):
-        residuals = fit.each[i].residuals
-        here = _inside(sound[i], part)
-        if here.size < parts[i].time.size:
-            near = fit_harmonics(group.time[here], group.values[:, here], tracked, limits[i]).amplitudes
-            residuals = parts[i].values - _fourier.at_times(near, tracked * parts[i].time)
-        _set_outliers(faults[i], parts[i], residuals, fit.frequency, part, moving[i])
+    for i, group in enumerate(groups):
+        rest = _residuals(group, parts[i], fit.each[i], _inside(sound[i], used[i]), tracked)
+        _set_outliers(faults[i], parts[i], rest, fit.frequency, used[i], moving[i])
     seen = findings(fit.frequency, limits, used)
     channels = [channel for group in groups for channel in group.channels]
-    ends = (max(group.time[0] for group in groups), min(group.time[-1] for group in groups))
-    seen += cycle_findings(channels, groups[0].time, steady, fit.frequency, total, ends)
+    seen += cycle_findings(channels, groups[0].time, steady, fit.frequency, total, _ends(groups))
     varies = pace.drifts or pace.wander > 0.0
     of_clocks, drifts = _clock_findings(groups, every, some[0].time, used[0], fit.frequency, total, varies)
     sizes = every.all.apart().sizes
@@ -171,13 +158,37 @@ def _clock_findings(
     if np.count_nonzero(inside) < clocks.FEWEST_WINDOWS:
         return [], []
     steps, places = clocks.steps(channels, phases, inside)
-    found = [*clocks.step_findings(steps, rates, frequency, inside.size)]
+    listed = [*clocks.step_findings(steps, rates, frequency, inside.size)]
     drifts: list[clocks.Drift] = []
     if not varies:
         cycles = round((stop - start) * frequency)
         drifts = clocks.clock_drifts(phases, inside, places)
-        found += clocks.drift_findings(drifts, channels, phases, (start, stop), cycles, total)
-    return found, drifts
+        listed += clocks.drift_findings(drifts, channels, phases, (start, stop), cycles, total)
+    return listed, drifts
+
+
+def _calm(group: Signals, faults: list[ChannelFaults], moving: np.ndarray) -> Signals:
+    """Return a group at the samples that move, without rare extremes; raise a ValueError if these are too few."""
+    if moving.size < LEAST_MOVING * group.time.size:
+        raise ValueError(_still(group, faults))
+    return replace(group, values=bounded(group.values)).part(moving)
+
+
+def _selected(group: Signals, samples: np.ndarray) -> Signals:
+    return group if samples.size == group.time.size else group.part(samples)
+
+
+def _residuals(group: Signals, part: Signals, fit: HarmonicFit, sound: np.ndarray, frequency: float) -> np.ndarray:
+    """Return the residuals of the part used, by its mean period, or that of its sound samples only."""
+    if sound.size == part.time.size:
+        return fit.residuals
+    near = fit_harmonics(group.time[sound], group.values[:, sound], frequency, fit.amplitudes.shape[1] - 1).amplitudes
+    return np.asarray(part.values - _fourier.at_times(near, frequency * part.time))
+
+
+def _ends(groups: list[Signals]) -> tuple[float, float]:
+    """Return the first and the last time that all groups have in common."""
+    return max(float(group.time[0]) for group in groups), min(float(group.time[-1]) for group in groups)
 
 
 def _inside(numbers: np.ndarray, part: slice) -> np.ndarray:
