@@ -121,9 +121,7 @@ def inspect(
     ]
     steady = steady.among(sound[0])
     parts = [group.part(part) for group, part in zip(groups, used, strict=True)]
-    determined = [
-        determined_harmonics(part.time, tracked, resolved_harmonics(part.time, tracked, points)) for part in parts
-    ]
+    determined = [_determined(part.time, tracked, points) for part in parts]
     limits, inflation = [limit for limit, _ in determined], [factors for _, factors in determined]
     fit, pace = refine_groups(parts, tracked, limits, other)
     for i, group in enumerate(groups):
@@ -189,6 +187,10 @@ def _residuals(group: Signals, part: Signals, fit: HarmonicFit, sound: np.ndarra
 def _ends(groups: list[Signals]) -> tuple[float, float]:
     """Return the first and the last time that all groups have in common."""
     return max(float(group.time[0]) for group in groups), min(float(group.time[-1]) for group in groups)
+
+
+def _determined(time: np.ndarray, frequency: float, points: int) -> tuple[int, np.ndarray]:
+    return determined_harmonics(time, frequency, resolved_harmonics(time, frequency, points))
 
 
 def _inside(numbers: np.ndarray, part: slice) -> np.ndarray:
