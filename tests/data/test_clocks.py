@@ -34,7 +34,7 @@ def two_rates(seed, noise=5e-4):
 
 
 def one_clock(ppm=0.0, seed=1, cycles=120, lost=(), delay=0.0, noise=0.01):
-    """A force and a response of 20 samples a period, the second one's clock slow, and without some samples."""
+    """Return a force and a response at 20 samples a period, the response on a slow clock and without some samples."""
     generator = np.random.default_rng(seed)
     time = np.arange(20 * cycles) / (20 * FREQUENCY)
     x = response_at(time * (1 + 1e-6 * ppm) + delay) / abs(RESPONSE) + noise * generator.standard_normal(time.size)
@@ -188,7 +188,7 @@ def test_channels_of_another_clock_have_the_amplitude_at_its_frequency(clocks):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run = one_clock(200.0, cycles=300, delay=0.05).fold(32, clocks=clocks, harmonics=1)
-    assert [*run.clocks.values()] == [("x",)] and run.cycles == 300
+    assert [*run.clocks.values()] == [("x",)] and run.cycles >= 299
     assert run.frequency == pytest.approx(FREQUENCY, rel=1e-6)
     assert abs(amplitude(run, "outputs", "x")) == pytest.approx(1.0, abs=5 * np.sqrt(run.amplitude_variance["x"][1]))
     assert "other clocks" in repr(run)
