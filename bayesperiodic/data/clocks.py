@@ -12,8 +12,10 @@ from bayesperiodic.data.steadiness import SMALL_RANGE, Windows
 
 # Windows on each side of a step, shortest and as a share of all, and the size of a step in robust standard deviations.
 SHORTEST_SIDE, SIDES, SIGNIFICANT_STEP = 3, 20, 8.0
+# Size of a step in standard deviations of what remains beside it: a transient is curved.
+SHARP = 5.0
 # Windows that may be missing at a step, and most steps that are searched for.
-MISSING, MOST_STEPS = 4, 50
+MISSING_WINDOWS, MOST_PHASE_STEPS = 4, 50
 # Windows, like those of the steady part in amplitude: largest distance in robust standard deviations.
 ALIKE = 6.0
 # Phase [cycles] that does not count for any purpose.
@@ -25,6 +27,8 @@ DRIFT_FALSE_ALARM, FEWEST_WINDOWS, FEWEST_ORDERS, MOST_ORDERS = 1e-4, 10, 4, 16
 BY_AMPLITUDE, HARMLESS_TURN, CURVED = 2.0, 0.05, 0.1
 # Quantile of the differences of means that are no steps although there may be many, and that of a normal distribution.
 FEW, FEW_TO_SD, MEDIAN_TO_SD = 0.15, 0.189, 1.4826
+# Least part of a drift that changes of the drive's frequency leave.
+LEAST_DETERMINED = 0.1
 CLOCK = "clock"
 
 
@@ -47,7 +51,7 @@ class Phases:
 
 
 @dataclass(frozen=True)
-class Step:
+class PhaseStep:
     """A step of the phase of one channel, of all together if there is no other one."""
 
     channel: str
@@ -95,48 +99,52 @@ def steps_of(series: np.ndarray, cycle: np.ndarray, least: float) -> list[tuple[
     A straight line and a step are fitted to as many windows before and after each window, which may contain the step;
     the step is compared with those elsewhere. Slopes and slow curves, as of a transient, are no steps.
     """
-    rest, found = series.copy(), list[tuple[int, float]]()
+    rest, listed = series.copy(), list[tuple[int, float]]()
     if series.size < FEWEST_WINDOWS:
-        return found
+        return listed
     length, next_ones = float(np.median(np.diff(cycle))), np.diff(series)
     white = MEDIAN_TO_SD / np.sqrt(2.0) * float(np.median(np.abs(next_ones - np.median(next_ones))))
     few = max(1.0, (SIDES / series.size) ** 2)
-    while len(found) < MOST_STEPS:
+    while len(listed) < MOST_PHASE_STEPS:
         best = (1.0, 0, 0.0, 0.0)
         side = SHORTEST_SIDE
         while 2 * side + 1 <= rest.size and (side == SHORTEST_SIDE or side * SIDES <= rest.size):
             number = np.arange(-side, side + 1.0)
             design = np.column_stack([np.ones(number.size), number, np.sign(number)])[number != 0.0]
-            line, step = np.insert(np.linalg.pinv(design)[[0, 2]], side, 0.0, axis=1)
-            jump = 2.0 * np.correlate(rest, step)
+            beside = np.delete(np.lib.stride_tricks.sliding_window_view(rest, number.size), side, axis=1)
+            inverse = np.linalg.pinv(design)
+            fitted = beside @ inverse.T
+            jump, size_of_one = 2.0 * fitted[:, 2], 2.0 * float(np.linalg.norm(inverse[2]))
+            curved = np.sqrt(np.sum((beside - fitted @ design.T) ** 2, axis=1) / (2 * side - design.shape[1]))
             usual = float(np.quantile(np.abs(jump), FEW)) / FEW_TO_SD
-            usual = max(usual, 2.0 * white * float(np.linalg.norm(step)))
-            near = cycle[2 * side :] - cycle[: -2 * side] <= (2 * side + MISSING) * length
-            score = np.where(near, np.abs(jump) / max(SIGNIFICANT_STEP * few * usual, least), 0.0)
+            usual = max(usual, white * size_of_one)
+            near = cycle[2 * side :] - cycle[: -2 * side] <= (2 * side + MISSING_WINDOWS) * length
+            limit = np.maximum(max(SIGNIFICANT_STEP * few * usual, least), SHARP * curved)
+            score = np.where(near, np.abs(jump) / limit, 0.0)
             k = int(np.argmax(score))
             if score[k] > best[0]:
-                best = (float(score[k]), k + side, float(jump[k]), float(line @ rest[k : k + 2 * side + 1]))
+                best = (float(score[k]), k + side, float(jump[k]), float(fitted[k, 0]))
             side *= 2
         _, k, size, middle = best
         if not size:
             break
-        found.append((k, size))
+        listed.append((k, size))
         rest[k] = middle - 0.5 * size
         rest[k + 1 :] -= size
-    return found
+    return listed
 
 
-def steps(channels: Sequence[str], phases: Phases, used: np.ndarray) -> tuple[list[Step], list[np.ndarray]]:
+def steps(channels: Sequence[str], phases: Phases, used: np.ndarray) -> tuple[list[PhaseStep], list[np.ndarray]]:
     """Return the steps of phases, and the windows of each channel but the first in which its relative phase steps.
 
     Steps of one channel relative to the others count wherever the amplitudes are those of the windows used; steps of
     all together only where they are used.
     """
-    found: list[Step] = []
+    listed: list[PhaseStep] = []
     inside = phases.chosen(used)
     least = HARMLESS_PHASE + inside.slip.max()
     for k, turns in steps_of(inside.turns[:, 0], inside.cycle, least):
-        found.append(Step("", "", float(inside.start[k]), turns, int(phases.order[0])))
+        listed.append(PhaseStep("", "", float(inside.start[k]), turns, int(phases.order[0])))
     same = np.flatnonzero(alike(phases, used))
     near = phases.chosen(same)
     places = []
@@ -145,20 +153,20 @@ def steps(channels: Sequence[str], phases: Phases, used: np.ndarray) -> tuple[li
         each = steps_of(near.turns[:, row] - near.turns[:, 0], near.cycle, least)
         places.append(same[[k for k, _ in each]])
         for k, turns in each:
-            found.append(Step(channel, channels[0], float(near.start[k]), turns, int(phases.order[row])))
-    return _attributed(channels, found, float(np.median(np.diff(phases.start))), int(phases.order[0])), places
+            listed.append(PhaseStep(channel, channels[0], float(near.start[k]), turns, int(phases.order[row])))
+    return _attributed(channels, listed, float(np.median(np.diff(phases.start))), int(phases.order[0])), places
 
 
-def _attributed(channels: Sequence[str], found: list[Step], length: float, order: int) -> list[Step]:
+def _attributed(channels: Sequence[str], listed: list[PhaseStep], length: float, order: int) -> list[PhaseStep]:
     """Return steps of the first channel alone as its own ones, not as those of all others or of all together."""
-    together = [step for step in found if not step.other]
-    result = [step for step in found if step.other]
+    together = [step for step in listed if not step.other]
+    result = [step for step in listed if step.other]
     for step in together:
         near = [other for other in result if abs(other.time - step.time) <= 2.0 * length]
         if len(channels) > 1 and len({other.channel for other in near}) == len(channels) - 1:
             result = [other for other in result if other not in near]
             turns = -float(np.mean([other.turns for other in near]))
-            result.append(Step(channels[0], channels[1], near[0].time, turns, order))
+            result.append(PhaseStep(channels[0], channels[1], near[0].time, turns, order))
         elif not near:
             result.append(replace(step, channel="" if len(channels) > 1 else channels[0]))
     return sorted(result, key=lambda step: step.time)
@@ -186,6 +194,8 @@ def drifts(phases: Phases, used: np.ndarray, steps: Sequence[np.ndarray]) -> Ite
         noise, size = float(np.sqrt(np.mean(component[3:] ** 2))), abs(float(component[1]))
         limit = float(student.isf(0.5 * level, orders)) * noise
         per_cycle = float(basis[1] @ middle)
+        if abs(per_cycle) < LEAST_DETERMINED * float(np.linalg.norm(middle)):
+            continue  # the drive drifts likewise
         turns = float(component[1]) / per_cycle * float(np.ptp(middle)) * numbers.size / (numbers.size - 1)
         if size <= limit or abs(turns) <= ROUNDING_PHASE + phases.slip[[0, row]].max():
             continue
@@ -215,16 +225,18 @@ def _others(phases: Phases, numbers: np.ndarray, middle: np.ndarray, places: np.
 def clock_drifts(phases: Phases, used: np.ndarray, steps: Sequence[np.ndarray]) -> list[Drift]:
     """Return the drifts over the windows used, or over all of their amplitude if most of these are not used."""
     same = alike(phases, used)
-    found = [*drifts(phases, used, steps)]
-    if not found and 2 * np.count_nonzero(used) < np.count_nonzero(same):
-        found = [drift for drift in drifts(phases, same, steps) if drift.steady]
-    return found
+    listed = [*drifts(phases, used, steps)]
+    if not listed and 2 * np.count_nonzero(used) < np.count_nonzero(same):
+        listed = [drift for drift in drifts(phases, same, steps) if drift.steady]
+    return listed
 
 
-def step_findings(found: list[Step], rates: dict[str, float], frequency: float, windows: int) -> Iterator[Finding]:
+def step_findings(
+    listed: list[PhaseStep], rates: dict[str, float], frequency: float, windows: int
+) -> Iterator[Finding]:
     """Return the findings of steps, one for each channel; `rates` are the sampling rates [Hz]."""
-    for channel, other in dict.fromkeys((step.channel, step.other) for step in found):
-        mine = [step for step in found if (step.channel, step.other) == (channel, other)]
+    for channel, other in dict.fromkeys((step.channel, step.other) for step in listed):
+        mine = [step for step in listed if (step.channel, step.other) == (channel, other)]
         at = np.array([[step.time, step.time] for step in mine])
         if other:
             worst = max(2.0 * np.pi * step.order * abs(step.turns) for step in mine)
@@ -248,7 +260,7 @@ def step_findings(found: list[Step], rates: dict[str, float], frequency: float, 
         yield Finding("phase step", channel, severity, at, len(mine), len(mine) / windows, np.nan, text, cure)
 
 
-def _relative(step: Step, rates: dict[str, float], frequency: float) -> str:
+def _relative(step: PhaseStep, rates: dict[str, float], frequency: float) -> str:
     """Return what a step of one channel relative to another one is."""
     delay = -step.turns / frequency
     loser, sooner = (step.channel, "earlier") if delay < 0.0 else (step.other, "later")
@@ -260,10 +272,10 @@ def _relative(step: Step, rates: dict[str, float], frequency: float) -> str:
 
 
 def drift_findings(
-    found: list[Drift], channels: Sequence[str], phases: Phases, span: tuple[float, float], cycles: int, total: int
+    listed: list[Drift], channels: Sequence[str], phases: Phases, span: tuple[float, float], cycles: int, total: int
 ) -> Iterator[Finding]:
     """Return the findings of drifts of phases."""
-    for drift in found:
+    for drift in listed:
         channel, angle = channels[drift.row], 360.0 * drift.turns
         if not drift.steady:
             yield Finding(

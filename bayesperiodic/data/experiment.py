@@ -432,7 +432,7 @@ class Experiment(Result):
         if self.period_test is not None:
             text += f"; {summary(self.period_test, self.periods)}"
         if self.clocks:
-            text += f"; other clocks: {', '.join(f'{name} {list(own)}' for name, own in self.clocks.items())}"
+            text += f"; other clocks: {', '.join(f'{name} {list(named)}' for name, named in self.clocks.items())}"
         return (
             f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz{error}, {self.samples} "
             f"samples per period, outputs {counts}, periodicity {self.periodicity:.4f}"

@@ -99,13 +99,7 @@ def inspect(
     try:
         if not any(group.channels for group in groups):
             raise ValueError(f"recording: must have a channel that varies, got {name!r} without one.")
-        for group, fault, these in zip(groups, faults, moving, strict=True):
-            if these.size < LEAST_MOVING * group.time.size:
-                raise ValueError(_still(group, fault))
-        calm = [
-            replace(group, values=bounded(group.values)).part(these)
-            for group, these in zip(groups, moving, strict=True)
-        ]
+        calm = [_calm(*each) for each in zip(groups, faults, moving, strict=True)]
         first = calm[leading(groups)]
         behind, tracked = counted_cycles(first, first_guess(first, frequency, periods), frequency is not None)
         counted = first.time[behind]
@@ -122,10 +116,7 @@ def inspect(
     sound = [_sound(*each, tracked, points) for each in zip(groups, calm, faults, moving, strict=True)]
     whole = all(these.size == group.time.size for these, group in zip(sound, groups, strict=True))
     sound = [_inside(these, part) for these, part in zip(sound, span, strict=True)]
-    some = [
-        group if these.size == group.time.size else group.part(these)
-        for group, these in zip(groups, sound, strict=True)
-    ]
+    some = [_selected(group, these) for group, these in zip(groups, sound, strict=True)]
     refined = frequency is None
     every, steady, tracked = _steady_of(some, tracked, points, refined, refined and not whole, other)
     if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
@@ -162,8 +153,7 @@ def inspect(
         describe(faults[i], parts[i], HarmonicFit(fit.frequency, amplitudes, residuals), part.start)
     seen = findings(fit.frequency, limits, used)
     channels = [channel for group in groups for channel in group.channels]
-    ends = (max(group.time[0] for group in groups), min(group.time[-1] for group in groups))
-    seen += cycle_findings(channels, groups[0].time, outer, steady, fit.frequency, total, ends)
+    seen += cycle_findings(channels, groups[0].time, outer, steady, fit.frequency, total, _ends(groups))
     if frequency is None:
         lead = parts[leading(groups)]
         seen += sampling_findings(lead.time, lead.values, fit.frequency, first.time, behind)
@@ -193,13 +183,29 @@ def _clock_findings(
     if np.count_nonzero(inside) < clocks.FEWEST_WINDOWS:
         return [], []
     steps, places = clocks.steps(channels, phases, inside)
-    found = [*clocks.step_findings(steps, rates, frequency, inside.size)]
+    listed = [*clocks.step_findings(steps, rates, frequency, inside.size)]
     drifts: list[clocks.Drift] = []
     if not varies:
         cycles = round((stop - start) * frequency)
         drifts = clocks.clock_drifts(phases, inside, places)
-        found += clocks.drift_findings(drifts, channels, phases, (start, stop), cycles, total)
-    return found, drifts
+        listed += clocks.drift_findings(drifts, channels, phases, (start, stop), cycles, total)
+    return listed, drifts
+
+
+def _calm(group: Signals, faults: list[ChannelFaults], moving: np.ndarray) -> Signals:
+    """Return a group at the samples that move, without rare extremes; raise a ValueError if these are too few."""
+    if moving.size < LEAST_MOVING * group.time.size:
+        raise ValueError(_still(group, faults))
+    return replace(group, values=bounded(group.values)).part(moving)
+
+
+def _selected(group: Signals, samples: np.ndarray) -> Signals:
+    return group if samples.size == group.time.size else group.part(samples)
+
+
+def _ends(groups: list[Signals]) -> tuple[float, float]:
+    """Return the first and the last time that all groups have in common."""
+    return max(float(group.time[0]) for group in groups), min(float(group.time[-1]) for group in groups)
 
 
 def _inside(numbers: np.ndarray, part: slice) -> np.ndarray:

@@ -107,8 +107,8 @@ class Recording(Channels):
         }
         if isinstance(time, Mapping):
             _checks.same_names("time", time, [key for _, key, _ in channels.values()])
-            own = channel_seconds(time)
-            at: Any = {argument: own[key] for argument, (_, key, _) in channels.items()}
+            by_channel = channel_seconds(time)
+            at: Any = {argument: by_channel[key] for argument, (_, key, _) in channels.items()}
         else:
             at = _checks.real_array("time", seconds("time", time))
         arrays = {argument: _checks.real_array(argument, values) for argument, (*_, values) in channels.items()}

@@ -40,8 +40,8 @@ def inspect_clocks(
         rate = _frequency(inspect(_only(groups, first), periods, None, points))
     scale = dict.fromkeys(channels, 1.0)
     for named in others.values():
-        own = _frequency(inspect(_only(groups, named), periods, rate * periods, points))
-        scale |= dict.fromkeys(named, own / rate)
+        measured = _frequency(inspect(_only(groups, named), periods, rate * periods, points))
+        scale |= dict.fromkeys(named, measured / rate)
     scaled = []
     for group in groups:
         for factor in dict.fromkeys(scale[channel] for channel in group.channels):
