@@ -34,10 +34,10 @@ def cycle_findings(
     start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
     level = [float(time[i]) for i in (steady.level[0], steady.level[1] - 1)]
     used = f"{start:.6g} to {stop:.6g} s are used ({len(steady.part.first) * steady.part.cycles} of {total} cycles)"
-    slow = []
-    if (level[1] - level[0]) * frequency < total - 1.0:
+    beats, slow = [*_beats(channels, time, steady.part, frequency)], []
+    if beats or (level[1] - level[0]) * frequency < total - 1.0:
         slow = [*slow_beats(channels, time, every, frequency)]
-    yield from slow
+    yield from slow or beats
     for kind, a, b, what in (
         ("ramp", float(time[0]), level[0], "the signals change until"),
         ("ramp", level[1], float(time[-1]), "the signals change from"),
@@ -55,8 +55,6 @@ def cycle_findings(
             )
     yield from _changes(channels, time, steady)
     yield from _phase_steps(channels, time, steady.part, frequency)
-    if not slow:
-        yield from _beats(channels, time, steady.part, frequency)
 
 
 def slow_beats(channels: tuple[str, ...], time: np.ndarray, every: Windows, frequency: float) -> Iterator[Finding]:
@@ -167,7 +165,9 @@ def _changes(channels: tuple[str, ...], time: np.ndarray, steady: Steady) -> Ite
             relative = float(size[i, worst] / level[i, worst or strongest])
             small = abs(relative) < (HARMLESS_STEP if step else HARMLESS_DRIFT)
             change = f"{relative:+.2%}"
-            which = f"the {what} of {channel}" + (f" at harmonic {worst}" if worst not in (0, strongest) else "")
+            which = f"the mean value of {channel}"
+            if worst:
+                which = f"the amplitude of {channel}" + (f" at harmonic {worst}" if worst != strongest else "")
             which += f" {'steps' if step else 'changes'} by {change}{'' if worst else ' of the amplitude'}"
             which += f" at about {at:.6g} s" if step else " over the part used"
             yield Finding(

@@ -41,7 +41,7 @@ class Finding(Storable):
     ----------
     kind : str
         "constant", "wraps", "stuck", "held" (a slower logger), "clipped", "outliers", "gaps", "ramp", "transient",
-        "drift", "beating", "amplitude step" or "phase step".
+        "drift", "beating", "amplitude step", "mean step" or "phase step".
     channel : str
         Empty for all channels together.
     severity : str

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
-from bayesperiodic.data.changes import POSSIBLE, PROBABLE, Changes, changes
+from bayesperiodic.data.changes import POSSIBLE, PROBABLE, TRANSIENT, Changes, changes
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES, determined_harmonics, resolved_harmonics
 
 # Parts of a cycle in which ramps begin or end, in recordings of so many cycles; most windows of long recordings.
@@ -24,8 +24,9 @@ LEAST_LEVEL = 0.5
 DISTANT, DISTANT_MEAN = 3.0, 12.0
 # Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
 FEWEST_FOR_MEDIAN = 9
-# Windows from which changes are searched for, and false-alarm rate of a significant slope.
-FEWEST_FOR_CHANGES, SLOPE_FALSE_ALARM = 5, 1e-4
+# Windows from which changes are searched for, probability of a transient from which its start is left out, and
+# false-alarm rate of a significant slope.
+FEWEST_FOR_CHANGES, CLEAR_TRANSIENT, SLOPE_FALSE_ALARM = 5, 0.95, 1e-4
 # Largest correlation of the noise of neighbouring windows.
 LONGEST_MEMORY = 0.8
 # Second differences of smooth signals and noise, relative to their median.
@@ -177,7 +178,8 @@ def steady_part(every: Windows) -> Steady | None:
     found = changes(components, PROBABLE if began else POSSIBLE)
     # The mean square error of what is biased is least.
     error = (1.0 + found.bias**2) / np.arange(len(components), 0, -1)
-    first = int(np.argmin(error[: len(error) - MINIMUM_CYCLES + 1]))
+    clear = found.probability[TRANSIENT] > CLEAR_TRANSIENT
+    first = int(np.argmin(error[: len(error) - MINIMUM_CYCLES + 1])) if clear else 0
     part = part.chosen(slice(first, None))
     enough = len(part.first) >= FEWEST_FOR_CHANGES
     later = changes(components[first:], POSSIBLE) if first and enough else found
@@ -200,7 +202,7 @@ def _samples(part: Windows) -> slice:
 
 
 def _components(shape: np.ndarray) -> np.ndarray:
-    """Return real components of amplitudes (windows, channels, harmonics + 1) without the common drift of the phase.
+    """Return real components of amplitudes (windows, channels, harmonics + 1) without common drifts of the phase.
 
     Of each channel they are the mean value, the parts along the mean amplitudes, and those across.
     """
@@ -209,10 +211,11 @@ def _components(shape: np.ndarray) -> np.ndarray:
     size = np.abs(mean)
     turned = shape * np.divide(np.conj(mean), size, out=np.ones(mean.shape, dtype=complex), where=size > 0.0)
     noise = np.mean(np.abs(np.diff(turned, axis=0)) ** 2, axis=0) + SMALLEST_DISTANCE
-    slope = np.einsum("k,kch->ch", place, turned.imag) / (place @ place)
     weight = harmonic * size / noise
-    turn = np.sum(weight * slope) / max(np.sum(weight * harmonic * size), np.finfo(float).tiny)
-    turned = turned * np.exp(-1j * turn * place[:, None, None] * harmonic)
+    total = max(np.sum(weight * harmonic * size), np.finfo(float).tiny)
+    for course in (place, place**2 - np.mean(place**2)):
+        slope = np.einsum("k,kch->ch", course, turned.imag) / (course @ course)
+        turned = turned * np.exp(-1j * np.sum(weight * slope) / total * course[:, None, None] * harmonic)
     return np.concatenate([turned.real, turned.imag[:, :, 1:]], axis=2).reshape(len(shape), -1)
 
 
