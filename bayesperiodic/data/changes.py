@@ -12,8 +12,8 @@ import numpy as np
 from scipy.linalg import solve_triangular, toeplitz
 from scipy.special import logsumexp
 
-# Probabilities before the data: of a transient where the start was left out or not, of a drift, a step and a line beside
-# the harmonics otherwise; and that a change is in any one component.
+# Probabilities before the data: of a transient where the start was left out or not, of a drift, a step and a line
+# beside the harmonics otherwise; and that a change is in any one component.
 PROBABLE, POSSIBLE, DRIFTING, STEPPING, SOUNDING, SHARED = 0.9, 0.6, 0.4, 0.1, 0.1, 0.2
 # Sizes of a change in standard deviations of its estimate.
 SIZES, FREQUENT = np.array([3.0, 10.0, 100.0]), np.array([0.7, 0.2, 0.1])

@@ -159,7 +159,7 @@ def _changes(channels: tuple[str, ...], time: np.ndarray, steady: Steady) -> Ite
         strongest = 1 + int(np.argmax(level[i, 1:]))
         for what, harmonics in (("amplitude", np.arange(1, level.shape[1])), ("mean value", np.zeros(1, dtype=int))):
             worst = int(harmonics[np.argmax(moving[i, harmonics] * bias[i, harmonics])])
-            if moving[i, worst] < 1.0 - CHANGE_FALSE_ALARM or np.abs(size[i, worst]) <= part.slip[i]:
+            if moving[i, worst] < 1.0 - CHANGE_FALSE_ALARM or np.abs(size[i, worst]) <= part.jump[i]:
                 continue
             effect = float(np.sqrt(np.sum(bias[i, harmonics] ** 2)))
             relative = float(size[i, worst] / level[i, worst or strongest])

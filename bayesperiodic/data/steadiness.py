@@ -46,11 +46,12 @@ class Windows:
     cycles: int  # in a window
     amplitudes: np.ndarray  # complex (windows, channels, harmonics + 1), relative to each channel's standard deviation
     slip: np.ndarray  # (channels,) changes of amplitudes by one sample more or less at jumps of the signals, likewise
+    jump: np.ndarray  # (channels,) the same by jumps and narrow peaks only
 
     def chosen(self, used: "slice | list[int]") -> "Windows":
         """Return the windows with these indices."""
         first, last, place = (array[used] for array in (self.first, self.last, self.place))
-        return Windows(first, last, place, self.overlap, self.cycles, self.amplitudes[used], self.slip)
+        return replace(self, first=first, last=last, place=place, amplitudes=self.amplitudes[used])
 
     def among(self, numbers: np.ndarray) -> "Windows":
         """Return the same windows of all samples, of which they have those with these numbers."""
@@ -121,23 +122,26 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
     first[0] -= np.count_nonzero(
         ((time[-1] - time[: first[0]]) * fundamental + 1e-9).astype(int) < int(duration * fundamental)
     )
-    slip = _slip(scaled, edges[::fine] - edges[0]) / np.median(last[enough] - first[enough])
-    return Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip)
+    samples = np.median(last[enough] - first[enough])
+    slip, jump = (size / samples for size in _slip(scaled, edges[::fine] - edges[0]))
+    return Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip, jump)
 
 
-def _slip(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+def _slip(values: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return twice the median of the largest second differences in parts of signals (channels, samples).
 
-    Samples that are not at the same phases of every cycle see jumps and narrow peaks earlier or later. What smooth
-    signals and noise have, a multiple of the median, does not count.
+    Samples that are not at the same phases of every cycle see jumps and narrow peaks earlier or later. The second array
+    is without what smooth signals and noise have, a multiple of the median.
     """
     edges = edges[: max(np.searchsorted(edges, values.shape[1] - 2), 1)]
     edges = edges[np.r_[True, np.diff(edges) > 0]]
     if values.shape[1] < 3:
-        return np.zeros(len(values))
-    bends = [np.abs(np.diff(v, 2)) for v in values]
-    largest = np.array([np.median(np.maximum.reduceat(bend, edges)) for bend in bends])
-    return 2.0 * np.maximum(largest - SMOOTH_OR_NOISE * np.array([np.median(bend) for bend in bends]), 0.0)
+        return np.zeros(len(values)), np.zeros(len(values))
+    largest, usual = np.empty(len(values)), np.empty(len(values))
+    for i, v in enumerate(values):
+        bend = np.abs(np.diff(v, 2))
+        largest[i], usual[i] = np.median(np.maximum.reduceat(bend, edges)), np.median(bend)
+    return 2.0 * largest, 2.0 * np.maximum(largest - SMOOTH_OR_NOISE * usual, 0.0)
 
 
 @dataclass(frozen=True)
