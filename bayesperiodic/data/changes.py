@@ -19,11 +19,11 @@ PROBABLE, POSSIBLE, DRIFTING, STEPPING, SOUNDING, SHARED = 0.9, 0.6, 0.4, 0.1, 0
 SIZES, FREQUENT = np.array([3.0, 10.0, 100.0]), np.array([0.7, 0.2, 0.1])
 # Correlation from one window to the next, and share of the variance, of noise that lasts; white noise is as probable
 # as all others together.
-MEMORIES, LASTING_SHARES, LASTING = (0.5, 0.8), (0.3, 0.8, 1.0), 0.1
+MEMORIES, LASTING_SHARES, SLOW_NOISE = (0.5, 0.8), (0.3, 0.8, 1.0), 0.1
 # Decay times of transients, in cycles and relative to the recording, their number, and the number of frequencies.
 SHORTEST_DECAY, LONGEST_DECAY, DECAYS, FREQUENCIES = 0.3, 0.5, 12, 13
 # Frequencies of slow transients near those of the harmonics, relative to 1/decay time, and places of steps.
-NEAR, NEARBY, MOST_STEPS, FIRST_STEP, MOST_TONES = (0.7, 1.5), 0.7, 64, 2, 64
+NEAR, NEARBY, STEP_PLACES, FIRST_STEP, MOST_TONES = (0.7, 1.5), 0.7, 64, 2, 64
 # Share of a channel's standard deviation below which noise does not count.
 SMALLEST_NOISE = 1e-6
 # Longest decay time relative to the recording of a transient of which a part can be left out; slower ones are drifts.
@@ -84,7 +84,7 @@ def courses(count: int, transient: float) -> Courses:
     rest = 1.0 - transient
     fading = len(every)
     every.append((cycle / (count - 1) + 0j, DRIFT, rest * DRIFTING, 0.0))
-    places = np.unique(np.linspace(FIRST_STEP, count - FIRST_STEP, MOST_STEPS).astype(int))
+    places = np.unique(np.linspace(FIRST_STEP, count - FIRST_STEP, STEP_PLACES).astype(int))
     every += [((cycle >= k) + 0j, STEP, rest * STEPPING / places.size, float(k)) for k in places]
     # Lines beside the harmonics, as of a subharmonic, do not decay, and have no effect on the mean.
     tones = np.arange(1, 1 + min(count // 2, MOST_TONES)) * max(1.0, count / 2 / MOST_TONES)
@@ -93,8 +93,8 @@ def courses(count: int, transient: float) -> Courses:
     # The sine of the highest frequency is rounding.
     single = np.abs(values[:, :, 1]).max(axis=1) < 1e-9
     values[single, :, 1] = 0.0
-    kind, place = np.array([k for _, k, _, _ in every]), np.array([p for *_, p in every])
-    return Courses(values, single, np.arange(len(every)) < fading, kind, np.log([p for _, _, p, _ in every]), place)
+    kinds, place = np.array([k for _, k, _, _ in every]), np.array([p for *_, p in every])
+    return Courses(values, single, np.arange(len(every)) < fading, kinds, np.log([p for _, _, p, _ in every]), place)
 
 
 def _covariances(count: int) -> list[tuple[float, np.ndarray]]:
@@ -104,7 +104,7 @@ def _covariances(count: int) -> list[tuple[float, np.ndarray]]:
         for memory in MEMORIES
         for share in LASTING_SHARES
     ]
-    priors = [1.0 - LASTING, *np.full(len(lasting), LASTING / len(lasting))]
+    priors = [1.0 - SLOW_NOISE, *np.full(len(lasting), SLOW_NOISE / len(lasting))]
     return [(float(np.log(p)), np.linalg.cholesky(c)) for p, c in zip(priors, [np.eye(count), *lasting], strict=True)]
 
 
@@ -167,7 +167,7 @@ def changes(shape: np.ndarray, transient: float) -> Changes:
     variances = np.einsum("jsmd,jsmd,j->jd", each, np.array(levels), np.array(means)) + constant_part * np.array(white)
     square, lasting = variances.sum(axis=0), each[1:].sum(axis=(0, 1, 2)) + constant_part[1:].sum(axis=0)
     # As far as it is more probable than before the data.
-    evident = np.clip((lasting - LASTING) / (1.0 - LASTING), 0.0, 1.0) / lasting
+    evident = np.clip((lasting - SLOW_NOISE) / (1.0 - SLOW_NOISE), 0.0, 1.0) / lasting
     wander = evident * np.maximum(variances[1:].sum(axis=0) - lasting * white[0], 0.0)
     return _effects(every, first, second, weight.sum(axis=0), np.sqrt(square), each.sum(axis=(0, 1, 2)), wander)
 

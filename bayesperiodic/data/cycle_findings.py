@@ -136,8 +136,8 @@ def _outer_steps(
 
 def _changes(channels: tuple[str, ...], time: np.ndarray, steady: Steady) -> Iterator[Finding]:
     """Return what is clearly not steady in the part used: the rest of a transient, drifts and steps."""
-    part, found = steady.part, steady.changes
-    if found is None:
+    part, effects = steady.part, steady.changes
+    if effects is None:
         return
     start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
     every, cycles = np.array([[start, stop]]), len(part.first) * part.cycles
@@ -147,14 +147,14 @@ def _changes(channels: tuple[str, ...], time: np.ndarray, steady: Steady) -> Ite
             steady.bias, f"a rest of the transient is in the part used, {start:.6g} to {stop:.6g} s, and biases the "
             f"amplitudes by {steady.bias:.2g} standard errors", "record longer, or begin later with recording.between",
         )  # fmt: skip
-    if not found.slow:
+    if not effects.slow:
         return
     shape = (len(channels), -1)
-    moving, size = found.moving.reshape(shape), found.size.reshape(shape)
-    bias = np.sqrt(found.lasting[0]).reshape(shape) / found.error[0].reshape(shape)
+    moving, size = effects.moving.reshape(shape), effects.size.reshape(shape)
+    bias = np.sqrt(effects.lasting[0]).reshape(shape) / effects.error[0].reshape(shape)
     level = np.abs(part.amplitudes.mean(axis=0))
-    step = found.probability[STEP] > found.probability[DRIFT]
-    at = float(time[part.first[found.place]])
+    step = effects.probability[STEP] > effects.probability[DRIFT]
+    at = float(time[part.first[effects.place]])
     for i, channel in enumerate(channels):
         strongest = 1 + int(np.argmax(level[i, 1:]))
         for what, harmonics in (("amplitude", np.arange(1, level.shape[1])), ("mean value", np.zeros(1, dtype=int))):

@@ -179,15 +179,15 @@ def steady_part(every: Windows) -> Steady | None:
         return Steady(part, _samples(part), level, np.zeros(part.amplitudes.shape[1:]), change)
     began = part.place[0] - every.place[0] >= part.overlap
     components = _components(part.amplitudes)
-    found = changes(components, PROBABLE if began else POSSIBLE)
+    effects = changes(components, PROBABLE if began else POSSIBLE)
     # The mean square error of what is biased is least.
-    error = (1.0 + found.bias**2) / np.arange(len(components), 0, -1)
-    clear = found.probability[TRANSIENT] > CLEAR_TRANSIENT
+    error = (1.0 + effects.bias**2) / np.arange(len(components), 0, -1)
+    clear = effects.probability[TRANSIENT] > CLEAR_TRANSIENT
     first = int(np.argmin(error[: len(error) - MINIMUM_CYCLES + 1])) if clear else 0
     part = part.chosen(slice(first, None))
     enough = len(part.first) >= FEWEST_FOR_CHANGES
-    later = changes(components[first:], POSSIBLE) if first and enough else found
-    squares = found.squares[first] + (later.lasting[0] if enough else found.lasting[first])
+    later = changes(components[first:], POSSIBLE) if first and enough else effects
+    squares = effects.squares[first] + (later.lasting[0] if enough else effects.lasting[first])
     by_part = squares.reshape(change.shape[1], -1)
     count = part.amplitudes.shape[2]
     # Slow noise of the mean value is extrapolated from its own spectrum.
@@ -195,9 +195,16 @@ def steady_part(every: Windows) -> Steady | None:
     by_harmonic = by_part[:, :count].copy()
     by_harmonic[:, 1:] += by_part[:, count:]
     change = np.array([_change(half) for half in np.array_split(part.sizes, 2)])
-    transient = 0.0 if found.slow else float(found.moving.max())
+    transient = 0.0 if effects.slow else float(effects.moving.max())
     return Steady(
-        part, _samples(part), level, by_harmonic, change, float(found.bias[first]), transient, later if enough else None
+        part,
+        _samples(part),
+        level,
+        by_harmonic,
+        change,
+        float(effects.bias[first]),
+        transient,
+        later if enough else None,
     )
 
 
