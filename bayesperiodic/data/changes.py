@@ -12,23 +12,23 @@ import numpy as np
 from scipy.linalg import solve_triangular, toeplitz
 from scipy.special import logsumexp
 
-# Probabilities before the data: of a transient where the start was left out or not, of a drift and of a step; and that
-# a change is in any one component.
-PROBABLE, POSSIBLE, DRIFTING, STEPPING, SHARED = 0.9, 0.6, 0.4, 0.1, 0.2
+# Probabilities before the data: of a transient where the start was left out or not, of a drift, a step and a line
+# beside the harmonics otherwise; and that a change is in any one component.
+PROBABLE, POSSIBLE, DRIFTING, STEPPING, SOUNDING, SHARED = 0.9, 0.6, 0.4, 0.1, 0.1, 0.2
 # Sizes of a change in standard deviations of its estimate.
 SIZES, FREQUENT = np.array([3.0, 10.0, 100.0]), np.array([0.7, 0.2, 0.1])
 # Correlation from one window to the next, and share of the variance, of noise that lasts; white noise is as probable
 # as all others together.
-MEMORIES, LASTING_SHARES, LASTING = (0.5, 0.8), (0.3, 0.8, 1.0), 0.1
+MEMORIES, LASTING_SHARES, SLOW_NOISE = (0.5, 0.8), (0.3, 0.8, 1.0), 0.1
 # Decay times of transients, in cycles and relative to the recording, their number, and the number of frequencies.
 SHORTEST_DECAY, LONGEST_DECAY, DECAYS, FREQUENCIES = 0.3, 0.5, 12, 13
 # Frequencies of slow transients near those of the harmonics, relative to 1/decay time, and places of steps.
-NEAR, NEARBY, MOST_STEPS, FIRST_STEP = (0.7, 1.5), 0.7, 64, 2
+NEAR, NEARBY, STEP_PLACES, FIRST_STEP, MOST_TONES = (0.7, 1.5), 0.7, 64, 2, 64
 # Share of a channel's standard deviation below which noise does not count.
 SMALLEST_NOISE = 1e-6
 # Longest decay time relative to the recording of a transient of which a part can be left out; slower ones are drifts.
 LONGEST_CUT = 0.25
-TRANSIENT, DRIFT, STEP = "transient", "drift", "step"
+TRANSIENT, DRIFT, STEP, TONE = "transient", "drift", "step", "tone"
 
 
 @dataclass(frozen=True)
@@ -84,14 +84,17 @@ def courses(count: int, transient: float) -> Courses:
     rest = 1.0 - transient
     fading = len(every)
     every.append((cycle / (count - 1) + 0j, DRIFT, rest * DRIFTING, 0.0))
-    places = np.unique(np.linspace(FIRST_STEP, count - FIRST_STEP, MOST_STEPS).astype(int))
+    places = np.unique(np.linspace(FIRST_STEP, count - FIRST_STEP, STEP_PLACES).astype(int))
     every += [((cycle >= k) + 0j, STEP, rest * STEPPING / places.size, float(k)) for k in places]
+    # Lines beside the harmonics, as of a subharmonic, do not decay, and have no effect on the mean.
+    tones = np.arange(1, 1 + min(count // 2, MOST_TONES)) * max(1.0, count / 2 / MOST_TONES)
+    every += [(np.exp(2j * np.pi * n / count * cycle), TONE, rest * SOUNDING / tones.size, 0.0) for n in tones]
     values = np.array([np.column_stack([course.real, course.imag]) for course, *_ in every])
     # The sine of the highest frequency is rounding.
     single = np.abs(values[:, :, 1]).max(axis=1) < 1e-9
     values[single, :, 1] = 0.0
-    kind, place = np.array([k for _, k, _, _ in every]), np.array([p for *_, p in every])
-    return Courses(values, single, np.arange(len(every)) < fading, kind, np.log([p for _, _, p, _ in every]), place)
+    kinds, place = np.array([k for _, k, _, _ in every]), np.array([p for *_, p in every])
+    return Courses(values, single, np.arange(len(every)) < fading, kinds, np.log([p for _, _, p, _ in every]), place)
 
 
 def _covariances(count: int) -> list[tuple[float, np.ndarray]]:
@@ -101,7 +104,7 @@ def _covariances(count: int) -> list[tuple[float, np.ndarray]]:
         for memory in MEMORIES
         for share in LASTING_SHARES
     ]
-    priors = [1.0 - LASTING, *np.full(len(lasting), LASTING / len(lasting))]
+    priors = [1.0 - SLOW_NOISE, *np.full(len(lasting), SLOW_NOISE / len(lasting))]
     return [(float(np.log(p)), np.linalg.cholesky(c)) for p, c in zip(priors, [np.eye(count), *lasting], strict=True)]
 
 
@@ -149,7 +152,7 @@ def changes(shape: np.ndarray, transient: float) -> Changes:
     share = _independent((np.diff(shape, axis=0) / noise)[:, noisy]) / noisy.sum() if noisy.any() else 1.0
     total_gain = share * np.logaddexp(np.log1p(-SHARED), np.log(SHARED) + clear)[:, :, noisy].sum(axis=2)
     weight = total_gain + every.prior + np.log(FREQUENT)[:, None]
-    constant = np.log((1.0 - transient) * (1.0 - DRIFTING - STEPPING))
+    constant = np.log((1.0 - transient) * (1.0 - DRIFTING - STEPPING - SOUNDING))
     weight = np.exp(weight - np.logaddexp(logsumexp(weight), constant))  # (sizes, courses)
     member = 1.0 / (1.0 + (1.0 / SHARED - 1.0) * np.exp(-np.clip(clear, -500, 500)))
     each = np.exp(some - logsumexp(some, axis=0)) * (
@@ -164,7 +167,7 @@ def changes(shape: np.ndarray, transient: float) -> Changes:
     variances = np.einsum("jsmd,jsmd,j->jd", each, np.array(levels), np.array(means)) + constant_part * np.array(white)
     square, lasting = variances.sum(axis=0), each[1:].sum(axis=(0, 1, 2)) + constant_part[1:].sum(axis=0)
     # As far as it is more probable than before the data.
-    evident = np.clip((lasting - LASTING) / (1.0 - LASTING), 0.0, 1.0) / lasting
+    evident = np.clip((lasting - SLOW_NOISE) / (1.0 - SLOW_NOISE), 0.0, 1.0) / lasting
     wander = evident * np.maximum(variances[1:].sum(axis=0) - lasting * white[0], 0.0)
     return _effects(every, first, second, weight.sum(axis=0), np.sqrt(square), each.sum(axis=(0, 1, 2)), wander)
 
@@ -182,21 +185,29 @@ def _effects(
     count = every.values.shape[1]
     remaining = np.arange(count, 0, -1.0)
     later = np.cumsum(every.values[:, ::-1], axis=1)[:, ::-1] / remaining[:, None]
-    fading, slow = every.fades, every.kind != TRANSIENT
+    transient, drifting = every.kind == TRANSIENT, every.kind == DRIFT
+    slow, asymptotic = drifting | (every.kind == STEP), drifting & every.fades
     # A transient ends at zero, so that its mean is the bias; of other changes the begin or the end is the right one.
-    mean = np.einsum("mka,mad->kd", later[~slow], first[~slow])
-    squares = _squares(later[~slow], second[~slow])
-    lasting = _squares(later[fading & slow], second[fading & slow])
-    for side in (every.values[~fading], np.repeat(every.values[~fading, -1:], count, axis=1)):
-        lasting += 0.5 * _squares(later[~fading] - side, second[~fading])
-    probability = {kind: float(weight[every.kind == kind].sum()) for kind in (TRANSIENT, DRIFT, STEP)}
+    mean = np.einsum("mka,mad->kd", later[transient], first[transient])
+    squares = _squares(later[transient], second[transient])
+    lasting, either = _squares(later[asymptotic], second[asymptotic]), slow & ~asymptotic
+    for side in (every.values[either], np.repeat(every.values[either, -1:], count, axis=1)):
+        lasting += 0.5 * _squares(later[either] - side, second[either])
+    probability = {kind: float(weight[every.kind == kind].sum()) for kind in (TRANSIENT, DRIFT, STEP, TONE)}
     steps = np.flatnonzero(every.kind == STEP)
+    ends = every.values[slow, -1] - every.values[slow, 0]
+    least = SMALLEST_NOISE / np.sqrt(count)
     return Changes(
-        mean, squares, lasting, probability, moving, np.einsum("ma,mad->d", every.values[slow, -1] - every.values[slow, 0], first[slow]),
-        np.maximum(error, SMALLEST_NOISE / np.sqrt(count)) * np.sqrt(count / remaining)[:, None],
-        int(every.place[steps[np.argmax(weight[steps])]]),
-        wander,
-    )  # fmt: skip
+        transient=mean,
+        squares=squares,
+        lasting=lasting,
+        probability=probability,
+        moving=moving,
+        size=np.einsum("ma,mad->d", ends, first[slow]),
+        error=np.maximum(error, least) * np.sqrt(count / remaining)[:, None],
+        place=int(every.place[steps[np.argmax(weight[steps])]]),
+        wander=wander,
+    )
 
 
 def _squares(effects: np.ndarray, moments: np.ndarray) -> np.ndarray:

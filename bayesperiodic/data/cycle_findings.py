@@ -43,10 +43,10 @@ def cycle_findings(
     start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
     level = [float(time[i]) for i in (steady.level[0], steady.level[1] - 1)]
     used = f"{start:.6g} to {stop:.6g} s are used ({len(steady.part.first) * steady.part.cycles} of {total} cycles)"
-    slow = []
-    if (level[1] - level[0]) * frequency < total - 1.0:
+    beats, slow = [*_beats(channels, time, steady.part, frequency)], []
+    if beats or (level[1] - level[0]) * frequency < total - 1.0:
         slow = [*slow_beats(channels, time, every, frequency)]
-    yield from slow
+    yield from slow or beats
     for kind, a, b, what in (
         ("ramp", ends[0], level[0], "the signals change until"),
         ("ramp", level[1], ends[1], "the signals change from"),
@@ -63,8 +63,6 @@ def cycle_findings(
                 kind, "", HARMLESS, np.array([[a, b]]), count, count / total, np.nan, f"{what} {place:.6g} s; {used}"
             )
     yield from _changes(channels, time, steady)
-    if not slow:
-        yield from _beats(channels, time, steady.part, frequency)
 
 
 def slow_beats(channels: Sequence[str], time: np.ndarray, every: Windows, frequency: float) -> Iterator[Finding]:
@@ -143,8 +141,8 @@ def _outer_steps(
 
 def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Iterator[Finding]:
     """Return what is clearly not steady in the part used: the rest of a transient, drifts and steps."""
-    part, found = steady.part, steady.changes
-    if found is None:
+    part, effects = steady.part, steady.changes
+    if effects is None:
         return
     start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
     every, cycles = np.array([[start, stop]]), len(part.first) * part.cycles
@@ -154,25 +152,27 @@ def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Itera
             steady.bias, f"a rest of the transient is in the part used, {start:.6g} to {stop:.6g} s, and biases the "
             f"amplitudes by {steady.bias:.2g} standard errors", "record longer, or begin later with recording.between",
         )  # fmt: skip
-    if not found.slow:
+    if not effects.slow:
         return
     shape = (len(channels), -1)
-    moving, size = found.moving.reshape(shape), found.size.reshape(shape)
-    bias = np.sqrt(found.lasting[0]).reshape(shape) / found.error[0].reshape(shape)
+    moving, size = effects.moving.reshape(shape), effects.size.reshape(shape)
+    bias = np.sqrt(effects.lasting[0]).reshape(shape) / effects.error[0].reshape(shape)
     level = np.abs(part.amplitudes.mean(axis=0))
-    step = found.probability[STEP] > found.probability[DRIFT]
-    at = float(time[part.first[found.place]])
+    step = effects.probability[STEP] > effects.probability[DRIFT]
+    at = float(time[part.first[effects.place]])
     for i, channel in enumerate(channels):
         strongest = 1 + int(np.argmax(level[i, 1:]))
         for what, harmonics in (("amplitude", np.arange(1, level.shape[1])), ("mean value", np.zeros(1, dtype=int))):
             worst = int(harmonics[np.argmax(moving[i, harmonics] * bias[i, harmonics])])
-            if moving[i, worst] < 1.0 - CHANGE_FALSE_ALARM or np.abs(size[i, worst]) <= part.slip[i]:
+            if moving[i, worst] < 1.0 - CHANGE_FALSE_ALARM or np.abs(size[i, worst]) <= part.jump[i]:
                 continue
             effect = float(np.sqrt(np.sum(bias[i, harmonics] ** 2)))
             relative = float(size[i, worst] / level[i, worst or strongest])
             small = abs(relative) < (HARMLESS_STEP if step else HARMLESS_DRIFT)
             change = f"{relative:+.2%}"
-            which = f"the {what} of {channel}" + (f" at harmonic {worst}" if worst not in (0, strongest) else "")
+            which = f"the mean value of {channel}"
+            if worst:
+                which = f"the amplitude of {channel}" + (f" at harmonic {worst}" if worst != strongest else "")
             which += f" {'steps' if step else 'changes'} by {change}{'' if worst else ' of the amplitude'}"
             which += f" at about {at:.6g} s" if step else " over the part used"
             yield Finding(

@@ -87,6 +87,7 @@ def common_windows(groups: Sequence[Signals], frequency: float) -> Windowed:
             each[0].first, each[0].last, place, first.overlap, first.cycles,
             np.concatenate([one.amplitudes[:, :, :harmonics] for one in each], axis=1),
             np.concatenate([one.slip for one in each]),
+            np.concatenate([one.jump for one in each]),
         ),
         each,
     )  # fmt: skip

@@ -45,8 +45,8 @@ class Finding(Storable):
     ----------
     kind : str
         "constant", "wraps", "stuck", "held" (a slower logger), "clipped", "saturated" (flat tops of the mean period),
-        "outliers", "heavy tails", "gaps", "aliases", "ramp", "transient", "drift", "beating", "amplitude step", "phase
-        step" or "clock" (the phase of a channel drifts steadily against the first one).
+        "outliers", "heavy tails", "gaps", "aliases", "ramp", "transient", "drift", "beating", "amplitude step", "mean
+        step", "phase step" or "clock" (the phase of a channel drifts steadily against the first one).
     channel : str
         Empty for all channels together.
     severity : str

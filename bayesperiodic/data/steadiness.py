@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from bayesperiodic import _fourier
-from bayesperiodic.data.changes import POSSIBLE, PROBABLE, Changes, changes
+from bayesperiodic.data.changes import POSSIBLE, PROBABLE, TRANSIENT, Changes, changes
 from bayesperiodic.data.coverage import SLOW, determined_harmonics, per_cycle, resolved_harmonics
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES, fit_harmonics
 
@@ -30,8 +30,9 @@ LEAST_LEVEL = 0.5
 DISTANT, DISTANT_MEAN = 3.0, 12.0
 # Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
 FEWEST_FOR_MEDIAN = 9
-# Windows from which changes are searched for, and false-alarm rate of a significant slope.
-FEWEST_FOR_CHANGES, SLOPE_FALSE_ALARM = 5, 1e-4
+# Windows from which changes are searched for, probability of a transient from which its start is left out, and
+# false-alarm rate of a significant slope.
+FEWEST_FOR_CHANGES, CLEAR_TRANSIENT, SLOPE_FALSE_ALARM = 5, 0.95, 1e-4
 # Largest correlation of the noise of neighbouring windows.
 LONGEST_MEMORY = 0.8
 # Second differences of smooth signals and noise, relative to their median.
@@ -51,11 +52,12 @@ class Windows:
     cycles: int  # in a window
     amplitudes: np.ndarray  # complex (windows, channels, harmonics + 1), relative to each channel's standard deviation
     slip: np.ndarray  # (channels,) changes of amplitudes by one sample more or less at jumps of the signals, likewise
+    jump: np.ndarray  # (channels,) the same by jumps and narrow peaks only
 
     def chosen(self, used: "slice | list[int]") -> "Windows":
         """Return the windows with these indices."""
         first, last, place = (array[used] for array in (self.first, self.last, self.place))
-        return Windows(first, last, place, self.overlap, self.cycles, self.amplitudes[used], self.slip)
+        return replace(self, first=first, last=last, place=place, amplitudes=self.amplitudes[used])
 
     def among(self, numbers: np.ndarray) -> "Windows":
         """Return the same windows of all samples, of which they have those with these numbers."""
@@ -157,26 +159,29 @@ def _windows_of(
     first[0] -= np.count_nonzero(
         ((time[-1] - time[: first[0]]) * fundamental + 1e-9).astype(int) < int(duration * fundamental)
     )
-    slip = np.zeros(len(values))
+    slip = jump = np.zeros(len(values))
     if enough.size and per_cycle(time, fundamental) >= SLOW:
-        slip = _slip(scaled, edges[::fine] - edges[0]) / np.median(last[enough] - first[enough])
-    found = Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip)
+        samples_of = np.median(last[enough] - first[enough])
+        slip, jump = (size / samples_of for size in _slip(scaled, edges[::fine] - edges[0]))
+    found = Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip, jump)
     return found, enough.size / np.count_nonzero(some)
 
 
-def _slip(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+def _slip(values: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return twice the median of the largest second differences in parts of signals (channels, samples).
 
-    Samples that are not at the same phases of every cycle see jumps and narrow peaks earlier or later. What smooth
-    signals and noise have, a multiple of the median, does not count.
+    Samples that are not at the same phases of every cycle see jumps and narrow peaks earlier or later. The second array
+    is without what smooth signals and noise have, a multiple of the median.
     """
     edges = edges[: max(np.searchsorted(edges, values.shape[1] - 2), 1)]
     edges = edges[np.r_[True, np.diff(edges) > 0]]
     if values.shape[1] < 3:
-        return np.zeros(len(values))
-    bends = [np.abs(np.diff(v, 2)) for v in values]
-    largest = np.array([np.median(np.maximum.reduceat(bend, edges)) for bend in bends])
-    return 2.0 * np.maximum(largest - SMOOTH_OR_NOISE * np.array([np.median(bend) for bend in bends]), 0.0)
+        return np.zeros(len(values)), np.zeros(len(values))
+    largest, usual = np.empty(len(values)), np.empty(len(values))
+    for i, v in enumerate(values):
+        bend = np.abs(np.diff(v, 2))
+        largest[i], usual[i] = np.median(np.maximum.reduceat(bend, edges)), np.median(bend)
+    return 2.0 * largest, 2.0 * np.maximum(largest - SMOOTH_OR_NOISE * usual, 0.0)
 
 
 @dataclass(frozen=True)
@@ -214,14 +219,15 @@ def steady_part(every: Windows) -> Steady | None:
         return Steady(part, _samples(part), level, np.zeros(part.amplitudes.shape[1:]), change)
     began = part.place[0] - every.place[0] >= part.overlap
     components = _components(part.amplitudes)
-    found = changes(components, PROBABLE if began else POSSIBLE)
+    effects = changes(components, PROBABLE if began else POSSIBLE)
     # The mean square error of what is biased is least.
-    error = (1.0 + found.bias**2) / np.arange(len(components), 0, -1)
-    first = int(np.argmin(error[: len(error) - MINIMUM_CYCLES + 1]))
+    error = (1.0 + effects.bias**2) / np.arange(len(components), 0, -1)
+    clear = effects.probability[TRANSIENT] > CLEAR_TRANSIENT
+    first = int(np.argmin(error[: len(error) - MINIMUM_CYCLES + 1])) if clear else 0
     part = part.chosen(slice(first, None))
     enough = len(part.first) >= FEWEST_FOR_CHANGES
-    later = changes(components[first:], POSSIBLE) if first and enough else found
-    squares = found.squares[first] + (later.lasting[0] if enough else found.lasting[first])
+    later = changes(components[first:], POSSIBLE) if first and enough else effects
+    squares = effects.squares[first] + (later.lasting[0] if enough else effects.lasting[first])
     by_part = squares.reshape(change.shape[1], -1)
     count = part.amplitudes.shape[2]
     # Slow noise of the mean value is extrapolated from its own spectrum.
@@ -229,9 +235,16 @@ def steady_part(every: Windows) -> Steady | None:
     by_harmonic = by_part[:, :count].copy()
     by_harmonic[:, 1:] += by_part[:, count:]
     change = np.array([_change(half) for half in np.array_split(part.sizes, 2)])
-    transient = 0.0 if found.slow else float(found.moving.max())
+    transient = 0.0 if effects.slow else float(effects.moving.max())
     return Steady(
-        part, _samples(part), level, by_harmonic, change, float(found.bias[first]), transient, later if enough else None
+        part,
+        _samples(part),
+        level,
+        by_harmonic,
+        change,
+        float(effects.bias[first]),
+        transient,
+        later if enough else None,
     )
 
 
@@ -240,7 +253,7 @@ def _samples(part: Windows) -> slice:
 
 
 def _components(shape: np.ndarray) -> np.ndarray:
-    """Return real components of amplitudes (windows, channels, harmonics + 1) without the common drift of the phase.
+    """Return real components of amplitudes (windows, channels, harmonics + 1) without common drifts of the phase.
 
     Of each channel they are the mean value, the parts along the mean amplitudes, and those across.
     """
@@ -249,10 +262,11 @@ def _components(shape: np.ndarray) -> np.ndarray:
     size = np.abs(mean)
     turned = shape * np.divide(np.conj(mean), size, out=np.ones(mean.shape, dtype=complex), where=size > 0.0)
     noise = np.mean(np.abs(np.diff(turned, axis=0)) ** 2, axis=0) + SMALLEST_DISTANCE
-    slope = np.einsum("k,kch->ch", place, turned.imag) / (place @ place)
     weight = harmonic * size / noise
-    turn = np.sum(weight * slope) / max(np.sum(weight * harmonic * size), np.finfo(float).tiny)
-    turned = turned * np.exp(-1j * turn * place[:, None, None] * harmonic)
+    total = max(np.sum(weight * harmonic * size), np.finfo(float).tiny)
+    for course in (place, place**2 - np.mean(place**2)):
+        slope = np.einsum("k,kch->ch", course, turned.imag) / (course @ course)
+        turned = turned * np.exp(-1j * np.sum(weight * slope) / total * course[:, None, None] * harmonic)
     return np.concatenate([turned.real, turned.imag[:, :, 1:]], axis=2).reshape(len(shape), -1)
 
 

@@ -33,7 +33,7 @@ SAMPLES, COUNT, NOISE = 50, 60, 0.01
 SHAPE = {1: np.exp(0.4j), 3: 0.2 * np.exp(1j)}
 # Natural frequency [cycles per cycle] and decay time [cycles] of the transients, and length [cycles] of the ramp.
 NATURAL, DECAY, RAMP = 1.37, 4.0, 5.0
-CHANGES = frozenset({"ramp", "transient", "drift", "amplitude step", "phase step", "beating"})
+CHANGES = frozenset({"ramp", "transient", "drift", "amplitude step", "mean step", "phase step", "beating"})
 
 
 def _rates(system: str) -> Rates:
