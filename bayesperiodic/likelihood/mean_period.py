@@ -143,7 +143,7 @@ class MeanPeriod(Timed):
         highest = (self.size - 1) // 2
         real, imag = factors.real, factors.imag[..., 1 : highest + 1]
         cosine, sine = components[..., : highest + 1], components[..., highest + 1 : 2 * highest + 1]
-        result = np.empty(np.broadcast_shapes(components.shape, (*real.shape[:-1], self.size)))
+        result = np.empty(components.shape)
         np.multiply(cosine, real[..., : highest + 1], out=result[..., : highest + 1])
         result[..., 1 : highest + 1] -= sine * imag
         np.multiply(sine, real[..., 1 : highest + 1], out=result[..., highest + 1 : 2 * highest + 1])
