@@ -130,10 +130,7 @@ def test_white_residuals_pass_and_smooth_ones_do_not():
 
 
 def test_residuals_of_right_models_with_few_values_are_white():
-    """7 values, 2 parameters that harmonic 1 determines: p < 1 % in at most 5 of 40, more by chance in 4e-6.
-
-    Where the residual is not projected, the harmonic that the parameters take up counts as one without noise.
-    """
+    """7 values, 2 parameters that harmonic 1 determines: p < 1 % in at most 5 of 40, more by chance in 4e-6."""
     harmonics, generator, tau, rejected = 3, np.random.default_rng(9), 2 * np.pi * grid(64), 0
     lines = np.arange(harmonics + 1)[:, None] * tau
     for _ in range(40):
