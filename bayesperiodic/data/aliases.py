@@ -9,14 +9,14 @@ from bayesperiodic.data.harmonics import MINIMUM_CYCLES, HarmonicFit, nearby_fit
 # sampling rates.
 SEARCHED, POINTS_PER_PERIOD, HIGHEST_RATE = 4000, 8, 30.0
 # Largest spectral lines whose frequencies, and parts of them, may be the fundamental, and harmonics that are compared.
-PEAKS, DIVISORS, COMPARED_HARMONICS = 8, (1, 2, 3), 5
+LARGEST_LINES, DIVISORS, COMPARED_HARMONICS = 8, (1, 2, 3), 5
 # Least height of the spectral window where frequencies may be confused, so many peaks that are compared, and the
 # difference of the deviances of two frequencies that tells them.
-CONFUSED, WINDOW_PEAKS, DECISIVE = 0.7, 12, 25.0
+CONFUSED, WINDOW_PEAKS, TELLING_DEVIANCE = 0.7, 12, 25.0
 # Least height of the window at the rate of regular times.
-REGULAR = 0.99
+REGULAR_WINDOW = 0.99
 # Points between lines at which a peak of the window is searched; residuals of exact signals, relative to them.
-FINE_LINES, EXACT = 17, 1e-6
+FINE_LINES, EXACT_RESIDUAL = 17, 1e-6
 # Least share of the variance that a frequency explains.
 LEAST_EXPLAINED = 0.5
 
@@ -47,7 +47,7 @@ def search_frequency(time: np.ndarray, values: np.ndarray, guess: float | None) 
     slowly = np.convolve(window > CONFUSED**2, np.ones(2 * slow + 1), "same") > 0.5
     highest = _half_rate(time, *_window_peaks(time, frequency, power[-1]))
     height = np.where(slowly | (frequency > highest), 0.0, power[:-1].sum(axis=0))
-    peaks = _peaks(height, MINIMUM_CYCLES / np.ptp(time), frequency)[:PEAKS]
+    peaks = _peaks(height, MINIMUM_CYCLES / np.ptp(time), frequency)[:LARGEST_LINES]
     candidates = [line / k for line in frequency[peaks] for k in DIVISORS] + ([guess] if guess else [])
     found: dict[float, float] = {}
     for candidate in candidates:
@@ -56,7 +56,7 @@ def search_frequency(time: np.ndarray, values: np.ndarray, guess: float | None) 
             found[fit.frequency] = _deviance(fit)
     if not found:
         return None
-    near = sorted(f for f, deviance in found.items() if deviance < min(found.values()) + DECISIVE)
+    near = sorted(f for f, deviance in found.items() if deviance < min(found.values()) + TELLING_DEVIANCE)
     # A multiple that explains as much is the fundamental.
     width = 1.0 / np.ptp(time)
     for factor in reversed(DIVISORS):
@@ -89,7 +89,7 @@ def aliases(time: np.ndarray, values: np.ndarray, frequency: float) -> list[floa
     for candidate in sorted({abs(rate + sign * frequency) for rate in peaks for sign in (-1, 1)}):
         fit = _fitted(time, values, candidate, harmonics) if candidate * np.ptp(time) > MINIMUM_CYCLES else None
         near = fit is not None and min(abs(fit.frequency - f) for f in [frequency, *found]) * np.ptp(time) < 1.0
-        if fit is not None and not near and _deviance(fit) < _deviance(own) + DECISIVE:
+        if fit is not None and not near and _deviance(fit) < _deviance(own) + TELLING_DEVIANCE:
             found.append(fit.frequency)
     return sorted(found)
 
@@ -125,7 +125,7 @@ def _half_rate(time: np.ndarray, peaks: np.ndarray, height: np.ndarray) -> float
 
     Samples may be missing. Lower frequencies are those at which groups of samples return.
     """
-    regular = peaks[(height > REGULAR) & (peaks * np.median(np.diff(time)) > 0.5)]
+    regular = peaks[(height > REGULAR_WINDOW) & (peaks * np.median(np.diff(time)) > 0.5)]
     return float(0.5 * regular[0]) if regular.size else np.inf
 
 
@@ -139,6 +139,6 @@ def _deviance(fit: HarmonicFit) -> float:
     """Return −2·log-likelihood of normal noise, up to a constant, with the penalty of the harmonics (BIC)."""
     channels, samples = fit.residuals.shape
     unknowns = channels * (2 * fit.amplitudes.shape[1] - 1)
-    least = EXACT**2 * np.sum(np.abs(fit.amplitudes) ** 2, axis=1)
+    least = EXACT_RESIDUAL**2 * np.sum(np.abs(fit.amplitudes) ** 2, axis=1)
     power = np.mean(fit.residuals**2, axis=1)
     return float(samples * np.sum(np.log(np.maximum(power, least))) + unknowns * np.log(samples))

@@ -25,7 +25,7 @@ HYSTERESIS = 0.25
 SMALLEST_PERIOD_STEP, SIGNIFICANT_PERIOD_STEP = 1e-3, 8.0
 # Fewest samples of which a frequency is guessed, and fewest in a cycle of the strongest harmonic at a regular rate;
 # aliases that are listed.
-FEWEST_SAMPLES, FEWEST_PER_CYCLE, LISTED_ALIASES = 8, 4.0, 4
+FEWEST_GUESSED, FEWEST_PER_CYCLE, LISTED_ALIASES = 8, 4.0, 4
 # Cycles that are searched for the frequency if there are many samples in each.
 SEARCHED_CYCLES = 50.0
 # Standard error of the phase [cycles] behind a gap with which cycles can be counted: five of them are less than a
@@ -94,7 +94,7 @@ def first_guess(signals: Signals, frequency: float | None, periods: int) -> floa
 def _estimate(signals: Signals) -> float | None:
     """Return a frequency from the longest stretch, or else from spectral lines; refuse one that has aliases."""
     time, values = _longest_stretch(signals)
-    guess = guess_frequency(time, values) if time.size > FEWEST_SAMPLES else None
+    guess = guess_frequency(time, values) if time.size > FEWEST_GUESSED else None
     fast = guess is not None and per_cycle(time, guess) >= SLOW and cycles_of(time, guess) >= MINIMUM_CYCLES
     step = np.diff(time)
     even = bool(step.max() <= USUAL_STEPS * np.median(step))
