@@ -11,6 +11,7 @@ from scipy.special import chdtrc, fdtrc
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.coverage import missing_phases, resolved_harmonics
+from bayesperiodic.data.faults import ROUNDING
 from bayesperiodic.data.groups import CommonFit, fit_groups, leading, within
 from bayesperiodic.data.harmonics import (
     NEGLIGIBLE_PHASE,
@@ -95,10 +96,13 @@ def fold_signals(
         amplitudes = {c: a * np.exp(turn * np.arange(a.size)) for c, a in amplitudes.items()}
     used = {channel: slice(highest + 1) for channel, highest in kept.items()}
     folded = {channel: _fourier.on_grid(amplitudes[channel][part], points) for channel, part in used.items()}
+    error = pace.se * periods if given is None else given[1]
+    error *= error > ROUNDING * fit.frequency
+    walks = given is None and error > 0.0
     return {
         "frequency": fit.frequency * periods,
-        "frequency_se": pace.se * periods if given is None else given[1],
-        "phase_diffusion": (2.0 * np.pi * periods) ** 2 * pace.diffusion * fit.frequency if given is None else 0.0,
+        "frequency_se": error,
+        "phase_diffusion": (2.0 * np.pi * periods) ** 2 * pace.diffusion * fit.frequency * walks,
         "period_drift": -pace.drift,
         "outputs": {channel: folded[channel] for channel in outputs},
         "inputs": {channel: folded[channel] for channel in inputs},
@@ -111,7 +115,7 @@ def fold_signals(
         "harmonics": kept,
         "amplitude_variance": {channel: noise[channel].variance[part] for channel, part in used.items()},
         "amplitude_freedom": {channel: noise[channel].freedom[part] for channel, part in used.items()},
-        "error_slopes": _error_slopes(noise, inputs, kept),
+        "error_slopes": _error_slopes(noise, inputs, kept, amplitudes),
         "periodicity": _periodicity(seen, fit),
         "drift": drift,
         "origin": start,
@@ -362,15 +366,21 @@ def _noise(
 
 
 def _error_slopes(
-    noise: Mapping[str, AmplitudeNoise], inputs: Sequence[str], kept: Mapping[str, int]
+    noise: Mapping[str, AmplitudeNoise],
+    inputs: Sequence[str],
+    kept: Mapping[str, int],
+    amplitudes: Mapping[str, np.ndarray],
 ) -> dict[str, dict[str, np.ndarray]]:
     """Return the regression of the errors of outputs on those of inputs, by input and output, where they correlate.
 
     That none of the harmonics from the first on does is tested by their coherences γ², of which −2(n − 1)·ln(1 − γ²)
     has the distribution χ² with two degrees of freedom for n lines. Slopes are averaged over neighbouring harmonics.
+    Rounding errors of an input cause nothing.
     """
     slopes: dict[str, dict[str, np.ndarray]] = {}
     for name in inputs:
+        if np.abs(noise[name].beside).max(initial=0.0) < ROUNDING * np.abs(amplitudes[name]).max():
+            continue
         for channel in [other for other in noise if other not in inputs]:
             one, two = (noise[c].beside[:, : 1 + min(kept[name], kept[channel])] for c in (name, channel))
             common, weight = np.sum(np.conj(one) * two, axis=0), np.sum(np.abs(one) ** 2, axis=0)
