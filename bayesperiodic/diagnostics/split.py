@@ -16,7 +16,7 @@ from bayesperiodic.estimation.adequacy import holm
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
 
-AMPLITUDE, FREQUENCY = "amplitude", "frequency"
+BY_AMPLITUDE, BY_FREQUENCY = "amplitude", "frequency"
 # Relative difference below which amplitudes and frequencies of experiments are the same.
 SAME = 1e-3
 SPLIT_LEVEL = 0.01
@@ -85,7 +85,7 @@ class SplitCheck(Result):
 
 
 def split_check(
-    problem: Problem, by: str | Mapping[str, str] = AMPLITUDE, *, start: Mapping[str, float] | None = None,
+    problem: Problem, by: str | Mapping[str, str] = BY_AMPLITUDE, *, start: Mapping[str, float] | None = None,
     progress: bool = True,
 ) -> SplitCheck:  # fmt: skip
     """Estimate the parameters from parts of the experiments, and compare their spread with the standard deviations.
@@ -140,8 +140,8 @@ def _parts(problem: Problem, by: str | Mapping[str, str]) -> dict[str, tuple[str
     if len(experiments) < 2:
         raise ValueError(f"problem: must have at least two experiments, got {len(experiments)}; add some.")
     if isinstance(by, str):
-        _checks.one_of("by", by, (AMPLITUDE, FREQUENCY))
-        values = np.array([e.frequency if by == FREQUENCY else amplitude(e) for e in experiments])
+        _checks.one_of("by", by, (BY_AMPLITUDE, BY_FREQUENCY))
+        values = np.array([e.frequency if by == BY_FREQUENCY else amplitude(e) for e in experiments])
         ordered = np.sort(values)
         cuts = [i for i in range(1, len(values)) if ordered[i] > ordered[i - 1] * (1.0 + SAME)]
         if not cuts:
