@@ -16,9 +16,9 @@ from bayesperiodic.estimation.adequacy import holm
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
 
-AMPLITUDE, FREQUENCY = "amplitude", "frequency"
+BY_AMPLITUDE, BY_FREQUENCY = "amplitude", "frequency"
 # Relative difference below which amplitudes and frequencies of experiments are the same.
-SAME = 1e-3
+SAME_VALUE = 1e-3
 SPLIT_LEVEL = 0.01
 AGREES = with_tone("agrees", GOOD)
 WITHIN_ROBUST = with_tone("moves within robust sds", CAUTION)
@@ -85,7 +85,7 @@ class SplitCheck(Result):
 
 
 def split_check(
-    problem: Problem, by: str | Mapping[str, str] = AMPLITUDE, *, start: Mapping[str, float] | None = None,
+    problem: Problem, by: str | Mapping[str, str] = BY_AMPLITUDE, *, start: Mapping[str, float] | None = None,
     progress: bool = True,
 ) -> SplitCheck:  # fmt: skip
     """Estimate the parameters from parts of the experiments, and compare their spread with the standard deviations.
@@ -140,10 +140,10 @@ def _parts(problem: Problem, by: str | Mapping[str, str]) -> dict[str, tuple[str
     if len(experiments) < 2:
         raise ValueError(f"problem: must have at least two experiments, got {len(experiments)}; add some.")
     if isinstance(by, str):
-        _checks.one_of("by", by, (AMPLITUDE, FREQUENCY))
-        values = np.array([e.frequency if by == FREQUENCY else amplitude(e) for e in experiments])
+        _checks.one_of("by", by, (BY_AMPLITUDE, BY_FREQUENCY))
+        values = np.array([e.frequency if by == BY_FREQUENCY else amplitude(e) for e in experiments])
         ordered = np.sort(values)
-        cuts = [i for i in range(1, len(values)) if ordered[i] > ordered[i - 1] * (1.0 + SAME)]
+        cuts = [i for i in range(1, len(values)) if ordered[i] > ordered[i - 1] * (1.0 + SAME_VALUE)]
         if not cuts:
             raise ValueError(
                 f"by: the experiments must differ in their {by}, got {ordered[0]:.6g} in all; give a mapping."

@@ -151,13 +151,13 @@ def misfit(problem: Problem, fit: MapEstimate) -> str:
     """Return why the model is misspecified at an estimate, in words; "" if it is not, or not fitted to the data."""
     if fit.other_orbits or fit.prior_conflict.members:
         return ""
-    if fit.checks is None or (found := fit.checks.misfit) is None:
+    if fit.checks is None or (reason := fit.checks.misfit) is None:
         theta = problem.vector(fit.theta)
         guesses = {name: solution.states for name, solution in fit.solutions.items()}
         here = problem.anchored(theta, guesses).density().linearise(theta)
         noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
-        found = misfit_at(problem, Iterate(theta, here, noise, np.nan))
-    return found and f"{found}; the verdicts take the model for right"
+        reason = misfit_at(problem, Iterate(theta, here, noise, np.nan))
+    return reason and f"{reason}; the verdicts take the model for right"
 
 
 def misfit_at(problem: Problem, estimate: Iterate) -> str:

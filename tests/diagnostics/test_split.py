@@ -11,7 +11,7 @@ TIME = np.arange(64) / 64
 
 
 def problem(gains, seed=1):
-    """Runs of different gains and amplitudes, with noise of 1 %."""
+    """Return runs of different gains and amplitudes, with noise of 1 %."""
     generator, runs = np.random.default_rng(seed), []
     for i, gain in enumerate(gains):
         u = (i + 1.0) * np.cos(2 * np.pi * TIME)

@@ -13,7 +13,7 @@ GAIN = bp.Model(
 
 @pytest.fixture(scope="module")
 def wrong():
-    """A gain fitted to a curve with a third and a fifth harmonic, its estimate and draws."""
+    """Return a gain fitted to a curve with a second harmonic, its estimate and draws."""
     time = np.arange(10 * 64) / 64
     u = np.cos(2 * np.pi * time)
     y = 2.0 * u + 1.0 + 0.3 * np.cos(4 * np.pi * time) + 0.05 * np.random.default_rng(1).standard_normal(time.size)
