@@ -96,9 +96,9 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
         unknowns = 2 * min(HARMONICS, highest) + 1
         cycles = max(cycles, min(int(np.ceil(SLOW_SAMPLES * unknowns / many)), total // (2 * MINIMUM_CYCLES)))
     while True:
-        found, share = _windows_of(time, values, fundamental, duration, total, cycles, min(HARMONICS, highest))
+        result, share = _windows_of(time, values, fundamental, duration, total, cycles, min(HARMONICS, highest))
         if share >= MOST_COVERED or 2 * MINIMUM_CYCLES * cycles > total:
-            return found
+            return result
         cycles *= 2
 
 
@@ -147,8 +147,8 @@ def _windows_of(
     slip = np.zeros(len(values))
     if enough.size and per_cycle(time, fundamental) >= SLOW:
         slip = _slip(scaled, edges[::fine] - edges[0]) / np.median(last[enough] - first[enough])
-    found = Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip)
-    return found, enough.size / np.count_nonzero(some)
+    result = Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip)
+    return result, enough.size / np.count_nonzero(some)
 
 
 def _slip(values: np.ndarray, edges: np.ndarray) -> np.ndarray:
