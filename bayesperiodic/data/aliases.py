@@ -49,14 +49,14 @@ def search_frequency(time: np.ndarray, values: np.ndarray, guess: float | None) 
     height = np.where(slowly | (frequency > highest), 0.0, power[:-1].sum(axis=0))
     peaks = _peaks(height, MINIMUM_CYCLES / np.ptp(time), frequency)[:LARGEST_LINES]
     candidates = [line / k for line in frequency[peaks] for k in DIVISORS] + ([guess] if guess else [])
-    found: dict[float, float] = {}
+    deviances: dict[float, float] = {}
     for candidate in candidates:
         fit = _fitted(time, scaled, candidate, max(int(highest / candidate), 1) if highest < np.inf else None)
         if fit is not None and np.max(fit.variances) < 1.0 - LEAST_EXPLAINED:
-            found[fit.frequency] = _deviance(fit)
-    if not found:
+            deviances[fit.frequency] = _deviance(fit)
+    if not deviances:
         return None
-    near = sorted(f for f, deviance in found.items() if deviance < min(found.values()) + TELLING_DEVIANCE)
+    near = sorted(f for f, deviance in deviances.items() if deviance < min(deviances.values()) + TELLING_DEVIANCE)
     # A multiple that explains as much is the fundamental.
     width = 1.0 / np.ptp(time)
     for factor in reversed(DIVISORS):
@@ -81,17 +81,17 @@ def aliases(time: np.ndarray, values: np.ndarray, frequency: float) -> list[floa
     lines, power = spectral_lines(time, np.ones((1, time.size)))
     peaks, height = _window_peaks(time, lines, power[0])
     highest = _half_rate(time, peaks, height)
-    own = _fitted(time, values, frequency, max(int(highest / frequency), 1) if highest < np.inf else None)
-    if own is None:
+    fitted = _fitted(time, values, frequency, max(int(highest / frequency), 1) if highest < np.inf else None)
+    if fitted is None:
         return []
-    harmonics = own.amplitudes.shape[1] - 1
-    found: list[float] = []
+    harmonics = fitted.amplitudes.shape[1] - 1
+    others: list[float] = []
     for candidate in sorted({abs(rate + sign * frequency) for rate in peaks for sign in (-1, 1)}):
         fit = _fitted(time, values, candidate, harmonics) if candidate * np.ptp(time) > MINIMUM_CYCLES else None
-        near = fit is not None and min(abs(fit.frequency - f) for f in [frequency, *found]) * np.ptp(time) < 1.0
-        if fit is not None and not near and _deviance(fit) < _deviance(own) + TELLING_DEVIANCE:
-            found.append(fit.frequency)
-    return sorted(found)
+        near = fit is not None and min(abs(fit.frequency - f) for f in [frequency, *others]) * np.ptp(time) < 1.0
+        if fit is not None and not near and _deviance(fit) < _deviance(fitted) + TELLING_DEVIANCE:
+            others.append(fit.frequency)
+    return sorted(others)
 
 
 def samples_per_cycle(time: np.ndarray, values: np.ndarray, frequency: float, others: list[float]) -> float:

@@ -301,8 +301,8 @@ def track_frequency(time: np.ndarray, channels: np.ndarray, fundamental: float) 
                 part, values = time[window][used], channels[:, window][:, used]
             else:
                 part, values = time[window], channels[:, window]
-            found = nearby_fit(part, values, fundamental, few)
-            fundamental = fundamental if found is None else found.frequency
+            nearby = nearby_fit(part, values, fundamental, few)
+            fundamental = fundamental if nearby is None else nearby.frequency
         if cycles >= total / 2:
             return fundamental
         cycles = min(2 * cycles, total / 2)

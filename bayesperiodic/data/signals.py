@@ -102,17 +102,17 @@ def _estimate(signals: Signals) -> float | None:
         return guess
     some = _searched(signals.time, guess if fast else None)
     time, values = signals.time[some], signals.values[:, some]
-    found = search_frequency(time, values, guess)
-    if found is None or (fast and even or guess is None) and per_cycle(time, found) >= SLOW:
+    estimate = search_frequency(time, values, guess)
+    if estimate is None or (fast and even or guess is None) and per_cycle(time, estimate) >= SLOW:
         return guess
-    others = aliases(time, values, found)
-    if (many := samples_per_cycle(time, values, found, others)) < FEWEST_PER_CYCLE:
+    others = aliases(time, values, estimate)
+    if (many := samples_per_cycle(time, values, estimate, others)) < FEWEST_PER_CYCLE:
         raise ValueError(
             f"frequency: must be given for {signals.name!r}, in which {many:.3g} samples per cycle do not tell "
-            f"{found:.6g} Hz from {', '.join(f'{f:.6g}' for f in others[:LISTED_ALIASES])} Hz (aliases), got None; "
+            f"{estimate:.6g} Hz from {', '.join(f'{f:.6g}' for f in others[:LISTED_ALIASES])} Hz (aliases), got None; "
             "give it, or sample faster or at irregular times."
         )
-    return found
+    return estimate
 
 
 def _searched(time: np.ndarray, guess: float | None) -> slice:
@@ -193,9 +193,9 @@ def _coherent_part(signals: Signals, fundamental: float) -> tuple[slice, float]:
                 continue
             other = pieces[near]
             frequency, error = known
-            if (own := _measured(time[other], values[:, other], frequency)) is not None:
-                weight = error**2 / (error**2 + own[1] ** 2)
-                frequency += weight * (own[0] - frequency)
+            if (measured := _measured(time[other], values[:, other], frequency)) is not None:
+                weight = error**2 / (error**2 + measured[1] ** 2)
+                frequency += weight * (measured[0] - frequency)
                 error *= np.sqrt(1.0 - weight)
             apart = 0.5 * abs(time[[other.start, other.stop - 1]].sum() - time[[part.start, part.stop - 1]].sum())
             if error * apart > COUNTED:

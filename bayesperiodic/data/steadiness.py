@@ -111,9 +111,9 @@ def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows
         unknowns = 2 * min(HARMONICS, highest) + 1
         cycles = max(cycles, min(int(np.ceil(SLOW_SAMPLES * unknowns / many)), total // (2 * MINIMUM_CYCLES)))
     while True:
-        found, share = _windows_of(time, values, fundamental, duration, total, cycles, min(HARMONICS, highest))
+        result, share = _windows_of(time, values, fundamental, duration, total, cycles, min(HARMONICS, highest))
         if share >= MOST_COVERED or 2 * MINIMUM_CYCLES * cycles > total:
-            return found
+            return result
         cycles *= 2
 
 
@@ -161,10 +161,10 @@ def _windows_of(
     )
     slip = jump = np.zeros(len(values))
     if enough.size and per_cycle(time, fundamental) >= SLOW:
-        samples_of = np.median(last[enough] - first[enough])
-        slip, jump = (size / samples_of for size in _slip(scaled, edges[::fine] - edges[0]))
-    found = Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip, jump)
-    return found, enough.size / np.count_nonzero(some)
+        number = np.median(last[enough] - first[enough])
+        slip, jump = (size / number for size in _slip(scaled, edges[::fine] - edges[0]))
+    result = Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip, jump)
+    return result, enough.size / np.count_nonzero(some)
 
 
 def _slip(values: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
