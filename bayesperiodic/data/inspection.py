@@ -129,7 +129,7 @@ def _steady_of(
         steady = steady_part(every)
     if steady is not None and refined and not some.inputs and steady.level != (0, some.time.size):
         fit, pace = refine_frequency(some.time, some.values, tracked, few)
-        if pace.diffusion:
+        if pace.diffusion and not pace.drifts:
             # A phase that walks at random is no transient.
             aligned = windows(some.time, some.values, fit.frequency).aligned()
             longer = steady_part(aligned)
