@@ -269,7 +269,7 @@ def _steady_of(
     driven = any(group.inputs for group in some)
     if steady is not None and refined and not driven and steady.level != (0, some[0].time.size):
         fit, pace = refine_groups(some, tracked, few, other)
-        if pace.diffusion:
+        if pace.diffusion and not pace.drifts:
             # A phase that walks at random is no transient.
             again = common_windows(some, fit.frequency)
             again = replace(again, all=again.all.aligned())

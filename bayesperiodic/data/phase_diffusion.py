@@ -9,8 +9,8 @@ from scipy.special import softmax
 # Cycles from which a random walk is looked for.
 FEWEST_PHASES = 8
 # Variances of the walk's step that are tried, so many of them, by what they contribute to the variance of the slope
-# relative to the noise of one cycle; and the gain in ln L that shows a walk, with false alarms in 1 to 3 %.
-STEP_RANGE, STEPS_TRIED, GAIN = (1e-1, 1e6), 60, 1.35
+# relative to the noise of one cycle; and the gain in ln L that shows a walk, with false alarms in about 1 %.
+STEP_RANGE, STEPS_TRIED, GAIN = (1e-1, 1e6), 60, 2.0
 
 
 class Diffusion(NamedTuple):

@@ -18,7 +18,7 @@ def phases(cycles: int, step: float, random: np.random.Generator) -> tuple[np.nd
 
 @pytest.mark.parametrize("cycles", [12, 40, 100])
 def test_white_noise_rarely_looks_like_a_random_walk(cycles):
-    """Measured 1 to 3 %; more than 14 of 200 have a probability of 0.2 % at 3 %."""
+    """Measured about 1 %; more than 14 of 200 have a probability of 0.2 % at 3 %."""
     random = np.random.default_rng(cycles)
     found = [phase_diffusion(*phases(cycles, 0.0, random), 1.0) is not None for _ in range(200)]
     assert sum(found) <= 14
