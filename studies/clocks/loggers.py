@@ -26,7 +26,7 @@ def response(frequency: float) -> complex:
 def recording(
     seed: int, ppm: float = 0.0, cycles: int = 120, lost: list[tuple[int, int]] | None = None
 ) -> bp.Recording:
-    """Return force and displacement, 50 samples a cycle, with clocks that differ and without the samples lost by one."""
+    """Return force and displacement, 50 samples a cycle, with two clocks and without samples that one has lost."""
     omega, generator = 2 * np.pi * FREQUENCY, np.random.default_rng(seed)
     time = np.arange(50 * cycles) / 10.0
     x = np.real(response(FREQUENCY) * np.exp(1j * omega * (1 + 1e-6 * ppm) * time))
@@ -73,4 +73,4 @@ def rates(seed: int, count: int) -> dict[str, float]:
         priors = {"c": bp.LogNormal(C, 1.0), "k": bp.LogNormal(K, 0.5)}
         fit = bp.map_estimate(bp.Problem(model, [run], priors=priors, scheme="fourier"), progress=False)
         inside += abs(np.log(fit.theta["c"] / C)) < 1.645 * fit.sd["c"] / fit.theta["c"]
-    return {"coverage of c": inside / count, "data sets": count}
+    return {"coverage of c": float(inside / count), "data sets": count}
