@@ -113,8 +113,10 @@ def _refined(
 
 def next_step(gradient: float, information: float, frequency: float, duration: float) -> float:
     """Return the Gauss-Newton step of a frequency, 0 where it is small compared with the standard error."""
-    step = gradient / information if information > 0.0 else 0.0
-    if abs(step) < max(1e-3 / np.sqrt(information or np.inf), np.finfo(float).eps * frequency):
+    if not information > 0.0:
+        return 0.0
+    step = gradient / information
+    if abs(step) < max(1e-3 / np.sqrt(information), np.finfo(float).eps * frequency):
         return 0.0
     return float(np.clip(step, -0.25 / duration, 0.25 / duration))
 

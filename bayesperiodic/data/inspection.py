@@ -103,9 +103,9 @@ def inspect(
         first = calm[leading(groups)]
         behind, tracked = counted_cycles(first, first_guess(first, frequency, periods), frequency is not None)
         counted = first.time[behind]
+        span = common_span(groups, tracked)
         for group in calm:
             resolved_harmonics(group.time[within(group.time, counted)], tracked, points)
-        span = common_span(groups, tracked)
     except ValueError as error:
         return Inspection(groups, faults, worst_first(findings(None)), reason=str(error))
     total = int(min(cycles_of(group.time[part], tracked) for group, part in zip(groups, span, strict=True)))

@@ -539,9 +539,9 @@ class Recording(Channels):
         ValueError
             For fewer than three cycles, a constant channel, a signal that is not periodic, ``periods="auto"`` without
             frequency and inputs, samples at too few phases, an estimated frequency that has aliases, a frequency
-            that is not that of the recording, more harmonics than the samples resolve, an unknown channel in `harmonics` or
-            `clocks`, a drift beyond the limit, clocks that differ, or samples lost by one of the channels, so far that
-            its phase is wrong by more than 0.05 rad.
+            that is not that of the recording, more harmonics than the samples resolve, an unknown channel in
+            `harmonics` or `clocks`, a drift beyond the limit, clocks that differ, or samples lost by one of the
+            channels, so far that its phase is wrong by more than 0.05 rad.
 
         Warns
         -----

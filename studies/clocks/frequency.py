@@ -43,10 +43,10 @@ def replicate(task: Task) -> dict[str, Any]:
     """Return z and coverage of the parameters, and z of the frequency, from one recording."""
     case, number, seed = task
     line: dict[str, Any] = {"case": case, "number": number, "seed": seed, "source": source()}
-    random, settings = np.random.default_rng([seed, STRIDE + number]), cases()[case]
+    random, (first, *rest) = np.random.default_rng([seed, STRIDE + number]), cases()[case]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return line | (resonance(*settings, random) if len(settings) == 2 else limit_cycle(*settings, random))
+        return line | (resonance(first, rest[0], random) if rest else limit_cycle(first, random))
 
 
 def resonance(quality: float, cycles: float, random: np.random.Generator) -> dict[str, Any]:
@@ -141,7 +141,7 @@ def _rms(values: Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def checks(found: dict[str, Any], band: Sequence[float]) -> list[common.Row]:
+def checks(found: dict[str, Any], band: tuple[float, float]) -> list[common.Row]:
     """Return the coverage of each case against the band of a nominal share."""
     return [
         common.row(f"{case}: 90 % intervals of {name} that contain it", share, *band)

@@ -9,7 +9,7 @@ import argparse
 from scipy import stats
 
 from studies import common
-from studies.clocks import frequency
+from studies.clocks import frequency, loggers, sampling
 
 REPLICATES, QUICK, FALSE_ALARM = 200, 3, 0.01
 # Each part has tasks, replicate, source, summary, checks, table and draw.
@@ -38,6 +38,15 @@ def run(options: argparse.Namespace) -> None:
         figures[name] = part.draw(found[name], band)
         checks += part.checks(found[name], band)
         print("\n" + part.table(found[name]))
+    with watch.part("sampling", "gaps, missing samples, slow sampling"):
+        checks += sampling.coverage(count)
+    with watch.part("loggers", "two clocks, lost samples, two rates"):
+        found |= {"loggers": loggers.loggers(options.seed, count), "rates": loggers.rates(options.seed, count)}
+        alone = found["loggers"]["0 ppm"].get("silent", 0) / count
+        checks.append(common.row("one clock: recordings without an alarm", alone, 0.99, None))
+        checks.append(
+            common.row("two rates: 90 % intervals of c that contain it", found["rates"]["coverage of c"], *band)
+        )
     with watch.part("figures", "drawing"):
         paths = common.save_figures(options.out, figures)
     print("\n" + common.table_of_rows(checks) + "\n")

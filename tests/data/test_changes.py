@@ -88,16 +88,17 @@ def test_drifts_and_steps_are_named_with_their_size(kind, severity, said, signal
     assert finding.bias > 0.5
 
 
-@pytest.mark.parametrize(("at", "severity"), [(3, "serious"), (56, "harmless")])
+@pytest.mark.parametrize("at", [3, 56])
 @pytest.mark.parametrize("lost", [1, 5])
-def test_lost_samples_near_the_ends_are_steps_of_the_phase(at, severity, lost):
-    """Of one channel: before the part used its delay from the drive is wrong there."""
+def test_lost_samples_near_the_ends_are_steps_of_the_phase(at, lost):
+    """Of one channel: which of its delays from the drive is right is not known."""
     check = checked(lambda t: wave(t + lost / PER_CYCLE * (t > at)))
-    (finding,) = [f for f in check.findings if f.kind in ("phase step", "ramp")]
-    assert (finding.kind, finding.severity, finding.channel) == ("phase step", severity, "y")
+    (finding,) = [f for f in check.findings if f.kind == "phase step"]
+    assert finding.severity != "harmless" and finding.channel == "y"
     assert finding.times[0, 0] == pytest.approx(at, abs=1.5)
-    size = float(re.search(r"steps by ([\d.]+)°", str(finding)).group(1))
-    assert size == pytest.approx(360 * lost / PER_CYCLE, rel=0.05)
+    size = float(re.search(r"\(([\d.]+)°", str(finding)).group(1))
+    # By the four cycles beyond it.
+    assert size == pytest.approx(360 * lost / PER_CYCLE, rel=0.2)
 
 
 @pytest.mark.parametrize("size", [0.3, 0.6])

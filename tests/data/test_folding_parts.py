@@ -148,7 +148,7 @@ def test_every_field_of_a_folded_response_of_two_forcing_periods():
         + 0.05 * generator.standard_normal(u.size)
     )
     given = Signals("record", time, ("u", "y"), np.array([u, y]), 1)
-    found = folding.fold_signals([given], 20, 2, 2.5, {"y": 3}, 1.0, None)
+    found = folding.fold_signals([given], 20, 2, (2.5, 0.0), {"y": 3}, 1.0, None)
     basis = design(1.25 * (time - 1.0), 3)
     fitted = np.linalg.lstsq(basis, np.array([u, y]).T, rcond=None)[0].T
     grid = design(np.arange(40) / 40, 3)
@@ -192,12 +192,12 @@ def test_every_field_of_a_folded_response_of_two_forcing_periods():
             {"largest_drift": 1e-9},
             "^recording: must be steady, got 'record', in which the strongest harmonic of 'y' changes by",
         ),
-        ({"frequency": 0.25}, r"^recording: must have at least 3 cycles, got 1.60 cycles in 'record'"),
+        ({"given": (0.25, 0.0)}, r"^recording: must have at least 3 cycles, got 1.60 cycles in 'record'"),
     ],
 )
 def test_arguments_of_a_fold_are_checked(changes, message):
     time = np.arange(16 * 24) / (1.25 * 24)
     y = (1.0 + 0.001 * time) * np.cos(2 * np.pi * 1.25 * time)
-    given = {"samples": 20, "periods": 2, "frequency": 2.5, "harmonics": None, "origin": 0.0, "largest_drift": None}
+    given = {"samples": 20, "periods": 2, "given": (2.5, 0.0), "harmonics": None, "origin": 0.0, "largest_drift": None}
     with pytest.raises(ValueError, match=message):
         folding.fold_signals([Signals("record", time, ("y",), y[None], 0)], **(given | changes))

@@ -58,20 +58,24 @@ def test_exact_periods_are_recovered_at_any_times_that_cover_the_phases(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_amplitudes_are_those_of_least_squares_and_their_variances_those_of_its_covariance(kind):
-    """Variances are estimated from some 30 components of noise: within a factor of 2.5 of the exact ones."""
-    time = sampled(kind)
-    y = wave(time) + 0.1 * np.random.default_rng(0).standard_normal(time.size)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        e = bp.Recording.from_arrays(time, {"x": y}).fold(32, frequency=1.0, harmonics=2)
-    basis = design(time, 2)
+    """Variances are estimated from some 30 components of noise, with a part for changes that may be hidden in it.
+
+    Their median of seven recordings is within a factor of two of the exact ones.
+    """
+    time, basis, ratios = sampled(kind), design(sampled(kind), 2), []
+    for seed in range(7):
+        y = wave(time) + 0.1 * np.random.default_rng(seed).standard_normal(time.size)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            e = bp.Recording.from_arrays(time, {"x": y}).fold(32, frequency=1.0, harmonics=2)
+        covariance = 0.01 * np.linalg.inv(basis.T @ basis)
+        variance = np.r_[covariance[0, 0], np.diag(covariance)[1::2] + np.diag(covariance)[2::2]]
+        ratios.append(e.amplitude_variance["x"][1:] / variance[1:])
+    ratio = np.median(ratios, axis=0)
+    assert np.all((ratio > 0.5) & (ratio < 2.0))
     found = np.linalg.lstsq(basis, y, rcond=None)[0]
     expected = np.r_[found[0], found[1::2] - 1j * found[2::2]]
-    covariance = 0.01 * np.linalg.inv(basis.T @ basis)
-    variance = np.r_[covariance[0, 0], np.diag(covariance)[1::2] + np.diag(covariance)[2::2]]
     assert np.abs(amplitudes(e) - expected).max() < 2.0 * np.sqrt(variance.max())
-    ratio = e.amplitude_variance["x"][1:] / variance[1:]
-    assert np.all((ratio > 0.4) & (ratio < 2.5))
 
 
 def test_in_step_with_the_period_as_many_harmonics_as_phases_determine():
