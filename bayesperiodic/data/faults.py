@@ -198,7 +198,9 @@ def heavy_tails(residuals: np.ndarray, outliers: np.ndarray, predicted: np.ndarr
     if not outliers.size or not scale > 0.0:
         return result
     sizes = distance[distance > TAIL * scale] / (TAIL * scale)
-    between = np.count_nonzero(sizes < FAR / TAIL)
+    # Samples next to each other, as at the end of a part that ramps, are one.
+    place = np.flatnonzero((distance > TAIL * scale) & (distance < FAR * scale))
+    between = np.count_nonzero(np.diff(place, prepend=-residuals.size) > residuals.size // 200)
     chance = float(erfc(TAIL / np.sqrt(2.0))) * residuals.size
     relative = distance[outliers] / (TAIL * scale)
     far = np.flatnonzero(distance > FAR * scale)

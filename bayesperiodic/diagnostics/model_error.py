@@ -85,6 +85,8 @@ def model_errors(problem: Problem, here: Linearisation, noise: np.ndarray) -> pd
     cycles, or a given one, that of the inputs included; if it is unknown, there is only an upper end, for which all of
     the residual may be error of the model. `noise` are parameters of the noise model (noise_names,).
     """
+    if problem.likelihood.correlated:
+        return pd.DataFrame(columns=[*MODEL_ERROR])
     white, likelihood = Whitened(problem, here, noise), problem.likelihood
     experiments = {e.name: e for e in problem.experiments}
     blocks = likelihood.blocks
@@ -154,7 +156,8 @@ def _error(
         parts = variances * left**2
         along = dependent * float(parts.sum()) / max(square, TINY)
         # A few harmonics may hold all of the error, whose noise is known less well than that of all.
-        few = float(parts.sum()) ** 2 / max(float(np.sum(parts**2 / each)), TINY)
+        uncertain = float(np.sum(parts**2 / each))
+        few = float(parts.sum()) ** 2 / uncertain if uncertain > 0.0 else np.inf
         return ErrorPart(
             square, float(variances.sum()), 2.0 * dependent * float(variances @ variances), along, freedom, few
         ).error()

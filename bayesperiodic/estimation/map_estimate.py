@@ -345,6 +345,7 @@ def _describe(
             {e.name: model_inputs(problem, e, best.theta) for e in problem.experiments},
             estimated_inputs(problem, best).sd,
             problem.input_errors,
+            updated_frequencies(problem, best, solutions, covariance),
         ),
         search=Search(
             history,
@@ -356,7 +357,6 @@ def _describe(
         ),
         tied=_tied_slopes(problem, best.theta),
         fingerprint=fingerprint(problem),
-        frequencies=updated_frequencies(problem, best, solutions, covariance),
     )
     return replace(fit, checks=checked(objective, best, uncertain, fit.solutions)) if checks else fit
 

@@ -157,6 +157,7 @@ class TrueInputs(Storable):
     values: dict[str, dict[str, np.ndarray]]
     sd: dict[str, dict[str, np.ndarray]]
     errors: dict[str, InputErrors]
+    frequencies: pd.DataFrame | None = None
 
 
 @dataclass(frozen=True)
@@ -272,13 +273,12 @@ class MapEstimate(Result):
     tied: dict[str, dict[str, float]]
     fingerprint: str
     checks: FitCheck | None = None
-    frequencies: pd.DataFrame | None = None
 
     joint_mode, joint_covariance = _part("joint", "mode"), _part("joint", "covariance")
     noise, noise_prior = _part("noise_estimate", "values"), _part("noise_estimate", "prior")
     independent = _part("noise_estimate", "independent")
     inputs, input_sd = _part("true_inputs", "values"), _part("true_inputs", "sd")
-    input_errors = _part("true_inputs", "errors")
+    input_errors, frequencies = _part("true_inputs", "errors"), _part("true_inputs", "frequencies")
     history, starts, at_ends, other_orbits, other_modes, supports = (
         _part("search", part.name) for part in fields(Search)
     )

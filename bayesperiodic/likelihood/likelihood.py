@@ -154,6 +154,11 @@ class Likelihood:
         """Whether the components of every block are independent and have the same variance."""
         return not self._uneven and not self._dense
 
+    @property
+    def correlated(self) -> bool:
+        """Whether the components of any block are correlated."""
+        return bool(self._dense)
+
     def groups(self) -> list[tuple[tuple[str, ...], list[int]]]:
         """Return the noise parameters that belong together, by name, and the indices of their blocks."""
         together: dict[tuple[str, ...], list[int]] = {}

@@ -159,12 +159,10 @@ def test_failures_are_counted_by_kind():
         (lambda: bp.Problem(LINEAR, [run()], priors=PRIORS, noise=FLAT), "the flat prior"),
         (lambda: bp.Problem(LINEAR, [run()], priors=PRIORS, noise="circulant"), "got 'circulant'"),
         (lambda: linear().with_experiments([masked()]), "got .* with .* points of a mask"),
-        (lambda: bp.Problem(LINEAR, [run()], priors=PRIORS | {"shift": bp.Normal(0.0, 1e-3)}, noise=INVERSE_GAMMA),
-         r"got .* with a delay \(shift\)"),
         (lambda: bp.Problem(bp.models.van_der_pol, [cycle_run()], priors={"mu": bp.LogNormal(1.5, 0.3)},
                             fixed={"omega": 1.0}, noise=INVERSE_GAMMA), "got the autonomous 'van_der_pol'"),
     ],
-    ids=["jeffreys", "flat", "circulant", "mask", "shift", "autonomous"],
+    ids=["jeffreys", "flat", "circulant", "mask", "autonomous"],
 )  # fmt: skip
 def test_error_names_what_cannot_be_simulated(problem, said):
     with pytest.raises(ValueError, match=f"problem: .*{said}"):

@@ -290,7 +290,9 @@ def end(theta, objective, status="converged", others=()):
 
 def test_optima_are_more_than_one_sd_apart_converged_and_on_the_measured_orbits(monkeypatch):
     monkeypatch.setattr(modes, "_credible_images", lambda objective, here: np.empty((0, 1)))
-    curved = SimpleNamespace(hessian_and_gradient=lambda iterate: (np.array([[4.0]]), None))
+    monkeypatch.setattr(modes, "prior_only", lambda problem, theta, hessian: np.zeros(1, dtype=bool))
+    density = SimpleNamespace(problem=None)
+    curved = SimpleNamespace(hessian_and_gradient=lambda iterate: (np.array([[4.0]]), None), density=density)
 
     def found(*ends):
         return [float(one.iterate.theta[0]) for one in modes.with_images(curved, ends, None)]
@@ -309,6 +311,7 @@ def test_optima_are_more_than_one_sd_apart_converged_and_on_the_measured_orbits(
     started = []
     moving = SimpleNamespace(
         hessian_and_gradient=curved.hessian_and_gradient,
+        density=density,
         at=lambda theta, here, noise: started.append(float(theta[0])) or SimpleNamespace(theta=theta),
         anchored=lambda iterate: iterate,
     )

@@ -23,7 +23,7 @@ def fitted(**changes):
         "doubling_shift": {"a": 0.0, "b": np.nan}, "at_ends": (), "theta": {"a": 1.25, "b": 3.0},
         "prior_conflict": SimpleNamespace(text=""), "fvu": {"y": 0.1}, "converged": True, "other_modes": (),
         "undetermined": (), "noise_split": {}, "input_errors": {}, "input_nonlinearity": {"a": 0.29, "b": 0.0},
-        "checks": True, "over_logarithm": {},
+        "checks": True, "over_logarithm": {}, "misspecified": False, "noisy_inputs": False, "_on_frequencies": list,
     }  # fmt: skip
     return SimpleNamespace(**(given | changes))
 

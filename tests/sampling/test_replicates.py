@@ -39,7 +39,8 @@ def test_residual_of_a_replicate_equals_its_simulated_noise(case):
         assert all(np.isfinite(y[0, kept]).all() for y in outputs.values())
         again = replace(e, outputs={channel: np.nan_to_num(y[0]) for channel, y in outputs.items()})
         response = Response(*(part[0] for part in solved.response(e.name)))
-        residuals = type(observation)(again, problem.model, problem.parameter_maps[e.name].delayed).residuals(response)
+        sensors = problem.sensors.parameters(problem.parameter_maps[e.name].delayed)
+        residuals = type(observation)(again, problem.model, sensors).residuals(response)
         for block, found, given in zip(observation.blocks, residuals, own, strict=True):
             if block.channel in e.outputs or block.channel == "scale":
                 assert found == pytest.approx(given[0], abs=1e-9 * np.abs(given).max())
