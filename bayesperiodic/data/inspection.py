@@ -190,7 +190,7 @@ def _describe_faults(
     sound: np.ndarray,
     moving: np.ndarray,
 ) -> None:
-    """Set what `ChannelFaults` tell of a group by the fit of the part used, made anew of sound samples if some are not."""
+    """Set what `ChannelFaults` tell of a group by the fit of the part used, without samples that are not sound."""
     part, amplitudes, residuals = group.part(used), fit.amplitudes, fit.residuals
     here = _inside(sound, used)
     if here.size < part.time.size:
