@@ -24,7 +24,7 @@ ROUNDING_PHASE = 1e-4
 DRIFT_FALSE_ALARM, FEWEST_WINDOWS, FEWEST_ORDERS, MOST_ORDERS = 1e-4, 10, 4, 16
 # Drift of the phase [rad] that a relative change of amplitudes explains, and up to which it is harmless then; curvature
 # of a clock's drift.
-BY_AMPLITUDE, HARMLESS_TURN, CURVED = 2.0, 0.05, 0.1
+TURN_BY_AMPLITUDE, HARMLESS_TURN, CURVED = 2.0, 0.05, 0.1
 # Quantile of the differences of means that are no steps although there may be many, and that of a normal distribution.
 FEW, FEW_TO_SD, MEDIAN_TO_SD = 0.15, 0.189, 1.4826
 # Least part of a drift that changes of the drive's frequency leave.
@@ -200,7 +200,7 @@ def drifts(phases: Phases, used: np.ndarray, steps: Sequence[np.ndarray]) -> Ite
         if size <= limit or abs(turns) <= ROUNDING_PHASE + phases.slip[[0, row]].max():
             continue
         growth = float(np.abs(basis[1] @ phases.sizes[numbers][:, [0, row]]).max())
-        by_amplitude = 2.0 * np.pi * phases.order[row] * size <= BY_AMPLITUDE * growth
+        by_amplitude = 2.0 * np.pi * phases.order[row] * size <= TURN_BY_AMPLITUDE * growth
         if by_amplitude and 2.0 * np.pi * phases.order[row] * abs(turns) < HARMLESS_TURN:
             continue
         steady = not by_amplitude and abs(component[2]) <= CURVED * size + limit

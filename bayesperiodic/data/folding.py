@@ -89,11 +89,7 @@ def fold_signals(
     kept = {c: _last_significant(a, noise[c]) for c, a in amplitudes.items()} | chosen
     outputs = [channel for channel in amplitudes if channel not in inputs]
     if origin == CROSSING:
-        # The first time ≥ 0 at which the fundamental of the first output crosses zero upwards.
-        phase = np.angle(amplitudes[outputs[0]][1]) / (2 * np.pi)
-        start = float((-0.25 - phase) % 1.0 / fit.frequency)
-        turn = 2j * np.pi * fit.frequency * start
-        amplitudes = {c: a * np.exp(turn * np.arange(a.size)) for c, a in amplitudes.items()}
+        start, amplitudes = _from_crossing(amplitudes, outputs[0], fit.frequency)
     used = {channel: slice(highest + 1) for channel, highest in kept.items()}
     folded = {channel: _fourier.on_grid(amplitudes[channel][part], points) for channel, part in used.items()}
     error = pace.se * periods if given is None else given[1]
@@ -124,6 +120,16 @@ def fold_signals(
         "findings": seen.findings,
         "clocks": others,
     }
+
+
+def _from_crossing(
+    amplitudes: dict[str, np.ndarray], output: str, frequency: float
+) -> tuple[float, dict[str, np.ndarray]]:
+    """Return the first time ≥ 0 at which the fundamental of an output crosses zero upwards, and amplitudes from it."""
+    phase = np.angle(amplitudes[output][1]) / (2 * np.pi)
+    start = float((-0.25 - phase) % 1.0 / frequency)
+    turn = 2j * np.pi * frequency * start
+    return start, {c: a * np.exp(turn * np.arange(a.size)) for c, a in amplitudes.items()}
 
 
 def _by_channel(parts: list[Signals], fit: CommonFit) -> tuple[dict[str, np.ndarray], dict[str, int]]:

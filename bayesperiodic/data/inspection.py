@@ -80,37 +80,22 @@ def inspect(
     """
     faults = [[signal_faults(v, drive=i < group.inputs) for i, v in enumerate(group.values)] for group in groups]
 
-    def findings(rate: float | None, limits: Iterable[int] = (), used: Iterable[slice] = ()) -> list[Finding]:
-        limits, used = [*limits] or [0] * len(groups), [*used] or [slice(0, group.time.size) for group in groups]
-        every: list[Finding] = []
-        for group, fault, limit, part in zip(groups, faults, limits, used, strict=True):
-            for c, v, f in zip(group.channels, group.values, fault, strict=True):
-                every += sample_findings(c, group.time, v, f, rate, limit, part)
-        return every + _gaps(groups)
+    def stopped(reason: str, rate: float | None = None, total: int = 0) -> Inspection:
+        return Inspection(groups, faults, _worst_first(_findings(groups, faults, rate)), total, reason=reason)
 
-    def worst_first(some: list[Finding]) -> tuple[Finding, ...]:
-        return tuple(sorted(some, key=lambda finding: -SEVERITIES.index(finding.severity)))
-
-    name = groups[0].name
     if any(fault.wrap for group in faults for fault in group):
-        wraps = worst_first(findings(None))
-        return Inspection(groups, faults, wraps, reason=_wrapped(name, wraps))
+        wraps = _worst_first(_findings(groups, faults, None))
+        return Inspection(groups, faults, wraps, reason=_wrapped(groups[0].name, wraps))
     moving = [_moving(group, fault) for group, fault in zip(groups, faults, strict=True)]
     try:
-        if not any(group.channels for group in groups):
-            raise ValueError(f"recording: must have a channel that varies, got {name!r} without one.")
-        calm = [_calm(*each) for each in zip(groups, faults, moving, strict=True)]
+        calm = _calm_groups(groups, faults, moving)
         first = calm[leading(groups)]
-        behind, tracked = counted_cycles(first, first_guess(first, frequency, periods), frequency is not None)
-        counted = first.time[behind]
-        span = common_span(groups, tracked)
-        for group in calm:
-            resolved_harmonics(group.time[within(group.time, counted)], tracked, points)
+        behind, tracked, span = _counted(groups, calm, periods, frequency, points)
     except ValueError as error:
-        return Inspection(groups, faults, worst_first(findings(None)), reason=str(error))
+        return stopped(str(error))
     total = int(min(cycles_of(group.time[part], tracked) for group, part in zip(groups, span, strict=True)))
     # Without the parts behind gaps over which the cycles cannot be counted.
-    among = [within(group.time, counted) for group in calm]
+    among = [within(group.time, first.time[behind]) for group in calm]
     calm = [group.part(part) for group, part in zip(calm, among, strict=True)]
     moving = [these[part] for these, part in zip(moving, among, strict=True)]
     sound = [_sound(*each, tracked, points) for each in zip(groups, calm, faults, moving, strict=True)]
@@ -120,9 +105,7 @@ def inspect(
     refined = frequency is None
     every, steady, tracked = _steady_of(some, tracked, points, refined, refined and not whole, other)
     if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
-        return Inspection(
-            groups, faults, worst_first(findings(tracked)), total, reason=_unsteady(groups, every.all, tracked)
-        )
+        return stopped(_unsteady(groups, every.all, tracked), tracked, total)
     used = [
         slice(int(these[part.start]), int(these[part.stop - 1]) + 1)
         for these, part in zip(sound, every.samples(steady.part), strict=True)
@@ -132,26 +115,17 @@ def inspect(
     try:
         highest = [resolved_harmonics(part.time, tracked, points, asked) for part in parts]
     except ValueError as error:
-        return Inspection(groups, faults, worst_first(findings(tracked)), total, reason=str(error))
+        return stopped(str(error), tracked, total)
     determined = [determined_harmonics(part.time, tracked, limit) for part, limit in zip(parts, highest, strict=True)]
     limits, inflation = [limit for limit, _ in determined], [factors for _, factors in determined]
     fit, pace = refine_groups(parts, tracked, limits, other)
     if np.ptp(parts[0].time) * fit.frequency < MINIMUM_CYCLES - 1:
-        return Inspection(
-            groups, faults, worst_first(findings(tracked)), total, reason=_unsteady(groups, every.all, tracked)
-        )
+        return stopped(_unsteady(groups, every.all, tracked), tracked, total)
     if lost := next(filter(None, map(undetermined, parts, fit.each, highest)), ""):
-        return Inspection(groups, faults, worst_first(findings(tracked)), total, reason=lost)
-    for i, (group, part) in enumerate(zip(groups, used, strict=True)):
-        amplitudes, residuals = fit.each[i].amplitudes, fit.each[i].residuals
-        here = _inside(sound[i], part)
-        if here.size < parts[i].time.size:
-            near = fit_harmonics(group.time[here], group.values[:, here], fit.frequency, limits[i])
-            amplitudes = near.amplitudes
-            residuals = parts[i].values - _fourier.at_times(amplitudes, fit.frequency * parts[i].time)
-        _set_outliers(faults[i], parts[i], residuals, fit.frequency, part, moving[i])
-        describe(faults[i], parts[i], HarmonicFit(fit.frequency, amplitudes, residuals), part.start)
-    seen = findings(fit.frequency, limits, used)
+        return stopped(lost, tracked, total)
+    for i, part in enumerate(used):
+        _describe_faults(faults[i], groups[i], part, fit.each[i], limits[i], sound[i], moving[i])
+    seen = _findings(groups, faults, fit.frequency, limits, used)
     channels = [channel for group in groups for channel in group.channels]
     seen += cycle_findings(channels, groups[0].time, outer, steady, fit.frequency, total, _ends(groups))
     if frequency is None:
@@ -161,8 +135,69 @@ def inspect(
     of_clocks, drifts = _clock_findings(groups, every, some[0].time, used[0], fit.frequency, total, varies)
     sizes = every.all.apart().sizes
     return Inspection(
-        groups, faults, worst_first(seen + of_clocks), total, steady, used, sizes, fit, pace, limits, inflation, drifts
+        groups, faults, _worst_first(seen + of_clocks), total, steady, used, sizes, fit, pace, limits, inflation, drifts
     )
+
+
+def _findings(
+    groups: list[Signals],
+    faults: list[list[ChannelFaults]],
+    rate: float | None,
+    limits: Iterable[int] = (),
+    used: Iterable[slice] = (),
+) -> list[Finding]:
+    """Return the findings of samples and times, at a frequency with the highest harmonics and the parts used."""
+    limits, used = [*limits] or [0] * len(groups), [*used] or [slice(0, group.time.size) for group in groups]
+    every: list[Finding] = []
+    for group, fault, limit, part in zip(groups, faults, limits, used, strict=True):
+        for c, v, f in zip(group.channels, group.values, fault, strict=True):
+            every += sample_findings(c, group.time, v, f, rate, limit, part)
+    return every + _gaps(groups)
+
+
+def _worst_first(some: list[Finding]) -> tuple[Finding, ...]:
+    return tuple(sorted(some, key=lambda finding: -SEVERITIES.index(finding.severity)))
+
+
+def _calm_groups(groups: list[Signals], faults: list[list[ChannelFaults]], moving: list[np.ndarray]) -> list[Signals]:
+    """Return what `_calm` does of each group; raise a ValueError if no channel varies."""
+    if not any(group.channels for group in groups):
+        raise ValueError(f"recording: must have a channel that varies, got {groups[0].name!r} without one.")
+    return [_calm(*each) for each in zip(groups, faults, moving, strict=True)]
+
+
+def _counted(
+    groups: list[Signals], calm: list[Signals], periods: int, frequency: float | None, points: int
+) -> tuple[slice, float, list[slice]]:
+    """Return samples of the leading group whose cycles can be counted, at which frequency, and the time in common.
+
+    Raise a ValueError if the cycles cannot be counted, or the samples resolve no harmonic.
+    """
+    first = calm[leading(groups)]
+    behind, tracked = counted_cycles(first, first_guess(first, frequency, periods), frequency is not None)
+    span = common_span(groups, tracked)
+    for group in calm:
+        resolved_harmonics(group.time[within(group.time, first.time[behind])], tracked, points)
+    return behind, tracked, span
+
+
+def _describe_faults(
+    faults: list[ChannelFaults],
+    group: Signals,
+    used: slice,
+    fit: HarmonicFit,
+    limit: int,
+    sound: np.ndarray,
+    moving: np.ndarray,
+) -> None:
+    """Set what `ChannelFaults` tell of a group by the fit of the part used, without samples that are not sound."""
+    part, amplitudes, residuals = group.part(used), fit.amplitudes, fit.residuals
+    here = _inside(sound, used)
+    if here.size < part.time.size:
+        amplitudes = fit_harmonics(group.time[here], group.values[:, here], fit.frequency, limit).amplitudes
+        residuals = part.values - _fourier.at_times(amplitudes, fit.frequency * part.time)
+    _set_outliers(faults, part, residuals, fit.frequency, used, moving)
+    describe(faults, part, HarmonicFit(fit.frequency, amplitudes, residuals), used.start)
 
 
 def _clock_findings(

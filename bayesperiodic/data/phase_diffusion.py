@@ -10,7 +10,7 @@ from scipy.special import softmax
 FEWEST_PHASES = 8
 # Variances of the walk's step that are tried, so many of them, by what they contribute to the variance of the slope
 # relative to the noise of one cycle; and the gain in ln L that shows a walk, with false alarms in about 1 %.
-STEP_RANGE, STEPS_TRIED, GAIN = (1e-1, 1e6), 60, 2.0
+STEP_RANGE, STEPS_TRIED, LEAST_GAIN = (1e-1, 1e6), 60, 2.0
 
 
 class Diffusion(NamedTuple):
@@ -48,7 +48,7 @@ def phase_diffusion(phase: np.ndarray, basis: np.ndarray, least: float) -> Diffu
     noise = np.stack([np.maximum(square / freedom, least), np.full(ratios.size, least)])
     logarithm = freedom * np.log(noise) + square / noise + np.sum(np.log(size), axis=1) + np.linalg.slogdet(gram)[1]
     gain = -0.5 * (logarithm - logarithm[0, 0])[:, 1:]
-    if gain.max() < GAIN:
+    if gain.max() < LEAST_GAIN:
         return None
     share = softmax(gain)
     step = float(np.sum(share * noise[:, 1:] * ratios[1:]))

@@ -15,7 +15,7 @@ FIRST_SHARES, MOST_SEARCHES = (0.5, 0.35, 0.2, 0.1, 0.05), 30
 # Error of the mean period relative to its standard deviation below which a series is exact.
 EXACT_SERIES = 1e-3
 # Rounding errors relative to the largest value.
-ROUNDED = 1e-9
+ROUNDED_VALUES = 1e-9
 # Difference of χ² by which the saturated series is better than any other one, and standard deviations of a χ² that
 # a good model exceeds it by.
 CLEARLY_SATURATED, GOODNESS = 25.0, 4.0
@@ -96,7 +96,7 @@ def means_of(bins: PhaseBins, residuals: np.ndarray, amplitudes: np.ndarray, ste
     best = int(np.argmin(score))
     rest = values - _fourier.at_times(amplitudes[None, : best + 1], phase)[0]
     misfit = float(weights @ rest**2) + (2.0 * best + 1.0) * np.log(weights.size)
-    error = float(np.sqrt(max(variance, (ROUNDED * float(np.abs(values).max())) ** 2) / residuals.size))
+    error = float(np.sqrt(max(variance, (ROUNDED_VALUES * float(np.abs(values).max())) ** 2) / residuals.size))
     return Means(phase, values, weights, error, best, misfit)
 
 

@@ -17,7 +17,7 @@ from bayesperiodic.likelihood.block import Block
 
 MODEL_ERROR = ("model_error", "model_error_low", "model_error_high")
 # Probability beyond each end of the interval.
-TAIL = 0.05
+TAIL_PROBABILITY = 0.05
 # Values tried of a noise variance that is itself estimated.
 NOISE_SCALES = 25
 
@@ -62,8 +62,8 @@ class ErrorPart(NamedTuple):
         most = max(self.square, self.noise)
         return (
             max(self.square - self.noise, 0.0),
-            _root(lambda error: self.below(error, self.square) - (1.0 - TAIL), self.square),
-            _root(lambda error: self.below(error, most) - TAIL, most),
+            _root(lambda error: self.below(error, self.square) - (1.0 - TAIL_PROBABILITY), self.square),
+            _root(lambda error: self.below(error, most) - TAIL_PROBABILITY, most),
         )
 
 
@@ -162,7 +162,7 @@ def _error(
             square, float(variances.sum()), 2.0 * dependent * float(variances @ variances), along, freedom, few
         ).error()
     values = min(block.count, block.size) - float(np.sum(basis**2))
-    return np.nan, 0.0, square * values / stats.chi2.ppf(TAIL, values) if values >= 1.0 else np.inf
+    return np.nan, 0.0, square * values / stats.chi2.ppf(TAIL_PROBABILITY, values) if values >= 1.0 else np.inf
 
 
 def _noise_variances(

@@ -18,7 +18,7 @@ from bayesperiodic.estimation.result import MapEstimate
 
 BY_AMPLITUDE, BY_FREQUENCY = "amplitude", "frequency"
 # Relative difference below which amplitudes and frequencies of experiments are the same.
-SAME_VALUE = 1e-3
+SAME_CONDITION = 1e-3
 SPLIT_LEVEL = 0.01
 AGREES = with_tone("agrees", GOOD)
 WITHIN_ROBUST = with_tone("moves within robust sds", CAUTION)
@@ -143,7 +143,7 @@ def _parts(problem: Problem, by: str | Mapping[str, str]) -> dict[str, tuple[str
         _checks.one_of("by", by, (BY_AMPLITUDE, BY_FREQUENCY))
         values = np.array([e.frequency if by == BY_FREQUENCY else amplitude(e) for e in experiments])
         ordered = np.sort(values)
-        cuts = [i for i in range(1, len(values)) if ordered[i] > ordered[i - 1] * (1.0 + SAME_VALUE)]
+        cuts = [i for i in range(1, len(values)) if ordered[i] > ordered[i - 1] * (1.0 + SAME_CONDITION)]
         if not cuts:
             raise ValueError(
                 f"by: the experiments must differ in their {by}, got {ordered[0]:.6g} in all; give a mapping."

@@ -68,8 +68,8 @@ def robust_covariance(
     if not np.isfinite(information).all():
         return np.full_like(covariance, np.nan)
     free = np.flatnonzero(~held) if held is not None else np.arange(len(information))
-    fitted, own = [s[free] for s in changes], information[np.ix_(free, free)]
-    variances = residual_variances(likelihood, fitted, residuals, estimate.noise, own)
+    fitted, of_free = [s[free] for s in changes], information[np.ix_(free, free)]
+    variances = residual_variances(likelihood, fitted, residuals, estimate.noise, of_free)
     middle = prior + sum((s * variance) @ s.T for s, variance in zip(changes, variances, strict=True))
     return covariance @ middle @ covariance
 

@@ -110,7 +110,7 @@ def _gradients(problem: Description, theta: np.ndarray, mode: Iterate) -> dict[s
 
 SHOWN_PART = 0.05
 LARGEST_EXPONENT = 4
-ROUNDED = 0.06
+ROUNDED_RATIO = 0.06
 
 
 def reduced(directions: np.ndarray) -> np.ndarray:
@@ -136,7 +136,7 @@ def exponents(direction: np.ndarray) -> list[Fraction] | None:
         ]
         errors = [abs(float(f) - v / unit) for f, v in zip(fractions, direction, strict=True)]
         largest, lost = max(abs(f) for f in fractions), any(not f for f, s in zip(fractions, shown, strict=True) if s)
-        if largest <= LARGEST_EXPONENT and not lost and max(errors) < ROUNDED * max(1.0, float(largest)):
+        if largest <= LARGEST_EXPONENT and not lost and max(errors) < ROUNDED_RATIO * max(1.0, float(largest)):
             sign = 1 if next(f for f in fractions if f) > 0 else -1
             return [sign * f for f in fractions]
     return None
@@ -191,7 +191,7 @@ def _product(name: str, ratio: Fraction, other: str, *, first: bool) -> str:
 
 
 def _sum(name: str, ratio: float, other: str) -> str:
-    scale = "" if abs(abs(ratio) - 1.0) < ROUNDED else f"{abs(ratio):.3g}*"
+    scale = "" if abs(abs(ratio) - 1.0) < ROUNDED_RATIO else f"{abs(ratio):.3g}*"
     return f"{name} {'+' if ratio > 0 else '-'} {scale}{other}"
 
 

@@ -3,17 +3,16 @@
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import stdtr, stdtrit
 
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse_all
 from bayesperiodic._io import Result, Storable
 from bayesperiodic.estimation.conflict import PriorConflict
+from bayesperiodic.estimation.intervals import carried_covariance, shortest_interval
 from bayesperiodic.estimation.laplace import JointLaplace
 from bayesperiodic.estimation.modes import Mode, notable
 from bayesperiodic.likelihood.input_noise import InputErrors
@@ -385,7 +384,7 @@ class MapEstimate(Result):
             if not np.isfinite(sd):
                 result[name] = (low, high) if sd == np.inf else (np.nan, np.nan)
                 continue
-            ends = _shortest(freedom, probability, (low - value) / sd, (high - value) / sd)
+            ends = shortest_interval(freedom, probability, (low - value) / sd, (high - value) / sd)
             result[name] = max(value + sd * ends[0], low), min(value + sd * ends[1], high)
         return result
 
@@ -435,7 +434,7 @@ class MapEstimate(Result):
                     f"expressions[{name!r}]: must be finite at the estimate, got {value} for {quantities[name].text!r}."
                 )
         gradients = [self._gradient(quantity, values, named) for quantity in quantities.values()]
-        covariance = _carried(self.covariance.to_numpy(), gradients)
+        covariance = carried_covariance(self.covariance.to_numpy(), gradients)
         with np.errstate(invalid="ignore"):
             sd = np.sqrt(np.diag(covariance))
         table = pd.DataFrame({"value": list(at.values()), "sd": sd}, index=list(at))
@@ -572,19 +571,6 @@ class MapEstimate(Result):
         return "\n".join(lines)
 
 
-def _shortest(freedom: float, probability: float, low: float, high: float) -> tuple[float, float]:
-    """Return the shortest interval of Student's t between two ends, low ≤ 0 ≤ high."""
-    below, inside = float(stdtr(freedom, low)), probability
-    if low > -np.inf or high < np.inf:
-        inside *= float(stdtr(freedom, high)) - below
-    half = float(stdtrit(freedom, 0.5 + 0.5 * inside))
-    if half <= min(-low, high):
-        return -half, half
-    if -low <= high:
-        return low, float(stdtrit(freedom, below + inside))
-    return -_shortest(freedom, probability, -high, -low)[1], high
-
-
 def sds(covariance: pd.DataFrame) -> dict[str, float]:
     """Return the roots of the diagonal of a covariance."""
     with np.errstate(invalid="ignore"):
@@ -600,12 +586,3 @@ def orbit_advice(fit: MapEstimate) -> str:
 def written(theta: dict[str, float]) -> str:
     """Return the names and values of parameters, as in messages."""
     return ", ".join(f"{name} = {value:.6g}" for name, value in theta.items())
-
-
-def _carried(matrix: np.ndarray, gradients: list[np.ndarray]) -> np.ndarray:
-    """Return the covariance of quantities with these gradients; parameters of gradient 0 may have an infinite sd."""
-    result = np.zeros((len(gradients), len(gradients)))
-    with np.errstate(invalid="ignore", over="ignore"):
-        for (i, a), (j, b) in product(enumerate(gradients), repeat=2):
-            result[i, j] = a[a != 0.0] @ matrix[np.ix_(a != 0.0, b != 0.0)] @ b[b != 0.0]
-    return result

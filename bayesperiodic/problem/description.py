@@ -8,8 +8,7 @@ import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic.data.experiment import DATA, Experiment
-from bayesperiodic.data.recording import Recording
+from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.frequency_error import FrequencyError
 from bayesperiodic.likelihood.input_noise import (
     EXACT,
@@ -33,6 +32,7 @@ from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.priors.joint import JointPrior
 from bayesperiodic.priors.single import Uniform
+from bayesperiodic.problem.arguments import checked_experiments, checked_local, fixed_values, values_by_name
 from bayesperiodic.problem.parameters import (
     SHIFT,
     ParameterMap,
@@ -71,7 +71,7 @@ class Description:
             raise ValueError(f"model: must be a Model, got {_checks.shortened(model)}.")
         if not isinstance(priors, Mapping):
             raise ValueError(f"priors: must be a mapping of names to priors, got {priors!r}.")
-        self.noise, self.experiments = as_noise(noise), _checked_experiments(model, experiments)
+        self.noise, self.experiments = as_noise(noise), checked_experiments(model, experiments)
         local = local if isinstance(local, str) else tuple(local)
         self.input_noise = checked(input_noise, model.inputs, self.experiments)
         self._settings: dict[str, Any] = {
@@ -100,8 +100,8 @@ class Description:
         self.channels, runs = self.sensors.channels, [e.name for e in self.experiments]
         tied, every = dict(tied or {}), (*model.parameters, *self.sensors.names, SHIFT)
         priors, fixed = self.sensors.with_entries(priors, fixed or {})
-        self.local = _checked_local(local, every, priors, tied)
-        self.fixed = {n: _constant(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
+        self.local = checked_local(local, every, priors, tied)
+        self.fixed = {n: fixed_values(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
         given = expand_priors(priors, self.local, runs, self.fixed) | self._free_phases(priors, fixed, tied)
         self.joint_prior = JointPrior.of(given, free_names(every[:-1], self.local, runs))
         self.names = self.joint_prior.names
@@ -401,7 +401,7 @@ class Description:
         ValueError
             For unknown or missing names, or another last axis.
         """
-        return _values("theta", theta, self.names)
+        return values_by_name("theta", theta, self.names)
 
     def noise_values(self, variances: Mapping[str, Any] | np.ndarray) -> np.ndarray:
         """Return the noise parameters as an array from a mapping or an array.
@@ -426,7 +426,7 @@ class Description:
             longer = {f"variance[{name}]": name for name in variances}
             renamed = {long if long in names else short: variances[short] for long, short in longer.items()}
             variances = {**self.likelihood.fixed, **renamed}
-        return _values("variances", variances, names)
+        return values_by_name("variances", variances, names)
 
     def log_prior(self, theta: Mapping[str, float] | np.ndarray) -> np.ndarray:
         """Return Σ ln p(θ_α).
@@ -563,81 +563,3 @@ def written_out(problem: Description) -> dict[str, Any]:
         "model": model, "priors": problem.priors, "fixed": problem.fixed | problem.likelihood.fixed,
         "local": problem.local, "input_noise": EXACT if problem.input_noise == JOINT else problem.input_noise,
     }  # fmt: skip
-
-
-def _values(argument: str, given: Any, names: tuple[str, ...]) -> np.ndarray:
-    if isinstance(given, Mapping):
-        _checks.same_names(argument, given, names)
-        given = np.stack(np.broadcast_arrays(*(_checks.real_array(argument, given[name]) for name in names)), -1)
-    values = _checks.real_array(argument, given)
-    if values.shape[-1:] != (len(names),):
-        raise ValueError(f"{argument}: last axis must be {list(names)}, got shape {values.shape}.")
-    return values
-
-
-def _checked_local(
-    local: Iterable[str], every: tuple[str, ...], priors: Any, tied: Mapping[str, str]
-) -> tuple[str, ...]:
-    if isinstance(local, str):
-        raise ValueError(f"local: must be a sequence of names, got {local!r}. Give [{local!r}].")
-    names = tuple(local)
-    for name in names:
-        _checks.one_of("local", name, every)
-        if name in tied:
-            raise ValueError(f"local: {name!r} is tied; it follows what it is tied to, so leave it out.")
-    for key in priors:
-        for name in key if isinstance(key, tuple) else ():
-            if name in names:
-                raise ValueError(
-                    f"priors[{key!r}]: {name!r} is local; a joint prior needs the names of single experiments, such as "
-                    f"'{name}[run]'."
-                )
-    return names if SHIFT in names else (*names, SHIFT)
-
-
-def _constant(name: str, given: Any, runs: list[str], local: bool) -> dict[str, float]:
-    """Return the value of a fixed parameter in each experiment; a local one may be fixed in some of them."""
-    if not isinstance(given, Mapping):
-        return dict.fromkeys(runs, _checks.finite_number(f"fixed[{name!r}]", given))
-    for run in given:
-        _checks.one_of(f"fixed[{name!r}]", run, runs)
-    if not local:
-        _checks.same_names(f"fixed[{name!r}]", given, runs)
-    return {run: _checks.finite_number(f"fixed[{name!r}][{run!r}]", given[run]) for run in runs if run in given}
-
-
-def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tuple[Experiment, ...]:
-    if isinstance(experiments, Experiment):
-        raise ValueError(
-            f"experiments: must be a sequence, got {experiments.name!r}. Give a list of one, [experiment]."
-        )
-    result = tuple(experiments)
-    for e in result:
-        if isinstance(e, Recording):
-            raise ValueError(f"experiments: must be experiments, got the recording {e.name!r}. Fold it, see fold().")
-        if not isinstance(e, Experiment):
-            raise ValueError(f"experiments: must each be an Experiment, got {e!r}.")
-    if not result:
-        raise ValueError("experiments: must have at least one experiment, got ().")
-    names = [experiment.name for experiment in result]
-    if len(set(names)) < len(names):
-        raise ValueError(f"experiments: names must differ, got {names}. Name them with fold(name=…).")
-    for e in result:
-        _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
-        if not e.outputs:
-            raise ValueError(f"outputs of experiment {e.name!r}: must have at least one channel, got {{}}.")
-        for channel in e.outputs:
-            _checks.one_of(f"outputs of experiment {e.name!r}", channel, model.outputs)
-        if e.guess == DATA and model.autonomous:
-            raise ValueError(
-                f"guess of experiment {e.name!r}: must be states for {model.name!r}, which is autonomous, got {DATA!r}."
-            )
-        if e.guess and not isinstance(e.guess, str):
-            _checks.same_names(f"guess of experiment {e.name!r}", e.guess, model.states)
-        if model.autonomous and not e.frequency_se > 0.0:
-            raise ValueError(
-                f"experiment {e.name!r}: frequency_se must be > 0, got {e.frequency_se:g}; {model.name!r} is "
-                "autonomous, so that its measured frequency is data. Fold without `frequency`, which is then "
-                "estimated with its error, or set Experiment(…, frequency_se=…)."
-            )
-    return result

@@ -6,7 +6,7 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 
 import bayesperiodic as bp
-from bayesperiodic.estimation.result import _shortest
+from bayesperiodic.estimation.intervals import shortest_interval
 from tests.known import LINEAR, linear_experiment
 
 TRUTH = [900.0, 40.0, 25.0]
@@ -26,7 +26,7 @@ def test_an_interval_is_the_shortest_of_students_t_restricted_to_the_support(fre
     first, last = t.cdf(low) + 1e-12, t.cdf(high) - mass - 1e-12
     best = minimize_scalar(length, bounds=(first, last), method="bounded", options={"xatol": 1e-10}).x
     best = min((first, best, last), key=length)
-    found = _shortest(freedom, 0.9, low, high)
+    found = shortest_interval(freedom, 0.9, low, high)
     assert found == pytest.approx((t.ppf(best), upper(best)), abs=2e-4)
     assert t.cdf(found[1]) - t.cdf(found[0]) == pytest.approx(mass) and low <= found[0] < found[1] <= high
 

@@ -1,0 +1,93 @@
+"""Checked arguments of a problem: experiments, local and fixed parameters, and values by name."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesperiodic import _checks
+from bayesperiodic.data.experiment import DATA, Experiment
+from bayesperiodic.data.recording import Recording
+from bayesperiodic.models.model import Model
+from bayesperiodic.models.sensed import SHIFT
+
+
+def values_by_name(argument: str, given: Any, names: tuple[str, ...]) -> np.ndarray:
+    """Return the values (…, names) of an argument that is a mapping or such an array; raise a ValueError otherwise."""
+    if isinstance(given, Mapping):
+        _checks.same_names(argument, given, names)
+        given = np.stack(np.broadcast_arrays(*(_checks.real_array(argument, given[name]) for name in names)), -1)
+    values = _checks.real_array(argument, given)
+    if values.shape[-1:] != (len(names),):
+        raise ValueError(f"{argument}: last axis must be {list(names)}, got shape {values.shape}.")
+    return values
+
+
+def checked_local(
+    local: Iterable[str], every: tuple[str, ...], priors: Any, tied: Mapping[str, str]
+) -> tuple[str, ...]:
+    """Return the names of local parameters, the delay of all outputs included; raise a ValueError unless they fit."""
+    if isinstance(local, str):
+        raise ValueError(f"local: must be a sequence of names, got {local!r}. Give [{local!r}].")
+    names = tuple(local)
+    for name in names:
+        _checks.one_of("local", name, every)
+        if name in tied:
+            raise ValueError(f"local: {name!r} is tied; it follows what it is tied to, so leave it out.")
+    for key in priors:
+        for name in key if isinstance(key, tuple) else ():
+            if name in names:
+                raise ValueError(
+                    f"priors[{key!r}]: {name!r} is local; a joint prior needs the names of single experiments, such as "
+                    f"'{name}[run]'."
+                )
+    return names if SHIFT in names else (*names, SHIFT)
+
+
+def fixed_values(name: str, given: Any, runs: list[str], local: bool) -> dict[str, float]:
+    """Return the value of a fixed parameter in each experiment; a local one may be fixed in some of them."""
+    if not isinstance(given, Mapping):
+        return dict.fromkeys(runs, _checks.finite_number(f"fixed[{name!r}]", given))
+    for run in given:
+        _checks.one_of(f"fixed[{name!r}]", run, runs)
+    if not local:
+        _checks.same_names(f"fixed[{name!r}]", given, runs)
+    return {run: _checks.finite_number(f"fixed[{name!r}][{run!r}]", given[run]) for run in runs if run in given}
+
+
+def checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tuple[Experiment, ...]:
+    """Return the experiments; raise a ValueError unless they are experiments with signals that the model has."""
+    if isinstance(experiments, Experiment):
+        raise ValueError(
+            f"experiments: must be a sequence, got {experiments.name!r}. Give a list of one, [experiment]."
+        )
+    result = tuple(experiments)
+    for e in result:
+        if isinstance(e, Recording):
+            raise ValueError(f"experiments: must be experiments, got the recording {e.name!r}. Fold it, see fold().")
+        if not isinstance(e, Experiment):
+            raise ValueError(f"experiments: must each be an Experiment, got {e!r}.")
+    if not result:
+        raise ValueError("experiments: must have at least one experiment, got ().")
+    names = [experiment.name for experiment in result]
+    if len(set(names)) < len(names):
+        raise ValueError(f"experiments: names must differ, got {names}. Name them with fold(name=…).")
+    for e in result:
+        _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
+        if not e.outputs:
+            raise ValueError(f"outputs of experiment {e.name!r}: must have at least one channel, got {{}}.")
+        for channel in e.outputs:
+            _checks.one_of(f"outputs of experiment {e.name!r}", channel, model.outputs)
+        if e.guess == DATA and model.autonomous:
+            raise ValueError(
+                f"guess of experiment {e.name!r}: must be states for {model.name!r}, which is autonomous, got {DATA!r}."
+            )
+        if e.guess and not isinstance(e.guess, str):
+            _checks.same_names(f"guess of experiment {e.name!r}", e.guess, model.states)
+        if model.autonomous and not e.frequency_se > 0.0:
+            raise ValueError(
+                f"experiment {e.name!r}: frequency_se must be > 0, got {e.frequency_se:g}; {model.name!r} is "
+                "autonomous, so that its measured frequency is data. Fold without `frequency`, which is then "
+                "estimated with its error, or set Experiment(…, frequency_se=…)."
+            )
+    return result
