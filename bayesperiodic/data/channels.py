@@ -45,7 +45,7 @@ class Channels(Result):
 
     @property
     def times(self) -> dict[str, np.ndarray]:
-        """Times of each channel [s]."""
+        """Times (samples,) of each channel [s]."""
         if isinstance(self.time, Mapping):
             return dict(self.time)
         return dict.fromkeys((*self.inputs, *self.outputs), self.time)

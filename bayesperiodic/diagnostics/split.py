@@ -48,7 +48,7 @@ class SplitCheck(Result):
     Examples
     --------
     >>> runs = [bp.Experiment(f"run {i}", run.frequency, run.outputs, run.inputs, samples=run.samples) for i in (1, 2)]
-    >>> both = bp.Problem(bp.models.duffing, runs, priors=problem.priors, fixed=problem.fixed, scheme="fourier")
+    >>> both = bp.Problem(bp.models.duffing, runs, priors=problem.priors, fixed={"m": 1, "k3": 0.5}, scheme="fourier")
     >>> bp.split_check(both, by={"run 1": "first", "run 2": "second"}, progress=False).table["verdict"].to_dict()
     {'c': 'agrees', 'k': 'agrees'}
     """
@@ -117,6 +117,21 @@ def split_check(
     ValueError
         For fewer than two experiments or parts, experiments that do not differ in what they are divided by, a mapping
         without one of the experiments, or parts that have no free parameter in common.
+
+    Examples
+    --------
+    The stiffness of a model without the cubic spring of the data increases with the amplitude:
+
+    >>> truth, runs = {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, []
+    >>> for size, name in ((0.1, "weak"), (1.0, "strong")):
+    ...     x = bp.simulate(bp.models.duffing, truth, {"force": size * force["force"]}, frequency=0.1, duration=400,
+    ...                     sampling_rate=4, noise={"displacement": 0.01 * size}, seed=1)
+    ...     runs.append(x.fold(32, name=name))
+    >>> linear = bp.Problem(bp.models.duffing, runs, priors=problem.priors, fixed={"m": 1, "k3": 0}, scheme="fourier")
+    >>> check = bp.split_check(linear, by="amplitude", progress=False)
+    >>> small, large, verdict = check.table.loc["k", ["small amplitude", "large amplitude", "verdict"]]
+    >>> print(f"k {verdict}: {small:.1f} and {large:.1f} N/m")
+    k moves: 1.0 and 1.4 N/m
     """
     _checks.instance("problem", problem, Problem)
     parts = _parts(problem, by)
