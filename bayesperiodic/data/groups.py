@@ -61,16 +61,23 @@ def within(time: np.ndarray, other: np.ndarray) -> slice:
 
 def common_windows(groups: Sequence[Signals], frequency: float) -> Windowed:
     """Return the windows that all groups have in common, counted back from the ends of the groups."""
-    cycles = min(cycles_of(group.time, frequency) for group in groups)
+    cycles, length = min(cycles_of(group.time, frequency) for group in groups), 1
     while True:
         used = [group.time > group.time[-1] - cycles / frequency for group in groups]
         parts = [group if u.all() else group.part(u) for group, u in zip(groups, used, strict=True)]
-        each = [windows(part.time, part.values, frequency) for part in parts]
+        each = [windows(part.time, part.values, frequency, length) for part in parts]
         if len(groups) == 1:
             return Windowed(each[0], each)
         if len({(one.cycles, one.overlap) for one in each}) == 1:
             break
-        cycles -= 1.0  # numbers of whole cycles about a limit at which longer windows begin
+        # Slow sampling needs longer windows; else numbers of whole cycles are about a limit at which these begin.
+        longest = max(one.cycles for one in each)
+        cycles, length = (cycles, longest) if longest > length else (cycles - 1.0, length)
+        if cycles < MINIMUM_CYCLES * length:
+            raise ValueError(
+                f"recording: must have samples of all channels in the same cycles, got {groups[0].name!r}, whose "
+                f"channels have no common windows of {length} cycles; record longer, or fold them one by one."
+            )
     first, numbers = each[0], []
     for i, (one, part, u) in enumerate(zip(each, parts, used, strict=True)):
         skipped = int(np.argmax(u))

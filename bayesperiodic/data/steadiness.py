@@ -94,14 +94,14 @@ class Windows:
         return np.abs(self.lines)
 
 
-def windows(time: np.ndarray, values: np.ndarray, fundamental: float) -> Windows:
+def windows(time: np.ndarray, values: np.ndarray, fundamental: float, length: int = 1) -> Windows:
     """Return the amplitudes of signals (channels, samples) in windows along a recording.
 
-    They are as long as needed for samples at all phases in most of them, gaps apart.
+    They are as long as needed for samples at all phases in most of them, gaps apart, and at least `length` cycles.
     """
     duration = np.ptp(time) * time.size / (time.size - 1) * (1 + 1e-9)
     total = int(duration * fundamental)
-    cycles = max(1, total // MOST_WINDOWS)
+    cycles = max(length, total // MOST_WINDOWS)
     highest = resolved_harmonics(time, fundamental, time.size)
     if (many := per_cycle(time, fundamental)) < SLOW:
         # Higher harmonics of few samples would look like changes of the lower ones.
