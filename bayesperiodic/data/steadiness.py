@@ -32,7 +32,7 @@ DISTANT, DISTANT_MEAN = 3.0, 12.0
 FEWEST_FOR_MEDIAN = 9
 # Windows from which changes are searched for, probability of a transient from which its start is left out, and
 # false-alarm rate of a significant slope.
-FEWEST_FOR_CHANGES, CLEAR_TRANSIENT, SLOPE_FALSE_ALARM = 5, 0.95, 1e-4
+FEWEST_FOR_CHANGES, CLEAR_TRANSIENT, SLOPE_FALSE_ALARM = 5, 0.5, 1e-4
 # Largest correlation of the noise of neighbouring windows.
 LONGEST_MEMORY = 0.8
 # Second differences of smooth signals and noise, relative to their median.
