@@ -33,7 +33,8 @@ WITHOUT_RESULTS = {
     "docs/explanation/adequacy.md": {
         SETTING: ("the upper end of the 90 % interval of its error is below 2 %",),
         DEFINITION: (
-            "by Holm's method, is below 1 %", "is called misspecified is at most 1 %", "as with 7 values and 3 parameters",
+            "by Holm's method, is below 1 %", "is called misspecified is at most 1 %",
+            "as with 7 values and 3 parameters",
         ),
     },
     "docs/explanation/frequency_error.md": {
