@@ -215,7 +215,7 @@ class Prediction(Bands):
         model with the parameters that fit all experiments best, relative to the rms of the measured period about its
         mean, and the ends of its 90 % interval; it concerns the harmonics that the experiment keeps. Where the noise is
         unknown there is only the upper end, as if all of the residual were error of the model; in the row "all" the
-        largest. With a `tolerance`, "adequate within tolerance" is the verdict in place of "misspecified" and "not
+        largest. With a ``tolerance``, "adequate within tolerance" is the verdict in place of "misspecified" and "not
         tested" where the upper end is below it, if there is neither another orbit nor a conflict of the prior.
     tolerance : float, optional
         That of `predict`.

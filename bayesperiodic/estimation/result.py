@@ -349,7 +349,7 @@ class MapEstimate(Result):
 
     @property
     def misspecified(self) -> bool:
-        """Whether tests reject the model, see `FitCheck.misfit`; robust intervals are the valid ones then."""
+        """Whether tests reject the model, see ``FitCheck.misfit``; robust intervals are the valid ones then."""
         return bool(self.checks and self.checks.misfit)
 
     def interval(self, probability: float = 0.9, *, robust: bool | None = None) -> dict[str, tuple[float, float]]:

@@ -236,7 +236,7 @@ class Posterior(Result):
 
     @property
     def misfit(self) -> str:
-        """Why the model is misspecified at the estimate from which was sampled, see `FitCheck.misfit`; or ""."""
+        """Why the model is misspecified at the estimate from which was sampled, see ``FitCheck.misfit``; or ""."""
         return str(self.tree.attrs.get(MISFIT, ""))
 
     @property
