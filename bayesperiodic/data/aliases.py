@@ -59,11 +59,7 @@ def search_frequency(time: np.ndarray, values: np.ndarray, guess: float | None) 
     near = sorted(f for f, deviance in deviances.items() if deviance < min(deviances.values()) + TELLING_DEVIANCE)
     # A multiple that explains as much is the fundamental.
     width = 1.0 / np.ptp(time)
-    for factor in reversed(DIVISORS):
-        for other in near:
-            if abs(other - factor * near[0]) < width:
-                return other
-    return near[0]
+    return next(other for other in reversed(near) if abs(other - round(other / near[0]) * near[0]) < width)
 
 
 def explains(time: np.ndarray, values: np.ndarray, frequency: float) -> bool:

@@ -177,3 +177,16 @@ def test_response_period_is_found_in_spite_of_gaps():
     drive, x = np.cos(2 * np.pi * time), np.cos(2 * np.pi * time) + 0.3 * np.cos(np.pi * time)
     x += 0.01 * np.random.default_rng(0).standard_normal(x.size)
     assert bp.Recording.from_arrays(time, {"x": x}, {"force": drive}).fold(32, periods="auto").periods == 2
+
+
+@pytest.mark.parametrize("missing", [[(12.5, 12.745)], [(8.999, 9.001), (14.999, 15.011)]])
+@pytest.mark.parametrize("ramps", [True, False])
+def test_few_missing_samples_do_not_change_the_estimated_frequency(missing, ramps):
+    time = np.arange(3000) / 100
+    size = np.clip(np.minimum(time / 5, (30 - time) / 3), 0, 1) if ramps else 1.0
+    y = size * np.cos(2 * np.pi * 0.84 * time) + 0.01 * np.random.default_rng(1).standard_normal(time.size)
+    kept = ~np.any([(time > a) & (time < b) for a, b in missing], axis=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        e = bp.Recording.from_arrays(time[kept], {"y": y[kept]}).fold(64)
+    assert e.frequency == pytest.approx(0.84, rel=1e-3)
