@@ -14,6 +14,8 @@ ALLOWED_BIAS, CHANGE_FALSE_ALARM = 0.3, 0.01
 LARGE_BEAT, HARMLESS_PHASE = 0.05, 1.0 / 180.0
 # Drift and step relative to the amplitude whose effect is in the errors stated, and that are no fault.
 HARMLESS_DRIFT, HARMLESS_STEP = 0.015, 0.005
+# Effect of a drift or step on the mean, in standard errors, from which it is serious: slow noise has smaller ones.
+SERIOUS_CHANGE = 2.0
 # Change between neighbouring cycles that is a step, in standard deviations of the other changes, and cycles needed;
 # the standard deviation is uncertain if there are fewer cycles than this.
 STEP_FROM_CYCLE, FEWEST_FOR_STEPS, ENOUGH_FOR_STEPS = 8.0, 10, 20
@@ -167,17 +169,17 @@ def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Itera
             if moving[i, worst] < 1.0 - CHANGE_FALSE_ALARM or np.abs(size[i, worst]) <= part.jump[i]:
                 continue
             effect = float(np.sqrt(np.sum(bias[i, harmonics] ** 2)))
-            relative = float(size[i, worst] / level[i, worst or strongest])
+            relative = float(size[i, worst] / level[i, strongest])
             small = abs(relative) < (HARMLESS_STEP if step else HARMLESS_DRIFT)
             change = f"{relative:+.2%}"
             which = f"the mean value of {channel}"
             if worst:
                 which = f"the amplitude of {channel}" + (f" at harmonic {worst}" if worst != strongest else "")
-            which += f" {'steps' if step else 'changes'} by {change}{'' if worst else ' of the amplitude'}"
+            which += f" {'steps' if step else 'changes'} by {change}{'' if worst == strongest else ' of the amplitude'}"
             which += f" at about {at:.6g} s" if step else " over the part used"
             yield Finding(
                 f"{what.split()[0]} step" if step else "drift", channel,
-                HARMLESS if small or effect <= SERIOUS_BIAS else SERIOUS, np.array([[at, at]]) if step else every,
+                HARMLESS if small or effect <= SERIOUS_CHANGE else SERIOUS, np.array([[at, at]]) if step else every,
                 1 if step else cycles, 1.0 / len(part.first) if step else 1.0, effect,
                 f"{which}: {effect:.2g} standard errors of its mean amplitudes, which are added to their errors",
                 "fold the parts before and after it: recording.between(start, stop)" if step else

@@ -29,7 +29,7 @@ FEWEST_GUESSED, FEWEST_PER_CYCLE, LISTED_ALIASES = 8, 4.0, 4
 # Cycles that are searched for the frequency if there are many samples in each.
 SEARCHED_CYCLES = 50.0
 # Share of the steps that are usual ones where a frequency can be guessed from correlations.
-MOST_STEPS = 0.95
+USUAL_SHARE = 0.95
 # Standard error of the phase [cycles] behind a gap with which cycles can be counted: five of them are less than a
 # quarter of a cycle.
 COUNTED = 0.05
@@ -100,7 +100,7 @@ def _estimate(signals: Signals) -> float | None:
     fast = guess is not None and per_cycle(time, guess) >= SLOW and cycles_of(time, guess) >= MINIMUM_CYCLES
     step = np.diff(time)
     # A few gaps leave the correlation of neighbouring samples as it is.
-    even = bool(np.quantile(step, MOST_STEPS) <= USUAL_STEPS * np.median(step))
+    even = bool(np.quantile(step, USUAL_SHARE) <= USUAL_STEPS * np.median(step))
     if guess is not None and fast and even and explains(time, values, guess):
         return guess
     some = _searched(signals.time, guess if fast else None)

@@ -227,11 +227,12 @@ def steady_part(every: Windows) -> Steady | None:
     part = part.chosen(slice(first, None))
     enough = len(part.first) >= FEWEST_FOR_CHANGES
     later = changes(components[first:], POSSIBLE) if first and enough else effects
-    squares = effects.squares[first] + (later.lasting[0] if enough else effects.lasting[first])
+    squares, slow = effects.squares[first], later if enough else effects
+    # What noise alone would show is in the variance already.
+    if slow.slow:
+        squares = squares + slow.lasting[0 if enough else first]
     by_part = squares.reshape(change.shape[1], -1)
     count = part.amplitudes.shape[2]
-    # Slow noise of the mean value is extrapolated from its own spectrum.
-    by_part[:, 1:] += later.wander.reshape(by_part.shape)[:, 1:] * len(components) / len(part.first)
     by_harmonic = by_part[:, :count].copy()
     by_harmonic[:, 1:] += by_part[:, count:]
     change = np.array([_change(half) for half in np.array_split(part.sizes, 2)])

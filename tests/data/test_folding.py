@@ -10,6 +10,8 @@ from scipy import stats
 import bayesperiodic as bp
 from bayesperiodic import _fourier
 from bayesperiodic.data import folding, harmonics, lines
+from bayesperiodic.data.harmonics import fit_harmonics
+from bayesperiodic.data.lines import Sampling
 from tests.known import NOISES, autoregressive, grid
 
 FREQUENCY = 2.317
@@ -120,8 +122,8 @@ def test_variance_of_the_mean_is_right_within_half_under_noise_of_any_spectrum(n
     stated, actual = np.zeros(3), np.zeros(3)
     for _ in range(2000):
         signals = folding.Signals("slow", time, ("y",), noise(time, generator)[None], 0)
-        fit = folding.fit_harmonics(time, signals.values, 1.0, 3)
-        stated += folding._noise(signals, fit, 0, 20)[1].variance[:3]
+        fit = fit_harmonics(time, signals.values, 1.0, 3)
+        stated += folding._noise(signals, fit, 0, 20, Sampling.of(time, 1.0, 3, 20))[1].variance[:3]
         actual += np.abs(fit.amplitudes[0, :3]) ** 2
     assert np.all(stated < 1.5 * actual)
     assert np.all(stated > actual / 1.5)
