@@ -27,7 +27,6 @@ from bayesperiodic.data.recording_check import refuse
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, aperiodic, even_times, response_period
 from bayesperiodic.data.several_clocks import ONE, Clocks, inspect_clocks
 from bayesperiodic.data.signals import Signals, counted_cycles, cycles_of, explains_more, first_guess
-from bayesperiodic.data.steadiness import steady_part, windows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -174,7 +173,7 @@ def given_frequency(frequency: Any) -> tuple[float, float] | None:
 
 
 def automatic_periods(groups: list[Signals], frequency: float | None) -> "tuple[int, pd.DataFrame]":
-    """Return the response period in drive periods, and its evidence, of the steady part or of its later half.
+    """Return the response period in drive periods, and its evidence, of the signals or else of their later half.
 
     Of several groups of channels it is the least common multiple, and the evidence is that of the longest one.
     """
@@ -203,10 +202,6 @@ def automatic_periods(groups: list[Signals], frequency: float | None) -> "tuple[
 def _response_period(signals: Signals, drive: float) -> "tuple[int | None, pd.DataFrame]":
     """Return the response period of channels with common times, None if there is none, and its evidence."""
     time, values = even_times(signals.time, signals.values, drive), signals.values
-    # Of the cycles of the drive, those that ramp or contain a transient have lines of their own.
-    steady = steady_part(windows(time, values, drive))
-    if steady is not None:
-        time, values = time[steady.samples], values[:, steady.samples]
     chosen, evidence = response_period(time, values, signals.channels, drive)
     later = time >= 0.5 * (time[0] + time[-1])
     if chosen is None and cycles_of(time[later], drive) >= LATER_CYCLES:

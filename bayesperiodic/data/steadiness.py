@@ -30,9 +30,11 @@ LEAST_LEVEL = 0.5
 DISTANT, DISTANT_MEAN = 3.0, 12.0
 # Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
 FEWEST_FOR_MEDIAN = 9
-# Windows from which changes are searched for, probability of a transient from which its start is left out, and
-# false-alarm rate of a significant slope.
-FEWEST_FOR_CHANGES, CLEAR_TRANSIENT, SLOPE_FALSE_ALARM = 5, 0.5, 1e-4
+# Windows from which changes are searched for, and false-alarm rate of a significant slope.
+FEWEST_FOR_CHANGES, SLOPE_FALSE_ALARM = 5, 1e-4
+# Probability of a transient from which the start is left out; with few windows, in which noise looks like one more
+# often, it has to be clear.
+LEFT_OUT, LEFT_OUT_OF_FEW, FEW_WINDOWS = 0.5, 0.95, 10
 # Largest correlation of the noise of neighbouring windows.
 LONGEST_MEMORY = 0.8
 # Second differences of smooth signals and noise, relative to their median.
@@ -222,7 +224,8 @@ def steady_part(every: Windows) -> Steady | None:
     effects = changes(components, PROBABLE if began else POSSIBLE)
     # The mean square error of what is biased is least.
     error = (1.0 + effects.bias**2) / np.arange(len(components), 0, -1)
-    clear = effects.probability[TRANSIENT] > CLEAR_TRANSIENT
+    least = LEFT_OUT_OF_FEW if len(components) < FEW_WINDOWS else LEFT_OUT
+    clear = effects.probability[TRANSIENT] > least
     first = int(np.argmin(error[: len(error) - MINIMUM_CYCLES + 1])) if clear else 0
     part = part.chosen(slice(first, None))
     enough = len(part.first) >= FEWEST_FOR_CHANGES

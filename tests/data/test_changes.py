@@ -107,12 +107,3 @@ def test_a_slow_beat_is_named_with_its_frequency(size):
     assert "the amplitude of 'y' changes throughout" not in check.reason
     said = check.reason + " ".join(map(str, check.findings))
     assert float(re.search(r"the amplitude of y beats at ([\d.]+) Hz", said).group(1)) == pytest.approx(0.03, abs=0.002)
-
-
-def test_response_period_of_a_ramped_recording_is_that_of_the_steady_part():
-    time = np.arange(7 * 200) / 200
-    envelope = np.clip(np.minimum(time / 2, (7 - time) / 1.5), 0, 1)
-    x = envelope * wave(time) + 0.002 * np.random.default_rng(0).standard_normal(time.size)
-    run = bp.Recording.from_arrays(time, {"x": x}, {"f": envelope * np.cos(2 * np.pi * time)})
-    with pytest.warns(UserWarning, match="only"):
-        assert run.fold(64, periods="auto").periods == 1
