@@ -121,7 +121,8 @@ def _mark(axes: Axes, findings: list[Finding], time: np.ndarray, values: np.ndar
         bad = check.bad.get(finding.channel, {}).get(kind, np.zeros(0, dtype=int))
         if kind in POINTS:
             at = (time[np.sort(bad)], values[np.sort(bad)])
-            axes.plot(*(_extremes(*at) if bad.size > PARTS else at), label=label, **POINTS[kind])
+            shown = np.unique(np.column_stack(_extremes(*at) if 2 * bad.size > PARTS else at), axis=0)
+            axes.plot(*shown.T, label=label, **POINTS[kind])
         elif kind in LINES:
             axes.vlines(finding.times[:, 0], 0.0, 1.0, transform=axes.get_xaxis_transform(), label=label, **LINES[kind])
         elif kind in SPANS:
