@@ -55,7 +55,6 @@ class Changes:
     size: np.ndarray  # (components,) expected change by a drift or step
     error: np.ndarray  # (cycles, components) standard errors of the means by noise
     place: int  # most probable first cycle after a step
-    wander: np.ndarray  # (components,) variance of the means by noise that lasts, beyond that of white noise
 
     @property
     def slow(self) -> bool:
@@ -165,11 +164,8 @@ def changes(shape: np.ndarray, transient: float) -> Changes:
     second += np.einsum("jsmd,s,jsmd,jmab->mabd", each, kept, np.array(levels), np.array(inverses), optimize=True)
     constant_part = (1.0 - each.sum(axis=(0, 1, 2))) * np.exp(none - logsumexp(none, axis=0))  # (noises, components)
     variances = np.einsum("jsmd,jsmd,j->jd", each, np.array(levels), np.array(means)) + constant_part * np.array(white)
-    square, lasting = variances.sum(axis=0), each[1:].sum(axis=(0, 1, 2)) + constant_part[1:].sum(axis=0)
-    # As far as it is more probable than before the data.
-    evident = np.clip((lasting - SLOW_NOISE) / (1.0 - SLOW_NOISE), 0.0, 1.0) / lasting
-    wander = evident * np.maximum(variances[1:].sum(axis=0) - lasting * white[0], 0.0)
-    return _effects(every, first, second, weight.sum(axis=0), np.sqrt(square), each.sum(axis=(0, 1, 2)), wander)
+    error = np.sqrt(variances.sum(axis=0))
+    return _effects(every, first, second, weight.sum(axis=0), error, each.sum(axis=(0, 1, 2)))
 
 
 def _effects(
@@ -179,7 +175,6 @@ def _effects(
     weight: np.ndarray,
     error: np.ndarray,
     moving: np.ndarray,
-    wander: np.ndarray,
 ) -> Changes:
     """Return the effects of changes by the first and second moments of their sizes."""
     count = every.values.shape[1]
@@ -206,7 +201,6 @@ def _effects(
         size=np.einsum("ma,mad->d", ends, first[slow]),
         error=np.maximum(error, least) * np.sqrt(count / remaining)[:, None],
         place=int(every.place[steps[np.argmax(weight[steps])]]),
-        wander=wander,
     )
 
 

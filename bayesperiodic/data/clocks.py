@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import t as student
 
-from bayesperiodic.data.cycle_findings import HARMLESS_PHASE
+from bayesperiodic.data.cycle_findings import HARMLESS_PHASE, stepped
 from bayesperiodic.data.recording_check import RUINOUS, RUINOUS_BIAS, SERIOUS, Finding
 from bayesperiodic.data.steadiness import SMALL_RANGE, Windows
 
@@ -248,13 +248,8 @@ def step_findings(
             )
         else:
             severity, largest = SERIOUS, max(mine, key=lambda step: abs(step.turns))
-            delay = largest.turns / frequency
-            samples = abs(delay) * (rates[channel] if channel else max(rates.values()))
-            text = (
-                f"the phase of {channel or 'all channels'} steps by {360.0 * largest.turns:.3g}° ({delay:.3g} s, "
-                f"{samples:.3g} samples) at about {largest.time:.6g} s: samples were lost, or the clock or the drive "
-                "stepped"
-            )
+            rate = rates[channel] if channel else max(rates.values())
+            text = stepped(channel, largest.turns, largest.time, rate, frequency)
             cure = "fold the parts before and after it: recording.between(start, stop)"
         text += f" ({len(mine)} steps)" if len(mine) > 1 else ""
         yield Finding("phase step", channel, severity, at, len(mine), len(mine) / windows, np.nan, text, cure)

@@ -134,9 +134,10 @@ def _outer_steps(
     if not together:
         return
     at = float(time[steady.level[0] if before else steady.level[1] - 1])
+    largest, rate = float(turn[np.argmax(np.abs(turn))]), (time.size - 1) / float(np.ptp(time))
     yield Finding(
         PHASE_STEP, "", HARMLESS, np.array([[at, at]]), 1, 1.0 / len(steady.part.first), np.nan,
-        f"{stepped((-1.0 if before else 1.0) * float(turn[np.argmax(np.abs(turn))]), at, time, frequency)}; {used}",
+        f"{stepped('', -largest if before else largest, at, rate, frequency)}; {used}",
         "fold the parts before and after it: recording.between(start, stop)",
     )  # fmt: skip
 
@@ -187,13 +188,12 @@ def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Itera
             )  # fmt: skip
 
 
-def stepped(turn: float, at: float, time: np.ndarray, frequency: float) -> str:
-    """Return a step of the phase [cycles] of all channels in words."""
-    delay = turn / frequency
-    samples = abs(delay) * (time.size - 1) / float(np.ptp(time))
+def stepped(channel: str, turns: float, at: float, rate: float, frequency: float) -> str:
+    """Return a step of the phase [cycles] of a channel, or of all, in words; `rate` is the sampling rate [Hz]."""
+    delay = turns / frequency
     return (
-        f"the phase of all channels steps by {360.0 * turn:.3g}° ({delay:.3g} s, {samples:.3g} samples) "
-        f"at about {at:.6g} s: samples were lost, or the clock or the drive stepped"
+        f"the phase of {channel or 'all channels'} steps by {360.0 * turns:.3g}° ({delay:.3g} s, "
+        f"{abs(delay) * rate:.3g} samples) at about {at:.6g} s: samples were lost, or the clock or the drive stepped"
     )
 
 

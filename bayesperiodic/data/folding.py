@@ -31,7 +31,7 @@ from bayesperiodic.data.signals import Signals, counted_cycles, cycles_of, expla
 if TYPE_CHECKING:
     import pandas as pd
 
-# Spreads of a channel whose squares and inverse squares are ordinary numbers, and grid points of a response period.
+# Most grid points of a response period.
 MAXIMUM_POINTS = 1_000_000
 # Share of a channel's variance that its mean period explains at least, and of one that is surely periodic.
 MINIMUM_PERIODICITY, CLEARLY_PERIODIC = 0.5, 0.9

@@ -78,7 +78,7 @@ class Recording(Channels):
             Values in the units of the model's channels.
         missing : "drop" or "interpolate", optional
             What to do with missing samples (NaN, masked values, pandas' NA, NaT), which are refused by default: leave
-            their times out in all channels, or interpolate linearly in time over at most three successive ones.
+            them out of their channel, or interpolate linearly in time over at most three successive ones.
         name : str, optional
             By default "recording".
 
@@ -202,7 +202,7 @@ class Recording(Channels):
             "delta_degC". Logarithmic units such as dB are refused.
         missing : "drop" or "interpolate", optional
             What to do with NaN and empty cells (in a file with one column: empty lines), which are refused by default:
-            leave their rows out, or interpolate linearly in time over at most three successive ones.
+            leave them out of their channel, or interpolate linearly in time over at most three successive ones.
         split : str, optional
             Column of numbers or texts that distinguishes successive records, such as the drive frequency: each part in
             which it is constant is a recording. `split` divides a recording by the steps of its drive.

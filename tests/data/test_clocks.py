@@ -214,3 +214,23 @@ def test_one_clock_has_no_other_ones():
 def test_clocks_are_checked(clocks, message):
     with pytest.raises(ValueError, match=message):
         one_clock().fold(32, clocks=clocks)
+
+
+def test_rounding_errors_of_an_exact_drive_do_not_explain_a_response_that_drifts():
+    time = np.arange(15000) / 10
+    x = np.cos(0.4 * np.pi * (1 + 2e-5) * time) + 0.01 * np.random.default_rng(1).standard_normal(time.size)
+    with pytest.warns(UserWarning, match="drifts steadily"):
+        e = bp.Recording.from_arrays(time, {"x": x}, {"force": np.cos(0.4 * np.pi * time)}).fold(32)
+    assert e.error_slopes == {} and e.frequency_se == 0.0
+
+
+@pytest.mark.parametrize("rate", [2.13, 0.7])
+def test_a_channel_that_is_sampled_more_slowly_than_the_period_has_its_amplitude(rate):
+    fast, slow, random = np.arange(0, 300, 0.02), 0.137 + np.arange(0, 299.5, 1 / rate), np.random.default_rng(1)
+    x = 0.25 * np.cos(6 * np.pi * slow - 1.0) + 1e-3 * random.standard_normal(slow.size)
+    force = np.cos(6 * np.pi * fast) + 1e-3 * random.standard_normal(fast.size)
+    run = bp.Recording.from_arrays({"force": fast, "x": slow}, {"x": x}, {"force": force})
+    e = run.fold(32, frequency=3.0, harmonics={"x": 2, "force": 1})
+    error = np.fft.rfft(e.outputs["x"])[1] / 16 - 0.25 * np.exp(-1.0j)
+    # Exceeded with a probability of 1e-4.
+    assert np.abs(error) < 3.04 * np.sqrt(e.amplitude_variance["x"][1])
