@@ -43,7 +43,8 @@ def replicate(task: Task) -> dict[str, Any]:
     """Return z and coverage of the parameters, and z of the frequency, from one recording."""
     case, number, seed = task
     line: dict[str, Any] = {"case": case, "number": number, "seed": seed, "source": source()}
-    random, (first, *rest) = np.random.default_rng([seed, STRIDE + number]), cases()[case]
+    first, *rest = cases()[case]
+    random = np.random.default_rng([seed, STRIDE + number, list(cases()).index(case)])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return line | (resonance(first, rest[0], random) if rest else limit_cycle(first, random))

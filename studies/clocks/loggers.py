@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 import bayesperiodic as bp
+from studies import common
 
 PPM = (0.0, 5.0, 20.0, 50.0, 100.0, 300.0)
 LOSSES: dict[str, list[tuple[int, int]]] = {
@@ -15,6 +16,10 @@ LOSSES: dict[str, list[tuple[int, int]]] = {
     "14 times one sample": [(400 * i + 200, 1) for i in range(14)],
 }
 FREQUENCY, C, K = 0.2, 0.2, 1.0
+OSCILLATOR = bp.Model(
+    "oscillator", states=["x"], inputs=["force"], parameters=["c", "k"], equations=["ddx + c*dx + k*x - force"],
+    outputs={"x": "x"},
+)  # fmt: skip
 
 
 def response(frequency: float) -> complex:
@@ -46,31 +51,36 @@ def outcome(run: bp.Recording, **arguments: Any) -> str:
     return "warned" if raised else "silent"
 
 
+def case_outcome(case: str, seed: int) -> str:
+    """Return the outcome of one recording of a case, "… ppm" or a name of `LOSSES`."""
+    lost = LOSSES.get(case)
+    return outcome(recording(seed, lost=lost) if lost else recording(seed, float(case.split()[0]), 300))
+
+
 def loggers(seed: int, count: int) -> dict[str, dict[str, int]]:
     """Return how often recordings of two clocks, with lost samples, and of one clock are refused or warned of."""
-    results = {
-        f"{ppm:g} ppm": dict(Counter(outcome(recording(seed + i, ppm, 300)) for i in range(count))) for ppm in PPM
-    }
-    for name, lost in LOSSES.items():
-        results[name] = dict(Counter(outcome(recording(seed + i, lost=lost)) for i in range(count)))
-    return results
+    cases = [*(f"{ppm:g} ppm" for ppm in PPM), *LOSSES]
+    tasks = [(case, seed + i) for case in cases for i in range(count)]
+    outcomes = list(common.each(case_outcome, tasks))
+    return {case: dict(Counter(outcomes[n * count : (n + 1) * count])) for n, case in enumerate(cases)}
 
 
 def rates(seed: int, count: int) -> dict[str, float]:
     """Return the share of 90 % intervals of c that contain the truth: 50 Hz force, 4.7 Hz displacement, one clock."""
-    omega, inside = 2 * np.pi * FREQUENCY, 0
-    model = bp.Model(
-        "oscillator", states=["x"], inputs=["force"], parameters=["c", "k"],
-        equations=["ddx + c*dx + k*x - force"], outputs={"x": "x"},
-    )  # fmt: skip
-    for i in range(count):
-        generator = np.random.default_rng(seed + i)
-        fast, slow = np.arange(0, 300, 0.02), 0.137 + np.arange(0, 299, 1 / 4.7)
-        force = 0.5 * np.cos(omega * fast) + 0.02 * generator.standard_normal(fast.size)
-        x = np.real(response(FREQUENCY) * np.exp(1j * omega * slow)) + 0.01 * generator.standard_normal(slow.size)
-        both = bp.Recording.from_arrays({"force": fast, "x": slow}, {"x": x}, {"force": force})
-        run = both.fold(32, frequency=FREQUENCY, harmonics={"x": 4, "force": 1})
-        priors = {"c": bp.LogNormal(C, 1.0), "k": bp.LogNormal(K, 0.5)}
-        fit = bp.map_estimate(bp.Problem(model, [run], priors=priors, scheme="fourier"), progress=False)
-        inside += abs(np.log(fit.theta["c"] / C)) < 1.645 * fit.sd["c"] / fit.theta["c"]
-    return {"coverage of c": float(inside / count), "data sets": count}
+    inside = list(common.each(covered, [(seed + i,) for i in range(count)]))
+    return {"coverage of c": float(np.mean(inside)), "data sets": count}
+
+
+def covered(seed: int) -> bool:
+    """Return whether the 90 % interval of c of one recording of two rates contains the truth."""
+    omega, generator = 2 * np.pi * FREQUENCY, np.random.default_rng(seed)
+    fast, slow = np.arange(0, 300, 0.02), 0.137 + np.arange(0, 299, 1 / 4.7)
+    force = 0.5 * np.cos(omega * fast) + 0.02 * generator.standard_normal(fast.size)
+    x = np.real(response(FREQUENCY) * np.exp(1j * omega * slow)) + 0.01 * generator.standard_normal(slow.size)
+    both = bp.Recording.from_arrays({"force": fast, "x": slow}, {"x": x}, {"force": force})
+    run = both.fold(32, frequency=FREQUENCY, harmonics={"x": 4, "force": 1})
+    priors = {"c": bp.LogNormal(C, 1.0), "k": bp.LogNormal(K, 0.5)}
+    problem = bp.Problem(OSCILLATOR, [run], priors=priors, scheme="fourier")
+    fit = bp.map_estimate(problem, start={"c": C, "k": K}, checks=False, progress=False)
+    low, high = fit.interval(0.9)["c"]
+    return bool(low < C < high)
