@@ -41,6 +41,7 @@ Row = dict[str, Any]
 def row(what: str, value: float | None, low: float, high: float | None, note: str = "") -> Row:
     """Return a row of results.json; `high` None means no upper limit, and a missing value gives no verdict."""
     value = None if value is None or math.isnan(value) else float(value)
+    low, high = float(low), None if high is None else float(high)
     met = None if value is None else value >= low and (high is None or value <= high)
     return {"what": what, "value": value, "low": low, "high": high, "met": met, "note": note}
 
