@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from bayesperiodic import _checks, _fourier
+from bayesperiodic.data.clocks import CLOCK
 from bayesperiodic.data.coverage import missing_phases, resolved_harmonics
 from bayesperiodic.data.faults import ROUNDING
 from bayesperiodic.data.groups import CommonFit, fit_groups, leading, within
@@ -23,7 +24,7 @@ from bayesperiodic.data.harmonics import (
 from bayesperiodic.data.inspection import Inspection
 from bayesperiodic.data.lines import LEAST_LEFT, Sampling
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
-from bayesperiodic.data.recording_check import refuse
+from bayesperiodic.data.recording_check import SERIOUS, refuse
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, aperiodic, even_times, response_period
 from bayesperiodic.data.several_clocks import ONE, Clocks, inspect_clocks
 from bayesperiodic.data.signals import Signals, counted_cycles, cycles_of, explains_more, first_guess
@@ -55,7 +56,7 @@ def fold_signals(
     harmonics: int | Mapping[str, int] | None,
     origin: float | str,
     largest_drift: float | None,
-    clocks: Clocks = ONE,
+    clocks: Clocks | None = None,
 ) -> dict[str, Any]:
     """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`.
 
@@ -79,7 +80,9 @@ def fold_signals(
     parts, fit = _at_phases(parts, fit, pace, periods, given, seen.limits)
     drift = dict(zip(seen.channels, _drift(seen.sizes), strict=True))
     _refuse_drift(name, drift, largest_drift)
-    refuse(name, seen.findings)
+    # Where there was one clock, it is the system that changes.
+    stated = clocks == ONE
+    refuse(name, [replace(f, severity=SERIOUS) if stated and f.kind == CLOCK else f for f in seen.findings])
     cycles = round(max(np.ptp(part.time) for part in parts) * fit.frequency)
     _warn(name, pace, cycles, seen, given is None)
     one_cycle, noise = _noises(seen, parts, fit, cycles)

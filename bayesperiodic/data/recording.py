@@ -18,7 +18,6 @@ from bayesperiodic.data.folding import AUTO, automatic_periods, fold_signals, gi
 from bayesperiodic.data.inspection import inspect, summary
 from bayesperiodic.data.layout import Layout, reader, recordings, without_missing
 from bayesperiodic.data.recording_check import RecordingCheck
-from bayesperiodic.data.several_clocks import ONE
 from bayesperiodic.data.signals import parts
 from bayesperiodic.data.times import channel_seconds, seconds
 from bayesperiodic.data.units import Units
@@ -474,7 +473,7 @@ class Recording(Channels):
         harmonics: int | Mapping[str, int] | None = None,
         origin: float | str = 0.0,
         largest_drift: float | None = None,
-        clocks: str | Mapping[str, Sequence[str]] = ONE,
+        clocks: str | Mapping[str, Sequence[str]] | None = None,
         guess: str | Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> Experiment:
@@ -519,11 +518,12 @@ class Recording(Channels):
             at which the fundamental of the first output crosses zero upwards.
         largest_drift : float, optional
             Limit of the relative change of a channel's strongest harmonic over the recording, by linear regression.
-        clocks : "one", "auto" or mapping of str to sequence of str
+        clocks : "one", "auto" or mapping of str to sequence of str, optional
             Channels that other clocks have sampled, such as ``{"logger 2": ["x"]}``; the others have the first clock,
             whose frequency is that of the experiment. Each clock's channels are folded at its own frequency, and their
-            delay, which is unknown, must be a parameter of the `Problem`. "one" tests whether the channels' phases
-            step or drift against the first one; "auto" gives those that drift steadily clocks of their own.
+            delay, which is unknown, must be a parameter of the `Problem`. By default channels whose phases drift
+            steadily against the first one are refused; "one" states that all have one clock, and only warns; "auto"
+            gives those that drift clocks of their own.
         guess : "data" or mapping of str to array (samples·periods,), optional
             See `Experiment`.
         name : str, optional
@@ -541,7 +541,7 @@ class Recording(Channels):
             frequency and inputs, samples at too few phases, an estimated frequency that has aliases, a frequency
             that is not that of the recording, more harmonics than the samples resolve, an unknown channel in
             `harmonics` or `clocks`, a drift beyond the limit, clocks that differ, or samples lost by one of the
-            channels, so far that its phase is wrong by more than 0.05 rad.
+            channels, so many that its phase is wrong by more than 0.05 rad.
 
         Warns
         -----

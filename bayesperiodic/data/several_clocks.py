@@ -9,7 +9,7 @@ from bayesperiodic import _checks
 from bayesperiodic.data.inspection import Inspection, inspect
 from bayesperiodic.data.signals import Signals
 
-# One clock, which is tested, or as many as the phases of the channels show.
+# One clock, as is stated, or as many as the phases of the channels show.
 ONE, AUTO = "one", "auto"
 # Standard errors by which frequencies of one clock may differ.
 SAME_CLOCK = 4.0
@@ -18,7 +18,7 @@ Clocks = str | Mapping[str, Sequence[str]]
 
 
 def inspect_clocks(
-    groups: list[Signals], clocks: Clocks, periods: int, frequency: float | None, points: int, asked: int = 0
+    groups: list[Signals], clocks: Clocks | None, periods: int, frequency: float | None, points: int, asked: int = 0
 ) -> tuple[Inspection, dict[str, tuple[str, ...]]]:
     """Return what signals are like on the first clock, and the channels of the other clocks.
 
@@ -26,8 +26,8 @@ def inspect_clocks(
     if all are named. Times of the others are multiplied by the ratio of the frequencies that both clocks measure.
     """
     channels = [channel for group in groups for channel in group.channels]
-    if isinstance(clocks, str):
-        _checks.one_of("clocks", clocks, (ONE, AUTO))
+    if clocks is None or isinstance(clocks, str):
+        _checks.one_of("clocks", clocks or ONE, (ONE, AUTO))
         seen = inspect(groups, periods, frequency, points, asked=asked)
         others = _found(seen) if clocks == AUTO else {}
         if not others:
