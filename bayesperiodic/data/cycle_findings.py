@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from bayesperiodic.data.changes import DRIFT, STEP, Changes
+from bayesperiodic.data.harmonics import MINIMUM_CYCLES
 from bayesperiodic.data.recording_check import HARMLESS, SERIOUS, SERIOUS_BIAS, Finding
 from bayesperiodic.data.steadiness import Steady, Windows
 
@@ -148,10 +149,13 @@ def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Itera
     start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
     every, cycles = np.array([[start, stop]]), len(part.first) * part.cycles
     if steady.transient > 1.0 - CHANGE_FALSE_ALARM and steady.bias > ALLOWED_BIAS:
+        # The last cycles are used in any case, and their scatter contains the transient.
+        ended = len(part.first) > MINIMUM_CYCLES
         yield Finding(
-            "transient", "", SERIOUS if steady.bias > SERIOUS_BIAS else HARMLESS, every, cycles, 1.0,
+            "transient", "", SERIOUS if steady.bias > SERIOUS_BIAS or not ended else HARMLESS, every, cycles, 1.0,
             steady.bias, f"a rest of the transient is in the part used, {start:.6g} to {stop:.6g} s, and biases the "
-            f"amplitudes by {steady.bias:.2g} standard errors", "record longer, or begin later with recording.between",
+            f"amplitudes by {'' if ended else 'at least '}{steady.bias:.2g} standard errors",
+            "record longer, or begin later with recording.between",
         )  # fmt: skip
     if effects is None:
         return
