@@ -195,9 +195,7 @@ def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Itera
             )  # fmt: skip
 
 
-def _vibrations(
-    channels: Sequence[str], steady: Steady, effects: Changes, times: np.ndarray
-) -> Iterator[Finding]:
+def _vibrations(channels: Sequence[str], steady: Steady, effects: Changes, times: np.ndarray) -> Iterator[Finding]:
     """Return oscillations of the cycles about their mean that are not over at the end of the part used."""
     part = steady.part
     shape = (len(channels), -1)
