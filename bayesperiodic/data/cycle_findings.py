@@ -210,10 +210,12 @@ def _vibrations(channels: Sequence[str], steady: Steady, effects: Changes, times
         effect = float(np.sqrt(np.sum(bias[i, clear] ** 2)))
         if relative <= part.jump[i] / level[i] or not clear.any():
             continue
-        lasting = decay > cycles
+        lasting = not 0.0 < decay < cycles
+        serious = (relative > LARGE_BEAT and effect > SERIOUS_BIAS) or (
+            relative > HARMLESS_BEAT and effect > SERIOUS_CHANGE
+        )
         yield Finding(
-            BEATING if lasting else "transient", channel,
-            SERIOUS if relative > LARGE_BEAT or (effect > SERIOUS_CHANGE and relative > HARMLESS_BEAT) else HARMLESS,
+            BEATING if lasting else "transient", channel, SERIOUS if serious else HARMLESS,
             times, cycles, 1.0, effect,
             f"the cycles of {channel} beat with a period of {beat:.3g} cycles by {relative:.1%} of the amplitude"
             + ("" if lasting else f", decaying in {decay:.2g} cycles") + f": {effect:.2g} standard errors of its mean "
