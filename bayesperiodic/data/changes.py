@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular, toeplitz
+from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 # Probabilities before the data: of a transient where the start was left out or not, of a drift, a step and a line
@@ -27,7 +28,11 @@ NEAR, NEARBY, STEP_PLACES, FIRST_STEP, MOST_TONES = (0.7, 1.5), 0.7, 64, 2, 64
 # Share of a channel's standard deviation below which noise does not count.
 SMALLEST_NOISE = 1e-6
 # Longest decay time relative to the recording of a transient of which a part can be left out; slower ones are drifts.
-LONGEST_CUT = 0.25
+LONGEST_CUT = 0.5
+# Probability of a change from which its course is fitted, and longest decay time of it relative to the recording.
+WORTH_A_FIT, LONGEST_FITTED = 0.2, 20.0
+# Angle over the recording from which a change oscillates.
+LEAST_TURN = 4.5
 TRANSIENT, DRIFT, STEP, TONE = "transient", "drift", "step", "tone"
 
 
@@ -41,6 +46,68 @@ class Courses:
     kind: np.ndarray  # (courses,)
     prior: np.ndarray  # (courses,) logarithms of probabilities
     place: np.ndarray  # (courses,) decay time, or first cycle after a step
+    turn: np.ndarray  # (courses,) angle by which an oscillation turns in a cycle
+    constant: float  # probability of no change
+
+    def refined(self, index: int, shape: np.ndarray) -> "Courses":
+        """Return the courses and one more: the best fit to components (cycles, components) near one of them."""
+        count = len(shape)
+        cycle = np.arange(count, dtype=float)
+        tone = self.kind[index] == TONE
+        if self.kind[index] == STEP or not (tone or self.fades[index]):
+            return self._with(self.values[index], index, self.place[index], self.turn[index])
+        scaled = shape - shape.mean(axis=0)
+        floor = count * SMALLEST_NOISE**2
+
+        def course(point: np.ndarray) -> np.ndarray:
+            wave = np.exp(-cycle * np.exp(-point[0]) + 1j * point[1] * cycle)
+            return np.column_stack([wave.real, wave.imag])
+
+        def misfit(point: np.ndarray) -> float:
+            flat = course(point)
+            flat = flat - flat.mean(axis=0)
+            u, d, _ = np.linalg.svd(flat, full_matrices=False)
+            u = u[:, d > 1e-9 * d[0]]
+            rest = np.sum(scaled**2, axis=0) - np.sum((u.T @ scaled) ** 2, axis=0)
+            return float(np.log(np.maximum(rest, 0.0) + floor).sum())
+
+        longest = np.log(LONGEST_FITTED * count)
+        start = [longest if tone else np.log(self.place[index]), self.turn[index]]
+        bounds = [(np.log(SHORTEST_DECAY), longest), (0.0, np.pi)]
+        simplex = np.array([start, [start[0] - 0.3, start[1]], [start[0], start[1] + 0.5 / count]])
+        simplex[2, 1] = simplex[2, 1] if simplex[2, 1] <= np.pi else start[1] - 0.5 / count
+        best = minimize(misfit, start, method="Nelder-Mead", bounds=bounds, options={"initial_simplex": simplex})
+        return self._with(course(best.x), index, float(np.exp(best.x[0])), float(best.x[1]))
+
+    def _with(self, values: np.ndarray, index: int, decay: float, turn: float) -> "Courses":
+        """Return the courses and one more with half the prior probability of one of them."""
+        count = self.values.shape[1]
+        kind = self.kind[index]
+        if self.fades[index] or kind == TONE:
+            kind = TRANSIENT if decay <= LONGEST_CUT * count else DRIFT
+        prior = np.append(self.prior, self.prior[index] + np.log(0.5))
+        prior[index] += np.log(0.5)
+        return Courses(
+            np.concatenate([self.values, values[None]]),
+            np.append(self.single, np.abs(values[:, 1]).max() < 1e-9),
+            np.append(self.fades, self.fades[index] or self.kind[index] == TONE),
+            np.append(self.kind, kind),
+            prior,
+            np.append(self.place, decay),
+            np.append(self.turn, turn),
+            self.constant,
+        )
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """Probabilities of courses and moments of their sizes."""
+
+    weight: np.ndarray  # (courses,)
+    first: np.ndarray  # (courses, 2, components)
+    second: np.ndarray  # (courses, 2, 2, components)
+    error: np.ndarray  # (components,) of the mean by noise
+    moving: np.ndarray  # (components,) probability of any change
 
 
 @dataclass(frozen=True)
@@ -55,6 +122,9 @@ class Changes:
     size: np.ndarray  # (components,) expected change by a drift or step
     error: np.ndarray  # (cycles, components) standard errors of the means by noise
     place: int  # most probable first cycle after a step
+    swing: np.ndarray  # (components,) expected amplitude, in the first cycle, of a change that oscillates
+    beat: tuple[float, float]  # probable number of cycles in which it does, and in which it decays
+    oscillating: float  # probability of it
 
     @property
     def slow(self) -> bool:
@@ -70,7 +140,7 @@ class Changes:
 def courses(count: int, transient: float) -> Courses:
     """Return courses over so many cycles, with this probability of a transient."""
     cycle = np.arange(count, dtype=float)
-    every: list[tuple[np.ndarray, str, float, float]] = []
+    every: list[tuple[np.ndarray, str, float, float, float]] = []
     decays = np.geomspace(SHORTEST_DECAY, max(LONGEST_DECAY * count, 2.0 * SHORTEST_DECAY), DECAYS)
     for decay in decays:
         linear = np.linspace(0.0, np.pi, FREQUENCIES)
@@ -79,21 +149,24 @@ def courses(count: int, transient: float) -> Courses:
             for angle in angles:
                 course = np.exp(-cycle / decay + 1j * angle * cycle)
                 kind = TRANSIENT if decay <= LONGEST_CUT * count else DRIFT
-                every.append((course, kind, transient * part / decays.size / len(angles), decay))
+                every.append((course, kind, transient * part / decays.size / len(angles), decay, angle))
     rest = 1.0 - transient
     fading = len(every)
-    every.append((cycle / (count - 1) + 0j, DRIFT, rest * DRIFTING, 0.0))
+    every.append((cycle / (count - 1) + 0j, DRIFT, rest * DRIFTING, 0.0, 0.0))
     places = np.unique(np.linspace(FIRST_STEP, count - FIRST_STEP, STEP_PLACES).astype(int))
-    every += [((cycle >= k) + 0j, STEP, rest * STEPPING / places.size, float(k)) for k in places]
+    every += [((cycle >= k) + 0j, STEP, rest * STEPPING / places.size, float(k), 0.0) for k in places]
     # Lines beside the harmonics, as of a subharmonic, do not decay, and have no effect on the mean.
     tones = np.arange(1, 1 + min(count // 2, MOST_TONES)) * max(1.0, count / 2 / MOST_TONES)
-    every += [(np.exp(2j * np.pi * n / count * cycle), TONE, rest * SOUNDING / tones.size, 0.0) for n in tones]
+    turns = 2.0 * np.pi * tones / count
+    every += [(np.exp(1j * turn * cycle), TONE, rest * SOUNDING / tones.size, 0.0, turn) for turn in turns]
     values = np.array([np.column_stack([course.real, course.imag]) for course, *_ in every])
     # The sine of the highest frequency is rounding.
     single = np.abs(values[:, :, 1]).max(axis=1) < 1e-9
     values[single, :, 1] = 0.0
-    kinds, place = np.array([k for _, k, _, _ in every]), np.array([p for *_, p in every])
-    return Courses(values, single, np.arange(len(every)) < fading, kinds, np.log([p for _, _, p, _ in every]), place)
+    kinds, prior = np.array([k for _, k, *_ in every]), np.log([p for _, _, p, *_ in every])
+    place, turn = np.array([p for *_, p, _ in every]), np.array([a for *_, a in every])
+    constant = rest * (1.0 - DRIFTING - STEPPING - SOUNDING)
+    return Courses(values, single, np.arange(len(every)) < fading, kinds, prior, place, turn, constant)
 
 
 def _covariances(count: int) -> list[tuple[float, np.ndarray]]:
@@ -109,8 +182,20 @@ def _covariances(count: int) -> list[tuple[float, np.ndarray]]:
 
 def changes(shape: np.ndarray, transient: float) -> Changes:
     """Return the expected changes of components (cycles, components), with this probability of a transient before."""
+    every = courses(len(shape), transient)
+    first = _posterior(shape, every, _independent(shape, None))
+    best = int(np.argmax(first.weight))
+    if first.weight.sum() < WORTH_A_FIT or every.kind[best] == STEP:
+        return _effects(every, first)
+    # Courses between those of the grid, and the correlation of what is noise beside the change.
+    every = every.refined(best, shape)
+    return _effects(every, _posterior(shape, every, _independent(shape, every.values[-1])))
+
+
+def _posterior(shape: np.ndarray, every: Courses, independent: float) -> _Posterior:
+    """Return probabilities of courses and moments of their sizes, with so many independent components of the noise."""
     count = len(shape)
-    every, covariances = courses(count, transient), _covariances(count)
+    covariances = _covariances(count)
     scaled = shape - shape.mean(axis=0)
     floor = count * SMALLEST_NOISE**2
     kept = SIZES**2 / (1.0 + SIZES**2)
@@ -148,10 +233,10 @@ def changes(shape: np.ndarray, transient: float) -> Changes:
     clear = logsumexp(some, axis=0) - logsumexp(none, axis=0)  # (sizes, courses, components)
     noise = np.sqrt(np.array(white[0]) * count)
     noisy = noise > 2.0 * SMALLEST_NOISE
-    share = _independent((np.diff(shape, axis=0) / noise)[:, noisy]) / noisy.sum() if noisy.any() else 1.0
+    share = min(independent / max(noisy.sum(), 1), 1.0)
     total_gain = share * np.logaddexp(np.log1p(-SHARED), np.log(SHARED) + clear)[:, :, noisy].sum(axis=2)
     weight = total_gain + every.prior + np.log(FREQUENT)[:, None]
-    constant = np.log((1.0 - transient) * (1.0 - DRIFTING - STEPPING - SOUNDING))
+    constant = np.log(every.constant)
     weight = np.exp(weight - np.logaddexp(logsumexp(weight), constant))  # (sizes, courses)
     member = 1.0 / (1.0 + (1.0 / SHARED - 1.0) * np.exp(-np.clip(clear, -500, 500)))
     each = np.exp(some - logsumexp(some, axis=0)) * (
@@ -165,18 +250,12 @@ def changes(shape: np.ndarray, transient: float) -> Changes:
     constant_part = (1.0 - each.sum(axis=(0, 1, 2))) * np.exp(none - logsumexp(none, axis=0))  # (noises, components)
     variances = np.einsum("jsmd,jsmd,j->jd", each, np.array(levels), np.array(means)) + constant_part * np.array(white)
     error = np.sqrt(variances.sum(axis=0))
-    return _effects(every, first, second, weight.sum(axis=0), error, each.sum(axis=(0, 1, 2)))
+    return _Posterior(weight.sum(axis=0), first, second, error, each.sum(axis=(0, 1, 2)))
 
 
-def _effects(
-    every: Courses,
-    first: np.ndarray,
-    second: np.ndarray,
-    weight: np.ndarray,
-    error: np.ndarray,
-    moving: np.ndarray,
-) -> Changes:
-    """Return the effects of changes by the first and second moments of their sizes."""
+def _effects(every: Courses, posterior: _Posterior) -> Changes:
+    """Return the effects of changes."""
+    weight, first, second = posterior.weight, posterior.first, posterior.second
     count = every.values.shape[1]
     remaining = np.arange(count, 0, -1.0)
     later = np.cumsum(every.values[:, ::-1], axis=1)[:, ::-1] / remaining[:, None]
@@ -190,6 +269,9 @@ def _effects(
         lasting += 0.5 * _squares(later[either] - side, second[either])
     probability = {kind: float(weight[every.kind == kind].sum()) for kind in (TRANSIENT, DRIFT, STEP, TONE)}
     steps = np.flatnonzero(every.kind == STEP)
+    # Fractions of a turn are no oscillation that can be told from a drift.
+    turning = (drifting | (every.kind == TONE)) & (every.turn * count > LEAST_TURN)
+    fastest = int(np.argmax(np.where(turning, weight, 0.0)))
     ends = every.values[slow, -1] - every.values[slow, 0]
     least = SMALLEST_NOISE / np.sqrt(count)
     return Changes(
@@ -197,10 +279,13 @@ def _effects(
         squares=squares,
         lasting=lasting,
         probability=probability,
-        moving=moving,
+        moving=posterior.moving,
         size=np.einsum("ma,mad->d", ends, first[slow]),
-        error=np.maximum(error, least) * np.sqrt(count / remaining)[:, None],
+        error=np.maximum(posterior.error, least) * np.sqrt(count / remaining)[:, None],
         place=int(every.place[steps[np.argmax(weight[steps])]]),
+        swing=np.sqrt(np.sum(first[turning] ** 2, axis=1)).sum(axis=0),
+        beat=(2.0 * np.pi / max(float(every.turn[fastest]), LEAST_TURN / count), float(every.place[fastest])),
+        oscillating=float(weight[turning].sum()),
     )
 
 
@@ -209,12 +294,28 @@ def _squares(effects: np.ndarray, moments: np.ndarray) -> np.ndarray:
     return np.asarray(np.einsum("mka,mkb,mabd->kd", effects, effects, moments, optimize=True))
 
 
-def _independent(steps: np.ndarray) -> float:
-    """Return the effective number of independent components of noise, by the products of different cycles' steps."""
+def _independent(shape: np.ndarray, course: np.ndarray | None) -> float:
+    """Return the effective number of independent components of noise, by the products of different cycles' steps.
+
+    A course (cycles, 2) is fitted and subtracted before.
+    """
+    step = np.diff(np.eye(len(shape)), axis=0)
+    basis = np.ones((len(shape), 1)) if course is None else np.column_stack([np.ones(len(shape)), course])
+    rest = shape - basis @ np.linalg.lstsq(basis, shape, rcond=None)[0]
+    freedom = len(shape) - np.linalg.matrix_rank(basis)
+    size = np.sqrt(np.sum(rest**2, axis=0) / freedom)
+    noisy = size > SMALLEST_NOISE
+    if not noisy.any():
+        return float(shape.shape[1])
+    steps = step @ (rest[:, noisy] / size[noisy])
     products = steps @ steps.T
     number = np.arange(len(steps))
     apart = np.abs(number[:, None] - number) > 1
-    square = float(np.mean(products[apart] ** 2)) if apart.any() else 0.0
+    # The fit correlates what it leaves of white noise.
+    fitted = np.eye(len(shape)) - basis @ np.linalg.pinv(basis)
+    expected = step @ fitted @ step.T
+    usual = np.trace(products) / np.trace(expected)
+    square = float(np.mean((products - usual * expected)[apart] ** 2)) if apart.any() else 0.0
     if not square > 0.0:
         return 1.0
     return float(np.clip(np.median(np.diag(products)) ** 2 / square, 1.0, steps.shape[1]))

@@ -4,7 +4,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from bayesperiodic.data.changes import DRIFT, STEP
+from bayesperiodic.data.changes import DRIFT, STEP, Changes
+from bayesperiodic.data.harmonics import MINIMUM_CYCLES
 from bayesperiodic.data.recording_check import HARMLESS, SERIOUS, SERIOUS_BIAS, Finding
 from bayesperiodic.data.steadiness import Steady, Windows
 
@@ -145,16 +146,22 @@ def _outer_steps(
 def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Iterator[Finding]:
     """Return what is clearly not steady in the part used: the rest of a transient, drifts and steps."""
     part, effects = steady.part, steady.changes
-    if effects is None:
-        return
     start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
     every, cycles = np.array([[start, stop]]), len(part.first) * part.cycles
     if steady.transient > 1.0 - CHANGE_FALSE_ALARM and steady.bias > ALLOWED_BIAS:
+        # The last cycles are used in any case, and their scatter contains the transient.
+        ended = len(part.first) > MINIMUM_CYCLES
         yield Finding(
-            "transient", "", SERIOUS if steady.bias > SERIOUS_BIAS else HARMLESS, every, cycles, 1.0,
+            "transient", "", SERIOUS if steady.bias > SERIOUS_BIAS or not ended else HARMLESS, every, cycles, 1.0,
             steady.bias, f"a rest of the transient is in the part used, {start:.6g} to {stop:.6g} s, and biases the "
-            f"amplitudes by {steady.bias:.2g} standard errors", "record longer, or begin later with recording.between",
+            f"amplitudes by {'' if ended else 'at least '}{steady.bias:.2g} standard errors",
+            "record longer, or begin later with recording.between",
         )  # fmt: skip
+    if effects is None:
+        return
+    if effects.oscillating > 1.0 - CHANGE_FALSE_ALARM:
+        yield from _vibrations(channels, steady, effects, every)
+        return
     if not effects.slow:
         return
     shape = (len(channels), -1)
@@ -186,6 +193,35 @@ def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Itera
                 "fold the parts before and after it: recording.between(start, stop)" if step else
                 "select a steadier part with recording.between(start, stop)",
             )  # fmt: skip
+
+
+def _vibrations(channels: Sequence[str], steady: Steady, effects: Changes, times: np.ndarray) -> Iterator[Finding]:
+    """Return oscillations of the cycles about their mean that are not over at the end of the part used."""
+    part = steady.part
+    shape = (len(channels), -1)
+    level = np.abs(part.amplitudes.mean(axis=0))[:, 1:].max(axis=1)
+    swing, moving = effects.swing.reshape(shape), effects.moving.reshape(shape)
+    bias = np.sqrt(effects.lasting[0]).reshape(shape) / effects.error[0].reshape(shape)
+    beat, decay = (number * part.cycles for number in effects.beat)
+    cycles = len(part.first) * part.cycles
+    for i, channel in enumerate(channels):
+        clear = moving[i] > 1.0 - CHANGE_FALSE_ALARM
+        relative = float(np.where(clear, swing[i], 0.0).max() / level[i])
+        effect = float(np.sqrt(np.sum(bias[i, clear] ** 2)))
+        if relative <= part.jump[i] / level[i] or not clear.any():
+            continue
+        lasting = not 0.0 < decay < cycles
+        serious = (relative > LARGE_BEAT and effect > SERIOUS_BIAS) or (
+            relative > HARMLESS_BEAT and effect > SERIOUS_CHANGE
+        )
+        yield Finding(
+            BEATING if lasting else "transient", channel, SERIOUS if serious else HARMLESS,
+            times, cycles, 1.0, effect,
+            f"the cycles of {channel} beat with a period of {beat:.3g} cycles by {relative:.1%} of the amplitude"
+            + ("" if lasting else f", decaying in {decay:.2g} cycles") + f": {effect:.2g} standard errors of its mean "
+            "amplitudes; a vibration that is not over, a second frequency, or a response period of several cycles",
+            "record longer, begin later with recording.between, or fold with the `periods` of the response",
+        )  # fmt: skip
 
 
 def stepped(channel: str, turns: float, at: float, rate: float, frequency: float) -> str:

@@ -37,6 +37,8 @@ from bayesperiodic.data.steadiness import Steady, Windows, steady_part
 LARGEST_CHANGE = 0.1
 # Harmonics of the first mean period, from which outliers are left out.
 ROUGH_HARMONICS = 40
+# Most refinements of the frequency by a steady part that changes with it.
+MOST_REFINEMENTS = 4
 # Findings whose samples are those of another kind.
 SAMPLES_OF = {"held": "stuck", "saturated": "clipped"}
 
@@ -294,13 +296,17 @@ def _steady_of(
         tracked = refine_groups(some, tracked, few, other)[0].frequency
     every = common_windows(some, tracked)
     steady = steady_part(every.all)
-    if steady is not None and refined and steady.level != (0, some[0].time.size):
-        # The frequency of a part that ramps is not that of the steady one.
-        used = every.samples(steady.part)
+    for _ in range(MOST_REFINEMENTS):
+        if steady is None or not refined or steady.level == (0, some[0].time.size):
+            break
+        # The frequency of a part that ramps is not that of the steady one, and at a wrong one ramps are steady.
+        before, used = steady.level, every.samples(steady.part)
         parts = [group.part(part) for group, part in zip(some, used, strict=True)]
         tracked = refine_groups(parts, tracked, few, other)[0].frequency
         every = common_windows(some, tracked)
         steady = steady_part(every.all)
+        if steady is None or steady.level == before or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
+            break
     driven = any(group.inputs for group in some)
     if steady is not None and refined and not driven and steady.level != (0, some[0].time.size):
         fit, pace = refine_groups(some, tracked, few, other)

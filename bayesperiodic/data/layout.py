@@ -60,7 +60,7 @@ class Layout:
                 f"got {self.units['time']!r} for column {self.time!r} of {self.file}."
             )
         argument = f"time (column {self.time!r} of {self.file})"
-        return {**columns, self.time: _checks.real_array(argument, seconds(argument, times))}
+        return {**columns, self.time: _checks.real_array(argument, seconds(argument, times, unit="time" in self.units))}
 
     def signals(self, columns: Mapping[str, np.ndarray]) -> tuple[Times, dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Return times, outputs and inputs, without missing samples, from columns of numbers."""

@@ -71,8 +71,9 @@ class Recording(Channels):
         time : array (samples,)
             Strictly increasing times [s], or dates or durations: datetime64 and timedelta64 of any resolution, pandas
             and xarray objects, Python's datetime and timedelta, texts after ISO 8601. Dates and durations are converted
-            to seconds from the first sample, without a loss of precision; integers beyond 2**53 are counted from the
-            first sample as well. Dates with a time zone are compared in UTC, those without are taken as UTC.
+            to seconds from the first sample, without a loss of precision. Dates with a time zone are compared in UTC,
+            those without are taken as UTC. Integers that are no seconds by their size (as milliseconds since 1970) or
+            their steps (as microseconds) are refused.
         outputs, inputs : mapping of str to array (samples,)
             Values in the units of the model's channels.
         missing : "drop" or "interpolate", optional

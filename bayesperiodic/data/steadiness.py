@@ -35,6 +35,8 @@ FEWEST_FOR_CHANGES, SLOPE_FALSE_ALARM = 5, 1e-4
 # Probability of a transient from which the start is left out; with few windows, in which noise looks like one more
 # often, it has to be clear.
 LEFT_OUT, LEFT_OUT_OF_FEW, FEW_WINDOWS = 0.5, 0.95, 10
+# Weight of the squared bias by a transient relative to the variance, where cycles are left out.
+BIAS_WEIGHT = 4.0
 # Largest correlation of the noise of neighbouring windows.
 LONGEST_MEMORY = 0.8
 # Second differences of smooth signals and noise, relative to their median.
@@ -222,8 +224,8 @@ def steady_part(every: Windows) -> Steady | None:
     began = part.place[0] - every.place[0] >= part.overlap
     components = _components(part.amplitudes)
     effects = changes(components, PROBABLE if began else POSSIBLE)
-    # The mean square error of what is biased is least.
-    error = (1.0 + effects.bias**2) / np.arange(len(components), 0, -1)
+    # The mean square error of what is biased is least; a bias counts more than noise, whose size is known.
+    error = (1.0 + BIAS_WEIGHT * effects.bias**2) / np.arange(len(components), 0, -1)
     least = LEFT_OUT_OF_FEW if len(components) < FEW_WINDOWS else LEFT_OUT
     clear = effects.probability[TRANSIENT] > least
     first = int(np.argmin(error[: len(error) - MINIMUM_CYCLES + 1])) if clear else 0

@@ -14,6 +14,10 @@ SECONDS = {"W": 604_800, "D": 86_400, "h": 3600, "m": 60, "s": 1}
 PER_SECOND = {"ms": 1e3, "us": 1e6, "ns": 1e9, "ps": 1e12, "fs": 1e15, "as": 1e18}
 # Integers beyond this one are not all floats.
 LARGEST_EXACT = 2**53
+# Integers from which they are no seconds since 1970 (of the year 5138) but smaller units, with that unit.
+SINCE_1970 = {"ms": 1e11, "us": 1e14, "ns": 1e17}
+# Usual step [s] of integers from which they are no seconds but parts of them, unless they are whole minutes.
+LONG_STEP, MINUTE = 1000, 60
 ISO_DATE = re.compile(r"\s*\d{4}-\d\d")
 # More decimals of a second than pandas keeps (3.0.1 drops the others without a word).
 TOO_FINE = re.compile(r"[.,]\d{10}")
@@ -52,11 +56,12 @@ def dates(argument: str, values: Any) -> np.ndarray | None:
     return None
 
 
-def seconds(argument: str, values: Any) -> Any:
+def seconds(argument: str, values: Any, *, unit: bool = False) -> Any:
     """Return dates and durations in seconds from the first of them that is not missing, NaT as NaN.
 
-    Differences are those of integers, so that those below 2**53 units are the nearest floats. Integers beyond it (as
-    nanoseconds since 1970) are counted from the first one too, in their unit. Other values are returned as they are.
+    Differences are those of integers, so that those below 2**53 units are the nearest floats. Integers that can hardly
+    be seconds are refused, unless their `unit` is given; then those beyond 2**53 (as nanoseconds since 1970) are
+    counted from the first one too, in their unit. Other values are returned as they are.
     """
     try:
         np.shape(values)
@@ -64,11 +69,13 @@ def seconds(argument: str, values: Any) -> Any:
         return values
     times = dates(argument, values)
     if times is None:
+        if not unit:
+            _refuse_integers(argument, values)
         return _differences(values)
-    unit, step = np.datetime_data(times.dtype)
-    if times.dtype.kind == "M" and unit in ("Y", "M", "generic"):
-        times, unit, step = times.astype("datetime64[s]"), "s", 1
-    if unit not in SECONDS | PER_SECOND:
+    base, step = np.datetime_data(times.dtype)
+    if times.dtype.kind == "M" and base in ("Y", "M", "generic"):
+        times, base, step = times.astype("datetime64[s]"), "s", 1
+    if base not in SECONDS | PER_SECOND:
         raise ValueError(
             f"{argument}: must be durations in weeks or a shorter unit, got {times.dtype}, whose length in seconds is "
             "not defined."
@@ -77,11 +84,11 @@ def seconds(argument: str, values: Any) -> Any:
     if lost.all():
         return np.full(times.shape, np.nan)
     steps = np.where(lost, 0, (times - times[~lost][0]).astype(np.int64)) * step
-    return np.where(lost, np.nan, steps * float(SECONDS[unit]) if unit in SECONDS else steps / PER_SECOND[unit])
+    return np.where(lost, np.nan, steps * float(SECONDS[base]) if base in SECONDS else steps / PER_SECOND[base])
 
 
 def channel_seconds(times: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the times of channels in seconds; dates and large integers from the earliest one of all channels."""
+    """Return the times of channels in seconds; dates from the earliest one of all channels."""
     read = {channel: dates(f"time[{channel!r}]", values) for channel, values in times.items()}
     dated = {channel: values for channel, values in read.items() if values is not None}
     if dated and len(dated) < len(read):
@@ -90,10 +97,12 @@ def channel_seconds(times: Mapping[str, Any]) -> dict[str, np.ndarray]:
             f"time: must be dates or durations of all channels, or numbers of all, got dates of {next(iter(dated))!r} "
             f"and numbers of {other!r}; convert them to seconds from one instant."
         )
-    if not dated and all(_differences(values) is values for values in times.values()):
+    if not dated:
+        for channel, values in times.items():
+            _refuse_integers(f"time[{channel!r}]", values)
         return {channel: _checks.real_array(f"time[{channel!r}]", values) for channel, values in times.items()}
-    given = [np.atleast_1d(values) for values in (dated or times).values()]
-    every = _checks.real_array("time", seconds("time", np.concatenate(given) if dated else np.ma.concatenate(given)))
+    given = [np.atleast_1d(values) for values in dated.values()]
+    every = _checks.real_array("time", seconds("time", np.concatenate(given)))
     parts = np.split(every - np.nanmin(every), np.cumsum([values.size for values in given])[:-1])
     return dict(zip(times, parts, strict=True))
 
@@ -108,6 +117,27 @@ def shared(times: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         if result[channel] is time and not any(time is other for other in distinct):
             distinct.append(time)
     return result
+
+
+def _refuse_integers(argument: str, values: Any) -> None:
+    """Raise a ValueError for integers that are milli-, micro- or nanoseconds by their size or their steps."""
+    array = values.compressed() if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
+    if array.dtype.kind not in "iu" or array.ndim != 1 or array.size < 2:
+        return
+    first, steps = int(array[0]), np.abs(np.diff(array.astype(np.int64)))
+    epoch = next((unit for unit, least in reversed(SINCE_1970.items()) if abs(first) >= least), "")
+    step = float(np.median(steps))
+    if not epoch and (step < LONG_STEP or not (steps % MINUTE).any()):
+        return
+    if epoch:
+        guess, kind, unit = f"{first}, as {epoch} since 1970", "datetime64", epoch
+    else:
+        unit = "us" if step < PER_SECOND["us"] else "ns"
+        guess, kind = f"integers in steps of {step:.6g}, as {unit}", "timedelta64"
+    raise ValueError(
+        f"{argument}: must be in seconds, got {guess}; give times.astype('{kind}[{unit}]') for these (of a file, "
+        f"units={{'time': ({unit!r}, 's')}}), or floats if they are seconds."
+    )
 
 
 def _differences(values: Any) -> Any:
