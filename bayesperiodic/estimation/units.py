@@ -1,5 +1,6 @@
 """Hints where a fit fails: measured against modelled frequency and amplitude, and units as a likely cause."""
 
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -7,8 +8,11 @@ import numpy as np
 
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.likelihood.observation import Response
+from bayesperiodic.periodic.compiled import NOT_FINITE, STATUSES
 from bayesperiodic.periodic.equations import FREQUENCY
 from bayesperiodic.periodic.floquet import first_order_matrix
+from bayesperiodic.periodic.singular_terms import singular_term
+from bayesperiodic.periodic.solution import as_guess
 
 # Experiments named in a message, and the powers of ten that point to a unit.
 SHOWN_EXPERIMENTS, UNIT_DECADES = 3, 2.0
@@ -46,6 +50,17 @@ def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
                     modelled[channel] = 0.5 * float(np.ptp(values))
         scales[e.name] = Scales(measured, {name: size for name, size in modelled.items() if 0.0 < size < np.inf})
     return scales
+
+
+def singular_start(problem: Problem, theta: np.ndarray, statuses: Mapping[str, str]) -> str:
+    """Return the term that is singular where the solve of an experiment, whose status is "not finite", starts."""
+    for e in problem.experiments:
+        if statuses[e.name] == STATUSES[NOT_FINITE]:
+            equations, parameters = problem.equations[e.name], problem.parameters(theta[None], e.name)[0]
+            at_rest = isinstance(e.guess, str) or not e.guess
+            start = equations.static_guess(parameters) if at_rest else as_guess(equations, e.guess)
+            return singular_term(equations, start, parameters)
+    return ""
 
 
 def _quantity(name: str) -> str:

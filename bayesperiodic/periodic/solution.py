@@ -306,6 +306,21 @@ class PeriodicSolution(Result):
         )
 
 
+def resolution_warning(solution: PeriodicSolution, orbit: str) -> str:
+    """Return a warning, about an orbit that is named, if the trivial multiplier shows that it is not resolved."""
+    if solution.resolved:
+        return ""
+    spectral = np.isinf(solution.scheme.order)
+    error = np.nan if spectral else solution.error_estimate()[FREQUENCY] / solution.frequency
+    size = f" and its frequency is wrong by about {error:.2g} of its value" if np.isfinite(error) else ""
+    cure = "more samples" if spectral else 'scheme="fourier", or more samples'
+    return (
+        f"{orbit} is not resolved by {solution.samples} samples and the scheme {solution.scheme.name!r}: its trivial "
+        f"multiplier is {_shown(min(solution.exponents, key=abs) * solution.period)} in place of 1{size}. Its stability "
+        f"is unknown. Take {cure}."
+    )
+
+
 def _shown(logarithm: complex) -> str:
     with np.errstate(over="ignore"):
         multiplier = np.exp(logarithm)
