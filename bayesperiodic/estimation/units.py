@@ -57,8 +57,8 @@ def singular_start(problem: Problem, theta: np.ndarray, statuses: Mapping[str, s
     for e in problem.experiments:
         if statuses[e.name] == STATUSES[NOT_FINITE]:
             equations, parameters = problem.equations[e.name], problem.parameters(theta[None], e.name)[0]
-            at_rest = isinstance(e.guess, str) or not e.guess
-            start = equations.static_guess(parameters) if at_rest else as_guess(equations, e.guess)
+            given = None if isinstance(e.guess, str) else e.guess
+            start = as_guess(equations, given) if given else equations.static_guess(parameters)
             return singular_term(equations, start, parameters)
     return ""
 

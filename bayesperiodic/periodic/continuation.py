@@ -385,8 +385,8 @@ class _Lost(Exception):
 
 def _doubling_test(solution: PeriodicSolution) -> float:
     """Return a test function that changes its sign where a multiplier passes −1; NaN if the orbit is not resolved."""
-    known = solution.floquet is not None and solution.resolved
-    exponents = solution.floquet.exponents if known else np.array([np.nan])
+    floquet = solution.floquet if solution.resolved else None
+    exponents = floquet.exponents if floquet is not None else np.array([np.nan])
     growth = np.abs(exponents.real)
     parts = np.exp(-growth) + np.exp(exponents - growth)
     return float(np.prod(parts).real)

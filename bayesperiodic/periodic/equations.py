@@ -28,7 +28,6 @@ from bayesperiodic.periodic.compiled import (
 )
 from bayesperiodic.periodic.schemes import CyclicGrid, Scheme, default_scheme, find_scheme
 
-
 # Values of all states from which an equilibrium is sought if the equations are singular at zero, in SI units, and the
 # relative size of the last step at an equilibrium.
 STARTS = tuple(sign * 10.0**k for sign in (1, -1) for k in sorted(range(-9, 10), key=abs))

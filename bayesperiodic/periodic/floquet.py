@@ -121,7 +121,9 @@ def floquet_of(steps: np.ndarray, *, reduced: bool = False) -> Floquet:
     """Return multipliers and eigenfunctions from the transfer matrices (points, size, size) of one period."""
     points, size, _ = steps.shape
     if not size:
-        return Floquet(np.empty(0, dtype=complex), steps, 1, *np.empty((2, 0, points, 0)), reduced)
+        return Floquet(
+            np.empty(0, dtype=complex), steps, 1, np.empty((0, points, 0)), np.empty((0, points, 0)), reduced
+        )
     groups, length = _harmless_products(steps)
     splits, right = _invariant_bases(groups)
     _, left = _invariant_bases(np.swapaxes(groups[::-1], 1, 2), splits)

@@ -314,10 +314,10 @@ def resolution_warning(solution: PeriodicSolution, orbit: str) -> str:
     error = np.nan if spectral else solution.error_estimate()[FREQUENCY] / solution.frequency
     size = f" and its frequency is wrong by about {error:.2g} of its value" if np.isfinite(error) else ""
     cure = "more samples" if spectral else 'scheme="fourier", or more samples'
+    multiplier = _shown(min(solution.exponents, key=abs) * solution.period)
     return (
         f"{orbit} is not resolved by {solution.samples} samples and the scheme {solution.scheme.name!r}: its trivial "
-        f"multiplier is {_shown(min(solution.exponents, key=abs) * solution.period)} in place of 1{size}. Its stability "
-        f"is unknown. Take {cure}."
+        f"multiplier is {multiplier} in place of 1{size}. Its stability is unknown. Take {cure}."
     )
 
 
