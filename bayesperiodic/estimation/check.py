@@ -32,7 +32,9 @@ from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit, W
 from bayesperiodic.estimation.unexplained import Unexplained, testable, used
 from bayesperiodic.estimation.units import unit_error
 from bayesperiodic.likelihood.input_noise import EXACT, FEWEST_CYCLES, ROUGH
-from bayesperiodic.periodic.solution import PeriodicSolution, resolution_warning
+from bayesperiodic.periodic.isolation import MANY_CYCLES
+from bayesperiodic.periodic.solution import PeriodicSolution, equations_of, resolution_warning
+from bayesperiodic.periodic.solve import is_one_of_many
 from bayesperiodic.problem.fingerprint import check_results
 
 # Part of a residual that noise of inputs taken as exact may cause, and changes [sds] by the grid and by what is not
@@ -203,6 +205,10 @@ def check_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
     for name, solution in fit.solutions.items():
         if text := resolution_warning(solution, f"The orbit of experiment {name!r}"):
             yield text
+        elif solution.autonomous and solution.converged and solution.stable is None:
+            equations, theta, _ = equations_of(problem.model, solution)
+            if is_one_of_many(equations, theta, solution):
+                yield f"The cycles of {solution.model!r} are not isolated: {MANY_CYCLES}"
     shifts = {name: shift for name, shift in fit.doubling_shift.items() if abs(shift) > LARGEST_SHIFT}
     shifts = {} if fit.without_noise else shifts
     if shifts:

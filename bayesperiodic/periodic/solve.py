@@ -9,8 +9,9 @@ import numpy as np
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.models.model import Model, integration_kernels, parameter_vector
 from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
-from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, OTHER_ORBIT, STATUSES
+from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, OTHER_ORBIT, SINGULAR, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
+from bayesperiodic.periodic.isolation import MANY_CYCLES, has_neighbours
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.singular_terms import singular_term
 from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, as_guess, describe, resolution_warning
@@ -206,7 +207,8 @@ def solve_periodic(
     UserWarning
         If the transition of a smooth sign takes fewer than four steps of the grid, if the estimated discretisation
         error of a state exceeds 30 % of its range, if the status is "not resolved", or if the trivial multiplier of an
-        autonomous model's orbit is wrong by more than 10 %, and if the equations are singular where the solve starts.
+        autonomous model's orbit is wrong by more than 10 %, if its cycles are not isolated, as those of conservative
+        models (status "singular"), and if the equations are singular where the solve starts.
 
     References
     ----------
@@ -242,9 +244,23 @@ def solve_periodic(
     else:
         solved, found_by = solve_driven(equations, theta, guess)
     solution = describe(equations, theta, solved, found_by)
+    in_family = model.autonomous and (not solution.converged or (solution.resolved and solution.stable is None))
+    if in_family and is_one_of_many(equations, theta, guess if not solution.converged else solution):
+        solution = describe(equations, theta, solved._replace(code=SINGULAR), found_by)
+        warnings.warn(f"The cycles of {model.name!r} are not isolated: {MANY_CYCLES}", UserWarning, stacklevel=2)
     for text in _solution_warnings(equations, theta, solution, solved.z):
         warnings.warn(text, UserWarning, stacklevel=2)
     return solution
+
+
+def is_one_of_many(
+    equations: PeriodicEquations, theta: np.ndarray, guess: str | Mapping[str, np.ndarray] | PeriodicSolution
+) -> bool:
+    """Return whether the cycle of an autonomous model near a guess is not isolated, see `isolation`."""
+    if isinstance(guess, str):
+        cycle = measured_cycle(equations, theta)
+        return cycle is not None and has_neighbours(equations, theta, *cycle)
+    return has_neighbours(equations, theta, as_guess(equations, guess), equations.frequency)
 
 
 def _solution_warnings(
