@@ -213,7 +213,7 @@ def _curve(draw: int, branches: Sequence[Branch]) -> pd.DataFrame:
     order = [(first, i) for i in backwards] + order
     columns: dict[str, list] = {
         "value": [branch.values[i] for branch, i in order],
-        "stable": [branch[i].stable for branch, i in order],
+        "stable": [bool(branch[i].stable) for branch, i in order],
         "kind": [branch.kinds[i] for branch, i in order],
     }
     for output in first[0].outputs:

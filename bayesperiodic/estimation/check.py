@@ -32,7 +32,9 @@ from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit, W
 from bayesperiodic.estimation.unexplained import Unexplained, testable, used
 from bayesperiodic.estimation.units import unit_error
 from bayesperiodic.likelihood.input_noise import EXACT, FEWEST_CYCLES, ROUGH
-from bayesperiodic.periodic.solution import PeriodicSolution
+from bayesperiodic.periodic.isolation import MANY_CYCLES
+from bayesperiodic.periodic.solution import PeriodicSolution, equations_of, resolution_warning
+from bayesperiodic.periodic.solve import is_one_of_many
 from bayesperiodic.problem.fingerprint import check_results
 
 # Part of a residual that noise of inputs taken as exact may cause, and changes [sds] by the grid and by what is not
@@ -67,7 +69,8 @@ def check(problem: Problem, fit: MapEstimate) -> FitCheck:
     -----
     UserWarning
         If the noise of the measured inputs causes more than a tenth of an output's residual, if twice as many points
-        would move an estimate by more than a tenth of its standard deviation, if the prior and the data are in
+        would move an estimate by more than a tenth of its standard deviation, if the trivial multiplier shows that the
+        grid does not resolve an orbit of an autonomous model, if the prior and the data are in
         conflict, if more than half of a channel's variance is unexplained, and if the data do not determine a parameter
         or a combination of parameters.
 
@@ -199,6 +202,13 @@ def channel_whiteness(problem: Problem, estimate: Iterate) -> dict[str, Whitenes
 def check_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
     """Yield the warnings about the checks of an estimate."""
     yield from _input_noise(problem, fit)
+    for name, solution in fit.solutions.items():
+        if text := resolution_warning(solution, f"The orbit of experiment {name!r}"):
+            yield text
+        elif solution.autonomous and solution.converged and solution.stable is None:
+            equations, theta, _ = equations_of(problem.model, solution)
+            if is_one_of_many(equations, theta, solution):
+                yield f"The cycles of {solution.model!r} are not isolated: {MANY_CYCLES}"
     shifts = {name: shift for name, shift in fit.doubling_shift.items() if abs(shift) > LARGEST_SHIFT}
     shifts = {} if fit.without_noise else shifts
     if shifts:

@@ -37,7 +37,7 @@ from bayesperiodic.estimation.gauss_newton import (
 from bayesperiodic.estimation.laplace import joint_laplace
 from bayesperiodic.estimation.modes import default_starts, notable, weighed, with_images
 from bayesperiodic.estimation.result import MapEstimate, NoiseEstimate, Search, TrueInputs
-from bayesperiodic.estimation.units import compared_with_data, unit_error
+from bayesperiodic.estimation.units import compared_with_data, not_isolated, singular_start, unit_error
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.problem.model_inputs import model_inputs
@@ -442,9 +442,14 @@ def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
             "start={…} nearer to the truth."
         )
     near = _linearised(problem, theta, initial)
+    if text := not_isolated(problem, theta, near.statuses):
+        return text
     failed = ", ".join(f"{name!r} ({status})" for name, status in near.statuses.items() if status != "converged")
     ended = f"without the orbit of {failed}" if failed else "well, but the outputs or the noise are not finite"
     cures = "start={…}, or priors with other medians, at which problem.solve(theta) converges."
+    if term := singular_start(problem, theta, near.statuses):
+        ended += f", because the equations contain {term}"
+        cures = "guess={…} in fold, with states at which they are finite, or start={…}."
     if STATUSES[NOT_RESOLVED] in near.statuses.values():
         cures = "more samples, an odd number of them, or another scheme, such as Problem(scheme='backward2')."
     return (

@@ -1,5 +1,6 @@
 """Hints where a fit fails: measured against modelled frequency and amplitude, and units as a likely cause."""
 
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -7,8 +8,13 @@ import numpy as np
 
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.likelihood.observation import Response
+from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 from bayesperiodic.periodic.equations import FREQUENCY
 from bayesperiodic.periodic.floquet import first_order_matrix
+from bayesperiodic.periodic.isolation import MANY_CYCLES
+from bayesperiodic.periodic.singular_terms import singular_term
+from bayesperiodic.periodic.solution import as_guess
+from bayesperiodic.periodic.solve import is_one_of_many
 
 # Experiments named in a message, and the powers of ten that point to a unit.
 SHOWN_EXPERIMENTS, UNIT_DECADES = 3, 2.0
@@ -46,6 +52,28 @@ def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
                     modelled[channel] = 0.5 * float(np.ptp(values))
         scales[e.name] = Scales(measured, {name: size for name, size in modelled.items() if 0.0 < size < np.inf})
     return scales
+
+
+def singular_start(problem: Problem, theta: np.ndarray, statuses: Mapping[str, str]) -> str:
+    """Return the term that is singular where the solve of an experiment, whose status is "not finite", starts."""
+    for e in problem.experiments:
+        if statuses[e.name] == STATUSES[NOT_FINITE]:
+            equations, parameters = problem.equations[e.name], problem.parameters(theta[None], e.name)[0]
+            given = None if isinstance(e.guess, str) else e.guess
+            start = as_guess(equations, given) if given else equations.static_guess(parameters)
+            return singular_term(equations, start, parameters)
+    return ""
+
+
+def not_isolated(problem: Problem, theta: np.ndarray, statuses: Mapping[str, str]) -> str:
+    """Return what is wrong with an autonomous model whose cycles are not isolated, where a solve has failed."""
+    for e in problem.experiments if problem.model.autonomous else ():
+        if statuses[e.name] != STATUSES[CONVERGED]:
+            equations, parameters = problem.equations[e.name], problem.parameters(theta[None], e.name)[0]
+            given = None if isinstance(e.guess, str) else e.guess
+            if is_one_of_many(equations, parameters, given or "static"):
+                return f"model: must have isolated cycles, got {problem.model.name!r}: {MANY_CYCLES}"
+    return ""
 
 
 def _quantity(name: str) -> str:

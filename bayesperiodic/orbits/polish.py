@@ -282,7 +282,10 @@ class _Polisher:
         samples, count = self.samples, equations.count
         starts = self._phases(orbit, equations, orbit.points, rates=True)
         half = _fourier.on_grid(_fourier.coefficients(equations.inputs[:samples].T), 2 * samples).T
-        paths = [integrate(equations, self.theta, start, half, samples + 1, samples + 1) for start in starts]
+        paths = [
+            integrate(equations, self.theta, start, half, samples + 1, samples + 1, equations.grid.samples)
+            for start in starts
+        ]
         segments = np.array([path[:, :count] for path in paths if path is not None])
         if len(segments) < orbit.period:
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -19,7 +20,13 @@ from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.arclength import INPUTS, BranchPoint, ParametrisedEquations, Tracer, trace
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved, null_vector
-from bayesperiodic.periodic.solution import PeriodicSolution, describe, equations_of, settings_of
+from bayesperiodic.periodic.solution import (
+    PeriodicSolution,
+    describe,
+    equations_of,
+    resolution_warning,
+    settings_of,
+)
 from bayesperiodic.periodic.solve import solve_periodic
 
 if TYPE_CHECKING:
@@ -111,7 +118,8 @@ class Branch(Result, Sequence):
                 "frequency": ("point", [s.frequency for s in self.solutions], {"units": "Hz"}),
                 "multiplier_real": (("point", "multiplier"), multipliers.real),
                 "multiplier_imaginary": (("point", "multiplier"), multipliers.imag),
-                "stable": ("point", [s.stable for s in self.solutions]),
+                "stable": ("point", [bool(s.stable) for s in self.solutions]),
+                "stability_known": ("point", [s.stable is not None for s in self.solutions]),
                 "kind": ("point", list(self.kinds)),
             },
             coords={
@@ -171,6 +179,11 @@ def continue_periodic(
         If the solution has not converged or is of another model, for an unknown `vary`, the frequency of an autonomous
         model, `until` equal to the start value, a step ≤ 0.
 
+    Warns
+    -----
+    UserWarning
+        If the grid does not resolve some orbits of an autonomous model, see `PeriodicSolution.resolved`.
+
     References
     ----------
     .. [1] H. B. Keller, Numerical solution of bifurcation and nonlinear eigenvalue problems, in: P. H. Rabinowitz
@@ -192,6 +205,12 @@ def continue_periodic(
     values, solutions, kinds = zip(*points, strict=True)
     units = model.units | ({FREQUENCY: "Hz"} if vary == FREQUENCY else {vary: ""} if vary in model.inputs else {})
     complete = values[-1] == until or (len(values) > 1 and values[-1] == values[0])
+    if blurred := [s for s in solutions if not s.resolved]:
+        worst = max(blurred, key=lambda s: s.trivial_error)
+        orbits = (
+            f"{len(blurred)} of {len(solutions)} orbits of the branch are not resolved, and period doublings there "
+        )
+        warnings.warn(f"{orbits}not found. {resolution_warning(worst, 'The worst')}", UserWarning, stacklevel=3)
     return Branch(vary, units, np.array(values), solutions, kinds, complete)
 
 
@@ -271,7 +290,7 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
     (2, {'phi': 2}, True)
     """
     equations, parameters, z = equations_of(model, solution)
-    if np.min(abs(solution.multipliers + 1.0)) > 0.1:
+    if np.min(abs(solution.multipliers + 1.0), initial=np.inf) > 0.1:
         raise ValueError(
             f"solution: must have a multiplier near -1, got {solution.multipliers}. Take a period doubling of a branch."
         )
@@ -347,7 +366,10 @@ def _locate(
             if corrected is None:
                 raise _Lost
             known[distance] = corrected[0]
-        return test(known[distance])
+        value = test(known[distance])
+        if np.isnan(value):
+            raise _Lost
+        return value
 
     try:
         root = brentq(at, 0.0, span, xtol=LOCATED * span, rtol=1e-14)
@@ -358,12 +380,13 @@ def _locate(
 
 
 class _Lost(Exception):
-    """A correction failed."""
+    """A correction failed, or the point is not resolved."""
 
 
 def _doubling_test(solution: PeriodicSolution) -> float:
-    """Return a test function that changes its sign where a multiplier passes −1."""
-    exponents = solution.floquet.exponents if solution.floquet is not None else np.array([np.nan])
+    """Return a test function that changes its sign where a multiplier passes −1; NaN if the orbit is not resolved."""
+    floquet = solution.floquet if solution.resolved else None
+    exponents = floquet.exponents if floquet is not None else np.array([np.nan])
     growth = np.abs(exponents.real)
     parts = np.exp(-growth) + np.exp(exponents - growth)
     return float(np.prod(parts).real)

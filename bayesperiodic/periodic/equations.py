@@ -28,6 +28,11 @@ from bayesperiodic.periodic.compiled import (
 )
 from bayesperiodic.periodic.schemes import CyclicGrid, Scheme, default_scheme, find_scheme
 
+# Values of all states from which an equilibrium is sought if the equations are singular at zero, in SI units, and the
+# relative size of the last step at an equilibrium.
+STARTS = tuple(sign * 10.0**k for sign in (1, -1) for k in sorted(range(-9, 10), key=abs))
+AT_EQUILIBRIUM = 1e-6
+
 
 class CyclicFactors:
     """Factors of the folded band of ∂g/∂z, with pivoting; not `regular` if a pivot is zero or not finite.
@@ -216,11 +221,29 @@ class PeriodicEquations:
         return replace(self, frequency=frequency, inputs=inputs)
 
     def static_guess(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the equilibrium under the mean inputs, (points, states); least squares where it is not unique."""
+        """Return the equilibrium under the mean inputs, (points, states); least squares where it is not unique.
+
+        The iteration starts from zero; where the equations are singular there, from `STARTS` for all states, until an
+        equilibrium is found.
+        """
+        solution, found, finite = self._equilibrium(parameters, 0.0)
+        for start in () if finite else STARTS:
+            other, found, _ = self._equilibrium(parameters, start)
+            if found:
+                solution = other
+                break
+        return np.tile(solution, (self.grid.points, 1))
+
+    def _equilibrium(self, parameters: np.ndarray, start: float) -> tuple[np.ndarray, bool, bool]:
+        """Return where Newton's iteration ends, if that is an equilibrium, and if the equations are finite at a start.
+
+        All states are equal at the start.
+        """
         kernels, count = self.model.kernels, self.count
         inputs, tau = np.ascontiguousarray(self.inputs.mean(axis=0)[None]), np.zeros(1)
         inputs[0, len(self.model.inputs) :] = 0.0
-        states, best = np.zeros((1, 3 * count)), np.inf
+        states, best, step = np.zeros((1, 3 * count)), np.inf, np.full(count, np.inf)
+        states[0, :count] = start
         solution = states[0, :count].copy()
         for _ in range(MOST_NEWTON_STEPS):
             row = kernels.evaluate("residual_jacobian", states, inputs, parameters, tau, self.frequency)[0]
@@ -229,8 +252,10 @@ class PeriodicEquations:
             if not np.isfinite(row).all() or size >= best:
                 break
             best, solution = size, states[0, :count].copy()
-            states[0, :count] -= np.linalg.lstsq(stiffness, residual, rcond=None)[0]
-        return np.tile(solution, (self.grid.points, 1))
+            step = np.linalg.lstsq(stiffness, residual, rcond=None)[0]
+            states[0, :count] -= step
+        near = np.max(np.abs(step)) <= AT_EQUILIBRIUM * np.max(np.abs(solution))
+        return solution, bool(near), best < np.inf
 
     def solve(
         self, parameters: np.ndarray, guess: np.ndarray, unknowns: Unknowns = NO_UNKNOWNS, border: Border = NO_BORDER

@@ -51,6 +51,7 @@ class Floquet:
     _every: int
     _along: np.ndarray
     _across: np.ndarray
+    reduced: bool = False  # True if the equations contain algebraic ones: then not in the variables of the equations
 
     def leading(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return for the first multipliers v of ẏ = A y and w of the adjoint ẇ = −Aᵀ w, complex (count, points, size).
@@ -113,8 +114,16 @@ def floquet(matrix: np.ndarray, period: float) -> Floquet:
 
     `matrix` (points, size, size) is A [1/s] on an equidistant grid of one period [s], end point excluded.
     """
-    points, size, _ = matrix.shape
-    steps = _transfer_matrices(matrix, period / points)
+    return floquet_of(transfer_matrices(matrix, period / len(matrix)))
+
+
+def floquet_of(steps: np.ndarray, *, reduced: bool = False) -> Floquet:
+    """Return multipliers and eigenfunctions from the transfer matrices (points, size, size) of one period."""
+    points, size, _ = steps.shape
+    if not size:
+        return Floquet(
+            np.empty(0, dtype=complex), steps, 1, np.empty((0, points, 0)), np.empty((0, points, 0)), reduced
+        )
     groups, length = _harmless_products(steps)
     splits, right = _invariant_bases(groups)
     _, left = _invariant_bases(np.swapaxes(groups[::-1], 1, 2), splits)
@@ -124,7 +133,7 @@ def floquet(matrix: np.ndarray, period: float) -> Floquet:
         modes += _block(groups, *_eigenspaces(right, left, start, stop))
     exponents, v, w = (np.array(part) for part in zip(*modes, strict=True))
     order = np.argsort(-exponents.real, kind="stable")
-    return Floquet(exponents[order], steps, length, v[order], w[order])
+    return Floquet(exponents[order], steps, length, v[order], w[order], reduced)
 
 
 def leading_multipliers(matrix: np.ndarray, period: float, count: int) -> np.ndarray | None:
@@ -135,7 +144,7 @@ def leading_multipliers(matrix: np.ndarray, period: float, count: int) -> np.nda
     are those of `floquet`.
     """
     points, size, _ = matrix.shape
-    steps = _transfer_matrices(matrix, period / points)
+    steps = transfer_matrices(matrix, period / points)
     if count == 1:
         dominant, logarithm, sign = _kernels().dominant_multiplier(
             steps, np.full(size, 1.0 / np.sqrt(size)), POWER_ROUNDS, DECOUPLED
@@ -150,8 +159,8 @@ def leading_multipliers(matrix: np.ndarray, period: float, count: int) -> np.nda
     return values[np.argsort(-np.abs(values), kind="stable")][:count]
 
 
-def _transfer_matrices(matrix: np.ndarray, step: float) -> np.ndarray:
-    """Return (points, size, size): from each grid point to the next."""
+def transfer_matrices(matrix: np.ndarray, step: float) -> np.ndarray:
+    """Return those of ẏ = A y, (points, size, size), from each grid point to the next."""
     width = min(STENCIL, len(matrix))
     first = 1 - width // 2
     stiffness = step * float(np.max(np.linalg.norm(matrix, axis=(1, 2))))

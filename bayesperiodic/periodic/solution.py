@@ -22,7 +22,8 @@ from bayesperiodic.periodic.equations import (
     parameter_sensitivities,
     phase_row,
 )
-from bayesperiodic.periodic.floquet import Floquet, derivative_factors, first_order_matrix, floquet
+from bayesperiodic.periodic.floquet import Floquet, derivative_factors, first_order_matrix
+from bayesperiodic.periodic.index_one import orbit_floquet
 from bayesperiodic.periodic.schemes import CyclicGrid, Scheme
 
 
@@ -76,6 +77,10 @@ def _twice_the_points(equations: PeriodicEquations, z: np.ndarray, theta: np.nda
 NEWTON = "newton"
 # Difference of an output from a state [rad] up to which it is this angle, but for a constant.
 SAME_ANGLE = 1e-6
+# Largest error of the logarithm of an autonomous orbit's trivial multiplier for which the grid resolves the orbit: the
+# period is then right to 0.4 % in relaxation oscillations with mu up to 20 and all schemes. A multiplier is on one side
+# of the unit circle if its logarithm exceeds this error by a factor.
+TRIVIAL_ERROR, CLEAR = 0.1, 2.0
 
 
 @dataclass(frozen=True)
@@ -179,18 +184,17 @@ class PeriodicSolution(Result):
         """The response period [s]."""
         return self.periods / self.frequency
 
-    @cached_property
+    @property
     def floquet(self) -> Floquet | None:
         """Exponents and eigenfunctions of the linearised equations; None unless converged."""
+        return None if isinstance(self._linearised, str) else self._linearised
+
+    @cached_property
+    def _linearised(self) -> Floquet | str:
+        """Multipliers and eigenfunctions, or why there are none."""
         if not self.converged:
-            return None
-        orders = tuple(self.orders.values())
-        try:
-            matrix = first_order_matrix(self.linearisation, orders)
-        except np.linalg.LinAlgError:
-            return None
-        sizes = self._sizes()
-        return floquet(matrix * (sizes / sizes[:, None]), self.period)
+            return f"the solve ended with the status {self.status!r}"
+        return orbit_floquet(self.linearisation, tuple(self.orders.values()), self._sizes(), self.period)
 
     def _sizes(self) -> np.ndarray:
         """Return typical sizes of the states, then of the rates of the second-order ones, for scaling."""
@@ -223,7 +227,8 @@ class PeriodicSolution(Result):
         """Floquet multipliers over the response period, complex (multipliers,), largest modulus first.
 
         They are those of the linearised differential equations, including the trivial 1 of an autonomous model; none
-        unless converged.
+        unless converged. If some equations are algebraic (a singular matrix of the highest derivatives, index 1),
+        there are as many as the rank of this matrix.
         """
         with np.errstate(over="ignore"):
             return np.exp(self.floquet.exponents) if self.floquet is not None else np.empty(0, dtype=complex)
@@ -234,14 +239,49 @@ class PeriodicSolution(Result):
         return self.floquet.exponents / self.period if self.floquet is not None else np.empty(0, dtype=complex)
 
     @property
-    def stable(self) -> bool:
-        """True if all multipliers except an autonomous model's trivial one are inside the unit circle."""
-        if self.floquet is None:
-            return False
-        exponents = self.floquet.exponents
-        if self.autonomous:
-            exponents = np.delete(exponents, np.argmin(abs(exponents)))
-        return bool(np.all(exponents.real < 0.0))
+    def trivial_error(self) -> float:
+        """Modulus of the logarithm of an autonomous orbit's trivial multiplier, zero if the orbit is resolved.
+
+        An autonomous orbit has a multiplier 1, so that this is the error of the multipliers. NaN for a driven model and
+        without multipliers.
+        """
+        if not self.autonomous or self.floquet is None or not self.floquet.exponents.size:
+            return np.nan
+        return float(np.min(abs(self.floquet.exponents)))
+
+    @property
+    def resolved(self) -> bool:
+        """False if the trivial multiplier of an autonomous orbit is wrong by more than 10 %: take more points."""
+        return not self.trivial_error > TRIVIAL_ERROR
+
+    @property
+    def stable(self) -> bool | None:
+        """True if all multipliers except an autonomous model's trivial one are inside the unit circle; None if unknown.
+
+        It is unknown (`stability_unknown` says why) unless the solve has converged, if the grid does not resolve an
+        autonomous orbit or another of its multipliers is as close to the unit circle as the trivial one is to 1, and if
+        there are no multipliers.
+        """
+        return None if self.stability_unknown else bool(np.all(self._others.real < 0.0))
+
+    @property
+    def stability_unknown(self) -> str:
+        """Why the stability is unknown; empty if it is known."""
+        if isinstance(self._linearised, str):
+            return self._linearised
+        if not self.resolved:
+            trivial = min(self.exponents, key=abs) * self.period
+            return f"the trivial multiplier is {_shown(trivial)} in place of 1: the grid does not resolve the orbit"
+        near = self._others[np.abs(self._others.real) <= CLEAR * self.trivial_error]
+        if near.size:
+            return f"the multiplier {_shown(near[0])} is as near to the unit circle as the trivial one is to 1"
+        return ""
+
+    @property
+    def _others(self) -> np.ndarray:
+        """Logarithms of the multipliers without the trivial one."""
+        exponents = self.floquet.exponents if self.floquet is not None else np.empty(0, dtype=complex)
+        return np.delete(exponents, np.argmin(abs(exponents))) if self.autonomous and exponents.size else exponents
 
     def error_estimate(self) -> dict[str, float]:
         """Return the estimated discretisation error of each state, the largest on the grid.
@@ -258,11 +298,33 @@ class PeriodicSolution(Result):
         return estimate_error(self, z)
 
     def __repr__(self) -> str:
+        unknown = f", stability unknown: {self.stability_unknown}" if self.converged and self.stability_unknown else ""
         return (
             f"PeriodicSolution({self.model!r}, {self.status!r}, frequency={self.frequency:.6g} Hz, "
             f"samples={self.samples}, periods={self.periods}, iterations={self.iterations}, "
-            f"residual={self.residual:.1e})"
+            f"residual={self.residual:.1e}{unknown})"
         )
+
+
+def resolution_warning(solution: PeriodicSolution, orbit: str) -> str:
+    """Return a warning, about an orbit that is named, if the trivial multiplier shows that it is not resolved."""
+    if solution.resolved:
+        return ""
+    spectral = np.isinf(solution.scheme.order)
+    error = np.nan if spectral else solution.error_estimate()[FREQUENCY] / solution.frequency
+    size = f" and its frequency is wrong by about {error:.2g} of its value" if np.isfinite(error) else ""
+    cure = "more samples" if spectral else 'scheme="fourier", or more samples'
+    multiplier = _shown(min(solution.exponents, key=abs) * solution.period)
+    return (
+        f"{orbit} is not resolved by {solution.samples} samples and the scheme {solution.scheme.name!r}: its trivial "
+        f"multiplier is {multiplier} in place of 1{size}. Its stability is unknown. Take {cure}."
+    )
+
+
+def _shown(logarithm: complex) -> str:
+    with np.errstate(over="ignore"):
+        multiplier = np.exp(logarithm)
+    return f"{multiplier.real:.3g}" if abs(multiplier.imag) < 1e-9 * abs(multiplier) else f"{multiplier:.3g}"
 
 
 def describe(
@@ -402,6 +464,11 @@ def multiplier_sensitivities(model: Model, solution: PeriodicSolution) -> dict[s
     derivative = parameter_sensitivities(equations, z, theta)
     if solution.floquet is None or derivative is None:
         raise ValueError("solution: must be regular, got singular linearised equations. Change a parameter slightly.")
+    if solution.floquet.reduced:
+        raise ValueError(
+            "solution: must be of a model without algebraic equations, got a singular matrix of the highest "
+            "derivatives. Eliminate a state, or take differences of `multipliers` at two parameter values."
+        )
     names = [*model.parameters, FREQUENCY][: len(derivative.frequency)]
     directions = np.eye(len(names), theta.size)
     frequency = derivative.frequency if model.autonomous else np.eye(len(names))[-1]

@@ -9,10 +9,12 @@ import numpy as np
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.models.model import Model, integration_kernels, parameter_vector
 from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
-from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, OTHER_ORBIT, STATUSES
+from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, OTHER_ORBIT, SINGULAR, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
+from bayesperiodic.periodic.isolation import MANY_CYCLES, has_neighbours
 from bayesperiodic.periodic.schemes import Scheme
-from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, as_guess, describe
+from bayesperiodic.periodic.singular_terms import singular_term
+from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, as_guess, describe, resolution_warning
 
 SOFTEST = 1e-3
 SHARPENING = 2.0
@@ -60,12 +62,19 @@ def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndar
 PERIODS = 40
 SETTLING_CYCLES = 120
 NUDGE = 0.1
+REFINEMENTS = (1, 4, 16)  # of the grid, until the integration does not overflow
 
 
 def integrate(
-    equations: PeriodicEquations, parameters: np.ndarray, start: np.ndarray, inputs: np.ndarray, steps: int, kept: int
+    equations: PeriodicEquations,
+    parameters: np.ndarray,
+    start: np.ndarray,
+    inputs: np.ndarray,
+    steps: int,
+    kept: int,
+    samples: int,
 ) -> np.ndarray | None:
-    """Integrate by the classical fourth-order Runge-Kutta method on the grid; None if the states overflow.
+    """Integrate by the classical fourth-order Runge-Kutta method in `samples` steps a period; None if states overflow.
 
     `start` (size,) contains the states and then the rates of the second-order ones at tau = 0; `inputs`
     (2·samples·periods, 3·inputs) u, u̇, ü at half steps over one response period, which is repeated. The result (kept,
@@ -76,7 +85,7 @@ def integrate(
         equations.model.kernels.residual_jacobian.address,
     )
     path = np.empty((kept, orders.sum()))
-    given = np.array(start, dtype=float), np.ascontiguousarray(inputs), equations.grid.samples, parameters
+    given = np.array(start, dtype=float), np.ascontiguousarray(inputs), samples, parameters
     solved = integration_kernels().runge_kutta(function, *given, equations.frequency, orders, steps, path)
     return path if solved else None
 
@@ -90,7 +99,7 @@ def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: 
     second = [i for i, state in enumerate(equations.model.states) if equations.model.orders[state] == 2]
     half = _fourier.on_grid(_fourier.coefficients(equations.inputs.T), 2 * grid.points).T
     state, steps = np.concatenate([start[0], equations.drift[second] * equations.frequency]), PERIODS * grid.points
-    path = integrate(equations, parameters, state, half, steps, grid.points)
+    path = integrate(equations, parameters, state, half, steps, grid.points, grid.samples)
     if path is None:
         return None
     z = path[:, :count] - equations.drift * (grid.tau[:, None] + (PERIODS - 1) * grid.periods)
@@ -111,9 +120,14 @@ def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tupl
     equilibrium = equations.static_guess(parameters)[0]
     rates = sum(model.orders.values()) - count
     start = np.concatenate([equilibrium + NUDGE * np.maximum(np.abs(equilibrium), 1.0), np.zeros(rates)])
-    steps = SETTLING_CYCLES * grid.samples
-    path = integrate(equations, parameters, start, np.empty((2, 0)), steps, steps // 4)
-    if path is None:
+    path = None
+    for finer in REFINEMENTS:  # stiff equations need shorter steps than the orbit
+        samples = grid.samples * finer
+        steps = SETTLING_CYCLES * samples
+        path = integrate(equations, parameters, start, np.empty((2, 0)), steps, steps // 4, samples)
+        if path is not None:
+            break
+    else:
         return None
     state = path[:, int(np.argmax(np.ptp(path[:, :count], axis=0) / (1.0 + np.abs(path[:, :count]).max(axis=0))))]
     height = state - 0.5 * (state.max() + state.min())
@@ -123,7 +137,7 @@ def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tupl
     times = passages - height[passages] / (height[passages + 1] - height[passages])
     at = np.linspace(times[-2], times[-1], grid.points, endpoint=False)
     z = np.stack([np.interp(at, np.arange(len(path)), path[:, s]) for s in range(count)], axis=-1)
-    return z, equations.frequency * grid.samples / float(times[-1] - times[-2])
+    return z, equations.frequency * samples / float(times[-1] - times[-2])
 
 
 GUESSES = ("static", "integration")
@@ -171,7 +185,8 @@ def solve_periodic(
     winding : int or mapping of str to int
         Turns that an angle advances per response period.
     guess : "static", "integration", mapping of str to array (samples·periods,), or PeriodicSolution
-        The equilibrium under the mean inputs, the end of a short time integration from there, every state (turns of
+        The equilibrium under the mean inputs (sought from zero, or from powers of ten if the equations are singular
+        there), the end of a short time integration from there, every state (turns of
         angles included), or an earlier solution, on any grid, of as many periods or a fraction of them. If the
         integration fails or does not lock to the winding number, the static guess is used. For an autonomous model
         "static" means an integration from near the equilibrium; the phase of its orbit is the closest to the guess.
@@ -191,7 +206,9 @@ def solve_periodic(
     -----
     UserWarning
         If the transition of a smooth sign takes fewer than four steps of the grid, if the estimated discretisation
-        error of a state exceeds 30 % of its range, or if the status is "not resolved".
+        error of a state exceeds 30 % of its range, if the status is "not resolved", or if the trivial multiplier of an
+        autonomous model's orbit is wrong by more than 10 %, if its cycles are not isolated, as those of conservative
+        models (status "singular"), and if the equations are singular where the solve starts.
 
     References
     ----------
@@ -227,9 +244,23 @@ def solve_periodic(
     else:
         solved, found_by = solve_driven(equations, theta, guess)
     solution = describe(equations, theta, solved, found_by)
+    in_family = model.autonomous and (not solution.converged or (solution.resolved and solution.stable is None))
+    if in_family and is_one_of_many(equations, theta, guess if not solution.converged else solution):
+        solution = describe(equations, theta, solved._replace(code=SINGULAR), found_by)
+        warnings.warn(f"The cycles of {model.name!r} are not isolated: {MANY_CYCLES}", UserWarning, stacklevel=2)
     for text in _solution_warnings(equations, theta, solution, solved.z):
         warnings.warn(text, UserWarning, stacklevel=2)
     return solution
+
+
+def is_one_of_many(
+    equations: PeriodicEquations, theta: np.ndarray, guess: str | Mapping[str, np.ndarray] | PeriodicSolution
+) -> bool:
+    """Return whether the cycle of an autonomous model near a guess is not isolated, see `isolation`."""
+    if isinstance(guess, str):
+        cycle = measured_cycle(equations, theta)
+        return cycle is not None and has_neighbours(equations, theta, *cycle)
+    return has_neighbours(equations, theta, as_guess(equations, guess), equations.frequency)
 
 
 def _solution_warnings(
@@ -237,6 +268,11 @@ def _solution_warnings(
 ) -> Iterator[str]:
     """Yield the warnings about a solution: what the grid does not resolve."""
     name, samples = solution.model, solution.samples
+    if solution.status == STATUSES[NOT_FINITE] and (term := singular_term(equations, z, theta)):
+        yield (
+            f"The equations of {name!r} are not finite at states that the solve starts from or reaches: {term}. Give "
+            "guess={…} with states at which they are finite."
+        )
     if solution.status == STATUSES[NOT_RESOLVED]:
         yield (
             f"The solution of {name!r} is not resolved: its values at even and odd points differ, or "
@@ -245,6 +281,8 @@ def _solution_warnings(
         )
     if not solution.converged:
         return
+    if text := resolution_warning(solution, f"The orbit of {name!r}"):
+        yield text
     steps = _steps_of_transitions(equations, theta, z)
     if steps < FEW_STEPS:
         yield (

@@ -18,10 +18,12 @@ from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, styled
 
 BRANCH_MEASURES = ("amplitude", "maximum", "section", "period")
-STABILITIES = {True: "stable", False: "unstable"}
+STABILITIES = ("unstable", "stable", "stability unknown")
+UNKNOWN, SPECIAL = 2, 3
 BRANCH_STYLES: dict[str, dict[str, Any]] = {
     "stable": {"lw": 1.6, "ls": "-"},
     "unstable": {"lw": 1.6, "ls": "--"},
+    "stability unknown": {"lw": 1.6, "ls": ":"},
     FOLD: {"marker": "o", "mfc": "white", "mew": 1.4, "ls": ""},
     PERIOD_DOUBLING: {"marker": "D", "mfc": "white", "mew": 1.4, "ls": ""},
 }
@@ -108,7 +110,7 @@ def _draw_branch(ax: Axes, branch: Branch, measure: Any, output: str, factor: fl
     across, up = factor * branch.values, _measures(branch, measure, output)
     runs = _runs(branch)
     for stable, part in runs:
-        ax.plot(across[part], up[part], color=colour, zorder=2 + stable, **BRANCH_STYLES[STABILITIES[stable]])
+        ax.plot(across[part], up[part], color=colour, zorder=2 + (stable == 1), **BRANCH_STYLES[STABILITIES[stable]])
     for kind in (FOLD, PERIOD_DOUBLING):
         at = np.array([k == kind for k in branch.kinds])
         ax.plot(np.repeat(across[at], up.shape[1]), up[at].ravel(), color=colour, ms=6, zorder=4, **BRANCH_STYLES[kind])
@@ -130,7 +132,7 @@ def _draw_prediction(
     look = BRANCH_STYLES[FOLD] | {"color": colour, "ms": 6, "zorder": 4}
     if len(middle):
         ax.errorbar(middle, heights, xerr=[middle - low, high - middle], **look)
-    return {STABILITIES[stable] for stable in curves["stable"]} | {*curves["kind"]}
+    return {STABILITIES[int(stable)] for stable in curves["stable"]} | {*curves["kind"]}
 
 
 def _measures(branch: Branch, measure: str | Callable, output: str) -> np.ndarray:
@@ -151,17 +153,20 @@ def _measures(branch: Branch, measure: str | Callable, output: str) -> np.ndarra
     return points
 
 
-def _runs(branch: Branch) -> list[tuple[bool, slice]]:
-    """Return the stable and unstable parts of the branch; folds and period doublings belong to both neighbours."""
-    plain = [None if kind else solution.stable for solution, kind in zip(branch, branch.kinds, strict=True)]
-    between = [True in pair and False not in pair for pair in pairwise(plain)]
+def _runs(branch: Branch) -> list[tuple[int, slice]]:
+    """Return the parts of equal stability (an index of `STABILITIES`); special points belong to both neighbours."""
+    plain = [
+        SPECIAL if kind else UNKNOWN if solution.stable is None else int(solution.stable)
+        for solution, kind in zip(branch, branch.kinds, strict=True)
+    ]
+    between = [0 if 0 in pair else UNKNOWN if UNKNOWN in pair else int(1 in pair) for pair in pairwise(plain)]
     return [(stable, slice(part.start, part.stop + 1)) for stable, part in _stretches(between) if between]
 
 
-def _stretches(flags: Sequence[bool] | np.ndarray) -> list[tuple[bool, slice]]:
+def _stretches(flags: Sequence[int] | np.ndarray) -> list[tuple[int, slice]]:
     """Return the stretches of equal flags, with the flag."""
     starts = [0, *(np.flatnonzero(np.diff(flags)) + 1), len(flags)]
-    return [(bool(flags[begin]), slice(begin, end)) for begin, end in pairwise(starts)]
+    return [(int(flags[begin]), slice(begin, end)) for begin, end in pairwise(starts)]
 
 
 def _measure_label(measure: str | Callable, output: str, unit: str) -> str:
