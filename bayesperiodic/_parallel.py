@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 from tqdm import tqdm
 
 from bayesperiodic import _checks
+from bayesperiodic._files import in_folder, locked
 from bayesperiodic._linalg import in_one_thread
 
 Item = TypeVar("Item")
@@ -354,16 +355,17 @@ def checkpointed_tasks(
     return [done[task] for task in tasks]
 
 
-def _locked(path: Path) -> Any:
-    from filelock import FileLock, Timeout
-
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
     path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        return FileLock(path.with_name(f".{path.name}.lock")).acquire(timeout=0.0)
-    except Timeout:
-        raise ValueError(
-            f"folder: must not be in use by another run, got {str(path.parent)!r}; wait, or choose another folder."
-        ) from None
+    with ExitStack() as held:
+        try:
+            held.enter_context(locked(in_folder(path)))
+        except BlockingIOError:
+            raise ValueError(
+                f"folder: must not be in use by another run, got {str(path.parent)!r}; wait, or choose another folder."
+            ) from None
+        yield
 
 
 def _read(path: Path | None) -> list[Line]:
