@@ -68,8 +68,8 @@ def remove_drafts(target: Path) -> None:
 
 
 @contextmanager
-def locked(target: Path) -> Iterator[None]:
-    """Hold the lock of a file from `in_folder`; raise a BlockingIOError if another run holds it.
+def locked(target: Path, *, wait: float = 0.0) -> Iterator[None]:
+    """Hold the lock of a file from `in_folder`; raise a BlockingIOError if another run holds it for so many seconds.
 
     The lock ends with its process. Its file has a name that no other program uses; one that was there before is taken
     over only if it is empty, as a killed process leaves it, and others are not removed.
@@ -80,7 +80,7 @@ def locked(target: Path) -> Iterator[None]:
     if os.path.lexists(place) and (place.is_symlink() or not place.is_file()):
         raise FileExistsError(f"{str(place)!r} is in the place of the lock; remove it")
     foreign = place.exists() and place.stat().st_size > 0
-    lock = FileLock(place, timeout=0.0)
+    lock = FileLock(place, timeout=wait)
     try:
         lock.acquire()
     except Timeout:
