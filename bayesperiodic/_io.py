@@ -4,15 +4,12 @@ A file is composed in memory, because HDF5 itself crashes on a full disk, and en
 other readers of HDF5 ignore.
 """
 
-import hashlib
 import io
 import json
 import os
 import re
 import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import MISSING, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -20,11 +17,15 @@ from typing import Any
 
 import numpy as np
 
+from bayesperiodic import _checks
+from bayesperiodic._files import read_sealed, write_sealed
+
 HEADER = "bayesperiodic_result"
 ARRAYS = "arrays"
-SEAL = b"\nbayesperiodic sha256 "
 OTHER = "path: must contain a result of this version of bayesperiodic"
 REMEDY = "load it with the version that saved it, or compute it again"
+# Bytes of a file, by default; its values are not larger.
+LARGEST_FILE = 2.0**31
 # Metadata of fields that are left out of files; they have defaults.
 NOT_STORED = {"stored": False}
 # Modules in files are paths below this package, without private names: nothing outside of it can be named.
@@ -41,6 +42,8 @@ class Result(Storable):
     def save(self, path: str | Path) -> None:
         """Write the result to an HDF5 file; an existing file is replaced when the new one is complete.
 
+        Symbolic links stay, and the file to which they lead is written.
+
         The file of a result with draws is a netCDF file, which xarray and ArviZ open (``arviz.from_netcdf``).
 
         Parameters
@@ -51,7 +54,7 @@ class Result(Storable):
         Raises
         ------
         OSError
-            If the file cannot be written.
+            If the file cannot be written, or the path leads to a folder, a device or a pipe.
         TypeError
             If the result contains something other than plain data, such as a function.
         """
@@ -71,54 +74,14 @@ class Result(Storable):
         write_sealed(path, content.getbuffer())
 
 
-def write_sealed(path: str | Path, content: memoryview) -> None:
-    """Write content and its checksum; an existing file is replaced when the new one is complete, or else stays."""
-    with written_whole(path) as draft, draft.open("wb") as file:
-        file.write(content)
-        file.write(SEAL + hashlib.sha256(content).hexdigest().encode())
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def read_sealed(path: str | Path) -> bytes:
-    """Return the content of a file; raise a ValueError if its checksum is missing or wrong."""
-    content, seal, digest = Path(path).read_bytes().rpartition(SEAL)
-    if not seal:
-        raise ValueError("it has no checksum; it was cut off, or not written by this version of bayesperiodic")
-    if hashlib.sha256(content).hexdigest().encode() != digest:
-        raise ValueError("its content has changed since it was written")
-    return content
-
-
-def in_folder(path: str | Path) -> Path:
-    """Return the path; raise a FileNotFoundError if its folder does not exist."""
-    target = Path(path)
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"path: must be in an existing folder, got {str(path)!r}.")
-    return target
-
-
-def draft_prefix(path: Path) -> str:
-    """Return how the names of temporary folders of a file begin, which a killed process leaves behind."""
-    return f".{path.name}.draft-"
-
-
-@contextmanager
-def written_whole(path: str | Path) -> Iterator[Path]:
-    """Provide a temporary path whose file replaces `path` when the block ends without an error."""
-    target = in_folder(path)
-    with tempfile.TemporaryDirectory(prefix=draft_prefix(target), dir=target.parent) as folder:
-        draft = Path(folder) / target.name
-        yield draft
-        os.replace(draft, target)
-
-
-def load(path: str | Path) -> Any:
-    """Load a saved result; the model is not needed and no stored code is executed.
+def load(path: str | Path, *, largest: float = LARGEST_FILE) -> Any:
+    """Load a saved result; the model is not needed, no stored code is executed, and no other file is read.
 
     Parameters
     ----------
     path : path
+    largest : float
+        Largest size of the file [bytes], by default 2 GiB; the values in it are not compressed, and not larger.
 
     Returns
     -------
@@ -130,8 +93,8 @@ def load(path: str | Path) -> Any:
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file contains no saved result or one of another version of this package, or has changed since it was
-        written.
+        If the file contains no saved result or one of another version of this package, has changed since it was
+        written, is too large, or refers to data in other files.
 
     Examples
     --------
@@ -143,15 +106,19 @@ def load(path: str | Path) -> Any:
     """
     import h5py
 
+    from bayesperiodic import _hdf5
+
     if not Path(path).is_file():
         raise FileNotFoundError(f"path: must be an existing file, got {str(path)!r}.")
+    if (size := os.path.getsize(path)) > _checks.positive("largest", largest):
+        raise ValueError(
+            f"path: must be a file of at most {largest / 1e9:.3g} GB, got {str(path)!r} with {size / 1e9:.3g} GB; "
+            f"load(path, largest={size}) reads it."
+        )
     try:
-        content = io.BytesIO(read_sealed(path))
-        with h5py.File(content, "r") as file:
-            header = json.loads(file.attrs[HEADER])
-            stored = file.get(ARRAYS, {})
-            arrays = {key: stored[key][()] for key in stored}
-        result = _decode(header, arrays, content)
+        content = read_sealed(path)
+        with h5py.File(io.BytesIO(content), "r") as file:
+            result = _decode(json.loads(file.attrs[HEADER]), _hdf5.Arrays(file, ARRAYS, len(content)), content)
         if not isinstance(result, Storable):
             raise ValueError(f"it contains a {type(result).__name__}")
     except Exception as error:  # whatever HDF5, JSON, NumPy and xarray raise for files that someone has made up
@@ -195,15 +162,16 @@ def _encode(value: Any, arrays: dict[str, Any], trees: list[Any]) -> Any:
     raise TypeError(f"result: must consist of numbers, texts, arrays, tables and draws, got {type(value).__name__}.")
 
 
-def _decode(value: Any, arrays: dict[str, Any], whole: io.BytesIO) -> Any:
+def _decode(value: Any, arrays: Any, content: bytes) -> Any:
+    """Return a value of the header; only arrays that it names are read."""
     if not isinstance(value, dict):
         return value
     if "array" in value:
-        return arrays[value["array"]]
+        return arrays[str(value["array"])]
     if "mapping" in value:
-        return {key: _decode(item, arrays, whole) for key, item in value["mapping"]}
+        return {key: _decode(item, arrays, content) for key, item in value["mapping"]}
     if "sequence" in value:
-        return tuple(_decode(item, arrays, whole) for item in value["sequence"])
+        return tuple(_decode(item, arrays, content) for item in value["sequence"])
     if "table" in value:
         import pandas as pd
 
@@ -211,15 +179,18 @@ def _decode(value: Any, arrays: dict[str, Any], whole: io.BytesIO) -> Any:
     if "tree" in value:
         import xarray as xr
 
-        with xr.open_datatree(whole, engine="h5netcdf") as tree:
-            draws = tree.load().drop_nodes(ARRAYS, errors="ignore")
+        from bayesperiodic import _hdf5
+
+        _hdf5.check_all(content)  # before xarray follows its links
+        with xr.open_datatree(io.BytesIO(content), engine="h5netcdf") as tree:
+            draws = tree.drop_nodes(ARRAYS, errors="ignore").load()
         del draws.attrs[HEADER]
         return draws
     name = str(value["result"])
     kind = _class(str(value.get("module")), name)
     if kind is None:
         raise ValueError(f"{OTHER}, got class {name!r}; {REMEDY}.")
-    content = {field: _decode(item, arrays, whole) for field, item in value["fields"].items()}
+    content = {field: _decode(item, arrays, content) for field, item in value["fields"].items()}
     needed = {f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING}
     if not needed <= content.keys() <= {f.name for f in fields(kind)}:
         raise ValueError(f"{OTHER}, got other fields of {name}; {REMEDY}.")

@@ -4,6 +4,8 @@ The entries of Hessians and covariances of parameters differ by many orders of m
 different units. All decompositions here are those of the matrix scaled to a unit diagonal.
 """
 
+import os
+import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import cache, wraps
@@ -76,12 +78,71 @@ def in_one_thread(function: Callable[Arguments, Value]) -> Callable[Arguments, V
     return limited
 
 
+class _OneThread:
+    """The limit of one BLAS thread, which ends when the last of the threads that hold it has left it.
+
+    The number of threads belongs to the process: a block that restored the number that it found would restore the limit
+    of another one that began before. Where each thread has a number of its own (OpenMP), it restores that one.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._held: dict[int, list[list[int]]] = {}  # by thread: the numbers at each entry
+        self._before: list[int] = []
+
+    def __enter__(self) -> None:
+        libraries, thread = _libraries(), threading.get_ident()
+        with self._lock:
+            found = [library.get_num_threads() for library in libraries]
+            if not self._held:
+                self._before = found
+            self._held.setdefault(thread, []).append(found)
+            for library in libraries:
+                _set_threads(library, 1)
+
+    def __exit__(self, *_: object) -> None:
+        libraries, thread = _libraries(), threading.get_ident()
+        with self._lock:
+            found = self._held[thread].pop()
+            if not self._held[thread]:
+                del self._held[thread]
+            for library, own, shared in zip(libraries, found, self._before, strict=True):
+                if getattr(library, "threading_layer", None) == "openmp":
+                    _set_threads(library, own)
+                elif not self._held:
+                    _set_threads(library, shared)
+
+    def after_fork(self) -> None:
+        """Forget the holders that the new process does not have."""
+        self._lock, thread = threading.Lock(), threading.get_ident()
+        others = [holder for holder in self._held if holder != thread]
+        for holder in others:
+            del self._held[holder]
+        if others and not self._held:
+            for library, shared in zip(_libraries(), self._before, strict=True):
+                _set_threads(library, shared)
+
+
+def _set_threads(library: Any, number: int) -> None:
+    release = getattr(library, "clear_controlling_thread", None)  # newer versions let one thread alone set the number
+    if release:
+        release(force=True)
+    library.set_num_threads(number)
+    if release:
+        release(force=True)
+
+
+_ONE_THREAD = _OneThread()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_ONE_THREAD.after_fork)
+
+
 def one_thread() -> AbstractContextManager[Any]:
     """Limit BLAS to one thread, see `in_one_thread`, without a frame of its own where warnings name the caller's."""
-    return _libraries().limit(limits=1, user_api="blas")
+    return _ONE_THREAD
 
 
 @cache
-def _libraries() -> ThreadpoolController:
-    """Return the loaded libraries that have threads; looking for them takes some milliseconds."""
-    return ThreadpoolController()
+def _libraries() -> list[Any]:
+    """Return the loaded libraries of linear algebra; looking for them takes some milliseconds."""
+    return [*ThreadpoolController().select(user_api="blas").lib_controllers]

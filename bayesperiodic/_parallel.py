@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 from tqdm import tqdm
 
 from bayesperiodic import _checks
+from bayesperiodic._files import in_folder, locked
 from bayesperiodic._linalg import in_one_thread
 
 Item = TypeVar("Item")
@@ -107,47 +108,70 @@ def _end_with(parent: int) -> None:
         threading.Thread(target=wait, daemon=True).start()
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM inside `ended_by_termination`."""
+
+
 @contextmanager
-def interrupted_by_termination() -> Iterator[None]:
-    """Let SIGTERM, unless the user's program handles it, raise a KeyboardInterrupt as Ctrl-C does."""
+def ended_by_termination() -> Iterator[None]:
+    """Let SIGTERM, unless the user's program handles it, raise a `Terminated`, and end the process after the block.
+
+    The process ends by the signal, as without this package, however the block ends. Where the signal has no effect, as
+    in the first process of a container, the exception is raised.
+    """
     main = threading.current_thread() is threading.main_thread()
     if not main or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
         yield
         return
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    _TERMINATED.clear()
+    signal.signal(signal.SIGTERM, _terminate)
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        if _TERMINATED:
+            signal.raise_signal(signal.SIGTERM)
+            raise Terminated
+
+
+_TERMINATED: list[int] = []
+
+
+def _terminate(number: int, _: Any) -> None:
+    _TERMINATED.append(number)
+    raise Terminated
 
 
 @contextmanager
 def interrupts_deferred() -> Iterator[Callable[[], None]]:
-    """Defer Ctrl-C, and SIGTERM where it acts as Ctrl-C, until the function provided is called.
+    """Defer Ctrl-C, and SIGTERM within `ended_by_termination`, until the function provided is called, or to the end.
 
     A second signal acts at once.
     """
     noted: list[int] = []
+    actions: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: _terminate}
 
-    def note(number: int, _: Any) -> None:
-        if noted:
-            raise KeyboardInterrupt
+    def note(number: int, frame: Any) -> None:
         noted.append(number)
+        if len(noted) > 1:
+            check(frame)
 
-    def check() -> None:
+    def check(frame: Any = None) -> None:
         if noted:
-            raise KeyboardInterrupt
+            number = signal.SIGTERM if signal.SIGTERM in noted else signal.SIGINT
+            noted.clear()
+            actions[number](number, frame)
 
     main = threading.current_thread() is threading.main_thread()
-    default = signal.default_int_handler
-    taken = [n for n in (signal.SIGINT, signal.SIGTERM) if main and signal.getsignal(n) is default]
+    taken = [number for number, action in actions.items() if main and signal.getsignal(number) is action]
     for number in taken:
         signal.signal(number, note)
     try:
         yield check
     finally:
         for number in taken:
-            signal.signal(number, default)
+            signal.signal(number, actions[number])
+        check()
 
 
 class TaskPool:
@@ -354,16 +378,17 @@ def checkpointed_tasks(
     return [done[task] for task in tasks]
 
 
-def _locked(path: Path) -> Any:
-    from filelock import FileLock, Timeout
-
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
     path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        return FileLock(path.with_name(f".{path.name}.lock")).acquire(timeout=0.0)
-    except Timeout:
-        raise ValueError(
-            f"folder: must not be in use by another run, got {str(path.parent)!r}; wait, or choose another folder."
-        ) from None
+    with ExitStack() as held:
+        try:
+            held.enter_context(locked(in_folder(path)))
+        except BlockingIOError:
+            raise ValueError(
+                f"folder: must not be in use by another run, got {str(path.parent)!r}; wait, or choose another folder."
+            ) from None
+        yield
 
 
 def _read(path: Path | None) -> list[Line]:

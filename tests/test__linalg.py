@@ -1,10 +1,13 @@
+import os
+import threading
+
 import numpy as np
 import pytest
 import scipy.linalg
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import bayesperiodic as bp
-from bayesperiodic._linalg import covariance_cholesky, covariance_eigh, hessian_eigh, in_one_thread
+from bayesperiodic._linalg import covariance_cholesky, covariance_eigh, hessian_eigh, in_one_thread, one_thread
 from bayesperiodic.data import recording
 from tests.known import LINEAR
 
@@ -88,3 +91,71 @@ def test_estimates_and_draws_are_computed_with_one_thread(two_threads):
     found.clear()
     bp.sample(problem, fit, seed=1, walkers=8, ensembles=2, max_steps=250, progress=False)
     assert found == {1}
+
+
+def in_another_thread(entered, leave):
+    """Start a thread that holds the limit between two events."""
+
+    def work():
+        with one_thread():
+            entered.set()
+            leave.wait()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    entered.wait()
+    return thread
+
+
+@pytest.mark.parametrize("last", ["this thread", "the other"])
+def test_overlapping_calls_in_threads_leave_as_many_threads_as_before(two_threads, last):
+    """One thread as long as any call holds it, whichever began first and whichever ends last."""
+    leave = threading.Event()
+    if last == "the other":
+        with one_thread():
+            other = in_another_thread(threading.Event(), leave)
+        assert set(threads()) == {1}
+        leave.set()
+        other.join()
+    else:
+        other = in_another_thread(threading.Event(), leave)
+        with one_thread():
+            leave.set()
+            other.join()
+            assert set(threads()) == {1}
+    assert set(threads()) == {2}
+
+
+def test_the_limit_may_be_nested_and_held_by_many_threads_whose_ends_are_mixed(two_threads):
+    leave = [threading.Event() for _ in range(4)]
+    with one_thread(), one_thread():
+        others = [in_another_thread(threading.Event(), event) for event in leave]
+        for number in (2, 0):
+            leave[number].set()
+            others[number].join()
+        with pytest.raises(ZeroDivisionError):
+            in_one_thread(lambda: 1 / 0)()
+        assert set(threads()) == {1}
+    assert set(threads()) == {1}
+    for number in (1, 3):
+        leave[number].set()
+        others[number].join()
+    assert set(threads()) == {2}
+    with threadpool_limits(limits=1, user_api="blas"):  # the user may still set the number
+        assert set(threads()) == {1}
+    assert set(threads()) == {2}
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_a_forked_process_does_not_inherit_the_limit_of_other_threads(two_threads):
+    leave = threading.Event()
+    other = in_another_thread(threading.Event(), leave)
+    child = os.fork()
+    if child == 0:
+        with one_thread():
+            inside = set(threads())
+        os._exit(0 if inside == {1} and set(threads()) == {2} else 1)
+    assert os.waitpid(child, 0)[1] == 0
+    leave.set()
+    other.join()

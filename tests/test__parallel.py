@@ -14,7 +14,15 @@ from multiprocessing import get_context
 import pytest
 
 from bayesperiodic import _parallel
-from bayesperiodic._parallel import TaskPool, WorkersLost, available_cores, checked_executor, in_threads
+from bayesperiodic._parallel import (
+    TaskPool,
+    WorkersLost,
+    available_cores,
+    checked_executor,
+    ended_by_termination,
+    in_threads,
+    interrupts_deferred,
+)
 
 LOADS: Counter[str] = Counter()
 
@@ -186,6 +194,42 @@ def test_object_that_cannot_be_pickled_is_rejected(processes):
     ):
         with TaskPool(processes, threading.Lock()):
             pass
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_between_the_last_check_and_the_end_is_not_lost(number, monkeypatch):
+    ends = []
+    monkeypatch.setattr(signal, "raise_signal", ends.append)
+    with pytest.raises(KeyboardInterrupt), ended_by_termination():
+        with interrupts_deferred() as check:
+            check()
+            os.kill(os.getpid(), number)
+    assert ends == [signal.SIGTERM] * (number == signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_termination_is_not_lost_beside_another_error(monkeypatch):
+    """Also where the error, or a handler of it, replaces the interrupt."""
+    ends = []
+    monkeypatch.setattr(signal, "raise_signal", ends.append)
+    with pytest.raises(KeyboardInterrupt), ended_by_termination():
+        with interrupts_deferred():
+            os.kill(os.getpid(), signal.SIGTERM)
+            raise WorkersLost("executor: lost")
+    with pytest.raises(KeyboardInterrupt), ended_by_termination():
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        except KeyboardInterrupt:
+            pass
+    assert ends == [signal.SIGTERM] * 2
+
+
+def test_a_second_signal_acts_at_once():
+    with pytest.raises(KeyboardInterrupt), interrupts_deferred():
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+        raise AssertionError("not interrupted")
 
 
 def test_items_shared_by_threads_keep_their_order_and_raise():

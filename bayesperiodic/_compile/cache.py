@@ -1,11 +1,12 @@
 """Compiled kernels and their cache on disk: one folder per source text and constants, private to its user.
 
-An entry is built in a temporary folder and renamed, so that several processes can fill the cache at once. Before an
-entry is executed, the folder must belong to the user and be closed to others, the source must equal the expected one,
-and every compiled file must have the digest recorded when it was written. A damaged entry is removed, with a warning,
-and built again; if the folder cannot be used, the kernels are compiled in memory.
+An entry is built in a temporary folder and renamed, by the first of several processes that need it, while the others
+wait. Before an entry is executed, the folder and the entry must belong to the user and be closed to others, the source
+must equal the expected one, and every compiled file must have the digest recorded when it was written. A damaged entry
+is removed, with a warning, and built again; if the folder cannot be used, the kernels are compiled in memory.
 """
 
+import errno
 import gc
 import hashlib
 import json
@@ -19,8 +20,8 @@ import threading
 import time
 import types
 import warnings
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ from typing import Any
 import llvmlite.binding
 import numba
 import platformdirs
+
+from bayesperiodic._files import locked
 
 try:
     from numba.core.compiler_lock import global_compiler_lock
@@ -37,6 +40,10 @@ except ImportError:
 SOURCE, MANIFEST, BUILDING = "kernels.py", "manifest.json", "building-"
 # Age in seconds after which an unfinished entry is that of a killed process.
 ABANDONED = 3600.0
+# Seconds for which a process waits for another one that builds the same entry, before it builds it too.
+LONGEST_WAIT = 600.0
+# Folders in which no entry could be built; this process does not try again.
+_UNUSABLE: set[Path] = set()
 
 
 class CacheProblem(Exception):
@@ -69,16 +76,29 @@ def load(
     execute = partial(_execute, source, names, run or _run)
     try:
         entry = _private_folder() / _digest(source)
-        return _stored(source, entry, execute) or _build(source, entry, execute)
-    except (CacheProblem, OSError) as problem:
-        reason = str(problem)
-    warnings.warn(
-        f"The kernel cache in {cache_folder()} cannot be used ({reason}); compiling in memory, at every start. Delete "
-        "the folder or set BAYESPERIODIC_CACHE to one that you own.",
-        RuntimeWarning,
-        stacklevel=2,
-    )
+        if found := _stored(source, entry, execute):
+            return found
+        if entry.parent not in _UNUSABLE:
+            return _build(source, entry, execute)
+    except (CacheProblem, OSError, NotImplementedError) as problem:
+        if cache_folder() not in _UNUSABLE:
+            _UNUSABLE.add(cache_folder())
+            warnings.warn(
+                f"The kernel cache in {cache_folder()} cannot be used ({problem}); compiling in memory, at every start. "
+                f"{_remedy(problem)}",
+                RuntimeWarning,
+                stacklevel=2,
+            )
     return execute(Path("<kernels compiled in memory>"), cache=False)
+
+
+def _remedy(problem: Exception) -> str:
+    """Return what to do about a cache that cannot be used."""
+    if isinstance(problem, OSError) and problem.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)):
+        return "Free space there, or set BAYESPERIODIC_CACHE to a folder on another disk."
+    if isinstance(problem, CacheProblem):
+        return "Delete the folder, or set BAYESPERIODIC_CACHE to one that you own and others cannot write to."
+    return "Set BAYESPERIODIC_CACHE to a folder in which you may write."
 
 
 def is_stored(body: str, constants: Mapping[str, Any]) -> bool:
@@ -145,12 +165,19 @@ def _header() -> str:
 
 
 def _private_folder() -> Path:
+    """Return the folder; raise a CacheProblem if others could put entries there.
+
+    The folder above may be open to the user's group, as many systems create it, or to all like /tmp, where only the
+    owner of a folder can rename it.
+    """
     folder = cache_folder()
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if hasattr(os, "getuid"):
-        status = folder.stat()
+        status, above = folder.stat(), folder.parent.stat()
         if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
             raise CacheProblem("it is not private to this user (owner only, mode 0700)")
+        if above.st_uid not in (os.getuid(), 0) or stat.S_IMODE(above.st_mode) & (0o002 | stat.S_ISVTX) == 0o002:
+            raise CacheProblem(f"others can replace it, because {folder.parent} is theirs or open to all")
     return folder
 
 
@@ -160,28 +187,47 @@ def _announce() -> None:
 
 
 def _build(source: str, entry: Path, execute: Callable[..., types.ModuleType]) -> types.ModuleType:
+    """Return the module of a new entry, or of one that another process has built meanwhile."""
     for other in entry.parent.glob(f"{BUILDING}*"):
         with suppress(OSError):
             if other.stat().st_mtime < time.time() - ABANDONED:
                 shutil.rmtree(other)
-    _announce()
-    workshop = Path(tempfile.mkdtemp(prefix=BUILDING, dir=entry.parent))
-    try:
-        (workshop / SOURCE).write_text(source, encoding="utf-8")
-        module = execute(workshop / SOURCE, cache=True)
-        (workshop / MANIFEST).write_text(json.dumps(_digests(workshop)), encoding="utf-8")
+    with global_compiler_lock, _alone(entry):  # in this order, because texts that are executed may load others
+        if found := _stored(source, entry, execute):
+            return found
+        _announce()
+        workshop = Path(tempfile.mkdtemp(prefix=BUILDING, dir=entry.parent))
         try:
-            workshop.rename(entry)
-        except OSError:
-            if not entry.is_dir():
-                raise
-        return module
-    finally:
-        shutil.rmtree(workshop, ignore_errors=True)
+            (workshop / SOURCE).write_text(source, encoding="utf-8")
+            module = execute(workshop / SOURCE, cache=True)
+            (workshop / MANIFEST).write_text(json.dumps(_digests(workshop)), encoding="utf-8")
+            try:
+                workshop.rename(entry)
+            except OSError:
+                if not entry.is_dir():
+                    raise
+            return module
+        finally:
+            shutil.rmtree(workshop, ignore_errors=True)
+
+
+@contextmanager
+def _alone(entry: Path) -> Iterator[None]:
+    """Wait until no other process builds an entry, where files can be locked."""
+    with ExitStack() as held:
+        with suppress(OSError, NotImplementedError):
+            held.enter_context(locked(entry, wait=LONGEST_WAIT))
+        yield
 
 
 def _check(entry: Path, source: str) -> None:
+    """Raise a CacheProblem unless an entry is complete, unchanged, and was written by this user."""
     try:
+        files = [entry, *entry.rglob("*")]
+        if hasattr(os, "getuid") and ({file.lstat().st_uid for file in files} != {os.getuid()}):
+            raise CacheProblem(f"the entry {entry.name} has files of another user")
+        if any(file.is_symlink() for file in files):
+            raise CacheProblem(f"the entry {entry.name} contains links")
         if (entry / SOURCE).read_text(encoding="utf-8") != source:
             raise CacheProblem(f"the source in {entry.name} is not the one expected")
         if json.loads((entry / MANIFEST).read_text(encoding="utf-8")) != _digests(entry):

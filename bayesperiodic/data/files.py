@@ -237,33 +237,18 @@ def _hdf5_columns(file: Path, wanted: list[str]) -> Stored:
     """Return names and wanted arrays of a MAT file, version 7.3."""
     import h5py
 
+    from bayesperiodic import _hdf5
+
     arrays = {}
     with h5py.File(file, "r") as archive:
         names = [name for name in archive if isinstance(name, str)]  # bytes are no text
         for name in {*wanted} & {*names}:
-            item, inside = archive[name], isinstance(archive.get(name, getlink=True), h5py.HardLink)
-            if not inside or not isinstance(item, h5py.Dataset) or item.is_virtual or item.external:
-                raise ValueError(f"its variable {name!r} is not an array in this file")
+            item = _hdf5.dataset(archive, name)
             kind = np.bytes_(item.attrs.get("MATLAB_class", b"double")).decode()
             if kind not in (*NUMERIC.values(), "logical") or item.attrs.get("MATLAB_empty"):
                 raise ValueError(f"its variable {name!r} is empty or no array of numbers, but {kind}")
-            _check_size(name, item.nbytes)
-            if not _is_stored(item):
-                raise ValueError(f"parts of its variable {name!r} are missing")
-            arrays[name] = item[()]
+            arrays[name] = _hdf5.values(item, LARGEST_ARRAY)
     return names, arrays
-
-
-def _is_stored(item: Any) -> bool:
-    """Return whether all values of an HDF5 array are in the file; HDF5 reads missing parts as zeros."""
-    if item.chunks is None:
-        return item.id.get_storage_size() == item.nbytes
-    places = [range(0, length, step) for length, step in zip(item.shape, item.chunks, strict=True)]
-    if item.id.get_num_chunks() != math.prod(map(len, places)):
-        return False
-    stored: set[Any] = set()
-    item.id.chunk_iter(lambda chunk: stored.add((chunk.chunk_offset, chunk.filter_mask)))
-    return stored == {(place, 0) for place in itertools.product(*places)}
 
 
 def _mat5_columns(file: Path, wanted: list[str]) -> Stored:

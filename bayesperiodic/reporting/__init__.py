@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from bayesperiodic import plot
-from bayesperiodic._io import in_folder, written_whole
+from bayesperiodic._files import in_folder, written_whole
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.comparison import Comparison
 from bayesperiodic.diagnostics.identifiability import Identifiability
@@ -75,7 +75,7 @@ def report(
     >>> page[:15], "<script" in page
     ('<!DOCTYPE html>', False)
     """
-    target = in_folder(path)
+    in_folder(path)
     text = html.page(
         title=title or problem.model.name,
         given=contents.ReportInputs(problem, fit, posterior, identifiability, comparison, prediction, missing),
@@ -84,6 +84,6 @@ def report(
         level=ADEQUACY_LEVEL,
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     )
-    with written_whole(target) as draft:
+    with written_whole(path) as draft:
         draft.write_text(text, encoding="utf-8")
-    return target
+    return Path(path)

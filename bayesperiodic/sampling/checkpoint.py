@@ -1,20 +1,18 @@
 """Checkpoints of sampling runs: one HDF5 file, always complete, written by emcee's backend."""
 
-import glob
 import io
 import json
-import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import emcee
 import h5py
-from filelock import FileLock, Timeout
 
-from bayesperiodic._io import draft_prefix, read_sealed, write_sealed
+from bayesperiodic import _hdf5
+from bayesperiodic._files import in_folder, locked, read_sealed, remove_drafts, write_sealed
 from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.fingerprint import changed_parts, fingerprint
 
@@ -41,7 +39,11 @@ class MemoryBackend(emcee.backends.HDFBackend):
         yield self.file
 
     def content(self) -> memoryview:
-        """Return the file as bytes."""
+        """Return the file as bytes, without the space of steps that were not made."""
+        if self.initialized:
+            group = self.file[self.name]
+            for name in {"chain", "log_prob", "blobs"} & {*group}:
+                group[name].resize(self.iteration, axis=0)
         self.file.flush()
         return self._buffer.getbuffer()
 
@@ -57,35 +59,35 @@ class Checkpoint:
 
     def __init__(self, path: str | Path, problem: Description, settings: str):
         self._path, self._mark = Path(path), f"{fingerprint(problem)}; {settings}"
-        self._lock = FileLock(f"{path}.lock", timeout=0.0)
-        self._next = 0.0
+        self._held, self._next = ExitStack(), 0.0
 
     def __enter__(self) -> "Checkpoint":
+        given = str(self._path)
         try:
-            self._lock.acquire()
-        except Timeout:
+            self._path = in_folder(self._path)  # from now on the file itself: links and the current folder may change
+            self._held.enter_context(locked(self._path))
+        except BlockingIOError:
             raise ValueError(
-                f"checkpoint: must not be in use by another run, got {str(self._path)!r}; wait, or name another file."
+                f"checkpoint: must not be in use by another run, got {given!r}; wait, or name another file."
             ) from None
-        except OSError as error:
+        except (OSError, NotImplementedError) as error:
             raise ValueError(
-                f"checkpoint: must be a writable file, got {str(self._path)!r} ({error}); name another file."
+                f"checkpoint: must be a writable file, got {given!r} ({error}); name another file."
             ) from None
-        for draft in self._path.parent.glob(f"{glob.escape(draft_prefix(self._path))}*"):  # of a killed process
-            shutil.rmtree(draft, ignore_errors=True)
+        remove_drafts(self._path)
         return self
 
     def __exit__(self, *_: object) -> None:
-        with suppress(OSError):
-            Path(self._lock.lock_file).unlink()
-        self._lock.release()
+        self._held.close()
 
     def load(self) -> tuple[MemoryBackend, dict[str, Any]]:
         """Return the chain of the file and the state of its run; both are empty if there is no file."""
         if not self._path.exists():
             return MemoryBackend(), {}
         try:
-            backend = MemoryBackend(read_sealed(self._path))
+            content = read_sealed(self._path)
+            _hdf5.check_all(content)
+            backend = MemoryBackend(content)
             mark = str(backend.file.attrs.get(MARK, "no run of this package"))
             state = json.loads(backend.file[RUN][()])
             backend.get_last_sample()

@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
+from bayesperiodic._parallel import Terminated
 from bayesperiodic.density.log_posterior import SAMPLED, LogPosterior
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.problem.parameters import CHAIN, DRAW
@@ -154,7 +155,9 @@ class _Chains:
         """Wait until the stop rule is passed twice in succession, `max_steps` are reached, or Ctrl-C."""
         try:
             self._judge(max_steps, progress)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as interrupt:
+            if isinstance(interrupt, Terminated):
+                raise
             self.steps = min(chain.done for chain in self.chains)
             if self.steps < DRAWS_BETWEEN_CHECKS:
                 raise

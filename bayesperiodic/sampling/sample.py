@@ -19,9 +19,10 @@ from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic._parallel import (
     TaskPool,
+    Terminated,
     WorkersLost,
     checked_executor,
-    interrupted_by_termination,
+    ended_by_termination,
     interrupts_deferred,
 )
 from bayesperiodic.density.log_posterior import (
@@ -105,8 +106,8 @@ def sample(
     Sampling stops if, twice in succession, the chain after the burn-in and after its first fifth is 50 autocorrelation
     times long, that time has changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and
     95 % quantiles agree within a quarter of a standard deviation; if there are several optima, the same holds for the
-    fraction of draws at each. Ctrl-C, SIGTERM or the loss of the executor's workers ends it with the steps so far, not
-    converged.
+    fraction of draws at each. Ctrl-C or the loss of the executor's workers ends it with the steps so far, not converged.
+    SIGTERM, unless your program handles it, ends the process, after the checkpoint was written.
 
     ``sampler="nuts"`` checks the result: it samples the same density by its gradient, with the no-U-turn sampler [3]_
     of nutpie. Each ensemble is then a single chain with 300 tuning draws, which are removed, and must be 500
@@ -215,7 +216,7 @@ def sample(
     if fit.input_errors:
         settings += f", input noise {digest([astuple(wave) for wave in fit.input_errors.values()])}"
     opened = nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings)
-    with interrupted_by_termination(), opened as store:
+    with ended_by_termination(), opened as store:
         backend, saved = (emcee.backends.Backend(), {}) if store is None else store.load()
         anchor = np.array(saved["anchor"]) if saved else problem.vector(fit.theta)
         guesses = saved["guesses"] if saved else {name: s.states for name, s in fit.solutions.items()}
@@ -304,8 +305,8 @@ class _EnsembleRun:
                 return
             with TaskPool(executor, self.density) as pool:
                 self._sample(max_steps, store, partial(_evaluate_pieces, pool), progress)
-        except KeyboardInterrupt:
-            if not self._stopped("interrupted", store):
+        except KeyboardInterrupt as interrupt:
+            if not self._stopped("interrupted", store) or isinstance(interrupt, Terminated):
                 raise
         except WorkersLost as lost:
             if not self._stopped("stopped", store, f": {lost}"):

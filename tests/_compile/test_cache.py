@@ -1,3 +1,4 @@
+import errno
 import gc
 import os
 import shutil
@@ -6,6 +7,7 @@ import sys
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ import sympy as sp
 
 from bayesperiodic._compile import cache, expectations
 from bayesperiodic._compile.code_generation import FUNCTIONS
+from bayesperiodic._files import locked
 from bayesperiodic._parallel import available_cores
 from tests.known import formula_model
 
@@ -267,6 +270,134 @@ def test_folder_open_to_others_is_not_used(folder):
     folder.chmod(0o777)
     load_with_warning("not private")
     assert not list(folder.iterdir())
+
+
+def test_folder_that_others_can_replace_is_not_used(folder):
+    """The folder above: open to all without the restriction of /tmp, but a group may write to it."""
+    cache.load(SMALL)
+    filled = entry(folder)
+    for mode, used in ((0o777, False), (0o757, False), (0o1777, True), (0o775, True)):
+        folder.parent.chmod(mode)
+        cache._UNUSABLE.clear()
+        with nullcontext() if used else pytest.warns(RuntimeWarning, match="others can replace it.*Delete the folder"):
+            loaded = cache.load(SMALL)
+        assert (loaded.__file__ == str(filled / cache.SOURCE)) is used
+    folder.parent.chmod(0o700)
+
+
+def owned_by(monkeypatch, owner, places):
+    """Let files of these places be those of another user, without the right to give files away."""
+    original = os.stat_result
+
+    def changed(status, path):
+        return original([*status[:4], owner if path in places else status[4], *status[5:]])
+
+    for name in ("stat", "lstat"):
+        ask = getattr(Path, name)
+        monkeypatch.setattr(Path, name, lambda self, ask=ask, **named: changed(ask(self, **named), self))
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs owners of files")
+def test_folder_of_another_user_is_not_used(folder, monkeypatch):
+    cache.load(SMALL)
+    for place in (folder, folder.parent):
+        cache._UNUSABLE.clear()
+        with monkeypatch.context() as patch:
+            owned_by(patch, os.getuid() + 1, {place})
+            with pytest.warns(RuntimeWarning, match="cannot be used .*compiling in memory"):
+                assert cache.load(SMALL).__file__ == "<kernels compiled in memory>"
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs owners of files")
+@pytest.mark.parametrize("what", ["entry", "machine code"])
+def test_files_of_another_user_in_an_own_folder_are_not_executed(folder, monkeypatch, what):
+    """As they stand there if the folder was once open to others."""
+    cache.load(SMALL)
+    place = entry(folder) if what == "entry" else sorted((entry(folder) / "__pycache__").glob("*.nbc"))[0]
+    mark = entry(folder) / "mark"
+    mark.touch()
+    with monkeypatch.context() as patch:
+        owned_by(patch, os.getuid() + 1, {place})
+        with pytest.warns(RuntimeWarning, match="damaged entry .* is built again .*files of another user"):
+            cache.load(SMALL)
+    assert place.exists() and not mark.exists()
+
+
+def test_entry_that_is_a_link_is_not_executed(folder, tmp_path):
+    cache.load(SMALL)
+    place = entry(folder)
+    place.rename(tmp_path / "elsewhere")
+    place.symlink_to(tmp_path / "elsewhere")
+    load_with_warning("built again .*contains links")
+    assert not entry(folder).is_symlink() and (tmp_path / "elsewhere").is_dir()
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_full_disk_is_one_warning_that_advises_to_free_space(folder, monkeypatch, number):
+    """Not one for each of the kernels, and no advice to delete what is in the cache; entries are still read."""
+    cache.load(SMALL)
+    stored = entry(folder)
+
+    def full(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    built = []
+    original = cache._announce
+    monkeypatch.setattr(cache, "_announce", lambda: built.append(original()))
+    monkeypatch.setattr(Path, "write_text", full)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for factor in ("3.0", "4.0", "5.0", "6.0"):
+            assert cache.load(SMALL.replace("2.0", factor)).twice(1.0) == float(factor)
+        assert cache.load(SMALL).__file__ == str(stored / cache.SOURCE)
+    (warning,) = caught
+    assert f"({OSError(number, os.strerror(number))}); compiling in memory" in str(warning.message)
+    assert "Free space there, or set BAYESPERIODIC_CACHE" in str(warning.message)
+    assert "elete" not in str(warning.message) and warning.filename == __file__
+    assert built == [None] and [*folder.iterdir()] == [stored]
+
+
+@pytest.mark.parametrize("what", ["name", "features"])
+def test_another_processor_gets_an_entry_of_its_own(folder, monkeypatch, what):
+    """As in a home folder that the different computers of a cluster share."""
+    cache.load(SMALL)
+    here = entry(folder)
+    with monkeypatch.context() as patch:
+        if what == "name":
+            patch.setattr(cache.llvmlite.binding, "get_host_cpu_name", lambda: "another")
+        else:
+            features = {**cache.llvmlite.binding.get_host_cpu_features(), "another": True}
+            patch.setattr(
+                cache.llvmlite.binding,
+                "get_host_cpu_features",
+                lambda: type("Features", (), {"flatten": lambda self: str(features)})(),
+            )
+        assert not cache.is_stored(SMALL, {})
+    assert cache.is_stored(SMALL, {}) and entry(folder) == here
+
+
+def test_four_processes_that_start_with_an_empty_cache_build_each_entry_once(folder):
+    program = """
+from bayesperiodic._compile import cache
+from tests._compile.test_cache import SMALL
+print(cache.load(SMALL).four_times(1.5))
+"""
+    command = [sys.executable, "-W", "error::RuntimeWarning", "-c", program]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT}
+    processes = [subprocess.Popen(command, **pipes) for _ in range(4)]
+    found = [process.communicate() for process in processes]
+    assert [output for output, _ in found] == ["6.0\n"] * 4
+    assert sorted(announced for _, announced in found) == ["", "", "", "compiling kernels (once per machine) …\n"]
+    assert len([*folder.iterdir()]) == 1
+
+
+def test_a_process_that_waits_too_long_builds_the_entry_too(folder, monkeypatch):
+    """Another one may have been stopped, or the file system has no locks."""
+    monkeypatch.setattr(cache, "LONGEST_WAIT", 0.0)
+    folder.mkdir(mode=0o700, parents=True)
+    with locked(folder / cache._digest(cache._definitions(SMALL, {}, None)[0])):
+        assert cache.load(SMALL).four_times(1.5) == 6.0
+    assert cache.is_stored(SMALL, {})
 
 
 def test_unwritable_cache_falls_back_to_memory(tmp_path, monkeypatch):

@@ -5,15 +5,18 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 
 import emcee
 import numpy as np
 import pytest
-from filelock import FileLock
 from tqdm import tqdm
 
 import bayesperiodic as bp
+from bayesperiodic import _parallel
+from bayesperiodic._files import locked
 from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.sampling import checkpoint
 from tests.known import LINEAR, linear_experiment
@@ -175,7 +178,7 @@ def test_checkpoint_that_is_damaged_locked_or_of_another_run_is_rejected(problem
         ValueError, match=r"checkpoint: must be a file of this run \(seed 6.*\), got .* of another run \(seed 5"
     ):
         bp.sample(*problem, checkpoint=path, **(RUN | {"seed": 6}))
-    with FileLock(f"{path}.lock"), pytest.raises(ValueError, match="checkpoint: must not be in use by another run"):
+    with locked(path), pytest.raises(ValueError, match="checkpoint: must not be in use by another run"):
         bp.sample(*problem, checkpoint=path, **RUN)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
@@ -215,20 +218,117 @@ def test_draft_of_a_killed_process_is_removed_at_the_next_run(problem, tmp_path)
     assert os.listdir(tmp_path) == ["run.h5"]
 
 
-def test_termination_returns_the_draws_as_an_interrupt_does(problem, uninterrupted, tmp_path, monkeypatch):
-    path, original, calls = tmp_path / "run.h5", LogPosterior.log_likelihood, iter(range(10**9))
+def terminated_at(monkeypatch: pytest.MonkeyPatch, call: int) -> None:
+    """Send SIGTERM at the nth call of the likelihood."""
+    original, calls = LogPosterior.log_likelihood, iter(range(10**9))
 
     def terminated(self, *arguments, **named):
-        if next(calls) == 150:
-            signal.raise_signal(signal.SIGTERM)
+        if next(calls) == call:
+            os.kill(os.getpid(), signal.SIGTERM)
         return original(self, *arguments, **named)
 
+    monkeypatch.setattr(LogPosterior, "log_likelihood", terminated)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+@pytest.mark.parametrize("call", [10, 150])
+@pytest.mark.parametrize("with_checkpoint", [True, False])
+def test_termination_ends_the_process_after_the_checkpoint_was_saved(
+    problem, uninterrupted, tmp_path, with_checkpoint, call
+):
+    """Also after fewer steps than a result needs; nothing that follows `sample` runs."""
+    path, after = tmp_path / "run.h5", tmp_path / "after"
+
+    def work() -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            terminated_at(patch, call)
+            bp.sample(*problem, checkpoint=path if with_checkpoint else None, **RUN)
+        after.write_text("the program went on")
+
+    _, status = os.waitpid(in_child(work), 0)
+    assert os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGTERM
+    assert os.listdir(tmp_path) == (["run.h5"] if with_checkpoint else [])
+    if with_checkpoint:
+        assert 0 < len(content(path)["chain"]) < 150
+        bp.sample(*problem, checkpoint=path, **RUN)
+        assert same(content(path), uninterrupted[1])
+
+
+def test_termination_raises_where_the_signal_has_no_effect(problem, uninterrupted, tmp_path, monkeypatch):
+    """As in the first process of a container, which the kernel protects."""
+    path = tmp_path / "run.h5"
     with monkeypatch.context() as patch:
-        patch.setattr(LogPosterior, "log_likelihood", terminated)
-        partial = bp.sample(*problem, checkpoint=path, **RUN)
-    assert partial.reason.startswith("interrupted after ") and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+        terminated_at(patch, 150)
+        patch.setattr(signal, "raise_signal", lambda _: None)
+        with pytest.raises(KeyboardInterrupt):
+            bp.sample(*problem, checkpoint=path, **RUN)
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     bp.sample(*problem, checkpoint=path, **RUN)
     assert same(content(path), uninterrupted[1])
+
+
+class Stopped(Exception):
+    """Raised by the handler of a user."""
+
+
+@pytest.mark.parametrize("raises", [True, False])
+def test_handler_of_the_user_is_called_and_stays(problem, tmp_path, monkeypatch, raises):
+    received = []
+
+    def handler(number, _):
+        received.append(number)
+        if raises:
+            raise Stopped
+
+    before = signal.signal(signal.SIGTERM, handler)
+    try:
+        terminated_at(monkeypatch, 30)
+        with pytest.raises(Stopped) if raises else nullcontext():
+            bp.sample(*problem, checkpoint=tmp_path / "run.h5", **(RUN | {"max_steps": 50}))
+        assert received == [signal.SIGTERM] and signal.getsignal(signal.SIGTERM) is handler
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_a_run_in_another_thread_leaves_signals_alone(problem, monkeypatch):
+    found, original = set(), LogPosterior.log_likelihood
+
+    def watched(self, *arguments, **named):
+        found.update(map(signal.getsignal, (signal.SIGINT, signal.SIGTERM)))
+        return original(self, *arguments, **named)
+
+    monkeypatch.setattr(LogPosterior, "log_likelihood", watched)
+    with ThreadPoolExecutor(1) as pool:
+        posterior = pool.submit(lambda: bp.sample(*problem, **(RUN | {"max_steps": 50}))).result()
+    assert posterior.draws("k").size and found == {signal.default_int_handler, signal.SIG_DFL}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_termination_of_a_whole_group_of_processes_ends_the_run_though_its_workers_were_lost(problem, tmp_path):
+    """As a cluster's batch system sends it: the broken pool must not turn it into a result."""
+    path, after = tmp_path / "run.h5", tmp_path / "after"
+
+    def work() -> None:
+        os.setsid()
+        original, calls = _parallel.TaskPool.run, iter(range(10**9))
+
+        def killing(self, *arguments, **named):
+            yield from original(self, *arguments, **named)
+            if next(calls) == 120:
+                os.killpg(0, signal.SIGTERM)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(_parallel.TaskPool, "run", killing)
+            bp.sample(*problem, checkpoint=path, executor=2, **RUN)
+        after.write_text("the program went on")
+
+    _, status = os.waitpid(in_child(work), 0)
+    assert os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGTERM
+    assert os.listdir(tmp_path) == ["run.h5"] and len(content(path)["chain"]) >= 50
 
 
 def test_no_temporary_files_remain_beside_the_checkpoint(problem, tmp_path):
