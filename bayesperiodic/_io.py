@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from bayesperiodic._printing import Printed
+
 HEADER = "bayesperiodic_result"
 ARRAYS = "arrays"
 SEAL = b"\nbayesperiodic sha256 "
@@ -31,7 +33,7 @@ NOT_STORED = {"stored": False}
 MODULE = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
 
 
-class Storable:
+class Storable(Printed):
     """Base class of dataclasses of plain data that files may contain; `load` finds them in their modules."""
 
 

@@ -253,7 +253,7 @@ def _combined(problem: Problem, texts: Sequence[str]) -> Iterator[str]:
     directions = [text for text in texts if not text.startswith(IN_COMBINATION)]
     if directions:
         more = len(directions) - MOST_DIRECTIONS
-        scaled = {part.partition(" → ")[0] for text in directions for part in text.split(", ") if "·t" in part}
+        scaled = {part.partition(" -> ")[0] for text in directions for part in text.split(", ") if "·t" in part}
         signed = [n for n, log in zip(problem.names, problem.logarithmic, strict=True) if n in scaled and not log]
         shown = "; or under ".join(directions[:MOST_DIRECTIONS]) + (f"; and {more} more" if more > 0 else "")
         yield (

@@ -8,6 +8,7 @@ import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
+from bayesperiodic._printing import Printed
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.frequency_error import FrequencyError
 from bayesperiodic.likelihood.input_noise import (
@@ -48,7 +49,7 @@ from bayesperiodic.problem.sensors import Sensor, Sensors
 LEAST_WIDTH = 1e-12
 
 
-class Description:
+class Description(Printed):
     """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction and immutable."""
 
     def __init__(
