@@ -12,6 +12,7 @@ import pandas as pd
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
+from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import ResponseSolver
 from bayesperiodic.estimation.adequacy import misfit_at
@@ -38,7 +39,6 @@ from bayesperiodic.problem.fingerprint import check_results
 # Part of a residual that noise of inputs taken as exact may cause, and changes [sds] by the grid and by what is not
 # linear in the errors of the inputs, above which there is a warning.
 LARGEST_INPUT_SHARE, LARGEST_SHIFT, LARGEST_NONLINEARITY = 0.1, 0.1, 0.3
-MOST_UNEXPLAINED = 0.5
 MOST_DIRECTIONS = 3
 
 
