@@ -19,6 +19,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic._files import read_sealed, write_sealed
+from bayesperiodic._printing import Printed
 
 HEADER = "bayesperiodic_result"
 ARRAYS = "arrays"
@@ -32,7 +33,7 @@ NOT_STORED = {"stored": False}
 MODULE = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)*")
 
 
-class Storable:
+class Storable(Printed):
     """Base class of dataclasses of plain data that files may contain; `load` finds them in their modules."""
 
 

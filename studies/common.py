@@ -57,9 +57,9 @@ def table_of_rows(rows: list[Row]) -> str:
         if low == high:
             allowed = f"{low:g}"
         elif high is None:
-            allowed = f"≥ {low:g}"
+            allowed = f">= {low:g}"
         else:
-            allowed = f"≤ {high:g}" if low == 0.0 else f"{low:g} … {high:g}"
+            allowed = f"<= {high:g}" if low == 0.0 else f"{low:g} … {high:g}"
         lines.append({"": verdicts[entry["met"]], "what": entry["what"] + mark, "found": value, "allowed": allowed})
     shown = pd.DataFrame(lines).to_string(index=False)
     return "\n".join([shown, *(f"  ({i}) {note}" for i, note in enumerate(notes, start=1))])

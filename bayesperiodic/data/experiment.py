@@ -181,7 +181,7 @@ class Experiment(Result):
             }
             object.__setattr__(self, "guess", guess)
         if not (np.isfinite(self.frequency_se) and self.frequency_se >= 0.0):
-            raise ValueError(f"frequency_se: must be a finite number ≥ 0 [Hz], got {self.frequency_se!r}.")
+            raise ValueError(f"frequency_se: must be a finite number, at least 0 [Hz], got {self.frequency_se!r}.")
         for argument in CHANNEL_MAPPINGS:
             given = dict(getattr(self, argument) or {})
             object.__setattr__(self, argument, given)

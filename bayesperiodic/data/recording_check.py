@@ -10,6 +10,7 @@ from scipy.linalg import toeplitz
 
 from bayesperiodic import _fourier
 from bayesperiodic._io import Result, Storable
+from bayesperiodic._printing import printable
 from bayesperiodic._verdicts import BAD, CAUTION, GOOD, with_tone
 from bayesperiodic.data import faults
 from bayesperiodic.data.aliases import SEARCHED, aliases, samples_per_cycle
@@ -86,7 +87,7 @@ class Finding(Storable):
     cure: str = ""
 
     def __str__(self) -> str:
-        return f"{self.text}{'; ' + self.cure if self.cure else ''}"
+        return printable(f"{self.text}{'; ' + self.cure if self.cure else ''}")
 
 
 def signal_faults(values: np.ndarray, *, drive: bool = False) -> ChannelFaults:
@@ -449,7 +450,7 @@ class RecordingCheck(Result):
         """The worst severity of the findings; "harmless" without any."""
         return max((finding.severity for finding in self.findings), key=SEVERITIES.index, default=HARMLESS)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         lines = [f"Recording {self.name!r}: {self.sentence}", self.table.to_string(float_format="{:.5g}".format)]
         lines += [f"{finding.severity}: {finding}." for finding in self.findings]
         return "\n".join(lines + ([] if self.findings else ["Nothing was found."]))
@@ -464,5 +465,3 @@ class RecordingCheck(Result):
             f"{self.cycles} of {self.total} cycles at {self.frequency:.6g} Hz are used, {self.start:.6g} to "
             f"{self.stop:.6g} s{jitter}."
         )
-
-    __repr__ = __str__

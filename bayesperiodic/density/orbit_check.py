@@ -18,6 +18,8 @@ ORBIT_LEVEL = 1e-3
 PRESENT, FOLLOWED = 1e-3, 0.25
 LOG_ODDS = 7.0
 SAME = 1e-6
+# Fraction of a channel's variance above which the model may follow another orbit than the measured one.
+MOST_UNEXPLAINED = 0.5
 
 
 def other_orbit(observation: Observation, response: Response) -> str:
@@ -32,10 +34,16 @@ def other_orbit(observation: Observation, response: Response) -> str:
     reason = next(_differences(observation, response), "")
     if not reason:
         return ""
-    left = observation.compared(response).values()
-    measured = observation.data[observation.experiment.measured_points].T
-    share = max(np.sum(e**2) / np.sum((y - y.mean()) ** 2) for y, e in zip(measured, left, strict=True))
+    share = max(unexplained(observation, response).values())
     return f"{reason}; {share:.1%} of the variance of the recording is unexplained"
+
+
+def unexplained(observation: Observation, response: Response) -> dict[str, float]:
+    """Return the mean square of each channel's residual over the variance of its recorded period."""
+    count = np.count_nonzero(observation.experiment.measured_points)
+    power = np.maximum(observation.data.var(axis=0), np.finfo(float).tiny).tolist()
+    left = observation.compared(response).items()
+    return {c: float(np.sum(e**2)) / count / size for (c, e), size in zip(left, power, strict=True)}
 
 
 def _differences(observation: Observation, response: Response) -> Iterator[str]:

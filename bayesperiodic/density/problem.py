@@ -9,6 +9,7 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, SAMPLED, Evaluation, LogPosterior
+from bayesperiodic.density.recorded_orbits import recorded_orbits
 from bayesperiodic.density.responses import Guesses, ResponseSolver
 from bayesperiodic.likelihood.input_noise import EXACT, InputErrors, same
 from bayesperiodic.periodic.solution import PeriodicSolution
@@ -315,15 +316,20 @@ class Problem(Description):
         return self.density().outputs(self.vector(theta))
 
     def solve(self, theta: Mapping[str, float] | np.ndarray) -> dict[str, PeriodicSolution]:
-        """Return the periodic solution of every experiment at one θ.
+        """Return the periodic solution of every experiment at one θ, the recorded orbit where the model has it.
+
+        The orbits are followed from the anchors, see `anchored`. If that fails, or leaves more than half of the
+        variance of a channel unexplained, the experiment's guess and the orbit that the measured outputs show are tried
+        too. The log-posterior, which does not try them, may exclude such a θ until the problem is `anchored` there.
 
         Parameters
         ----------
         theta : mapping of str to float, or array (names,)
+            A mapping may leave out parameters that the problem adds by itself, see `completed`.
 
         Returns
         -------
         dict of str to PeriodicSolution
             By experiment; a solve that fails has another status than "converged".
         """
-        return self.density().solver.solutions(self.vector(theta))
+        return recorded_orbits(self, self.density().solver, self.vector(self.completed(theta)))

@@ -423,7 +423,8 @@ def _input_noise(problem: Problem, e: Experiment, name: str, size: int, generato
 def _first_state(problem: Problem, e: Experiment, theta: dict[str, float]) -> dict[str, float]:
     """Return the states and rates at τ = 0 of the guess of an experiment; empty without a guess."""
     state_values: dict[str, float] = {}
-    states = problem.solve(theta)[e.name].states if isinstance(e.guess, str) else e.guess
+    solved = problem.density().solver.solutions(problem.vector(theta)) if isinstance(e.guess, str) else {}
+    states = e.guess if not isinstance(e.guess, str) else solved[e.name].states
     for state, values in states.items():
         state_values[state] = float(values[0])
         if problem.model.orders[state] == 2:

@@ -130,7 +130,7 @@ class Comparison(Result):
         return (
             f"Laplace against MCMC in {self.coordinates} coordinates{data} (± Monte Carlo error)",
             pd.DataFrame(columns).set_axis(table["coordinate"].map(text).tolist()),
-            f"The 50, 90 and 95% Laplace ellipsoids contain {inside} of the draws; Pareto k̂ is {joint['pareto_k']:.2f} "
+            f"The 50, 90 and 95% Laplace ellipsoids contain {inside} of the draws; Pareto k is {joint['pareto_k']:.2f} "
             f"± {joint['pareto_k_mcse']:.2f}. Joint verdict: {mark(str(joint['verdict']))}; "
             f"{text(str(joint['recommendation']))}." + "".join(f" {text(one)}." for one in self.limitations),
         )

@@ -264,7 +264,9 @@ def _left_out(models: Models, notes: list[str]) -> tuple[np.ndarray, list[np.nda
         values.append(elpd / np.sqrt(weight))
         rows.append((elpd.sum(), _sum_error(values[-1]), pareto_k.max()))
         if bad := int((pareto_k > USABLE_K).sum()):
-            notes.append(f"Leave-one-out of {name!r} is unreliable: k̂ > {USABLE_K} for {bad} of {elpd.size} values.")
+            notes.append(
+                f"Leave-one-out of {name!r} is unreliable: Pareto k > {USABLE_K} for {bad} of {elpd.size} values."
+            )
         if weight.min() < 1.0:
             notes.append(
                 "There are fewer independent values than samples: leave-one-out is too optimistic, as the neighbours "

@@ -12,6 +12,7 @@ import pandas as pd
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
+from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import ResponseSolver
 from bayesperiodic.estimation.adequacy import misfit_at
@@ -40,7 +41,6 @@ from bayesperiodic.problem.fingerprint import check_results
 # Part of a residual that noise of inputs taken as exact may cause, and changes [sds] by the grid and by what is not
 # linear in the errors of the inputs, above which there is a warning.
 LARGEST_INPUT_SHARE, LARGEST_SHIFT, LARGEST_NONLINEARITY = 0.1, 0.1, 0.3
-MOST_UNEXPLAINED = 0.5
 MOST_DIRECTIONS = 3
 
 
@@ -263,7 +263,7 @@ def _combined(problem: Problem, texts: Sequence[str]) -> Iterator[str]:
     directions = [text for text in texts if not text.startswith(IN_COMBINATION)]
     if directions:
         more = len(directions) - MOST_DIRECTIONS
-        scaled = {part.partition(" → ")[0] for text in directions for part in text.split(", ") if "·t" in part}
+        scaled = {part.partition(" -> ")[0] for text in directions for part in text.split(", ") if "·t" in part}
         signed = [n for n, log in zip(problem.names, problem.logarithmic, strict=True) if n in scaled and not log]
         shown = "; or under ".join(directions[:MOST_DIRECTIONS]) + (f"; and {more} more" if more > 0 else "")
         yield (

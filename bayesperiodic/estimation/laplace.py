@@ -201,7 +201,7 @@ def in_words(direction: np.ndarray, names: Sequence[str], logarithmic: np.ndarra
     Examples
     --------
     >>> in_words(np.array([0.5, -1.0]), ["a", "b"], np.array([True, True]))
-    'a → a·t, b → b·t^-2'
+    'a -> a·t, b -> b·t^-2'
     """
     shown = np.flatnonzero(np.abs(direction) > SHOWN_PART * np.abs(direction).max())
     powers = [i for i in shown if logarithmic[i]]
@@ -212,10 +212,10 @@ def in_words(direction: np.ndarray, names: Sequence[str], logarithmic: np.ndarra
         name = names[int(i)]
         ratio = float(simple[k] / simple[0]) if simple else float(direction[i] / unit)
         if logarithmic[i]:
-            parts.append(f"{name} → {name}·t" + ("" if abs(ratio - 1.0) < 5e-4 else f"^{ratio:.3g}"))
+            parts.append(f"{name} -> {name}·t" + ("" if abs(ratio - 1.0) < 5e-4 else f"^{ratio:.3g}"))
         else:
             scale = "" if abs(abs(ratio) - 1.0) < 5e-4 else f"{abs(ratio):.3g}·"
-            parts.append(f"{name} → {name} {'+' if ratio > 0 else '−'} {scale}{'ln t' if powers else 't'}")
+            parts.append(f"{name} -> {name} {'+' if ratio > 0 else '-'} {scale}{'ln t' if powers else 't'}")
     return ", ".join(parts)
 
 
@@ -246,7 +246,7 @@ def undetermined(
     >>> row = np.array([2.0, 1.0]) / [3.0, 5.0]
     >>> product = lambda theta: abs(np.log((theta[0] / 3) ** 2 * theta[1] / 5))
     >>> undetermined(np.outer(row, row), np.array([3.0, 5.0]), ["a", "b"], np.array([True, True]), product)
-    ('a → a·t, b → b·t^-2',)
+    ('a -> a·t, b -> b·t^-2',)
     """
     slopes = np.where(theta != 0.0, theta, 1.0)
     information = scaled(information, slopes)
@@ -274,7 +274,7 @@ def undetermined(
 
 
 def by_powers(direction: np.ndarray, theta: np.ndarray, names: Sequence[str]) -> tuple[str, np.ndarray]:
-    """Return a relative direction as powers, such as "a → a·t, b → b·t^-2", and such a θ; "" if none fit."""
+    """Return a relative direction as powers, such as "a -> a·t, b -> b·t^-2", and such a θ; "" if none fit."""
     shown = np.flatnonzero(direction)
     simple = exponents(direction[shown]) if np.all(theta[shown]) else None
     if simple is None or not all(simple):
@@ -282,17 +282,17 @@ def by_powers(direction: np.ndarray, theta: np.ndarray, names: Sequence[str]) ->
     powers = np.zeros(theta.size)
     powers[shown] = np.array(simple, dtype=float) / float(simple[0])
     factors = [f"·t^{power:.3g}" if power != 1.0 else "·t" for power in powers[shown]]
-    text = ", ".join(f"{names[int(i)]} → {names[int(i)]}{f}" for i, f in zip(shown, factors, strict=True))
+    text = ", ".join(f"{names[int(i)]} -> {names[int(i)]}{f}" for i, f in zip(shown, factors, strict=True))
     return text, theta * (1.0 + TESTED_CHANGE) ** (powers / np.abs(powers).max())
 
 
 def by_sums(direction: np.ndarray, theta: np.ndarray, names: Sequence[str]) -> tuple[str, np.ndarray]:
-    """Return a direction as sums, such as "a → a + t, b → b − 0.5·t", and a θ changed so."""
+    """Return a direction as sums, such as "a -> a + t, b -> b - 0.5·t", and a θ changed so."""
     shown = np.flatnonzero(direction)
     ratios = np.zeros(theta.size)
     for i in shown:
         ratios[i] = float(f"{direction[i] / direction[shown[0]]:.6g}")  # the numbers that are written are tested
-    terms = [("" if abs(r) == 1.0 else f"{abs(r):.6g}·", "+" if r > 0.0 else "−") for r in ratios[shown]]
-    text = ", ".join(f"{names[int(i)]} → {names[int(i)]} {b} {a}t" for i, (a, b) in zip(shown, terms, strict=True))
+    terms = [("" if abs(r) == 1.0 else f"{abs(r):.6g}·", "+" if r > 0.0 else "-") for r in ratios[shown]]
+    text = ", ".join(f"{names[int(i)]} -> {names[int(i)]} {b} {a}t" for i, (a, b) in zip(shown, terms, strict=True))
     scale = np.min(np.where(theta != 0.0, np.abs(theta), 1.0)[shown] / np.abs(ratios[shown]))
     return text, theta + TESTED_CHANGE * scale * ratios

@@ -13,9 +13,10 @@ from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.density.initial_orbits import InitialEstimate, measured_orbits, simultaneous_fit
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
+from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import ResponseSolver
-from bayesperiodic.estimation.check import MOST_UNEXPLAINED, check_warnings, checked
+from bayesperiodic.estimation.check import check_warnings, checked
 from bayesperiodic.estimation.covariance import (
     degrees_of_freedom,
     estimated_inputs,
@@ -93,7 +94,8 @@ def map_estimate(
     ----------
     problem : Problem
     start : mapping of str to float, optional
-        First guess of every free parameter; by default the medians of the priors.
+        First guess of every free parameter; those that the problem adds by itself may be left out, see
+        `Problem.completed`. By default the medians of the priors.
     starts : int, optional
         Number of starts; those after the first are draws from the priors, solved from the orbits of the first. By
         default one if `start` is given, and otherwise up to eight, with at most 16 000 unknowns of all periodic solves
@@ -136,6 +138,7 @@ def map_estimate(
     """
     _checks.instance("problem", problem, Problem)
     if isinstance(start, Mapping):
+        start = problem.completed(start)
         _checks.same_names("start", start, problem.names)
     theta = problem.median() if start is None else problem.vector(start)
     if starts is None:

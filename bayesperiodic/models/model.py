@@ -17,6 +17,7 @@ from bayesperiodic._compile.cache import load
 from bayesperiodic._compile.code_generation import Kernels, SymbolicModel, VjpKernels, grid_functions
 from bayesperiodic._compile.grid_function import GridFunction
 from bayesperiodic._expressions import parse
+from bayesperiodic._printing import Printed
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
 DERIVATIVES = ("", "d", "dd")
@@ -45,7 +46,7 @@ class Names:
         return self._symbols[name]
 
 
-class Model:
+class Model(Printed):
     """Nonlinear model g(q, q̇, q̈, u, τ, θ) = 0 with outputs ŷ = f(q, q̇, q̈, u, τ, θ), eq. (1) of [1]_.
 
     Residuals, all derivatives and compiled functions are derived from the symbolic equations.

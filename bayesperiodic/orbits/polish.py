@@ -456,7 +456,9 @@ def _unsuitable(orbit: Orbit, largest_multiplier: float, least_quality: float) -
         return "a state of rest"
     if orbit.quality < least_quality:
         return f"disagrees with its returns: quality {orbit.quality:.2g} < {least_quality:g}"
-    return f"too unstable: |μ| = {modulus:.4g} > {largest_multiplier:g}" if modulus > largest_multiplier else ""
+    if modulus > largest_multiplier:
+        return f"too unstable: multiplier of modulus {modulus:.4g} > {largest_multiplier:g}"
+    return ""
 
 
 def _uninformative(information: list[np.ndarray], most: float) -> dict[int, float]:

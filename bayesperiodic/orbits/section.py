@@ -324,7 +324,7 @@ def _check_angle(name: str, values: np.ndarray) -> None:
         )
     if jumps and largest > 1.0 and abs(extent / (2.0 * np.pi) - 1.0) > 0.1:
         raise ValueError(
-            f"outputs[{name!r}]: must be an angle that is continuous or jumps by 2π (6.283 rad), got jumps of "
+            f"outputs[{name!r}]: must be an angle that is continuous or jumps by a turn (6.283 rad), got jumps of "
             f"{largest:.4g}. Check the unit, and whether the angle covers half a turn only (arctan instead of arctan2)."
         )
     if np.quantile(np.abs(wrapped(np.diff(values))), 0.9) > 0.75 * np.pi or smooth > 2.0 * np.pi:

@@ -63,7 +63,7 @@ class CyclicFactors:
 
     def _substitute(self, routine: Callable[..., None], right: np.ndarray) -> np.ndarray:
         if not self.regular:
-            raise np.linalg.LinAlgError("∂g/∂z is singular")
+            raise np.linalg.LinAlgError("the derivative of the equations by the states is singular")
         folded = self._fold(right)
         routine(self.band, self._lower, self._lower, self.pivots, folded)
         return self._unfold(folded).reshape(right.shape)

@@ -46,7 +46,7 @@ class Scheme(Storable):
 
     def __post_init__(self) -> None:
         if not self.order >= 1:
-            raise ValueError(f"order: must be ≥ 1, got {self.order!r}.")
+            raise ValueError(f"order: must be at least 1, got {self.order!r}.")
         for argument, weights, derivative in (("first", self.first, 1), ("second", self.second, 2)):
             for power in range(derivative + 1):
                 moment = sum(weight * offset**power for offset, weight in weights.items())

@@ -57,7 +57,10 @@ class Prior(LogDensity, Protocol):
 
 
 class Univariate(Prior, ABC):
-    """Base of the priors of one parameter; only points inside the support reach their formulas."""
+    """Base of the priors of one parameter; only points inside the support reach their formulas.
+
+    What overflows there is infinite or NaN, for which densities have a status.
+    """
 
     # Checks of the arguments, by name; they return plain floats, so that equal priors print alike.
     _arguments: ClassVar[Mapping[str, Callable[[str, Any], float]]] = {}
@@ -99,19 +102,20 @@ class Univariate(Prior, ABC):
 
     def _where_inside(self, function: Callable[[np.ndarray], Any], x: np.ndarray, outside: float) -> np.ndarray:
         low, high = self.support
-        if np.ndim(x) == 0:
-            # Not as an array without axes, with which everything takes several times as long.
-            number: Any = np.float64(x)
-            number = np.float64(function(number) if low < number < high else outside)
-            return number
-        x = np.ascontiguousarray(x, dtype=float)
-        inside = (x > low) & (x < high)
-        if np.count_nonzero(inside) == x.size:
-            result = np.empty(x.shape)
-            result[...] = function(x)
-            return result
-        result = np.full(x.shape, outside)
-        result[inside] = function(x[inside])
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            if np.ndim(x) == 0:
+                # Not as an array without axes, with which everything takes several times as long.
+                number: Any = np.float64(x)
+                number = np.float64(function(number) if low < number < high else outside)
+                return number
+            x = np.ascontiguousarray(x, dtype=float)
+            inside = (x > low) & (x < high)
+            if np.count_nonzero(inside) == x.size:
+                result = np.empty(x.shape)
+                result[...] = function(x)
+                return result
+            result = np.full(x.shape, outside)
+            result[inside] = function(x[inside])
         return result
 
     # Squares are products in the formulas: x**2 of a number and of an array may differ in the last bit.

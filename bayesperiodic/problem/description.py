@@ -8,6 +8,7 @@ import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
+from bayesperiodic._printing import Printed
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.frequency_error import FrequencyError
 from bayesperiodic.likelihood.input_noise import (
@@ -48,7 +49,7 @@ from bayesperiodic.problem.sensors import Sensor, Sensors
 LEAST_WIDTH = 1e-12
 
 
-class Description:
+class Description(Printed):
     """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction and immutable."""
 
     def __init__(
@@ -81,6 +82,7 @@ class Description:
             "sensors": dict(sensors) if isinstance(sensors, Mapping) else sensors,
             "input_errors": dict(input_errors or {}), "anchors": dict(anchors or {}),
         }  # fmt: skip
+        errors: dict[str, Any] = {}
         if self.input_noise == JOINT:
             model, errors, none = with_errors_as_parameters(model, self.experiments)
             priors, fixed = {**priors, **errors}, {**(fixed or {}), **none}
@@ -102,10 +104,12 @@ class Description:
         priors, fixed = self.sensors.with_entries(priors, fixed or {})
         self.local = checked_local(local, every, priors, tied)
         self.fixed = {n: fixed_values(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
-        given = expand_priors(priors, self.local, runs, self.fixed) | self._free_phases(priors, fixed, tied)
+        phases = self._free_phases(priors, fixed, tied)
+        given = expand_priors(priors, self.local, runs, self.fixed) | phases
         self.joint_prior = JointPrior.of(given, free_names(every[:-1], self.local, runs))
         self.names = self.joint_prior.names
         self.plain_names = plain_names(self.names, self.local, runs)
+        self.automatic = tuple(n for n, plain in self.plain_names.items() if n in phases or n in errors or plain in errors)
         self._check_widths()
         self._check_free(fixed)
         check_delays(self.experiments, (*self.names, *fixed, *tied, *self.sensors.known_delays))
@@ -402,6 +406,26 @@ class Description:
             For unknown or missing names, or another last axis.
         """
         return values_by_name("theta", theta, self.names)
+
+    def completed(self, theta: Any) -> Any:
+        """Return a mapping of θ with the parameters that the problem adds by itself, at their priors' medians.
+
+        They are the delays of an autonomous model and, with ``input_noise="joint"``, the amplitudes of the errors of
+        the inputs, unless they are given priors or values.
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or anything else
+            Which is returned as it is.
+
+        Returns
+        -------
+        dict of str to float
+        """
+        if not isinstance(theta, Mapping):
+            return theta
+        medians = dict(zip(self.names, self.median().tolist(), strict=True))
+        return {name: medians[name] for name in self.automatic} | dict(theta)
 
     def noise_values(self, variances: Mapping[str, Any] | np.ndarray) -> np.ndarray:
         """Return the noise parameters as an array from a mapping or an array.

@@ -261,7 +261,7 @@ def _checked(sensors: Any, model: Model, measured: Sequence[str]) -> dict[str, S
         acting = dict(sensor.acting())
         if channel in model.angles and (wrong := next((k for k in (GAIN, CUTOFF) if k in acting), "")):
             raise ValueError(
-                f"{argument}: must be without {wrong} for an angle, which is compared modulo 2π, got {sensor!r}."
+                f"{argument}: must be without {wrong} for an angle, which is compared modulo 2 pi, got {sensor!r}."
             )
         if channel in model.inputs and model.autonomous:
             raise ValueError(

@@ -54,7 +54,7 @@ class Symmetry(Storable):
 
     def __repr__(self) -> str:
         if self.transformation:
-            return f"{self.kind}: {', '.join(f'{name} → {image}' for name, image in self.transformation.items())}"
+            return f"{self.kind}: {', '.join(f'{name} -> {image}' for name, image in self.transformation.items())}"
         changes = ", ".join(f"d({name}) = {move}" for name, move in self.generator.items())
         return f"{self.kind}: {changes} (infinitesimally; no closed form found)"
 
@@ -96,7 +96,7 @@ class Structure(Result):
     (True, {'m': 'determined', 'c': 'determined', 'k3': 'determined'})
     >>> swing = bp.structure(bp.models.pendulum, fixed=["a", "g", "v0"])
     >>> swing.symmetries
-    (scaling: m → m*t, k1 → k1*t, k2 → k2*t, k3 → k3*t,)
+    (scaling: m -> m*t, k1 -> k1*t, k2 -> k2*t, k3 -> k3*t,)
     """
 
     model: str

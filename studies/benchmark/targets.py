@@ -21,8 +21,8 @@ def problem(name: str, found: Mapping[str, Any]) -> str:
     kind = "SYNTHETIC data" if found["synthetic"] else "measured data"
     experiments = "1 experiment" if found["experiments"] == 1 else f"{found['experiments']} experiments"
     title = (
-        f"{name} ({kind}, {experiments}, {found['samples']} samples; |Δ log-posterior| ≤ {found['allowed']:g} at "
-        f"{found['draws']} draws, reference uncertain by {found['reference_uncertainty']:.0e})"
+        f"{name} ({kind}, {experiments}, {found['samples']} samples; |change of log-posterior| <= "
+        f"{found['allowed']:g} at {found['draws']} draws, reference uncertain by {found['reference_uncertainty']:.0e})"
     )
     methods = {
         entry["name"]: {
@@ -175,7 +175,7 @@ def _of_floor(name: str, floor: Mapping[str, Any], limits: Mapping[str, float]) 
         if "gradient_error" in entry:
             what = f"{name}, {scheme}: error of the gradient by 15 parameters, of its largest component"
             result.append(row(what, entry["gradient_error"][ALL_FREE], 0.0, GRADIENT_ERROR, DIFFERENCES))
-            what = f"{name}, {scheme}: |Δ log-posterior| against solves anchored at the draw"
+            what = f"{name}, {scheme}: |change of log-posterior| against solves anchored at the draw"
             result.append(row(what, entry["same_grid_error"], 0.0, SAME_GRID))
     return result
 

@@ -109,7 +109,7 @@ def run(options: argparse.Namespace) -> None:
         "choices": [_by_noise(experiment, every), _by_noise(in_drive, within)],
     }
     results |= {"seconds": watch.total() | {"from_rest": seconds}, "versions": common.versions()}
-    print(f"\nSilverbox, {kind} data, w0 = 2π·65 rad/s: estimate ± Laplace sd (robust sd) by noise model")
+    print(f"\nSilverbox, {kind} data, w0 = 2 pi·65 rad/s: estimate ± Laplace sd (robust sd) by noise model")
     print("\n".join([*_fits_lines(every), *_check_lines(results)]))
     kept, fraction = in_drive.harmonics["response"], within["independent"].rms["response"] / spread(in_drive)
     print(f"\nThe same with {kept} harmonics of the response, up to the drive's last line: residual {fraction:.3%}")

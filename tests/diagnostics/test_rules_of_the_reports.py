@@ -165,10 +165,10 @@ def test_directions_are_described_with_their_gain_and_invariant_combinations():
     assert table["parameters"].tolist() == ["a", "b", "c, d", "c, d"]
     assert table["combinations"].tolist() == ["", "", "d - 1.33*c", ""]
     assert table["direction"].tolist() == [
-        "a → a·t",
-        "b → b·t",
-        "c → c + 0.75·t, d → d + t",
-        "c → c + t, d → d − 0.75·t",
+        "a -> a·t",
+        "b -> b·t",
+        "c -> c + 0.75·t, d -> d + t",
+        "c -> c + t, d -> d - 0.75·t",
     ]
 
 

@@ -85,14 +85,14 @@ def test_combinations_do_not_change_along_the_direction(direction, logarithmic, 
 @pytest.mark.parametrize(
     ("direction", "logarithmic", "expected"),
     [
-        ([1.0, -2.0, 0.0], BOTH, "a → a·t, b → b·t^-2"),
-        ([1.0, 0.14, 0.0], BOTH, "a → a·t, b → b·t^0.14"),
-        ([0.0, 2.0, 1.0], BOTH, "b → b·t, c → c·t^0.5"),
-        ([1.0, -2.0, 0.0], NONE, "a → a − 0.5·t, b → b + t"),
-        ([1.0, 1.0, 0.0], NONE, "a → a + t, b → b + t"),
-        ([1.0, 1.0, 0.0], np.array([True, False, True]), "a → a·t, b → b + ln t"),
-        ([1.0, 2.0, -0.5], np.array([False, True, False]), "a → a + 0.5·ln t, b → b·t, c → c − 0.25·ln t"),
-        ([1.0, 0.04, 0.0], NONE, "a → a + t"),
+        ([1.0, -2.0, 0.0], BOTH, "a -> a·t, b -> b·t^-2"),
+        ([1.0, 0.14, 0.0], BOTH, "a -> a·t, b -> b·t^0.14"),
+        ([0.0, 2.0, 1.0], BOTH, "b -> b·t, c -> c·t^0.5"),
+        ([1.0, -2.0, 0.0], NONE, "a -> a - 0.5·t, b -> b + t"),
+        ([1.0, 1.0, 0.0], NONE, "a -> a + t, b -> b + t"),
+        ([1.0, 1.0, 0.0], np.array([True, False, True]), "a -> a·t, b -> b + ln t"),
+        ([1.0, 2.0, -0.5], np.array([False, True, False]), "a -> a + 0.5·ln t, b -> b·t, c -> c - 0.25·ln t"),
+        ([1.0, 0.04, 0.0], NONE, "a -> a + t"),
     ],
 )
 def test_joint_changes_in_words(direction, logarithmic, expected):
@@ -102,7 +102,7 @@ def test_joint_changes_in_words(direction, logarithmic, expected):
 def test_powers_of_a_factor_change_the_largest_by_ten_percent():
     theta = np.array([2.0, -3.0, 5.0])
     text, there = by_powers(np.array([1.0, -2.0, 0.0]), theta, NAMES)
-    assert text == "a → a·t, b → b·t^-2"
+    assert text == "a -> a·t, b -> b·t^-2"
     assert there == pytest.approx([2.0 * 1.1**0.5, -3.0 / 1.1, 5.0])
     for unfit in ([1.0, 0.14, 0.0], [1.0, 0.0, 1.0], [1e-9, 1.0, 0.0]):
         text, there = by_powers(np.array(unfit), np.array([2.0, 3.0, 0.0]), NAMES)
@@ -112,10 +112,10 @@ def test_powers_of_a_factor_change_the_largest_by_ten_percent():
 def test_sums_change_no_parameter_by_more_than_ten_percent():
     theta = np.array([2.0, 0.0, 5.0])
     text, there = by_sums(np.array([3.0, -1.5, 0.0]), theta, NAMES)
-    assert text == "a → a + t, b → b − 0.5·t"
+    assert text == "a -> a + t, b -> b - 0.5·t"
     assert there == pytest.approx(theta + 0.1 * np.array([2.0, -1.0, 0.0]))
     text, there = by_sums(np.array([0.0, -1.0, 8.0]), theta, NAMES)
-    assert text == "b → b + t, c → c − 8·t"
+    assert text == "b -> b + t, c -> c - 8·t"
     assert there == pytest.approx(theta + 0.1 * np.array([0.0, 5.0 / 8.0, -5.0]))
 
 
@@ -129,9 +129,11 @@ def vanishing(residuals, theta, names, logarithmic):
 
 
 def test_directions_without_information_are_named_by_sums_or_powers_or_as_combinations():
-    assert vanishing(lambda t: np.array([t[0] * t[1], t[2]]), [2.0, 3.0, 1.0], NAMES, BOTH) == ("a → a·t, b → b·t^-1",)
+    assert vanishing(lambda t: np.array([t[0] * t[1], t[2]]), [2.0, 3.0, 1.0], NAMES, BOTH) == (
+        "a -> a·t, b -> b·t^-1",
+    )
     assert vanishing(lambda t: np.array([t[0] - 2 * t[1]]), [2.0, 3.0], ["a", "b"], [False, False]) == (
-        "a → a + t, b → b + 0.5·t",
+        "a -> a + t, b -> b + 0.5·t",
     )
     assert vanishing(lambda t: np.array([t[0] + np.sin(t[1]), t[2]]), [2.0, 0.5, 1.0], NAMES, NONE) == (
         "a combination of a and b",

@@ -130,8 +130,8 @@ def test_directions_without_information_are_named():
     assert fit.converged
     assert set(fit.undetermined) == {
         "idle: no output depends on it",
-        "a → a·t, b → b·t^-0.5",
-        "shift_a → shift_a + t, shift_b → shift_b − 0.5·t",
+        "a -> a·t, b -> b·t^-0.5",
+        "shift_a -> shift_a + t, shift_b -> shift_b - 0.5·t",
     }
     assert fit.theta["idle"] == pytest.approx(5.0) and fit.sd["idle"] == pytest.approx(2.0)
     assert "Not determined by the data: idle" in repr(fit)
@@ -159,8 +159,12 @@ def test_several_undetermined_directions_are_named_separately():
 
         return undetermined(np.outer(row, row), np.ones(4), list("abcd"), np.ones(4, dtype=bool), change)
 
-    assert found(lambda x: np.log(x).sum()) == ("a → a·t, d → d·t^-1", "b → b·t, d → d·t^-1", "c → c·t, d → d·t^-1")
-    assert found(np.sum) == ("a → a + t, d → d − t", "b → b + t, d → d − t", "c → c + t, d → d − t")
+    assert found(lambda x: np.log(x).sum()) == (
+        "a -> a·t, d -> d·t^-1",
+        "b -> b·t, d -> d·t^-1",
+        "c -> c·t, d -> d·t^-1",
+    )
+    assert found(np.sum) == ("a -> a + t, d -> d - t", "b -> b + t, d -> d - t", "c -> c + t, d -> d - t")
     assert found(lambda x: np.sum(x**3) / 3) == tuple(f"a combination of {x} and d" for x in "abc")
 
 
@@ -187,7 +191,7 @@ def test_a_scale_that_all_parameters_share_is_named_completely():
     problem = bp.Problem(model, [run], priors=priors | {"h": bp.Normal(0.1, 0.05)})
     with pytest.warns(UserWarning, match="The data do not change under .*k3, h: LogNormal priors, if the signs are kn"):
         fit = bp.map_estimate(problem, progress=False)
-    assert fit.undetermined == ("m → m·t, c → c·t, k → k·t, k3 → k3·t, h → h·t",)
+    assert fit.undetermined == ("m -> m·t, c -> c·t, k -> k·t, k3 -> k3·t, h -> h·t",)
 
 
 def test_a_difference_seen_at_one_frequency_is_named_as_such():
@@ -206,7 +210,7 @@ def test_a_difference_seen_at_one_frequency_is_named_as_such():
     problem = bp.Problem(bp.models.duffing, [run], priors=priors, fixed={"k3": 0.0}, scheme="fourier")
     with pytest.warns(UserWarning, match="The data do not change under"):
         (text,) = bp.map_estimate(problem, progress=False).undetermined
-    coefficient = float(re.fullmatch(r"m → m \+ t, k → k \+ ([0-9.]+)·t", text)[1])
+    coefficient = float(re.fullmatch(r"m -> m \+ t, k -> k \+ ([0-9.]+)·t", text)[1])
     assert coefficient == pytest.approx(omega**2, rel=1e-4)
 
 

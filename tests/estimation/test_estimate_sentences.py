@@ -116,16 +116,16 @@ def test_other_optima_are_listed_up_to_three():
 
 def test_parameters_without_effect_and_directions_are_named():
     found = warnings_of(
-        undetermined=("b: no output depends on it", "a combination of a and b", "a → a·t, b → b + t", "a → a + t")
+        undetermined=("b: no output depends on it", "a combination of a and b", "a -> a·t, b -> b + t", "a -> a + t")
     )
     assert found[0] == "The data do not depend on 'b'; its posterior equals its prior. Fix it."
     assert found[1].startswith("The data do not determine a combination of a and b: near the estimate")
-    assert found[2].startswith("The data do not change under a → a·t, b → b + t; or under a → a + t, for any t.")
+    assert found[2].startswith("The data do not change under a -> a·t, b -> b + t; or under a -> a + t, for any t.")
     assert found[2].endswith("or report the combination that does not change.") and len(found) == 3
-    (text,) = warnings_of(undetermined=("a → a·t, b → b·t^-1",))
+    (text,) = warnings_of(undetermined=("a -> a·t, b -> b·t^-1",))
     assert text.endswith(" b: LogNormal priors, if the signs are known, make sampling easier.")
-    (text,) = warnings_of(undetermined=("a → a + 1·x", "a → a + 2·x", "a → a + 3·x", "a → a + 4·x", "a → a + 5·x"))
-    assert "a → a + 3·x; and 2 more, for any t." in text
+    (text,) = warnings_of(undetermined=("a -> a + 1·x", "a -> a + 2·x", "a -> a + 3·x", "a -> a + 4·x", "a -> a + 5·x"))
+    assert "a -> a + 3·x; and 2 more, for any t." in text
 
 
 def test_noise_parameters_are_named_in_short_without_the_word_variance():

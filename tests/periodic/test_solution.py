@@ -320,7 +320,7 @@ def test_windings_of_two_angles_are_given_by_name():
     [
         ({"first": {-1: -1.0, 1: 1.0}}, "first: must give 1 for the derivative of t\\*\\*1 at 0, got 2"),
         ({"second": {0: 1.0, 1: -2.0}}, "second: must give 0 for the derivative of t"),
-        ({"order": 0}, "order: must be ≥ 1, got 0"),
+        ({"order": 0}, "order: must be at least 1, got 0"),
     ],
 )
 def test_inconsistent_schemes_are_rejected(changes, message):

@@ -243,8 +243,8 @@ def test_error_without_a_laplace_approximation_names_the_alternative(known_varia
     problem, fit = known_variance
     for known, step in (
         (
-            {"checks": replace(fit.checks, undetermined=("k → k·t, c → c·t",))},
-            r"fix what the data do not determine \(k → k·t, c → c·t\)",
+            {"checks": replace(fit.checks, undetermined=("k -> k·t, c -> c·t",))},
+            r"fix what the data do not determine \(k -> k·t, c -> c·t\)",
         ),
         ({"search": replace(fit.search, at_ends=("k",))}, "widen the prior of 'k', which is at the end of its support"),
         ({}, "run map_estimate from another start"),

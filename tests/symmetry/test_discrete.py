@@ -43,7 +43,7 @@ def found(model, **settings):
 def test_symmetries_of_formulas_are_found(parameters, output, kind, images):
     structure, discrete = found(formula_model("formula", parameters, lambda p, u, s: {"y": output(p, u)}))
     assert discrete == [(kind, images)]
-    assert f"{kind}: {', '.join(f'{n} → {i}' for n, i in images.items())}" in repr(structure)
+    assert f"{kind}: {', '.join(f'{n} -> {i}' for n, i in images.items())}" in repr(structure)
     assert set(structure.table["verdict"]) == {"determined"}
 
 

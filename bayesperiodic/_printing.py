@@ -1,0 +1,20 @@
+"""Printed texts."""
+
+import sys
+
+
+def printable(text: str) -> str:
+    r"""Return a text that the standard output can show; characters that its encoding lacks are escaped, as ``\u03b8``.
+
+    The texts of this package need no more than cp1252, the encoding of files that output on Windows is redirected into.
+    Names and units are the user's.
+    """
+    encoding = getattr(sys.stdout, "encoding", None)
+    return text if encoding is None else text.encode(encoding, "backslashreplace").decode(encoding)
+
+
+class Printed:
+    """Base class of objects that can be printed whatever characters are in the names and units that the user gave."""
+
+    def __str__(self) -> str:
+        return printable(repr(self))
