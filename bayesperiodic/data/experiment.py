@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic._io import Result
+from bayesperiodic._io import Result, Storable
 from bayesperiodic._linalg import covariance_cholesky
 from bayesperiodic.data.recording_check import Finding
 from bayesperiodic.data.response_period import summary
@@ -18,8 +18,18 @@ if TYPE_CHECKING:
 
 MEANING, DATA = "samples·periods", "data"
 CHANNEL_MAPPINGS = (
-    "scatter", "independent", "harmonics", "amplitude_variance", "amplitude_freedom", "drift", "middle",
+    "scatter", "independent", "harmonics", "amplitude_variance", "amplitude_freedom", "left_out", "drift", "middle",
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LeftOut(Storable):
+    """Harmonics of a recording above those that an experiment keeps, which are no data: (harmonics,) each."""
+
+    harmonic: np.ndarray
+    amplitude: np.ndarray  # complex
+    variance: np.ndarray  # of the complex amplitude
+    freedom: np.ndarray  # degrees of freedom of the variance
 
 
 @dataclass(frozen=True)
@@ -60,6 +70,9 @@ class Experiment(Result):
         Variance of the mean's complex Fourier amplitudes.
     amplitude_freedom : mapping of str to array (harmonics + 1,), optional
         Degrees of freedom of ``amplitude_variance``; by default 2(cycles − 1), and cycles − 1 for harmonic 0.
+    left_out : mapping of str to LeftOut, optional
+        By output, the harmonics above those kept that the recording resolves, with the noise in them. They are no
+        data, but count in the size of the error of the model (`predict`).
     error_slopes : mapping of str to mapping of str to complex array (harmonics + 1,), optional
         By input and output, the regression of the errors of the output's complex amplitudes on those of the input's;
         none where they are independent.
@@ -139,6 +152,7 @@ class Experiment(Result):
     unmeasured: Mapping[str, Sequence[int]] = field(default_factory=dict, kw_only=True)
     amplitude_variance: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
     amplitude_freedom: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+    left_out: Mapping[str, LeftOut] = field(default_factory=dict, kw_only=True)
     error_slopes: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict, kw_only=True)
     frequency_se: float = field(default=0.0, kw_only=True)
     periodicity: float = field(default=1.0, kw_only=True)

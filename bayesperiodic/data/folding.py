@@ -12,6 +12,7 @@ from scipy.special import chdtrc, fdtrc
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.clocks import CLOCK
 from bayesperiodic.data.coverage import missing_phases, resolved_harmonics
+from bayesperiodic.data.experiment import LeftOut
 from bayesperiodic.data.faults import ROUNDING
 from bayesperiodic.data.groups import CommonFit, fit_groups, leading, within
 from bayesperiodic.data.harmonics import (
@@ -113,6 +114,7 @@ def fold_signals(
         "harmonics": kept,
         "amplitude_variance": {channel: noise[channel].variance[part] for channel, part in used.items()},
         "amplitude_freedom": {channel: noise[channel].freedom[part] for channel, part in used.items()},
+        "left_out": _left_out(amplitudes, noise, {channel: kept[channel] for channel in outputs}),
         "error_slopes": _error_slopes(noise, inputs, kept, amplitudes),
         "periodicity": _periodicity(seen, fit),
         "drift": drift,
@@ -396,6 +398,19 @@ def _error_slopes(
                 slope[0] = slope[0].real
                 slopes.setdefault(name, {})[channel] = slope
     return slopes
+
+
+def _left_out(
+    amplitudes: Mapping[str, np.ndarray], noise: Mapping[str, AmplitudeNoise], kept: Mapping[str, int]
+) -> dict[str, LeftOut]:
+    """Return the harmonics above those kept, by channel, where there are any."""
+    result = {}
+    for channel, highest in kept.items():
+        above = np.arange(highest + 1, min(amplitudes[channel].size, noise[channel].variance.size))
+        if above.size:
+            values = amplitudes[channel], noise[channel].variance, noise[channel].freedom
+            result[channel] = LeftOut(above, *(value[above] for value in values))
+    return result
 
 
 def neighbours_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

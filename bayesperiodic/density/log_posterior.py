@@ -85,6 +85,10 @@ class Linearisation:
         """Return y − ŷ (points,) by experiment and channel, within the harmonics kept."""
         return {name: o.compared(self._responses[name]) for name, o in self._observations.items()}
 
+    def left_out(self) -> dict[str, dict[str, np.ndarray]]:
+        """Return measured less predicted amplitudes of harmonics that were left out, by experiment and channel."""
+        return {name: o.left_out(self._responses[name]) for name, o in self._observations.items()}
+
     @cached_property
     def other_orbits(self) -> dict[str, str]:
         """Why the model's orbit is not the measured one, by experiment, see `other_orbit`; without the others."""

@@ -1,6 +1,7 @@
 """Size of the error of a model: how far its predicted periods are from the true ones, with an interval."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,13 +10,14 @@ from scipy import stats
 from scipy.optimize import brentq
 
 from bayesperiodic._linalg import TINY, column_space
-from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.data.experiment import Experiment, LeftOut
 from bayesperiodic.density.log_posterior import Linearisation
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.adequacy import ALL, Whitened, measured_freedom
-from bayesperiodic.likelihood.block import Block
 
 MODEL_ERROR = ("model_error", "model_error_low", "model_error_high")
+# Column of the highest harmonic that the error contains.
+UP_TO = "model_error_up_to"
 # Probability beyond each end of the interval.
 TAIL_PROBABILITY = 0.05
 # Values tried of a noise variance that is itself estimated.
@@ -67,6 +69,56 @@ class ErrorPart(NamedTuple):
         )
 
 
+@dataclass(frozen=True)
+class Residual:
+    """Residual components of a block, with the variances of the noise in them.
+
+    `left` are the components (size,), `variances` those of their noise (size,), with degrees of freedom `each` (size,),
+    `freedom` those of the sum of all variances, 0 if they are unknown. The components are `dependent` times as many
+    as independent values.
+    """
+
+    left: np.ndarray
+    variances: np.ndarray
+    each: np.ndarray
+    freedom: float
+    dependent: float
+
+    def with_harmonics(self, size: int, amplitudes: np.ndarray, without: LeftOut) -> "Residual":
+        """Return the same with complex amplitudes of further harmonics, scaled as components of a block of this size.
+
+        The real and imaginary parts of an amplitude share a variance.
+        """
+        left = np.sqrt(0.5 * size) * np.concatenate([amplitudes.real, amplitudes.imag])
+        variances, each = 0.25 * size * np.tile(without.variance, 2), np.tile(0.5 * without.freedom, 2)
+        freedom = self.freedom
+        if freedom > 0.0:
+            known = float(self.variances.sum())
+            # The sum of independent estimates of variances by Satterthwaite.
+            uncertain = known**2 / freedom + float(np.sum(variances**2 / each))
+            freedom = (known + float(variances.sum())) ** 2 / uncertain if uncertain > 0.0 else np.inf
+        pairs = (self.left, left), (self.variances, variances), (self.each, each)
+        values, noise, known_by = (np.concatenate(pair) for pair in pairs)
+        return Residual(values, noise, known_by, freedom, self.dependent)
+
+    def error(self, values: float) -> tuple[float, float, float]:
+        """Return the sum of squares of the error of the model and the ends of its interval.
+
+        `values` is the number of independent ones that the parameters leave.
+        """
+        square = float(self.left @ self.left)
+        if self.freedom > 0.0:
+            # Fewer independent values than components make sums of squares more variable.
+            parts = self.variances * self.left**2
+            along = self.dependent * float(parts.sum()) / max(square, TINY)
+            # A few harmonics may hold all of the error, whose noise is known less well than that of all.
+            uncertain = float(np.sum(parts**2 / self.each))
+            few = float(parts.sum()) ** 2 / uncertain if uncertain > 0.0 else np.inf
+            variance = 2.0 * self.dependent * float(self.variances @ self.variances)
+            return ErrorPart(square, float(self.variances.sum()), variance, along, self.freedom, few).error()
+        return np.nan, 0.0, square * values / stats.chi2.ppf(TAIL_PROBABILITY, values) if values >= 1.0 else np.inf
+
+
 def _root(falling: Callable[[float], float], scale: float) -> float:
     """Return where a falling function of a positive number is zero; 0 if it is negative there."""
     if falling(0.0) <= 0.0:
@@ -81,9 +133,11 @@ def model_errors(problem: Problem, here: Linearisation, noise: np.ndarray) -> pd
     """Return the error of the model in units of the measured rms and its 90 % interval, by experiment and channel.
 
     It is the rms of the difference between the true period and that of the model with the parameters that fit all
-    experiments best, relative to the rms of the measured period about its mean. The noise is the one measured between
-    cycles, or a given one, that of the inputs included; if it is unknown, there is only an upper end, for which all of
-    the residual may be error of the model. `noise` are parameters of the noise model (noise_names,).
+    experiments best, relative to the rms of the measured period about its mean. Harmonics that the recording resolves
+    but the experiment does not keep are in it: each may be too weak to be noticed, but not all of them together. The
+    noise is the one measured between cycles, or a given one, that of the inputs included; if it is unknown, there is
+    only an upper end, for which all of the residual may be error of the model. `noise` are parameters of the noise
+    model (noise_names,).
     """
     if problem.likelihood.correlated:
         return pd.DataFrame(columns=[*MODEL_ERROR])
@@ -105,14 +159,24 @@ def model_errors(problem: Problem, here: Linearisation, noise: np.ndarray) -> pd
     after = _after_projection(basis, spread * root**2) / root**2 + _of_inputs(likelihood, blocks, basis, root)
     ends = np.cumsum([block.size for block in blocks])
     rows: dict[str, Any] = {}
+    above = here.left_out()
     for block, (_, freedom, each), end in zip(blocks, sources, ends, strict=True):
         if block.counted and block.timed:
-            place = slice(end - block.size, end)
-            error = _error(block, left[place], after[place], basis[place], freedom, each)
-            rms = float(np.std(experiments[block.experiment].outputs[block.channel][_measured(experiments, block)]))
+            place, e = slice(end - block.size, end), experiments[block.experiment]
+            part = Residual(left[place], after[place], each, freedom, max(block.size / block.count, 1.0))
+            used, up_to = float(np.sum(basis[place] ** 2)), np.nan
+            if block.spectral:
+                up_to = float(block.harmonic.max())
+            if block.channel in e.left_out:
+                without = e.left_out[block.channel]
+                part = part.with_harmonics(block.size, above[block.experiment][block.channel], without)
+                up_to = float(without.harmonic.max())
+            error = part.error(min(block.count, block.size) + part.left.size - block.size - used)
+            rms = float(np.std(e.outputs[block.channel][e.measured_points]))
             relative = np.sqrt(np.array(error) / block.size) / rms if rms > 0.0 else np.full(3, np.nan)
-            rows[f"{block.experiment} {block.channel}"] = dict(zip(MODEL_ERROR, relative.tolist(), strict=True))
-    return pd.DataFrame.from_dict(rows, orient="index", columns=[*MODEL_ERROR])
+            values = dict(zip(MODEL_ERROR, relative.tolist(), strict=True)) | {UP_TO: up_to}
+            rows[f"{block.experiment} {block.channel}"] = values
+    return pd.DataFrame.from_dict(rows, orient="index", columns=[*MODEL_ERROR, UP_TO])
 
 
 def with_model_error(table: pd.DataFrame, errors: pd.DataFrame) -> pd.DataFrame:
@@ -124,45 +188,23 @@ def with_model_error(table: pd.DataFrame, errors: pd.DataFrame) -> pd.DataFrame:
     return table.join(pd.concat([errors, largest]))
 
 
-def in_words(sizes: Sequence[float], tolerance: float | None) -> str:
-    """Return an error of the model, the ends of its interval and how it compares with a tolerance, in words."""
+def in_words(sizes: Sequence[float], up_to: float, tolerance: float | None) -> str:
+    """Return an error of the model, the ends of its interval and how it compares with a tolerance, in words.
+
+    `up_to` is the highest harmonic that the error contains, NaN where values at points are compared.
+    """
     error, low, high = sizes
+    where = "at the measured points" if np.isnan(up_to) else f"up to harmonic {up_to:.0f}"
     if np.isnan(error):
-        size = f"the model is wrong by at most {high:.2%} of the rms (95 %), if all of the residual is its error"
+        size = (
+            f"the model is wrong by at most {high:.2%} of the rms {where} (95 %), if all of the residual is its error"
+        )
     else:
-        ends = f"{100 * low:.3g} to {100 * high:.3g} %"
-        size = f"the model is wrong by {error:.2%} of the rms in the harmonics kept (90 %: {ends})"
+        size = f"the model is wrong by {error:.2%} of the rms {where} (90 %: {100 * low:.3g} to {100 * high:.3g} %)"
     if tolerance is None:
         return size
     relation = "below" if high < tolerance else "above" if low > tolerance else "not shown to be below"
     return f"{size}, {relation} the tolerance of {100 * tolerance:.3g} %"
-
-
-def _measured(experiments: dict[str, Experiment], block: Block) -> np.ndarray:
-    return experiments[block.experiment].measured_points
-
-
-def _error(
-    block: Block, left: np.ndarray, variances: np.ndarray, basis: np.ndarray, freedom: float, each: np.ndarray
-) -> tuple[float, float, float]:
-    """Return the sum of squares of the error of the model in a block and the ends of its interval.
-
-    `freedom` and `each` (size,) are the degrees of freedom of the variances of all components and of single ones.
-    """
-    square = float(left @ left)
-    if freedom > 0.0:
-        # Fewer independent values than components make sums of squares more variable.
-        dependent = max(block.size / block.count, 1.0)
-        parts = variances * left**2
-        along = dependent * float(parts.sum()) / max(square, TINY)
-        # A few harmonics may hold all of the error, whose noise is known less well than that of all.
-        uncertain = float(np.sum(parts**2 / each))
-        few = float(parts.sum()) ** 2 / uncertain if uncertain > 0.0 else np.inf
-        return ErrorPart(
-            square, float(variances.sum()), 2.0 * dependent * float(variances @ variances), along, freedom, few
-        ).error()
-    values = min(block.count, block.size) - float(np.sum(basis**2))
-    return np.nan, 0.0, square * values / stats.chi2.ppf(TAIL_PROBABILITY, values) if values >= 1.0 else np.inf
 
 
 def _noise_variances(

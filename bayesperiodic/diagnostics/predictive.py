@@ -18,7 +18,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.density.log_posterior import NATURAL
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.model_error import MODEL_ERROR, in_words, model_errors, with_model_error
+from bayesperiodic.diagnostics.model_error import MODEL_ERROR, UP_TO, in_words, model_errors, with_model_error
 from bayesperiodic.estimation.adequacy import (
     ADEQUACY_LEVEL,
     ALL,
@@ -175,7 +175,7 @@ def _experiment_of(problem: Problem, experiment: str | None) -> str:
 # In place of "misspecified" where the error of the model is shown to be smaller than the user tolerates.
 TOLERATED = with_tone("adequate within tolerance", GOOD)
 SENTENCES = {
-    TOLERATED: "In the harmonics kept, the error of the model is below the tolerance, whatever the other tests find.",
+    TOLERATED: "Up to the harmonic stated, the error of the model is below the tolerance, whatever other tests find.",
     UNTESTED: "There are too few values to test the model.",
     UNSOUND: "No test contradicts the model, but a recording is not sound (see the findings of its experiment), and "
     "its faults count as noise in these tests.",
@@ -213,7 +213,8 @@ class Prediction(Bands):
         tested", or "recording not sound" in place of "adequate" where ``Experiment.findings`` has more than harmless
         ones, which count as noise. ``model_error``, ``model_error_low`` and ``model_error_high``: the rms error of the
         model with the parameters that fit all experiments best, relative to the rms of the measured period about its
-        mean, and the ends of its 90 % interval; it concerns the harmonics that the experiment keeps. Where the noise is
+        mean, and the ends of its 90 % interval. It contains all harmonics up to ``model_error_up_to``: those that the
+        experiment keeps, and those that its recording resolves beyond (``Experiment.left_out``). Where the noise is
         unknown there is only the upper end, as if all of the residual were error of the model; in the row "all" the
         largest. With a ``tolerance``, "adequate within tolerance" is the verdict in place of "misspecified" and "not
         tested" where the upper end is below it, if there is neither another orbit nor a conflict of the prior.
@@ -250,8 +251,9 @@ class Prediction(Bands):
         """Error of the model in words, and how it compares with the tolerance, by row of the table."""
         if MODEL_ERROR[0] not in self.table:
             return {}
-        rows = self.table.loc[self.table[MODEL_ERROR[2]].notna(), [*MODEL_ERROR]].drop(ALL, errors="ignore")
-        return {str(label): in_words(row.tolist(), self.tolerance) for label, row in rows.iterrows()}
+        table = self.table.assign(**{UP_TO: self.table.get(UP_TO, np.nan)})
+        rows = table.loc[table[MODEL_ERROR[2]].notna(), [*MODEL_ERROR, UP_TO]].drop(ALL, errors="ignore")
+        return {str(label): in_words(row[:-1], row[-1], self.tolerance) for label, *row in rows.itertuples()}
 
     @property
     def verdict(self) -> str:
@@ -279,7 +281,7 @@ class Prediction(Bands):
         subject = "model or the noise model" if self.concerns_noise else "model"
         verdict = f"The {subject} is {self.verdict} (overall false alarm rate {ADEQUACY_LEVEL:.0%})."
         shown = {} if self.tolerance is None and self.verdict != MISSPECIFIED else self.model_errors
-        tests = self.table.drop(columns=[*MODEL_ERROR], errors="ignore")
+        tests = self.table.drop(columns=[*MODEL_ERROR, UP_TO], errors="ignore")
         lines = [
             f"Tests of the model from {self.draws} draws, {self.failed} without a periodic solution",
             tests.to_string(float_format="{:.2g}".format, na_rep="-"),

@@ -238,6 +238,19 @@ class Observation:
         pairs = zip(self.channels, np.moveaxis(self._difference(predicted), -1, 0), strict=True)
         return {channel: self.experiment.compared(channel, e) for channel, e in pairs}
 
+    def left_out(self, response: Response) -> dict[str, np.ndarray]:
+        """Return measured less predicted amplitudes (harmonics,) of the harmonics left out, by channel with any."""
+        without = self.experiment.left_out
+        predicted, result = self._signals(response).values, {}
+        for place, channel in enumerate(self.channels):
+            if channel in without:
+                above = np.zeros(without[channel].harmonic.max() + 1, dtype=complex)
+                above[without[channel].harmonic] = without[channel].amplitude
+                e = self.data[:, place] + _fourier.on_grid(above, self._points) - predicted[:, place]
+                e = _fourier.within_half_turn(e) if self.angles[place] else e
+                result[channel] = _fourier.coefficients(e)[without[channel].harmonic]
+        return result
+
     def _signals(self, response: Response) -> ComparedSignals:
         """Return the prediction of what was measured, the outputs turned and passed through their sensors."""
         values = response.outputs[..., self.picked]

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics.model_error import ErrorPart, model_errors
+from bayesperiodic.diagnostics.model_error import MODEL_ERROR, UP_TO, ErrorPart, model_errors
 
 GAIN = bp.Model("gain", states=["w"], inputs=["u"], parameters=["a"], equations=["dw + w - u"], outputs={"y": "a*u"})
 TIME = np.arange(10 * 64) / 64
@@ -19,8 +19,8 @@ def sizes(seed, error):
     problem = bp.Problem(GAIN, [run], priors={"a": bp.Normal(1, 10)}, scheme="fourier", input_noise="exact")
     fit = bp.map_estimate(problem, checks=False, progress=False)
     here = problem.anchored(fit.theta).density().linearise(problem.vector(fit.theta))
-    found = model_errors(problem, here, problem.noise_values(dict(fit.noise))).iloc[0].tolist()
-    return *found, float(np.std(wrong) / np.std(2.0 * u + wrong))
+    found = model_errors(problem, here, problem.noise_values(dict(fit.noise))).iloc[0]
+    return *found[[*MODEL_ERROR]], float(np.std(wrong) / np.std(2.0 * u + wrong))
 
 
 def test_ends_are_those_of_the_noncentral_distribution_where_the_noise_is_known():

@@ -1,0 +1,105 @@
+"""Coverage of 90 % intervals by Laplace, robust and by draws, where model, noise or bounds are not ideal.
+
+``--replicates N`` makes N data sets of each case (default 200); the first 100 of them are sampled too.
+"""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from scipy import stats
+
+from studies import common
+from studies.coverage import cases
+
+REPLICATES, QUICK, FALSE_ALARM = 200, 2, 0.01
+KINDS = {cases.LAPLACE: "Laplace", cases.ROBUST: "robust", cases.DRAWS: "draws"}
+Counts = Mapping[str, Mapping[str, Any]]
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the study."""
+    watch, count = common.Stopwatch(), QUICK if options.quick else options.replicates or REPLICATES
+    options.out.mkdir(parents=True, exist_ok=True)
+    tasks = cases.tasks(count, options.seed)
+    with watch.part("data sets", f"intervals from {len(tasks)} data sets"):
+        lines = common.resumed(
+            options.out / "data_sets.jsonl",
+            tasks,
+            cases.replicate,
+            lambda line: (line["case"], line["number"], line["seed"]),
+            cases.source(),
+        )
+    found = summary(lines)
+    numbers = {kind: min(count, cases.SAMPLED) if kind == cases.DRAWS else count for kind in KINDS}
+    bands = {kind: band(number) for kind, number in numbers.items()}
+    with watch.part("figure", "drawing"):
+        paths = common.save_figures(options.out, {"coverage": draw(found, bands)})
+    print("\n" + table(found, bands) + "\n")
+    results = {"seed": options.seed, "data_sets": numbers, "bands": bands, "cases": found}
+    common.finish(options.out, results, watch, paths, synthetic=True)
+
+
+def band(count: int) -> list[float]:
+    """Return the shares of `count` data sets between which right intervals cover, but for false alarms."""
+    return [float(end) / count for end in stats.binom.interval(1.0 - FALSE_ALARM, count, cases.COVERED)]
+
+
+def summary(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the share of intervals that contain the truth, by case, parameter and kind of interval."""
+    found: dict[str, Any] = {}
+    for name in cases.CASES:
+        own = [line for line in lines if line["case"] == name]
+        good = [line for line in own if "error" not in line]
+        covered = {
+            q: {kind: _share([line["covered"][kind][q] for line in good if kind in line["covered"]]) for kind in KINDS}
+            for q in (good[0]["covered"][cases.LAPLACE] if good else ())
+        }
+        found[name] = {
+            "covered": covered,
+            "misspecified": _share([line["misspecified"] for line in good]),
+            "errors": [line["error"] for line in own if "error" in line],
+        }
+    return found
+
+
+def _share(values: Sequence[bool]) -> float:
+    return float(np.mean(values)) if values else np.nan
+
+
+def rows(found: Counts) -> list[tuple[str, str, Mapping[str, float]]]:
+    """Return case, parameter and coverage by kind of interval."""
+    return [(name, q, shares) for name, one in found.items() for q, shares in one["covered"].items()]
+
+
+def table(found: Counts, bands: Mapping[str, Sequence[float]]) -> str:
+    """Return the text to print; a star marks what is outside the band."""
+    shown = {}
+    for name, q, shares in rows(found):
+        marks = {kind: "" if bands[kind][0] <= share <= bands[kind][1] else " *" for kind, share in shares.items()}
+        shown[f"{name}: {q}"] = {KINDS[kind]: f"{share:.1%}{marks[kind]}" for kind, share in shares.items()} | {
+            "misspecified": f"{found[name]['misspecified']:.1%}",
+            "errors": len(found[name]["errors"]),
+        }
+    limits = ", ".join(f"{KINDS[kind]} {low:.1%} to {high:.1%}" for kind, (low, high) in bands.items())
+    title = f"synthetic: coverage of 90 % intervals; * outside the 99 % band ({limits})"
+    return common.shown(title, shown)
+
+
+def draw(found: Counts, bands: Mapping[str, Sequence[float]]) -> Figure:
+    """Return the coverage of each parameter of each case, with the bands."""
+    each = rows(found)
+    figure, axes = plt.subplots(figsize=(7.0, 0.22 * len(each) + 1.2), layout="constrained")
+    height = np.arange(len(each))[::-1]
+    axes.axvspan(*bands[cases.DRAWS], color="0.93", zorder=0)
+    axes.axvspan(*bands[cases.LAPLACE], color="0.85", zorder=0)
+    axes.axvline(cases.COVERED, color="0.6", lw=0.8, zorder=0)
+    for (kind, label), marker, colour in zip(KINDS.items(), ("o", "x", "+"), ("C0", "C3", "k"), strict=True):
+        axes.plot([shares[kind] for *_, shares in each], height, ls="none", marker=marker, color=colour, label=label)
+    axes.set_yticks(height, [f"{name}: {q}" for name, q, _ in each])
+    axes.set(xlabel="coverage of 90 % intervals", title="synthetic data")
+    axes.legend(frameon=False, loc="lower left")
+    return figure
