@@ -173,15 +173,14 @@ def _excess(freedom: np.ndarray) -> np.ndarray:
 
 
 class VariancePart(NamedTuple):
-    """Part of the covariance C of θ (names, names) that an unknown variance v is responsible for.
+    """Part of the covariance C of θ (names, names) that an unknown variance is responsible for.
 
-    With F the information, P = −∂F/∂(ln v) and Q = ½ (P + ∂²F/∂(ln v)²), `caused` is C P C, and `added` is C Q C −
-    C P C P C, by which an uncertain ln v increases the covariance. `left` are the values that neither the estimate of θ
-    nor errors of the inputs take up, `freedom` these and what the prior of the variance is worth.
+    With F the information of the values behind it, `once` is C F C, `twice` C F C F C; `left` are the values that the
+    estimate of θ does not take up, `freedom` these and what the prior of the variance is worth.
     """
 
-    caused: np.ndarray
-    added: np.ndarray
+    once: np.ndarray
+    twice: np.ndarray
     left: float
     freedom: float
 
@@ -191,24 +190,14 @@ def variance_parts(
 ) -> dict[str, VariancePart]:
     """Return the part of each unknown variance; `inverse` is C, the factor what `bias_correction` returns."""
     likelihood, parts = problem.likelihood, {}
-    changes, counts = changes_by_variance(problem, estimate), likelihood.values_of_noise(estimate.noise)
+    changes = changes_by_variance(problem, estimate)
     factors = np.broadcast_to(log_variance_factor, len(likelihood.blocks))
     for (name, *_), members in likelihood.groups():
         if (jacobian := changes.get(name)) is not None:
-            moved, left = inverse @ jacobian, counts[name] * float(factors[members[0]])
-            caused, freedom = moved @ moved.T, max(left + _worth(problem, estimate, name), 1.0)
-            again = np.concatenate(_alone(likelihood, moved, members, estimate.noise), axis=1)
-            parts[name] = VariancePart(caused, again @ again.T - (caused @ jacobian) @ moved.T, max(left, 1.0), freedom)
+            moved, left = inverse @ jacobian, likelihood.counts[name] * float(factors[members[0]])
+            once, freedom = moved @ moved.T, max(left + _worth(problem, estimate, name), 1.0)
+            parts[name] = VariancePart(once, (once @ jacobian) @ moved.T, max(left, 1.0), freedom)
     return parts
-
-
-def _alone(likelihood: Likelihood, moved: np.ndarray, members: Sequence[int], noise: np.ndarray) -> list[np.ndarray]:
-    """Return changes (names, components) of some blocks, zero in all others, times the root of the noise's share."""
-    vectors = [np.zeros((len(moved), block.size)) for block in likelihood.blocks]
-    ends = np.cumsum([likelihood.blocks[b].size for b in members])[:-1]
-    for b, part in zip(members, np.split(moved, ends, axis=1), strict=True):
-        vectors[b] = part
-    return likelihood.shrunk(vectors, noise)
 
 
 class Uncertainty(NamedTuple):
@@ -239,7 +228,7 @@ def degrees_of_freedom(inverse: np.ndarray, parts: Mapping[str, VariancePart]) -
     uncertain = np.zeros(len(inverse))
     with np.errstate(divide="ignore", invalid="ignore"):
         for part in parts.values():
-            uncertain += np.nan_to_num(np.diag(part.caused) / np.diag(inverse)) ** 2 / part.freedom
+            uncertain += np.nan_to_num(np.diag(part.once) / np.diag(inverse)) ** 2 / part.freedom
         return 1.0 / uncertain
 
 
@@ -268,18 +257,18 @@ def with_uncertain_noise(
     """Return the covariance of θ (names, names) with uncertain noise parameters, `parts` those of the variances.
 
     Unknown variances make the weights of the channels and of the prior uncertain, which increases the covariance by
-    4 (C Q C − C P C P C)/ν each, see `VariancePart` (M. G. Kenward, J. H. Roger, Biometrics 53 (1997) 983-997), nothing
-    where the values behind one variance determine θ alone; Student's t accounts for the rest. For unknown shapes of the
-    spectrum θ is estimated again by linear least squares for shapes from the whole support of their prior. Their
-    posterior is that of the restricted likelihood (see `bias_correction`), with θ integrated out; the covariance is
-    that of the mixture about the estimate. The changes of the covariance by several channels are added.
+    4 (C F C − C F C F C)/ν each (M. G. Kenward, J. H. Roger, Biometrics 53 (1997) 983-997), nothing where the values
+    behind one variance determine θ alone; Student's t accounts for the rest. For unknown shapes of the spectrum θ is
+    estimated again by linear least squares for shapes from the whole support of their prior. Their posterior is that of
+    the restricted likelihood (see `bias_correction`), with θ integrated out; the covariance is that of the mixture
+    about the estimate. The changes of the covariance by several channels are added.
     """
     shaped = [group for group in problem.likelihood.groups() if _is_shaped(problem, *group)]
     if not np.all(np.diag(covariance) > 0.0):
         return covariance
     result = covariance.copy()
     for part in parts.values():
-        result += 4.0 / part.freedom * _without_negative(part.added, covariance)
+        result += 4.0 / part.freedom * _without_negative(part.once - part.twice, covariance)
     if not shaped:
         return result
     fit = _with_errors(problem, estimate, covariance)

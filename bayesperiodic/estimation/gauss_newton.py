@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesperiodic._linalg import TINY, hessian_eigh, hessian_scale, scaled
+from bayesperiodic._linalg import hessian_eigh, hessian_scale, scaled
 from bayesperiodic.density.log_posterior import Linearisation, LogPosterior
 from bayesperiodic.likelihood.noise_estimate import estimate_noise
 from bayesperiodic.problem.description import Description
@@ -117,13 +117,8 @@ def inverse_hessian(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def changes_by_variance(problem: Description, iterate: Iterate) -> dict[str, np.ndarray]:
-    """Return the Jacobian A (names, components) of the values behind each unknown variance, by its name.
-
-    It is whitened, and multiplied by the noise's own share of the covariance, so that A·Aᵀ = −∂F/∂(ln v), with F the
-    information on θ; without errors of inputs this is the variance's part of F.
-    """
-    white = problem.likelihood.whitened(iterate.here.jacobian, iterate.noise)
-    changes = problem.likelihood.shrunk(white, iterate.noise)
+    """Return the whitened Jacobian (names, components) of the values behind each unknown variance, by its name."""
+    changes = problem.likelihood.whitened(iterate.here.jacobian, iterate.noise)
     return {
         group[0]: np.concatenate([changes[b] for b in members], axis=1)
         for group, members in problem.likelihood.groups()
@@ -134,11 +129,10 @@ def changes_by_variance(problem: Description, iterate: Iterate) -> dict[str, np.
 def bias_correction(problem: Description, iterate: Iterate) -> np.ndarray:
     """Return 1 − p/n of each block's variance (blocks,), for which the variances are those of eq. (7).
 
-    Of the n values behind a variance, those that errors of the inputs do not take up, the estimate of θ takes up
-    p = −tr(∂F/∂(ln v) C), with F the information and C the inverse of H of eq. (8). Without priors and errors of inputs
-    the p of all variances sum to the number of parameters l; they are l/s each, as in eq. (7), where all s channels
-    tell the same. The maximum over the variances is then that of the density with θ integrated out (D. A. Harville, J.
-    Am. Statist. Assoc. 72 (1977) 320-338).
+    Of the n values behind a variance the estimate of θ takes up p = tr(F C), with F their part of the information and
+    C the inverse of H of eq. (8). Without priors the p of all variances sum to the number of parameters l; they are
+    l/s each, as in eq. (7), where all s channels tell the same. The maximum over the variances is then that of the
+    density with θ integrated out (D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320-338).
     """
     likelihood = problem.likelihood
     result = np.ones(len(likelihood.blocks))
@@ -146,11 +140,11 @@ def bias_correction(problem: Description, iterate: Iterate) -> np.ndarray:
     if not np.isfinite(hessian).all():
         return result
     inverse, _ = inverse_hessian(hessian)
-    changes, counts = changes_by_variance(problem, iterate), likelihood.values_of_noise(iterate.noise)
+    changes = changes_by_variance(problem, iterate)
     for group, members in likelihood.groups():
         if (jacobian := changes.get(group[0])) is not None:
-            taken = float(np.sum(jacobian * (inverse @ jacobian)))
-            result[members] = 1.0 - np.clip(taken / max(counts[group[0]], TINY), 0.0, MOST_TAKEN)
+            taken = float(np.sum(jacobian * (inverse @ jacobian))) / likelihood.counts[group[0]]
+            result[members] = 1.0 - np.clip(taken, 0.0, MOST_TAKEN)
     return result
 
 

@@ -344,12 +344,6 @@ class Shared:
         vectors, values, _ = np.linalg.svd(np.concatenate(scaled, axis=-2), full_matrices=False)
         return vectors, values**2
 
-    def taken(self, p: Sequence[np.ndarray]) -> list[float]:
-        """Return how many components of each block the errors take up."""
-        axes, squares = self.whitening(p)
-        shares = np.sum(axes**2 * (squares / (1.0 + squares)), axis=-1)
-        return [float(part.sum()) for part in np.split(shares, np.cumsum([len(part) for part in self.parts])[:-1])]
-
     def whitened(self, vectors: Sequence[np.ndarray], p: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return vectors (…, size) in units of 1/√p, times the symmetric root of the inverse of that covariance."""
         axes, squares = self.whitening(p)

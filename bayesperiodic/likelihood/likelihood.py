@@ -519,26 +519,11 @@ class Likelihood:
             block, (root, _) = self.blocks[b], self._root(b, values)
             white = solve_triangular(root, vectors[b].reshape(-1, block.size).T, lower=True)
             result[b] = np.sqrt(block.weight) * white.T.reshape(vectors[b].shape)
-        return self.shrunk(result, values)
-
-    def shrunk(self, white: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
-        """Return whitened vectors (…, size), one a block, times the symmetric root of the noise's own share.
-
-        That share is (1 + L·Lᵀ)⁻¹ for the loadings L of shared errors, in units of the noise.
-        """
-        result = list(white)
         for one in self.shared:
-            joint = one.whitened([result[b] for b in one.members], self.precisions(one.members, values))
+            joint = one.whitened([result[b] for b in one.members], self._precisions(one.members, spectra))
             for b, part in zip(one.members, joint, strict=True):
                 result[b] = part
         return result
-
-    def values_of_noise(self, values: np.ndarray) -> dict[str, float]:
-        """Return `counts` without the values that shared errors take up: −2 ∂/∂(ln v) of the logarithms of ln p(z)."""
-        taken = np.zeros(len(self.blocks))
-        for one in self.shared:
-            taken[list(one.members)] = one.taken(self.precisions(one.members, values))
-        return self._summed(block.count - part for block, part in zip(self.blocks, taken, strict=True))
 
     def simulate(self, values: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:
         """Return noise at values (draws, names): components (draws, size), one array a block."""

@@ -87,25 +87,6 @@ def test_the_likelihood_is_exact_where_errors_explain_all_and_the_variance_vanis
             assert likelihood(residuals, np.full(len(likelihood.names), v)) < found + 1e-3
 
 
-def test_values_and_information_behind_a_variance_are_those_of_differences(case):
-    """Without those that shared errors take up: derivatives of ln p(0) and of JᵀΣ⁻¹J by ln v."""
-    likelihood, _, values, loadings = case
-    if isinstance(likelihood.model, bp.noise.Measured):
-        return  # its variance is not all of the noise
-    random, step = np.random.default_rng(5), 1e-5
-    changes = [random.standard_normal((2, b.size)) for b in BLOCKS]
-    parts = likelihood.shrunk(likelihood.whitened(changes, values), values)
-    joined = np.concatenate(changes, axis=1)
-    counts = likelihood.values_of_noise(values)
-    for (name, *_), members in likelihood.groups():
-        ends = [values * np.where(np.array(likelihood.names) == name, np.exp(s * step), 1.0) for s in (1.0, -1.0)]
-        up, down = (float(likelihood([np.zeros(b.size) for b in BLOCKS], end)) for end in ends)
-        assert counts[name] == pytest.approx(-(up - down) / step, rel=1e-6)
-        up, down = (joined @ np.linalg.solve(dense(likelihood, end, loadings), joined.T) for end in ends)
-        expected = -(up - down) / (2.0 * step)
-        assert sum(parts[b] @ parts[b].T for b in members) == pytest.approx(expected, rel=1e-6, abs=1e-9)
-
-
 def test_several_points_at_once_give_the_same_bits_as_single_ones(case):
     likelihood, residuals, values, _ = case
     many = [np.stack([r, 2 * r, -r]) for r in residuals]
