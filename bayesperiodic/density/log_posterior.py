@@ -314,14 +314,21 @@ class LogPosterior(SamplingCoordinates):
         """Solve at one θ (names,) from the present anchors, and return residuals and Jacobian there."""
         return Linearisation(theta, self.solver.anchored(theta), self.comparisons)
 
-    def objective(self, here: Linearisation, noise: np.ndarray, log_variance_factor: float | np.ndarray) -> float:
+    def objective(
+        self,
+        here: Linearisation,
+        noise: np.ndarray,
+        log_variance_factor: float | np.ndarray,
+        *,
+        of_total: bool = False,
+    ) -> float:
         """Return the log-density over the coordinates where all solves have converged.
 
-        For `log_variance_factor` see `Likelihood.__call__`.
+        For `log_variance_factor` see `Likelihood.__call__`, for `of_total` `Likelihood.log_prior`.
         """
         prior = self.problem.joint_prior.log_prob(here.theta) + np.sum(np.log(here.theta[self.logarithmic]))
         likelihood = self.problem.likelihood
-        return float((likelihood(here.residuals, noise, log_variance_factor) + likelihood.log_prior(noise)) + prior)
+        return float((likelihood(here.residuals, noise, log_variance_factor) + likelihood.log_prior(noise, of_total=of_total)) + prior)
 
     def outputs(self, theta: np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
         """Return the predicted outputs at θ (draws, names) and whether the solves converged, see `Problem.outputs`."""

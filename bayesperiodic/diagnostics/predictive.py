@@ -393,7 +393,7 @@ def predict(
         raise RuntimeError(
             "posterior: its draw of highest density has no periodic solution. Give draws of this problem."
         )
-    objective, conflict = Objective(anchored.with_settings(coordinates=NATURAL)), ""
+    objective, conflict = Objective(anchored.with_settings(coordinates=NATURAL), of_total=True), ""
     estimate = objective.iterate(here, np.median(noise, axis=0))
     if estimate is not None:
         objective = replace(objective, log_variance_factor=bias_correction(problem, estimate))

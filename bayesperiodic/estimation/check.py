@@ -100,7 +100,7 @@ def at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate]
     density = LogPosterior(problem, ResponseSolver.start(problem, theta, guesses), coordinates=NATURAL)
     here = Linearisation(theta, density.solver, density.comparisons)
     factor = bias_correction(problem, Iterate(theta, here, noise, np.nan)) if here.converged else 1.0
-    objective = Objective(density, factor)
+    objective = Objective(density, factor, of_total=True)
     peak = objective.iterate(here, noise)
     if peak is None:
         raise ValueError(

@@ -130,7 +130,9 @@ def _from_elsewhere(problem: Problem, alone: Iterate, members: tuple[str, ...]) 
     """Yield the estimate found, and those from draws of the prior, which is widened for parameters in conflict."""
     inside = np.isin(problem.names, members)
     objective = _almost_flat(problem, alone, np.where(inside, ALMOST_FLAT, 1.0))
-    yield replace(alone, objective=objective.density.objective(alone.here, alone.noise, objective.log_variance_factor))
+    factor, of_total = objective.log_variance_factor, objective.of_total
+    value = objective.density.objective(alone.here, alone.noise, factor, of_total=of_total)
+    yield replace(alone, objective=value)
     generator, median = np.random.default_rng(0), problem.joint_prior.median()
     wide = objective.density.problem.joint_prior
     for scale, theta in zip(START_WIDTHS, problem.joint_prior.sample(len(START_WIDTHS), generator), strict=True):
@@ -150,7 +152,7 @@ def _almost_flat(problem: Problem, near: Iterate, factor: np.ndarray) -> Objecti
     wide = Problem(**written_out(problem) | {"priors": _widened(problem, factor)})
     wide = wide.with_input_errors(problem.input_errors)
     density = LogPosterior(wide, near.here.solver, coordinates=RIDGE_COORDINATES)
-    return Objective(density, bias_correction(wide, near))
+    return Objective(density, bias_correction(wide, near), of_total=True)
 
 
 def _widened(problem: Problem, factor: np.ndarray) -> dict[Any, Any]:

@@ -12,7 +12,8 @@ from bayesperiodic._linalg import TINY, covariance_eigh, hessian_scale, scaled
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import orbit_multipliers
-from bayesperiodic.estimation.gauss_newton import Iterate, changes_by_variance, information, inverse_hessian
+from bayesperiodic.estimation.gauss_newton import Iterate, information, inverse_hessian
+from bayesperiodic.estimation.noise_changes import NoiseChange, changes_by_measured, changes_by_variance
 from bayesperiodic.likelihood.block import Block
 from bayesperiodic.likelihood.input_noise import (
     InputErrors,
@@ -175,28 +176,41 @@ def _excess(freedom: np.ndarray) -> np.ndarray:
 class VariancePart(NamedTuple):
     """Part of the covariance C of θ (names, names) that an unknown variance is responsible for.
 
-    With F the information of the values behind it, `once` is C F C, `twice` C F C F C; `left` are the values that the
-    estimate of θ does not take up, `freedom` these and what the prior of the variance is worth.
+    With F and G the `information` and `doubled` of its `NoiseChange`, `once` is C F C, `added` C G C − C F C F C; `left`
+    are the values that the estimate of θ does not take up, `freedom` these and what the prior of the variance is worth,
+    or what it was measured with.
     """
 
     once: np.ndarray
-    twice: np.ndarray
+    added: np.ndarray
     left: float
     freedom: float
+
+    @classmethod
+    def of(cls, change: NoiseChange, inverse: np.ndarray, left: float, freedom: float) -> "VariancePart":
+        """Return the part of a variance with this change; `inverse` is C."""
+        once, twice = inverse @ change.information @ inverse, inverse @ change.doubled @ inverse
+        return cls(once, twice - once @ change.information @ inverse, max(left, 1.0), freedom)
 
 
 def variance_parts(
     problem: Problem, estimate: Iterate, inverse: np.ndarray, log_variance_factor: float | np.ndarray
 ) -> dict[str, VariancePart]:
-    """Return the part of each unknown variance; `inverse` is C, the factor what `bias_correction` returns."""
+    """Return the part of each unknown or measured variance.
+
+    `inverse` is C, the factor what `bias_correction` returns. A measured variance has a number for a name.
+    """
     likelihood, parts = problem.likelihood, {}
-    changes = changes_by_variance(problem, estimate)
+    changes = changes_by_variance(problem, estimate.here.jacobian, estimate.noise)
     factors = np.broadcast_to(log_variance_factor, len(likelihood.blocks))
     for (name, *_), members in likelihood.groups():
-        if (jacobian := changes.get(name)) is not None:
-            moved, left = inverse @ jacobian, likelihood.counts[name] * float(factors[members[0]])
-            once, freedom = moved @ moved.T, max(left + _worth(problem, estimate, name), 1.0)
-            parts[name] = VariancePart(once, (once @ jacobian) @ moved.T, max(left, 1.0), freedom)
+        if (change := changes.get(name)) is not None:
+            left, one = change.square * float(factors[members[0]]), (change.square / change.trace) ** 2
+            freedom = max(left + _worth(problem, estimate, name, one), one)
+            parts[name] = VariancePart.of(change, inverse, left, freedom)
+    measured = changes_by_measured(problem, estimate.here.jacobian, estimate.noise)
+    for number, (change, freedom) in enumerate(measured):
+        parts[str(number)] = VariancePart.of(change, inverse, freedom, freedom)
     return parts
 
 
@@ -232,16 +246,18 @@ def degrees_of_freedom(inverse: np.ndarray, parts: Mapping[str, VariancePart]) -
         return 1.0 / uncertain
 
 
-def _worth(problem: Problem, estimate: Iterate, variance: str) -> float:
+def _worth(problem: Problem, estimate: Iterate, variance: str, one: float) -> float:
     """Return how many values the prior of a variance is worth: 2a for InverseGamma(a, b), −2 for the flat one.
+
+    `one` is what one value counts, less than 1 if its variance is in part known.
 
     It is −2 ∂²/∂(ln v)² of −½(n − p) ln v − ½ M/v + ln p(v) at its maximum, less n − p.
     """
     likelihood, noise = problem.likelihood, problem.noise
     if not noise.proper:
-        return -float(noise.spare)
+        return -one * noise.spare
     ends = estimate.noise[likelihood.names.index(variance)] * np.exp(np.array([-VARIANCE_STEP, VARIANCE_STEP]))
-    slopes = noise.log_prior(VARIANCE, ends, likelihood.measured[variance])[1]
+    slopes = noise.log_prior_of_total(VARIANCE, ends, likelihood.measured[variance])[1]
     return -float(slopes.sum() + (slopes[1] - slopes[0]) / VARIANCE_STEP)
 
 
@@ -257,7 +273,7 @@ def with_uncertain_noise(
     """Return the covariance of θ (names, names) with uncertain noise parameters, `parts` those of the variances.
 
     Unknown variances make the weights of the channels and of the prior uncertain, which increases the covariance by
-    4 (C F C − C F C F C)/ν each (M. G. Kenward, J. H. Roger, Biometrics 53 (1997) 983-997), nothing where the values
+    4 (C G C − C F C F C)/ν each (M. G. Kenward, J. H. Roger, Biometrics 53 (1997) 983-997), nothing where the values
     behind one variance determine θ alone; Student's t accounts for the rest. For unknown shapes of the spectrum θ is
     estimated again by linear least squares for shapes from the whole support of their prior. Their posterior is that of
     the restricted likelihood (see `bias_correction`), with θ integrated out; the covariance is that of the mixture
@@ -268,7 +284,7 @@ def with_uncertain_noise(
         return covariance
     result = covariance.copy()
     for part in parts.values():
-        result += 4.0 / part.freedom * _without_negative(part.once - part.twice, covariance)
+        result += 4.0 / part.freedom * _without_negative(part.added, covariance)
     if not shaped:
         return result
     fit = _with_errors(problem, estimate, covariance)

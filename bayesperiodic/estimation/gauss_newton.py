@@ -8,6 +8,7 @@ import numpy as np
 
 from bayesperiodic._linalg import hessian_eigh, hessian_scale, scaled
 from bayesperiodic.density.log_posterior import Linearisation, LogPosterior
+from bayesperiodic.estimation.noise_changes import changes_by_variance
 from bayesperiodic.likelihood.noise_estimate import estimate_noise
 from bayesperiodic.problem.description import Description
 
@@ -60,11 +61,13 @@ class Objective:
     """Density that the iteration maximises over θ, with the best noise parameters at every θ.
 
     The logarithms of the variances are multiplied by `log_variance_factor`, one or (blocks,): their best values are
-    those of eq. (6) for 1, and those of eq. (7) for `bias_correction`.
+    those of eq. (6) for 1, and those of eq. (7) for `bias_correction`. With `of_total` the density is over coordinates
+    of the noise in which a model error beside known noise may be zero, see `Likelihood.log_prior`.
     """
 
     density: LogPosterior
     log_variance_factor: float | np.ndarray = 1.0
+    of_total: bool = False
 
     def at(self, theta: np.ndarray, near: Linearisation, noise: np.ndarray) -> Iterate | None:
         """Return the iterate at θ, solved from the anchors of a near one; None if the log-posterior is not finite."""
@@ -76,8 +79,9 @@ class Objective:
         """Return the iterate of solved residuals; None if the log-posterior is not finite."""
         if not here.converged or not all(np.abs(r).max(initial=0.0) < OVERFLOWS for r in here.residuals):
             return None
-        noise = estimate_noise(self.density.problem.likelihood, here.residuals, noise, self.log_variance_factor)
-        value = self.density.objective(here, noise, self.log_variance_factor)
+        likelihood, factor = self.density.problem.likelihood, self.log_variance_factor
+        noise = estimate_noise(likelihood, here.residuals, noise, factor, of_total=self.of_total)
+        value = self.density.objective(here, noise, factor, of_total=self.of_total)
         return Iterate(here.theta, here, noise, value) if np.isfinite(value) else None
 
     def anchored(self, iterate: Iterate) -> Iterate:
@@ -116,23 +120,14 @@ def inverse_hessian(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return inverse, np.any(np.abs(vectors[:, ~curved]) > LOST_PART, axis=1)
 
 
-def changes_by_variance(problem: Description, iterate: Iterate) -> dict[str, np.ndarray]:
-    """Return the whitened Jacobian (names, components) of the values behind each unknown variance, by its name."""
-    changes = problem.likelihood.whitened(iterate.here.jacobian, iterate.noise)
-    return {
-        group[0]: np.concatenate([changes[b] for b in members], axis=1)
-        for group, members in problem.likelihood.groups()
-        if group[0] in problem.free_noise
-    }
-
-
 def bias_correction(problem: Description, iterate: Iterate) -> np.ndarray:
     """Return 1 − p/n of each block's variance (blocks,), for which the variances are those of eq. (7).
 
     Of the n values behind a variance the estimate of θ takes up p = tr(F C), with F their part of the information and
     C the inverse of H of eq. (8). Without priors the p of all variances sum to the number of parameters l; they are
     l/s each, as in eq. (7), where all s channels tell the same. The maximum over the variances is then that of the
-    density with θ integrated out (D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320-338).
+    density with θ integrated out (D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320-338). Values whose variance is
+    in part known count for both by the other part, see `NoiseChange`.
     """
     likelihood = problem.likelihood
     result = np.ones(len(likelihood.blocks))
@@ -140,10 +135,10 @@ def bias_correction(problem: Description, iterate: Iterate) -> np.ndarray:
     if not np.isfinite(hessian).all():
         return result
     inverse, _ = inverse_hessian(hessian)
-    changes = changes_by_variance(problem, iterate)
+    changes = changes_by_variance(problem, iterate.here.jacobian, iterate.noise, least=0.0)
     for group, members in likelihood.groups():
-        if (jacobian := changes.get(group[0])) is not None:
-            taken = float(np.sum(jacobian * (inverse @ jacobian))) / likelihood.counts[group[0]]
+        if (change := changes.get(group[0])) is not None and change.trace > 0.0:
+            taken = float(np.sum(change.information * inverse)) / change.trace
             result[members] = 1.0 - np.clip(taken, 0.0, MOST_TAKEN)
     return result
 

@@ -233,7 +233,7 @@ def _of_problem(problem: Problem, iterate: Iterate) -> tuple[Objective, Iterate 
 
 
 def _objective(problem: Problem, near: Linearisation) -> Objective:
-    return Objective(LogPosterior(problem, near.solver, coordinates=NATURAL))
+    return Objective(LogPosterior(problem, near.solver, coordinates=NATURAL), of_total=True)
 
 
 def _first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:

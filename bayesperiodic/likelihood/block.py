@@ -48,6 +48,7 @@ class Block(ABC):
     points: int = 0  # grid points of the response period
     averaged: float = 1.0  # measured samples behind the components
     measured: float = float("nan")  # variance of one value that the scatter of the cycles explains; NaN if unknown
+    spectrum_measured: np.ndarray = field(default_factory=_nothing)  # (size,), of each Fourier component, if known
     place: int = 0  # of the channel among the measured ones
     log_scale: float = 0.0  # ln|∂ components/∂ data| of values that are divided by known standard deviations
 

@@ -23,7 +23,7 @@ import sympy as sp
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Storable
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.data.folding import neighbours_mean
+from bayesperiodic.likelihood.noise_spectrum import NoiseSpectrum
 from bayesperiodic.models.model import DERIVATIVES, Model
 from bayesperiodic.priors.single import Normal
 
@@ -117,14 +117,6 @@ def kept(experiment: Experiment, name: str) -> int:
     return min(experiment.harmonics.get(name, highest), highest)
 
 
-def pooled(variance: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    """Return variances of amplitudes (harmonics + 1,), averaged over neighbours by their degrees of freedom.
-
-    The mean value, which slow noise moves, keeps its own.
-    """
-    return np.where(freedom > 0.0, neighbours_mean(variance * freedom, freedom), variance)
-
-
 def with_errors_as_parameters(
     model: Model, experiments: Sequence[Experiment]
 ) -> tuple[Model, dict[str, Normal], dict[str, dict[str, float]]]:
@@ -204,9 +196,8 @@ def _root(experiment: Experiment, name: str, harmonics: int, noise: InputNoise) 
             return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
         # White noise has as much power in each of the components.
         return np.diag(float(noise[name]) * np.sqrt(np.r_[1.0, np.full(size - 1, 2.0)] / size))
-    variance = experiment.amplitude_variance[name][: harmonics + 1]
-    freedom = experiment.amplitude_freedom.get(name)
-    variance = variance if freedom is None else pooled(variance, freedom[: harmonics + 1])
+    spectrum = NoiseSpectrum.of(experiment, name)
+    variance = np.zeros(0) if spectrum is None else spectrum.variance[: harmonics + 1]
     variance = np.pad(variance, (0, harmonics + 1 - variance.size))
     return np.diag(np.sqrt(np.concatenate([variance[:1], 0.5 * variance[1:], 0.5 * variance[1:]])))
 

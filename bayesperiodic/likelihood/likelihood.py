@@ -227,12 +227,16 @@ class Likelihood:
         values[..., self._free] = free
         return values
 
-    def log_prior(self, values: np.ndarray) -> np.ndarray:
-        """Return the log-density of the free noise parameters over their logarithms, (…,)."""
-        total = np.zeros(values.shape[:-1])
+    def log_prior(self, values: np.ndarray, *, of_total: bool = False) -> np.ndarray:
+        """Return the log-density of the free noise parameters over their logarithms, (…,).
+
+        Or that of which the estimate is the maximum: `of_total` takes the coordinates in which Jeffreys' prior of a
+        variance that is added to known ones is flat.
+        """
+        total, prior = np.zeros(values.shape[:-1]), self._log_prior_of(of_total)
         for kind, columns, measured in self._kinds:
-            total = total + self.model.log_prior(kind, values[..., columns], measured)[0].sum(axis=-1)
-        for _, b, added in self._spectra_of_errors:
+            total = total + prior(kind, values[..., columns], measured)[0].sum(axis=-1)
+        for _, b, added in self._spectra_of_errors if not of_total else ():
             mean = self._mean_variance(b, values)[0][..., None]
             # With variances V + λ Jeffreys' prior is √(Σ 1/(V + λ)²), the root of the information, in place of 1/V;
             # the density has no integral otherwise where errors of the inputs can explain all components.
@@ -244,12 +248,16 @@ class Likelihood:
         """Return the mean variance (…,) of a block's components, and the part proportional to its parameter."""
         return self.blocks[b].mean_variance(self.model, values[..., self._columns[b]])
 
-    def _prior_slopes(self, values: np.ndarray) -> np.ndarray:
+    def _log_prior_of(self, total: bool) -> Any:
+        """Return the method of the noise model that gives the log-density over these coordinates."""
+        return self.model.log_prior_of_total if total else self.model.log_prior
+
+    def _prior_slopes(self, values: np.ndarray, of_total: bool) -> np.ndarray:
         """Return the derivatives of `log_prior` by the logarithms of the parameters, (…, names)."""
-        slopes = np.zeros(values.shape)
+        slopes, prior = np.zeros(values.shape), self._log_prior_of(of_total)
         for kind, columns, measured in self._kinds:
-            slopes[..., columns] = self.model.log_prior(kind, values[..., columns], measured)[1]
-        for column, b, added in self._spectra_of_errors:
+            slopes[..., columns] = prior(kind, values[..., columns], measured)[1]
+        for column, b, added in self._spectra_of_errors if not of_total else ():
             mean, proportional = self._mean_variance(b, values)
             share = mean[..., None] / (mean[..., None] + added)
             slope = np.mean(share**2 * (1.0 - share), axis=-1) / np.mean(share**2, axis=-1)
@@ -432,6 +440,14 @@ class Likelihood:
     def _precisions(self, members: Sequence[int], spectra: Spectra) -> list[np.ndarray]:
         return [self.blocks[b].weight / spectra[self._group_of[b]][0] for b in members]
 
+    def variance_slopes(self, values: np.ndarray) -> list[np.ndarray]:
+        """Return ∂ ln V/∂ ln v (size,) or (1,) of each block by its variance, zero where it has none."""
+        spectra, result = self._spectra(values), []
+        for b, names in enumerate(self._parameters):
+            spectral = names and b in self._group_of
+            result.append(spectra[self._group_of[b]][1][..., 0] if spectral else np.full(1, float(bool(names))))
+        return result
+
     def _root(self, b: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower Cholesky factor of the covariance of correlated components, and the covariance's slopes."""
         covariance, slopes = self.model.covariance(self.blocks[b], values[self._columns[b]])
@@ -450,15 +466,20 @@ class Likelihood:
         return result
 
     def value_and_gradients(
-        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray = 1.0
+        self,
+        residuals: Sequence[np.ndarray],
+        values: np.ndarray,
+        log_variance_factor: float | np.ndarray = 1.0,
+        *,
+        of_total: bool = False,
     ) -> tuple[float, Sequence[np.ndarray], np.ndarray]:
         """Return the log-likelihood of residuals (size,) at values (names,), and gradients.
 
-        The gradients are those of log-likelihood plus log-prior of φ by each block's residual and by ln φ (names,).
+        The gradients are those of log-likelihood plus `log_prior` of φ by each block's residual and by ln φ (names,).
         """
         factors, residuals = np.full(len(self.blocks), log_variance_factor), Residuals.of(residuals)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            spectra, by_value = self._spectra(values), self._prior_slopes(values)
+            spectra, by_value = self._spectra(values), self._prior_slopes(values, of_total)
             total = self._independent(residuals, values, spectra, factors)
             by_residual = self._even_gradients(residuals, spectra, factors, by_value)
             if self._uneven or self._dense or self.shared:

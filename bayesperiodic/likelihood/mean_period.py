@@ -11,6 +11,7 @@ import numpy as np
 from bayesperiodic import _fourier
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.block import Block, ComparedSignals, Timed, common, measured_channels
+from bayesperiodic.likelihood.noise_spectrum import component_variances
 from bayesperiodic.likelihood.sensing import NO_PLACE, ComplexFactors, Sensing
 from bayesperiodic.models.model import Model
 
@@ -44,7 +45,7 @@ class MeanPeriod(Timed):
             harmonic = every[~np.isin(every, experiment.unmeasured.get(channel, ()))]
             count = float(experiment.independent[channel])
             given = common(experiment, channel, place, count=count, size=harmonic.size, harmonic=harmonic)
-            blocks.append(cls(**given))
+            blocks.append(cls(**given, spectrum_measured=component_variances(experiment, channel, harmonic)))
         return blocks
 
     @property

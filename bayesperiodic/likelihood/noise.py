@@ -217,6 +217,22 @@ class Noise(ABC):
             return np.log(value), np.ones_like(value)
         return _over_logarithm(self._proper_prior, value)
 
+    def log_prior_of_total(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log-density of which the estimate is the maximum, over other coordinates than `log_prior`'s.
+
+        Parameters
+        ----------
+        kind, value, measured
+            See `log_prior`.
+
+        Returns
+        -------
+        log_density, slope : array (…)
+            By default those of `log_prior`, over ln φ. A variance that is added to a measured one has its maximum over
+            ln φ above zero, whatever the data.
+        """
+        return self.log_prior(kind, value, measured)
+
     def _mean_variance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean variance (…,) of a block's components, and the part that is proportional to the parameter."""
         variances, slopes = self.spectrum(block, values)
@@ -298,13 +314,13 @@ class Measured(Noise):
     needs_scatter: ClassVar[bool] = True
 
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return V = scatter²/cycles + v."""
-        total = values + block.measured
+        """Return V = measured variance + v."""
+        total = values + (block.spectrum_measured if block.spectrum_measured.size else block.measured)
         return total, (values / total)[..., None]
 
     def alike(self, block: Block) -> Hashable:
-        """Return scatter²/cycles."""
-        return block.measured
+        """Return the measured variances."""
+        return block.measured, block.spectrum_measured.tobytes()
 
     @property
     def constant_prior(self) -> bool:
@@ -315,9 +331,14 @@ class Measured(Noise):
         """Return the log-density over ln v; Jeffreys' is that of 1/(measured + v)."""
         if self.prior != JEFFREYS:
             return super().log_prior(kind, value, measured)
-        known = np.where(np.asarray(measured) > 0.0, measured, 0.0)
-        share = np.where(known > 0.0, value / (known + value), 1.0)
+        share = _share(value, measured)
         return np.log(share), 1.0 - share
+
+    def log_prior_of_total(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log-density over ln(measured + v), in which Jeffreys' prior is flat."""
+        share = _share(value, measured)
+        density, slope = self.log_prior(kind, value, measured)
+        return density - np.log(share), slope - (1.0 - share)
 
 
 @dataclass(frozen=True)
@@ -445,6 +466,12 @@ def as_noise(given: str | Noise) -> Noise:
         raise ValueError(f"noise: must be a name or a model such as noise.Independent(), got {given!r}.")
     _checks.one_of("noise", given, NAMED)
     return NAMED[given]()
+
+
+def _share(value: np.ndarray, measured: Any) -> np.ndarray:
+    """Return the share of a variance in the sum with the measured one, 1 where that is not known."""
+    known = np.where(np.asarray(measured) > 0.0, measured, 0.0)
+    return np.where(known > 0.0, value / (known + value), 1.0)
 
 
 def _over_logarithm(prior: Prior, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,15 +11,23 @@ from bayesperiodic.likelihood.noise import FLAT_PRIOR, JEFFREYS, VARIANCE, Indep
 from bayesperiodic.likelihood.section_points import SCALE
 
 LOWEST_LOG_SCALE, HIGHEST_LOG_SCALE = 25.0, 8.0
+# Difference of log-densities that is none.
+FLAT = 1e-7
 
 
 def estimate_noise(
-    likelihood: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, log_variance_factor: float | np.ndarray
+    likelihood: Likelihood,
+    residuals: Sequence[np.ndarray],
+    start: np.ndarray,
+    log_variance_factor: float | np.ndarray,
+    *,
+    of_total: bool = False,
 ) -> np.ndarray:
     """Return the noise parameters (names,) that fit residuals best, one array (size,) a block, from a start.
 
     For independent errors with the prior 1/v this is eq. (7) of [1]_, v = Σe²/(n·f) with the factor f; otherwise it
-    maximises the log-likelihood, its logarithms multiplied by f as in `Likelihood.__call__`, plus the log-prior.
+    maximises the log-likelihood, its logarithms multiplied by f as in `Likelihood.__call__`, plus the log-prior. For
+    `of_total` see `Likelihood.log_prior`.
 
     References
     ----------
@@ -29,7 +37,7 @@ def estimate_noise(
     if likelihood.shared and likelihood.free:
         without = Likelihood(likelihood.model, likelihood.blocks, likelihood.fixed)
         centre = estimate_noise(without, residuals, start, log_variance_factor)
-        return _maximise(likelihood, residuals, start, centre, log_variance_factor)
+        return _maximise(likelihood, residuals, start, centre, log_variance_factor, of_total)
     values, moments = start.copy(), likelihood.moments(residuals)
     for group, members in likelihood.groups():
         if not set(group) & set(likelihood.free):
@@ -48,7 +56,7 @@ def estimate_noise(
         part = Likelihood(likelihood.model, blocks, held)
         total = sum(block.weight * float(r @ r) for block, r in zip(blocks, chosen, strict=True))
         size = np.where([name.startswith((VARIANCE, SCALE)) for name in group], max(total / count, TINY), part.guess())
-        values[columns] = _maximise(part, chosen, values[columns], size, factor)
+        values[columns] = _maximise(part, chosen, values[columns], size, factor, of_total)
     return values
 
 
@@ -58,6 +66,7 @@ def _maximise(
     start: np.ndarray,
     centre: np.ndarray,
     log_variance_factor: float | np.ndarray,
+    of_total: bool,
 ) -> np.ndarray:
     """Return the best noise parameters (names,) from a start and from a centre, within bounds about the centre."""
     free = [part.names.index(name) for name in part.free]
@@ -69,8 +78,8 @@ def _maximise(
 
     def negative(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
         values = complete(logarithms)
-        value, _, slopes = part.value_and_gradients(residuals, values, log_variance_factor)
-        value += float(part.log_prior(values))
+        value, _, slopes = part.value_and_gradients(residuals, values, log_variance_factor, of_total=of_total)
+        value += float(part.log_prior(values, of_total=of_total))
         return (-value, -slopes[free]) if np.isfinite(value) else (1e300, np.zeros(len(free)))
 
     middle = np.log(centre[free])
@@ -84,4 +93,6 @@ def _maximise(
         bounds=bounds,
         options={"gtol": 1e-9, "ftol": 1e-15, "maxiter": 500},
     )
-    return complete(optimum.x)
+    # The density of a variance that is added to known ones is flat towards zero, where the search ends anywhere.
+    zero = np.array([low for low, _ in bounds])
+    return complete(zero if of_total and negative(zero)[0] <= optimum.fun + FLAT else optimum.x)
