@@ -4,11 +4,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from bayesperiodic.data.changes import DRIFT, STEP, Changes
+from bayesperiodic.data.changes import DRIFT, STEP, TONE, TRANSIENT, Changes
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES
 from bayesperiodic.data.recording_check import HARMLESS, SERIOUS, SERIOUS_BIAS, Finding
 from bayesperiodic.data.steadiness import Steady, Windows
 
+# Probability from which a change that is there oscillates, and from which a component has it.
+PROBABLE_KIND = 0.5
 # Bias by a transient that is listed, in standard errors, and probability that there is no change where one is.
 ALLOWED_BIAS, CHANGE_FALSE_ALARM = 0.3, 0.01
 # Beat relative to the amplitude that is serious, and step of the phase [cycles] that is harmless.
@@ -159,7 +161,8 @@ def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Itera
         )  # fmt: skip
     if effects is None:
         return
-    if effects.oscillating > 1.0 - CHANGE_FALSE_ALARM:
+    fading = sum(effects.probability[kind] for kind in (TRANSIENT, DRIFT, TONE))
+    if fading > 1.0 - CHANGE_FALSE_ALARM and effects.oscillating > PROBABLE_KIND:
         yield from _vibrations(channels, steady, effects, every)
         return
     if not effects.slow:
@@ -205,7 +208,7 @@ def _vibrations(channels: Sequence[str], steady: Steady, effects: Changes, times
     beat, decay = (number * part.cycles for number in effects.beat)
     cycles = len(part.first) * part.cycles
     for i, channel in enumerate(channels):
-        clear = moving[i] > 1.0 - CHANGE_FALSE_ALARM
+        clear = moving[i] > PROBABLE_KIND
         relative = float(np.where(clear, swing[i], 0.0).max() / level[i])
         effect = float(np.sqrt(np.sum(bias[i, clear] ** 2)))
         if relative <= part.jump[i] / level[i] or not clear.any():
