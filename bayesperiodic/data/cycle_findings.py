@@ -1,6 +1,6 @@
 """What is not steady in the cycles of a recording: ramps, transients, drifts, steps, beats, and phases that step."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -52,6 +52,7 @@ def cycle_findings(
     if beats or (level[1] - level[0]) * frequency < total - 1.0:
         slow = [*slow_beats(channels, time, every, frequency)]
     yield from slow or beats
+    named = {beat.channel: beat.severity for beat in slow or beats}
     for kind, a, b, what in (
         ("ramp", ends[0], level[0], "the signals change until"),
         ("ramp", level[1], ends[1], "the signals change from"),
@@ -67,7 +68,7 @@ def cycle_findings(
             yield Finding(
                 kind, "", HARMLESS, np.array([[a, b]]), count, count / total, np.nan, f"{what} {place:.6g} s; {used}"
             )
-    yield from _changes(channels, time, steady)
+    yield from _changes(channels, time, steady, named)
 
 
 def slow_beats(channels: Sequence[str], time: np.ndarray, every: Windows, frequency: float) -> Iterator[Finding]:
@@ -145,8 +146,13 @@ def _outer_steps(
     )  # fmt: skip
 
 
-def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Iterator[Finding]:
-    """Return what is clearly not steady in the part used: the rest of a transient, drifts and steps."""
+def _changes(
+    channels: Sequence[str], time: np.ndarray, steady: Steady, beating: Mapping[str, str]
+) -> Iterator[Finding]:
+    """Return what is clearly not steady in the part used: the rest of a transient, drifts and steps.
+
+    Beats that are `beating` by channel, with their severity, are not listed again unless they are more severe.
+    """
     part, effects = steady.part, steady.changes
     start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
     every, cycles = np.array([[start, stop]]), len(part.first) * part.cycles
@@ -163,7 +169,9 @@ def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Itera
         return
     fading = sum(effects.probability[kind] for kind in (TRANSIENT, DRIFT, TONE))
     if fading > 1.0 - CHANGE_FALSE_ALARM and effects.oscillating > PROBABLE_KIND:
-        yield from _vibrations(channels, steady, effects, every)
+        for finding in _vibrations(channels, steady, effects, every):
+            if beating.get(finding.channel) not in (SERIOUS, finding.severity):
+                yield finding
         return
     if not effects.slow:
         return
