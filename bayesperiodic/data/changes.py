@@ -33,6 +33,8 @@ LONGEST_CUT = 0.5
 WORTH_A_FIT, LONGEST_FITTED = 0.2, 20.0
 # Angle over the recording from which a change oscillates.
 LEAST_TURN = 4.5
+# Angle over the recording by which a turn differs from a whole or half one.
+LEAST_OFFSET = 0.3
 TRANSIENT, DRIFT, STEP, TONE = "transient", "drift", "step", "tone"
 
 
@@ -54,8 +56,8 @@ class Courses:
         count = len(shape)
         cycle = np.arange(count, dtype=float)
         tone = self.kind[index] == TONE
-        if self.kind[index] == STEP or not (tone or self.fades[index]):
-            return self._with(self.values[index], index, self.place[index], self.turn[index])
+        if not (tone or self.fades[index]):
+            return self
         scaled = shape - shape.mean(axis=0)
         floor = count * SMALLEST_NOISE**2
 
@@ -77,20 +79,23 @@ class Courses:
         simplex = np.array([start, [start[0] - 0.3, start[1]], [start[0], start[1] + 0.5 / count]])
         simplex[2, 1] = simplex[2, 1] if simplex[2, 1] <= np.pi else start[1] - 0.5 / count
         best = minimize(misfit, start, method="Nelder-Mead", bounds=bounds, options={"initial_simplex": simplex})
-        return self._with(course(best.x), index, float(np.exp(best.x[0])), float(best.x[1]))
+        decay, turn = float(np.exp(best.x[0])), float(best.x[1])
+        for whole in (0.0, np.pi):  # where sine and cosine are not told apart
+            if abs(turn - whole) * count < LEAST_OFFSET:
+                turn = whole
+        return self._with(course(np.array([np.log(decay), turn])), index, decay, turn)
 
     def _with(self, values: np.ndarray, index: int, decay: float, turn: float) -> "Courses":
         """Return the courses and one more with half the prior probability of one of them."""
         count = self.values.shape[1]
-        kind = self.kind[index]
-        if self.fades[index] or kind == TONE:
-            kind = TRANSIENT if decay <= LONGEST_CUT * count else DRIFT
+        kind = TRANSIENT if decay <= LONGEST_CUT * count else DRIFT
         prior = np.append(self.prior, self.prior[index] + np.log(0.5))
         prior[index] += np.log(0.5)
         return Courses(
             np.concatenate([self.values, values[None]]),
             np.append(self.single, np.abs(values[:, 1]).max() < 1e-9),
-            np.append(self.fades, self.fades[index] or self.kind[index] == TONE),
+            # Where a slow course would end is no more known than where a drift would.
+            np.append(self.fades, decay <= LONGEST_DECAY * count or turn * count > LEAST_TURN),
             np.append(self.kind, kind),
             prior,
             np.append(self.place, decay),
@@ -188,8 +193,9 @@ def changes(shape: np.ndarray, transient: float) -> Changes:
     if first.weight.sum() < WORTH_A_FIT or every.kind[best] == STEP:
         return _effects(every, first)
     # Courses between those of the grid, and the correlation of what is noise beside the change.
-    every = every.refined(best, shape)
-    return _effects(every, _posterior(shape, every, _independent(shape, every.values[-1])))
+    finer = every.refined(best, shape)
+    course = every.values[best] if finer is every else finer.values[-1]
+    return _effects(finer, _posterior(shape, finer, _independent(shape, course)))
 
 
 def _posterior(shape: np.ndarray, every: Courses, independent: float) -> _Posterior:
@@ -283,7 +289,7 @@ def _effects(every: Courses, posterior: _Posterior) -> Changes:
         size=np.einsum("ma,mad->d", ends, first[slow]),
         error=np.maximum(posterior.error, least) * np.sqrt(count / remaining)[:, None],
         place=int(every.place[steps[np.argmax(weight[steps])]]),
-        swing=np.sqrt(np.sum(first[turning] ** 2, axis=1)).sum(axis=0),
+        swing=np.abs(np.einsum("mka,mad->mkd", every.values[turning], first[turning])).max(axis=1, initial=0.0).sum(axis=0),
         beat=(2.0 * np.pi / max(float(every.turn[fastest]), LEAST_TURN / count), float(every.place[fastest])),
         oscillating=float(weight[turning].sum()),
     )

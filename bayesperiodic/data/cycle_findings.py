@@ -1,14 +1,16 @@
 """What is not steady in the cycles of a recording: ramps, transients, drifts, steps, beats, and phases that step."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from bayesperiodic.data.changes import DRIFT, STEP, Changes
+from bayesperiodic.data.changes import DRIFT, STEP, TONE, TRANSIENT, Changes
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES
 from bayesperiodic.data.recording_check import HARMLESS, SERIOUS, SERIOUS_BIAS, Finding
 from bayesperiodic.data.steadiness import Steady, Windows
 
+# Probability from which a change that is there oscillates, and from which a component has it.
+PROBABLE_KIND = 0.5
 # Bias by a transient that is listed, in standard errors, and probability that there is no change where one is.
 ALLOWED_BIAS, CHANGE_FALSE_ALARM = 0.3, 0.01
 # Beat relative to the amplitude that is serious, and step of the phase [cycles] that is harmless.
@@ -50,6 +52,7 @@ def cycle_findings(
     if beats or (level[1] - level[0]) * frequency < total - 1.0:
         slow = [*slow_beats(channels, time, every, frequency)]
     yield from slow or beats
+    named = {beat.channel: beat.severity for beat in slow or beats}
     for kind, a, b, what in (
         ("ramp", ends[0], level[0], "the signals change until"),
         ("ramp", level[1], ends[1], "the signals change from"),
@@ -65,7 +68,7 @@ def cycle_findings(
             yield Finding(
                 kind, "", HARMLESS, np.array([[a, b]]), count, count / total, np.nan, f"{what} {place:.6g} s; {used}"
             )
-    yield from _changes(channels, time, steady)
+    yield from _changes(channels, time, steady, named)
 
 
 def slow_beats(channels: Sequence[str], time: np.ndarray, every: Windows, frequency: float) -> Iterator[Finding]:
@@ -143,8 +146,13 @@ def _outer_steps(
     )  # fmt: skip
 
 
-def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Iterator[Finding]:
-    """Return what is clearly not steady in the part used: the rest of a transient, drifts and steps."""
+def _changes(
+    channels: Sequence[str], time: np.ndarray, steady: Steady, beating: Mapping[str, str]
+) -> Iterator[Finding]:
+    """Return what is clearly not steady in the part used: the rest of a transient, drifts and steps.
+
+    Beats that are `beating` by channel, with their severity, are not listed again unless they are more severe.
+    """
     part, effects = steady.part, steady.changes
     start, stop = float(time[steady.samples.start]), float(time[steady.samples.stop - 1])
     every, cycles = np.array([[start, stop]]), len(part.first) * part.cycles
@@ -159,8 +167,11 @@ def _changes(channels: Sequence[str], time: np.ndarray, steady: Steady) -> Itera
         )  # fmt: skip
     if effects is None:
         return
-    if effects.oscillating > 1.0 - CHANGE_FALSE_ALARM:
-        yield from _vibrations(channels, steady, effects, every)
+    fading = sum(effects.probability[kind] for kind in (TRANSIENT, DRIFT, TONE))
+    if fading > 1.0 - CHANGE_FALSE_ALARM and effects.oscillating > PROBABLE_KIND:
+        for finding in _vibrations(channels, steady, effects, every):
+            if beating.get(finding.channel) not in (SERIOUS, finding.severity):
+                yield finding
         return
     if not effects.slow:
         return
@@ -205,7 +216,7 @@ def _vibrations(channels: Sequence[str], steady: Steady, effects: Changes, times
     beat, decay = (number * part.cycles for number in effects.beat)
     cycles = len(part.first) * part.cycles
     for i, channel in enumerate(channels):
-        clear = moving[i] > 1.0 - CHANGE_FALSE_ALARM
+        clear = moving[i] > PROBABLE_KIND
         relative = float(np.where(clear, swing[i], 0.0).max() / level[i])
         effect = float(np.sqrt(np.sum(bias[i, clear] ** 2)))
         if relative <= part.jump[i] / level[i] or not clear.any():

@@ -296,7 +296,9 @@ def _steady_of(
         tracked = refine_groups(some, tracked, few, other)[0].frequency
     every = common_windows(some, tracked)
     steady = steady_part(every.all)
-    for _ in range(MOST_REFINEMENTS):
+    driven = any(group.inputs for group in some)
+    # At the frequency of its steady part, a motion without a drive has other steady parts.
+    for _ in range(MOST_REFINEMENTS if driven else 1):
         if steady is None or not refined or steady.level == (0, some[0].time.size):
             break
         # The frequency of a part that ramps is not that of the steady one, and at a wrong one ramps are steady.
@@ -307,7 +309,6 @@ def _steady_of(
         steady = steady_part(every.all)
         if steady is None or steady.level == before or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
             break
-    driven = any(group.inputs for group in some)
     if steady is not None and refined and not driven and steady.level != (0, some[0].time.size):
         fit, pace = refine_groups(some, tracked, few, other)
         if pace.diffusion and not pace.drifts:
