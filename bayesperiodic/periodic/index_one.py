@@ -21,7 +21,7 @@ from bayesperiodic.periodic.floquet import Floquet, first_order_matrix, floquet,
 
 # Smallest singular value of the derivative matrix, equations and variables scaled, below which it counts as zero, and
 # the largest condition number of M + ΠK.
-SINGULAR_VALUE, LARGEST_CONDITION = 1e-12, 1e10
+SINGULAR_VALUE, SOLVABLE = 1e-12, 1e10
 # Weights of a periodic central difference of order 8.
 DIFFERENCE = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
 HIGHER_INDEX = (
@@ -75,7 +75,7 @@ def _reduced(mass: np.ndarray, rest: np.ndarray, rank: int, period: float) -> Fl
     left = np.linalg.svd(mass)[0]
     projector = left[:, :, rank:] @ np.swapaxes(left[:, :, rank:], 1, 2)
     regular = mass + projector @ rest
-    if not np.max(np.linalg.cond(regular)) < LARGEST_CONDITION:
+    if not np.max(np.linalg.cond(regular)) < SOLVABLE:
         return HIGHER_INDEX
     if rank == 0:
         return floquet_of(np.empty((len(mass), 0, 0)))

@@ -24,7 +24,7 @@ class FirstOrder(NamedTuple):
 
     rate: Callable[..., np.ndarray]
     jacobian: Callable[..., np.ndarray]
-    count: int  # number of states, the first variables
+    states: int  # their number; they are the first variables
     size: int
 
     def path_rate(self, _: float, at: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -99,7 +99,7 @@ def _equilibria(system: FirstOrder, parameters: np.ndarray, random: np.random.Ge
     known: list[np.ndarray] = []
     for k in range(EQUILIBRIUM_STARTS):
         at = np.zeros(system.size)
-        at[: system.count] = random.standard_normal(system.count) * 10.0 ** random.uniform(-1, 1)
+        at[: system.states] = random.standard_normal(system.states) * 10.0 ** random.uniform(-1, 1)
         at = np.abs(at) if k % 2 else at
         try:
             for _ in range(EQUILIBRIUM_STEPS):

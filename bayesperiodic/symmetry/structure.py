@@ -132,9 +132,9 @@ class Structure(Result):
         if not self.centres:
             return []
         return [
-            "  Cycles are not isolated: for the same parameters there are others near each, as in conservative models. The",
-            "  verdicts below hold for a motion of known states, not for a fit of periodic solutions, which the parameters",
-            "  do not determine. Add the damping and the drive that select the amplitude.",
+            "  Cycles are not isolated: for the same parameters there are others near each, as in conservative models.",
+            "  What follows holds for motions in time, not for a fit of periodic solutions, whose amplitude the",
+            "  parameters do not determine. Add the damping and the drive that select it.",
         ]
 
     def _verdicts(self) -> list[str]:
