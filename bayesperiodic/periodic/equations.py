@@ -223,8 +223,8 @@ class PeriodicEquations:
     def static_guess(self, parameters: np.ndarray) -> np.ndarray:
         """Return the equilibrium under the mean inputs, (points, states); least squares where it is not unique.
 
-        The iteration starts from zero; where the equations are singular there, from `EQUILIBRIUM_VALUES` for all states,
-        until an equilibrium is found.
+        The iteration starts from zero, or, where the equations are singular there, from `EQUILIBRIUM_VALUES` for all
+        states until an equilibrium is found.
         """
         solution, _, finite = self._equilibrium(parameters, 0.0)
         for start in () if finite else EQUILIBRIUM_VALUES:
