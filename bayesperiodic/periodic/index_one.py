@@ -7,7 +7,7 @@ rank is constant. Where M + ΠK is regular, ΠK y = 0 are the algebraic equation
 
 on the range of M, which this flow maps onto itself [1]_. No bases that are smooth in time are needed. The transfer
 matrices of w between grid points are restricted to the range of M; their product has the finite multipliers, as many as
-the rank of M. Directions that decay faster than the grid follows, of very small singular values of M, are treated in the
+the rank of M. Directions that decay faster than the grid follows (very small singular values of M) are treated in the
 same way.
 
 References
