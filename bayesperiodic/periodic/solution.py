@@ -96,10 +96,11 @@ class PeriodicSolution(Result):
     autonomous : bool
         True if the frequency is part of the solution.
     status : str
-        "converged", "stalled", "singular", "not finite", "other orbit" (an equilibrium instead of an autonomous
-        model's orbit, or an orbit whose period is a fraction of the guess's) or "not resolved": the solution alternates
-        from point to point by more than 1 % of a state's standard deviation, which is the scheme's doing, or the scheme
-        does not relate even and odd points of an autonomous model ("central2", states of first order, an even grid).
+        "converged", "stalled", "singular" (also if the cycles of an autonomous model are not isolated), "not finite",
+        "other orbit" (an equilibrium instead of an autonomous model's orbit, or an orbit whose period is a fraction of
+        the guess's) or "not resolved": the solution alternates from point to point by more than 1 % of a state's
+        standard deviation, which is the scheme's doing, or the scheme does not relate even and odd points of an
+        autonomous model ("central2", states of first order, an even grid).
         More points or another scheme help.
     found_by : str
         "newton", "sharpness", "input amplitude" or "time integration", see `solve_periodic`.
