@@ -30,7 +30,7 @@ from bayesperiodic.periodic.schemes import CyclicGrid, Scheme, default_scheme, f
 
 # Values of all states from which an equilibrium is sought if the equations are singular at zero, in SI units, and the
 # relative size of the last step at an equilibrium.
-STARTS = tuple(sign * 10.0**k for sign in (1, -1) for k in sorted(range(-9, 10), key=abs))
+EQUILIBRIUM_VALUES = tuple(sign * 10.0**k for sign in (1, -1) for k in sorted(range(-9, 10), key=abs))
 AT_EQUILIBRIUM = 1e-6
 
 
@@ -223,13 +223,13 @@ class PeriodicEquations:
     def static_guess(self, parameters: np.ndarray) -> np.ndarray:
         """Return the equilibrium under the mean inputs, (points, states); least squares where it is not unique.
 
-        The iteration starts from zero; where the equations are singular there, from `STARTS` for all states, until an
-        equilibrium is found.
+        The iteration starts from zero, or, where the equations are singular there, from `EQUILIBRIUM_VALUES` for all
+        states until an equilibrium is found.
         """
-        solution, found, finite = self._equilibrium(parameters, 0.0)
-        for start in () if finite else STARTS:
-            other, found, _ = self._equilibrium(parameters, start)
-            if found:
+        solution, _, finite = self._equilibrium(parameters, 0.0)
+        for start in () if finite else EQUILIBRIUM_VALUES:
+            other, converged, _ = self._equilibrium(parameters, start)
+            if converged:
                 solution = other
                 break
         return np.tile(solution, (self.grid.points, 1))

@@ -7,7 +7,8 @@ rank is constant. Where M + ΠK is regular, ΠK y = 0 are the algebraic equation
 
 on the range of M, which this flow maps onto itself [1]_. No bases that are smooth in time are needed. The transfer
 matrices of w between grid points are restricted to the range of M; their product has the finite multipliers, as many as
-the rank of M.
+the rank of M. Directions that decay faster than the grid follows (very small singular values of M) are treated in the
+same way.
 
 References
 ----------
@@ -17,18 +18,29 @@ References
 
 import numpy as np
 
-from bayesperiodic.periodic.floquet import Floquet, first_order_matrix, floquet, floquet_of, transfer_matrices
+from bayesperiodic.periodic.floquet import (
+    MOST_PARTS,
+    Floquet,
+    first_order_matrix,
+    floquet,
+    floquet_of,
+    transfer_matrices,
+)
 
-# Smallest singular value of the derivative matrix, equations and variables scaled, below which it counts as zero, and
-# the largest condition number of M + ΠK.
-SINGULAR_VALUE, LARGEST_CONDITION = 1e-12, 1e10
+# Singular value of the derivative matrix, equations and variables scaled, below which it counts as zero, and largest
+# condition number of M + ΠK.
+SINGULAR_VALUE, SOLVABLE = 1e-12, 1e10
+# Product of the largest rate and the period, over the squared number of parts of all steps, up to which collocation
+# damps a decaying direction to nothing, by exp(−24/TOO_FAST).
+TOO_FAST = 0.3
 # Weights of a periodic central difference of order 8.
 DIFFERENCE = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
 HIGHER_INDEX = (
-    "the matrix of the highest derivatives is singular, and the equations do not determine all states "
-    "without further differentiation (index above 1)"
+    "the matrix of the highest derivatives is singular or nearly so, and the equations do not determine all states "
+    "without further differentiation (index above 1), or some vibrate too fast for the grid"
 )
-CHANGING_RANK = "the matrix of the highest derivatives is singular at some points of the orbit"
+GROWING = "the matrix of the highest derivatives is nearly singular, and a motion grows too fast for the grid"
+CHANGING_RANK = "the matrix of the highest derivatives is singular at some points, or in some directions nearly so"
 
 
 def orbit_floquet(
@@ -37,18 +49,19 @@ def orbit_floquet(
     """Return multipliers and eigenfunctions of an orbit in variables divided by `sizes`, or why there are none.
 
     The linearisation (points, states, 3·states) is ∂g/∂(q, q̇, q̈). If the matrix of the highest derivatives is
-    singular, the eigenfunctions are in bases of their own, see `Floquet.reduced`.
+    singular, or nearly so, there are as many as its rank, and the eigenfunctions are in other bases, see
+    `Floquet.reduced`.
     """
     mass, rest = _scaled(linearisation, orders, sizes, period)
-    values = np.linalg.svd(mass, compute_uv=False)
-    if not np.isfinite(values).all():
+    if not (np.isfinite(mass).all() and np.isfinite(rest).all()):
         return "the linearised equations are not finite"
-    if values[:, -1].min() > SINGULAR_VALUE:
-        return floquet(first_order_matrix(linearisation, orders) * (sizes / sizes[:, None]), period)
-    rank = np.sum(values > SINGULAR_VALUE, axis=1)
-    if np.ptp(rank):
+    values = np.linalg.svd(mass, compute_uv=False)
+    rank = np.sum(values > 2 * np.pi / (TOO_FAST * (MOST_PARTS * len(mass)) ** 2), axis=1)
+    if rank.min() < sizes.size and not np.ptp(rank):
+        return _reduced(mass, rest, int(rank[0]), period)
+    if values[:, -1].min() <= SINGULAR_VALUE:
         return CHANGING_RANK
-    return _reduced(mass, rest, int(rank[0]), period)
+    return floquet(first_order_matrix(linearisation, orders) * (sizes / sizes[:, None]), period)
 
 
 def _scaled(
@@ -72,11 +85,18 @@ def _scaled(
 
 
 def _reduced(mass: np.ndarray, rest: np.ndarray, rank: int, period: float) -> Floquet | str:
-    left = np.linalg.svd(mass)[0]
-    projector = left[:, :, rank:] @ np.swapaxes(left[:, :, rank:], 1, 2)
+    left, values, right = np.linalg.svd(mass)
+    null, fast = left[:, :, rank:], values[:, rank:]
+    algebraic = np.swapaxes(null, 1, 2) @ rest @ np.swapaxes(right[:, rank:], 1, 2)
+    mass = mass - (null * fast[:, None]) @ right[:, rank:]
+    projector = null @ np.swapaxes(null, 1, 2)
     regular = mass + projector @ rest
-    if not np.max(np.linalg.cond(regular)) < LARGEST_CONDITION:
+    if not np.max(np.linalg.cond(regular)) < SOLVABLE:
         return HIGHER_INDEX
+    if fast.min() <= SINGULAR_VALUE < fast.max():
+        return CHANGING_RANK
+    if fast.min() > SINGULAR_VALUE and np.max(np.linalg.eigvals(algebraic / fast[:, :, None]).real) > 0.0:
+        return GROWING
     if rank == 0:
         return floquet_of(np.empty((len(mass), 0, 0)))
     step = 2 * np.pi / len(mass)

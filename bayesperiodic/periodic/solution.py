@@ -81,6 +81,8 @@ SAME_ANGLE = 1e-6
 # period is then right to 0.4 % in relaxation oscillations with mu up to 20 and all schemes. A multiplier is on one side
 # of the unit circle if its logarithm exceeds this error by a factor.
 TRIVIAL_ERROR, CLEAR = 0.1, 2.0
+# Estimated error of a driven orbit, in units of a state's range, above which its stability is unknown.
+UNSURE = 0.05
 
 
 @dataclass(frozen=True)
@@ -94,10 +96,11 @@ class PeriodicSolution(Result):
     autonomous : bool
         True if the frequency is part of the solution.
     status : str
-        "converged", "stalled", "singular", "not finite", "other orbit" (an equilibrium instead of an autonomous
-        model's orbit, or an orbit whose period is a fraction of the guess's) or "not resolved": the solution alternates
-        from point to point by more than 1 % of a state's standard deviation, which is the scheme's doing, or the scheme
-        does not relate even and odd points of an autonomous model ("central2", states of first order, an even grid).
+        "converged", "stalled", "singular" (also if the cycles of an autonomous model are not isolated), "not finite",
+        "other orbit" (an equilibrium instead of an autonomous model's orbit, or an orbit whose period is a fraction of
+        the guess's) or "not resolved": the solution alternates from point to point by more than 1 % of a state's
+        standard deviation, which is the scheme's doing, or the scheme does not relate even and odd points of an
+        autonomous model ("central2", states of first order, an even grid).
         More points or another scheme help.
     found_by : str
         "newton", "sharpness", "input amplitude" or "time integration", see `solve_periodic`.
@@ -227,8 +230,8 @@ class PeriodicSolution(Result):
         """Floquet multipliers over the response period, complex (multipliers,), largest modulus first.
 
         They are those of the linearised differential equations, including the trivial 1 of an autonomous model; none
-        unless converged. If some equations are algebraic (a singular matrix of the highest derivatives, index 1),
-        there are as many as the rank of this matrix.
+        unless converged. If the matrix of the highest derivatives is singular (algebraic equations, index 1), or so
+        nearly that the grid does not follow the fastest decay, there are as many as its rank; the others are zero.
         """
         with np.errstate(over="ignore"):
             return np.exp(self.floquet.exponents) if self.floquet is not None else np.empty(0, dtype=complex)
@@ -259,12 +262,13 @@ class PeriodicSolution(Result):
         """True if all multipliers except an autonomous model's trivial one are inside the unit circle; None if unknown.
 
         It is unknown (`stability_unknown` says why) unless the solve has converged, if the grid does not resolve an
-        autonomous orbit or another of its multipliers is as close to the unit circle as the trivial one is to 1, and if
+        autonomous orbit or another of its multipliers is as close to the unit circle as the trivial one is to 1, if the
+        estimated error of a driven orbit exceeds 5 % of a state's range (not estimated for the fourier scheme), and if
         there are no multipliers.
         """
         return None if self.stability_unknown else bool(np.all(self._others.real < 0.0))
 
-    @property
+    @cached_property
     def stability_unknown(self) -> str:
         """Why the stability is unknown; empty if it is known."""
         if isinstance(self._linearised, str):
@@ -272,6 +276,10 @@ class PeriodicSolution(Result):
         if not self.resolved:
             trivial = min(self.exponents, key=abs) * self.period
             return f"the trivial multiplier is {_shown(trivial)} in place of 1: the grid does not resolve the orbit"
+        if not self.autonomous and np.isfinite(self.scheme.order):
+            for state, error in self.error_estimate().items():
+                if error > UNSURE * np.ptp(self.states[state] - self._turns(state)):
+                    return f"the discretisation error of {state!r} is estimated at more than {UNSURE:.0%} of its range"
         near = self._others[np.abs(self._others.real) <= CLEAR * self.trivial_error]
         if near.size:
             return f"the multiplier {_shown(near[0])} is as near to the unit circle as the trivial one is to 1"

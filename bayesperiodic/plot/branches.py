@@ -19,7 +19,7 @@ from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, styled
 
 BRANCH_MEASURES = ("amplitude", "maximum", "section", "period")
 STABILITIES = ("unstable", "stable", "stability unknown")
-UNKNOWN, SPECIAL = 2, 3
+STABILITY_UNKNOWN, SPECIAL = 2, 3
 BRANCH_STYLES: dict[str, dict[str, Any]] = {
     "stable": {"lw": 1.6, "ls": "-"},
     "unstable": {"lw": 1.6, "ls": "--"},
@@ -156,10 +156,13 @@ def _measures(branch: Branch, measure: str | Callable, output: str) -> np.ndarra
 def _runs(branch: Branch) -> list[tuple[int, slice]]:
     """Return the parts of equal stability (an index of `STABILITIES`); special points belong to both neighbours."""
     plain = [
-        SPECIAL if kind else UNKNOWN if solution.stable is None else int(solution.stable)
+        SPECIAL if kind else STABILITY_UNKNOWN if solution.stable is None else int(solution.stable)
         for solution, kind in zip(branch, branch.kinds, strict=True)
     ]
-    between = [0 if 0 in pair else UNKNOWN if UNKNOWN in pair else int(1 in pair) for pair in pairwise(plain)]
+    between = [
+        0 if 0 in pair else STABILITY_UNKNOWN if STABILITY_UNKNOWN in pair else int(1 in pair)
+        for pair in pairwise(plain)
+    ]
     return [(stable, slice(part.start, part.stop + 1)) for stable, part in _stretches(between) if between]
 
 

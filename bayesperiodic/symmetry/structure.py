@@ -12,6 +12,7 @@ from bayesperiodic._io import Result, Storable
 from bayesperiodic.models.model import Model
 from bayesperiodic.models.sensed import with_sensed_inputs
 from bayesperiodic.symmetry import invariants
+from bayesperiodic.symmetry.centres import has_centres
 from bayesperiodic.symmetry.determining import (
     Generator,
     System,
@@ -88,6 +89,10 @@ class Structure(Result):
         number of random parameter values.
     unexplained : tuple of str
         Parameters in directions without sensitivity that no symmetry found explains.
+    centres : bool
+        True if the model is autonomous and its cycles are not isolated, as those of conservative models: at random
+        parameter values an equilibrium is surrounded by cycles of different amplitudes. The verdicts then hold for
+        records of motions, but `solve_periodic` and `map_estimate` find no unique cycle.
 
     Examples
     --------
@@ -110,6 +115,7 @@ class Structure(Result):
     rank: int | None
     points: int
     unexplained: tuple[str, ...]
+    centres: bool = False
 
     @property
     def complete(self) -> bool:
@@ -119,8 +125,17 @@ class Structure(Result):
     def __repr__(self) -> str:
         known = f"; known: {', '.join(self.known)}" if self.known else ""
         lines = [f"Structure of {self.model}, measured: {', '.join(self.outputs)}{known}"]
-        lines += self._verdicts() + self._changes() + self._discrete_changes()
+        lines += self._families() + self._verdicts() + self._changes() + self._discrete_changes()
         return "\n".join([*lines, f"  {self._confirmation()}"])
+
+    def _families(self) -> list[str]:
+        if not self.centres:
+            return []
+        return [
+            "  Cycles are not isolated: for the same parameters there are others near each, as in conservative models.",
+            "  What follows holds for motions in time, not for a fit of periodic solutions, whose amplitude the",
+            "  parameters do not determine. Add the damping and the drive that select it.",
+        ]
 
     def _verdicts(self) -> list[str]:
         named = {v: list(self.table.index[self.table["verdict"] == v]) for v in self.table["verdict"].unique()}
@@ -309,7 +324,7 @@ def structure(
         if any(e.has(sp.zoo, sp.nan, sp.oo) for e in system.expressions):
             raise ValueError(f"fixed: must not be zero if the equations divide by it, got {name} = 0.")
     system = with_sensors(system, unknown, orders) if unknown else system
-    return analyse_structure(model.name, system, known)
+    return replace(analyse_structure(model.name, system, known), centres=has_centres(model, zeros))
 
 
 def _unknown_entries(
