@@ -27,7 +27,7 @@ MISSING = [
 # Lines among which the header is searched for, and separators of fields, in the order in which they are tried.
 PREAMBLE, SEPARATORS = 1000, (",", ";", "\t")
 # Bytes that are decoded at once, and columns per wanted column above which the others are not made numbers.
-PART_BYTES, WIDE = 2**20, 4
+PART_BYTES, WIDE = 2**20, 2
 
 # Bytes of an array, against files that unpack to more than the memory.
 LARGEST_ARRAY = 2**31
@@ -155,7 +155,7 @@ def _csv_columns(file: _Text, wanted: list[str]) -> Stored:
         names, lines, more, separator = _header(file, wanted)
         places = {column: _place(file.path, names, column) for column in wanted}
         with file.open() as text, warnings.catch_warnings():
-            rows = _skip(text, lines, separator)
+            _skip(text, lines, separator)
             warnings.simplefilter("error", pd.errors.ParserWarning)
             width, source = len(names), text
             # More columns than names hold the fields after trailing commas.
@@ -164,7 +164,9 @@ def _csv_columns(file: _Text, wanted: list[str]) -> Stored:
             if alone:
                 source = io.StringIO(text.read().rstrip())
             elif WIDE * len(places) < width:
-                source, width, surplus = _narrowed(rows, [*places.values()], width), len(places) + 1, 1
+                rows = csv.reader(text, delimiter=separator, skipinitialspace=True, strict=True)
+                source = _narrowed(rows, [*places.values()], width, width + surplus)
+                width, surplus = len(places) + 1, 1
                 places, separator = {column: place for place, column in enumerate(places)}, ","
             missing: Any = dict(enumerate([MISSING] * width + [[""]] * surplus))
             table = pd.read_csv(
@@ -195,17 +197,18 @@ class _OtherFields(Exception):
     """A row of a wide file has another number of fields than there are names."""
 
 
-def _narrowed(rows: Iterator[list[str]], places: list[int], width: int) -> TextIO:
-    """Return the wanted fields of all rows as CSV, with a last column of zeros.
+def _narrowed(rows: Iterable[list[str]], places: list[int], width: int, most: int) -> TextIO:
+    """Return the wanted fields of all rows as CSV, with a last column of zeros; rows have `width` to `most` fields.
 
     The table of all columns of a wide file would take several times the memory of the file.
     """
     narrow = io.TextIOWrapper(io.BytesIO(), "utf-8", newline="")
     writer = csv.writer(narrow)
     for row in rows:
-        if not any(field.strip() for field in row[:1]) and len(row) < 2:
+        if len(row) < 2 and not any(map(str.strip, row)):
             continue
-        if (len(row) < width and any(map(str.strip, row))) or any(map(str.strip, row[width:])):
+        short = len(row) < width and any(map(str.strip, row))
+        if short or len(row) > most or any(map(str.strip, row[width:])):
             raise _OtherFields("rows have different numbers of fields")
         writer.writerow([*(row[place] if place < len(row) else "" for place in places), "0"])
     narrow.seek(0)
@@ -219,7 +222,12 @@ def _header(file: _Text, columns: list[str]) -> tuple[list[str], int, int, str]:
     """
     headers: list[tuple[list[str], int, int, str]] = []
     for separator in SEPARATORS:
-        headers.append((*_line_of_names(file, columns, separator), separator))
+        try:
+            headers.append((*_line_of_names(file, columns, separator), separator))
+        except csv.Error:  # a long line is one field for another separator than its own
+            if not headers and separator == SEPARATORS[-1]:
+                raise
+            continue
         if {*columns} <= {*headers[-1][0]}:
             return headers[-1]
     best = max(headers, key=lambda header: len({*columns} & {*header[0]}))
