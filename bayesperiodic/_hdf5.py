@@ -55,7 +55,7 @@ def _member(group: h5py.Group, name: str) -> h5py.Dataset | h5py.Group:
 
 def values(item: h5py.Dataset, largest: float) -> Any:
     """Return the values of an array from `dataset`; raise a ValueError if some are missing, or of more bytes."""
-    _check(item, largest, f"{largest / 1e9:.3g} GB")
+    _check(item, largest, f"than {largest / 1e9:.3g} GB")
     return item[()]
 
 
@@ -80,7 +80,7 @@ def _check(item: h5py.Dataset, largest: float, limit: str) -> float:
     """Return the bytes of the values of an array; raise a ValueError if they are too many or some are missing."""
     name, size, plan = item.name.rpartition("/")[2], float(_stored_bytes(item)), item.id.get_create_plist()
     if size > largest:
-        raise ValueError(f"its array {name!r} has more than {limit}")
+        raise ValueError(f"its array {name!r} has more {limit}")
     packed = {plan.get_filter(k)[0] for k in range(plan.get_nfilters())}
     if not packed <= FILTERS or size > DEFLATION * item.id.get_storage_size() or not _is_stored(item):
         raise ValueError(f"parts of its variable {name!r} are missing")
@@ -89,7 +89,7 @@ def _check(item: h5py.Dataset, largest: float, limit: str) -> float:
         for place in np.ndindex(item.shape):  # one by one, because all may refer to one long text
             size += len(item[place]) if h5py.check_string_dtype(item.dtype) else math.inf
             if size > largest:
-                raise ValueError(f"its array {name!r} has more than {limit}")
+                raise ValueError(f"its array {name!r} has more {limit}")
     return size
 
 

@@ -191,11 +191,11 @@ def _decode(value: Any, arrays: Any, content: bytes) -> Any:
     kind = _class(str(value.get("module")), name)
     if kind is None:
         raise ValueError(f"{OTHER}, got class {name!r}; {REMEDY}.")
-    content = {field: _decode(item, arrays, content) for field, item in value["fields"].items()}
+    given = {field: _decode(item, arrays, content) for field, item in value["fields"].items()}
     needed = {f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING}
-    if not needed <= content.keys() <= {f.name for f in fields(kind)}:
+    if not needed <= given.keys() <= {f.name for f in fields(kind)}:
         raise ValueError(f"{OTHER}, got other fields of {name}; {REMEDY}.")
-    return kind(**content)
+    return kind(**given)
 
 
 def _class(module: str, name: str) -> Any:

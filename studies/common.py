@@ -29,6 +29,7 @@ from PIL import Image
 
 import bayesperiodic as bp
 from bayesperiodic import _parallel
+from bayesperiodic._files import written_whole
 from bayesperiodic._parallel import TaskPool, available_cores
 from bayesperiodic.plot.pairs import draw_ellipses as draw_ellipses
 from bayesperiodic.plot.pairs import draw_regions as draw_regions
@@ -89,9 +90,8 @@ def remembered(path: Path, source: str, make: Callable[[], Value]) -> Value:
             return part
     part = make()
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(".unfinished")
-    unfinished.write_bytes(cloudpickle.dumps((source, part)))
-    unfinished.replace(path)
+    with written_whole(path) as draft:
+        draft.write_bytes(cloudpickle.dumps((source, part)))
     return part
 
 
@@ -186,12 +186,13 @@ def versions() -> dict[str, str]:
 def write_results(folder: Path, results: dict[str, Any]) -> Path:
     """Write results.json atomically, as strict JSON: null instead of numbers that are not finite, with the reasons."""
     folder.mkdir(parents=True, exist_ok=True)
-    target, draft = folder / "results.json", folder / ".results.json.part"
+    target = folder / "results.json"
     reasons: dict[str, str] = {}
     finite = _finite(results, "", reasons)
     whole = finite | ({"null": reasons} if reasons else {})
-    draft.write_text(json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
-    draft.replace(target)
+    text = json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    with written_whole(target) as draft:
+        draft.write_text(text, encoding="utf-8")
     return target
 
 
@@ -217,12 +218,11 @@ def save_figures(folder: Path, figures: dict[str, Figure]) -> list[Path]:
     paths = []
     for name, figure in figures.items():
         for suffix in dict.fromkeys(("png", wanted)):
-            target, draft = folder / f"{name}.{suffix}", folder / f".{name}.part.{suffix}"
-            dots = DOTS_PER_INCH if suffix == "png" else DOTS_OF_CLOUDS
-            figure.savefig(draft, dpi=dots, metadata=WITHOUT_TIME.get(suffix))
-            if suffix == "png":
-                _shrink(draft)
-            draft.replace(target)
+            target, dots = folder / f"{name}.{suffix}", DOTS_PER_INCH if suffix == "png" else DOTS_OF_CLOUDS
+            with written_whole(target) as draft:
+                figure.savefig(draft, dpi=dots, metadata=WITHOUT_TIME.get(suffix))
+                if suffix == "png":
+                    _shrink(draft)
             paths.append(target)
     return paths
 

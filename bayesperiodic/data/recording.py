@@ -13,7 +13,7 @@ from bayesperiodic import _checks
 from bayesperiodic._linalg import one_thread
 from bayesperiodic.data.channels import Channels
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.data.files import CSV, MAT, NPZ
+from bayesperiodic.data.files import MAT, NPZ, csv_in
 from bayesperiodic.data.folding import AUTO, automatic_periods, fold_signals, given_frequency
 from bayesperiodic.data.inspection import inspect, summary
 from bayesperiodic.data.layout import Layout, reader, recordings, without_missing
@@ -180,6 +180,7 @@ class Recording(Channels):
         missing: str | None = None,
         split: str | None = None,
         name: str | None = None,
+        encoding: str = "utf-8",
     ) -> "Recording | list[Recording]":
         """Read a recording from a CSV file with a header line.
 
@@ -208,6 +209,8 @@ class Recording(Channels):
             which it is constant is a recording. `split` divides a recording by the steps of its drive.
         name : str, optional
             By default the file name without its extension.
+        encoding : str
+            Of the text, by Python's name, such as "latin-1", "cp1252" or "utf-16".
 
         Returns
         -------
@@ -232,7 +235,7 @@ class Recording(Channels):
         ('run', 0.025)
         """
         layout = Layout(Path(path).name, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
-        return recordings(cls, CSV, path, name, split, layout)
+        return recordings(cls, csv_in(encoding), path, name, split, layout)
 
     from_npz = reader(
         "from_npz",

@@ -90,7 +90,7 @@ class Checkpoint:
             backend = MemoryBackend(content)
             mark = str(backend.file.attrs.get(MARK, "no run of this package"))
             state = json.loads(backend.file[RUN][()])
-            backend.get_last_sample()
+            _ = backend.get_last_sample(), backend.accepted
         except Exception as error:  # whatever HDF5, JSON and emcee raise for damaged files
             raise ValueError(
                 f"checkpoint: must be an intact file, got {str(self._path)!r} ({error}); name another file or delete "

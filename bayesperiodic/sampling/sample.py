@@ -106,8 +106,8 @@ def sample(
     Sampling stops if, twice in succession, the chain after the burn-in and after its first fifth is 50 autocorrelation
     times long, that time has changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and
     95 % quantiles agree within a quarter of a standard deviation; if there are several optima, the same holds for the
-    fraction of draws at each. Ctrl-C or the loss of the executor's workers ends it with the steps so far, not converged.
-    SIGTERM, unless your program handles it, ends the process, after the checkpoint was written.
+    fraction of draws at each. Ctrl-C or the loss of the executor's workers ends it with the steps so far, not
+    converged. SIGTERM, unless your program handles it, ends the process, after the checkpoint was written.
 
     ``sampler="nuts"`` checks the result: it samples the same density by its gradient, with the no-U-turn sampler [3]_
     of nutpie. Each ensemble is then a single chain with 300 tuning draws, which are removed, and must be 500
@@ -142,7 +142,7 @@ def sample(
         ``sample_stats`` contains its statistics. Diverged trajectories are counted in `reason`.
     checkpoint : path, optional
         An HDF5 file that contains the run so far at any time; after an interruption the same call resumes the run, also
-        with another executor, and returns at once if it is finished. It can be read by emcee's HDFBackend, in
+        with another executor, and returns at once if it is finished. A symbolic link stands for its file. It can be read by emcee's HDFBackend, in
         coordinates in which the Laplace approximation is a standard normal distribution.
     executor : None, int, Dask Client, or executor with the interface of concurrent.futures
         Executor that evaluates the proposals of a step, 16 a task. By default they are solved together on all cores of

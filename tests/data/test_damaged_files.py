@@ -278,3 +278,93 @@ def test_field_without_a_name_is_refused_also_if_it_is_nan(tmp_path, text):
     (tmp_path / "run.csv").write_text(text)
     with pytest.raises(ValueError, match="path: must be a CSV file with 2 fields in each row, .*got 3 in data row"):
         bp.Recording.from_csv(tmp_path / "run.csv", sampling_rate=1.0, outputs={"x": "x"})
+
+
+PREAMBLE = "Messung µ-Schwinger, 20 °C\nt,x\n0,1\n0.5,2\n1,3\n"
+
+
+@pytest.mark.parametrize("written", ["latin-1", "cp1252", "utf-16", "mac-roman", "cp850"])
+def test_file_in_another_encoding_names_the_argument_and_is_read_with_it(tmp_path, written):
+    path, columns = tmp_path / "run.csv", {"time": "t", "outputs": {"x": "x"}}
+    path.write_bytes(PREAMBLE.encode(written))
+    advice = "UTF-16, encoding='utf-16'" if written == "utf-16" else "Latin-1, encoding='latin-1'"
+    with pytest.raises(
+        ValueError, match=rf"path: must be a CSV file in UTF-8, got .*run.csv', whose line 1 has .* may be in {advice}"
+    ):
+        bp.Recording.from_csv(path, **columns)
+    assert bp.Recording.from_csv(path, encoding=written, **columns).outputs["x"].tolist() == [1.0, 2.0, 3.0]
+
+
+def test_line_of_the_first_byte_of_another_encoding_is_counted(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_bytes(b"t,x,note\n" + b"0,1,ok\n" * 400_000 + b"1,2,20\xb0\n")
+    with pytest.raises(ValueError, match="whose line 400002 has the byte 0xb0"):
+        bp.Recording.from_csv(path, sampling_rate=1.0, outputs={"x": "x"})
+
+
+@pytest.mark.parametrize("bad", ["latin-one", "base64", "", None, 8, "a\0b"])
+def test_unknown_encoding_is_refused(tmp_path, bad):
+    with pytest.raises(ValueError, match="encoding: must be one of Python's, such as 'utf-8', 'latin-1' .*, got "):
+        bp.Recording.from_csv(tmp_path / "run.csv", sampling_rate=1.0, outputs={"x": "x"}, encoding=bad)
+
+
+def test_names_of_columns_in_another_encoding(tmp_path):
+    (tmp_path / "run.csv").write_bytes("Zeit;µ\n0;1\n1;2\n".encode("latin-1"))
+    recording = bp.Recording.from_csv(tmp_path / "run.csv", time="Zeit", outputs={"x": "µ"}, encoding="latin-1")
+    assert recording.outputs["x"].tolist() == [1.0, 2.0]
+
+
+WIDE = """
+import resource, sys
+import numpy as np
+import bayesperiodic as bp
+small, large, columns = "small.csv", "large.csv", int(sys.argv[1])
+open(small, "w").write("t,x\\n0,1\\n1,2\\n")
+bp.Recording.from_csv(small, time="t", outputs={"x": "x"})
+with open(large, "w") as file:
+    file.write(sys.argv[2].join(["t", *(f"c{i}" for i in range(1, columns))]) + "\\n")
+    row = sys.argv[2].join(f"{i % 997 / 100:.4f}" for i in range(1, columns))
+    for k in range(4_000_000 // columns):
+        file.write(f"{k}{sys.argv[2]}{row}\\n")
+    size = file.tell()
+memory = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # kB on Linux
+before = memory()
+recording = bp.Recording.from_csv(large, time="t", outputs={"x": f"c{columns - 1}"}, inputs={"u": "c1"})
+assert recording.outputs["x"][0] == (columns - 1) % 997 / 100 and recording.inputs["u"][-1] == 0.01
+print((memory() - before) / size)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="measures memory as on Linux")
+@pytest.mark.parametrize("columns, separator", [(20_000, ","), (5_000, "\t"), (40_000, ";")])
+def test_wide_file_is_read_within_twice_its_size(tmp_path, columns, separator):
+    """It was 18 times the size; a line may be longer than the longest field of the module csv."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(os.path.abspath(path or ".") for path in sys.path)}
+    command = [sys.executable, "-c", WIDE, str(columns), separator]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert float(done.stdout) < 2.0
+
+
+TABLES = [
+    "0,1,a\n1,2,b\n", "0,1,\n1,,\n", "0,NA,a\n\n1,2,b\n\n", "0, 1 ,a\n1, 2,b\n", '0,"1",a\n1,"2","b,c"\n',
+    "0,1,a\n1,2\n", "0,1,a\n1,2,b,\n", "0,1,a,\n1,2,b,\n", "0,1,a,\n1,2,b,3\n", "0,1,a\n1,2,b,c\n",
+    "0,1,a\n,,\n2,3,b\n",
+    "0,1,a\n , , \n", "0,x,a\n1,2,b\n", "0,1,a\r\n1,2,b\r\n", '0,1,"a\nb"\n1,2,c\n', '0,1,"a\n1,2,c\n', "", "\n\n",
+    "0,1e3,a\n1,-inf,b\n", "0,1,a\n1,2,b,,,,,\n", "0,1,a\n1\n", "2026-01-31T12:00:00,1,a\n2026-01-31T12:00:01,2,b\n",
+    "0,true,a\n1,false,b\n", "0,001,a\n1,2,b", "0,12345678901234567890,a\n1,2,b\n",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("channel", ["x", "n"])
+def test_wide_and_narrow_files_are_read_alike(tmp_path, monkeypatch, table, channel):
+    (tmp_path / "run.csv").write_bytes(f"t,x,n\n{table}".encode())
+    found = []
+    for wide in (10**9, 0):  # as a narrow file and as a wide one
+        monkeypatch.setattr(files, "WIDE", wide)
+        try:
+            run = bp.Recording.from_csv(tmp_path / "run.csv", time="t", outputs={"x": channel}, missing="drop")
+            found.append((np.array(run.time).tolist(), run.outputs["x"].tolist()))
+        except ValueError as error:
+            found.append(str(error).split("(")[0])
+    assert found[0] == found[1]
