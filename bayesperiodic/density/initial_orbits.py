@@ -37,6 +37,8 @@ SEEN, EQUATIONS, SEEN_ROUNDS, TURNS, FEW_TURNS = 8, 0.03, 5, 100, 5
 # Means of a state that are tried, in standard deviations from the one found.
 MEANS = (1.0, -1.0, 2.0, -2.0)
 Guesses = Mapping[str, Mapping[str, np.ndarray]]
+# What overflows or is not defined in an iteration is not finite, and ends it.
+unwarned = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ class InitialEstimate(NamedTuple):
     blocked: str  # the experiment whose orbit could not be followed; empty otherwise
 
 
+@unwarned
 def simultaneous_fit(problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> InitialEstimate | None:
     """Return θ and orbits near the MAP point; None if the model is autonomous or an experiment has no guess.
 
@@ -70,6 +73,7 @@ def simultaneous_fit(problem: Description, theta: np.ndarray, guesses: Guesses |
     return fit.iterate(fit.parameters_along_guesses(theta))
 
 
+@unwarned
 @in_one_thread
 def experiments_guesses(problem: Description, theta: np.ndarray) -> dict[str, Any]:
     """Return the experiments' guesses; in place of "data" states found from a θ (names,), see `measured_orbits`."""
@@ -94,6 +98,7 @@ def experiments_guesses(problem: Description, theta: np.ndarray) -> dict[str, An
     return guesses | {name: measured[name] for name in wanted}
 
 
+@unwarned
 def measured_orbits(problem: Description, theta: np.ndarray, near: Guesses, most: int = TURNS) -> InitialEstimate:
     """Return orbits of a driven model that give the measured outputs, and the θ that fits them, in turns from a θ.
 
@@ -239,6 +244,8 @@ class _SimultaneousFit:
                 linear[name] = one
             noise = estimate_noise(self.likelihood, [r for one in linear.values() for r in one.residuals], noise, 1.0)
             step, size = self._step(*self._information(linear, noise), theta)
+            if size == np.inf:
+                return InitialEstimate(theta, {}, next(iter(orbits)))
             off = {name: _size(one.correction, orbits[name]) for name, one in linear.items()}
             worst = max(off, key=lambda name: off[name])
             if off[worst] < ON_ORBIT and size < SMALL_TURN:
@@ -279,13 +286,18 @@ class _SimultaneousFit:
         return white @ white.T, white @ np.concatenate(self.likelihood.whitened(residuals, noise))
 
     def _step(self, hessian: np.ndarray, gradient: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the step of θ's coordinates, positive parameters in their logarithms, and its length in sds."""
+        """Return the step of θ's coordinates, positive parameters in their logarithms, and its length in sds.
+
+        None and infinite where the equations or the prior overflow.
+        """
         prior = self.problem.joint_prior
         by_prior = prior.gradient(theta)
         unit = np.where(self.problem.logarithmic, theta, 1.0)
         hessian = scaled(hessian + prior.curvature(theta), unit)
         hessian -= np.diag(np.where(self.problem.logarithmic, theta * by_prior, 0.0))
         gradient = (gradient + by_prior) * unit
+        if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
+            return np.zeros(theta.size), np.inf
         values, vectors, scale = hessian_eigh(hessian)
         values = np.maximum(np.abs(values), 1e-13 * np.abs(values).max())
         along = vectors.T @ (scale * gradient) / values

@@ -223,12 +223,13 @@ class LogPosterior(SamplingCoordinates):
         They are the gradient (names,) and, if it is given, minus the Hessian (names, names).
         """
         logs, prior = self._logarithms, self.problem.joint_prior
-        gradient = gradient + prior.gradient(theta)
-        if logs.size:
-            gradient[logs] += 1.0 / theta[logs]
-        if curvature is not None:
-            curvature = curvature + prior.curvature(theta)
-            curvature[logs, logs] += theta[logs] ** -2
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # callers check that both are finite
+            gradient = gradient + prior.gradient(theta)
+            if logs.size:
+                gradient[logs] += 1.0 / theta[logs]
+            if curvature is not None:
+                curvature = curvature + prior.curvature(theta)
+                curvature[logs, logs] += theta[logs] ** -2
         return gradient, curvature
 
     def log_likelihood(self, theta: np.ndarray, noise: np.ndarray, threads: int | None = None) -> Evaluation:

@@ -113,7 +113,12 @@ def information(problem: Description, iterate: Iterate) -> tuple[np.ndarray, np.
 
 
 def inverse_hessian(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inverse of H without its directions of no curvature, and which parameters belong to these."""
+    """Return the inverse of H without its directions of no curvature, and which parameters belong to these.
+
+    They are all parameters where H is not finite.
+    """
+    if not np.isfinite(hessian).all():
+        return np.zeros(hessian.shape), np.ones(len(hessian), dtype=bool)
     values, vectors, scale = hessian_eigh(hessian)
     curved = np.abs(values) > NO_CURVATURE * np.abs(values).max()
     inverse = scaled((vectors[:, curved] / values[curved]) @ vectors[:, curved].T, scale)

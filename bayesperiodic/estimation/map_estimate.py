@@ -200,7 +200,9 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
         step = end.iterate.theta - now.theta
         moved = [one.expected - (before[n].expected if n in before else np.inf) for n, one in errors.items()]
         still = all(np.abs(change).max(initial=0.0) < SETTLED_INPUTS for change in moved)
-        if still and step @ objective.hessian_and_gradient(end.iterate)[0] @ step < SETTLED_INPUTS**2:
+        with np.errstate(invalid="ignore"):  # of a Hessian that overflows: not settled
+            size = step @ objective.hessian_and_gradient(end.iterate)[0] @ step
+        if still and size < SETTLED_INPUTS**2:
             return problem, resumed(objective, end) or end
     if problem.noisy_inputs or problem.frequency_errors:
         names = " and ".join(["inputs"] * bool(problem.noisy_inputs) + ["frequencies"] * bool(problem.frequency_errors))

@@ -104,9 +104,11 @@ def _distance(objective: Objective, theta: np.ndarray, mode: Iterate) -> float:
     """Return the distance in standard deviations, directions without curvature left out.
 
     Parameters that the data do not narrow are integrated out: where their estimate is depends on the prior alone, whose
-    density may be flat far from its maximum.
+    density may be flat far from its maximum. Where the curvature is not finite, all other points are far.
     """
     hessian = objective.hessian_and_gradient(mode)[0]
+    if not np.isfinite(hessian).all():
+        return 0.0 if np.array_equal(theta, mode.theta) else np.inf
     idle = prior_only(objective.density.problem, mode.theta, hessian)
     if idle.all():
         return 0.0

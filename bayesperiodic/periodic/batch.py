@@ -97,9 +97,13 @@ class Batch:
             columns = equations.residual_jacobian(anchor.z, anchor.parameters)
             if not equations.factorise(columns, anchor.z, anchored):
                 anchored.ends[0] = NO_FACTORS
-            left[e], change = smallest_singular_vectors(equations, anchor.z, columns)
-            gradient[e] = stiffness_gradient(equations, anchor.z, anchor.parameters, sensitivities[e], left[e], change)
-            right[e] = change[:, : first.count]
+            with np.errstate(all="ignore"):  # of an orbit near the ends of the numbers, at which chords are not used
+                weights, change = smallest_singular_vectors(equations, anchor.z, columns)
+                slope = stiffness_gradient(equations, anchor.z, anchor.parameters, sensitivities[e], weights, change)
+            if not (np.isfinite(weights).all() and np.isfinite(change).all() and np.isfinite(slope).all()):
+                anchored.ends[0] = NO_FACTORS
+                continue
+            left[e], right[e], gradient[e] = weights, change[:, : first.count], slope
         ranges = np.stack([np.ptp(a.z, axis=0) for a in anchors])
         ratios = np.divide(ranges, amplitude, out=np.full(ranges.shape, np.inf), where=amplitude > 0.0)
         parameters, z = np.stack([a.parameters for a in anchors]), np.stack([a.z for a in anchors])

@@ -425,7 +425,8 @@ def directional_sensitivities(
 ) -> Sensitivities | None:
     """Return derivatives along directions (directions, parameters) of the parameters; None if singular."""
     d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
-    g, f = np.tensordot(directions, d.g_theta, (1, 2)), np.tensordot(directions, d.f_theta, (1, 2))
+    with np.errstate(over="ignore", invalid="ignore"):  # of derivatives that overflow; `respond` refuses them
+        g, f = np.tensordot(directions, d.g_theta, (1, 2)), np.tensordot(directions, d.f_theta, (1, 2))
     return respond(equations, z, columns, d, g, f)
 
 

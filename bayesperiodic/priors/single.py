@@ -93,7 +93,8 @@ class Univariate(Prior, ABC):
         result = np.full(p.shape, np.nan)
         result[p == 0.0], result[p == 1.0] = low, high
         inside = (p > 0.0) & (p < 1.0)
-        result[inside] = self._quantile(p[inside])
+        with np.errstate(over="ignore", divide="ignore"):  # of distributions wider than the numbers, to infinity
+            result[inside] = self._quantile(p[inside])
         return result[()]
 
     def sample(self, size: int, generator: np.random.Generator) -> np.ndarray:
@@ -455,7 +456,7 @@ class LogUniform(_Interval):
         return -1.0 / x**2
 
     def _quantile(self, p: np.ndarray) -> np.ndarray:
-        return np.clip(self.low * np.exp(p * self._width), self.low, self.high)
+        return np.clip(np.exp(math.log(self.low) + p * self._width), self.low, self.high)
 
 
 @dataclass(frozen=True)

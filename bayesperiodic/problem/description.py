@@ -109,7 +109,8 @@ class Description(Printed):
         self.joint_prior = JointPrior.of(given, free_names(every[:-1], self.local, runs))
         self.names = self.joint_prior.names
         self.plain_names = plain_names(self.names, self.local, runs)
-        self.automatic = tuple(n for n, plain in self.plain_names.items() if n in phases or n in errors or plain in errors)
+        added = {*phases, *errors}
+        self.automatic = tuple(n for n, plain in self.plain_names.items() if {n, plain} & added)
         self._check_widths()
         self._check_free(fixed)
         check_delays(self.experiments, (*self.names, *fixed, *tied, *self.sensors.known_delays))

@@ -50,7 +50,8 @@ def with_robust_covariance(posterior: xr.Dataset, robust: xr.Dataset) -> xr.Data
     points = np.stack([column(posterior, name).ravel() for name in names], axis=-1)
     points[:, logs] = np.log(points[:, logs])
     points = stretched(points, robust["covariance"].to_numpy())
-    points[:, logs] = np.exp(points[:, logs])
+    with np.errstate(over="ignore"):  # of parameters that the data leave open by hundreds of orders of magnitude
+        points[:, logs] = np.exp(points[:, logs])
     result = posterior.copy(deep=True)
     for name, values, (low, high) in zip(names, points.T, ends, strict=True):
         variable, at = places(posterior)[name]
