@@ -29,7 +29,7 @@ from bayesperiodic.diagnostics.verdicts import (
 )
 from bayesperiodic.estimation.adequacy import misfit
 from bayesperiodic.estimation.check import with_joint
-from bayesperiodic.estimation.modes import notable
+from bayesperiodic.estimation.modes import found_from, notable
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.problem.parameters import unit
@@ -82,7 +82,8 @@ class Comparison(Result):
     synthetic, converged : bool
         Whether the data are synthetic, and whether the draws have converged.
     limitations : tuple of str
-        What the verdicts on Laplace do not show, in words: a conflict of prior and data, a misspecified model.
+        What the verdicts on Laplace do not show, in words: a conflict of prior and data, a misspecified model, and
+        optima that the starts of `map_estimate` may have missed.
 
     Examples
     --------
@@ -218,7 +219,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
         units={name: unit(group, name) for name in draws},
         synthetic=bool(posterior.tree.attrs.get("synthetic")),
         converged=posterior.converged,
-        limitations=tuple(filter(None, [fit.prior_conflict.text, misfit(problem, fit)])),
+        limitations=tuple(filter(None, [fit.prior_conflict.text, misfit(problem, fit), _on_modes(fit)])),
     )
 
 
@@ -361,6 +362,10 @@ def _scores(problem: Problem, fit: MapEstimate, posterior: Posterior, coordinate
         joint = WRONG_MODE
     joint = _consistent(joint, set(marginal.values()))
     return Scores(laplace, samples, sampled(distances), marginal, (k[0], k[1]), efficiency, joint)
+
+
+def _on_modes(fit: MapEstimate) -> str:
+    return f"The verdicts hold for the optima {found_from(len(fit.starts))}"
 
 
 def _consistent(joint: str, rows: set[str]) -> str:

@@ -19,7 +19,7 @@ from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.adequacy import misfit
 from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
-from bayesperiodic.estimation.modes import NOTABLE, notable
+from bayesperiodic.estimation.modes import NOTABLE, found_from, notable
 from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
@@ -344,15 +344,16 @@ def identifiability(
 
 def _basis(fit: MapEstimate, posterior: Posterior | None) -> str:
     """Return a sentence on what the verdicts rest on."""
-    count, optima = sum(np.isfinite(one["objective"]) for one in fit.starts), 1 + len(notable(fit.other_modes))
+    starts, optima = len(fit.starts), 1 + len(notable(fit.other_modes))
     if posterior is not None:
         fewest = min(posterior.ess[name] for name in fit.theta)
-        return f"The verdicts rest on {fewest:.0f} or more effective draws of each parameter."
-    starts = f"{count} starts" if count > 1 else "one start"
+        return (
+            f"The verdicts rest on {fewest:.0f} or more effective draws of each parameter, and hold for the modes "
+            "that these have reached."
+        )
     if optima > 1:
-        return f"No draws: the verdicts rest on the Laplace approximations at {optima} optima, found from {starts}."
-    searched = f"no other optimum was found from {starts}" if count > 1 else f"one mode was looked at, from {starts}"
-    return f"No draws: the verdicts rest on the Laplace approximation at the estimate; {searched}."
+        return f"No draws: the verdicts rest on the Laplace approximations at {optima} optima, {found_from(starts)}."
+    return f"No draws: the verdicts rest on the Laplace approximation at the only optimum {found_from(starts)}."
 
 
 def _structural_images(problem: Problem, fit: MapEstimate, structure: Structure) -> dict[str, list[float]]:

@@ -5,6 +5,10 @@ from itertools import product
 import numpy as np
 from scipy.special import stdtr, stdtrit
 
+# Distance of the maxima of a density over the logarithm and over the value, in variances of the logarithm: 1 for a
+# log-normal density, and at least 1.3 for normal ones near zero, where the maxima differ by half a standard deviation.
+MOST_OF_LOG_NORMAL = 1.15
+
 
 def shortest_interval(freedom: float, probability: float, low: float, high: float) -> tuple[float, float]:
     """Return the shortest interval of Student's t between two ends, low ≤ 0 ≤ high."""
@@ -17,6 +21,20 @@ def shortest_interval(freedom: float, probability: float, low: float, high: floa
     if -low <= high:
         return low, float(stdtrit(freedom, below + inside))
     return -shortest_interval(freedom, probability, -high, -low)[1], high
+
+
+def is_log_normal(maximum: float, over_logarithm: float, variance: float) -> bool:
+    """Return whether a density is nearer to a log-normal than to a normal one, from its maxima in both coordinates.
+
+    `variance` is that of the logarithm.
+    """
+    return bool(np.log(over_logarithm / maximum) < MOST_OF_LOG_NORMAL * variance)
+
+
+def interval_of_logarithm(freedom: float, probability: float, centre: float, sd: float) -> tuple[float, float]:
+    """Return the interval of a quantity whose logarithm has Student's t distribution with this standard deviation."""
+    factor = float(np.exp(sd * shortest_interval(freedom, probability, -np.inf, np.inf)[1]))
+    return centre / factor, centre * factor
 
 
 def carried_covariance(matrix: np.ndarray, gradients: list[np.ndarray]) -> np.ndarray:

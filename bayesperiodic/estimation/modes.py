@@ -27,6 +27,8 @@ EQUAL_OBJECTIVES = 1e-3
 CREDIBLE, MOST_SIGNS = 1e-3, 4
 # Mass of another optimum above which the estimate alone does not describe the posterior.
 NOTABLE = 0.01
+# Share of the prior from which the iteration ends at an optimum, for the statement on what the starts can miss.
+BASIN = 0.1
 
 
 @dataclass(frozen=True)
@@ -188,3 +190,22 @@ def weighed(problem: Description, ends: Sequence[End], laplaces: Sequence[JointL
 def notable(modes: Sequence[Mode]) -> list[Mode]:
     """Return the optima with more than 1 % of the mass, or with a mass that is not known."""
     return [mode for mode in modes if not mode.mass <= NOTABLE]
+
+
+def missed_by(starts: int) -> str:
+    """Return with which probability a number of starts, the first not at random, has missed an optimum, in words.
+
+    If the iteration ends at an optimum from a share p of the prior, none of n draws from it does with (1 − p)ⁿ. This
+    share is not the mass of the optimum, which may be larger or smaller.
+    """
+    if starts < 2:
+        return "others were not looked for"
+    chance = (1.0 - BASIN) ** (starts - 1)
+    return f"one that a tenth of the prior leads to is missed with a probability of {chance:.2g}"
+
+
+def found_from(starts: int) -> str:
+    """Return what is said of optima, in words: the number of starts, and what these can miss."""
+    return (
+        f"found from {starts} starts ({missed_by(starts)})" if starts > 1 else f"found from one start; {missed_by(1)}"
+    )

@@ -12,7 +12,12 @@ from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse_all
 from bayesperiodic._io import Result, Storable
 from bayesperiodic.estimation.conflict import PriorConflict
-from bayesperiodic.estimation.intervals import carried_covariance, shortest_interval
+from bayesperiodic.estimation.intervals import (
+    carried_covariance,
+    interval_of_logarithm,
+    is_log_normal,
+    shortest_interval,
+)
 from bayesperiodic.estimation.laplace import JointLaplace
 from bayesperiodic.estimation.modes import Mode, notable
 from bayesperiodic.likelihood.input_noise import InputErrors
@@ -355,8 +360,10 @@ class MapEstimate(Result):
     def interval(self, probability: float = 0.9, *, robust: bool | None = None) -> dict[str, tuple[float, float]]:
         """Return the interval of each parameter, by Student's t with `degrees_of_freedom`, within its prior's support.
 
-        It is symmetric about the estimate. Near an end of the support Student's t is restricted to the support, and
-        where the symmetric interval would leave it, the interval ends there and is one-sided.
+        It is symmetric about the estimate, or about the logarithm at `joint_mode` for those of `over_logarithm` whose
+        density is nearer to a log-normal than to a normal one, such as a LogNormal prior that the data leave as it is.
+        Near an end of the support Student's t is restricted to the support, and where the symmetric interval would
+        leave it, the interval ends there and is one-sided.
 
         Parameters
         ----------
@@ -378,9 +385,16 @@ class MapEstimate(Result):
         if not 0.0 < _checks.finite_number("probability", probability) < 1.0:
             raise ValueError(f"probability: must be between 0 and 1, got {probability!r}.")
         sds, result = self.robust_sd if (self.misspecified if robust is None else robust) else self.sd, {}
+        logarithms = self.over_logarithm
         for name, value in self.theta.items():
             freedom, sd = min(self.degrees_of_freedom[name], MOST_FREEDOM), sds[name]
             low, high = self.supports.get(name, (-np.inf, np.inf))
+            if name in logarithms and np.isfinite(sd):
+                variance = float(self.joint_covariance.loc[name, name])
+                if is_log_normal(value, logarithms[name], variance):
+                    spread = sd / self.sd[name] * np.sqrt(variance)
+                    result[name] = interval_of_logarithm(freedom, probability, logarithms[name], spread)
+                    continue
             if not np.isfinite(sd):
                 result[name] = (low, high) if sd == np.inf else (np.nan, np.nan)
                 continue

@@ -24,6 +24,7 @@ from bayesperiodic.diagnostics.model_error import MODEL_ERROR
 from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction, predict
 from bayesperiodic.estimation.adequacy import ADEQUACY_TESTS
 from bayesperiodic.estimation.map_estimate import estimation_warnings
+from bayesperiodic.estimation.modes import missed_by
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import FROM_CYCLES, JOINT
 from bayesperiodic.periodic.schemes import find_scheme
@@ -490,7 +491,7 @@ def settings(given: ReportInputs) -> Rows:
         "Problem": fingerprint(problem),
         "Difference scheme": find_scheme(problem.scheme).name,
         "Noise model": repr(problem.noise),
-        "Search for the MAP": f"{fit.status}, {steps}, {starts}",
+        "Search for the MAP": f"{fit.status}, {steps}, {starts}; of further optima, {missed_by(len(fit.starts))}",
         "Largest shift of an estimate with twice as many points": (
             f"{number(shifts[worst], 2)} sd ({worst})" if worst else "not known"
         ),

@@ -317,6 +317,7 @@ def _improper(problem: Problem) -> dict[str, str]:
 def _notes(problem: Problem, improper: dict[str, str]) -> Iterator[str]:
     """Yield what limits the comparison of evidences."""
     yield f"It can be compared with evidences of the same data alone: {', '.join(_data(problem))}."
+    yield "It is that of the modes that the draws have reached: with others, it would be larger."
     if improper:
         yield (
             f"The prior of {', '.join(improper)} is improper ({', '.join(dict.fromkeys(improper.values()))}): the "

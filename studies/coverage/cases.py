@@ -12,8 +12,7 @@ import bayesperiodic as bp
 from studies import common
 
 COVERED = 0.9
-# Largest number of data sets of a case that are sampled, and the arguments of `bp.sample`.
-SAMPLED = 100
+# Arguments of `bp.sample`.
 SAMPLING: dict[str, Any] = {"ensembles": 2, "walkers": 10, "max_steps": 300}
 # Grid of a period, forcing frequency [Hz], samples per second and noise, relative to the amplitude of the displacement.
 POINTS, FREQUENCY, RATE, NOISE = 64, 0.16, 3.317, 0.1
@@ -22,7 +21,7 @@ WIDE = {"k": bp.Normal(1.0, 100.0), "c": bp.Normal(0.5, 100.0)}
 TRUTH = {"k": 1.0, "c": 0.5}
 
 LAPLACE, ROBUST, DRAWS = "laplace", "robust", "draws"
-Task = tuple[str, int, int]
+Task = tuple[str, str, int, int]
 
 
 class Case(NamedTuple):
@@ -179,28 +178,30 @@ CASES: Mapping[str, Callable[[np.random.Generator], Case]] = {
 }
 
 
-def tasks(count: int, seed: int) -> list[Task]:
-    """Return the data sets of all cases: case, number, seed."""
-    return [(case, number, seed) for number in range(count) for case in CASES]
+def tasks(count: int, sampled: int, seed: int) -> list[Task]:
+    """Return case, kind of interval, number and seed: first `count` data sets of each case, then those to sample."""
+    numbers = [(LAPLACE, number) for number in range(count)] + [(DRAWS, number) for number in range(sampled)]
+    return [(case, kind, number, seed) for kind, number in numbers for case in CASES]
 
 
 def replicate(task: Task) -> dict[str, Any]:
-    """Return by parameter which intervals contain the truth, of one data set."""
-    name, number, seed = task
-    line: dict[str, Any] = {"case": name, "number": number, "seed": seed, "source": source()}
+    """Return by parameter which intervals contain the truth, of one data set: robust ones with those by Laplace."""
+    name, kind, number, seed = task
+    line: dict[str, Any] = {"case": name, "kind": kind, "number": number, "seed": seed, "source": source()}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         case = CASES[name](np.random.default_rng([zlib.crc32(name.encode()), seed, number]))
         try:
             fit = bp.map_estimate(case.problem, start=case.start, starts=1, progress=False)
-            ends = {LAPLACE: fit.interval(COVERED, robust=False), ROBUST: fit.interval(COVERED, robust=True)}
-            if number < SAMPLED:
-                ends[DRAWS] = drawn(case.problem, fit, number)
+            if kind == DRAWS:
+                ends = {DRAWS: drawn(case.problem, fit, number)}
+            else:
+                ends = {LAPLACE: fit.interval(COVERED, robust=False), ROBUST: fit.interval(COVERED, robust=True)}
         except (RuntimeError, ValueError) as error:
             return line | {"error": f"{type(error).__name__}: {error}"}
     found = {
-        kind: {q: bool(interval[q][0] < value < interval[q][1]) for q, value in case.truth.items()}
-        for kind, interval in ends.items()
+        each: {q: bool(interval[q][0] < value < interval[q][1]) for q, value in case.truth.items()}
+        for each, interval in ends.items()
     }
     return line | {"status": fit.status, "misspecified": fit.misspecified, "covered": found}
 

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics.model_error import MODEL_ERROR, UP_TO, ErrorPart, model_errors
+from bayesperiodic.diagnostics.model_error import MODEL_ERROR, ErrorPart, model_errors
 
 GAIN = bp.Model("gain", states=["w"], inputs=["u"], parameters=["a"], equations=["dw + w - u"], outputs={"y": "a*u"})
 TIME = np.arange(10 * 64) / 64

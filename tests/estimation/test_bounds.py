@@ -108,3 +108,21 @@ def test_an_estimate_that_depends_on_the_coordinate_is_printed_as_such(median, s
     assert list(fit.over_logarithm) == ["s"] * named and len(fit.modes) == 1
     if named:
         assert fit.theta["s"] < 200.0 and fit.over_logarithm["s"] == pytest.approx(median, rel=0.1)
+
+
+@pytest.mark.parametrize(("median", "spread"), [(5000.0, 2.0), (3.0, 1.0)])
+def test_the_interval_of_a_parameter_without_influence_is_that_of_its_prior(median, spread):
+    """90 % of LogNormal(median, s) are between median·exp(±1.645 s); about the mode of the density it would be less."""
+    tau = np.arange(64) / 64
+    u = np.cos(2 * np.pi * tau)
+    y = 1.2 * u + 0.03 * np.random.default_rng(0).standard_normal(64)
+    run = bp.Experiment("run", 0.3, {"y": y}, {"u": u}, samples=64, harmonics={"y": 5})
+    model = bp.Model(
+        "idle", states=["w"], inputs=["u"], parameters=["a", "s"], equations=["dw + w - u"],
+        outputs={"y": "a*u + 1e-12*s*w"},
+    )  # fmt: skip
+    priors = {"a": bp.Normal(1.0, 10.0), "s": bp.LogNormal(median, spread)}
+    fit = bp.map_estimate(bp.Problem(model, [run], priors=priors, scheme="fourier"), progress=False)
+    for robust in (False, True):
+        ends = fit.interval(0.9, robust=robust)["s"]
+        assert ends == pytest.approx(priors["s"].quantile(np.array([0.05, 0.95])), rel=0.02)
