@@ -279,7 +279,8 @@ def with_uncertain_noise(
     the restricted likelihood (see `bias_correction`), with θ integrated out; the covariance is that of the mixture
     about the estimate. The changes of the covariance by several channels are added.
     """
-    shaped = [group for group in problem.likelihood.groups() if _is_shaped(problem, *group)]
+    groups = problem.likelihood.groups()
+    shaped = [(names, members) for names, members in groups if _is_shaped(problem, names, members) and names[0] in parts]
     if not np.all(np.diag(covariance) > 0.0):
         return covariance
     result = covariance.copy()

@@ -11,8 +11,8 @@ from bayesperiodic.likelihood.input_noise import FROM_CYCLES, error_waves
 from bayesperiodic.likelihood.noise_spectrum import NoiseSpectrum
 from bayesperiodic.problem.description import Description
 
-# Share of a variance in that of every component, below which it counts as zero.
-LEAST_SHARE = 1e-6
+# Share of an estimated variance in those of the components, below which it counts as zero.
+LEAST_SHARE = 1e-3
 
 
 class NoiseChange(NamedTuple):
@@ -64,8 +64,10 @@ class _Part(NamedTuple):
         """Return the change with the variances of errors of inputs, shares (errors,), loadings (components, errors)."""
         root = np.sqrt(np.concatenate([np.broadcast_to(p, b.size) for p, b in self._each()]))
         white = self.again(root * loadings.T)
-        along, gram = self.changes @ white.T * np.sqrt(share), (white @ white.T) * np.sqrt(np.outer(share, share))
-        return NoiseChange(along @ along.T, along @ gram @ along.T, float(np.trace(gram)), float(np.sum(gram**2)))
+        along, gram = self.changes @ white.T, white @ white.T
+        moved = along * share
+        square = float(share @ gram**2 @ share)
+        return NoiseChange(moved @ along.T, moved @ gram @ moved.T, float(share @ np.diag(gram)), square)
 
     def _each(self) -> Iterator[tuple[np.ndarray, Block]]:
         return zip(self.precisions, self.blocks, strict=True)
@@ -98,10 +100,10 @@ def changes_by_variance(
                 for b, block in zip(part.members, part.blocks, strict=True)
             ]
             share = np.concatenate(each)
-            if share.max() > least:
-                change = part.change(share)
-                result[name] = result[name] + change if name in result else change
-    return result
+            change = part.change(share)
+            result[name] = result[name] + change if name in result else change
+    counts = likelihood.counts
+    return {name: change for name, change in result.items() if change.trace > least * counts[name]}
 
 
 def changes_by_measured(
@@ -130,8 +132,6 @@ def _of_outputs(
         every = block.spectrum_measured if block.spectrum_measured.size else block.measured
         share = np.zeros(part.weight.size)
         share[first:last] = np.minimum(every / variances, 1.0)
-        if not share.max() > LEAST_SHARE:
-            continue
         spectrum = NoiseSpectrum.of(experiment, block.channel) if block.spectrum_measured.size else None
         if spectrum is None:
             if experiment.cycles > 1:

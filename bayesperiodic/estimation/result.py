@@ -541,7 +541,12 @@ class MapEstimate(Result):
 
     @property
     def without_noise(self) -> tuple[str, ...]:
-        """Channels of unknown variance whose residuals are rounding errors: no standard deviation follows from them."""
+        """Channels of unknown variance whose residuals are rounding errors: no standard deviation follows from them.
+
+        None where errors of the inputs may explain all of the residuals.
+        """
+        if any(errors.loadings.any() for errors in self.input_errors.values()):
+            return ()
         names = {name.partition(", ")[0] for name in self.independent}
         return tuple(c for c, fraction in self.fvu.items() if c in names and fraction < ROUNDING_VARIANCE)
 

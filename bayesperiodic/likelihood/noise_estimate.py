@@ -11,8 +11,10 @@ from bayesperiodic.likelihood.noise import FLAT_PRIOR, JEFFREYS, VARIANCE, Indep
 from bayesperiodic.likelihood.section_points import SCALE
 
 LOWEST_LOG_SCALE, HIGHEST_LOG_SCALE = 25.0, 8.0
+# The same for variances beside errors of the inputs, where smaller ones make the linearisation ill-conditioned.
+LOWEST_BESIDE_INPUTS = 14.0
 # Difference of log-densities that is none.
-FLAT = 1e-7
+FLAT = 1e-11
 
 
 def estimate_noise(
@@ -83,7 +85,8 @@ def _maximise(
         return (-value, -slopes[free]) if np.isfinite(value) else (1e300, np.zeros(len(free)))
 
     middle = np.log(centre[free])
-    bounds = [(c - LOWEST_LOG_SCALE, c + HIGHEST_LOG_SCALE) for c in middle]
+    lowest = LOWEST_BESIDE_INPUTS if part.shared else LOWEST_LOG_SCALE
+    bounds = [(c - lowest, c + HIGHEST_LOG_SCALE) for c in middle]
     here = np.clip(np.log(start[free]), *np.transpose(bounds))
     optimum = minimize(
         negative,

@@ -15,7 +15,7 @@ from bayesperiodic import _fourier
 from bayesperiodic.diagnostics import calibration
 from bayesperiodic.estimation.adequacy import misfit
 from bayesperiodic.likelihood.block import Block
-from bayesperiodic.likelihood.input_noise import pooled, same
+from bayesperiodic.likelihood.input_noise import same
 from bayesperiodic.likelihood.likelihood import Likelihood
 from bayesperiodic.likelihood.mean_period import MeanPeriod
 from bayesperiodic.likelihood.multipliers import Multipliers
@@ -136,12 +136,6 @@ def test_jeffreys_prior_is_the_root_of_the_information_and_proper():
         assert likelihood.log_prior(np.array([v])) == pytest.approx(expected, rel=1e-9)
     ends = likelihood.log_prior(np.array([[1e-12], [1e-10]]))
     assert ends[1] - ends[0] == pytest.approx(np.log(100.0), rel=1e-6)
-
-
-def test_variances_of_amplitudes_are_averaged_over_neighbours_by_their_freedom():
-    variance, freedom = np.array([9.0, 1.0, 2.0, 3.0, 40.0]), np.array([2.0, 4.0, 4.0, 8.0, 4.0])
-    expected = [9.0, (4 + 8 + 24) / 16, (4 + 8 + 24 + 160) / 20, (4 + 8 + 24 + 160) / 20, (8 + 24 + 160) / 16]
-    assert pooled(variance, freedom) == pytest.approx(expected)
 
 
 STATIC = formula_model("static", ["a", "c"], lambda p, u, s: {"y": p.a * u.x + p.c * u.x**3})
@@ -276,15 +270,18 @@ def gained(run: bp.Experiment, **settings: object) -> bp.MapEstimate:
     return bp.map_estimate(bp.Problem(GAIN, [run], priors={"a": bp.Normal(0.0, 10.0)}, **settings), starts=1, **QUIET)
 
 
-def test_noise_of_inputs_is_integrated_out_by_default_from_five_cycles_on():
+def test_noise_of_inputs_is_integrated_out_by_default_where_the_cycles_show_it():
     run = noisy_gain(1)
     fit = gained(run)
     assert same(fit.input_errors, gained(run, input_noise="measured").input_errors) and fit.input_errors
     assert not same(fit.input_errors, gained(run, input_noise="exact").input_errors)
-    with pytest.warns(UserWarning, match="inputs are taken as exact. Fold at least 5 cycles, and take input_noise"):
-        few = gained(noisy_gain(1, cycles=4))
-    assert not few.input_errors and not few.input_sd["run"]["x"].any()
-    problem = bp.Problem(GAIN, [noisy_gain(1, cycles=4)], priors={"a": bp.Normal(0.0, 10.0)})
+    few = gained(noisy_gain(1, cycles=3))
+    assert few.input_errors and few.input_sd["run"]["x"].any()
+    single = replace(run, cycles=1)
+    with pytest.warns(UserWarning, match="inputs are taken as exact. Fold at least 2 cycles, and take input_noise"):
+        alone = gained(single)
+    assert not alone.input_errors and not alone.input_sd["run"]["x"].any()
+    problem = bp.Problem(GAIN, [single], priors={"a": bp.Normal(0.0, 10.0)})
     assert problem.input_noise == "exact" and problem.with_experiments([run]).noisy_inputs == {"run": ["x"]}
 
 
