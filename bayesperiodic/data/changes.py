@@ -289,7 +289,9 @@ def _effects(every: Courses, posterior: _Posterior) -> Changes:
         size=np.einsum("ma,mad->d", ends, first[slow]),
         error=np.maximum(posterior.error, least) * np.sqrt(count / remaining)[:, None],
         place=int(every.place[steps[np.argmax(weight[steps])]]),
-        swing=np.abs(np.einsum("mka,mad->mkd", every.values[turning], first[turning])).max(axis=1, initial=0.0).sum(axis=0),
+        swing=np.abs(np.einsum("mka,mad->mkd", every.values[turning], first[turning]))
+        .max(axis=1, initial=0.0)
+        .sum(axis=0),
         beat=(2.0 * np.pi / max(float(every.turn[fastest]), LEAST_TURN / count), float(every.place[fastest])),
         oscillating=float(weight[turning].sum()),
     )

@@ -106,9 +106,7 @@ def changes_by_variance(
     return {name: change for name, change in result.items() if change.trace > least * counts[name]}
 
 
-def changes_by_measured(
-    problem: Description, jacobian: Any, noise: np.ndarray
-) -> Iterator[tuple[NoiseChange, float]]:
+def changes_by_measured(problem: Description, jacobian: Any, noise: np.ndarray) -> Iterator[tuple[NoiseChange, float]]:
     """Yield the change with each measured variance of noise, of outputs and inputs, and its degrees of freedom."""
     experiments = {e.name: e for e in problem.experiments}
     for part in _parts(problem, jacobian, noise):
