@@ -146,7 +146,7 @@ class Changes:
 
 
 def courses(count: int, transient: float, longest: float) -> Courses:
-    """Return courses over so many cycles, with this probability of a transient; slower ones than the longest are drifts."""
+    """Return courses over so many cycles, with this probability of a transient, and the longest decay time of one."""
     cycle = np.arange(count, dtype=float)
     every: list[tuple[np.ndarray, str, float, float, float]] = []
     decays = np.geomspace(SHORTEST_DECAY, max(LONGEST_DECAY * count, 2.0 * SHORTEST_DECAY), DECAYS)
