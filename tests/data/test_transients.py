@@ -50,6 +50,7 @@ def test_light_damping_is_named(quality, cycles):
         assert serious, (ratio, bias)
 
 
+@pytest.mark.slow
 def test_transients_are_left_out():
     """Of what is folded without a serious finding, the bias is below 0.3 standard errors in half, 0.6 in 90 %."""
     cases = [
