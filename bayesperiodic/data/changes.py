@@ -27,8 +27,9 @@ SHORTEST_DECAY, LONGEST_DECAY, DECAYS, FREQUENCIES = 0.3, 0.5, 12, 13
 NEAR, NEARBY, STEP_PLACES, FIRST_STEP, MOST_TONES = (0.7, 1.5), 0.7, 64, 2, 64
 # Share of a channel's standard deviation below which noise does not count.
 SMALLEST_NOISE = 1e-6
-# Longest decay time relative to the recording of a transient of which a part can be left out; slower ones are drifts.
-LONGEST_CUT = 0.5
+# Longest decay time relative to the recording of a transient of which a part can be left out, of a driven and of a
+# free-running motion, whose drifts of the period look like slower ones; slower ones are drifts.
+LONGEST_CUT, LONGEST_CUT_FREE = 0.5, 0.25
 # Probability of a change from which its course is fitted, and longest decay time of it relative to the recording.
 WORTH_A_FIT, LONGEST_FITTED = 0.2, 20.0
 # Angle over the recording from which a change oscillates.
@@ -50,6 +51,7 @@ class Courses:
     place: np.ndarray  # (courses,) decay time, or first cycle after a step
     turn: np.ndarray  # (courses,) angle by which an oscillation turns in a cycle
     constant: float  # probability of no change
+    longest: float  # decay time of a transient, relative to the recording
 
     def refined(self, index: int, shape: np.ndarray) -> "Courses":
         """Return the courses and one more: the best fit to components (cycles, components) near one of them."""
@@ -88,7 +90,7 @@ class Courses:
     def _with(self, values: np.ndarray, index: int, decay: float, turn: float) -> "Courses":
         """Return the courses and one more with half the prior probability of one of them."""
         count = self.values.shape[1]
-        kind = TRANSIENT if decay <= LONGEST_CUT * count else DRIFT
+        kind = TRANSIENT if decay <= self.longest * count else DRIFT
         prior = np.append(self.prior, self.prior[index] + np.log(0.5))
         prior[index] += np.log(0.5)
         return Courses(
@@ -101,6 +103,7 @@ class Courses:
             np.append(self.place, decay),
             np.append(self.turn, turn),
             self.constant,
+            self.longest,
         )
 
 
@@ -142,8 +145,8 @@ class Changes:
         return np.sqrt(np.sum((self.transient / self.error) ** 2, axis=1))
 
 
-def courses(count: int, transient: float) -> Courses:
-    """Return courses over so many cycles, with this probability of a transient."""
+def courses(count: int, transient: float, longest: float) -> Courses:
+    """Return courses over so many cycles, with this probability of a transient, and the longest decay time of one."""
     cycle = np.arange(count, dtype=float)
     every: list[tuple[np.ndarray, str, float, float, float]] = []
     decays = np.geomspace(SHORTEST_DECAY, max(LONGEST_DECAY * count, 2.0 * SHORTEST_DECAY), DECAYS)
@@ -153,7 +156,7 @@ def courses(count: int, transient: float) -> Courses:
         for angles, part in ((near, NEARBY), (linear[1:], 1.0 - NEARBY)):
             for angle in angles:
                 course = np.exp(-cycle / decay + 1j * angle * cycle)
-                kind = TRANSIENT if decay <= LONGEST_CUT * count else DRIFT
+                kind = TRANSIENT if decay <= longest * count else DRIFT
                 every.append((course, kind, transient * part / decays.size / len(angles), decay, angle))
     rest = 1.0 - transient
     fading = len(every)
@@ -171,7 +174,7 @@ def courses(count: int, transient: float) -> Courses:
     kinds, prior = np.array([k for _, k, *_ in every]), np.log([p for _, _, p, *_ in every])
     place, turn = np.array([p for *_, p, _ in every]), np.array([a for *_, a in every])
     constant = rest * (1.0 - DRIFTING - STEPPING - SOUNDING)
-    return Courses(values, single, np.arange(len(every)) < fading, kinds, prior, place, turn, constant)
+    return Courses(values, single, np.arange(len(every)) < fading, kinds, prior, place, turn, constant, longest)
 
 
 def _covariances(count: int) -> list[tuple[float, np.ndarray]]:
@@ -185,9 +188,12 @@ def _covariances(count: int) -> list[tuple[float, np.ndarray]]:
     return [(float(np.log(p)), np.linalg.cholesky(c)) for p, c in zip(priors, [np.eye(count), *lasting], strict=True)]
 
 
-def changes(shape: np.ndarray, transient: float) -> Changes:
-    """Return the expected changes of components (cycles, components), with this probability of a transient before."""
-    every = courses(len(shape), transient)
+def changes(shape: np.ndarray, transient: float, longest: float = LONGEST_CUT) -> Changes:
+    """Return the expected changes of components (cycles, components), with this probability of a transient before.
+
+    Transients that decay more slowly than the longest, relative to the recording, are drifts.
+    """
+    every = courses(len(shape), transient, longest)
     first = _posterior(shape, every, _independent(shape, None))
     best = int(np.argmax(first.weight))
     if first.weight.sum() < WORTH_A_FIT or every.kind[best] == STEP:

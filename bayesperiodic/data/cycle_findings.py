@@ -27,6 +27,8 @@ HARMLESS_BEAT, BEAT_FALSE_ALARM, FEWEST_FOR_BEATS = 0.01, 1e-4, 24
 # Beats of the whole recording: turns with one line beside the harmonic or two, step of the number of turns, share of
 # the variance of the amplitude that they explain, and fewest windows.
 LEAST_TURNS, STEP_OF_TURNS, EXPLAINED, FEWEST_FOR_SLOW_BEATS = (0.9, 1.75), 0.125, 0.9, 12
+# Turns below which a beat looks like a ramp up and down.
+FEW_TURNS = 1.5
 # Range of the logarithm of an amplitude that differs in its phase only: in itself, and in standard deviations.
 SAME_SIZE, SAME_IN_NOISE = 0.03, 4.0
 BEATING, PHASE_STEP = "beating", "phase step"
@@ -83,8 +85,10 @@ def slow_beats(channels: Sequence[str], time: np.ndarray, every: Windows, freque
             beat = turns * frequency / (len(line) * part.cycles)
             yield Finding(
                 BEATING, channel, SERIOUS, np.array([[time[part.first[0]], time[part.last[-1] - 1]]]), len(line), 1.0,
-                np.nan, f"the amplitude of {channel} beats at {beat:.4g} Hz by {amplitude:.1%}",
-                "a second frequency is in the signals: remove its source, or average whole beats",
+                np.nan, f"the amplitude of {channel} beats at {beat:.4g} Hz by {amplitude:.1%}"
+                + (", or ramps up and down" if turns < FEW_TURNS else ""),
+                "a second frequency is in the signals: remove its source, or average whole beats"
+                + ("; of ramps record the steady part" if turns < FEW_TURNS else ""),
             )  # fmt: skip
 
 

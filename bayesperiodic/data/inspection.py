@@ -295,8 +295,8 @@ def _steady_of(
     if first:
         tracked = refine_groups(some, tracked, few, other)[0].frequency
     every = common_windows(some, tracked)
-    steady = steady_part(every.all)
     driven = any(group.inputs for group in some)
+    steady = steady_part(every.all, driven)
     # At the frequency of its steady part, a motion without a drive has other steady parts.
     for _ in range(MOST_REFINEMENTS if driven else 1):
         if steady is None or not refined or steady.level == (0, some[0].time.size):
@@ -306,7 +306,7 @@ def _steady_of(
         parts = [group.part(part) for group, part in zip(some, used, strict=True)]
         tracked = refine_groups(parts, tracked, few, other)[0].frequency
         every = common_windows(some, tracked)
-        steady = steady_part(every.all)
+        steady = steady_part(every.all, driven)
         if steady is None or steady.level == before or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
             break
     if steady is not None and refined and not driven and steady.level != (0, some[0].time.size):
@@ -315,7 +315,7 @@ def _steady_of(
             # A phase that walks at random is no transient.
             again = common_windows(some, fit.frequency)
             again = replace(again, all=again.all.aligned())
-            longer = steady_part(again.all)
+            longer = steady_part(again.all, driven)
             if longer is not None:
                 return again, longer, fit.frequency
     return every, steady, tracked

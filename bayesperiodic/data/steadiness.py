@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from bayesperiodic import _fourier
-from bayesperiodic.data.changes import POSSIBLE, PROBABLE, TRANSIENT, Changes, changes
+from bayesperiodic.data.changes import LONGEST_CUT, LONGEST_CUT_FREE, POSSIBLE, PROBABLE, TRANSIENT, Changes, changes
 from bayesperiodic.data.coverage import SLOW, determined_harmonics, per_cycle, resolved_harmonics
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES, fit_harmonics
 
@@ -32,8 +32,8 @@ DISTANT, DISTANT_MEAN = 3.0, 12.0
 FEWEST_FOR_MEDIAN = 9
 # Windows from which changes are searched for, and false-alarm rate of a significant slope.
 FEWEST_FOR_CHANGES, SLOPE_FALSE_ALARM = 5, 1e-4
-# Probability of a transient from which the start is left out; with few windows, in which noise looks like one more
-# often, it has to be clear.
+# Probability of a transient from which the start is left out; more than half of the cycles are left out, and those of
+# few windows, in which noise looks like one more often, only if it is clear.
 LEFT_OUT, LEFT_OUT_OF_FEW, FEW_WINDOWS = 0.5, 0.95, 10
 # Weight of the squared bias by a transient relative to the variance, where cycles are left out.
 BIAS_WEIGHT = 4.0
@@ -208,8 +208,9 @@ class Steady:
         return replace(self, part=part, samples=slice(int(part.first[0]), int(part.last[-1])), level=level)
 
 
-def steady_part(every: Windows) -> Steady | None:
+def steady_part(every: Windows, driven: bool) -> Steady | None:
     """Return the steady part of a recording; None if less than three cycles have one level."""
+    longest = LONGEST_CUT if driven else LONGEST_CUT_FREE
     first, last = plateau(every) if len(every.first) > every.overlap else (0, 0)
     if last - first <= (MINIMUM_CYCLES - 1) * every.overlap // every.cycles:
         return None
@@ -223,15 +224,16 @@ def steady_part(every: Windows) -> Steady | None:
         return Steady(part, _samples(part), level, np.zeros(part.amplitudes.shape[1:]), change)
     began = part.place[0] - every.place[0] >= part.overlap
     components = _components(part.amplitudes)
-    effects = changes(components, PROBABLE if began else POSSIBLE)
+    effects = changes(components, PROBABLE if began else POSSIBLE, longest)
     # The mean square error of what is biased is least; a bias counts more than noise, whose size is known.
     error = (1.0 + BIAS_WEIGHT * effects.bias**2) / np.arange(len(components), 0, -1)
     least = LEFT_OUT_OF_FEW if len(components) < FEW_WINDOWS else LEFT_OUT
-    clear = effects.probability[TRANSIENT] > least
-    first = int(np.argmin(error[: len(error) - MINIMUM_CYCLES + 1])) if clear else 0
+    probable, clear = (effects.probability[TRANSIENT] > p for p in (least, LEFT_OUT_OF_FEW))
+    most = len(error) - MINIMUM_CYCLES + 1 if clear else len(error) // 2
+    first = int(np.argmin(error[:most])) if probable else 0
     part = part.chosen(slice(first, None))
     enough = len(part.first) >= FEWEST_FOR_CHANGES
-    later = changes(components[first:], POSSIBLE) if first and enough else effects
+    later = changes(components[first:], POSSIBLE, longest) if first and enough else effects
     squares, slow = effects.squares[first], later if enough else effects
     # What noise alone would show is in the variance already.
     if slow.slow:
