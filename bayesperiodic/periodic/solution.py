@@ -254,7 +254,7 @@ class PeriodicSolution(Result):
 
     @property
     def resolved(self) -> bool:
-        """True if the solve has converged and no trivial multiplier is wrong by more than 10 %; else take more points."""
+        """True if the solve has converged, and an autonomous orbit's trivial multiplier is right to 10 %."""
         return self.converged and not self.trivial_error > TRIVIAL_ERROR
 
     @property
