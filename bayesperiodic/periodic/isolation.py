@@ -11,10 +11,14 @@ from bayesperiodic import _fourier
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import CyclicGrid, find_scheme
 
-# Points of the grids that are tried, Gauss-Newton steps, residual of a solution and smallest singular values that count
-# as zero, equations and unknowns scaled, and the range of an orbit that has not shrunk, in units of the guess's.
-FAMILY_POINTS, FAMILY_STEPS = (81, 161), 15
-FAMILY_RESIDUAL, FAMILY_SINGULAR, NOT_SHRUNK = 1e-8, 1e-6, 0.1
+# Points of the grids that are tried, and most unknowns, Gauss-Newton steps.
+FAMILY_POINTS, MOST_FAMILY_UNKNOWNS, FAMILY_STEPS = (81, 161, 321), 700, 15
+# Residual of a cycle, singular values that are left out of a step, and the range of an orbit that has not shrunk, in
+# units of the guess's.
+FAMILY_RESIDUAL, LEFT_OUT, NOT_SHRUNK = 1e-10, 1e-6, 0.1
+# Smallest singular value of a family (of conservative models up to 1e-12 where the grid resolves them) and of a cycle
+# that is clearly isolated (van der Pol's: 3e-3 and more).
+ONE_OF_MANY, ISOLATED = 1e-8, 1e-5
 
 MANY_CYCLES = (
     "near one there are others for the same parameters, as in conservative models, so that the parameters do not "
@@ -28,35 +32,44 @@ def has_neighbours(equations: PeriodicEquations, theta: np.ndarray, z: np.ndarra
 
     False also if no cycle is found there.
     """
-    return any(_in_family(equations, theta, z, frequency, points) for points in FAMILY_POINTS)
+    for points in FAMILY_POINTS:
+        if points * z.shape[1] > MOST_FAMILY_UNKNOWNS and points > FAMILY_POINTS[0]:
+            break
+        smallest = _smallest_singular_value(equations, theta, z, frequency, points)
+        if smallest < ONE_OF_MANY or smallest > ISOLATED:
+            return bool(smallest < ONE_OF_MANY)
+    return False
 
 
-def _in_family(equations: PeriodicEquations, theta: np.ndarray, z: np.ndarray, frequency: float, points: int) -> bool:
+def _smallest_singular_value(
+    equations: PeriodicEquations, theta: np.ndarray, z: np.ndarray, frequency: float, points: int
+) -> float:
+    """Return that of the linearised equations at the cycle nearest to a guess; NaN if none is found."""
     grid = CyclicGrid(find_scheme("fourier"), points, 1)
     z = _fourier.on_grid(_fourier.coefficients(z.T), points).T
     here = PeriodicEquations(equations.model, grid, frequency, np.empty((points, 0)), equations.drift)
     size = np.ptp(z, axis=0)
     if not np.all(np.isfinite(z)) or not np.any(size > 0.0):
-        return False
+        return np.nan
     scales = np.where(size > 0.0, size, size.max())
     step = np.inf
     for _ in range(FAMILY_STEPS):
         here = here.at_frequency(frequency)
         residual, matrix = _linearised(here, theta, np.ascontiguousarray(z), scales)
         if not (np.isfinite(residual).all() and np.isfinite(matrix).all()):
-            return False
+            return np.nan
         if np.abs(residual).max() < FAMILY_RESIDUAL and step < 1.0:
             break
-        change = np.linalg.lstsq(matrix, -residual, rcond=FAMILY_SINGULAR)[0]
+        change = np.linalg.lstsq(matrix, -residual, rcond=LEFT_OUT)[0]
         step = float(np.abs(change).max())
         change /= max(1.0, 2.0 * step)
         z = z + change[:-1].reshape(z.shape) * scales
         frequency *= float(np.exp(change[-1]))
     else:
-        return False
+        return np.nan
     if np.any(np.ptp(z, axis=0) < NOT_SHRUNK * size):
-        return False
-    return bool(np.linalg.svd(matrix, compute_uv=False)[-1] < FAMILY_SINGULAR)
+        return np.nan
+    return float(np.linalg.svd(matrix, compute_uv=False)[-1])
 
 
 def _linearised(

@@ -254,8 +254,8 @@ class PeriodicSolution(Result):
 
     @property
     def resolved(self) -> bool:
-        """False if the trivial multiplier of an autonomous orbit is wrong by more than 10 %: take more points."""
-        return not self.trivial_error > TRIVIAL_ERROR
+        """True if the solve has converged, and an autonomous orbit's trivial multiplier is right to 10 %."""
+        return self.converged and not self.trivial_error > TRIVIAL_ERROR
 
     @property
     def stable(self) -> bool | None:
@@ -316,7 +316,7 @@ class PeriodicSolution(Result):
 
 def resolution_warning(solution: PeriodicSolution, orbit: str) -> str:
     """Return a warning, about an orbit that is named, if the trivial multiplier shows that it is not resolved."""
-    if solution.resolved:
+    if solution.resolved or not solution.converged:
         return ""
     spectral = np.isinf(solution.scheme.order)
     error = np.nan if spectral else solution.error_estimate()[FREQUENCY] / solution.frequency
