@@ -27,7 +27,7 @@ MISSING = [
 # Lines among which the header is searched for, and separators of fields, in the order in which they are tried.
 PREAMBLE, SEPARATORS = 1000, (",", ";", "\t")
 # Bytes that are decoded at once, and columns per wanted column above which the others are not made numbers.
-PART_BYTES, WIDE = 2**20, 2
+PART_BYTES, UNWANTED_RATIO = 2**20, 2
 
 # Bytes of an array, against files that unpack to more than the memory.
 LARGEST_ARRAY = 2**31
@@ -129,8 +129,8 @@ class _Text:
                     ) from None
                 if "\0" in text:
                     raise ValueError(
-                        f"path: must be a CSV file in {name}, got {self!r}, which contains bytes 0; it was damaged when "
-                        f"it was written, or is no text in {name}; see encoding, such as encoding='utf-16'."
+                        f"path: must be a CSV file in {name}, got {self!r}, which contains bytes 0; it was damaged "
+                        f"when it was written, or is no text in {name}; see encoding, such as encoding='utf-16'."
                     )
                 line += text.count("\n")
 
@@ -163,7 +163,7 @@ def _csv_columns(file: _Text, wanted: list[str]) -> Stored:
             alone, surplus = width == 1, max(more, 0) + 1
             if alone:
                 source = io.StringIO(text.read().rstrip())
-            elif WIDE * len(places) < width:
+            elif UNWANTED_RATIO * len(places) < width:
                 rows = csv.reader(text, delimiter=separator, skipinitialspace=True, strict=True)
                 source = _narrowed(rows, [*places.values()], width, width + surplus)
                 width, surplus = len(places) + 1, 1
@@ -252,10 +252,10 @@ def _line_of_names(file: _Text, columns: list[str], separator: str) -> tuple[lis
                 more, following = len(row) - len(names), False
                 if most == len({*columns}):
                     break
-            found = [name.strip() for name in row]
-            if (count := len({*columns} & {*found})) > most:
+            fields = [name.strip() for name in row]
+            if (count := len({*columns} & {*fields})) > most:
                 most, number, more, following = count, rows.line_num, 0, True
-                names = found[: max((i for i, name in enumerate(found, 1) if name), default=len(found))]
+                names = fields[: max((i for i, name in enumerate(fields, 1) if name), default=len(fields))]
     if most < 0:
         raise ValueError(f"path: must be a CSV file with a header line, got {file!r}, which is empty.")
     return names, number, more

@@ -361,7 +361,7 @@ def test_wide_and_narrow_files_are_read_alike(tmp_path, monkeypatch, table, chan
     (tmp_path / "run.csv").write_bytes(f"t,x,n\n{table}".encode())
     found = []
     for wide in (10**9, 0):  # as a narrow file and as a wide one
-        monkeypatch.setattr(files, "WIDE", wide)
+        monkeypatch.setattr(files, "UNWANTED_RATIO", wide)
         try:
             run = bp.Recording.from_csv(tmp_path / "run.csv", time="t", outputs={"x": channel}, missing="drop")
             found.append((np.array(run.time).tolist(), run.outputs["x"].tolist()))
