@@ -9,6 +9,8 @@ from typing import Any, NoReturn
 import numpy as np
 
 MOST_LETTERS, MOST_LISTED = 200, 12
+# Names above which not all are listed, such as the columns of a wide file.
+MANY = 100
 # Sizes of measured values, whose squares and their ratios must be numbers.
 SMALLEST_VALUE, LARGEST_VALUE = 1e-100, 1e100
 
@@ -22,7 +24,8 @@ def one_of(argument: str, value: Any, allowed: Iterable[str]) -> None:
     near = near or difflib.get_close_matches(str(value)[:MOST_LETTERS], names, n=1, cutoff=0.4)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     shown = repr(value) if isinstance(value, str) and len(value) <= MOST_LETTERS else shortened(value)
-    choice = f"{'one of ' if len(names) > 1 else ''}{_listed(names)}" if names else "left out"
+    listed = f"{_listed(names[:MOST_LISTED])}, … ({len(names)} in all)" if len(names) > MANY else _listed(names)
+    choice = f"{'one of ' if len(names) > 1 else ''}{listed}" if names else "left out"
     raise ValueError(f"{argument}: must be {choice}, got {shown}.{hint}")
 
 

@@ -53,9 +53,9 @@ def _member(group: h5py.Group, name: str) -> h5py.Dataset | h5py.Group:
     return item
 
 
-def values(item: h5py.Dataset, largest: float) -> Any:
-    """Return the values of an array from `dataset`; raise a ValueError if some are missing, or of more bytes."""
-    _check(item, largest, f"than {largest / 1e9:.3g} GB")
+def values(item: h5py.Dataset, largest: float, remedy: str) -> Any:
+    """Return the values of an array from `dataset`; raise a ValueError if some are missing, or they are too large."""
+    _check(item, largest, f"than {largest / 1e9:.3g} GB; {remedy}")
     return item[()]
 
 

@@ -81,8 +81,8 @@ def in_one_thread(function: Callable[Arguments, Value]) -> Callable[Arguments, V
 class _OneThread:
     """The limit of one BLAS thread, which ends when the last of the threads that hold it has left it.
 
-    The number of threads belongs to the process: a block that restored the number that it found would restore the limit
-    of another one that began before. Where each thread has a number of its own (OpenMP), it restores that one.
+    The number of threads belongs to the process: a block that restored what it saw at its start would restore the limit
+    of another one that began before. Where each thread has its own number (OpenMP), it restores that one.
     """
 
     def __init__(self) -> None:
@@ -93,22 +93,22 @@ class _OneThread:
     def __enter__(self) -> None:
         libraries, thread = _libraries(), threading.get_ident()
         with self._lock:
-            found = [library.get_num_threads() for library in libraries]
+            numbers = [library.get_num_threads() for library in libraries]
             if not self._held:
-                self._before = found
-            self._held.setdefault(thread, []).append(found)
+                self._before = numbers
+            self._held.setdefault(thread, []).append(numbers)
             for library in libraries:
                 _set_threads(library, 1)
 
     def __exit__(self, *_: object) -> None:
         libraries, thread = _libraries(), threading.get_ident()
         with self._lock:
-            found = self._held[thread].pop()
+            numbers = self._held[thread].pop()
             if not self._held[thread]:
                 del self._held[thread]
-            for library, own, shared in zip(libraries, found, self._before, strict=True):
+            for library, local, shared in zip(libraries, numbers, self._before, strict=True):
                 if getattr(library, "threading_layer", None) == "openmp":
-                    _set_threads(library, own)
+                    _set_threads(library, local)
                 elif not self._held:
                     _set_threads(library, shared)
 

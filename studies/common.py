@@ -29,7 +29,7 @@ from PIL import Image
 
 import bayesperiodic as bp
 from bayesperiodic import _parallel
-from bayesperiodic._files import written_whole
+from bayesperiodic._files import written_whole as written_whole
 from bayesperiodic._parallel import TaskPool, available_cores
 from bayesperiodic.plot.pairs import draw_ellipses as draw_ellipses
 from bayesperiodic.plot.pairs import draw_regions as draw_regions

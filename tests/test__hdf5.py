@@ -153,8 +153,11 @@ def test_texts_that_refer_to_one_long_text_are_refused():
     with h5py.File(content, "w") as file:
         file.create_dataset("texts", data=["a" * 1000] * 10, dtype=h5py.string_dtype())
     _hdf5.check_all(content.getvalue())
-    with h5py.File(content, "r") as file, pytest.raises(ValueError, match="its array 'texts' has more than 5e-06 GB"):
-        _hdf5.values(file["texts"], 5000.0)
+    with (
+        h5py.File(content, "r") as file,
+        pytest.raises(ValueError, match="its array 'texts' has more than 5e-06 GB; ask"),
+    ):
+        _hdf5.values(file["texts"], 5000.0, "ask")
 
 
 def test_file_above_the_limit_is_refused_before_it_is_read_unless_asked(other, monkeypatch):

@@ -10,6 +10,7 @@ import uuid
 from collections import Counter
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
+from pathlib import Path
 
 import pytest
 
@@ -230,6 +231,33 @@ def test_a_second_signal_acts_at_once():
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
         raise AssertionError("not interrupted")
+
+
+def line(_: object, task: int) -> dict:
+    return {"task": task, "source": "a"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs symbolic links")
+def test_results_of_tasks_are_appended_through_links_which_exclude_each_other(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "shelf").symlink_to("disk", target_is_directory=True)
+    (tmp_path / "lines.jsonl").symlink_to("disk/lines.jsonl")
+    (tmp_path / "disk" / ".lines.jsonl.lock").write_text("of another program")
+    paths = [tmp_path / "shelf" / "lines.jsonl", tmp_path / "lines.jsonl", tmp_path / "disk" / "lines.jsonl"]
+
+    def run(path: Path, last: int) -> list[dict]:
+        return _parallel.checkpointed_tasks(path, range(last), line, lambda done: done["task"], "a", progress=False)
+
+    for last, path in enumerate(paths, 1):
+        assert run(path, last) == [line(None, task) for task in range(last)]
+    assert len(paths[2].read_text().splitlines()) == 3 and paths[1].is_symlink()
+    for one in paths:
+        with _parallel._locked(one):
+            for other in paths:
+                with pytest.raises(ValueError, match="folder: must not be in use by another run"):
+                    run(other, 4)
+    assert sorted(os.listdir(tmp_path / "disk")) == [".lines.jsonl.lock", "lines.jsonl"]
+    assert (tmp_path / "disk" / ".lines.jsonl.lock").read_text() == "of another program"
 
 
 def test_items_shared_by_threads_keep_their_order_and_raise():

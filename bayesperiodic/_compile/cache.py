@@ -76,16 +76,16 @@ def load(
     execute = partial(_execute, source, names, run or _run)
     try:
         entry = _private_folder() / _digest(source)
-        if found := _stored(source, entry, execute):
-            return found
+        if module := _stored(source, entry, execute):
+            return module
         if entry.parent not in _UNUSABLE:
             return _build(source, entry, execute)
     except (CacheProblem, OSError, NotImplementedError) as problem:
         if cache_folder() not in _UNUSABLE:
             _UNUSABLE.add(cache_folder())
             warnings.warn(
-                f"The kernel cache in {cache_folder()} cannot be used ({problem}); compiling in memory, at every start. "
-                f"{_remedy(problem)}",
+                f"The kernel cache in {cache_folder()} cannot be used ({problem}); compiling in memory, at every "
+                f"start. {_remedy(problem)}",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -193,8 +193,8 @@ def _build(source: str, entry: Path, execute: Callable[..., types.ModuleType]) -
             if other.stat().st_mtime < time.time() - ABANDONED:
                 shutil.rmtree(other)
     with global_compiler_lock, _alone(entry):  # in this order, because texts that are executed may load others
-        if found := _stored(source, entry, execute):
-            return found
+        if module := _stored(source, entry, execute):
+            return module
         _announce()
         workshop = Path(tempfile.mkdtemp(prefix=BUILDING, dir=entry.parent))
         try:

@@ -27,10 +27,11 @@ MISSING = [
 # Lines among which the header is searched for, and separators of fields, in the order in which they are tried.
 PREAMBLE, SEPARATORS = 1000, (",", ";", "\t")
 # Bytes that are decoded at once, and columns per wanted column above which the others are not made numbers.
-PART_BYTES, WIDE = 2**20, 2
+PART_BYTES, UNWANTED_RATIO = 2**20, 2
 
 # Bytes of an array, against files that unpack to more than the memory.
 LARGEST_ARRAY = 2**31
+OTHERWISE = "read the part that you need with h5py or NumPy, and give it to from_arrays"
 # Of MAT files, version 5: types of elements and of numbers, classes of arrays, flag of complex arrays, and the bytes in
 # which the name of a variable ends.
 INT32, MAT_MATRIX, COMPRESSED, COMPLEX, HEADER_BYTES = 5, 14, 15, 0x800, 4096
@@ -116,9 +117,9 @@ class _Text:
         with self.path.open("rb") as content:
             marked = content.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
             content.seek(0)
-            for part in iter(lambda: content.read(PART_BYTES), b""):
+            for part in itertools.chain(iter(lambda: content.read(PART_BYTES), b""), [b""]):
                 try:
-                    text = decoder.decode(part)
+                    text = decoder.decode(part, final=not part)
                 except UnicodeDecodeError as error:
                     line += error.object[: error.start].count(b"\n")
                     other = "UTF-16, encoding='utf-16'" if marked else "Latin-1, encoding='latin-1'"
@@ -129,8 +130,8 @@ class _Text:
                     ) from None
                 if "\0" in text:
                     raise ValueError(
-                        f"path: must be a CSV file in {name}, got {self!r}, which contains bytes 0; it was damaged when "
-                        f"it was written, or is no text in {name}; see encoding, such as encoding='utf-16'."
+                        f"path: must be a CSV file in {name}, got {self!r}, which contains bytes 0; it was damaged "
+                        f"when it was written, or is no text in {name}; see encoding, such as encoding='utf-16'."
                     )
                 line += text.count("\n")
 
@@ -163,7 +164,7 @@ def _csv_columns(file: _Text, wanted: list[str]) -> Stored:
             alone, surplus = width == 1, max(more, 0) + 1
             if alone:
                 source = io.StringIO(text.read().rstrip())
-            elif WIDE * len(places) < width:
+            elif UNWANTED_RATIO * len(places) < width:
                 rows = csv.reader(text, delimiter=separator, skipinitialspace=True, strict=True)
                 source = _narrowed(rows, [*places.values()], width, width + surplus)
                 width, surplus = len(places) + 1, 1
@@ -252,10 +253,10 @@ def _line_of_names(file: _Text, columns: list[str], separator: str) -> tuple[lis
                 more, following = len(row) - len(names), False
                 if most == len({*columns}):
                     break
-            found = [name.strip() for name in row]
-            if (count := len({*columns} & {*found})) > most:
+            fields = [name.strip() for name in row]
+            if (count := len({*columns} & {*fields})) > most:
                 most, number, more, following = count, rows.line_num, 0, True
-                names = found[: max((i for i, name in enumerate(found, 1) if name), default=len(found))]
+                names = fields[: max((i for i, name in enumerate(fields, 1) if name), default=len(fields))]
     if most < 0:
         raise ValueError(f"path: must be a CSV file with a header line, got {file!r}, which is empty.")
     return names, number, more
@@ -333,7 +334,7 @@ def _hdf5_columns(file: Path, wanted: list[str]) -> Stored:
             kind = np.bytes_(item.attrs.get("MATLAB_class", b"double")).decode()
             if kind not in (*NUMERIC.values(), "logical") or item.attrs.get("MATLAB_empty"):
                 raise ValueError(f"its variable {name!r} is empty or no array of numbers, but {kind}")
-            arrays[name] = _hdf5.values(item, LARGEST_ARRAY)
+            arrays[name] = _hdf5.values(item, LARGEST_ARRAY, OTHERWISE)
     return names, arrays
 
 
@@ -362,7 +363,9 @@ def _mat5_columns(file: Path, wanted: list[str]) -> Stored:
         if compressed:
             data = memoryview(bytes(data) + stream.decompress(stream.unconsumed_tail, LARGEST_ARRAY))
             if not stream.eof:
-                raise ValueError(f"its variable {name!r} is cut off or has more than {LARGEST_ARRAY / 1e9:.3g} GB")
+                raise ValueError(
+                    f"its variable {name!r} is cut off or has more than {LARGEST_ARRAY / 1e9:.3g} GB; {OTHERWISE}"
+                )
         arrays[name] = _array(*_variable(data, order), order)
     return names, arrays
 
@@ -410,7 +413,7 @@ MAT = Format("a MAT file of version 5 or 7.3", _mat_columns)
 
 def _check_size(name: str, size: int) -> None:
     if size > LARGEST_ARRAY:
-        raise ValueError(f"its array {name!r} has more than {LARGEST_ARRAY / 1e9:.3g} GB")
+        raise ValueError(f"its array {name!r} has more than {LARGEST_ARRAY / 1e9:.3g} GB; {OTHERWISE}")
 
 
 def existing(path: str | Path) -> Path:

@@ -142,8 +142,9 @@ def sample(
         ``sample_stats`` contains its statistics. Diverged trajectories are counted in `reason`.
     checkpoint : path, optional
         An HDF5 file that contains the run so far at any time; after an interruption the same call resumes the run, also
-        with another executor, and returns at once if it is finished. A symbolic link stands for its file. It can be read by emcee's HDFBackend, in
-        coordinates in which the Laplace approximation is a standard normal distribution.
+        with another executor, and returns at once if it is finished. A symbolic link stands for its file. It can
+        be read by emcee's HDFBackend, in coordinates in which the Laplace approximation is a standard normal
+        distribution.
     executor : None, int, Dask Client, or executor with the interface of concurrent.futures
         Executor that evaluates the proposals of a step, 16 a task. By default they are solved together on all cores of
         this process, which is fastest on one machine. A number is a number of processes; a script needs

@@ -10,6 +10,8 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
+from studies import common
+
 # Of Okabe and Ito.
 BLUE, VERMILLION, SKY, ORANGE = "#0072B2", "#D55E00", "#56B4E9", "#E69F00"
 GREY = "#999999"
@@ -32,7 +34,6 @@ def drawn(count: int, *, quick: bool) -> int:
 def save(path: Path, figure: Figure, draw: Callable[[int], None], count: int, *, quick: bool) -> None:
     """Write the figure as an animation, and close it; `draw` changes the figure to a frame, by its number."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.stem}.part.gif")
 
     def update(number: int) -> list[Artist]:
         draw(QUICK * number if quick else number)
@@ -42,9 +43,9 @@ def save(path: Path, figure: Figure, draw: Callable[[int], None], count: int, *,
     figure.canvas.draw()
     figure.set_layout_engine("none")
     animation = FuncAnimation(figure, update, frames=drawn(count, quick=quick), init_func=list)
-    animation.save(draft, PillowWriter(fps=FRAMES_PER_SECOND), dpi=DOTS_PER_INCH)
+    with common.written_whole(path) as draft:
+        animation.save(draft, PillowWriter(fps=FRAMES_PER_SECOND), dpi=DOTS_PER_INCH)
     plt.close(figure)
-    draft.replace(path)
 
 
 def smooth(fraction: float) -> float:

@@ -308,6 +308,19 @@ def test_unknown_encoding_is_refused(tmp_path, bad):
         bp.Recording.from_csv(tmp_path / "run.csv", sampling_rate=1.0, outputs={"x": "x"}, encoding=bad)
 
 
+def test_text_that_ends_within_a_letter_is_refused(tmp_path):
+    (tmp_path / "run.csv").write_bytes("t,x\n0,1\n1,2 µ".encode()[:-1])
+    with pytest.raises(ValueError, match="must be a CSV file in UTF-8, got .*, whose line 3 has the byte 0xc2"):
+        bp.Recording.from_csv(tmp_path / "run.csv", time="t", outputs={"x": "x"})
+
+
+def test_message_on_a_column_of_a_wide_file_does_not_list_all(tmp_path):
+    (tmp_path / "run.csv").write_text(",".join(f"c{i}" for i in range(20_000)) + "\n")
+    with pytest.raises(ValueError, match=r"'c11', … \(20000 in all\), got 'c20000'. Did you mean 'c\d+'") as error:
+        bp.Recording.from_csv(tmp_path / "run.csv", sampling_rate=1.0, outputs={"x": "c20000"})
+    assert len(str(error.value)) < 400
+
+
 def test_names_of_columns_in_another_encoding(tmp_path):
     (tmp_path / "run.csv").write_bytes("Zeit;µ\n0;1\n1;2\n".encode("latin-1"))
     recording = bp.Recording.from_csv(tmp_path / "run.csv", time="Zeit", outputs={"x": "µ"}, encoding="latin-1")
@@ -361,7 +374,7 @@ def test_wide_and_narrow_files_are_read_alike(tmp_path, monkeypatch, table, chan
     (tmp_path / "run.csv").write_bytes(f"t,x,n\n{table}".encode())
     found = []
     for wide in (10**9, 0):  # as a narrow file and as a wide one
-        monkeypatch.setattr(files, "WIDE", wide)
+        monkeypatch.setattr(files, "UNWANTED_RATIO", wide)
         try:
             run = bp.Recording.from_csv(tmp_path / "run.csv", time="t", outputs={"x": channel}, missing="drop")
             found.append((np.array(run.time).tolist(), run.outputs["x"].tolist()))

@@ -357,3 +357,14 @@ def test_a_misspecified_model_is_pointed_to_the_search(solved, scored, tmp_path)
     rejected = replace(bp.predict(problem, posterior, draws=20), table=table)
     path = bp.report(*solved, tmp_path / "report.html", comparison=scored, prediction=rejected)
     assert "bp.missing_terms(problem, fit) looks for the term" in Page(path.read_text("utf-8")).text
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs symbolic links")
+def test_report_is_written_through_a_link(solved, tmp_path):
+    problem, fit, _ = solved
+    (tmp_path / "disk").mkdir()
+    link, target = tmp_path / "report.html", tmp_path / "disk" / "page.html"
+    link.symlink_to("disk/page.html")
+    assert bp.report(problem, fit, None, link) == link
+    assert link.is_symlink() and not target.is_symlink() and target.read_text(encoding="utf-8").startswith("<!DOCTYPE")
+    assert os.listdir(tmp_path / "disk") == ["page.html"]

@@ -334,3 +334,68 @@ def test_termination_of_a_whole_group_of_processes_ends_the_run_though_its_worke
 def test_no_temporary_files_remain_beside_the_checkpoint(problem, tmp_path):
     bp.sample(*problem, checkpoint=tmp_path / "run.h5", **(RUN | {"max_steps": 50}))
     assert [path.name for path in tmp_path.iterdir()] == ["run.h5"]
+
+
+SHORT = RUN | {"max_steps": 50}
+
+
+def test_files_of_other_programs_beside_a_checkpoint_stay(problem, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "poetry.lock").write_text("of another program")
+    (tmp_path / ".poetry.draft-1").mkdir()
+    (tmp_path / ".poetry.draft-1" / "thesis.tex").write_text("")
+    bp.sample(*problem, checkpoint="poetry", **SHORT)
+    assert (tmp_path / "poetry.lock").read_text() == "of another program"
+    assert sorted(os.listdir(tmp_path)) == [".poetry.draft-1", "poetry", "poetry.lock"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs symbolic links")
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_link_and_its_file_are_one_checkpoint(problem, uninterrupted, tmp_path, monkeypatch, exists):
+    """The link is relative to its folder, and the current folder changes while the run goes on."""
+    (tmp_path / "disk").mkdir()
+    link, target = tmp_path / "run.h5", tmp_path / "disk" / "data.h5"
+    if exists:
+        bp.sample(*problem, checkpoint=target, **SHORT)
+    link.symlink_to("disk/data.h5")
+    monkeypatch.chdir(tmp_path)
+    original, in_use = LogPosterior.log_likelihood, []
+
+    def elsewhere(self, *arguments, **named):
+        if not in_use:
+            in_use.append(True)
+            for other in (link, target, Path("run.h5"), Path("disk", "..", "run.h5")):
+                with pytest.raises(ValueError, match="checkpoint: must not be in use by another run"):
+                    bp.sample(*problem, checkpoint=other, **SHORT)
+            os.chdir(tmp_path / "disk")
+        return original(self, *arguments, **named)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LogPosterior, "log_likelihood", elsewhere)
+        bp.sample(*problem, checkpoint="run.h5", **(RUN if exists else SHORT))
+    assert link.is_symlink() and not target.is_symlink() and in_use
+    assert sorted(os.listdir(tmp_path)) == ["disk", "run.h5"] and os.listdir(tmp_path / "disk") == ["data.h5"]
+    bp.sample(*problem, checkpoint=target, **RUN)
+    assert same(content(link), uninterrupted[1])
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_checkpoint_that_is_no_file_is_refused(problem, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "loop").symlink_to("loop")
+    for place in (tmp_path, tmp_path / "pipe", tmp_path / "loop", "/dev/null", tmp_path / "nowhere" / "run.h5"):
+        with pytest.raises(ValueError, match="checkpoint: must be a writable file, got .*; name another file"):
+            bp.sample(*problem, checkpoint=place, **SHORT)
+    assert sorted(os.listdir(tmp_path)) == ["loop", "pipe"]
+
+
+def test_checkpoint_in_a_folder_that_cannot_be_written_is_refused(problem, tmp_path, monkeypatch):
+    def denied(path, flags, *arguments, **named):
+        if flags & os.O_CREAT and str(tmp_path) in os.fspath(path):
+            raise PermissionError(13, "Permission denied", path)
+        return original(path, flags, *arguments, **named)
+
+    original = os.open
+    monkeypatch.setattr(os, "open", denied)
+    with pytest.raises(ValueError, match="checkpoint: must be a writable file, got .*Permission denied"):
+        bp.sample(*problem, checkpoint=tmp_path / "run.h5", **SHORT)

@@ -1,10 +1,12 @@
 import json
 import math
+import os
 from pathlib import Path
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from studies import common
@@ -39,3 +41,20 @@ def test_results_are_strict_json_with_reasons(tmp_path):
 @pytest.mark.parametrize("path", sorted(Path("figures").rglob("*.json")), ids=str)
 def test_stored_results_are_strict_json(path):
     assert strict(path.read_text("utf-8"))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs symbolic links")
+def test_results_and_figures_are_written_through_links(tmp_path):
+    """The links stay, and nothing else is left in either folder."""
+    disk, out = tmp_path / "disk", tmp_path / "out"
+    disk.mkdir()
+    out.mkdir()
+    names = ["figure.png", "part.pickle", "results.json"]
+    for name in names:
+        (out / name).symlink_to(f"../disk/{name}")
+    common.write_results(out, {"value": 1.0})
+    common.save_figures(out, {"figure": Figure()})
+    assert common.remembered(out / "part.pickle", "a", lambda: 7) == 7
+    assert common.remembered(disk / "part.pickle", "a", lambda: 8) == 7
+    assert all((out / name).is_symlink() for name in names) and json.loads((disk / "results.json").read_text())
+    assert sorted(os.listdir(disk)) == sorted(os.listdir(out)) == names
