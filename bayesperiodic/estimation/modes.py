@@ -94,7 +94,7 @@ def with_images(objective: Objective, ends: Sequence[End], climbed: Callable[[It
                 optima.append(end)
                 waiting.append(end)
     optima.sort(key=lambda end: -end.iterate.objective)
-    return [end for end in optima if end.iterate.objective > optima[0].iterate.objective - LOWEST_OBJECTIVE]
+    return [end for end in optima if end.iterate.objective >= optima[0].iterate.objective - LOWEST_OBJECTIVE]
 
 
 def _is_separate(objective: Objective, theta: np.ndarray, optima: Sequence[End]) -> bool:

@@ -425,7 +425,7 @@ def directional_sensitivities(
 ) -> Sensitivities | None:
     """Return derivatives along directions (directions, parameters) of the parameters; None if singular."""
     d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
-    with np.errstate(over="ignore", invalid="ignore"):  # of derivatives that overflow; `respond` refuses them
+    with np.errstate(over="ignore", invalid="ignore"):  # of derivatives that overflow, which callers check
         g, f = np.tensordot(directions, d.g_theta, (1, 2)), np.tensordot(directions, d.f_theta, (1, 2))
     return respond(equations, z, columns, d, g, f)
 

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from bayesperiodic import _checks
 from bayesperiodic._verdicts import CAUTION, TONES
+from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.comparison import Comparison, compare
 from bayesperiodic.diagnostics.identifiability import identifiability
@@ -37,6 +38,8 @@ from bayesperiodic.sampling.draws import Posterior
 # Level of the whiteness test, and the ratio of robust to Laplace sd above which the report warns.
 NOT_WHITE, LARGE_RATIO = 0.01, 1.5
 LONGEST_PRIOR, MOST_PANELS = 120, 7
+# Experiments whose period is drawn; each takes about half a second and 80 kB.
+MOST_DRAWN = 24
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "xarray", "matplotlib")
 
 
@@ -148,6 +151,15 @@ def other_than(good: str, verdicts: Mapping[Any, str]) -> list[str]:
 def rms(values: np.ndarray) -> float:
     """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
+
+
+def drawn(given: ReportInputs) -> list[Experiment]:
+    """Return the experiments whose period is drawn: all, or those with the largest residuals, in their order."""
+    every, residuals = given.problem.experiments, given.fit.residuals
+    whole = {channel: max(size, np.finfo(float).tiny) for channel, size in given.fit.rms.items()}
+    deviations = [max(rms(left) / whole[c] for c, left in residuals[e.name].items()) for e in every]
+    kept = np.sort(np.argsort(np.negative(deviations), kind="stable")[:MOST_DRAWN])
+    return [every[i] for i in kept.tolist()]
 
 
 def embedded(drawing: Figure, name: str) -> str:

@@ -368,3 +368,17 @@ def test_report_is_written_through_a_link(solved, tmp_path):
     assert bp.report(problem, fit, None, link) == link
     assert link.is_symlink() and not target.is_symlink() and target.read_text(encoding="utf-8").startswith("<!DOCTYPE")
     assert os.listdir(tmp_path / "disk") == ["page.html"]
+
+
+def test_of_many_experiments_those_with_the_largest_residuals_are_drawn(tmp_path, monkeypatch, pictures_left_out):
+    """Of the residuals of three experiments, those of the second are enlarged; a note says how to draw the others."""
+    problem, fit = quadratic_damping()
+    monkeypatch.setattr("bayesperiodic.reporting.contents.MOST_DRAWN", 1)
+    residuals = {n: {c: e * (20.0 if n == "run 1" else 1.0) for c, e in r.items()} for n, r in fit.residuals.items()}
+    path = bp.report(problem, replace(fit, residuals=residuals), None, tmp_path / "report.html")
+    text = path.read_text(encoding="utf-8")
+    assert re.findall(r'<figure id="figure-fit-\d+">.*?(run \d)', text, re.DOTALL) == ["run 1"]
+    assert "Drawn are the 1 of 3 experiments with the largest residual" in text
+    monkeypatch.setattr("bayesperiodic.reporting.contents.MOST_DRAWN", 3)
+    whole = bp.report(problem, fit, None, tmp_path / "whole.html").read_text(encoding="utf-8")
+    assert len(re.findall(r'<figure id="figure-fit-\d+">', whole)) == 3 and "Drawn are the" not in whole
