@@ -132,10 +132,14 @@ WITHOUT_RESULTS = {
         DEFINITION: ("Coverage of 90 % intervals by Q/cycles", "probability of 99 %"),
     },
     "docs/studies/coverage.md": {
-        DEFINITION: ("coverage of 90 % intervals", "of the binomial distribution that 99 % of right intervals are in"),
+        DEFINITION: (
+            "Do 90 % intervals contain the truth in 90 % of data sets", "with a probability of 99 %",
+            "of the binomial distribution that 99 % of right intervals are in",
+            "differ by more than 1.96 standard deviations in", "5 % would be expected", "with 95 % confidence",
+            "which should be 1", "that a share is below 8 %",
+        ),
         SETTING: (
-            "white noise, 3 values |", "white noise, 11 values |", "white noise, 101 values |", "| 3 cycles |", "| 4 cycles |",
-            "AR(0.9), circulant |", "AR(0.9), measured |",
+            "25 minutes of processor time",
         ),
     },
     "docs/studies/damper.md": {ELSEWHERE: ("doi 10.5281/zenodo.4445334",)},

@@ -17,7 +17,8 @@ FOLDER, SERIES = "friction_damper", (2, 3)
 TESTS = ("30lb_0.5Hz_0.5in", "30lb_0.5Hz_1.5in", "30lb_1Hz_0.5in", "30lb_1Hz_1.5in")
 INCH, KIP = 0.0254, 4448.22
 PRIORS: dict[str, Any] = {
-    "Kx": bp.LogNormal(5e3, 1.0), "F0": bp.Normal(0.0, 1e3), "Kw": bp.LogNormal(1e4, 1.0), "rho": bp.LogNormal(5e2, 1.0),
+    "Kx": bp.LogNormal(5e3, 1.0), "F0": bp.Normal(0.0, 1e3), "Kw": bp.LogNormal(1e4, 1.0),
+    "rho": bp.LogNormal(5e2, 1.0),
 }  # fmt: skip
 FAR, CONFIDENCE = 1.96, 0.95
 SDS = ("sd", "robust_sd")

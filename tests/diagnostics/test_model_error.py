@@ -60,21 +60,21 @@ def test_an_error_spread_over_harmonics_that_fold_drops_is_seen():
 
 
 def test_harmonics_left_out_are_no_misfit_where_the_model_has_them():
-    """A model with a weak ninth harmonic, of which `fold` keeps the first: without noise its error is zero."""
+    """A model with a weak ninth harmonic, of which `fold` keeps the first: its error is that of the noise."""
     model = bp.Model(
         "nine", states=["w"], inputs=["u"], parameters=["a"], equations=["dw + w - u"],
         outputs={"y": "a*u + 1e-3*(256*u**9 - 576*u**7 + 432*u**5 - 120*u**3 + 9*u)"},
     )  # fmt: skip
     u = np.cos(2 * np.pi * TIME)
-    y = 2.0 * u + 1e-3 * np.cos(18 * np.pi * TIME) + 1e-9 * np.random.default_rng(1).standard_normal(TIME.size)
+    y = 2.0 * u + 1e-3 * np.cos(18 * np.pi * TIME) + 1e-5 * np.random.default_rng(1).standard_normal(TIME.size)
     run = bp.Recording.from_arrays(TIME, {"y": y}, {"u": u}).fold(64, frequency=1.0, harmonics={"y": 1})
     assert run.left_out["y"].harmonic[-1] == 31
-    assert abs(run.left_out["y"].amplitude[run.left_out["y"].harmonic == 9][0]) == pytest.approx(1e-3, rel=1e-5)
+    assert abs(run.left_out["y"].amplitude[run.left_out["y"].harmonic == 9][0]) == pytest.approx(1e-3, rel=0.01)
     problem = bp.Problem(model, [run], priors={"a": bp.Normal(1, 10)}, scheme="fourier", input_noise="exact")
     fit = bp.map_estimate(problem, checks=False, progress=False)
     here = problem.anchored(fit.theta).density().linearise(problem.vector(fit.theta))
     found = model_errors(problem, here, problem.noise_values(dict(fit.noise))).iloc[0]
-    assert found[MODEL_ERROR[2]] < 1e-7 and found[UP_TO] == 31.0
+    assert found[MODEL_ERROR[2]] < 1e-5 and found[UP_TO] == 31.0
 
 
 def test_the_words_say_up_to_which_harmonic_the_error_is_known():
