@@ -23,18 +23,19 @@ def shortest_interval(freedom: float, probability: float, low: float, high: floa
     return -shortest_interval(freedom, probability, -high, -low)[1], high
 
 
-def is_log_normal(maximum: float, over_logarithm: float, variance: float) -> bool:
-    """Return whether a density is nearer to a log-normal than to a normal one, from its maxima in both coordinates.
+def log_normal_interval(
+    freedom: float, probability: float, maxima: tuple[float, float], sd: float, factor: float
+) -> tuple[float, float] | None:
+    """Return the interval of a quantity whose density is nearer to a log-normal than to a normal one, otherwise None.
 
-    `variance` is that of the logarithm.
+    `maxima` are those of the density over the value and over the logarithm, `sd` is that of the logarithm, and `factor`
+    what it is multiplied by in the interval.
     """
-    return bool(np.log(over_logarithm / maximum) < MOST_OF_LOG_NORMAL * variance)
-
-
-def interval_of_logarithm(freedom: float, probability: float, centre: float, sd: float) -> tuple[float, float]:
-    """Return the interval of a quantity whose logarithm has Student's t distribution with this standard deviation."""
-    factor = float(np.exp(sd * shortest_interval(freedom, probability, -np.inf, np.inf)[1]))
-    return centre / factor, centre * factor
+    value, centre = maxima
+    if np.log(centre / value) > MOST_OF_LOG_NORMAL * sd**2:
+        return None
+    ratio = float(np.exp(factor * sd * shortest_interval(freedom, probability, -np.inf, np.inf)[1]))
+    return centre / ratio, centre * ratio
 
 
 def carried_covariance(matrix: np.ndarray, gradients: list[np.ndarray]) -> np.ndarray:

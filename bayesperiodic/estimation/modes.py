@@ -206,6 +206,4 @@ def missed_by(starts: int) -> str:
 
 def found_from(starts: int) -> str:
     """Return what is said of optima, in words: the number of starts, and what these can miss."""
-    return (
-        f"found from {starts} starts ({missed_by(starts)})" if starts > 1 else f"found from one start; {missed_by(1)}"
-    )
+    return f"found from {starts} start{'s' * (starts > 1)} ({missed_by(starts)})"

@@ -12,12 +12,7 @@ from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse_all
 from bayesperiodic._io import Result, Storable
 from bayesperiodic.estimation.conflict import PriorConflict
-from bayesperiodic.estimation.intervals import (
-    carried_covariance,
-    interval_of_logarithm,
-    is_log_normal,
-    shortest_interval,
-)
+from bayesperiodic.estimation.intervals import carried_covariance, log_normal_interval, shortest_interval
 from bayesperiodic.estimation.laplace import JointLaplace
 from bayesperiodic.estimation.modes import Mode, notable
 from bayesperiodic.likelihood.input_noise import InputErrors
@@ -390,16 +385,16 @@ class MapEstimate(Result):
             freedom, sd = min(self.degrees_of_freedom[name], MOST_FREEDOM), sds[name]
             low, high = self.supports.get(name, (-np.inf, np.inf))
             if name in logarithms and np.isfinite(sd):
-                variance = float(self.joint_covariance.loc[name, name])
-                if is_log_normal(value, logarithms[name], variance):
-                    spread = sd / self.sd[name] * np.sqrt(variance)
-                    result[name] = interval_of_logarithm(freedom, probability, logarithms[name], spread)
+                spread, wider = float(np.sqrt(self.joint_covariance.loc[name, name])), sd / self.sd[name]
+                ends = log_normal_interval(freedom, probability, (value, logarithms[name]), spread, wider)
+                if ends is not None:
+                    result[name] = ends
                     continue
             if not np.isfinite(sd):
                 result[name] = (low, high) if sd == np.inf else (np.nan, np.nan)
                 continue
-            ends = shortest_interval(freedom, probability, (low - value) / sd, (high - value) / sd)
-            result[name] = max(value + sd * ends[0], low), min(value + sd * ends[1], high)
+            below, above = shortest_interval(freedom, probability, (low - value) / sd, (high - value) / sd)
+            result[name] = max(value + sd * below, low), min(value + sd * above, high)
         return result
 
     def derive(self, expressions: Mapping[str, str], *, experiment: str | None = None) -> pd.DataFrame:

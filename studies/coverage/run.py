@@ -14,6 +14,7 @@ from scipy import stats
 
 from studies import common
 from studies.coverage import cases
+from studies.coverage.repeats import SDS, repeats
 
 # One in SAMPLED data sets is sampled, which takes most of the time.
 REPLICATES, QUICK, SAMPLED, FALSE_ALARM = 200, 2, 2, 0.01
@@ -38,10 +39,14 @@ def run(options: argparse.Namespace) -> None:
     found = summary(lines)
     numbers = {kind: sampled if kind == cases.DRAWS else count for kind in KINDS}
     bands = {kind: band(number) for kind, number in numbers.items()}
+    with watch.part("repeats", "repeated tests of a friction damper"):
+        repeated = None if options.quick else repeats()
     with watch.part("figure", "drawing"):
         paths = common.save_figures(options.out, {"coverage": draw(found, bands)})
-    print("\n" + table(found, bands) + "\n")
-    results = {"seed": options.seed, "data_sets": numbers, "bands": bands, "cases": found}
+    print("\n" + table(found, bands) + "\n\n" + "\n".join(page_rows(found, bands)) + "\n")
+    if repeated:
+        print("repeated tests: " + ", ".join(f"{repeated[k]['far']} of {repeated[k]['of']} far by {k}" for k in SDS))
+    results = {"seed": options.seed, "data_sets": numbers, "bands": bands, "cases": found, "repeats": repeated}
     common.finish(options.out, results, watch, paths, synthetic=True)
 
 
@@ -90,6 +95,19 @@ def table(found: Counts, bands: Mapping[str, Sequence[float]]) -> str:
     limits = ", ".join(f"{KINDS[kind]} {low:.1%} to {high:.1%}" for kind, (low, high) in bands.items())
     title = f"synthetic: coverage of 90 % intervals; * outside the 99 % band ({limits})"
     return common.shown(title, shown)
+
+
+def page_rows(found: Counts, bands: Mapping[str, Sequence[float]]) -> list[str]:
+    """Return the rows of the table of the page, in percent, with what is outside of the band in bold."""
+    lines = []
+    for name, q, shares in rows(found):
+        texts = [f"{100 * shares[kind]:.0f}" for kind in KINDS]
+        marked = [
+            text if bands[kind][0] <= shares[kind] <= bands[kind][1] else f"**{text}**"
+            for kind, text in zip(KINDS, texts, strict=True)
+        ]
+        lines.append(f"| {name} | {q} | {' | '.join(marked)} |")
+    return lines
 
 
 def draw(found: Counts, bands: Mapping[str, Sequence[float]]) -> Figure:

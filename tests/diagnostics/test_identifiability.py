@@ -174,7 +174,7 @@ def test_parameter_with_two_values_is_not_determined():
     )
     single = bp.identifiability(problem, bp.map_estimate(problem, start={"a": 2.9, "b": 2.0}, **QUIET), profile=False)
     assert single.verdicts["a"] == "determined"
-    assert "one mode was looked at, from one start" in repr(single)
+    assert "at the only optimum found from 1 start (others were not looked for)" in repr(single)
 
 
 def test_discrete_symmetry_of_the_equations_counts_where_the_search_has_missed_it():

@@ -295,8 +295,8 @@ def test_a_misspecified_model_is_named_beside_all_other_verdicts(coulomb, said):
     search = (
         "; bp.missing_terms(problem, fit) looks for the term that is missing; the verdicts take the model for right"
     )
-    assert all(one.endswith(search) for one in found.limitations)
-    assert all(odd in one for one in found.limitations) and len(found.limitations) == said
+    assert all(one.endswith(search) for one in found.limitations[:-1])
+    assert all(odd in one for one in found.limitations[:-1]) and len(found.limitations) == said + 1
 
 
 def test_missing_friction_is_found_under_coarse_quantisation():

@@ -162,7 +162,7 @@ def test_the_fit_without_the_prior_is_found_from_a_local_maximum_and_the_model_i
     found = bp.identifiability(problem, fit, posterior, profile=False, candidates=[])
     assert found.verdicts["k"] == "prior conflict" and "by power-scaling" in found.table.loc["k", "evidence"]
     assert found.verdicts["c"] == "determined"
-    assert bp.compare(problem, fit, posterior).limitations == (fit.prior_conflict.text,)
+    assert bp.compare(problem, fit, posterior).limitations[0] == fit.prior_conflict.text
 
 
 def test_an_estimate_that_explains_little_is_said_to():
