@@ -324,7 +324,10 @@ class LogPosterior(SamplingCoordinates):
         """
         prior = self.problem.joint_prior.log_prob(here.theta) + np.sum(np.log(here.theta[self.logarithmic]))
         likelihood = self.problem.likelihood
-        return float((likelihood(here.residuals, noise, log_variance_factor) + likelihood.log_prior(noise, of_total=of_total)) + prior)
+        return float(
+            (likelihood(here.residuals, noise, log_variance_factor) + likelihood.log_prior(noise, of_total=of_total))
+            + prior
+        )
 
     def outputs(self, theta: np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
         """Return the predicted outputs at θ (draws, names) and whether the solves converged, see `Problem.outputs`."""

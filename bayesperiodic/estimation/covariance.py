@@ -280,7 +280,9 @@ def with_uncertain_noise(
     about the estimate. The changes of the covariance by several channels are added.
     """
     groups = problem.likelihood.groups()
-    shaped = [(names, members) for names, members in groups if _is_shaped(problem, names, members) and names[0] in parts]
+    shaped = [
+        (names, members) for names, members in groups if _is_shaped(problem, names, members) and names[0] in parts
+    ]
     if not np.all(np.diag(covariance) > 0.0):
         return covariance
     result = covariance.copy()

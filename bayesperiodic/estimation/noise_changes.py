@@ -90,7 +90,8 @@ def changes_by_variance(
     problem: Description, jacobian: Any, noise: np.ndarray, least: float = LEAST_SHARE
 ) -> dict[str, NoiseChange]:
     """Return the change with each unknown variance, by its name, without those with no larger share than `least`."""
-    likelihood, result = problem.likelihood, {}
+    likelihood = problem.likelihood
+    result: dict[str, NoiseChange] = {}
     slopes = likelihood.variance_slopes(noise)
     named = {b: group[0] for group, members in likelihood.groups() if group[0] in likelihood.free for b in members}
     for part in _parts(problem, jacobian, noise):
@@ -106,9 +107,7 @@ def changes_by_variance(
     return {name: change for name, change in result.items() if change.trace > least * counts[name]}
 
 
-def changes_by_measured(
-    problem: Description, jacobian: Any, noise: np.ndarray
-) -> Iterator[tuple[NoiseChange, float]]:
+def changes_by_measured(problem: Description, jacobian: Any, noise: np.ndarray) -> Iterator[tuple[NoiseChange, float]]:
     """Yield the change with each measured variance of noise, of outputs and inputs, and its degrees of freedom."""
     experiments = {e.name: e for e in problem.experiments}
     for part in _parts(problem, jacobian, noise):

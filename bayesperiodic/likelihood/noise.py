@@ -310,8 +310,9 @@ class Measured(Noise):
 
     The estimate of v is its maximum over ln(scatter²/cycles + v), in which this prior is flat: zero where the residual
     is no larger than the measured noise. Intervals then follow from the measured variances and their degrees of
-    freedom, otherwise from the values that determine v. Draws contain all v that the prior and the data allow: with m
-    more values than parameters they are wider than those of the right model, by 40 % for m = 3, by 10 % for m = 11.
+    freedom, otherwise from the values that determine v. Draws take the measured variances for exact, and contain all v
+    that prior and data allow: without a model error 90 % intervals of draws contain the truth in 99, 96 and 94 % for 3,
+    11 and 29 more values than parameters.
 
     Parameters
     ----------
