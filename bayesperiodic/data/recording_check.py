@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 #: Severities of findings: without effect, a bias that counts, and a result that is wrong.
 HARMLESS, SERIOUS, RUINOUS = with_tone("harmless", GOOD), with_tone("serious", CAUTION), with_tone("ruinous", BAD)
-WRAPS, COARSE = "wraps", "coarse"
+WRAPS, FEW_LEVELS = "wraps", "coarse"
 # Levels up to which rounding errors follow the signal where the noise before rounding is smaller than this many steps.
 MOST_COARSE_LEVELS, LARGEST_NOISE = 32, 0.2
 SEVERITIES = (HARMLESS, SERIOUS, RUINOUS)
@@ -47,8 +47,9 @@ class Finding(Storable):
     ----------
     kind : str
         "constant", "wraps", "stuck", "held" (a slower logger), "clipped", "saturated" (flat tops of the mean period),
-        "outliers", "heavy tails", "gaps", "aliases", "ramp", "transient", "drift", "beating", "amplitude step", "mean
-        step", "phase step", "coarse" (few levels with little noise) or "clock" (the phase of a channel drifts steadily against the first one).
+        "outliers", "heavy tails", "coarse" (few levels with little noise), "gaps", "aliases", "ramp", "transient",
+        "drift", "beating", "amplitude step", "mean step", "phase step" or "clock" (the phase of a channel drifts
+        steadily against the first one).
     channel : str
         Empty for all channels together.
     severity : str
@@ -249,7 +250,7 @@ def _coarse(
     error = step / np.sqrt(12.0 * min(passed, values.size))
     bias = error / max(effect.noise / np.sqrt(values.size), 1e-9 * step)
     yield Finding(
-        COARSE, channel, SERIOUS if bias > SERIOUS_BIAS else HARMLESS,
+        FEW_LEVELS, channel, SERIOUS if bias > SERIOUS_BIAS else HARMLESS,
         np.array([[time[0], time[-1]]]), values.size, 1.0, bias,
         f"{channel} has only {levels} levels, steps of {step:.3g}, and little noise between them: its rounding errors "
         f"repeat in every cycle, do not average out, and change the mean period by about {error / values.std():.1%} of "

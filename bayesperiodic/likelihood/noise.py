@@ -365,10 +365,10 @@ class Measured(Noise):
 class Relative(Measured):
     """Measurement noise known from the scatter of the cycles, plus one relative model error of all channels.
 
-    V = scatter²/cycles + ρ²·m, with m the mean square of the measured channel about its mean, in each experiment, and ρ²
-    the only noise parameter, ``variance[relative]``. With `Measured` every channel has its own model error: if the model
-    is wrong, a fit may reproduce one channel to the measurement noise and leave the error to another. Here all channels
-    are reproduced to about the same fraction.
+    V = scatter²/cycles + ρ²·m, with m the mean square of the measured channel about its mean, in each experiment, and
+    ρ² the only noise parameter, ``variance[relative]``. With `Measured` every channel has its own model error: if the
+    model is wrong, a fit may reproduce one channel to the measurement noise and leave the error to another. Here all
+    channels are reproduced to about the same fraction.
 
     Parameters
     ----------

@@ -624,7 +624,7 @@ def test_a_relative_model_error_is_the_same_fraction_of_every_channel():
 
 
 def test_a_model_error_is_zero_where_the_residual_is_no_larger_than_the_measured_noise():
-    """The estimate of the total variance is the larger one of measured and residual variance, M/n' with n' = n·share."""
+    """The total variance is the larger one of the measured and that of the residual, M/n' with n' = n·share."""
     blocks, residuals, total, count = spectral_residuals()
     for measured in (1.5 * total / (count * SHARE), 0.5 * total / (count * SHARE)):
         likelihood = Likelihood(noise.Measured(), [replace(b, measured=measured) for b in blocks], {})
