@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
 #: Severities of findings: without effect, a bias that counts, and a result that is wrong.
 HARMLESS, SERIOUS, RUINOUS = with_tone("harmless", GOOD), with_tone("serious", CAUTION), with_tone("ruinous", BAD)
-WRAPS = "wraps"
+WRAPS, FEW_LEVELS = "wraps", "coarse"
+# Levels up to which rounding errors follow the signal where the noise before rounding is smaller than this many steps.
+MOST_COARSE_LEVELS, LARGEST_NOISE = 32, 0.2
 SEVERITIES = (HARMLESS, SERIOUS, RUINOUS)
 # Bias in standard errors of all amplitudes together that is serious, and relative to the signal that is ruinous.
 SERIOUS_BIAS, RUINOUS_BIAS = 0.5, 0.05
@@ -46,8 +48,9 @@ class Finding(Storable):
     ----------
     kind : str
         "constant", "wraps", "stuck", "held" (a slower logger), "clipped", "saturated" (flat tops of the mean period),
-        "outliers", "heavy tails", "gaps", "aliases", "ramp", "transient", "drift", "beating", "amplitude step", "mean
-        step", "phase step" or "clock" (the phase of a channel drifts steadily against the first one).
+        "outliers", "heavy tails", "coarse" (few levels with little noise), "gaps", "aliases", "ramp", "transient",
+        "drift", "beating", "amplitude step", "mean step", "phase step" or "clock" (the phase of a channel drifts
+        steadily against the first one).
     channel : str
         Empty for all channels together.
     severity : str
@@ -230,6 +233,32 @@ def sample_findings(
         yield _saturated(channel, time, fault.saturated, fault)
     if bad.any():
         yield from _bad_findings(channel, time, values, fault, bad, frequency, harmonics, used)
+    elif frequency and fault.step and fault.saturation is None:
+        yield from _coarse(channel, time[used], values[used], fault.step, frequency, harmonics)
+
+
+def _coarse(
+    channel: str, time: np.ndarray, values: np.ndarray, step: float, frequency: float, harmonics: int
+) -> Iterator[Finding]:
+    """Return the finding of few levels with little noise, whose rounding errors are no noise, see `quantisation`."""
+    levels = round(float(np.ptp(values)) / step) + 1
+    if levels > MOST_COARSE_LEVELS:
+        return
+    effect = effect_of(time, values, np.zeros(values.size, dtype=bool), frequency, harmonics)
+    if not effect.noise**2 < (1.0 / 12.0 + LARGEST_NOISE**2) * step**2:
+        return
+    passed = max(float(np.abs(np.diff(effect.predicted)).sum()) / step / max(np.ptp(time) * frequency, 1.0), 1.0)
+    error = step / np.sqrt(12.0 * min(passed, values.size))
+    bias = error / max(effect.noise / np.sqrt(values.size), 1e-9 * step)
+    yield Finding(
+        FEW_LEVELS, channel, SERIOUS if bias > SERIOUS_BIAS else HARMLESS,
+        np.array([[time[0], time[-1]]]), values.size, 1.0, bias,
+        f"{channel} has only {levels} levels, steps of {step:.3g}, and little noise between them: its rounding errors "
+        f"repeat in every cycle, do not average out, and change the mean period by about {error / values.std():.1%} of "
+        f"its rms, {bias:.3g} standard errors",
+        "take noise='measured' and input_noise='measured', whose variances contain them, or record with a smaller "
+        "range",
+    )  # fmt: skip
 
 
 def _bad_findings(

@@ -54,12 +54,12 @@ class Problem(Description):
         Free parameters that each experiment has its own of, called ``theta16[run 7]``. Their prior goes by the plain
         name, or by that of one experiment; an experiment may have a fixed value instead.
     noise : str or noise model
-        "independent", "measured" or "circulant", or a model of `bayesperiodic.noise`.
+        "independent", "measured", "relative" or "circulant", or a model of `bayesperiodic.noise`.
     scheme : str or Scheme, optional
         See `solve_periodic`.
     input_noise : "measured", "exact", "joint" or mapping of str to float or array (amplitudes, amplitudes)
         Errors of the measured inputs. "measured": with the variances that `fold` found, averaged over neighbouring
-        harmonics, in experiments of at least five cycles; the inputs of others are exact. A mapping gives the standard
+        harmonics, in experiments of at least two cycles; the inputs of others are exact. A mapping gives the standard
         deviation of one value of the mean period, white noise, or the covariance of mean, cosines and sines of the
         harmonics kept, as many amplitudes as these. The true inputs, with a flat prior, are integrated out, linearised
         about the estimate; see `MapEstimate.input_errors`. "joint": as "measured", but the amplitudes of the errors are

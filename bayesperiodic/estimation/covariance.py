@@ -176,9 +176,9 @@ def _excess(freedom: np.ndarray) -> np.ndarray:
 class VariancePart(NamedTuple):
     """Part of the covariance C of θ (names, names) that an unknown variance is responsible for.
 
-    With F and G the `information` and `doubled` of its `NoiseChange`, `once` is C F C, `added` C G C − C F C F C; `left`
-    are the values that the estimate of θ does not take up, `freedom` these and what the prior of the variance is worth,
-    or what it was measured with.
+    With F and G the `information` and `doubled` of its `NoiseChange`, `once` is C F C, `added` C G C − C F C F C.
+    `left` are the values that the estimate of θ does not take up, `freedom` these and what the prior of the variance is
+    worth, or what it was measured with.
     """
 
     once: np.ndarray

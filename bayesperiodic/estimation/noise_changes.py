@@ -12,7 +12,7 @@ from bayesperiodic.likelihood.noise_spectrum import NoiseSpectrum
 from bayesperiodic.problem.description import Description
 
 # Share of an estimated variance in those of the components, below which it counts as zero.
-LEAST_SHARE = 1e-3
+LEAST_VARIANCE_SHARE = 1e-3
 
 
 class NoiseChange(NamedTuple):
@@ -30,7 +30,7 @@ class NoiseChange(NamedTuple):
         return NoiseChange(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-class _Part(NamedTuple):
+class IndependentPart(NamedTuple):
     """Blocks whose components are independent of those of others, joined."""
 
     members: Sequence[int]
@@ -73,7 +73,7 @@ class _Part(NamedTuple):
         return zip(self.precisions, self.blocks, strict=True)
 
 
-def _parts(problem: Description, jacobian: Any, noise: np.ndarray) -> Iterator[_Part]:
+def _parts(problem: Description, jacobian: Any, noise: np.ndarray) -> Iterator[IndependentPart]:
     """Yield the blocks of every experiment with errors of inputs, and the other blocks one by one."""
     likelihood = problem.likelihood
     changes = likelihood.whitened(jacobian, noise)
@@ -83,14 +83,17 @@ def _parts(problem: Description, jacobian: Any, noise: np.ndarray) -> Iterator[_
         blocks, one = [likelihood.blocks[b] for b in members], shared.get(members[0])
         weight = np.concatenate([np.full(block.size, block.weight) for block in blocks])
         precisions = likelihood.precisions(members, noise) if one else []
-        yield _Part(members, blocks, np.concatenate([changes[b] for b in members], axis=1), weight, one, precisions)
+        yield IndependentPart(
+            members, blocks, np.concatenate([changes[b] for b in members], axis=1), weight, one, precisions
+        )
 
 
 def changes_by_variance(
-    problem: Description, jacobian: Any, noise: np.ndarray, least: float = LEAST_SHARE
+    problem: Description, jacobian: Any, noise: np.ndarray, least: float = LEAST_VARIANCE_SHARE
 ) -> dict[str, NoiseChange]:
     """Return the change with each unknown variance, by its name, without those with no larger share than `least`."""
-    likelihood, result = problem.likelihood, {}
+    likelihood = problem.likelihood
+    result: dict[str, NoiseChange] = {}
     slopes = likelihood.variance_slopes(noise)
     named = {b: group[0] for group, members in likelihood.groups() if group[0] in likelihood.free for b in members}
     for part in _parts(problem, jacobian, noise):
@@ -118,7 +121,7 @@ def changes_by_measured(problem: Description, jacobian: Any, noise: np.ndarray) 
 
 
 def _of_outputs(
-    problem: Description, part: _Part, experiment: Experiment, noise: np.ndarray
+    problem: Description, part: IndependentPart, experiment: Experiment, noise: np.ndarray
 ) -> Iterator[tuple[NoiseChange, float]]:
     """Yield the changes with the measured variances of outputs."""
     likelihood, last = problem.likelihood, 0
@@ -142,15 +145,17 @@ def _of_outputs(
                 yield part.change(share * mixture), freedom
 
 
-def _of_inputs(problem: Description, part: _Part, experiment: Experiment) -> Iterator[tuple[NoiseChange, float]]:
+def _of_inputs(
+    problem: Description, part: IndependentPart, experiment: Experiment
+) -> Iterator[tuple[NoiseChange, float]]:
     """Yield the changes with the measured variances of inputs."""
     where, waves = error_waves(experiment, problem.input_noise)
     loadings = problem.likelihood.loadings[experiment.name][:, : len(where)]
     harmonic = np.abs(waves).argmax(axis=1)
     for name in dict.fromkeys(where):
         spectrum = NoiseSpectrum.of(experiment, name)
-        own = np.flatnonzero([other == name for other in where])
+        columns = np.flatnonzero([other == name for other in where])
         for mixed, freedom in zip(spectrum.mixing.T, spectrum.freedom, strict=True) if spectrum else ():
-            share = mixed[harmonic[own]]
+            share = mixed[harmonic[columns]]
             if share.any():
-                yield part.change_of_errors(loadings[:, own], share), freedom
+                yield part.change_of_errors(loadings[:, columns], share), freedom

@@ -49,6 +49,7 @@ class Block(ABC):
     averaged: float = 1.0  # measured samples behind the components
     measured: float = float("nan")  # variance of one value that the scatter of the cycles explains; NaN if unknown
     spectrum_measured: np.ndarray = field(default_factory=_nothing)  # (size,), of each Fourier component, if known
+    mean_square: float = 1.0  # of the measured channel about its mean
     place: int = 0  # of the channel among the measured ones
     log_scale: float = 0.0  # ln|∂ components/∂ data| of values that are divided by known standard deviations
 
@@ -192,7 +193,8 @@ class Timed(LinearBlock):
 
     def parameter_names(self, noise: Any) -> tuple[str, ...]:
         """Return the variance and the parameters of the spectrum's shape."""
-        label = f"{self.channel}, {self.experiment}" if noise.separate else self.channel
+        channel = noise.pooled or self.channel
+        label = f"{channel}, {self.experiment}" if noise.separate else channel
         return tuple(f"{kind}[{label}]" for kind in ("variance", *noise.shape_priors))
 
     def alike(self, noise: Any) -> Hashable:
@@ -218,6 +220,7 @@ def common(experiment: Experiment, channel: str, place: int = 0, **more: Any) ->
         "points": e.measured_points.size,
         "averaged": float(averaged),
         "measured": measured_variance(e, channel),
+        "mean_square": float(np.var(e.outputs[channel][e.measured_points])) if channel in e.outputs else 1.0,
         "place": place,
         **more,
     }

@@ -183,7 +183,7 @@ class Likelihood:
     @cached_property
     def measured(self) -> dict[str, float]:
         """Measured variance behind each variance, the mean over its values; NaN where it is not known."""
-        total = self._summed(block.count * block.measured for block in self.blocks)
+        total = self._summed(block.count * block.measured / self.model.unit(block) for block in self.blocks)
         return {name: value / self.counts[name] for name, value in total.items()}
 
     def moments(self, residuals: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
@@ -268,7 +268,7 @@ class Likelihood:
     def _spectra_of_errors(self) -> list[tuple[int, int, np.ndarray]]:
         """Column and a block of each free variance with Jeffreys' prior, and eigenvalues of L·Lᵀ of all its blocks."""
         spectra: dict[str, dict[int, np.ndarray]] = {}
-        for one in self.shared if self.model.prior == JEFFREYS else ():
+        for one in self.shared if self.model.prior == JEFFREYS and not self.model.pooled else ():
             for b, matrix in zip(one.members, one.covariances, strict=True):
                 for name in set(self._parameters[b][:1]) & set(self.free):
                     spectra.setdefault(name, {})[b] = np.linalg.eigvalsh(matrix)

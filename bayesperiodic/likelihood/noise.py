@@ -18,7 +18,7 @@ from bayesperiodic.likelihood.block import PROPORTIONAL, Block
 from bayesperiodic.priors.joint import as_prior
 from bayesperiodic.priors.single import LogNormal, Prior
 
-__all__ = ["Circulant", "Independent", "Measured", "Noise"]
+__all__ = ["Circulant", "Independent", "Measured", "Noise", "Relative"]
 
 PER_CHANNEL, PER_EXPERIMENT = "channel", "experiment"
 JEFFREYS, FLAT_PRIOR = "jeffreys", "flat"
@@ -62,6 +62,20 @@ class Noise(ABC):
 
     name: ClassVar[str]
     needs_scatter: ClassVar[bool] = False
+    pooled: ClassVar[str] = ""  # name of the parameters in place of a channel's, if all channels have the same
+
+    def unit(self, block: Block) -> float:
+        """Return the part of one value's variance that is proportional to the parameter, for a parameter of 1.
+
+        Parameters
+        ----------
+        block : Block
+
+        Returns
+        -------
+        float
+        """
+        return 1.0
 
     @property
     def shape_priors(self) -> dict[str, Prior]:
@@ -289,10 +303,16 @@ class Independent(Noise):
 class Measured(Noise):
     """Measurement noise known from the scatter of the cycles, plus an independent model error of unknown variance.
 
-    V = scatter²/cycles + v, with the variance of the mean period that the fold found where there is one (corrected for
-    correlation between cycles); v is the mean square of the model error over the period, which does not depend on the
-    numbers of samples and cycles. Jeffreys' prior means 1/(V) here, which is 1/v for large model errors and proper
-    towards v = 0.
+    V = scatter²/cycles + v. Where the fold measured the variance of every harmonic beside the harmonics, that takes the
+    place of scatter²/cycles, smoothed over neighbouring harmonics; v is the mean square of the model error over the
+    period, which does not depend on the numbers of samples and cycles. Jeffreys' prior means 1/(V) here, which is 1/v
+    for large model errors and proper towards v = 0.
+
+    The estimate of v is its maximum over ln(scatter²/cycles + v), in which this prior is flat: zero where the residual
+    is no larger than the measured noise. Intervals then follow from the measured variances and their degrees of
+    freedom, otherwise from the values that determine v. Draws take the measured variances for exact, and contain all v
+    that prior and data allow: without a model error 90 % intervals of draws contain the truth in 99, 96 and 94 % for 3,
+    11 and 29 more values than parameters.
 
     Parameters
     ----------
@@ -339,6 +359,47 @@ class Measured(Noise):
         share = _share(value, measured)
         density, slope = self.log_prior(kind, value, measured)
         return density - np.log(share), slope - (1.0 - share)
+
+
+@dataclass(frozen=True)
+class Relative(Measured):
+    """Measurement noise known from the scatter of the cycles, plus one relative model error of all channels.
+
+    V = scatter²/cycles + ρ²·m, with m the mean square of the measured channel about its mean, in each experiment, and
+    ρ² the only noise parameter, ``variance[relative]``. With `Measured` every channel has its own model error: if the
+    model is wrong, a fit may reproduce one channel to the measurement noise and leave the error to another. Here all
+    channels are reproduced to about the same fraction.
+
+    Parameters
+    ----------
+    per, prior
+        See `Noise`; the prior is that of ρ².
+
+    Raises
+    ------
+    ValueError
+        For another ``per``, or a prior that is none of these.
+
+    Examples
+    --------
+    >>> bp.noise.Relative().name
+    'relative'
+    """
+
+    name: ClassVar[str] = "relative"
+    pooled: ClassVar[str] = "relative"
+
+    def unit(self, block: Block) -> float:
+        """Return the mean square of the channel."""
+        return block.mean_square
+
+    def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return V = measured variance + ρ²·m."""
+        return super().spectrum(block, values * block.mean_square)
+
+    def alike(self, block: Block) -> Hashable:
+        """Return the measured variances and the mean square."""
+        return super().alike(block), block.mean_square
 
 
 @dataclass(frozen=True)
@@ -455,7 +516,7 @@ def _harmonics_of_grid(points: int) -> tuple[np.ndarray, np.ndarray]:
     return on_grid, np.where((on_grid == 0) | (2 * on_grid == points), 1.0, 2.0) / points
 
 
-NAMED: dict[str, type[Noise]] = {model.name: model for model in (Independent, Measured, Circulant)}
+NAMED: dict[str, type[Noise]] = {model.name: model for model in (Independent, Measured, Relative, Circulant)}
 
 
 def as_noise(given: str | Noise) -> Noise:

@@ -8,7 +8,7 @@ from scipy.special import digamma, polygamma
 from bayesperiodic.data.experiment import Experiment
 
 # Harmonics through whose variances a line is laid; few, so that the spectrum may be any that is smooth over them.
-NEAREST = 5
+HARMONICS_OF_A_LINE = 5
 
 
 class NoiseSpectrum(NamedTuple):
@@ -47,7 +47,7 @@ def smoothed(variance: np.ndarray, freedom: np.ndarray) -> NoiseSpectrum:
     lines = _lines(np.log(np.arange(1.0, last + 1.0)), 1.0 / spread)
     expected = np.sum((np.eye(last) - lines) ** 2 * spread, axis=1) / spread
     off = (level - lines @ level) ** 2 / spread
-    part = 1.0 if last < NEAREST else min(1.0, expected.sum() / max(off.sum(), np.finfo(float).tiny))
+    part = 1.0 if last < HARMONICS_OF_A_LINE else min(1.0, expected.sum() / max(off.sum(), np.finfo(float).tiny))
     weights = part * lines + (1.0 - part) * np.eye(last)
     # The result has the mean of χ²/ν, where 2/ν + … = ψ′(ν/2) is the variance of its logarithm.
     after = 1.0 / (weights**2 @ spread) + 0.5
@@ -70,10 +70,10 @@ def component_variances(experiment: Experiment, channel: str, harmonic: np.ndarr
 
 def _lines(place: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return the matrix of weighted least-squares lines through the nearest places, each evaluated at its place."""
-    count = min(NEAREST, place.size)
+    count = min(HARMONICS_OF_A_LINE, place.size)
     result = np.zeros((place.size, place.size))
     for k, here in enumerate(place):
-        first = min(max(k - NEAREST // 2, 0), place.size - count)
+        first = min(max(k - HARMONICS_OF_A_LINE // 2, 0), place.size - count)
         near = slice(first, first + count)
         x, w = place[near] - here, weight[near]
         moments = np.array([[w.sum(), w @ x], [w @ x, w @ x**2]])

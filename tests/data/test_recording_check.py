@@ -418,3 +418,26 @@ def test_sound_recordings_have_no_serious_findings():
 def test_false_alarm_rate_of_serious_findings_is_at_most_one_percent():
     """Of 500 recordings at most 11 (binomial, 99.5 % at 1 %)."""
     assert len(alarms(range(100, 600))) <= stats.binom.ppf(0.995, 500, 0.01)
+
+
+@pytest.mark.parametrize("levels", [8, 12, 25])
+def test_few_levels_with_little_noise_are_named_with_their_effect(levels):
+    """The error of the amplitudes, by the mean period of the unrounded motion, is within a factor of four as stated."""
+    angle = clean() + 1e-4 * np.random.default_rng(1).standard_normal(TIME.size)
+    step = np.ptp(angle) / levels
+    rounded = step * np.round(angle / step)
+    finding = only(recorded(rounded).check(1.0), "coarse")
+    assert finding.severity == "serious" and finding.bias > 0.5 and "repeat in every cycle" in finding.text
+    with pytest.warns(UserWarning, match="levels, steps of"):
+        found = recorded(rounded).fold(64, frequency=1.0, harmonics=3)
+    off = np.abs(amplitudes(found) - amplitudes(recorded(angle).fold(64, frequency=1.0, harmonics=3)))
+    stated = np.sqrt(found.amplitude_variance["angle"])
+    assert 0.25 < np.sqrt(np.mean((off / stated) ** 2)) < 2.0
+
+
+@pytest.mark.parametrize(("levels", "noise"), [(12, 0.5), (400, 0.001)])
+def test_levels_with_enough_noise_or_in_large_number_are_not_named(levels, noise):
+    angle = clean()
+    step = np.ptp(angle) / levels
+    angle = angle + noise * step * np.random.default_rng(1).standard_normal(TIME.size)
+    assert not recorded(step * np.round(angle / step)).check(1.0).findings

@@ -585,3 +585,49 @@ def test_improper_prior_is_rejected_if_the_data_can_be_fitted_exactly(model, nee
 def test_a_known_variance_needs_no_scatter():
     problem = bp.Problem(LINEAR, [run(40)], priors=PRIORS, noise="measured", fixed={"variance[force]": 9.0})
     assert problem.free_noise == ()
+
+
+def test_measured_noise_has_the_measured_variance_of_every_harmonic():
+    """V_h = (2H + 1)·(variance of a cosine amplitude)/2 + v, those of a power law, which smoothing does not change."""
+    measured = np.concatenate([[5.0], 8.0 * np.arange(1.0, 7.0) ** -2.0])
+    freedom = np.full(7, 1e6)
+    experiment = run(
+        40, harmonics={"force": 6}, amplitude_variance={"force": measured}, amplitude_freedom={"force": freedom}
+    )
+    harmonic = np.r_[0, 1:7, 1:7]
+    variance = 13 * np.where(harmonic == 0, 1.0, 0.25) * measured[harmonic] + 2.0
+    amplitudes = np.fft.rfft(residual(experiment))[:7] / 40 * np.r_[1.0, np.full(6, 2.0)]
+    parts = np.sqrt(13) * np.r_[amplitudes[0].real, amplitudes[1:].real / 2**0.5, amplitudes[1:].imag / 2**0.5]
+    expected = -0.5 * np.sum(np.log(variance) + parts**2 / variance)
+    assert log_likelihood("measured", experiment, variance=2.0) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_relative_model_error_is_the_same_fraction_of_every_channel():
+    """V = scatter²/cycles + ρ²·m: a pure gain error of a tenth is found in both channels, in whatever units."""
+    model = formula_model("gains", ["a"], lambda p, u, s: {"force": p.a * u.x, "moment": 1000.0 * p.a * u.x})
+    wave, white = np.cos(2 * np.pi * grid(64)), np.random.default_rng(1).standard_normal((2, 64))
+    outputs = {"force": wave + 1e-4 * white[0], "moment": 1100.0 * wave + 0.1 * white[1]}
+    one = bp.Experiment(
+        "run", 1.0, outputs, {"x": wave}, samples=64, cycles=9, scatter={"force": 3e-4, "moment": 0.3}
+    )  # fmt: skip
+    given = {"priors": {"a": bp.Normal(1.0, 10.0)}, "scheme": "fourier", "input_noise": "exact"}
+    apart, even = (
+        bp.map_estimate(bp.Problem(model, [one], noise=kind, **given), progress=False, starts=1)
+        for kind in ("measured", "relative")
+    )
+    errors = [{"force": abs(f.theta["a"] - 1.0), "moment": abs(f.theta["a"] / 1.1 - 1.0)} for f in (apart, even)]
+    assert min(errors[0].values()) < 1e-3 and max(errors[0].values()) > 0.08
+    assert errors[1]["force"] == pytest.approx(errors[1]["moment"], rel=0.3) and list(even.noise) == [
+        "variance[relative]"
+    ]
+    assert even.noise["variance[relative]"] == pytest.approx(2 * 0.05**2 / 2, rel=0.2)
+
+
+def test_a_model_error_is_zero_where_the_residual_is_no_larger_than_the_measured_noise():
+    """The total variance is the larger one of the measured and that of the residual, M/n' with n' = n·share."""
+    blocks, residuals, total, count = spectral_residuals()
+    for measured in (1.5 * total / (count * SHARE), 0.5 * total / (count * SHARE)):
+        likelihood = Likelihood(noise.Measured(), [replace(b, measured=measured) for b in blocks], {})
+        found = estimate_noise(likelihood, residuals, likelihood.guess(), SHARE, of_total=True)
+        expected = max(total / (count * SHARE), measured)
+        assert found[0] + measured == pytest.approx(expected, rel=1e-5)

@@ -295,7 +295,7 @@ def test_the_phase_of_a_cycle_is_the_likeliest_one_of_all_channels():
             {"local": ["c"], "tied": {"c": "k/20"}, "priors": {k: v for k, v in PRIORS.items() if k != "c"}},
             "local: 'c' is tied; it follows what it is tied to",
         ),
-        ({"noise": "white"}, "noise: must be one of 'independent', 'measured', 'circulant', got 'white'"),
+        ({"noise": "white"}, "noise: must be one of 'independent', 'measured', 'relative', 'circulant', got 'white'"),
         ({"fixed": {"lengthscale[force]": 1.0}}, r"fixed: must be .*got 'lengthscale\[force\]'"),
     ],
 )
