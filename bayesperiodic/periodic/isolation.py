@@ -15,7 +15,7 @@ from bayesperiodic.periodic.schemes import CyclicGrid, find_scheme
 FAMILY_POINTS, MOST_FAMILY_UNKNOWNS, FAMILY_STEPS = (81, 161, 321), 700, 15
 # Residual of a cycle, singular values that are left out of a step, and the range of an orbit that has not shrunk, in
 # units of the guess's.
-FAMILY_RESIDUAL, LEFT_OUT, NOT_SHRUNK = 1e-10, 1e-6, 0.1
+FAMILY_RESIDUAL, NO_STEP, NOT_SHRUNK = 1e-10, 1e-6, 0.1
 # Smallest singular value of a family (of conservative models up to 1e-12 where the grid resolves them) and of a cycle
 # that is clearly isolated (van der Pol's: 3e-3 and more).
 ONE_OF_MANY, ISOLATED = 1e-8, 1e-5
@@ -60,7 +60,7 @@ def _smallest_singular_value(
             return np.nan
         if np.abs(residual).max() < FAMILY_RESIDUAL and step < 1.0:
             break
-        change = np.linalg.lstsq(matrix, -residual, rcond=LEFT_OUT)[0]
+        change = np.linalg.lstsq(matrix, -residual, rcond=NO_STEP)[0]
         step = float(np.abs(change).max())
         change /= max(1.0, 2.0 * step)
         z = z + change[:-1].reshape(z.shape) * scales
