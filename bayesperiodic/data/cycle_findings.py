@@ -28,7 +28,7 @@ HARMLESS_BEAT, BEAT_FALSE_ALARM, FEWEST_FOR_BEATS = 0.01, 1e-4, 24
 # the variance of the amplitude that they explain, and fewest windows.
 LEAST_TURNS, STEP_OF_TURNS, EXPLAINED, FEWEST_FOR_SLOW_BEATS = (0.9, 1.75), 0.125, 0.9, 12
 # Turns below which a beat looks like a ramp up and down.
-FEW_TURNS = 1.5
+TURNS_OF_A_RAMP = 1.5
 # Range of the logarithm of an amplitude that differs in its phase only: in itself, and in standard deviations.
 SAME_SIZE, SAME_IN_NOISE = 0.03, 4.0
 BEATING, PHASE_STEP = "beating", "phase step"
@@ -86,9 +86,9 @@ def slow_beats(channels: Sequence[str], time: np.ndarray, every: Windows, freque
             yield Finding(
                 BEATING, channel, SERIOUS, np.array([[time[part.first[0]], time[part.last[-1] - 1]]]), len(line), 1.0,
                 np.nan, f"the amplitude of {channel} beats at {beat:.4g} Hz by {amplitude:.1%}"
-                + (", or ramps up and down" if turns < FEW_TURNS else ""),
+                + (", or ramps up and down" if turns < TURNS_OF_A_RAMP else ""),
                 "a second frequency is in the signals: remove its source, or average whole beats"
-                + ("; of ramps record the steady part" if turns < FEW_TURNS else ""),
+                + ("; of ramps record the steady part" if turns < TURNS_OF_A_RAMP else ""),
             )  # fmt: skip
 
 
