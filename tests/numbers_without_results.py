@@ -136,10 +136,11 @@ WITHOUT_RESULTS = {
             "Do 90 % intervals contain the truth in 90 % of data sets", "with a probability of 99 %",
             "of the binomial distribution that 99 % of right intervals are in",
             "differ by more than 1.96 standard deviations in", "5 % would be expected", "with 95 % confidence",
-            "which should be 1", "that a share is below 8 %",
+            "which should be 1", "That a share is below 8 %",
+            "that it is above 1 %", "3 cycles, frequency estimated",
         ),
         SETTING: (
-            "25 minutes of processor time",
+            "30 minutes of processor time",
         ),
     },
     "docs/studies/damper.md": {ELSEWHERE: ("doi 10.5281/zenodo.4445334",)},
