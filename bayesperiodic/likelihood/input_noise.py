@@ -30,7 +30,7 @@ from bayesperiodic.priors.single import Normal
 EXACT, FROM_CYCLES, JOINT = "exact", "measured", "joint"
 # Measured noise in whatever number of cycles, to be compared with the residual where the inputs are taken as exact.
 ROUGH = "rough"
-# Cycles from which on the variances of an input's amplitudes are known well enough.
+# Cycles from which on the variances of an input's amplitudes are measured; intervals contain how well.
 FEWEST_CYCLES = 2
 # Variance of combined errors, relative to that of the outputs' errors, up to which they are left out; and squares of
 # singular values that are zero but for rounding, relative to the largest.
