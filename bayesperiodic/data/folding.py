@@ -25,7 +25,7 @@ from bayesperiodic.data.harmonics import (
 from bayesperiodic.data.inspection import Inspection
 from bayesperiodic.data.lines import LEAST_LEFT, Sampling
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
-from bayesperiodic.data.recording_check import SERIOUS, refuse
+from bayesperiodic.data.recording_check import SERIOUS, Finding, refuse
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, aperiodic, even_times, response_period
 from bayesperiodic.data.several_clocks import ONE, Clocks, inspect_clocks
 from bayesperiodic.data.signals import Signals, counted_cycles, cycles_of, explains_more, first_guess
@@ -81,9 +81,7 @@ def fold_signals(
     parts, fit = _at_phases(parts, fit, pace, periods, given, seen.limits)
     drift = dict(zip(seen.channels, _drift(seen.sizes), strict=True))
     _refuse_drift(name, drift, largest_drift)
-    # Where there was one clock, it is the system that changes.
-    stated = clocks == ONE
-    refuse(name, [replace(f, severity=SERIOUS) if stated and f.kind == CLOCK else f for f in seen.findings])
+    refuse(name, _with_stated_clock(seen.findings, clocks))
     cycles = round(max(np.ptp(part.time) for part in parts) * fit.frequency)
     _warn(name, pace, cycles, seen, given is None)
     one_cycle, noise = _noises(seen, parts, fit, cycles)
@@ -124,6 +122,11 @@ def fold_signals(
         "findings": seen.findings,
         "clocks": others,
     }
+
+
+def _with_stated_clock(findings: Sequence[Finding], clocks: Clocks | None) -> list[Finding]:
+    """Return the findings; where one clock is stated, drifts are those of the system, which do not refuse."""
+    return [replace(f, severity=SERIOUS) if clocks == ONE and f.kind == CLOCK else f for f in findings]
 
 
 def _from_crossing(

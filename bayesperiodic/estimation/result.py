@@ -384,15 +384,14 @@ class MapEstimate(Result):
         for name, value in self.theta.items():
             freedom, sd = min(self.degrees_of_freedom[name], MOST_FREEDOM), sds[name]
             low, high = self.supports.get(name, (-np.inf, np.inf))
-            if name in logarithms and np.isfinite(sd):
-                spread, wider = float(np.sqrt(self.joint_covariance.loc[name, name])), sd / self.sd[name]
-                ends = log_normal_interval(freedom, probability, (value, logarithms[name]), spread, wider)
-                if ends is not None:
-                    result[name] = ends
-                    continue
             if not np.isfinite(sd):
                 result[name] = (low, high) if sd == np.inf else (np.nan, np.nan)
                 continue
+            if name in logarithms:
+                spread, both = float(np.sqrt(self.joint_covariance.loc[name, name])), (value, logarithms[name])
+                if ends := log_normal_interval(freedom, probability, both, spread, sd / self.sd[name]):
+                    result[name] = ends
+                    continue
             below, above = shortest_interval(freedom, probability, (low - value) / sd, (high - value) / sd)
             result[name] = max(value + sd * below, low), min(value + sd * above, high)
         return result
