@@ -379,21 +379,20 @@ class MapEstimate(Result):
         """
         if not 0.0 < _checks.finite_number("probability", probability) < 1.0:
             raise ValueError(f"probability: must be between 0 and 1, got {probability!r}.")
-        sds, result = self.robust_sd if (self.misspecified if robust is None else robust) else self.sd, {}
-        logarithms = self.over_logarithm
+        sds = self.robust_sd if (self.misspecified if robust is None else robust) else self.sd
+        result, logarithms = dict[str, tuple[float, float]](), self.over_logarithm
         for name, value in self.theta.items():
             freedom, sd = min(self.degrees_of_freedom[name], MOST_FREEDOM), sds[name]
             low, high = self.supports.get(name, (-np.inf, np.inf))
             if not np.isfinite(sd):
                 result[name] = (low, high) if sd == np.inf else (np.nan, np.nan)
                 continue
+            ends = None
             if name in logarithms:
-                spread, both = float(np.sqrt(self.joint_covariance.loc[name, name])), (value, logarithms[name])
-                if ends := log_normal_interval(freedom, probability, both, spread, sd / self.sd[name]):
-                    result[name] = ends
-                    continue
+                spread, both = float(self.joint_covariance.loc[name, name]) ** 0.5, (value, logarithms[name])
+                ends = log_normal_interval(freedom, probability, both, spread, sd / self.sd[name])
             below, above = shortest_interval(freedom, probability, (low - value) / sd, (high - value) / sd)
-            result[name] = max(value + sd * below, low), min(value + sd * above, high)
+            result[name] = ends or (max(value + sd * below, low), min(value + sd * above, high))
         return result
 
     def derive(self, expressions: Mapping[str, str], *, experiment: str | None = None) -> pd.DataFrame:
