@@ -170,6 +170,7 @@ WITHOUT_RESULTS = {
             "which should be 1", "That a share is below 8 %",
             "that it is above 1 %", "3 cycles, frequency estimated",
         ),
+        UNSTORED: ("1 of 16 by Laplace and 0 by the robust ones, with both, 2 and 1 of 20",),
         SETTING: (
             "30 minutes of processor time",
         ),
