@@ -42,7 +42,7 @@ class Arrays:
 
 
 def _member(group: h5py.Group, name: str) -> h5py.Dataset | h5py.Group:
-    link = group.get(name, getlink=True) if name and not {"/", "."} & {*name} else None
+    link = group.get(name, getlink=True) if name and "/" not in name and name not in (".", "..") else None
     if not isinstance(link, h5py.HardLink):
         raise ValueError(f"its variable {name!r} is missing or not in this file, but a link")
     item = group[name]

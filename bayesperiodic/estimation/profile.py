@@ -374,8 +374,8 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     {'c': 'closed', 'k': 'closed'}
     >>> profile.table[["laplace_low", "low", "laplace_high", "high"]].round(4)
        laplace_low     low  laplace_high    high
-    c       0.1982  0.1981        0.2005  0.2006
-    k       0.9991  0.9990        1.0019  1.0020
+    c       0.1982  0.1981        0.2004  0.2005
+    k       0.9993  0.9992        1.0019  1.0020
     """
     _checks.instance("problem", problem, Problem)
     chosen, executor = _checked_names(problem, names), checked_executor(executor)

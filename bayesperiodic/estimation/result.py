@@ -426,7 +426,7 @@ class MapEstimate(Result):
         --------
         >>> fit.derive({"damping_ratio": "c/(2*sqrt(k))"}).round(4)
                         value      sd
-        damping_ratio  0.0997  0.0004
+        damping_ratio  0.0996  0.0003
         """
         if experiment is not None:
             _checks.one_of("experiment", experiment, self.solutions)

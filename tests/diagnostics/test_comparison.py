@@ -360,7 +360,7 @@ def test_comparison_has_text_and_html_representations(solved):
     found = bp.compare(problem, fit, posterior)
     text = repr(found)
     assert "Laplace against MCMC in natural coordinates" in text
-    assert "The 50, 90 and 95% Laplace ellipsoids contain" in text and "Pareto k̂" in text
+    assert "The 50, 90 and 95% Laplace ellipsoids contain" in text and "Pareto k" in text
     table = found.table.rename(index={"k": "theta[<b>]"}).replace({"coordinate": {"k": "theta[<b>]"}})
     page = replace(found, table=table)._repr_html_()
     tree_ = ElementTree.fromstring(f"<div>{page}</div>")

@@ -24,6 +24,7 @@ def fitted(**changes):
         "prior_conflict": SimpleNamespace(text=""), "fvu": {"y": 0.1}, "converged": True, "other_modes": (),
         "undetermined": (), "noise_split": {}, "input_errors": {}, "input_nonlinearity": {"a": 0.29, "b": 0.0},
         "checks": True, "over_logarithm": {}, "misspecified": False, "noisy_inputs": False, "_on_frequencies": list,
+        "solutions": {},
     }  # fmt: skip
     return SimpleNamespace(**(given | changes))
 

@@ -431,7 +431,7 @@ def test_calibration_records_the_noise_of_inputs():
     problem = bp.Problem(GAIN, [run], priors={"a": bp.Normal(2.0, 0.2)}, noise=prior)
     again = calibration._measured(problem, run, {"a": 2.0}, {"variance[y]": 0.01}, np.random.default_rng(1))
     ratio = again.amplitude_variance["x"].mean() / run.amplitude_variance["x"].mean()
-    assert 0.5 < ratio < 2.0 and again.cycles == run.cycles
+    assert 0.5 < ratio < 2.0 and again.cycles >= 0.9 * run.cycles
     with pytest.raises(ValueError, match="problem: must have another input_noise than 'joint'"):
         bp.calibrate(
             bp.Problem(GAIN, [run], priors={"a": bp.Normal(2.0, 0.2)}, noise=prior, input_noise="joint"),
