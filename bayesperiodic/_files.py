@@ -9,6 +9,7 @@ import glob
 import hashlib
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -77,9 +78,12 @@ def locked(target: Path, *, wait: float = 0.0) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     place = target.with_name(_beside(target, "bayesperiodic-lock"))
-    if os.path.lexists(place) and (place.is_symlink() or not place.is_file()):
-        raise FileExistsError(f"{str(place)!r} is in the place of the lock; remove it")
-    foreign = place.exists() and place.stat().st_size > 0
+    foreign = False
+    with suppress(FileNotFoundError):  # its holder may remove it at any time
+        found = os.lstat(place)
+        if not stat.S_ISREG(found.st_mode):
+            raise FileExistsError(f"path: must have nothing in the place of its lock, got {str(place)!r}; remove it.")
+        foreign = found.st_size > 0
     lock = FileLock(place, timeout=wait)
     try:
         lock.acquire()

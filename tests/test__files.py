@@ -173,7 +173,7 @@ def test_what_stands_in_the_place_of_a_lock_is_not_removed(tmp_path):
     assert place.read_text() == "of a user"
     place.unlink()
     place.mkdir()
-    with pytest.raises(FileExistsError, match="is in the place of the lock; remove it"), locked(path):
+    with pytest.raises(FileExistsError, match="path: must have nothing in the place of its lock, got .*; remove it"), locked(path):
         pass
     place.rmdir()
 
@@ -184,7 +184,7 @@ def test_a_link_in_the_place_of_a_lock_is_not_followed(tmp_path):
     place = lock_file(path)
     (tmp_path / "thesis.tex").write_text("of a user")
     place.symlink_to("thesis.tex")
-    with pytest.raises(FileExistsError, match="is in the place of the lock; remove it"), locked(path):
+    with pytest.raises(FileExistsError, match="path: must have nothing in the place of its lock, got .*; remove it"), locked(path):
         pass
     assert (tmp_path / "thesis.tex").read_text() == "of a user"
 
@@ -213,6 +213,38 @@ def test_lock_of_another_process_holds_until_that_ends_in_whatever_way(tmp_path)
     with locked(path):
         pass
     assert not os.listdir(tmp_path)
+
+
+CONTENDER = """
+import os, sys
+from pathlib import Path
+from bayesperiodic._files import locked
+path, held = Path(sys.argv[1]), 0
+print("ready", flush=True)
+sys.stdin.readline()
+while held < 200:
+    try:
+        with locked(path):
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL))  # fails if another process holds the lock
+            os.unlink(path)
+            held += 1
+    except BlockingIOError:
+        pass
+"""
+
+
+def test_processes_exclude_each_other_while_files_of_locks_come_and_go(tmp_path):
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(os.path.abspath(place or ".") for place in sys.path)}
+    command, pipe = [sys.executable, "-c", CONTENDER, tmp_path / "run.h5"], subprocess.PIPE
+    every = [
+        subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment) for _ in range(3)
+    ]
+    for one in every:
+        assert one.stdout.readline() == "ready\n"
+    for one in every:
+        one.stdin.write("\n")
+        one.stdin.flush()
+    assert [one.communicate()[1] for one in every] == [""] * 3 and not os.listdir(tmp_path)
 
 
 def test_threads_of_one_process_exclude_each_other(tmp_path):
