@@ -55,8 +55,11 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         yield draft
         with draft.open("rb+") as file:
             os.fsync(file.fileno())
-        if target.exists():
-            shutil.copymode(target, draft)  # who may read the file remains as it was
+        if target.exists():  # who may read the file remains as it was
+            with suppress(OSError):  # of a group of which the user is no member
+                if hasattr(os, "chown"):
+                    os.chown(draft, -1, target.stat().st_gid)
+            shutil.copymode(target, draft)
         os.replace(draft, target)
 
 

@@ -113,6 +113,19 @@ def test_a_replaced_file_keeps_who_may_read_it(tmp_path):
         assert stat.S_IMODE(path.stat().st_mode) == mode
 
 
+@pytest.mark.skipif(not hasattr(os, "getgroups"), reason="needs groups of files")
+def test_a_replaced_file_keeps_its_group(tmp_path):
+    """Otherwise the user's first group could read what was open to another one only."""
+    path = tmp_path / "run.h5"
+    experiment().save(path)
+    others = {12345, *os.getgroups()} if os.getuid() == 0 else {*os.getgroups()}
+    for group in sorted(others - {path.stat().st_gid})[:2]:
+        os.chown(path, -1, group)
+        path.chmod(0o640)
+        experiment(1.0).save(path)
+        assert path.stat().st_gid == group and stat.S_IMODE(path.stat().st_mode) == 0o640
+
+
 def test_a_file_that_must_not_be_written_is_not_replaced(tmp_path, monkeypatch):
     """A folder in which the user may write would allow it; root may write every file."""
     path = tmp_path / "run.h5"

@@ -63,7 +63,7 @@ def test_noise_of_the_inputs_counts_from_a_tenth_of_the_residual_on(rates, how):
     (text,) = warnings_of(rates, input_noise={"y": 0.21})
     assert text == (
         f"The noise of the measured inputs{how} causes 0.21 in 'y', 10% of the residual's 2, but the inputs are taken "
-        "as exact. Fold at least 2 cycles, and take input_noise='measured', or give the noise in input_noise={…}."
+        "as exact. Take input_noise='measured', which needs at least 2 cycles, or give the noise in input_noise={…}."
     )
     assert warnings_of(rates, input_noise={"y": 0.2}) == []
     assert warnings_of(rates, "measured", input_noise={"y": 0.21}) == []

@@ -278,7 +278,7 @@ def test_noise_of_inputs_is_integrated_out_by_default_where_the_cycles_show_it()
     few = gained(noisy_gain(1, cycles=3))
     assert few.input_errors and few.input_sd["run"]["x"].any()
     single = replace(run, cycles=1)
-    with pytest.warns(UserWarning, match="inputs are taken as exact. Fold at least 2 cycles, and take input_noise"):
+    with pytest.warns(UserWarning, match="inputs are taken as exact. Take input_noise='measured'"):
         alone = gained(single)
     assert not alone.input_errors and not alone.input_sd["run"]["x"].any()
     problem = bp.Problem(GAIN, [single], priors={"a": bp.Normal(0.0, 10.0)})

@@ -121,7 +121,7 @@ def uninterrupted(tmp_path_factory):
 
 
 SIGNALS = [signal.SIGKILL, signal.SIGINT, signal.SIGTERM]
-# Starting Dask takes a third of a minute; SIGTERM acts there as SIGINT does.
+# Starting Dask takes a third of a minute; SIGTERM ends the process there as SIGKILL does.
 KINDS = [("processes", SIGNALS), ("dask", SIGNALS[:2]), ("mpi", SIGNALS)]
 ENDS = [
     pytest.param(kind, how, marks=[needs_mpi] if kind == "mpi" else []) for kind, signals in KINDS for how in signals
