@@ -240,8 +240,8 @@ def _input_noise(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             yield (
                 f"The noise of the measured inputs{', differentiated,' if rates else ''} causes {noise:.3g} in "
                 f"{channel!r}, {noise / fit.rms[channel]:.0%} of the residual's {fit.rms[channel]:.3g}, but the inputs "
-                f"are taken as exact. Take input_noise='measured', which needs at least {FEWEST_CYCLES} cycles, or give "
-                "the noise in input_noise={…}."
+                f"are taken as exact. Take input_noise='measured', which needs at least {FEWEST_CYCLES} cycles, or "
+                "give the noise in input_noise={…}."
             )
     if curved := {n: size for n, size in fit.input_nonlinearity.items() if not size < LARGEST_NONLINEARITY}:
         worst = max(curved, key=lambda name: np.nan_to_num(curved[name], nan=np.inf))
