@@ -10,7 +10,10 @@ def printable(text: str) -> str:
     Names and units are the user's.
     """
     encoding = getattr(sys.stdout, "encoding", None)
-    return text if encoding is None else text.encode(encoding, "backslashreplace").decode(encoding)
+    try:
+        return text if encoding is None else text.encode(encoding, "backslashreplace").decode(encoding)
+    except (LookupError, TypeError):  # of an output that names no encoding of Python's
+        return text
 
 
 class Printed:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -152,7 +153,8 @@ def test_results_with_any_names_can_be_printed_where_the_encoding_lacks_their_ch
 
 
 def test_text_is_unchanged_where_nothing_is_known_of_the_output(monkeypatch):
-    for output in (None, io.StringIO()):
+    outputs = [SimpleNamespace(encoding=encoding) for encoding in ("", "console", 850)]
+    for output in (None, io.StringIO(), *outputs):
         monkeypatch.setattr(sys, "stdout", output)
         assert printable("θ = 1 → 2") == "θ = 1 → 2"
 
