@@ -550,7 +550,8 @@ class Recording(Channels):
         Warns
         -----
         UserWarning
-            If the period drifts by more than noise explains, or not more than half of the cycles are used.
+            If the period drifts by more than noise explains, not more than half of the cycles are used, or a finding of
+            `check` is serious.
 
         Examples
         --------
