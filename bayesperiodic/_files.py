@@ -83,10 +83,10 @@ def locked(target: Path, *, wait: float = 0.0) -> Iterator[None]:
     place = target.with_name(_beside(target, "bayesperiodic-lock"))
     foreign = False
     with suppress(FileNotFoundError):  # its holder may remove it at any time
-        found = os.lstat(place)
-        if not stat.S_ISREG(found.st_mode):
+        status = os.lstat(place)
+        if not stat.S_ISREG(status.st_mode):
             raise FileExistsError(f"path: must have nothing in the place of its lock, got {str(place)!r}; remove it.")
-        foreign = found.st_size > 0
+        foreign = status.st_size > 0
     lock = FileLock(place, timeout=wait)
     try:
         lock.acquire()
