@@ -28,7 +28,7 @@ def in_folder(path: str | Path) -> Path:
     if target.is_symlink():
         raise OSError(errno.ELOOP, "path: must not be a loop of symbolic links", str(path))
     if not target.parent.is_dir():
-        raise FileNotFoundError(f"path: must be in an existing folder, got {str(path)!r}.")
+        raise FileNotFoundError(f"path: must be in an existing folder, got {str(path)!r}; create the folder.")
     if target.is_dir():
         raise IsADirectoryError(f"path: must be a file, got the folder {str(path)!r}; add a file name.")
     if target.exists() and not target.is_file():

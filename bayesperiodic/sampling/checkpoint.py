@@ -71,9 +71,9 @@ class Checkpoint:
                 f"checkpoint: must not be in use by another run, got {given!r}; wait, or name another file."
             ) from None
         except (OSError, NotImplementedError) as error:
-            raise ValueError(
-                f"checkpoint: must be a writable file, got {given!r} ({error}); name another file."
-            ) from None
+            text = f"path: must be a writable file, got {given!r} ({error}); name another file."
+            text = str(error) if str(error).startswith("path: ") else text
+            raise ValueError(text.replace("path", "checkpoint", 1)) from None
         remove_drafts(self._path)
         return self
 

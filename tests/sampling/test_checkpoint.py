@@ -383,8 +383,15 @@ def test_a_link_and_its_file_are_one_checkpoint(problem, uninterrupted, tmp_path
 def test_checkpoint_that_is_no_file_is_refused(problem, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "loop").symlink_to("loop")
-    for place in (tmp_path, tmp_path / "pipe", tmp_path / "loop", "/dev/null", tmp_path / "nowhere" / "run.h5"):
-        with pytest.raises(ValueError, match="checkpoint: must be a writable file, got .*; name another file"):
+    messages = {
+        tmp_path: "must be a file, got the folder .*; add a file name",
+        tmp_path / "pipe": "must be a file, got .*, a device or a pipe; name another file",
+        "/dev/null": "must be a file, got '/dev/null', a device or a pipe; name another file",
+        tmp_path / "loop": "must be a writable file, got .* a loop of symbolic links.*; name another file",
+        tmp_path / "nowhere" / "run.h5": "must be in an existing folder, got '[^']*run.h5'; create the folder",
+    }
+    for place, message in messages.items():
+        with pytest.raises(ValueError, match=f"^checkpoint: {message}"):
             bp.sample(*problem, checkpoint=place, **SHORT)
     assert sorted(os.listdir(tmp_path)) == ["loop", "pipe"]
 
