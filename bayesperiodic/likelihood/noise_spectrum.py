@@ -47,7 +47,7 @@ def smoothed(variance: np.ndarray, freedom: np.ndarray) -> NoiseSpectrum:
     lines = _lines(np.log(np.arange(1.0, last + 1.0)), 1.0 / spread)
     expected = np.sum((np.eye(last) - lines) ** 2 * spread, axis=1) / spread
     off = (level - lines @ level) ** 2 / spread
-    part = 1.0 if last < HARMONICS_OF_A_LINE else min(1.0, expected.sum() / max(off.sum(), np.finfo(float).tiny))
+    part = min(1.0, expected.sum() / max(off.sum(), np.finfo(float).tiny))
     weights = part * lines + (1.0 - part) * np.eye(last)
     # The result has the mean of χ²/ν, where 2/ν + … = ψ′(ν/2) is the variance of its logarithm.
     after = 1.0 / (weights**2 @ spread) + 0.5
