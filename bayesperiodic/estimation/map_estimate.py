@@ -379,10 +379,12 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             "another model."
         )
     for channel in fit.without_noise:
+        own = [name for name in problem.free_noise if name.startswith(f"variance[{channel}")]
+        variance = (own or [*problem.free_noise, "variance"])[0]
         yield (
             f"The data of {channel!r} contain no noise: the residual's rms of {fit.rms[channel]:.2g} is a rounding "
             "error, and standard deviations that follow from it mean nothing. Add noise to simulated data, or give its "
-            f"variance, fixed={{'variance[{channel}]': …}}."
+            f"variance, fixed={{{variance!r}: …}}."
         )
     for name in fit.at_ends:
         low, high = problem.joint_prior.supports[name]
