@@ -60,3 +60,8 @@ def test_few_harmonics_and_harmonics_without_noise_are_left_as_they_are(variance
     found = smoothed(np.array(variance), np.full(len(variance), 8.0))
     assert found.variance.tolist() == variance
     assert found.mixing.tolist() == np.eye(len(variance)).tolist()
+
+
+def test_known_variances_are_left_as_they_are():
+    variance = np.array([1.0, 2.0, 5.0, 3.0, 1.0, 2.0])
+    assert smoothed(variance, np.full(6, np.inf)).variance.tolist() == variance.tolist()
