@@ -539,11 +539,9 @@ class MapEstimate(Result):
 
         None where errors of the inputs may explain all of the residuals.
         """
-        if any(errors.loadings.any() for errors in self.input_errors.values()):
-            return ()
-        names = {name.partition(", ")[0] for name in self.independent}
-        channels = self.fvu if Relative.pooled in names else names & {*self.fvu}
-        return tuple(c for c, fraction in self.fvu.items() if c in channels and fraction < ROUNDING_VARIANCE)
+        explained = any(errors.loadings.any() for errors in self.input_errors.values())
+        names = {name.partition(", ")[0] for name in self.independent if not explained}
+        return tuple(c for c, part in self.fvu.items() if names & {c, Relative.pooled} and part < ROUNDING_VARIANCE)
 
     def __repr__(self) -> str:
         status = self.status if self.converged else f"NOT CONVERGED: {self.status}; try another start, or starts=8"
