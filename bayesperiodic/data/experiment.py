@@ -123,7 +123,8 @@ class Experiment(Result):
     ValueError
         For arrays of a wrong length, NaN in measured samples, a frequency ≤ 0, an unknown channel, a name with ``/``,
         ``[`` or ``]``, a mask without points, a covariance that is not symmetric and positive definite, multipliers
-        that are zero or have no standard deviation.
+        that are zero or have no standard deviation, variances of amplitudes that are negative, or for which there are
+        too few degrees of freedom.
 
     Examples
     --------
@@ -201,6 +202,7 @@ class Experiment(Result):
             object.__setattr__(self, argument, given)
             for key in given:
                 _checks.one_of(argument, key, (*self.inputs, *self.outputs))
+        self._check_amplitude_variances()
         object.__setattr__(self, "clocks", {name: tuple(channels) for name, channels in self.clocks.items()})
         for name, named in self.clocks.items():
             for channel in named:
@@ -249,6 +251,20 @@ class Experiment(Result):
                 checked[key] = lines
         object.__setattr__(self, "unmeasured", checked)
         return checked
+
+    def _check_amplitude_variances(self) -> None:
+        for key, given in self.amplitude_variance.items():
+            variance = np.asarray(given, dtype=float)
+            if variance.ndim != 1 or not np.all(np.isfinite(variance) & (variance >= 0.0)):
+                raise ValueError(
+                    f"amplitude_variance[{key!r}]: must be a vector of finite values, at least 0, got {given}."
+                )
+            freedom = np.asarray(self.amplitude_freedom.get(key, np.ones(variance.size)), dtype=float)
+            if freedom.ndim != 1 or freedom.size < variance.size or not np.all(freedom > 0.0):
+                raise ValueError(
+                    f"amplitude_freedom[{key!r}]: must be {variance.size} values > 0, one for each variance of the "
+                    f"amplitudes, got {freedom.tolist()}."
+                )
 
     def _check_multipliers(self) -> None:
         if self.multipliers is None:

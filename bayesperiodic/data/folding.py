@@ -81,7 +81,8 @@ def fold_signals(
     parts, fit = _at_phases(parts, fit, pace, periods, given, seen.limits)
     drift = dict(zip(seen.channels, _drift(seen.sizes), strict=True))
     _refuse_drift(name, drift, largest_drift)
-    refuse(name, _with_stated_clock(seen.findings, clocks))
+    findings = _with_stated_clock(seen.findings, clocks)
+    refuse(name, findings)
     cycles = round(max(np.ptp(part.time) for part in parts) * fit.frequency)
     _warn(name, pace, cycles, seen, given is None)
     one_cycle, noise = _noises(seen, parts, fit, cycles)
@@ -119,7 +120,7 @@ def fold_signals(
         "origin": start,
         # The phase of a channel that defines τ = 0 is not turned.
         "middle": {} if origin == CROSSING else {c: float(p.time.mean()) for p in parts for c in p.channels},
-        "findings": seen.findings,
+        "findings": tuple(findings),
         "clocks": others,
     }
 

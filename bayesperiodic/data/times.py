@@ -122,6 +122,9 @@ def shared(times: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 def _refuse_integers(argument: str, values: Any) -> None:
     """Raise a ValueError for integers that are milli-, micro- or nanoseconds by their size or their steps."""
     array = values.compressed() if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
+    if array.dtype.kind == "O" and not any(isinstance(one, float) and one == one for one in array.flat):
+        # Python's integers, and others among which some are missing.
+        array = np.array([one for one in array.flat if isinstance(one, int | np.integer)])
     if array.dtype.kind not in "iu" or array.ndim != 1 or array.size < 2:
         return
     first, steps = int(array[0]), np.abs(np.diff(array.astype(np.int64)))

@@ -39,11 +39,15 @@ def other_orbit(observation: Observation, response: Response) -> str:
 
 
 def unexplained(observation: Observation, response: Response) -> dict[str, float]:
-    """Return the mean square of each channel's residual over the variance of its recorded period."""
-    count = np.count_nonzero(observation.experiment.measured_points)
-    power = np.maximum(observation.data.var(axis=0), np.finfo(float).tiny).tolist()
+    """Return the mean square of each channel's residual over the variance of its measured values.
+
+    Of a single value it is that over its square.
+    """
+    measured = observation.data[observation.experiment.measured_points]
+    power = measured.var(axis=0) if len(measured) > 1 else measured[0] ** 2
+    power = np.maximum(power, np.finfo(float).tiny).tolist()
     left = observation.compared(response).items()
-    return {c: float(np.sum(e**2)) / count / size for (c, e), size in zip(left, power, strict=True)}
+    return {c: float(np.sum(e**2)) / len(measured) / size for (c, e), size in zip(left, power, strict=True)}
 
 
 def _differences(observation: Observation, response: Response) -> Iterator[str]:

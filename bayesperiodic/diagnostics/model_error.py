@@ -167,7 +167,7 @@ def model_errors(problem: Problem, here: Linearisation, noise: np.ndarray) -> pd
             used, up_to = float(np.sum(basis[place] ** 2)), np.nan
             if block.spectral:
                 up_to = float(block.harmonic.max())
-            if block.channel in e.left_out:
+            if block.spectral and block.channel in e.left_out:
                 without = e.left_out[block.channel]
                 part = part.with_harmonics(block.size, above[block.experiment][block.channel], without)
                 up_to = float(without.harmonic.max())

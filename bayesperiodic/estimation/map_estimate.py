@@ -39,6 +39,7 @@ from bayesperiodic.estimation.laplace import joint_laplace
 from bayesperiodic.estimation.modes import default_starts, notable, weighed, with_images
 from bayesperiodic.estimation.result import MapEstimate, NoiseEstimate, Search, TrueInputs
 from bayesperiodic.estimation.units import compared_with_data, not_isolated, singular_start, unit_error
+from bayesperiodic.likelihood.noise import Relative
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.problem.model_inputs import model_inputs
@@ -379,10 +380,12 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             "another model."
         )
     for channel in fit.without_noise:
+        named = [n for n in problem.free_noise if _short(n).partition(", ")[0] in (channel, Relative.pooled)]
+        variance = (named or problem.noise_names)[0]
         yield (
             f"The data of {channel!r} contain no noise: the residual's rms of {fit.rms[channel]:.2g} is a rounding "
             "error, and standard deviations that follow from it mean nothing. Add noise to simulated data, or give its "
-            f"variance, fixed={{'variance[{channel}]': …}}."
+            f"variance, fixed={{{variance!r}: …}}."
         )
     for name in fit.at_ends:
         low, high = problem.joint_prior.supports[name]

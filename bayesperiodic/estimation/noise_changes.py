@@ -150,6 +150,8 @@ def _of_inputs(
 ) -> Iterator[tuple[NoiseChange, float]]:
     """Yield the changes with the measured variances of inputs."""
     where, waves = error_waves(experiment, problem.input_noise)
+    if not where:  # an error of the frequency only
+        return
     loadings = problem.likelihood.loadings[experiment.name][:, : len(where)]
     harmonic = np.abs(waves).argmax(axis=1)
     for name in dict.fromkeys(where):

@@ -16,6 +16,7 @@ from bayesperiodic.estimation.intervals import carried_covariance, log_normal_in
 from bayesperiodic.estimation.laplace import JointLaplace
 from bayesperiodic.estimation.modes import Mode, notable
 from bayesperiodic.likelihood.input_noise import InputErrors
+from bayesperiodic.likelihood.noise import Relative
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.priors.joint import MultivariateNormal
 from bayesperiodic.problem.parameters import checked_key, in_experiment, local_hint, local_names
@@ -538,10 +539,9 @@ class MapEstimate(Result):
 
         None where errors of the inputs may explain all of the residuals.
         """
-        if any(errors.loadings.any() for errors in self.input_errors.values()):
-            return ()
-        names = {name.partition(", ")[0] for name in self.independent}
-        return tuple(c for c, fraction in self.fvu.items() if c in names and fraction < ROUNDING_VARIANCE)
+        explained = any(errors.loadings.any() for errors in self.input_errors.values())
+        names = {name.partition(", ")[0] for name in self.independent if not explained}
+        return tuple(c for c, part in self.fvu.items() if names & {c, Relative.pooled} and part < ROUNDING_VARIANCE)
 
     def __repr__(self) -> str:
         status = self.status if self.converged else f"NOT CONVERGED: {self.status}; try another start, or starts=8"

@@ -389,6 +389,16 @@ class Relative(Measured):
     name: ClassVar[str] = "relative"
     pooled: ClassVar[str] = "relative"
 
+    def check(self, blocks: Sequence[Block]) -> None:
+        """Refuse unknown scatter, and points of a channel that do not vary."""
+        super().check(blocks)
+        for block in (b for b in blocks if b.timed and not b.mean_square > 0.0):
+            raise ValueError(
+                f"noise: must be 'measured' or 'independent' for points at which a channel does not vary, got "
+                f"{self.name!r}; the error of the model cannot be relative to {block.channel!r} of experiment "
+                f"{block.experiment!r}, whose mask has {block.size} points of one value."
+            )
+
     def unit(self, block: Block) -> float:
         """Return the mean square of the channel."""
         return block.mean_square

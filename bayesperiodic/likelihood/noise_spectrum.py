@@ -36,10 +36,11 @@ def smoothed(variance: np.ndarray, freedom: np.ndarray) -> NoiseSpectrum:
     The logarithms of the nearest harmonics' variances lie about a line in ln h, a power law, with the variances ψ′(ν/2)
     for ν degrees of freedom. Those that differ more from their lines than these explain, by the factor T in the mean
     square, move towards them by the part 1/T only, so that peaks of the spectrum remain. The mean value, which slow
-    noise moves, keeps its own variance.
+    noise moves, keeps its own variance, and so do all where some are known (infinite degrees of freedom) or zero.
     """
     mixing, last = np.eye(variance.size), variance.size - 1
-    usable = last > 2 and np.all(variance[1:] > 0.0) and np.all(freedom[1:] > 0.0)
+    measured = np.isfinite(freedom[1:]) & (freedom[1:] > 0.0)
+    usable = last > 2 and np.all(variance[1:] > 0.0) and measured.all()
     if not usable:
         return NoiseSpectrum(variance, freedom, mixing)
     half = 0.5 * freedom[1:]
@@ -47,7 +48,7 @@ def smoothed(variance: np.ndarray, freedom: np.ndarray) -> NoiseSpectrum:
     lines = _lines(np.log(np.arange(1.0, last + 1.0)), 1.0 / spread)
     expected = np.sum((np.eye(last) - lines) ** 2 * spread, axis=1) / spread
     off = (level - lines @ level) ** 2 / spread
-    part = 1.0 if last < HARMONICS_OF_A_LINE else min(1.0, expected.sum() / max(off.sum(), np.finfo(float).tiny))
+    part = min(1.0, expected.sum() / max(off.sum(), np.finfo(float).tiny))
     weights = part * lines + (1.0 - part) * np.eye(last)
     # The result has the mean of χ²/ν, where 2/ν + … = ψ′(ν/2) is the variance of its logarithm.
     after = 1.0 / (weights**2 @ spread) + 0.5

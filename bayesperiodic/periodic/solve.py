@@ -260,7 +260,8 @@ def is_one_of_many(
     if isinstance(guess, str):
         cycle = measured_cycle(equations, theta)
         return cycle is not None and has_neighbours(equations, theta, *cycle)
-    return has_neighbours(equations, theta, as_guess(equations, guess), equations.frequency)
+    frequency = guess.frequency if isinstance(guess, PeriodicSolution) else equations.frequency
+    return has_neighbours(equations, theta, as_guess(equations, guess), frequency)
 
 
 def _solution_warnings(

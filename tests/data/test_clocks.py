@@ -159,7 +159,8 @@ def test_clocks_that_differ_are_refused_with_their_difference(ppm):
     with pytest.raises(ValueError, match="drifts steadily against force"):
         recording.fold(32)
     with pytest.warns(UserWarning, match="drifts steadily against force"):
-        recording.fold(32, clocks="one")
+        stated = recording.fold(32, clocks="one")
+    assert [f.severity for f in stated.findings if f.kind == "clock"] == ["serious"]
 
 
 @pytest.mark.parametrize("losses", [[(800, 7)], [(600, 3), (1300, 5)], [(200 * i + 100, 1) for i in range(11)]])

@@ -53,3 +53,27 @@ def test_error_names_the_bad_harmonics(changes, message):
     arguments = {"name": "run", "frequency": 1.0, "outputs": {"x": AMPLITUDES}, "samples": 50}
     with pytest.raises(ValueError, match=message):
         bp.Experiment.from_harmonics(**(arguments | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"amplitude_variance": {"x": [1.0, -1.0]}},
+            r"amplitude_variance\['x'\]: must be .* finite .*got \[1.0, -1.0\]",
+        ),
+        (
+            {"amplitude_variance": {"x": [1.0, np.nan]}},
+            r"amplitude_variance\['x'\]: must be .* finite .*got \[1.0, nan\]",
+        ),
+        ({"amplitude_freedom": {"x": [4.0]}}, r"amplitude_freedom\['x'\]: must be 2 values > 0, .*got \[4.0\]"),
+        (
+            {"amplitude_freedom": {"x": [4.0, 0.0]}},
+            r"amplitude_freedom\['x'\]: must be 2 values > 0, .*got \[4.0, 0.0\]",
+        ),
+    ],
+)
+def test_error_names_the_bad_variance_of_amplitudes(changes, message):
+    given = {"samples": 8, "harmonics": {"x": 1}, "amplitude_variance": {"x": [1.0, 2.0]}}
+    with pytest.raises(ValueError, match=message):
+        bp.Experiment("run", 1.0, {"x": np.cos(np.arange(8.0))}, **(given | changes))

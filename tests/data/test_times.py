@@ -94,7 +94,8 @@ def test_numbers_keep_their_origin_unless_no_float_holds_them():
 )
 def test_integers_that_are_no_seconds_are_refused_with_their_unit(first, step, message):
     time = first + step * np.arange(COUNT)
-    for given in (time, time.tolist(), time.astype(np.uint64), pd.Series(time), np.ma.array(time), {"x": time}):
+    kinds = time, time.tolist(), time.astype(np.uint64), time.astype(object), pd.Series(time), np.ma.array(time)
+    for given in (*kinds, {"x": time}):
         with pytest.raises(ValueError, match=rf"^time(\['x'\])?: must be in seconds, got .*{message}"):
             bp.Recording.from_arrays(given, {"x": SIGNAL})
     cure = re.search(r"astype\('(.*?)'\)", message.replace("\\", ""))[1]

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.density.orbit_check import unexplained
+from bayesperiodic.likelihood.observation import Response
 from tests.known import grid
-from tests.problems import CASES, cycle_run
+from tests.problems import CASES, SAMPLES, cycle_run, duffing, duffing_run
 
 TRUTH = {"mu": 1.5, "omega": 1.0}
 WELLS = {"m": 1.0, "c": 0.3, "k": -1.0, "k3": 1.0}
@@ -68,6 +70,18 @@ def test_orbits_at_the_anchors_are_taken_where_they_explain_the_data():
         followed = problem.density().solver.solutions(theta)
         for run, solution in problem.solve(theta).items():
             assert all(np.array_equal(values, solution.states[n]) for n, values in followed[run].states.items())
+
+
+def test_unexplained_variance_is_that_of_the_measured_points():
+    """The residual of no motion is all of the mean square; other points of a mask are no data."""
+    for points, share in (([3], 1.0), ([3, 11, 40], None)):
+        run = duffing_run(mask=np.isin(np.arange(SAMPLES), points))
+        problem = duffing(run, noise=bp.noise.Independent(prior=bp.InverseGamma(3.0, 2.0)))
+        (observation,) = problem.observations.values()
+        still = Response(np.zeros((SAMPLES, 1)), np.array(0.1), np.empty(0), np.empty(0))
+        y = observation.experiment.outputs["displacement"][points]
+        expected = share or np.mean(y**2) / np.var(y)
+        assert unexplained(observation, still)["displacement"] == pytest.approx(expected)
 
 
 def test_failed_solves_keep_their_status():

@@ -1,5 +1,7 @@
 """Size of the error of a model, against an error of known size."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -75,6 +77,19 @@ def test_harmonics_left_out_are_no_misfit_where_the_model_has_them():
     here = problem.anchored(fit.theta).density().linearise(problem.vector(fit.theta))
     found = model_errors(problem, here, problem.noise_values(dict(fit.noise))).iloc[0]
     assert found[MODEL_ERROR[2]] < 1e-5 and found[UP_TO] == 31.0
+
+
+def test_harmonics_left_out_are_none_at_the_points_of_a_mask():
+    u = np.cos(2 * np.pi * TIME)
+    y = 2.0 * u + 0.1 * np.random.default_rng(3).standard_normal(TIME.size)
+    run = bp.Recording.from_arrays(TIME, {"y": y}, {"u": u}).fold(64, frequency=1.0, harmonics={"y": 1})
+    assert "y" in run.left_out
+    run = replace(run, mask=np.arange(64) % 4 == 0)
+    problem = bp.Problem(GAIN, [run], priors={"a": bp.Normal(1, 10)}, scheme="fourier", input_noise="exact")
+    fit = bp.map_estimate(problem, checks=False, progress=False)
+    here = problem.anchored(fit.theta).density().linearise(problem.vector(fit.theta))
+    found = model_errors(problem, here, problem.noise_values(dict(fit.noise))).iloc[0]
+    assert np.isnan(found[UP_TO]) and found[MODEL_ERROR[2]] < 0.03
 
 
 def test_the_words_say_up_to_which_harmonic_the_error_is_known():

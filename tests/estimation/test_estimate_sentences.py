@@ -32,6 +32,7 @@ def fitted(**changes):
 def problem(rates=0, noise="exact"):
     return SimpleNamespace(
         names=("a", "b"),
+        free_noise=("variance[y]",),
         logarithmic=np.array([True, False]),
         input_noise=noise,
         model=SimpleNamespace(input_derivatives=lambda: {"u": rates} if rates else {}),
@@ -269,3 +270,5 @@ def test_a_printed_estimate_lists_what_is_known_of_it():
 def test_channels_of_rounding_errors_are_without_noise_if_their_variance_is_unknown():
     fit = fitted(independent={"y": 9.0, "z, run": 9.0}, fvu={"y": 0.9e-16, "z": 0.9e-16, "w": 0.0, "v": 1.1e-16})
     assert MapEstimate.without_noise.fget(fit) == ("y", "z")
+    fit.independent = {"relative": 18.0}  # of all channels
+    assert MapEstimate.without_noise.fget(fit) == ("y", "z", "w")

@@ -234,3 +234,19 @@ def test_intervals_cover_where_the_error_of_the_frequency_is_the_largest():
             low, high = bp.map_estimate(problem, start=truth, checks=False, **QUIET).interval(0.9)["k"]
             covered[kept] += low < truth["k"] < high
     assert covered[True] >= 45 and covered[False] < 35
+
+
+def test_an_error_of_the_frequency_alone_stands_beside_measured_noise_of_inputs():
+    """The second experiment has no measured noise of its input, but an error of its frequency that counts."""
+    recording = recorded(INPUTS, 1, 1)[0]
+    generator, runs = np.random.default_rng(6), []
+    for name, error in (("noisy", 1e-7), ("exact", 1e-3)):
+        run = folded(recording, FREQUENCY, 1, 0.0)
+        outputs = {c: y + 1e-3 * y.std() * generator.standard_normal(y.size) for c, y in run.outputs.items()}
+        variance = {"F": np.full(8, 1e-6)} if name == "noisy" else {}
+        runs.append(replace(run, name=name, outputs=outputs, amplitude_variance=variance, frequency_se=error))
+    priors = {name: bp.Normal(value, 0.3) for name, value in TRUTH.items()}
+    problem = bp.Problem(INPUTS, runs, priors=priors)
+    fit = bp.map_estimate(problem, start=TRUTH, checks=False, **QUIET)
+    assert fit.converged and fit.input_errors["exact"].loadings.any() and fit.input_errors["noisy"].loadings.any()
+    assert all(abs(fit.theta[n] - TRUTH[n]) < 4 * fit.sd[n] and fit.degrees_of_freedom[n] > 1.0 for n in TRUTH)

@@ -570,6 +570,12 @@ def test_error_names_the_bad_noise_of_a_problem(changes, message):
         bp.Problem(LINEAR, [run(40)], **({"priors": PRIORS} | changes))
 
 
+def test_a_model_error_cannot_be_relative_to_one_point():
+    one = run(40, mask=np.arange(40) == 3, scatter={"force": 0.1}, cycles=4)
+    with pytest.raises(ValueError, match="noise: must be .*got 'relative'; .* whose mask has 1 points of one value"):
+        bp.Problem(LINEAR, [one], priors=PRIORS, noise="relative")
+
+
 @pytest.mark.parametrize(
     ("model", "needed"), [(noise.Independent(), 3), (noise.Independent(prior="flat"), 5), (noise.Circulant(), 3)]
 )

@@ -47,8 +47,21 @@ def test_a_line_of_the_noise_at_one_harmonic_is_not_smoothed_away():
     assert np.mean((found > 0.6 * alone[0] * 100.0) & (found < alone[1] * 100.0)) > 0.98
 
 
+@pytest.mark.parametrize("harmonics", [3, 4])
+def test_a_line_of_the_noise_remains_among_few_harmonics_too(harmonics):
+    true = np.ones(harmonics + 1)
+    true[2] = 100.0
+    found = smoothed(true, np.full(true.size, 200.0)).variance
+    assert found == pytest.approx(true, rel=0.1)
+
+
 @pytest.mark.parametrize("variance", [[1.0, 2.0, 3.0], [1.0, 2.0, 0.0, 3.0, 1.0, 2.0]])
 def test_few_harmonics_and_harmonics_without_noise_are_left_as_they_are(variance):
     found = smoothed(np.array(variance), np.full(len(variance), 8.0))
     assert found.variance.tolist() == variance
     assert found.mixing.tolist() == np.eye(len(variance)).tolist()
+
+
+def test_known_variances_are_left_as_they_are():
+    variance = np.array([1.0, 2.0, 5.0, 3.0, 1.0, 2.0])
+    assert smoothed(variance, np.full(6, np.inf)).variance.tolist() == variance.tolist()
