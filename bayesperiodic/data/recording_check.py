@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 #: Severities of findings: without effect, a bias that counts, and a result that is wrong.
 HARMLESS, SERIOUS, RUINOUS = with_tone("harmless", GOOD), with_tone("serious", CAUTION), with_tone("ruinous", BAD)
 WRAPS, FEW_LEVELS = "wraps", "coarse"
-# Levels up to which rounding errors are in few harmonics; those of more levels are like noise, and in the residual.
-MOST_COARSE_LEVELS = 32
+# Levels (fewer than six bits) up to which rounding errors prevail in few harmonics, so that intervals by the residual of
+# the harmonics kept can be too narrow; those of more levels are spread over the harmonics as noise is.
+MOST_COARSE_LEVELS = 63
 SEVERITIES = (HARMLESS, SERIOUS, RUINOUS)
 # Bias in standard errors of all amplitudes together that is serious, and relative to the signal that is ruinous.
 SERIOUS_BIAS, RUINOUS_BIAS = 0.5, 0.05
@@ -49,7 +50,7 @@ class Finding(Storable):
     ----------
     kind : str
         "constant", "wraps", "stuck", "held" (a slower logger), "clipped", "saturated" (flat tops of the mean period),
-        "outliers", "heavy tails", "coarse" (few levels with little noise), "gaps", "aliases", "ramp", "transient",
+        "outliers", "heavy tails", "coarse" (2 to 63 levels with little noise), "gaps", "aliases", "ramp", "transient",
         "drift", "beating", "amplitude step", "mean step", "phase step" or "clock" (the phase of a channel drifts
         steadily against the first one).
     channel : str

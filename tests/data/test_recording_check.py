@@ -420,7 +420,7 @@ def test_false_alarm_rate_of_serious_findings_is_at_most_one_percent():
     assert len(alarms(range(100, 600))) <= stats.binom.ppf(0.995, 500, 0.01)
 
 
-@pytest.mark.parametrize("levels", [2, 3, 5, 8, 12, 25])
+@pytest.mark.parametrize("levels", [2, 3, 5, 8, 12, 25, 50])
 def test_few_levels_with_little_noise_are_named_with_their_effect(levels):
     """The error of the amplitudes, by the mean period of the unrounded motion, is within a factor of four as stated."""
     angle = clean() + 1e-4 * np.random.default_rng(1).standard_normal(TIME.size)
