@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 #: Severities of findings: without effect, a bias that counts, and a result that is wrong.
 HARMLESS, SERIOUS, RUINOUS = with_tone("harmless", GOOD), with_tone("serious", CAUTION), with_tone("ruinous", BAD)
 WRAPS, FEW_LEVELS = "wraps", "coarse"
-# Levels (fewer than six bits) up to which rounding errors prevail in few harmonics, so that intervals by the residual of
-# the harmonics kept can be too narrow; those of more levels are spread over the harmonics as noise is.
+# Levels (fewer than six bits) up to which rounding errors prevail in few harmonics, so that intervals by the residual
+# of those kept can be too narrow; those of more levels are spread over the harmonics as noise is.
 MOST_COARSE_LEVELS = 63
 SEVERITIES = (HARMLESS, SERIOUS, RUINOUS)
 # Bias in standard errors of all amplitudes together that is serious, and relative to the signal that is ruinous.
