@@ -89,7 +89,7 @@ WITHOUT_RESULTS = {
         DEFINITION: (
             "biases them by more than 5 % of the signal", "jumps by 2π, 360, 1, or the range",
             "harmless below 1.5 % of the amplitude", "harmless below 0.5 % of the amplitude",
-            "at most 32 levels and little noise",
+            "2 to 63 levels with so little noise",
         ),
     },
     "docs/how_to/noisy_inputs.md": {DEFINITION: ("warns from 0.3 on", "false-alarm rate of 1 %")},

@@ -24,7 +24,7 @@ from bayesperiodic.data.harmonics import (
 )
 from bayesperiodic.data.inspection import Inspection
 from bayesperiodic.data.lines import LEAST_LEFT, Sampling
-from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
+from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance, rounded_step
 from bayesperiodic.data.recording_check import SERIOUS, Finding, refuse
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, aperiodic, even_times, response_period
 from bayesperiodic.data.several_clocks import ONE, Clocks, inspect_clocks
@@ -436,8 +436,10 @@ def _repeated_error(
     square = np.sum(residuals**2) - np.sum(np.bincount(place, residuals, points) ** 2 / np.maximum(count, 1))
     phases = np.count_nonzero(count)
     again = values.size - phases
+    if not again:
+        return 0.0
     fitted = _fourier.on_grid(amplitudes, points)
-    return repeated_variance(values, fitted, int(phases), square / again) if again else 0.0
+    return repeated_variance(rounded_step(values, phase), fitted, int(phases), scatter=square / again)
 
 
 def _last_significant(amplitudes: np.ndarray, noise: AmplitudeNoise) -> int:

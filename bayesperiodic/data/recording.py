@@ -491,8 +491,9 @@ class Recording(Channels):
         harmonic is the mean power of the nearest K/4 lines (from 4 to 16, at most K/2) on each side. The variance of
         harmonic 0 is extrapolated from the lines above it, as that of white, exponentially correlated or 1/f noise,
         whichever explains them. Noise that lasts longer than the recording cannot be told from the mean value.
-        Values that are multiples of one step, of eight or more, have quantisation errors; the part of them that repeats
-        in every cycle, and that no average removes, is added.
+        Values that are multiples of one step have quantisation errors, but for two levels that change at the same
+        phases in every cycle, as those of a square wave; the part of them that repeats in every cycle, and that no
+        average removes, is added.
 
         Parameters
         ----------

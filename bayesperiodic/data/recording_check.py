@@ -17,6 +17,7 @@ from bayesperiodic.data.aliases import SEARCHED, aliases, samples_per_cycle
 from bayesperiodic.data.coverage import per_cycle
 from bayesperiodic.data.faults import ChannelFaults
 from bayesperiodic.data.harmonics import fit_harmonics
+from bayesperiodic.data.quantisation import FEWEST_LEVELS, repeated_variance, rounded_step
 from bayesperiodic.data.signals import GAP, LISTED_ALIASES, USUAL_STEPS
 
 if TYPE_CHECKING:
@@ -25,8 +26,9 @@ if TYPE_CHECKING:
 #: Severities of findings: without effect, a bias that counts, and a result that is wrong.
 HARMLESS, SERIOUS, RUINOUS = with_tone("harmless", GOOD), with_tone("serious", CAUTION), with_tone("ruinous", BAD)
 WRAPS, FEW_LEVELS = "wraps", "coarse"
-# Levels up to which rounding errors follow the signal where the noise before rounding is smaller than this many steps.
-MOST_COARSE_LEVELS, LARGEST_NOISE = 32, 0.2
+# Levels (fewer than six bits) up to which rounding errors prevail in few harmonics, so that intervals by the residual
+# of those kept can be too narrow; those of more levels are spread over the harmonics as noise is.
+MOST_COARSE_LEVELS = 63
 SEVERITIES = (HARMLESS, SERIOUS, RUINOUS)
 # Bias in standard errors of all amplitudes together that is serious, and relative to the signal that is ruinous.
 SERIOUS_BIAS, RUINOUS_BIAS = 0.5, 0.05
@@ -48,7 +50,7 @@ class Finding(Storable):
     ----------
     kind : str
         "constant", "wraps", "stuck", "held" (a slower logger), "clipped", "saturated" (flat tops of the mean period),
-        "outliers", "heavy tails", "coarse" (few levels with little noise), "gaps", "aliases", "ramp", "transient",
+        "outliers", "heavy tails", "coarse" (2 to 63 levels with little noise), "gaps", "aliases", "ramp", "transient",
         "drift", "beating", "amplitude step", "mean step", "phase step" or "clock" (the phase of a channel drifts
         steadily against the first one).
     channel : str
@@ -233,31 +235,41 @@ def sample_findings(
         yield _saturated(channel, time, fault.saturated, fault)
     if bad.any():
         yield from _bad_findings(channel, time, values, fault, bad, frequency, harmonics, used)
-    elif frequency and fault.step and fault.saturation is None:
-        yield from _coarse(channel, time[used], values[used], fault.step, frequency, harmonics)
+    if frequency:
+        yield from _coarse(channel, time[used], values[used], bad[used], frequency, harmonics)
 
 
 def _coarse(
-    channel: str, time: np.ndarray, values: np.ndarray, step: float, frequency: float, harmonics: int
+    channel: str, time: np.ndarray, values: np.ndarray, bad: np.ndarray, frequency: float, harmonics: int
 ) -> Iterator[Finding]:
-    """Return the finding of few levels with little noise, whose rounding errors are no noise, see `quantisation`."""
-    levels = round(float(np.ptp(values)) / step) + 1
-    if levels > MOST_COARSE_LEVELS:
+    """Return the finding of few levels with little noise, whose rounding errors are no noise, see `quantisation`.
+
+    Noise beyond the outer levels is cut off, so that no noise helps two of them.
+    """
+    if bad.all():
         return
-    effect = effect_of(time, values, np.zeros(values.size, dtype=bool), frequency, harmonics)
-    if not effect.noise**2 < (1.0 / 12.0 + LARGEST_NOISE**2) * step**2:
+    phase, good = frequency * time, values[~bad]
+    step = rounded_step(good, phase[~bad])
+    levels = round(float(np.ptp(good)) / step) + 1 if step else 0
+    if not 2 <= levels <= MOST_COARSE_LEVELS:
         return
-    passed = max(float(np.abs(np.diff(effect.predicted)).sum()) / step / max(np.ptp(time) * frequency, 1.0), 1.0)
-    error = step / np.sqrt(12.0 * min(passed, values.size))
-    bias = error / max(effect.noise / np.sqrt(values.size), 1e-9 * step)
+    effect, error, bias = effect_of(time, values, bad, frequency, harmonics), np.nan, np.nan
+    if effect.predicted.size:
+        cycles = max(int(np.ptp(phase)), 1)
+        one = effect.predicted[: values.size // cycles]
+        error = float(np.sqrt(repeated_variance(step, one, values.size, residual=effect.noise**2)))
+        bias = error / max(effect.noise / np.sqrt(values.size), 1e-9 * step)
+    if levels > 2 and not bias > SERIOUS_BIAS:
+        return
+    size = f", and change the mean period by about {error / good.std():.1%} of its rms, {bias:.3g} standard errors"
+    several = f"has only {levels} levels, steps of {step:.3g}, and little noise between them"
+    two = f"has only two levels, {step:.3g} apart, and changes between them at other phases in every cycle"
     yield Finding(
-        FEW_LEVELS, channel, SERIOUS if bias > SERIOUS_BIAS else HARMLESS,
-        np.array([[time[0], time[-1]]]), values.size, 1.0, bias,
-        f"{channel} has only {levels} levels, steps of {step:.3g}, and little noise between them: its rounding errors "
-        f"repeat in every cycle, do not average out, and change the mean period by about {error / values.std():.1%} of "
-        f"its rms, {bias:.3g} standard errors",
+        FEW_LEVELS, channel, SERIOUS, np.array([[time[0], time[-1]]]), values.size, 1.0, bias,
+        f"{channel} {several if levels > 2 else two}: its rounding errors repeat in every cycle, do not average out"
+        f"{size if bias > SERIOUS_BIAS else ''}",
         "take noise='measured' and input_noise='measured', whose variances contain them, or record with a smaller "
-        "range",
+        "range" + ("; levels that are exact, as those of a switch, need nothing" if levels < FEWEST_LEVELS else ""),
     )  # fmt: skip
 
 

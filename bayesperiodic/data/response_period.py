@@ -8,7 +8,7 @@ from scipy.special import fdtrc
 
 from bayesperiodic.data.coverage import per_cycle, resolved_harmonics
 from bayesperiodic.data.harmonics import MINIMUM_CYCLES, fit_harmonics
-from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance
+from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance, rounded_step
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -151,8 +151,8 @@ def _lines(time: np.ndarray, values: np.ndarray, frequency: float, periods: int,
         rest = 2.0 * np.abs(spectrum / (time.size - 2 * amplitudes.size)) ** 2
         rest[cycles - 1 :: cycles] = 0.0
         scatter = float(np.mean(residuals**2)) * cycles / (cycles - 1)
-        one_cycle = signal - residuals
-        error = 2.0 * repeated_variance(signal, one_cycle[: signal.size // cycles], signal.size // cycles, scatter)
+        step, phases = rounded_step(signal, time * frequency / periods), signal.size // cycles
+        error = 2.0 * repeated_variance(step, (signal - residuals)[:phases], phases, scatter=scatter)
         explained = 1.0 - float(np.mean(residuals**2)) / float(np.var(signal))
         spectra.append(Lines(cycles, 0.5 * np.abs(amplitudes[1:]) ** 2, rest, error, explained))
     return spectra

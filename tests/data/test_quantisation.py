@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.data.quantisation import repeated_variance, step_of
+from bayesperiodic.data.quantisation import repeated_variance, rounded_step, step_of
 
 
 def quantised(values, step, offset=0.0):
@@ -29,7 +29,17 @@ def test_steps_are_found_and_exact_values_have_none():
     assert step_of(1e5 + quantised(values, 2.5e-3, 1e-3)) == pytest.approx(2.5e-3)
     assert step_of(values) == 0.0
     relay = np.where(values > 0.0, 1.0, -1.0)
-    assert step_of(relay) == 0.0
+    assert step_of(relay) == 0.0 and step_of(relay, fewest=2) == 2.0
+
+
+@pytest.mark.parametrize("per_cycle", [20, 20.7])
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_two_levels_are_rounded_if_noise_moves_their_changes(per_cycle, noise):
+    """A comparator of a sine, 20 cycles; without noise before it, it is a square wave. Three levels are rounded."""
+    phase = np.arange(int(20 * per_cycle)) / per_cycle
+    sine = np.sin(2 * np.pi * phase + 0.1) + noise * np.random.default_rng(2).standard_normal(phase.size)
+    assert rounded_step(np.where(sine > 0.3, 1.5, -0.5), phase) == (2.0 if noise else 0.0)
+    assert rounded_step(np.round(sine), phase) == 1.0
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.1, 0.2, 0.3, 0.5])
@@ -40,12 +50,13 @@ def test_repeated_part_of_the_error_is_that_of_a_simulated_converter(noise):
     error = quantised(places[:, None] + noise * generator.standard_normal((400, 4000)), 1.0) - places[:, None]
     scatter = error.var(axis=1, ddof=1).mean()
     expected = np.mean(error.mean(axis=1) ** 2) - scatter / 4000
-    levels = np.arange(10.0)
-    found = repeated_variance(levels, np.array([0.0, 400.0]), phases=1, scatter=scatter)
+    found = repeated_variance(1.0, np.array([0.0, 400.0]), 1, scatter=scatter)
     assert found == pytest.approx(expected, abs=0.006)
-    assert repeated_variance(levels, np.array([0.0, 400.0]), phases=20, scatter=scatter) == pytest.approx(found / 20)
-    assert repeated_variance(levels, np.array([0.0, 5.0]), phases=20, scatter=scatter) == pytest.approx(found / 10)
-    assert repeated_variance(levels + 1e-3 * places[:10], np.zeros(2), phases=1, scatter=scatter) == 0.0
+    total = np.mean(error**2)
+    assert repeated_variance(1.0, np.array([0.0, 400.0]), 1, residual=total) == pytest.approx(expected, abs=0.03)
+    assert repeated_variance(1.0, np.array([0.0, 400.0]), 20, scatter=scatter) == pytest.approx(found / 20)
+    assert repeated_variance(1.0, np.array([0.0, 5.0]), 20, scatter=scatter) == pytest.approx(found / 10)
+    assert repeated_variance(0.0, np.zeros(2), 1, scatter=scatter) == 0.0
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1, 0.3])

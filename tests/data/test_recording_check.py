@@ -420,7 +420,7 @@ def test_false_alarm_rate_of_serious_findings_is_at_most_one_percent():
     assert len(alarms(range(100, 600))) <= stats.binom.ppf(0.995, 500, 0.01)
 
 
-@pytest.mark.parametrize("levels", [8, 12, 25])
+@pytest.mark.parametrize("levels", [2, 3, 5, 8, 12, 25, 50])
 def test_few_levels_with_little_noise_are_named_with_their_effect(levels):
     """The error of the amplitudes, by the mean period of the unrounded motion, is within a factor of four as stated."""
     angle = clean() + 1e-4 * np.random.default_rng(1).standard_normal(TIME.size)
@@ -433,6 +433,21 @@ def test_few_levels_with_little_noise_are_named_with_their_effect(levels):
     off = np.abs(amplitudes(found) - amplitudes(recorded(angle).fold(64, frequency=1.0, harmonics=3)))
     stated = np.sqrt(found.amplitude_variance["angle"])
     assert 0.25 < np.sqrt(np.mean((off / stated) ** 2)) < 2.0
+
+
+@pytest.mark.parametrize("kind", ["outputs", "inputs"])
+def test_two_levels_are_named_if_noise_moves_their_changes_and_square_waves_are_not(kind):
+    noise = 0.005 * np.random.default_rng(1).standard_normal(TIME.size)
+    other = measured(noise=1e-3)
+    for named, moved in ((True, noise), (False, 0.0)):
+        switch = np.where(clean() + moved > 0.31, 1.0, 0.0)
+        channels = ({"y": switch}, {"x": other}) if kind == "outputs" else ({"y": other}, {"x": switch})
+        findings = [f for f in bp.Recording.from_arrays(TIME, *channels).check(1.0).findings if f.kind == "coarse"]
+        assert len(findings) == named
+    noisy = recorded(np.where(clean() + noise > 0.31, 1.0, 0.0))
+    finding = only(noisy.check(1.0), "coarse")
+    assert finding.severity == "serious" and "has only two levels, 1 apart" in finding.text
+    assert "noise='measured'" in finding.cure and "as those of a switch" in finding.cure
 
 
 @pytest.mark.parametrize(("levels", "noise"), [(12, 0.5), (400, 0.001)])
