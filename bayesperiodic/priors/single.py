@@ -15,6 +15,8 @@ from bayesperiodic import _checks
 LOG_ROOT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
 ROOT_TWO = math.sqrt(2.0)
+# Logarithm of dof/t² below which the distribution of Student's t is its first term, to rounding.
+FAR_TAIL = -40.0
 LEGENDRE_NODES, LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
@@ -503,7 +505,10 @@ class StudentT(Univariate):
         return (self.dof + 1.0) * (self.dof - square) / (self.dof + square) ** 2 / self.scale**2
 
     def _quantile(self, p: np.ndarray) -> np.ndarray:
-        return self.mean + self.scale * special.stdtrit(self.dof, p)
+        # The density in the tail is a power of the distance; `stdtrit` of SciPy 1.17.1 is wrong there, or +inf.
+        share = 2.0 / self.dof * (np.log(p * self.dof) + special.betaln(0.5 * self.dof, 0.5))
+        tail = -np.exp(0.5 * (math.log(self.dof) - np.minimum(share, FAR_TAIL)))
+        return self.mean + self.scale * np.where(share < FAR_TAIL, tail, special.stdtrit(self.dof, p))
 
     def _score(self, x: np.ndarray) -> np.ndarray:
         return (x - self.mean) / self.scale

@@ -172,6 +172,17 @@ def test_numerical_derivatives_of_scipys_densities_are_as_accurate_as_documented
     assert np.all(np.abs(wrapped.curvature(x) - curvature) < 1e-9 * (np.abs(curvature) + 1 / width**2))
 
 
+@pytest.mark.parametrize("dof", [1.0, 1.5, 2.5, 3.0, 5.0, 10.0, 30.0])
+@pytest.mark.parametrize("p", [1e-20, 1e-140, 1e-200, 1e-300])
+def test_quantiles_of_student_t_far_in_the_tail_have_their_probability(dof, p):
+    """The incomplete beta function of mpmath with 50 digits; SciPy's `stdtrit` is wrong there."""
+    score = float(bp.StudentT(0.0, 1.0, dof).quantile(p))
+    with mpmath.workdps(50):
+        share = mpmath.mpf(dof) / (mpmath.mpf(dof) + mpmath.mpf(score) ** 2)
+        found = mpmath.betainc(mpmath.mpf(dof) / 2, 0.5, 0, share, regularized=True) / 2
+    assert score < 0.0 and float(found / mpmath.mpf(p)) == pytest.approx(1.0, rel=1e-11)
+
+
 def test_numerical_derivatives_stay_inside_the_support():
     """At a distance d from the end of the support the curvature may lose 1e-13/d²."""
     exact, wrapped = bp.LogUniform(1.0, 1e5), FromScipy(stats.loguniform(1.0, 1e5))
