@@ -50,7 +50,7 @@ def errors(fitted: rig.Fitted, experiments: rig.Experiments) -> dict[str, Any]:
     found = {}
     for name, e in experiments.items():
         orbit = fitted.fit.solutions[name]
-        as_measured = orbit.stable == (kind_of(name) == "stable")
+        as_measured = orbit.stable is (kind_of(name) == "stable")
         found[name] = _errors_of(orbit, e) | {"stable": orbit.stable, "as_measured": as_measured}
     return found
 

@@ -287,7 +287,7 @@ def curves(values: Mapping[str, float]) -> dict[tuple[str, bool], np.ndarray]:
     length = np.r_[0.0, np.cumsum(steps)][new]
     fine = np.linspace(0.0, length[-1], FINE)
     speed, *amplitudes = CubicSpline(length, at[new])(fine).T
-    stable = np.interp(fine, length, np.array([o.stable for o in orbits])[new]) > 0.5
+    stable = np.interp(fine, length, np.array([bool(o.stable) for o in orbits])[new]) > 0.5
     return {
         (channel, kind): np.array([speed, np.where(stable == kind, size, np.nan)])
         for channel, size in zip(CHANNELS, amplitudes, strict=True)
