@@ -299,7 +299,8 @@ def _steady_of(
     steady = steady_part(every.all, driven)
     # At the frequency of its steady part, a motion without a drive has other steady parts.
     for _ in range(MOST_REFINEMENTS if driven else 1):
-        if steady is None or not refined or steady.level == (every.all.first[0], every.all.last[-1]):
+        whole = every.all.apart()
+        if steady is None or not refined or steady.level == (whole.first[0], whole.last[-1]):
             break
         # The frequency of a part that ramps is not that of the steady one, and at a wrong one ramps are steady.
         before, used = steady.level, every.samples(steady.part)
@@ -309,7 +310,7 @@ def _steady_of(
         steady = steady_part(every.all, driven)
         if steady is None or steady.level == before or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
             break
-    if steady is not None and refined and not driven and steady.level != (every.all.first[0], every.all.last[-1]):
+    if steady is not None and refined and not driven:
         fit, pace = refine_groups(some, tracked, few, other)
         if pace.diffusion and not pace.drifts:
             # A phase that walks at random is no transient.

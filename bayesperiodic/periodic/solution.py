@@ -243,7 +243,7 @@ class PeriodicSolution(Result):
 
     @property
     def trivial_error(self) -> float:
-        """Modulus of the logarithm of an autonomous orbit's trivial multiplier, zero if the orbit is resolved.
+        """Modulus of the logarithm of an autonomous orbit's trivial multiplier, zero without discretisation errors.
 
         An autonomous orbit has a multiplier 1, so that this is the error of the multipliers. NaN for a driven model and
         without multipliers.

@@ -62,17 +62,10 @@ def _first_order(model: Model) -> FirstOrder:
     variables = [symbols[s] for s in states] + [symbols["d" + s] for s in second]
     highest = [symbols["d" * model.orders[s] + s] for s in states]
     given = [*variables, *model.parameter_symbols.values(), model.time_symbols["frequency"]]
-    equations = sp.Matrix(model.equations)
-    at_rest = equations.subs(dict.fromkeys(highest, 0))
-    numeric = [
-        sp.lambdify(given, matrix.subs(dict.fromkeys(highest, 0)), "numpy")
-        for matrix in (
-            equations.jacobian(highest).subs(dict.fromkeys(highest, 0)),
-            at_rest,
-            at_rest.jacobian(variables),
-        )
-    ]
-    mass, force, stiffness = numeric
+    equations, none = sp.Matrix(model.equations), dict.fromkeys(highest, 0)
+    at_rest = equations.subs(none)
+    matrices = equations.jacobian(highest).subs(none), at_rest, at_rest.jacobian(variables)
+    mass, force, stiffness = (sp.lambdify(given, matrix, "numpy") for matrix in matrices)
     places = [len(states) + second.index(s) if s in second else i for i, s in enumerate(states)]
     turned = [states.index(s) for s in second]
 

@@ -19,7 +19,7 @@ PARTS = {"frequency": frequency}
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
     watch, count = common.Stopwatch(), QUICK if options.quick else options.replicates or REPLICATES
-    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "parts").mkdir(parents=True, exist_ok=True)
     # A share of `count` data sets, with the probability of the nominal one to lie outside by chance.
     low, high = stats.binom.interval(1.0 - FALSE_ALARM, count, frequency.COVERED)
     band = float(low) / count, float(high) / count
@@ -28,7 +28,7 @@ def run(options: argparse.Namespace) -> None:
         tasks = part.tasks(count, options.seed)
         with watch.part(name, f"estimates from {len(tasks)} recordings"):
             lines = common.resumed(
-                options.out / f"{name}.jsonl",
+                options.out / "parts" / f"{name}.jsonl",
                 tasks,
                 part.replicate,
                 lambda line: (line["case"], line["number"], line["seed"]),

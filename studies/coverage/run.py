@@ -25,12 +25,12 @@ Counts = Mapping[str, Mapping[str, Any]]
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
     watch, count = common.Stopwatch(), QUICK if options.quick else options.replicates or REPLICATES
-    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "parts").mkdir(parents=True, exist_ok=True)
     sampled = -(-count // SAMPLED)
     tasks = cases.tasks(count, sampled, options.seed)
     with watch.part("data sets", f"intervals in {len(tasks)} tasks"):
         lines = common.resumed(
-            options.out / "data_sets.jsonl",
+            options.out / "parts" / "data_sets.jsonl",
             tasks,
             cases.replicate,
             lambda line: (line["case"], line["kind"], line["number"], line["seed"]),

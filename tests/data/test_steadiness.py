@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
-from bayesperiodic.data import steadiness
+from bayesperiodic.data import inspection, steadiness
 from tests.known import NOISES
 
 PER_CYCLE = 40
@@ -304,3 +304,14 @@ def test_a_transient_of_few_cycles_before_a_ramp_is_left_out_or_in_the_stated_er
     assert check.cycles >= 3
     e = run.fold(64, frequency=FREQUENCY, harmonics=3)
     assert abs(np.fft.rfft(e.outputs["x"])[1] / 32 - exact) < np.sqrt(e.amplitude_variance["x"][1])
+
+
+@pytest.mark.parametrize("begins", [0.0, 0.37])
+def test_the_frequency_of_a_recording_that_is_steady_throughout_is_refined_once(begins, monkeypatch):
+    """Windows are whole cycles from the end, so that a part of all of them need not begin with the first sample."""
+    calls, refinement = [], inspection.refine_groups
+    monkeypatch.setattr(inspection, "refine_groups", lambda *given: calls.append(given) or refinement(*given))
+    time = begins + np.arange(0.0, 40.3, 0.05)
+    x = np.cos(2 * np.pi * time - 0.3) + 0.01 * np.random.default_rng(1).standard_normal(time.size)
+    run = bp.Recording.from_arrays(time, {"x": x}, {"force": np.cos(2 * np.pi * time)}).fold(32)
+    assert run.cycles == 40 and len(calls) == 1
