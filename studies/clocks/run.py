@@ -19,7 +19,6 @@ PARTS = {"frequency": frequency}
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
     watch, count = common.Stopwatch(), QUICK if options.quick else options.replicates or REPLICATES
-    (options.out / "parts").mkdir(parents=True, exist_ok=True)
     # A share of `count` data sets, with the probability of the nominal one to lie outside by chance.
     low, high = stats.binom.interval(1.0 - FALSE_ALARM, count, frequency.COVERED)
     band = float(low) / count, float(high) / count

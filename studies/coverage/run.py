@@ -25,7 +25,6 @@ Counts = Mapping[str, Mapping[str, Any]]
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
     watch, count = common.Stopwatch(), QUICK if options.quick else options.replicates or REPLICATES
-    (options.out / "parts").mkdir(parents=True, exist_ok=True)
     sampled = -(-count // SAMPLED)
     tasks = cases.tasks(count, sampled, options.seed)
     with watch.part("data sets", f"intervals in {len(tasks)} tasks"):

@@ -627,6 +627,9 @@ def test_a_relative_model_error_is_the_same_fraction_of_every_channel():
         "variance[relative]"
     ]
     assert even.noise["variance[relative]"] == pytest.approx(2 * 0.05**2 / 2, rel=0.2)
+    # The prior knows the measured noise in the same units: scatter²/cycles over the mean squares ½ and ½·1100².
+    measured = bp.Problem(model, [one], noise="relative", **given).likelihood.measured["variance[relative]"]
+    assert measured == pytest.approx(0.5 * (1e-8 / 0.5 + 1e-2 / (0.5 * 1100.0**2)), rel=1e-3)
 
 
 def test_a_model_error_is_zero_where_the_residual_is_no_larger_than_the_measured_noise():
