@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -14,6 +15,7 @@ import bayesperiodic as bp
 from bayesperiodic import _fourier
 from bayesperiodic.diagnostics import calibration
 from bayesperiodic.estimation.adequacy import misfit
+from bayesperiodic.estimation.noise_changes import changes_by_variance
 from bayesperiodic.likelihood.block import Block
 from bayesperiodic.likelihood.input_noise import same
 from bayesperiodic.likelihood.likelihood import Likelihood
@@ -113,6 +115,25 @@ def test_gradients_are_those_of_differences(case):
             ends = [[*residuals[:b], r + sign * 1e-6 * np.eye(r.size)[j], *residuals[b + 1 :]] for sign in (1, -1)]
             slope = (density(ends[0], values) - density(ends[1], values)) / 2e-6
             assert by_residual[b][j] == pytest.approx(slope, rel=1e-5, abs=1e-6)
+
+
+def test_changes_with_a_variance_are_those_of_the_dense_covariance(case):
+    """With S the covariance and S' its derivative by ln v: J S⁻¹S'S⁻¹ Jᵀ and so on, for errors that blocks share."""
+    likelihood, _, values, loadings = case
+    random = np.random.default_rng(5)
+    jacobian = [random.standard_normal((2, b.size)) for b in BLOCKS]
+    joined, inverse = np.concatenate(jacobian, axis=1), np.linalg.inv(dense(likelihood, values, loadings))
+    problem = SimpleNamespace(likelihood=likelihood, experiments=())
+    found = changes_by_variance(problem, jacobian, values)
+    assert found
+    for name, change in found.items():
+        ends = [values * np.where(np.array(likelihood.names) == name, np.exp(s * 1e-5), 1.0) for s in (1.0, -1.0)]
+        up, down = (dense(likelihood, end, loadings) for end in ends)
+        once = inverse @ (up - down) / 2e-5
+        assert change.information == pytest.approx(joined @ once @ inverse @ joined.T, rel=1e-6, abs=1e-9)
+        assert change.doubled == pytest.approx(joined @ once @ once @ inverse @ joined.T, rel=1e-6, abs=1e-9)
+        assert change.trace == pytest.approx(np.trace(once), rel=1e-6)
+        assert change.square == pytest.approx(np.trace(once @ once), rel=1e-6)
 
 
 def test_simulated_noise_has_the_covariance(case):
