@@ -640,3 +640,21 @@ def test_a_model_error_is_zero_where_the_residual_is_no_larger_than_the_measured
         found = estimate_noise(likelihood, residuals, likelihood.guess(), SHARE, of_total=True)
         expected = max(total / (count * SHARE), measured)
         assert found[0] + measured == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("freedom", [4.0, 10.0])
+def test_a_parameter_of_one_harmonic_has_the_degrees_of_freedom_of_its_measured_variance(freedom):
+    """The residual is a thousandth of the measured noise, so that the model error is zero."""
+    model = formula_model("gain", ["a"], lambda p, u, s: {"force": p.a * u.x})
+    wave = np.cos(2 * np.pi * grid(32))
+    one = bp.Experiment(
+        "run", 1.0, {"force": 2.0 * wave + 1e-4 * np.sin(4 * np.pi * grid(32))}, {"x": wave}, samples=32, cycles=9,
+        harmonics={"force": 2, "x": 1}, amplitude_variance={"force": np.full(3, 0.01)},
+        amplitude_freedom={"force": np.array([50.0, freedom, 50.0])},
+    )  # fmt: skip
+    priors = {"a": bp.Normal(0.0, 1e3)}
+    problem = bp.Problem(model, [one], priors=priors, noise="measured", input_noise="exact")
+    fit = bp.map_estimate(problem, starts=1, progress=False)
+    assert fit.sd["a"] == pytest.approx(0.1, rel=0.02) and fit.degrees_of_freedom["a"] == pytest.approx(
+        freedom, rel=0.02
+    )
