@@ -5,6 +5,9 @@ from . import plot as plot
 from ._io import load as load
 from ._versions import show_versions as show_versions
 from .data.experiment import Experiment as Experiment
+from .data.file_inspection import FileChannel as FileChannel
+from .data.file_inspection import FileInspection as FileInspection
+from .data.file_inspection import inspect as inspect
 from .data.recording import Recording as Recording
 from .data.recording_check import Finding as Finding
 from .data.recording_check import RecordingCheck as RecordingCheck

@@ -1,5 +1,6 @@
-"""Meaning of the columns of a file, and missing samples of files and arrays."""
+"""Meaning of the channels of a file, and missing samples of files and arrays."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,28 +9,28 @@ from typing import Any
 import numpy as np
 
 from bayesperiodic import _checks
-from bayesperiodic.data.files import Format
-from bayesperiodic.data.times import seconds
-from bayesperiodic.data.units import Units, convert
+from bayesperiodic.data.formats import recognise
+from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChannel
+from bayesperiodic.data.times import dates, seconds
+from bayesperiodic.data.units import Units, from_file
 
 DROP, INTERPOLATE = "drop", "interpolate"
 # Successive samples that may be interpolated.
 LONGEST_INTERPOLATION = 3
-# Key of the times of a file without a column of times.
-NO_COLUMN = "\0"
 
 Times = np.ndarray | dict[str, np.ndarray]
+Rate = float | Mapping[str, float] | None
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Meaning of the columns of a file, with the arguments of `Recording.from_csv`."""
+    """Meaning of the channels of a file, with the arguments of `Recording.from_file`."""
 
-    file: str
-    outputs: Mapping[str, str]
-    inputs: Mapping[str, str]
-    time: str | None
-    sampling_rate: float | None
+    path: str | Path
+    outputs: Mapping[str, Key]
+    inputs: Mapping[str, Key]
+    time: Key | None
+    sampling_rate: Rate
     units: Units
     missing: str | None
 
@@ -37,58 +38,247 @@ class Layout:
         example = "{'force': 'the column of the force'}"
         for kind in ("outputs", "inputs"):
             _checks.mapping(kind, getattr(self, kind), example)
-        if (self.time is None) == (self.sampling_rate is None):
+        if self.time is not None and self.sampling_rate is not None:
             raise ValueError(
                 f"time: must be given or sampling_rate, and not both, got {self.time!r} and {self.sampling_rate!r}."
             )
         for key in self.units:
-            _checks.one_of("units", key, ("time", *self.outputs, *self.inputs))
+            _checks.one_of("units", key, ("time", *self.sources))
+        if isinstance(self.sampling_rate, Mapping):
+            for key in self.sampling_rate:
+                _checks.one_of("sampling_rate", key, self.sources)
 
     @property
-    def columns(self) -> dict[str, None]:
-        """Names of the columns, each once."""
-        return dict.fromkeys([*([self.time] if self.time else []), *self.outputs.values(), *self.inputs.values()])
+    def sources(self) -> dict[str, Key]:
+        """Keys in the file by channel."""
+        return {**self.outputs, **self.inputs}
 
-    def timed(self, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the columns of a file with dates and durations in seconds from the first one of the file."""
-        if not self.time:
-            return dict(columns)
-        times = columns[self.time]
-        if times.dtype.kind in "mM" and "time" in self.units:
+    @property
+    def file(self) -> str:
+        """Name of the file, for messages."""
+        return Path(self.path).name
+
+    @property
+    def wanted(self) -> list[Key]:
+        """Keys that are read, each once."""
+        return [*dict.fromkeys([*([self.time] if self.time is not None else []), *self.sources.values()])]
+
+
+def recordings(
+    cls: Any, layout: Layout, form: str | None, options: dict[str, Any], split: Key | None, name: str | None
+) -> Any:
+    """Return the recording in a file; with `split`, one for each part in which this channel is constant."""
+    wanted = [*layout.wanted, *([] if split is None else [split])]
+    contents = recognise.contents(layout.path, form, wanted, options)
+    name = name or Path(layout.path).stem
+    given = None if layout.time is None else _time_column(layout, contents)
+    columns = {channel: _Column.of(layout, contents, key) for channel, key in layout.sources.items()}
+    times = _times(layout, contents, columns) if given is None else given
+    if split is None:
+        return cls(*_signals(layout, columns, times), name)
+    label = _label(layout, contents, split, columns, times)
+    edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), label.size]
+    return [
+        cls(
+            *_signals(
+                layout,
+                {key: column.part(first, last) for key, column in columns.items()},
+                times[first:last] if isinstance(times, np.ndarray) else {k: t[first:last] for k, t in times.items()},
+            ),
+            f"{name} {i}: {split} {label[first]}",
+        )
+        for i, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True), 1)
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Column:
+    """Values of a channel of a file that were read."""
+
+    stored: StoredChannel
+    values: np.ndarray
+
+    @classmethod
+    def of(cls, layout: Layout, contents: Contents, key: Key, *, text: bool = False, time: bool = False) -> "_Column":
+        stored = contents.find(layout.file, key)
+        argument = f"{contents.word} {stored.label!r} of {layout.file}"
+        if stored.refusal:
             raise ValueError(
-                f"units['time']: must be left out for a column of dates or durations, which is converted to seconds, "
-                f"got {self.units['time']!r} for column {self.time!r} of {self.file}."
+                f"{contents.word} {stored.label!r} of {layout.file}: must be usable, got {stored.refusal}."
             )
-        argument = f"time (column {self.time!r} of {self.file})"
-        return {**columns, self.time: _checks.real_array(argument, seconds(argument, times, unit="time" in self.units))}
+        values = stored.values()
+        argument = f"{contents.word} {stored.label!r} of {layout.file}"
+        return cls(stored, numbers(argument, values, text=text, time=time))
 
-    def signals(self, columns: Mapping[str, np.ndarray]) -> tuple[Times, dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return times, outputs and inputs, without missing samples, from columns of numbers."""
-        if not self.time:
-            rows = max((values.size for values in columns.values()), default=0)
-            columns = {**columns, NO_COLUMN: np.arange(rows) / _checks.positive("sampling_rate", self.sampling_rate)}
+    def part(self, first: int, last: int) -> "_Column":
+        return _Column(self.stored, self.values[first:last])
 
-        def label(key: str, column: str) -> str:
-            return f"{key} (column {column!r} of {self.file})"
 
-        def converted(argument: str, key: str, values: np.ndarray) -> np.ndarray:
-            vector = _checks.measured_vector(argument, values)
-            return convert(key, vector, self.units[key]) if key in self.units else vector
+def numbers(argument: str, values: Any, *, text: bool = False, time: bool = False) -> np.ndarray:
+    """Return values of a file as numbers; of times also as dates, and integers as they are."""
+    array = np.squeeze(np.asarray(values))
+    time = time and not text
+    if time and (times := dates(argument, array)) is not None:
+        array = times
+    if array.dtype == object and not text:
+        import pandas as pd
 
-        sources = {**self.outputs, **self.inputs}
-        at = label("time", self.time or NO_COLUMN)
-        given = {label(key, column): columns[column] for key, column in sources.items()}
-        times, present = without_missing(at, columns[self.time or NO_COLUMN], given, self.missing)
-        timed: Times
-        if isinstance(times, dict):
-            timed = {key: converted(at, "time", time) for key, time in zip(sources, times.values(), strict=True)}
-        else:
-            timed = converted(at, "time", times)
-        values = {
-            key: converted(argument, key, vector)
-            for key, (argument, vector) in zip(sources, present.items(), strict=True)
-        }
-        return timed, {key: values[key] for key in self.outputs}, {key: values[key] for key in self.inputs}
+        cells = np.atleast_1d(array)
+        rows = np.flatnonzero(pd.isna(pd.to_numeric(cells, errors="coerce")) & pd.notna(cells))
+        got = f"{cells[rows[0]]!r} in data row {rows[0] + 1}" if rows.size else "numbers too long to be read"
+        hint = (
+            "; dates must be those of ISO 8601, others are read by pandas.to_datetime for from_arrays" if time else ""
+        )
+        raise ValueError(f"{argument}: must contain numbers, with a decimal point, got {got}{hint}.")
+    if array.ndim != 1 or (array.dtype.kind not in ("fiubmM" if time else "fiub") and not text):
+        raise ValueError(
+            f"{argument}: must be one column of real numbers, got shape {np.shape(values)} and type {array.dtype}."
+        )
+    return array if text or time else array.astype(float)
+
+
+def _label(layout: Layout, contents: Contents, split: Key, columns: Mapping[str, _Column], times: Times) -> np.ndarray:
+    """Return the column that distinguishes records, which has one value per sample."""
+    label = _Column.of(layout, contents, split, text=True).values
+    if any(lost := [value != value for value in label]):
+        row = lost.index(True) + 1
+        raise ValueError(f"split: must be a column without empty cells, got {split!r}, empty in data row {row}.")
+    sizes = {column.stored.label: column.values.size for column in columns.values()}
+    if isinstance(times, np.ndarray) and layout.time is not None:
+        sizes = {str(layout.time): times.size} | sizes
+    for column, size in sizes.items():
+        if size != label.size:
+            raise ValueError(
+                f"split: must be a column with one value per sample, got {split!r} with {label.size} values and "
+                f"{column!r} with {size}."
+            )
+    return label
+
+
+def _times(layout: Layout, contents: Contents, columns: Mapping[str, _Column]) -> Times:
+    """Return the times of all channels [s] that are no channel: one array, or one for each if they differ."""
+    clocks = {channel: column.stored.clock for channel, column in columns.items()}
+    rates = (
+        layout.sampling_rate
+        if isinstance(layout.sampling_rate, Mapping)
+        else dict.fromkeys(columns, layout.sampling_rate)
+    )
+    distinct = {id(clock) for clock in clocks.values() if clock}
+    if isinstance(layout.sampling_rate, int | float) and len(distinct) > 1:
+        different = {(clock.start, clock.step, clock.stored) for clock in clocks.values() if clock}
+        if len(different) > 1:
+            raise ValueError(
+                f"sampling_rate: must be given by channel, as the channels of {layout.file} have times of their own, "
+                f"got {layout.sampling_rate!r}; such as {{{next(iter(columns))!r}: {layout.sampling_rate!r}}}."
+            )
+    offsets = _offsets(layout, clocks)
+    times, known = {}, {}
+    for channel, column in columns.items():
+        clock, rate = clocks[channel], rates.get(channel)
+        key = (id(clock), column.values.size, rate, offsets[channel])
+        if key not in known:
+            known[key] = _clocked(layout, contents, column, rate) + offsets[channel]
+        times[channel] = known[key]
+    if len(known) == 1:
+        return next(iter(known.values()))
+    if all(clock is None for clock in clocks.values()):  # one rate, different lengths: refused by `Recording`
+        return max(known.values(), key=len)
+    return times
+
+
+def _time_column(layout: Layout, contents: Contents) -> np.ndarray:
+    """Return the channel of times of a file in seconds, from the first one if they are dates or durations."""
+    column = _Column.of(layout, contents, layout.time, time=True)  # type: ignore[arg-type]
+    named = column.stored.label
+    if column.values.dtype.kind in "mM" and "time" in layout.units:
+        raise ValueError(
+            f"units['time']: must be left out for a column of dates or durations, which is converted to seconds, "
+            f"got {layout.units['time']!r} for column {named!r} of {layout.file}."
+        )
+    argument = f"time (column {named!r} of {layout.file})"
+    stored = "" if column.values.dtype.kind in "mM" else column.stored.unit
+    given = "time" in layout.units or bool(stored)
+    time = _checks.real_array(argument, seconds(argument, column.values, unit=given))
+    return from_file("time", time, layout.units.get("time"), stored)
+
+
+def _offsets(layout: Layout, clocks: Mapping[str, Clock | None]) -> dict[str, float]:
+    """Return the time [s] of each channel's origin after the earliest one."""
+    origins = {channel: clock.origin for channel, clock in clocks.items() if clock and clock.origin is not None}
+    if not origins:
+        return dict.fromkeys(clocks, 0.0)
+    without = [channel for channel in clocks if channel not in origins]
+    if without:
+        raise ValueError(
+            f"time: must be counted from one instant for all channels of {layout.file}, got dates for "
+            f"{[*origins]} and none for {without}; read them separately, and join them by Recording.join if they "
+            "started together."
+        )
+    first = min(origins.values())
+    return {channel: (origin - first) / np.timedelta64(1, "ns") * 1e-9 for channel, origin in origins.items()}
+
+
+def _clocked(layout: Layout, contents: Contents, column: _Column, rate: float | None) -> np.ndarray:
+    """Return the times of a channel by a given rate, or as the file has them."""
+    clock, size = column.stored.clock, column.values.size
+    if rate is not None:
+        start = clock.start if clock else 0.0
+        return start + np.arange(size) / _checks.positive("sampling_rate", rate)
+    if clock is None:
+        raise ValueError(
+            f"time: must be given or sampling_rate, and not both, got None and None; {layout.file} does not say when "
+            f"{contents.word} {column.stored.label!r} was sampled."
+        )
+    if clock.refusal:
+        raise ValueError(
+            f"time: must be known, got {contents.word} {column.stored.label!r} of {layout.file}, {clock.refusal}."
+        )
+    if clock.error:
+        warnings.warn(
+            f"sampling_rate: {layout.file} gives the interval of {contents.word} {column.stored.label!r} with few "
+            f"digits, so that its rate is {1.0 / clock.step:.9g} Hz with an error of up to "
+            f"{1e6 * clock.error / clock.step:.2g} ppm; {rounded_rate(clock)}give sampling_rate= if you know it.",
+            stacklevel=6,
+        )
+    return clock.times(size)
+
+
+def rounded_rate(clock: Clock) -> str:
+    """Return the words that name a round rate [Hz] within the error of the step, if there is one."""
+    low, high = 1.0 / (clock.step + clock.error), 1.0 / (clock.step - clock.error)
+    for digits in range(1, 7):
+        rate = float(f"{1.0 / clock.step:.{digits - 1}e}")
+        if low <= rate <= high:
+            return f"{rate:.9g} Hz has the same digits; "
+    return ""
+
+
+def _signals(
+    layout: Layout, columns: Mapping[str, _Column], times: Times
+) -> tuple[Times, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Return times, outputs and inputs, without missing samples and in the units asked for."""
+
+    def label(key: str, column: str) -> str:
+        return f"{key} (column {column!r} of {layout.file})"
+
+    named = str(layout.time) if layout.time is not None else "\0"
+    at = label("time", named)
+    labels = {label(key, column.stored.label): key for key, column in columns.items()}
+    given = {argument: columns[key].values for argument, key in labels.items()}
+    each: Any = {argument: times[key] for argument, key in labels.items()} if isinstance(times, dict) else times
+    kept, present = without_missing(at, each, given, layout.missing)
+    timed: Times
+    if isinstance(kept, dict):
+        timed = {labels[argument]: _checks.measured_vector(at, time) for argument, time in kept.items()}
+    else:
+        timed = _checks.measured_vector(at, kept)
+    values = {
+        key: from_file(
+            key, _checks.measured_vector(argument, present[argument]), layout.units.get(key), columns[key].stored.unit
+        )
+        for argument, key in labels.items()
+    }
+    return timed, {key: values[key] for key in layout.outputs}, {key: values[key] for key in layout.inputs}
 
 
 def without_missing(
@@ -133,71 +323,3 @@ def _interpolated(argument: str, time: np.ndarray, values: np.ndarray) -> np.nda
             f"{LONGEST_INTERPOLATION} successive values, and {longest} are missing."
         )
     return np.interp(time, time[known], values[known], left=np.nan, right=np.nan) if known.size else values
-
-
-def reader(name: str, form: Format, source: str, columns: str, refused: str) -> Any:
-    """Return a class method of this name that reads a format as `Recording.from_csv` reads its own."""
-
-    def read(
-        cls: Any, path: str | Path, *, outputs: Mapping[str, str], inputs: Mapping[str, str] | None = None,
-        time: str | None = None, sampling_rate: float | None = None, units: Units | None = None,
-        missing: str | None = None, split: str | None = None, name: str | None = None,
-    ) -> Any:  # fmt: skip
-        layout = Layout(Path(path).name, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
-        return recordings(cls, form, path, name, split, layout)
-
-    read.__name__, read.__qualname__ = name, f"Recording.{name}"
-    read.__annotations__["return"] = "Recording | list[Recording]"
-    read.__doc__ = f"""Read a recording from the {source}.
-
-        Parameters
-        ----------
-        path, outputs, inputs, time, sampling_rate, units, missing, split, name
-            As for `from_csv`, with {columns} in place of columns.
-
-        Returns
-        -------
-        Recording, or list of Recording with `split`
-
-        Raises
-        ------
-        FileNotFoundError, ValueError
-            As for `from_csv`, and {refused}.
-        """
-    return classmethod(read)
-
-
-def recordings(cls: Any, form: Format, path: str | Path, name: str | None, split: str | None, meaning: Layout) -> Any:
-    """Return the recording in a file; with `split`, one for each part in which this column is constant."""
-    parts = [cls(*part) for part in read(form, path, name, split, meaning)]
-    return parts[0] if split is None else parts
-
-
-def read(
-    form: Format, path: str | Path, name: str | None, split: str | None, meaning: Layout
-) -> list[tuple[Any, Any, Any, str]]:
-    """Return the arguments of the recordings in a file: one, or one for each part in which `split` is constant."""
-    name = name or Path(path).stem
-    if split is None:
-        columns = form.read(path, meaning.columns, time=meaning.time)
-        return [(*meaning.signals(meaning.timed(columns)), name)]
-    columns = form.read(path, dict.fromkeys([*meaning.columns, split]), split, meaning.time)
-    label = columns[split] if split in meaning.columns else columns.pop(split)
-    if any(lost := [value != value for value in label]):
-        row = lost.index(True) + 1
-        raise ValueError(f"split: must be a column without empty cells, got {split!r}, empty in data row {row}.")
-    for column, values in columns.items():
-        if values.size != label.size:
-            raise ValueError(
-                f"split: must be a column with one value per sample, got {split!r} with {label.size} values and "
-                f"{column!r} with {values.size}."
-            )
-    columns = meaning.timed(columns)
-    edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), label.size]
-    return [
-        (
-            *meaning.signals({column: values[first:last] for column, values in columns.items()}),
-            f"{name} {i}: {split} {label[first]}",
-        )
-        for i, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True), 1)
-    ]

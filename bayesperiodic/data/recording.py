@@ -3,28 +3,25 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import one_thread
-from bayesperiodic.data.channels import Channels
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.data.files import MAT, NPZ, csv_in
 from bayesperiodic.data.folding import AUTO, automatic_periods, fold_signals, given_frequency
+from bayesperiodic.data.from_file import FromFile
 from bayesperiodic.data.inspection import inspect, summary
-from bayesperiodic.data.layout import Layout, reader, recordings, without_missing
+from bayesperiodic.data.layout import without_missing
 from bayesperiodic.data.recording_check import RecordingCheck
 from bayesperiodic.data.signals import parts
 from bayesperiodic.data.times import channel_seconds, seconds
-from bayesperiodic.data.units import Units
 
 
 @dataclass(frozen=True, repr=False)
-class Recording(Channels):
+class Recording(FromFile):
     """Signals measured at the same times.
 
     Attributes
@@ -158,99 +155,6 @@ class Recording(Channels):
         inputs = {channel: values for one in recordings for channel, values in one.inputs.items()}
         times = {channel: time for one in recordings for channel, time in one.times.items()}
         return cls(times, outputs, inputs, name or recordings[0].name, any(one.synthetic for one in recordings))
-
-    @overload
-    @classmethod
-    def from_csv(cls, path: str | Path, *, split: None = None, **arguments: Any) -> "Recording": ...
-
-    @overload
-    @classmethod
-    def from_csv(cls, path: str | Path, *, split: str, **arguments: Any) -> "list[Recording]": ...
-
-    @classmethod  # type: ignore[misc]
-    def from_csv(
-        cls,
-        path: str | Path,
-        *,
-        outputs: Mapping[str, str],
-        inputs: Mapping[str, str] | None = None,
-        time: str | None = None,
-        sampling_rate: float | None = None,
-        units: Units | None = None,
-        missing: str | None = None,
-        split: str | None = None,
-        name: str | None = None,
-        encoding: str = "utf-8",
-    ) -> "Recording | list[Recording]":
-        """Read a recording from a CSV file with a header line.
-
-        The header is the first line that contains all columns; lines before it are skipped.
-
-        Parameters
-        ----------
-        path : path
-        outputs, inputs : mapping of str to str
-            Column in the file by channel, such as ``{"force": "force_N"}``.
-        time : str, optional
-            Column of times [s], or of dates after ISO 8601, such as 2026-01-31T12:00:00.01, which are converted to
-            seconds from the first one as by `from_arrays`.
-        sampling_rate : float, optional
-            Sampling rate [Hz], if the file has no column of times.
-        units : mapping of str to float or (from, to), optional
-            Conversion of a channel (or of "time") by a factor or a pair of units such as ``("mm", "m")``. Angles must
-            be in both units or in neither; a hertz is a cycle per second where the other unit has an angle: ``("rpm",
-            "Hz")`` divides by 60, ``("Hz", "rad/s")`` multiplies by 2π. Temperatures are absolute, differences are
-            "delta_degC". Logarithmic units such as dB are refused.
-        missing : "drop" or "interpolate", optional
-            What to do with NaN and empty cells (in a file with one column: empty lines), which are refused by default:
-            leave them out of their channel, or interpolate linearly in time over at most three successive ones.
-        split : str, optional
-            Column of numbers or texts that distinguishes successive records, such as the drive frequency: each part in
-            which it is constant is a recording. `split` divides a recording by the steps of its drive.
-        name : str, optional
-            By default the file name without its extension.
-        encoding : str
-            Of the text, by Python's name, such as "latin-1", "cp1252" or "utf-16".
-
-        Returns
-        -------
-        Recording, or list of Recording with `split`
-
-        Raises
-        ------
-        FileNotFoundError
-            If there is no such file.
-        ValueError
-            As for `Recording`, and for a missing or repeated column, rows with other numbers of fields than the header,
-            a cell that is not a number, both or neither of ``time`` and ``sampling_rate``, an unknown unit.
-
-        Examples
-        --------
-        >>> import pathlib, tempfile, numpy as np, pandas as pd
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
-        >>> t = np.arange(500) / 50
-        >>> pd.DataFrame({"t": t, "x_mm": 25 * np.sin(2 * np.pi * t)}).to_csv(path, index=False)
-        >>> run = bp.Recording.from_csv(path, time="t", outputs={"x": "x_mm"}, units={"x": ("mm", "m")})
-        >>> run.name, round(float(run.outputs["x"].max()), 3)
-        ('run', 0.025)
-        """
-        layout = Layout(Path(path).name, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
-        return recordings(cls, csv_in(encoding), path, name, split, layout)
-
-    from_npz = reader(
-        "from_npz",
-        NPZ,
-        "named arrays of an NPZ file",
-        "arrays",
-        "for a damaged file or an array of objects, which would have to be unpickled",
-    )
-    from_mat = reader(
-        "from_mat",
-        MAT,
-        "variables of a MAT file, version 5 or 7.3",
-        "variables",
-        "for a damaged file, one of version 4, or a variable that is not a vector of real\n            numbers",
-    )
 
     def between(self, start: float, stop: float) -> "Recording":
         """Return the part with start ≤ time ≤ stop.

@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 
-Units = Mapping[str, float | Sequence[str]]
+Units = Mapping[str, float | str | Sequence[str]]
 
 LONGEST_UNIT = 100
 # Products, quotients and groups of names with an exponent of one digit; the only number is the 1 of "1/s".
@@ -30,6 +30,94 @@ LOGARITHMIC = {
     r"oct|octaves?": "reference*2**level",
     r"decades?": "reference*10**level",
 }
+# Spellings of measurement programs.
+SPELLINGS = {
+    "sec": "s", "Sec": "s", "seconds": "s", "Seconds": "s", "msec": "ms", "usec": "us", "Volt": "V", "Volts": "V",
+    "volts": "V", "Newton": "N", "Newtons": "N", "Nm": "N*m", "kNm": "kN*m", "Nmm": "N*mm", "gn": "g_0", "g_n": "g_0",
+    "RPM": "rpm", "HZ": "Hz", "hz": "Hz", "Ampere": "A", "Amps": "A", "Deg": "deg", "Rad": "rad",
+    "inch": "in", "C°": "degC", "°C": "degC", "Celsius": "degC", "Ohm": "ohm", "Pascal": "Pa", "PA": "Pa",
+    "µe": "um/m", "ue": "um/m", "µε": "um/m", "με": "um/m", "µm/m": "um/m", "ustrain": "um/m", "microstrain": "um/m",
+    "-": "", "1": "", "none": "", "None": "", "NONE": "",
+}  # fmt: skip
+# Units that stand for two things, and what to write.
+AMBIGUOUS = {
+    "g": "('g_0', 'm/s**2') for the acceleration of gravity, ('g', 'kg') for the gram",
+    "G": "('g_0', 'm/s**2') for the acceleration of gravity, ('G', 'T') for the gauss",
+    "rpm": "('rpm', 'Hz') for a frequency, ('rpm', 'rad/s') for an angular velocity",
+}
+# A unit with an exponent that has no sign of its own, such as m/s2.
+BARE_EXPONENT = re.compile(r"(?<=[A-Za-z])([234])(?![\w.])")
+
+
+def from_file(name: str, values: np.ndarray, unit: float | str | Sequence[str] | None, stored: str) -> np.ndarray:
+    """Return the values of a channel with the unit `stored` in its file in that which the user asks for, or in SI.
+
+    `unit` is a factor, a pair of units, whose first must be the one stored, or the unit wanted.
+    """
+    argument = f"units[{name!r}]"
+    if not stored.strip():
+        if isinstance(unit, str):
+            raise ValueError(
+                f"{argument}: must be a factor or a pair such as ('mm', {unit!r}), got {unit!r}, and the file does not "
+                "say the unit."
+            )
+        return values if unit is None else convert(name, values, unit)
+    if isinstance(unit, int | float):
+        return convert(name, values, unit)
+    text = _spelled(stored)
+    if isinstance(unit, str) or unit is None:
+        if text in AMBIGUOUS:
+            raise ValueError(
+                f"{argument}: must say what {stored!r} in the file is, got {unit!r}; give {AMBIGUOUS[text]}."
+            )
+        try:
+            return convert(name, values, (text, in_si(text) if unit is None else unit))
+        except ValueError as error:
+            if unit is None:
+                raise ValueError(
+                    f"{argument}: must say what {stored!r} in the file is, got None; give a factor, such as "
+                    f"units={{{name!r}: 1.0}} for values as they are."
+                ) from error
+            raise
+    if len(unit) == 2 and text not in AMBIGUOUS and is_known(text) and not _is_same(unit[0], text):
+        raise ValueError(
+            f"{argument}: must begin with the unit {stored!r} of the file, got {tuple(unit)!r}; give a factor if the "
+            "file is wrong."
+        )
+    return convert(name, values, unit)
+
+
+def _spelled(text: str) -> str:
+    """Return a unit as pint writes it."""
+    text = text.strip()
+    return SPELLINGS.get(text) if text in SPELLINGS else BARE_EXPONENT.sub(r"**\1", text)  # type: ignore[return-value]
+
+
+def is_known(text: str) -> bool:
+    """Return whether a text is a unit of pint."""
+    try:
+        in_si(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_same(one: str, other: str) -> bool:
+    """Return whether two texts are one unit."""
+    registry = _registry()
+    try:
+        return bool(registry.Unit(_spelled(one)) == registry.Unit(_spelled(other)))
+    except Exception:  # pint raises errors of many kinds for what is no unit
+        return False
+
+
+def in_si(text: str) -> str:
+    """Return the SI unit of a unit of pint; angles in radians."""
+    registry = _registry()
+    try:
+        return f"{registry.Quantity(1.0, registry.Unit(_spelled(text))).to_base_units().units:~}" or "dimensionless"
+    except Exception:  # pint raises errors of many kinds for what is no unit
+        raise ValueError(f"{text!r} is no known unit") from None
 
 
 def convert(name: str, values: np.ndarray, unit: float | Sequence[str]) -> np.ndarray:

@@ -9,8 +9,6 @@ import scipy.io
 import xarray as xr
 
 import bayesperiodic as bp
-from bayesperiodic.data import files
-from bayesperiodic.data.layout import reader
 
 TIME = np.arange(200) / 50
 FORCE, DISPLACEMENT = np.cos(TIME), 3.0 * np.sin(TIME)
@@ -370,22 +368,3 @@ def test_arrays_of_a_file_are_split_like_columns(tmp_path):
         ValueError, match="split: must be a column with one value per sample, got 'short' with 5 values"
     ):
         bp.Recording.from_npz(tmp_path / "runs.npz", time="t", outputs={"x": "x"}, split="short")
-
-
-def test_further_format_is_a_function_of_named_columns_and_one_line(tmp_path):
-    def columns(file, wanted):
-        table = dict(line.split(":") for line in file.read_text().splitlines())
-        return list(table), {name: [float(x) for x in table[name].split()] for name in wanted if name in table}
-
-    class Further(bp.Recording):
-        from_lines = reader("from_lines", files.Format("a file of lines", columns), "lines", "lines", "")
-
-    path = tmp_path / "run.txt"
-    path.write_text("x:1 nan 3 4\ngroup:1 1 2 2\n")
-    arguments = {"outputs": {"x": "x"}, "sampling_rate": 2.0, "units": {"x": ("mm", "m")}, "missing": "interpolate"}
-    assert np.allclose(Further.from_lines(path, **arguments).outputs["x"], [1e-3, 2e-3, 3e-3, 4e-3], rtol=1e-12)
-    with pytest.raises(ValueError, match="column of run.txt: must be one of"):
-        Further.from_lines(path, outputs={"x": "y"}, sampling_rate=2.0)
-    path.write_text("x:1 two\n")
-    with pytest.raises(ValueError, match=r"path: must be a file of lines, got '.*run.txt' \(could not convert"):
-        Further.from_lines(path, **arguments)

@@ -1,23 +1,18 @@
-"""Reading of columns from CSV, NPZ and MAT files."""
+"""Texts of columns, such as CSV."""
 
 import codecs
 import csv
 import io
 import itertools
-import math
-import struct
 import warnings
-import zipfile
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
-import numpy as np
-
 from bayesperiodic import _checks
-from bayesperiodic.data.times import dates
+from bayesperiodic.data.formats.contents import Contents, Key, StoredChannel
 
 # Texts of missing values.
 MISSING = [
@@ -29,70 +24,8 @@ PREAMBLE, SEPARATORS = 1000, (",", ";", "\t")
 # Bytes that are decoded at once, and columns per wanted column above which the others are not made numbers.
 PART_BYTES, UNWANTED_RATIO = 2**20, 2
 
-# Bytes of an array, against files that unpack to more than the memory.
-LARGEST_ARRAY = 2**31
-OTHERWISE = "read the part that you need with h5py or NumPy, and give it to from_arrays"
-# Of MAT files, version 5: types of elements and of numbers, classes of arrays, flag of complex arrays, and the bytes in
-# which the name of a variable ends.
-INT32, MAT_MATRIX, COMPRESSED, COMPLEX, HEADER_BYTES = 5, 14, 15, 0x800, 4096
-STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", INT32: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-NUMERIC = {
-    6: "double", 7: "single", 8: "int8", 9: "uint8", 10: "int16", 11: "uint16", 12: "int32", 13: "uint32", 14: "int64",
-    15: "uint64",
-}  # fmt: skip
 
-Stored = tuple[Iterable[str], Mapping[str, Any]]
-
-
-@dataclass(frozen=True)
-class Format:
-    """A format of files with named columns.
-
-    ``columns(file, wanted)`` returns all names in the file and the values of the wanted ones among them. Any error that
-    it raises is reported with `kind`, unless its message begins with the name of an argument.
-    """
-
-    kind: str  # what a file must be, for errors
-    columns: Callable[[Path, list[str]], Stored]
-
-    def read(
-        self, path: str | Path, wanted: Iterable[str], label: str | None = None, time: str | None = None
-    ) -> dict[str, np.ndarray]:
-        """Return named columns of numbers; the column `label` may contain text, and `time` dates."""
-        wanted, file = [*wanted], existing(path)
-        try:
-            names, stored = self.columns(file, wanted)
-        except Exception as error:  # whatever zipfile, zlib, NumPy and HDF5 raise for damaged files
-            if str(error).startswith(("path: ", "column ")):
-                raise
-            reason = error if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-            raise ValueError(f"path: must be {self.kind}, got {str(path)!r} ({reason}).") from None
-        for column in wanted:
-            _checks.one_of(f"column of {file.name}", column, names)
-        return {column: _column(file, column, stored[column], column == label, column == time) for column in wanted}
-
-
-def _column(file: Path, column: str, values: Any, text: bool, time: bool) -> np.ndarray:
-    """Return a column of numbers, or of texts too; of times also as dates, and integers as they are."""
-    argument, array = f"column {column!r} of {file.name}", np.squeeze(np.asarray(values))
-    time = time and not text
-    if time and (times := dates(argument, array)) is not None:
-        array = times
-    if array.dtype == object and not text:
-        import pandas as pd
-
-        cells = np.atleast_1d(array)
-        rows = np.flatnonzero(pd.isna(pd.to_numeric(cells, errors="coerce")) & pd.notna(cells))
-        got = f"{cells[rows[0]]!r} in data row {rows[0] + 1}" if rows.size else "numbers too long to be read"
-        hint = (
-            "; dates must be those of ISO 8601, others are read by pandas.to_datetime for from_arrays" if time else ""
-        )
-        raise ValueError(f"{argument}: must contain numbers, with a decimal point, got {got}{hint}.")
-    if array.ndim != 1 or (array.dtype.kind not in ("fiubmM" if time else "fiub") and not text):
-        raise ValueError(
-            f"{argument}: must be one column of real numbers, got shape {np.shape(values)} and type {array.dtype}."
-        )
-    return array if text or time else array.astype(float)
+Stored = tuple[list[str], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -136,15 +69,18 @@ class _Text:
                 line += text.count("\n")
 
 
-def csv_in(encoding: str) -> Format:
-    """Return the format of CSV files in an encoding."""
+def contents(file: Path, wanted: list[Key], *, encoding: str = "utf-8") -> Contents:
+    """Return the columns of a text; those that are `wanted` are read at once."""
     try:
         "".encode(encoding)
     except (LookupError, TypeError, ValueError):
         raise ValueError(
             f"encoding: must be one of Python's, such as 'utf-8', 'latin-1' or 'cp1252', got {encoding!r}."
         ) from None
-    return Format("a CSV file with a header line", lambda path, wanted: _csv_columns(_Text(path, encoding), wanted))
+    names, columns = _csv_columns(_Text(file, encoding), [str(key) for key in wanted])
+    rows = len(next(iter(columns.values()), ()))
+    channels = [StoredChannel(name, rows, partial(columns.__getitem__, name)) for name in names if name in columns]
+    return Contents("CSV file with a header line", tuple(channels), word="column")
 
 
 def _csv_columns(file: _Text, wanted: list[str]) -> Stored:
@@ -293,135 +229,6 @@ def _place(file: Path, names: list[str], column: str) -> int:
             f"(columns {', '.join(map(str, places))}); rename them in the file."
         )
     return names.index(column)
-
-
-def _npz_columns(file: Path, wanted: list[str]) -> Stored:
-    """Return names and wanted arrays of an NPZ file; whole members are read, because only they have a checksum."""
-    arrays = {}
-    with zipfile.ZipFile(file) as archive:
-        members = [(member, member.filename.removesuffix(".npy")) for member in archive.infolist()]
-        for member, name in members:
-            if name not in wanted:
-                continue
-            if name in arrays:
-                raise ValueError(f"it has two arrays {name!r}")
-            _check_size(name, member.file_size)
-            content = io.BytesIO(archive.read(member))
-            arrays[name] = np.lib.format.read_array(content, allow_pickle=False)
-            if content.read(1):
-                raise ValueError(f"its array {name!r} has another size than its header says")
-    return [name for _, name in members], arrays
-
-
-def _mat_columns(file: Path, wanted: list[str]) -> Stored:
-    """Return names and wanted arrays of a MAT file, version 5 or 7.3."""
-    import h5py
-
-    return (_hdf5_columns if h5py.is_hdf5(file) else _mat5_columns)(file, wanted)
-
-
-def _hdf5_columns(file: Path, wanted: list[str]) -> Stored:
-    """Return names and wanted arrays of a MAT file, version 7.3."""
-    import h5py
-
-    from bayesperiodic import _hdf5
-
-    arrays = {}
-    with h5py.File(file, "r") as archive:
-        names = [name for name in archive if isinstance(name, str)]  # bytes are no text
-        for name in {*wanted} & {*names}:
-            item = _hdf5.dataset(archive, name)
-            kind = np.bytes_(item.attrs.get("MATLAB_class", b"double")).decode()
-            if kind not in (*NUMERIC.values(), "logical") or item.attrs.get("MATLAB_empty"):
-                raise ValueError(f"its variable {name!r} is empty or no array of numbers, but {kind}")
-            arrays[name] = _hdf5.values(item, LARGEST_ARRAY, OTHERWISE)
-    return names, arrays
-
-
-def _mat5_columns(file: Path, wanted: list[str]) -> Stored:
-    """Return names and wanted arrays of a MAT file, version 5, after MathWorks' "MAT-File Format".
-
-    scipy.io.loadmat ends the process with a segmentation fault for some damaged files.
-    """
-    content = file.read_bytes()
-    order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
-    if order is None:
-        raise ValueError("it has no header of version 5; an older version is converted by save('-v7') in MATLAB")
-    names, arrays = [], {}
-    for kind, data in _elements(memoryview(content)[128:], order):
-        stream = zlib.decompressobj()
-        if compressed := kind == COMPRESSED:
-            data = memoryview(stream.decompress(data, HEADER_BYTES))[8:]
-        elif kind != MAT_MATRIX:
-            raise ValueError(f"it contains an element of type {kind}")
-        name, *_ = _variable(data, order)
-        names.append(name)
-        if name not in wanted:
-            continue
-        if name in arrays:
-            raise ValueError(f"it has two variables {name!r}")
-        if compressed:
-            data = memoryview(bytes(data) + stream.decompress(stream.unconsumed_tail, LARGEST_ARRAY))
-            if not stream.eof:
-                raise ValueError(
-                    f"its variable {name!r} is cut off or has more than {LARGEST_ARRAY / 1e9:.3g} GB; {OTHERWISE}"
-                )
-        arrays[name] = _array(*_variable(data, order), order)
-    return names, arrays
-
-
-def _elements(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    """Yield types and contents of the elements of a MAT file, version 5."""
-    place = 0
-    while place < len(content):
-        kind, size = struct.unpack_from(f"{order}II", content, place)
-        start, step = place + 8, size if kind == COMPRESSED else size + -size % 8
-        if kind >> 16:  # at most four bytes, in the place of the size
-            kind, size, start, step = kind & 0xFFFF, kind >> 16, place + 4, 0
-        if start + size > len(content):
-            raise ValueError("it is cut off")
-        yield kind, content[start : start + size]
-        place += 8 + step
-
-
-def _variable(data: memoryview, order: str) -> tuple[str, int, list[int], Iterator[tuple[int, memoryview]]]:
-    """Return name, flags and shape of a variable, and its remaining elements."""
-    parts = _elements(data, order)
-    (flags, _), (kind, second) = struct.unpack(f"{order}II", next(parts)[1]), next(parts)
-    # Objects of classes have no shape.
-    shape, name = (np.frombuffer(second, f"{order}i4").tolist(), next(parts)[1]) if kind == INT32 else ([], second)
-    return bytes(name).decode(), flags, shape, parts
-
-
-def _array(name: str, flags: int, shape: list[int], parts: Iterator[tuple[int, memoryview]], order: str) -> np.ndarray:
-    if flags & 0xFF not in NUMERIC or flags & COMPLEX:
-        other = "complex" if flags & COMPLEX else f"of MATLAB class {flags & 0xFF}"
-        raise ValueError(f"its variable {name!r} is no array of real numbers, but {other}")
-    kind, values = next(parts)
-    array = np.frombuffer(values, f"{order}{STORED[kind]}")
-    if next(parts, None) is not None or min(shape) < 0 or array.size != math.prod(shape):
-        raise ValueError(f"its variable {name!r} has another size than its header says")
-    return array.reshape(shape)
-
-
-NPZ = Format(
-    "an NPZ file of named arrays (numpy.savez) without pickled objects, or be read by from_csv or from_mat",
-    _npz_columns,
-)
-MAT = Format("a MAT file of version 5 or 7.3", _mat_columns)
-
-
-def _check_size(name: str, size: int) -> None:
-    if size > LARGEST_ARRAY:
-        raise ValueError(f"its array {name!r} has more than {LARGEST_ARRAY / 1e9:.3g} GB; {OTHERWISE}")
-
-
-def existing(path: str | Path) -> Path:
-    """Return the path; raise a FileNotFoundError if there is no such file."""
-    file = Path(path)
-    if not file.is_file():
-        raise FileNotFoundError(f"path: must be an existing file, got {str(path)!r}.")
-    return file
 
 
 def _is_no_header(names: list[str]) -> bool:

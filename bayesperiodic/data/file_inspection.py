@@ -1,0 +1,246 @@
+"""What is in a file of measurements, and the call that reads it."""
+
+import keyword
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesperiodic._io import Result, Storable
+from bayesperiodic._printing import printable
+from bayesperiodic.data.formats import recognise
+from bayesperiodic.data.formats.contents import Clock, Contents, StoredChannel, unique_names
+from bayesperiodic.data.times import dates
+
+# Channels that are printed, and that the suggested call names.
+MOST_PRINTED, MOST_SUGGESTED = 60, 6
+
+
+@dataclass(frozen=True)
+class FileChannel(Storable):
+    """A channel of a file.
+
+    Attributes
+    ----------
+    group, name, unit : str
+        As in the file; empty without.
+    samples : int
+    rate : float
+        Mean sampling rate [Hz]; NaN if the file does not say it.
+    first, last : float
+        Times of the first and last sample [s] from the file's origin; NaN if the file does not say it.
+    low, high : float
+        Range in the file's unit, without missing samples; NaN for texts and for what cannot be read.
+    remarks : tuple of str
+        What a user would not guess.
+    refused : bool
+        Whether the channel cannot be read, or not without `sampling_rate` for its times; the last remark says why.
+    """
+
+    group: str
+    name: str
+    unit: str
+    samples: int
+    rate: float
+    first: float
+    last: float
+    low: float
+    high: float
+    remarks: tuple[str, ...] = ()
+    refused: bool = False
+
+
+@dataclass(frozen=True, repr=False)
+class FileInspection(Result):
+    """Channels of a file, remarks, and the call that reads it, from `inspect`.
+
+    Attributes
+    ----------
+    path, kind : str
+    channels : tuple of FileChannel
+    remarks : tuple of str
+        On the whole file.
+    code : str
+        A call of `Recording.from_file`, in which inputs and outputs are still to be told apart.
+    """
+
+    path: str
+    kind: str
+    channels: tuple[FileChannel, ...]
+    remarks: tuple[str, ...]
+    code: str
+
+    def __str__(self) -> str:
+        rows: list[tuple[str, ...]] = [
+            ("group", "channel", "unit", "samples", "rate [Hz]", "first [s]", "last [s]", "range", "")
+        ]
+        listed: dict[str, int] = {remark: k for k, remark in enumerate(self.remarks, 1)}
+        for channel in self.channels[:MOST_PRINTED]:
+            notes = ", ".join(str(listed.setdefault(remark, len(listed) + 1)) for remark in channel.remarks)
+            spread = "" if np.isnan(channel.low) else f"{channel.low:.6g} to {channel.high:.6g}"
+            numbers = (_number(value) for value in (channel.rate, channel.first, channel.last))
+            mark = f"{'refused ' if channel.refused else ''}{f'({notes})' if notes else ''}"
+            rows.append((channel.group, channel.name, channel.unit, str(channel.samples), *numbers, spread, mark))
+        keep = [k for k in range(9) if k in (1, 3) or any(row[k] for row in rows[1:])]
+        widths = [max(len(row[k]) for row in rows) for k in keep]
+        lines = [f"{self.kind} {self.path!r}, {len(self.channels)} channels", ""]
+        for row in rows:
+            cells = (
+                row[k].rjust(w) if k in (3, 4, 5, 6) else row[k].ljust(w) for k, w in zip(keep, widths, strict=True)
+            )
+            lines.append("  ".join(cells).rstrip())
+        if len(self.channels) > MOST_PRINTED:
+            lines.append(f"… and {len(self.channels) - MOST_PRINTED} more")
+        if listed:
+            lines += ["", *(f"({k}) {remark}" for remark, k in listed.items())]
+        return printable("\n".join([*lines, "", self.code]))
+
+    __repr__ = __str__
+
+
+def inspect(
+    path: str | Path,
+    *,
+    format: str | None = None,
+    encoding: str | None = None,
+    separator: str | None = None,
+    decimal: str | None = None,
+    thousands: str | None = None,
+    header: int | None = None,
+    date_format: str | None = None,
+) -> FileInspection:
+    """Return what is in a file of measurements: channels, units, rates, ranges, remarks, and the call that reads it.
+
+    Parameters
+    ----------
+    path : path
+    format, encoding, separator, decimal, thousands, header, date_format
+        As for `Recording.from_file`, where they are not recognised.
+
+    Returns
+    -------
+    FileInspection
+
+    Raises
+    ------
+    FileNotFoundError, ImportError, ValueError
+        As for `Recording.from_file`.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile, numpy as np, scipy.io.wavfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.wav"
+    >>> scipy.io.wavfile.write(path, 8000, np.arange(-100, 100, dtype="int16"))
+    >>> seen = bp.inspect(path)
+    >>> seen.channels[0].rate, seen.channels[0].samples, seen.channels[0].unit
+    (8000.0, 200, '')
+    """
+    options = {
+        "encoding": encoding,
+        "separator": separator,
+        "decimal": decimal,
+        "thousands": thousands,
+        "header": header,
+        "date_format": date_format,
+    }
+    whole = recognise.contents(path, format, (), options)
+    channels = tuple(_summary(channel) for channel in whole.channels)
+    given = {key: value for key, value in {"format": format, **options}.items() if value is not None}
+    return FileInspection(str(path), whole.kind, channels, whole.remarks, _code(path, whole, channels, given))
+
+
+def _summary(channel: StoredChannel) -> FileChannel:
+    """Return a channel with its range and its times."""
+    remarks, low, high, refused = [*channel.remarks], np.nan, np.nan, bool(channel.refusal)
+    if channel.refusal:
+        remarks.append(channel.refusal)
+    else:
+        try:
+            low, high, note = _range(channel.values())
+        except ValueError as error:
+            note, refused = str(error), True
+        remarks += [note] if note else []
+    rate, first, last = np.nan, np.nan, np.nan
+    if clock := channel.clock:
+        remarks += clock.remarks
+        if clock.refusal:
+            remarks.append(f"times are refused: {clock.refusal}")
+            refused = True
+        elif channel.samples:
+            rate, first, last = _times(clock, channel.samples)
+            if clock.error:
+                remarks.append(
+                    f"the interval has few digits: rate {rate:.9g} Hz with an error of up to "
+                    f"{1e6 * clock.error / clock.step:.2g} ppm; sampling_rate= overrides it"
+                )
+    return FileChannel(
+        channel.group,
+        channel.name,
+        channel.unit,
+        channel.samples,
+        rate,
+        first,
+        last,
+        low,
+        high,
+        tuple(remarks),
+        refused,
+    )
+
+
+def _times(clock: Clock, samples: int) -> tuple[float, float, float]:
+    """Return mean rate, first and last time."""
+    if clock.stored is None:
+        return 1.0 / clock.step, clock.start, clock.start + (samples - 1) * clock.step
+    times = np.asarray(clock.stored(), dtype=float)
+    length = float(times[-1] - times[0])
+    return (times.size - 1) / length if length > 0.0 else np.nan, float(times[0]), float(times[-1])
+
+
+def _range(values: Any) -> tuple[float, float, str]:
+    """Return the range of the values of a channel, and a remark on them."""
+    array = np.squeeze(np.asarray(values))
+    if (times := dates("values", array) if array.dtype.kind in "OUTmM" else None) is not None:
+        return np.nan, np.nan, f"dates or durations from {times.flat[0]} to {times.flat[-1]}"
+    if array.dtype.kind not in "fiub":
+        return np.nan, np.nan, "texts, or not only numbers" if array.dtype.kind in "OUT" else f"of type {array.dtype}"
+    if array.ndim > 1:
+        return np.nan, np.nan, f"no column, but an array of shape {array.shape}"
+    finite = array[np.isfinite(array)] if array.dtype.kind == "f" else array
+    lost = array.size - finite.size
+    note = f"{lost} of {array.size} values are missing; missing='drop' leaves them out" if lost else ""
+    return (float(finite.min()), float(finite.max()), note) if finite.size else (np.nan, np.nan, note)
+
+
+def _code(path: str | Path, whole: Contents, channels: tuple[FileChannel, ...], options: dict[str, Any]) -> str:
+    """Return a call that reads the usable channels."""
+    usable = [
+        channel for channel in channels
+        if not np.isnan(channel.low) and channel.name != whole.suggested_time
+    ]  # fmt: skip
+    names = [channel.name for channel in channels]
+    pairs = []
+    for name, channel in zip(unique_names(_identifier(one.name) for one in usable), usable, strict=True):
+        key = channel.name if names.count(channel.name) == 1 else (channel.group, channel.name)
+        pairs.append(f"{_identifier(name)!r}: {key!r}")
+    shown = ", ".join(pairs[:MOST_SUGGESTED])
+    arguments = [repr(str(path)), f"inputs={{}}, outputs={{{shown}}}"]
+    if whole.suggested_time:
+        arguments.append(f"time={whole.suggested_time!r}")
+    elif any(np.isnan(channel.rate) for channel in usable):
+        arguments.append("sampling_rate=…")
+    arguments += [f"{key}={value!r}" for key, value in options.items()]
+    more = f"  # and {len(pairs) - MOST_SUGGESTED} more" if len(pairs) > MOST_SUGGESTED else ""
+    return f"recording = bp.Recording.from_file({', '.join(arguments)}){more}"
+
+
+def _identifier(name: str) -> str:
+    """Return a name of a channel of a model, which is a Python identifier."""
+    word = re.sub(r"\W+", "_", re.sub(r"[\[(].*?[\])]", "", name)).strip("_").lower() or "x"
+    return f"x{word}" if word[0].isdigit() else f"{word}_" if keyword.iskeyword(word) else word
+
+
+def _number(value: float) -> str:
+    return "" if np.isnan(value) else f"{value:.9g}"

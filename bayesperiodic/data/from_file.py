@@ -1,0 +1,192 @@
+"""Recordings from files of all formats."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, overload
+
+from bayesperiodic.data.channels import Channels
+from bayesperiodic.data.formats.contents import Key
+from bayesperiodic.data.layout import Layout, Rate, recordings
+from bayesperiodic.data.units import Units
+
+
+@dataclass(frozen=True, repr=False)
+class FromFile(Channels):
+    """Channels that are read from files."""
+
+    @overload
+    @classmethod
+    def from_file(cls, path: str | Path, *, split: None = None, **arguments: Any) -> "FromFile": ...
+
+    @overload
+    @classmethod
+    def from_file(cls, path: str | Path, *, split: Key, **arguments: Any) -> "list[FromFile]": ...
+
+    @classmethod  # type: ignore[misc]
+    def from_file(
+        cls,
+        path: str | Path,
+        *,
+        outputs: Mapping[str, Key],
+        inputs: Mapping[str, Key] | None = None,
+        time: Key | None = None,
+        sampling_rate: Rate = None,
+        units: Units | None = None,
+        format: str | None = None,
+        missing: str | None = None,
+        split: Key | None = None,
+        name: str | None = None,
+        encoding: str | None = None,
+        separator: str | None = None,
+        decimal: str | None = None,
+        thousands: str | None = None,
+        header: int | None = None,
+        date_format: str | None = None,
+    ) -> "FromFile | list[FromFile]":
+        """Read a recording from a file of one of eleven formats.
+
+        `bayesperiodic.inspect` prints what is in a file, and the call that reads it. The formats are CSV and other
+        texts, NPZ, MAT, HDF5 and WAV, and with ``pip install "bayesperiodic[files]"`` UFF 58, TDMS, MDF, LVM, Parquet
+        and Excel.
+
+        Parameters
+        ----------
+        path : path
+        outputs, inputs : mapping of str to str, int or (group, name)
+            Channel in the file by channel of the model, such as ``{"force": "Force [N]"}``, or the number of a column
+            from 1.
+        time : str, int or (group, name), optional
+            Channel of times [s], or of dates after ISO 8601, such as 2026-01-31T12:00:00.01, which are converted to
+            seconds from the first one. By default the times that the file has for each channel; channels with
+            different ones keep them.
+        sampling_rate : float or mapping of channel to float, optional
+            Sampling rate [Hz], if the file does not say it, or with too few digits.
+        units : mapping of str to float, unit or (from, to), optional
+            Conversion of a channel (or of "time"). If the file says the unit, it is converted to SI by default (angles
+            to rad, temperatures to K), or to the unit given here, such as ``{"x": "mm"}``. If not, values are taken as
+            they are, or are converted by a factor or a pair such as ``("mm", "m")``. Angles must be in both units or
+            in neither; a hertz is a cycle per second where the other unit has an angle: ``("rpm", "Hz")`` divides by
+            60, ``("Hz", "rad/s")`` multiplies by 2π. Temperatures are absolute, differences are "delta_degC".
+            Logarithmic units such as dB, and names of two units such as g, are refused.
+        format : str, optional
+            "csv", "npz", "mat", "uff", "tdms", "mdf", "lvm", "wav", "hdf5", "parquet" or "excel"; by default it is
+            recognised by the first bytes of the file.
+        missing : "drop" or "interpolate", optional
+            What to do with NaN and empty cells (in a file with one column: empty lines), which are refused by default:
+            leave them out of their channel, or interpolate linearly in time over at most three successive ones.
+        split : str, int or (group, name), optional
+            Column of numbers or texts that distinguishes successive records, such as the drive frequency: each part in
+            which it is constant is a recording. `Recording.split` divides a recording by the steps of its drive.
+        name : str, optional
+            By default the file name without its extension.
+        encoding, separator, decimal, thousands, header, date_format : optional
+            Of texts, where they are not recognised: Python's name of the encoding, such as "latin-1" or "cp1252"; the
+            characters between fields, before decimals and between thousands; the line of the names, from 1, or 0 for
+            none; dates as `datetime.strptime` reads them, such as "%d.%m.%Y %H:%M:%S.%f". `header` also of Excel.
+
+        Returns
+        -------
+        Recording, or list of Recording with `split`
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is no such file.
+        ImportError
+            If the package for its format is not installed.
+        ValueError
+            As for `Recording`, and for a missing or repeated channel, rows with other numbers of fields than the
+            header, a cell that is not a number, neither or both of ``time`` and ``sampling_rate`` for a file without
+            times, an unknown or ambiguous unit, a damaged file, and one that can be read in several ways.
+
+        Examples
+        --------
+        >>> import pathlib, tempfile, numpy as np, scipy.io.wavfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.wav"
+        >>> swing = 0.5 * np.sin(2 * np.pi * 5 * np.arange(8000) / 8000)
+        >>> scipy.io.wavfile.write(path, 8000, np.round(2**15 * swing).astype("int16"))
+        >>> run = bp.Recording.from_file(path, outputs={"x": "channel 1"}, units={"x": 20.0})
+        >>> run, round(float(run.outputs["x"].max()), 3)
+        (Recording('run': recording of 8000 samples at 8000 Hz, inputs [], outputs ['x']), 10.0)
+        """
+        layout = Layout(path, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
+        options = {
+            "encoding": encoding,
+            "separator": separator,
+            "decimal": decimal,
+            "thousands": thousands,
+            "header": header,
+            "date_format": date_format,
+        }
+        return recordings(cls, layout, format, options, split, name)
+
+    @classmethod
+    def from_csv(cls, path: str | Path, **arguments: Any) -> Any:
+        """Read a recording from a text of columns.
+
+        Parameters
+        ----------
+        path, **arguments
+            As for `from_file`.
+
+        Returns
+        -------
+        Recording, or list of Recording with `split`
+
+        Raises
+        ------
+        FileNotFoundError, ValueError
+            As for `from_file`.
+
+        Examples
+        --------
+        >>> import pathlib, tempfile, numpy as np, pandas as pd
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
+        >>> t = np.arange(500) / 50
+        >>> pd.DataFrame({"t": t, "x_mm": 25 * np.sin(2 * np.pi * t)}).to_csv(path, index=False)
+        >>> run = bp.Recording.from_csv(path, time="t", outputs={"x": "x_mm"}, units={"x": ("mm", "m")})
+        >>> run.name, round(float(run.outputs["x"].max()), 3)
+        ('run', 0.025)
+        """
+        return cls.from_file(path, format="csv", **arguments)
+
+    @classmethod
+    def from_npz(cls, path: str | Path, **arguments: Any) -> Any:
+        """Read a recording from the named arrays of an NPZ file.
+
+        Parameters
+        ----------
+        path, **arguments
+            As for `from_file`, with arrays as channels.
+
+        Returns
+        -------
+        Recording, or list of Recording with `split`
+
+        Raises
+        ------
+        FileNotFoundError, ValueError
+            As for `from_file`, and for an array of objects, which would have to be unpickled.
+        """
+        return cls.from_file(path, format="npz", **arguments)
+
+    @classmethod
+    def from_mat(cls, path: str | Path, **arguments: Any) -> Any:
+        """Read a recording from the variables of a MAT file, version 5 or 7.3.
+
+        Parameters
+        ----------
+        path, **arguments
+            As for `from_file`, with variables as channels.
+
+        Returns
+        -------
+        Recording, or list of Recording with `split`
+
+        Raises
+        ------
+        FileNotFoundError, ValueError
+            As for `from_file`, and for a file of version 4 or a variable that is not a vector of real numbers.
+        """
+        return cls.from_file(path, format="mat", **arguments)
