@@ -15,6 +15,8 @@ LOSSES: dict[str, list[tuple[int, int]]] = {
     "7, 15 and 40 samples": [(1500, 7), (3000, 15), (4500, 40)],
     "14 times one sample": [(400 * i + 200, 1) for i in range(14)],
 }
+# Recordings of one clock, in which an alarm would be false, for 200 of each other case.
+ONE_CLOCK = 2.5
 FREQUENCY, C, K = 0.2, 0.2, 1.0
 OSCILLATOR = bp.Model(
     "oscillator", states=["x"], inputs=["force"], parameters=["c", "k"], equations=["ddx + c*dx + k*x - force"],
@@ -59,10 +61,12 @@ def case_outcome(case: str, seed: int) -> str:
 
 def loggers(seed: int, count: int) -> dict[str, dict[str, int]]:
     """Return how often recordings of two clocks, with lost samples, and of one clock are refused or warned of."""
-    cases = [*(f"{ppm:g} ppm" for ppm in PPM), *LOSSES]
-    tasks = [(case, seed + i) for case in cases for i in range(count)]
+    sizes = dict.fromkeys([*(f"{ppm:g} ppm" for ppm in PPM), *LOSSES], count) | {"0 ppm": round(ONE_CLOCK * count)}
+    tasks = [(case, seed + i) for case, size in sizes.items() for i in range(size)]
     outcomes = list(common.each(case_outcome, tasks))
-    return {case: dict(Counter(outcomes[n * count : (n + 1) * count])) for n, case in enumerate(cases)}
+    return {
+        case: dict(Counter(out for (of, _), out in zip(tasks, outcomes, strict=True) if of == case)) for case in sizes
+    }
 
 
 def rates(seed: int, count: int) -> dict[str, float]:
