@@ -5,8 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
 
+from bayesperiodic import _checks
+from bayesperiodic.data import objects
 from bayesperiodic.data.channels import Channels
-from bayesperiodic.data.formats.contents import Key
+from bayesperiodic.data.formats import recognise
+from bayesperiodic.data.formats.contents import Contents, Key
 from bayesperiodic.data.layout import Layout, Rate, recordings
 from bayesperiodic.data.units import Units
 
@@ -110,7 +113,7 @@ class FromFile(Channels):
         >>> run, round(float(run.outputs["x"].max()), 3)
         (Recording('run': recording of 8000 samples at 8000 Hz, inputs [], outputs ['x']), 10.0)
         """
-        layout = Layout(path, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
+        layout = Layout(Path(path).name, outputs, inputs or {}, time, sampling_rate, units or {}, missing)
         options = {
             "encoding": encoding,
             "separator": separator,
@@ -119,7 +122,9 @@ class FromFile(Channels):
             "header": header,
             "date_format": date_format,
         }
-        return recordings(cls, layout, format, options, split, name)
+        wanted = [*layout.wanted, *([] if split is None else [split])]
+        contents = recognise.contents(path, format, wanted, options)
+        return recordings(cls, layout, contents, split, name or Path(path).stem)
 
     @classmethod
     def from_csv(cls, path: str | Path, **arguments: Any) -> Any:
@@ -190,3 +195,107 @@ class FromFile(Channels):
             As for `from_file`, and for a file of version 4 or a variable that is not a vector of real numbers.
         """
         return cls.from_file(path, format="mat", **arguments)
+
+    @classmethod
+    def from_dataframe(cls, table: Any, **arguments: Any) -> Any:
+        """Make a recording from the columns of a pandas DataFrame.
+
+        Parameters
+        ----------
+        table : pandas.DataFrame
+            Columns are channels; those with two levels of names are ``(group, name)``. An index of dates or durations
+            has the times, another one with a name is a channel too. Units are those of ``table.attrs["units"]``, of
+            a column's ``attrs["units"]``, or of the type ``pint[…]`` of pint-pandas.
+        **arguments
+            ``outputs, inputs, time, sampling_rate, units, missing, split, name`` as for `from_file`.
+
+        Returns
+        -------
+        Recording, or list of Recording with `split`
+
+        Raises
+        ------
+        ValueError
+            As for `from_file`.
+
+        Examples
+        --------
+        >>> import numpy as np, pandas as pd
+        >>> t = pd.timedelta_range("0s", periods=400, freq="10ms")
+        >>> table = pd.DataFrame({"x": 25 * np.cos(2 * np.pi * t.total_seconds())}, index=t)
+        >>> table.attrs["units"] = {"x": "mm"}
+        >>> run = bp.Recording.from_dataframe(table, outputs={"x": "x"})
+        >>> run, round(float(run.outputs["x"].max()), 4)
+        (Recording('recording': recording of 400 samples at 100 Hz, inputs [], outputs ['x']), 0.025)
+        """
+        return _from_object(cls, "DataFrame", objects.dataframe(table), arguments)
+
+    @classmethod
+    def from_xarray(cls, dataset: Any, **arguments: Any) -> Any:
+        """Make a recording from the variables of an xarray Dataset, or from a DataArray with a name.
+
+        Parameters
+        ----------
+        dataset : xarray.Dataset or xarray.DataArray
+            Variables and coordinates with one dimension are channels. A coordinate of dates or durations, or of numbers
+            whose ``attrs["units"]`` is a unit of time, has the times of the variables along its dimension; variables
+            along others keep their own. Units are those of ``attrs["units"]``.
+        **arguments
+            ``outputs, inputs, time, sampling_rate, units, missing, split, name`` as for `from_file`.
+
+        Returns
+        -------
+        Recording, or list of Recording with `split`
+
+        Raises
+        ------
+        ValueError
+            As for `from_file`.
+        """
+        return _from_object(cls, "Dataset", objects.dataset(dataset), arguments)
+
+    @classmethod
+    def from_sep005(cls, channels: Any, **arguments: Any) -> Any:
+        """Make a recording from time series after SEP 005 of the project SDyPy, as its readers return them.
+
+        Parameters
+        ----------
+        channels : list of dict
+            Each has "data", "name" and "unit_str", "fs" [Hz] or "time" [s], and perhaps "group" and "start_timestamp"
+            (ISO 8601), from which the times of channels with different starts are counted.
+        **arguments
+            ``outputs, inputs, time, sampling_rate, units, missing, split, name`` as for `from_file`.
+
+        Returns
+        -------
+        Recording, or list of Recording with `split`
+
+        Raises
+        ------
+        ValueError
+            As for `from_file`, and for "fs" and "time" that contradict each other.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> force = {"name": "F", "unit_str": "kN", "fs": 100.0, "data": np.cos(np.arange(400) / 10)}
+        >>> run = bp.Recording.from_sep005([force], outputs={"force": "F"})
+        >>> run, float(run.outputs["force"][0])
+        (Recording('recording': recording of 400 samples at 100 Hz, inputs [], outputs ['force']), 1000.0)
+        """
+        return _from_object(cls, "the list", objects.sep005(channels), arguments)
+
+
+def _from_object(
+    cls: Any,
+    label: str,
+    contents: Contents,
+    arguments: dict[str, Any],
+) -> Any:
+    """Return the recording in an object in memory."""
+    known = ("outputs", "inputs", "time", "sampling_rate", "units", "missing", "split", "name")
+    for argument in arguments:
+        _checks.one_of("arguments", argument, known)
+    outputs, inputs, time, rate, units, missing, split, name = (arguments.get(argument) for argument in known)
+    layout = Layout(label, {} if outputs is None else outputs, inputs or {}, time, rate, units or {}, missing)
+    return recordings(cls, layout, contents, split, name or "recording")

@@ -3,13 +3,11 @@
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bayesperiodic import _checks
-from bayesperiodic.data.formats import recognise
 from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChannel
 from bayesperiodic.data.times import dates, seconds
 from bayesperiodic.data.units import Units, from_file
@@ -26,7 +24,7 @@ Rate = float | Mapping[str, float] | None
 class Layout:
     """Meaning of the channels of a file, with the arguments of `Recording.from_file`."""
 
-    path: str | Path
+    file: str  # its name, for messages
     outputs: Mapping[str, Key]
     inputs: Mapping[str, Key]
     time: Key | None
@@ -38,6 +36,8 @@ class Layout:
         example = "{'force': 'the column of the force'}"
         for kind in ("outputs", "inputs"):
             _checks.mapping(kind, getattr(self, kind), example)
+        if not self.outputs:
+            raise ValueError("outputs: must have at least one channel, got none.")
         if self.time is not None and self.sampling_rate is not None:
             raise ValueError(
                 f"time: must be given or sampling_rate, and not both, got {self.time!r} and {self.sampling_rate!r}."
@@ -54,23 +54,13 @@ class Layout:
         return {**self.outputs, **self.inputs}
 
     @property
-    def file(self) -> str:
-        """Name of the file, for messages."""
-        return Path(self.path).name
-
-    @property
     def wanted(self) -> list[Key]:
         """Keys that are read, each once."""
         return [*dict.fromkeys([*([self.time] if self.time is not None else []), *self.sources.values()])]
 
 
-def recordings(
-    cls: Any, layout: Layout, form: str | None, options: dict[str, Any], split: Key | None, name: str | None
-) -> Any:
+def recordings(cls: Any, layout: Layout, contents: Contents, split: Key | None, name: str) -> Any:
     """Return the recording in a file; with `split`, one for each part in which this channel is constant."""
-    wanted = [*layout.wanted, *([] if split is None else [split])]
-    contents = recognise.contents(layout.path, form, wanted, options)
-    name = name or Path(layout.path).stem
     given = None if layout.time is None else _time_column(layout, contents)
     columns = {channel: _Column.of(layout, contents, key) for channel, key in layout.sources.items()}
     times = _times(layout, contents, columns) if given is None else given

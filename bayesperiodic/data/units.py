@@ -39,12 +39,17 @@ SPELLINGS = {
     "µe": "um/m", "ue": "um/m", "µε": "um/m", "με": "um/m", "µm/m": "um/m", "ustrain": "um/m", "microstrain": "um/m",
     "-": "", "1": "", "none": "", "None": "", "NONE": "",
 }  # fmt: skip
-# Units that stand for two things, and what to write.
+# Units that stand for two things, or that pint takes for other ones than measurement programs, and what to write.
 AMBIGUOUS = {
     "g": "('g_0', 'm/s**2') for the acceleration of gravity, ('g', 'kg') for the gram",
-    "G": "('g_0', 'm/s**2') for the acceleration of gravity, ('G', 'T') for the gauss",
     "rpm": "('rpm', 'Hz') for a frequency, ('rpm', 'rad/s') for an angular velocity",
+    "C": "('degC', 'K') for a temperature, ('C', 'C') for the coulomb",
+    "F": "('degF', 'K') for a temperature, ('F', 'F') for the farad",
+    "lb": "('lbf', 'N') for a force, ('lb', 'kg') for a mass",
 }
+A_FACTOR = "a factor, such as 1.0 for values as they are"
+# Single letters that are no doubt the unit, and other texts that are no units but would be taken for some.
+LETTERS, NO_UNITS = set("msNVAKWJTHLlhΩ°%"), ("EU", "AU", "au", "cts", "units", "unit", "pk", "rms", "lin")
 # A unit with an exponent that has no sign of its own, such as m/s2.
 BARE_EXPONENT = re.compile(r"(?<=[A-Za-z])([234])(?![\w.])")
 
@@ -66,25 +71,32 @@ def from_file(name: str, values: np.ndarray, unit: float | str | Sequence[str] |
         return convert(name, values, unit)
     text = _spelled(stored)
     if isinstance(unit, str) or unit is None:
-        if text in AMBIGUOUS:
-            raise ValueError(
-                f"{argument}: must say what {stored!r} in the file is, got {unit!r}; give {AMBIGUOUS[text]}."
-            )
+        if hint := _doubt(text):
+            raise ValueError(f"{argument}: must say what {stored!r} in the file is, got {unit!r}; give {hint}.")
         try:
             return convert(name, values, (text, in_si(text) if unit is None else unit))
         except ValueError as error:
             if unit is None:
                 raise ValueError(
-                    f"{argument}: must say what {stored!r} in the file is, got None; give a factor, such as "
-                    f"units={{{name!r}: 1.0}} for values as they are."
-                ) from error
+                    f"{argument}: must say what {stored!r} in the file is, got None; give {A_FACTOR} ({error})"
+                ) from None
             raise
-    if len(unit) == 2 and text not in AMBIGUOUS and is_known(text) and not _is_same(unit[0], text):
+    if len(unit) == 2 and not _doubt(text) and is_known(text) and not _is_same(unit[0], text):
         raise ValueError(
             f"{argument}: must begin with the unit {stored!r} of the file, got {tuple(unit)!r}; give a factor if the "
             "file is wrong."
         )
     return convert(name, values, unit)
+
+
+def _doubt(text: str) -> str:
+    """Return what to write for a unit that can be misunderstood; empty if it cannot."""
+    for word in re.findall(r"[^\W\d_]\w*", text):
+        if word in AMBIGUOUS:
+            return AMBIGUOUS[word] if word == text else A_FACTOR
+        if word in NO_UNITS or (len(word) == 1 and word not in LETTERS):
+            return A_FACTOR
+    return ""
 
 
 def _spelled(text: str) -> str:
@@ -100,6 +112,11 @@ def is_known(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def is_duration(text: str) -> bool:
+    """Return whether a text is a unit of time."""
+    return bool(text.strip()) and is_known(_spelled(text)) and in_si(_spelled(text)) == "s"
 
 
 def _is_same(one: str, other: str) -> bool:

@@ -1,0 +1,147 @@
+"""Recordings from tables of pandas, datasets of xarray and time series after SEP 005."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import bayesperiodic as bp
+
+TIME = np.arange(400) / 100
+X = np.cos(2 * np.pi * TIME)
+SERIES = {"name": "F", "unit_str": "kN", "fs": 100.0, "data": X}
+
+
+def test_columns_of_two_levels_and_an_index_of_dates():
+    index = pd.date_range("2026-03-29T01:59:59", periods=400, freq="10ms", tz="UTC").tz_convert("Europe/Berlin")
+    table = pd.DataFrame({("A", "x"): X, ("B", "x"): 2 * X}, index=index)
+    table.attrs["units"] = {("A", "x"): "mm"}
+    run = bp.Recording.from_dataframe(table, outputs={"x": ("A", "x"), "y": ("B", "x")})
+    assert run.time == pytest.approx(TIME) and run.outputs["x"] == pytest.approx(1e-3 * X)
+    assert np.array_equal(run.outputs["y"], 2 * X)
+    with pytest.raises(ValueError, match="column of DataFrame: must be the name of one column, got 'x', the name of 2"):
+        bp.Recording.from_dataframe(table, outputs={"x": "x"})
+
+
+def test_index_of_numbers_is_a_column_by_its_name():
+    table = pd.DataFrame({"x": X}, index=pd.Index(1e3 * TIME, name="t"))
+    run = bp.Recording.from_dataframe(table, outputs={"x": "x"}, time="t", units={"time": ("ms", "s")})
+    assert run.time == pytest.approx(TIME)
+    with pytest.raises(ValueError, match="time: must be given or sampling_rate.*DataFrame does not say when"):
+        bp.Recording.from_dataframe(table, outputs={"x": "x"})
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"outputs": {}}, "outputs: must have at least one channel, got none"),
+        ({"outputs": {"x": "y"}}, "column of DataFrame: must be 'x', got 'y'"),
+        ({"outputs": {"x": "x"}, "rate": 5.0}, "arguments: must be one of .*, got 'rate'"),
+        ({"outputs": {"x": "x"}, "sampling_rate": 100.0, "units": {"x": ("m", "m")}}, "must begin with the unit 'mm'"),
+        ({"outputs": {"x": "x"}, "sampling_rate": 100.0, "units": {"x": "s"}}, "two units of the same dimension"),
+    ],
+)
+def test_wrong_arguments_have_one_error(arguments, message):
+    table = pd.DataFrame({"x": X})
+    table.attrs["units"] = {"x": "mm"}
+    with pytest.raises(ValueError, match=message):
+        bp.Recording.from_dataframe(table, **arguments)
+
+
+def test_unit_wanted_is_given_alone_where_the_file_says_the_unit():
+    table = pd.DataFrame({"x": X, "bare": X})
+    table.attrs["units"] = {"x": "mm"}
+    kept = bp.Recording.from_dataframe(table, outputs={"x": "x"}, sampling_rate=100.0, units={"x": "cm"})
+    assert kept.outputs["x"] == pytest.approx(0.1 * X)
+    with pytest.raises(ValueError, match="must be a factor or a pair such as .*the file does not say the unit"):
+        bp.Recording.from_dataframe(table, outputs={"x": "bare"}, sampling_rate=100.0, units={"x": "cm"})
+
+
+@pytest.mark.parametrize(
+    "unit, factor",
+    [("deg", np.pi / 180), ("m/s2", 1.0), ("gn", 9.80665), ("N/mm", 1e3), ("bar", 1e5), ("%", 0.01), ("Nm", 1.0),
+     ("µm/m", 1e-6), ("", 1.0), ("-", 1.0), ("lbf", 4.4482216152605), ("kHz", 1e3)],
+)  # fmt: skip
+def test_units_are_converted_to_si(unit, factor):
+    run = bp.Recording.from_sep005([SERIES | {"unit_str": unit}], outputs={"x": "F"})
+    assert run.outputs["x"] == pytest.approx(factor * X)
+
+
+@pytest.mark.parametrize("unit", ["g", "rpm", "EU", "dB", "counts/div", "C", "V/g", "k", "Mm/EU"])
+def test_units_that_are_unknown_or_mean_two_things_are_refused(unit):
+    with pytest.raises(ValueError, match=rf"units\['x'\]: must say what '{unit}' in the file is, got None; give"):
+        bp.Recording.from_sep005([SERIES | {"unit_str": unit}], outputs={"x": "F"})
+    run = bp.Recording.from_sep005([SERIES | {"unit_str": unit}], outputs={"x": "F"}, units={"x": 2.0})
+    assert run.outputs["x"] == pytest.approx(2.0 * X)
+
+
+def test_acceleration_in_g_is_no_gram():
+    series = [SERIES | {"unit_str": "g"}]
+    run = bp.Recording.from_sep005(series, outputs={"a": "F"}, units={"a": ("g_0", "m/s**2")})
+    assert run.outputs["a"] == pytest.approx(9.80665 * X)
+
+
+def test_dataset_keeps_the_times_of_each_dimension():
+    data = xr.Dataset(
+        {
+            "F": ("t", X, {"units": "kN"}),
+            "x": ("s", X[::4], {"units": "µm"}),
+            "all": (("t", "s"), np.zeros((400, 100))),
+        },
+        coords={"t": ("t", 1e3 * TIME, {"units": "ms"}), "s": ("s", 1.0 + TIME[::4], {"units": "s"})},
+    )
+    run = bp.Recording.from_xarray(data, outputs={"x": "x"}, inputs={"force": "F"})
+    assert run.times["x"] == pytest.approx(1.0 + TIME[::4]) and run.times["force"] == pytest.approx(TIME)
+    assert run.inputs["force"] == pytest.approx(1e3 * X) and run.outputs["x"] == pytest.approx(1e-6 * X[::4])
+    with pytest.raises(
+        ValueError, match=r"variable 'all' of Dataset: must be usable, got dimensions .*; choose one column"
+    ):
+        bp.Recording.from_xarray(data, outputs={"x": "all"})
+    with pytest.raises(ValueError, match="dataset: must have a name if it is a DataArray"):
+        bp.Recording.from_xarray(xr.DataArray(X, dims="t"), outputs={"x": "x"})
+
+
+def test_series_after_sep005_count_from_the_earliest_start():
+    late = {
+        "name": "x",
+        "unit_str": "mm",
+        "time": 0.1 + TIME[::4],
+        "data": X[::4],
+        "start_timestamp": "2026-01-01T02:00:01.5+02:00",
+    }
+    series = [SERIES | {"start_timestamp": "2026-01-01T00:00:00Z"}, late]
+    run = bp.Recording.from_sep005(series, outputs={"x": "x"}, inputs={"force": "F"})
+    assert run.times["force"] == pytest.approx(TIME) and run.times["x"] == pytest.approx(1.6 + TIME[::4])
+    with pytest.raises(ValueError, match=r"counted from one instant .*got dates for \['x'\] and none for \['force'\]"):
+        bp.Recording.from_sep005([SERIES, late], outputs={"x": "x"}, inputs={"force": "F"})
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"time": 2 * TIME}, "must have 'fs' and 'time' that agree, got 100.0 Hz and times of 50 Hz"),
+        ({"fs": None, "time": -TIME}, "time: must increase, got -0.01 s after"),
+        ({"data": X.reshape(2, 200)}, r"must have data of one dimension, got shape \(2, 200\)"),
+        ({"fs": None}, "must have 'fs' or 'time', got neither"),
+        ({"fs": 0.0}, r"channels\[0\]\['fs'\]: must be > 0, got 0.0"),
+        ({"time": TIME[1:]}, "must have one time per value, got 399 and 400"),
+        ({"start_timestamp": "yesterday"}, "must be a date after ISO 8601, got 'yesterday'"),
+        (
+            {"fs": None, "time": 1.7e9 + TIME, "start_timestamp": "2026-01-01"},
+            "must have times from 'start_timestamp' on",
+        ),
+    ],
+)
+def test_series_that_contradict_themselves_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        bp.Recording.from_sep005([SERIES | changes], outputs={"x": "F"})
+
+
+def test_what_is_no_series_is_refused():
+    for wrong in (SERIES, [X], None):
+        with pytest.raises(ValueError, match="channels: must be a list of dictionaries after SEP 005, got"):
+            bp.Recording.from_sep005(wrong, outputs={"x": "F"})
+    with pytest.raises(ValueError, match=r"channels\[0\].*SEP 005 requires them"):
+        bp.Recording.from_sep005([{"data": X}], outputs={"x": "F"})
+    with pytest.raises(ValueError, match="channels: must have channels of different names, got 'F' 2 times"):
+        bp.Recording.from_sep005([SERIES, SERIES], outputs={"x": "F"})
