@@ -69,7 +69,10 @@ class Univariate(Prior, ABC):
 
     def __post_init__(self) -> None:
         for name, check in self._arguments.items():
-            object.__setattr__(self, name, check(name, getattr(self, name)))
+            number = check(name, getattr(self, name))
+            if math.isfinite(number):  # sizes whose squares are no floats would only be found by the densities
+                _checks.measured_vector(name, [number])
+            object.__setattr__(self, name, number)
 
     @property
     def support(self) -> tuple[float, float]:
