@@ -15,6 +15,8 @@ from bayesperiodic import _checks
 LOG_ROOT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 ROOT_HALF_PI = math.sqrt(0.5 * math.pi)
 ROOT_TWO = math.sqrt(2.0)
+# Scales between which squares, and their inverses, are floats.
+SMALLEST_SCALE, LARGEST_SCALE = 1e-150, 1e150
 # Logarithm of dof/t² below which the distribution of Student's t is its first term, to rounding.
 FAR_TAIL = -40.0
 LEGENDRE_NODES, LEGENDRE_WEIGHTS = np.polynomial.legendre.leggauss(20)
@@ -58,6 +60,14 @@ class Prior(LogDensity, Protocol):
         """Return the inverse of the distribution function, (…); NaN unless the probability is between 0 and 1."""
 
 
+def _scale(argument: str, value: Any) -> float:
+    """Return a positive number whose square is a float."""
+    number = _checks.positive(argument, value)
+    if not SMALLEST_SCALE <= number <= LARGEST_SCALE:
+        raise ValueError(f"{argument}: must be between {SMALLEST_SCALE:g} and {LARGEST_SCALE:g}, got {value!r}.")
+    return number
+
+
 class Univariate(Prior, ABC):
     """Base of the priors of one parameter; only points inside the support reach their formulas.
 
@@ -69,10 +79,7 @@ class Univariate(Prior, ABC):
 
     def __post_init__(self) -> None:
         for name, check in self._arguments.items():
-            number = check(name, getattr(self, name))
-            if math.isfinite(number):  # sizes whose squares are no floats would only be found by the densities
-                _checks.measured_vector(name, [number])
-            object.__setattr__(self, name, number)
+            object.__setattr__(self, name, check(name, getattr(self, name)))
 
     @property
     def support(self) -> tuple[float, float]:
@@ -192,7 +199,7 @@ class Normal(Univariate):
     mean: float
     sd: float
 
-    _arguments = {"mean": _checks.finite_number, "sd": _checks.positive}
+    _arguments = {"mean": _checks.finite_number, "sd": _scale}
 
     def _log_density(self, x: np.ndarray) -> Any:
         score = (x - self.mean) / self.sd
@@ -233,7 +240,7 @@ class LogNormal(_Positive):
     median: float
     spread: float
 
-    _arguments = {"median": _checks.positive, "spread": _checks.positive}
+    _arguments = {"median": _checks.positive, "spread": _scale}
 
     def _log_density(self, x: np.ndarray) -> Any:
         logarithm = np.log(x)
@@ -288,7 +295,7 @@ class TruncatedNormal(_Interval):
     low: float
     high: float
 
-    _arguments = {"mean": _checks.finite_number, "sd": _checks.positive, "low": _bound, "high": _bound}
+    _arguments = {"mean": _checks.finite_number, "sd": _scale, "low": _bound, "high": _bound}
 
     @cached_property
     def _tail(self) -> tuple[float, float, float, float]:
@@ -364,7 +371,7 @@ class HalfNormal(_Positive):
 
     scale: float
 
-    _arguments = {"scale": _checks.positive}
+    _arguments = {"scale": _scale}
 
     def _log_density(self, x: np.ndarray) -> Any:
         score = x / self.scale
@@ -492,7 +499,7 @@ class StudentT(Univariate):
     scale: float
     dof: float
 
-    _arguments = {"mean": _checks.finite_number, "scale": _checks.positive, "dof": _checks.positive}
+    _arguments = {"mean": _checks.finite_number, "scale": _scale, "dof": _scale}
 
     def _log_density(self, x: np.ndarray) -> Any:
         constant = special.betaln(0.5 * self.dof, 0.5) + 0.5 * math.log(self.dof) + math.log(self.scale)
@@ -542,7 +549,7 @@ class InverseGamma(_Positive):
     shape: float
     scale: float
 
-    _arguments = {"shape": _checks.positive, "scale": _checks.positive}
+    _arguments = {"shape": _checks.positive, "scale": _scale}
 
     def _log_density(self, x: np.ndarray) -> Any:
         constant = self.shape * math.log(self.scale) - math.lgamma(self.shape)

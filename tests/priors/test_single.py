@@ -388,21 +388,19 @@ def test_error_names_what_is_no_prior(value, message):
         as_prior("priors['k']", value)
 
 
-@pytest.mark.parametrize("size", [1e-300, 1e-100, 1e100, 1e300])
+@pytest.mark.parametrize("size", [1e-300, 1e-151, 1e151, 1e300])
 @pytest.mark.parametrize(
     "prior",
     [
         lambda size: bp.Normal(0.0, size),
-        lambda size: bp.Normal(size, 1.0),
-        lambda size: bp.LogNormal(size, 0.5),
         lambda size: bp.HalfNormal(size),
+        lambda size: bp.LogNormal(1.0, size),
+        lambda size: bp.StudentT(0.0, 1.0, size),
         lambda size: bp.StudentT(0.0, size, 4.0),
         lambda size: bp.TruncatedNormal(0.0, size, -1.0, math.inf),
-        lambda size: bp.Uniform(-size, size),
-        lambda size: bp.LogUniform(size, 2.0 * size),
         lambda size: bp.InverseGamma(3.0, size),
     ],
 )
 def test_sizes_whose_squares_are_no_floats_are_refused(prior, size):
-    with pytest.raises(ValueError, match="must be between 1e-100 and 1e.100 in size, got up to"):
+    with pytest.raises(ValueError, match="must be between 1e-150 and 1e.150, got"):
         prior(size)
