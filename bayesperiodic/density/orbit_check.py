@@ -47,7 +47,8 @@ def unexplained(observation: Observation, response: Response) -> dict[str, float
     power = measured.var(axis=0) if len(measured) > 1 else measured[0] ** 2
     power = np.maximum(power, np.finfo(float).tiny).tolist()
     left = observation.compared(response).items()
-    return {c: float(np.sum(e**2)) / len(measured) / size for (c, e), size in zip(left, power, strict=True)}
+    with np.errstate(over="ignore"):
+        return {c: float(np.sum(e**2)) / len(measured) / size for (c, e), size in zip(left, power, strict=True)}
 
 
 def _differences(observation: Observation, response: Response) -> Iterator[str]:
@@ -114,5 +115,6 @@ def _log_likelihood(observation: Observation, response: Response, ahead: int) ->
     """Return the log-likelihood of the data, maximised over the variances, some forcing periods ahead."""
     e, left = observation.experiment, observation.compared(response, ahead)
     counts = {c: e.independent[c] if observation.whole else np.count_nonzero(e.measured_points) for c in left}
-    squares = {c: max(float(np.sum(x**2)), np.finfo(float).tiny) for c, x in left.items()}
+    with np.errstate(over="ignore"):
+        squares = {c: max(float(np.sum(x**2)), np.finfo(float).tiny) for c, x in left.items()}
     return float(sum(-0.5 * counts[c] * np.log(squares[c]) for c in left))

@@ -86,6 +86,7 @@ def solve_autonomous(equations: PeriodicEquations, parameters: np.ndarray, z: np
 
 
 MAX_POINTS = 2000
+SMALLEST_SIZE = 1e-100  # of a state, below which it is zero
 SMALLEST_STEP = 1e-6
 LARGEST_TURN = 0.8
 FEW_ITERATIONS, MANY_ITERATIONS = 3, 6
@@ -113,7 +114,7 @@ class Tracer:
     def __init__(self, equations: ParametrisedEquations, size: np.ndarray, values: np.ndarray, until: float):
         self.parametrised = equations
         points = equations.equations.grid.points
-        self._size = np.where(size > 0, size, 1.0)
+        self._size = np.where(size > SMALLEST_SIZE, np.minimum(size, 1.0 / SMALLEST_SIZE), 1.0)
         self._weights = 1.0 / (self._size**2 * points * len(size))
         self._value_scales = np.maximum(np.abs(values), 1e-12)
         self._value_scales[0] = abs(until - values[0])

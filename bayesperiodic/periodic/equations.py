@@ -248,7 +248,8 @@ class PeriodicEquations:
         for _ in range(MOST_NEWTON_STEPS):
             row = kernels.evaluate("residual_jacobian", states, inputs, parameters, tau, self.frequency)[0]
             residual, stiffness = row[:count], row[count:].reshape(count, 3, count)[:, 0]
-            size = float(np.linalg.norm(residual))
+            with np.errstate(over="ignore"):
+                size = float(np.linalg.norm(residual))
             if not np.isfinite(row).all() or size >= best:
                 break
             best, solution = size, states[0, :count].copy()
