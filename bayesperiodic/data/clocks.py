@@ -191,7 +191,7 @@ def drifts(phases: Phases, used: np.ndarray, steps: Sequence[np.ndarray]) -> Ite
         polynomials = np.polynomial.legendre.legvander(middle / np.abs(middle).max(), orders + 2)[:, 1:]
         basis = np.linalg.qr(np.column_stack([others, polynomials]))[0].T[others.shape[1] - 1 :]
         component = basis @ (phases.turns[numbers, row] - phases.turns[numbers, 0])
-        noise, size = float(np.sqrt(np.mean(component[3:] ** 2))), abs(float(component[1]))
+        noise, size = _noise(phases, numbers, row, basis[3:], component[3:]), abs(float(component[1]))
         limit = float(student.isf(0.5 * level, orders)) * noise
         per_cycle = float(basis[1] @ middle)
         if abs(per_cycle) < LEAST_DETERMINED * float(np.linalg.norm(middle)):
@@ -205,6 +205,16 @@ def drifts(phases: Phases, used: np.ndarray, steps: Sequence[np.ndarray]) -> Ite
             continue
         steady = not by_amplitude and abs(component[2]) <= CURVED * size + limit
         yield Drift(row, float(component[1]) / per_cycle, noise / abs(per_cycle), turns, steady)
+
+
+def _noise(phases: Phases, numbers: np.ndarray, row: int, basis: np.ndarray, component: np.ndarray) -> float:
+    """Return the standard deviation of components of a relative phase [cycles], not below that by the amplitudes.
+
+    White noise turns a line as much as it changes its size; a few phases can be alike by chance.
+    """
+    both = [0, row]
+    sizes = basis @ phases.sizes[numbers][:, both] / (2.0 * np.pi * phases.order[both])
+    return float(np.sqrt(max(np.mean(component**2), np.mean(np.sum(sizes**2, axis=1)))))
 
 
 def _others(phases: Phases, numbers: np.ndarray, middle: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -20,6 +20,8 @@ PRIORS: dict[str, Any] = {
     "Kx": bp.LogNormal(5e3, 1.0), "F0": bp.Normal(0.0, 1e3), "Kw": bp.LogNormal(1e4, 1.0),
     "rho": bp.LogNormal(5e2, 1.0),
 }  # fmt: skip
+# Harmonics of the force that are compared: fewer would not determine four parameters and a variance.
+HARMONICS = 15
 FAR, CONFIDENCE = 1.96, 0.95
 SDS = ("sd", "robust_sd")
 
@@ -38,7 +40,7 @@ def estimate(path: Path) -> bp.MapEstimate:
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        problem = bp.Problem(bp.models.dahl, [recording.fold()], priors=PRIORS, fixed={"K": 0.0})
+        problem = bp.Problem(bp.models.dahl, [recording.fold(harmonics={"force": HARMONICS})], priors=PRIORS, fixed={"K": 0.0})
         return bp.map_estimate(problem, progress=False)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.data import clocks
 
 FREQUENCY, C, K = 3.0, 0.8, 400.0
 OMEGA = 2 * np.pi * FREQUENCY
@@ -239,3 +240,18 @@ def test_a_channel_that_is_sampled_more_slowly_than_the_period_has_its_amplitude
     error = np.fft.rfft(e.outputs["x"])[1] / 16 - 0.25 * np.exp(-1.0j)
     # Exceeded with a probability of 1e-4.
     assert np.abs(error) < 3.04 * np.sqrt(e.amplitude_variance["x"][1])
+
+
+def test_noise_of_a_relative_phase_is_not_below_that_by_the_amplitudes():
+    """A drift of 2.4 standard deviations whose other components happen to be a tenth of the noise is no drift."""
+    cycle, count = np.arange(20.0), 20
+    legendre = np.linalg.qr(np.polynomial.legendre.legvander((cycle - 9.5) / 9.5, 12))[0]
+    quiet = 1e-4 * legendre[:, 3:] @ np.ones(10)
+    relative = 3.4e-3 * legendre[:, 1] + quiet
+    noise = np.random.default_rng(3).standard_normal((count, 2)) * 2 * np.pi * 1e-3
+    for sizes, seen in ((np.zeros((count, 2)), 1), (noise, 0)):
+        phases = clocks.Phases(
+            cycle, cycle, 1, np.column_stack([np.zeros(count), relative]), sizes, np.ones(2), np.zeros(2)
+        )
+        listed = [*clocks.drifts(phases, np.ones(count, dtype=bool), [np.zeros(0, dtype=int)])]
+        assert len(listed) == seen
