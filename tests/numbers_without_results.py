@@ -159,7 +159,10 @@ WITHOUT_RESULTS = {
         ),
     },
     "docs/studies/clocks.md": {
-        SETTING: ("with noise of 2 % of force and displacement", "from 0 to 0.01 cycles in a cycle"),
+        SETTING: (
+            "with noise of 2 % of force and displacement", "from 0 to 0.01 cycles in a cycle", "15 minutes on two cores",
+            "30 to 90 % of their samples missing", "800 amplitudes each",
+        ),
         DEFINITION: ("Coverage of 90 % intervals by Q/cycles", "probability of 99 %"),
     },
     "docs/studies/coverage.md": {
@@ -168,9 +171,10 @@ WITHOUT_RESULTS = {
             "of the binomial distribution that 99 % of right intervals are in",
             "differ by more than 1.96 standard deviations in", "5 % would be expected", "with 95 % confidence",
             "which should be 1", "That a share is below 8 %",
-            "that it is above 1 %", "3 cycles, frequency estimated",
+            "that it is above 1 %", "above the band by at most 1 %", "Of 81 shares",
+            "3 cycles; AR(0.9)", "from the residuals of 13", "compared with 15 harmonics",
         ),
-        UNSTORED: ("1 of 16 by Laplace and 0 by the robust ones, with both, 2 and 1 of 20",),
+        UNSTORED: ("2 of 16 by Laplace and 0 by the robust ones, with both, 5 and 1 of 20",),
         SETTING: (
             "30 minutes of processor time",
         ),

@@ -40,7 +40,9 @@ def estimate(path: Path) -> bp.MapEstimate:
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        problem = bp.Problem(bp.models.dahl, [recording.fold(harmonics={"force": HARMONICS})], priors=PRIORS, fixed={"K": 0.0})
+        problem = bp.Problem(
+            bp.models.dahl, [recording.fold(harmonics={"force": HARMONICS})], priors=PRIORS, fixed={"K": 0.0}
+        )
         return bp.map_estimate(problem, progress=False)
 
 
