@@ -160,7 +160,8 @@ WITHOUT_RESULTS = {
     },
     "docs/studies/clocks.md": {
         SETTING: (
-            "with noise of 2 % of force and displacement", "from 0 to 0.01 cycles in a cycle", "15 minutes on two cores",
+            "with noise of 2 % of force and displacement", "from 0 to 0.01 cycles in a cycle",
+            "15 minutes on two cores",
             "30 to 90 % of their samples missing", "800 amplitudes each",
         ),
         DEFINITION: ("Coverage of 90 % intervals by Q/cycles", "probability of 99 %"),

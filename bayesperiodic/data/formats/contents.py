@@ -54,6 +54,7 @@ class StoredChannel:
     clock: Clock | None = None  # None: the file does not say when it was sampled
     remarks: tuple[str, ...] = ()
     refusal: str = ""
+    frequencies: Callable[[], np.ndarray] | None = None  # [Hz] of a frequency response, whose values are complex
 
     @property
     def label(self) -> str:
