@@ -1,0 +1,160 @@
+"""MDF files, versions 2 to 4, of measurements in vehicles."""
+
+import functools
+import io
+import mmap
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayesperiodic.data.formats import mdf_blocks
+from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChannel, package, silenced, unique_names
+
+# Kinds of channels that are masters, and of what, in version 4; in version 3, the kind 1 is a time.
+MASTERS, TIME, VIRTUAL = {4: (2, 3), 3: (1,)}, 1, 3
+AXES = {0: "an unknown quantity", 2: "angles", 3: "distances", 4: "indices"}
+# Flags of channels of version 4: all samples are invalid, or those with a bit.
+ALL_INVALID, INVALID_BIT = 1, 2
+# Conversions of numbers by few coefficients, and those that are refused: by a formula, which asammdf evaluates as code,
+# and in version 3 exponential ones, which programs compute in different ways.
+NUMERIC = {4: (1, 2), 3: (0, 6, 9)}
+REFUSED = {4: {3: "by a formula"}, 3: {10: "by a formula", 7: "that is exponential", 8: "that is logarithmic"}}
+# Ends of names of files that asammdf leaves as they are.
+KEPT = (".mf4", ".mdf", ".dat", "")
+BY_RATE = "sampling_rate= gives it"
+
+
+def contents(file: Path, wanted: list[Key]) -> Contents:
+    """Return the channels of an MDF file but its masters, which are their times; each is read when it is asked for."""
+    asammdf = package("asammdf", "asammdf", "MDF files")
+    with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        mdf_blocks.check(content)
+    # asammdf deletes, when it is done, what has a name that ends in .bz2, .gzip, .mf4z or .zip.
+    source = file if file.suffix.lower() in KEPT else io.BytesIO(file.read_bytes())
+    with silenced("asammdf"):
+        # Bus messages remain as they are: databases that decode them may be attached.
+        mdf = asammdf.MDF(source, process_bus_logging=False, use_display_names=False)
+    version = 4 if mdf.version >= "4" else 3
+    labels = [*unique_names(_group_name(group, k, len(mdf.groups)) for k, group in enumerate(mdf.groups, 1))]
+    channels = [channel for k, label in enumerate(labels) for channel in _channels(mdf, version, k, label)]
+    return Contents("MDF file", tuple(channels), (f"version {mdf.version}",))
+
+
+def _group_name(group: Any, number: int, count: int) -> str:
+    """Return the name of a group: that of the acquisition or the comment, or a number if there are several."""
+    stated = getattr(group.channel_group, "acq_name", "") or getattr(group.channel_group, "comment", "")
+    line = next(iter(str(stated or "").strip().splitlines()), "")
+    return line if line and not line.startswith("<") else f"group {number}" if count > 1 else ""
+
+
+def _origin(mdf: Any) -> np.datetime64 | None:
+    """Return the time of the file, from which those of all channels count."""
+    start = getattr(mdf.header, "abs_time", 0)  # nanoseconds, from version 3.20
+    return np.datetime64(start, "ns") if 0 < start < 2**63 else None
+
+
+def _channels(mdf: Any, version: int, k: int, label: str) -> Iterator[StoredChannel]:
+    """Yield the channels of a group, of its masters those that are no times."""
+    group = mdf.groups[k]
+    clock, samples = _clock(mdf, version, k), int(group.channel_group.cycles_nr)
+    listed = [
+        (i, channel)
+        for i, channel in enumerate(group.channels)
+        if channel.channel_type not in MASTERS[version] or (version == 4 and channel.sync_type != TIME)
+    ]
+    for name, (i, channel) in zip(unique_names(channel.name for _, channel in listed), listed, strict=True):
+        yield StoredChannel(
+            name,
+            samples,
+            partial(_values, mdf, version, k, i),
+            label,
+            _unit(channel),
+            clock,
+            refusal=_refusal(version, group, channel),
+        )
+
+
+def _unit(channel: Any) -> str:
+    """Return the unit of a channel, before that of its conversion."""
+    conversion = channel.conversion
+    return str(getattr(channel, "unit", "") or (conversion.unit if conversion else "") or "").strip(" \0")
+
+
+def _refusal(version: int, group: Any, channel: Any) -> str:
+    """Return why the values of a channel are not those that asammdf returns."""
+    for conversion in _conversions(channel.conversion):
+        if how := REFUSED[version].get(conversion.conversion_type):
+            return f"a conversion {how}; read it by asammdf with raw=True, and convert it for from_arrays"
+    if version == 4:
+        bits = 8 * channel.byte_offset + channel.bit_offset + channel.bit_count
+        if channel.channel_type not in (VIRTUAL, 6) and bits > 8 * group.channel_group.samples_byte_nr:
+            return "samples that lie beyond the end of the records"
+        if channel.flags & ALL_INVALID and not channel.flags & INVALID_BIT:
+            return "samples that are all marked as invalid"
+    return ""
+
+
+def _conversions(conversion: Any) -> Iterator[Any]:
+    """Yield a conversion and those that it refers to."""
+    if hasattr(conversion, "conversion_type"):
+        yield conversion
+        blocks = conversion.referenced_blocks if hasattr(conversion, "referenced_blocks") else None
+        for block in (blocks or {}).values():
+            yield from _conversions(block)
+
+
+def _values(mdf: Any, version: int, k: int, i: int) -> Any:
+    """Return the physical values of a channel, NaN where they are marked as invalid, texts as such."""
+    channel = mdf.groups[k].channels[i]
+    with silenced("asammdf"):
+        values, invalid = mdf.get(group=k, index=i, raw=True, samples_only=True, ignore_invalidation_bits=True)
+        if conversion := channel.conversion:
+            # asammdf computes squares of integers in 32 bits, and products of short floats in those.
+            if conversion.conversion_type in NUMERIC[version] and values.dtype.kind in "fiu":
+                values = values.astype(float)
+            values = conversion.convert(values)
+    if len(values) != mdf.groups[k].channel_group.cycles_nr:
+        raise ValueError(f"its channel {channel.name!r} has {len(values)} samples and not those that its group says")
+    if values.dtype.kind == "S":
+        values = np.char.decode(values, "utf-8" if version == 4 else "latin-1", "replace")
+    lost = None if invalid is None else np.asarray(invalid, dtype=bool)
+    if lost is not None and lost.any() and values.ndim == 1 and values.dtype.kind in "fiub":
+        values = np.where(lost, np.nan, values)
+    return np.asarray(values)
+
+
+def _clock(mdf: Any, version: int, k: int) -> Clock | None:
+    """Return the times of a group by its master; one without is None."""
+    group = mdf.groups[k].channel_group
+    if version == 4 and group.flags & mdf_blocks.REMOTE_MASTER and mdf.version >= "4.20":
+        return _clock(mdf, version, group.cg_master_index) if group.cg_master_index != k else None
+    masters = [(i, one) for i, one in enumerate(mdf.groups[k].channels) if one.channel_type in MASTERS[version]]
+    if not masters:
+        return None
+    times = [(i, one) for i, one in masters if version == 3 or one.sync_type == TIME]
+    if not times:
+        axis = AXES.get(masters[0][1].sync_type, "an unknown quantity")
+        return Clock(refusal=f"which is recorded over {axis} ({masters[0][1].name!r}) and not over time; {BY_RATE}")
+    (i, master), refusal = times[0], _refusal(version, mdf.groups[k], times[0][1])
+    conversion = master.conversion
+    if len(times) > 1:
+        refusal = f"{len(times)} channels of time"
+    elif conversion and conversion.conversion_type not in (*NUMERIC[version][:1], 0, 65535):
+        refusal = "a conversion that is not linear"
+    elif (unit := _unit(master)) not in ("", "s", "sec", "Sec", "seconds"):
+        refusal = f"the unit {unit!r}"
+    if refusal:
+        return Clock(refusal=f"whose times {master.name!r} have {refusal}; {BY_RATE}")
+    return Clock(stored=functools.cache(partial(_times, mdf, version, k, i)), origin=_origin(mdf))
+
+
+def _times(mdf: Any, version: int, k: int, i: int) -> np.ndarray:
+    """Return the times of a group [s] from the start of the file."""
+    master = mdf.groups[k].channels[i]
+    if (version == 4 and master.channel_type == VIRTUAL) or (version == 3 and master.bit_count == 0):
+        with silenced("asammdf"):
+            return np.asarray(mdf.get_master(k), dtype=float)
+    return np.asarray(_values(mdf, version, k, i), dtype=float)
