@@ -2,7 +2,6 @@
 
 import functools
 import io
-import mmap
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -22,21 +21,18 @@ ALL_INVALID, INVALID_BIT = 1, 2
 # and in version 3 exponential ones, which programs compute in different ways.
 NUMERIC = {4: (1, 2), 3: (0, 6, 9)}
 REFUSED = {4: {3: "by a formula"}, 3: {10: "by a formula", 7: "that is exponential", 8: "that is logarithmic"}}
-# Ends of names of files that asammdf leaves as they are.
-KEPT = (".mf4", ".mdf", ".dat", "")
 BY_RATE = "sampling_rate= gives it"
 
 
 def contents(file: Path, wanted: list[Key]) -> Contents:
     """Return the channels of an MDF file but its masters, which are their times; each is read when it is asked for."""
     asammdf = package("asammdf", "asammdf", "MDF files")
-    with file.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        mdf_blocks.check(content)
-    # asammdf deletes, when it is done, what has a name that ends in .bz2, .gzip, .mf4z or .zip.
-    source = file if file.suffix.lower() in KEPT else io.BytesIO(file.read_bytes())
+    content = file.read_bytes()
+    mdf_blocks.check(content)
     with silenced("asammdf"):
-        # Bus messages remain as they are: databases that decode them may be attached.
-        mdf = asammdf.MDF(source, process_bus_logging=False, use_display_names=False)
+        # It gets no name, as it deletes a file whose name ends in .bz2 or .gzip. Bus messages remain as they are:
+        # databases that decode them may be attached.
+        mdf = asammdf.MDF(io.BytesIO(content), process_bus_logging=False, use_display_names=False)
     version = 4 if mdf.version >= "4" else 3
     labels = [*unique_names(_group_name(group, k, len(mdf.groups)) for k, group in enumerate(mdf.groups, 1))]
     channels = [channel for k, label in enumerate(labels) for channel in _channels(mdf, version, k, label)]

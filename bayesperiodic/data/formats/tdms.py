@@ -16,7 +16,9 @@ from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChan
 INTERLEAVED, DAQMX = 1 << 5, 1 << 7
 STEP, START, OFFSET, AXIS = "wf_increment", "wf_start_time", "wf_start_offset", "wf_xunit_string"
 # Scales that npTDMS applies; for others it returns the raw values.
-SCALES = ("Polynomial", "Linear", "RTD", "Strain", "Table", "Thermistor", "Thermocouple", "Add", "Subtract", "AdvancedAPI")  # fmt: skip
+SCALES = (
+    "Polynomial", "Linear", "RTD", "Strain", "Table", "Thermistor", "Thermocouple", "Add", "Subtract", "AdvancedAPI",
+)  # fmt: skip
 SCALE = re.compile(r"NI_Scal|NI_Number_Of_Scales|unit_string|NI_UnitDescription")
 SCALE_TYPE = re.compile(r"NI_Scale\[\d+\]_Scale_Type")
 # Dates of TDMS files count from 1904; those of NumPy in nanoseconds end in 2262.
@@ -45,7 +47,7 @@ def contents(file: Path, wanted: list[Key]) -> Contents:
         changes, rows = _structure(mapped)
         opened = _opened(nptdms, mapped, keep_open=True, read_metadata_only=True)
     whole = functools.cache(partial(_opened, nptdms, mapped)) if rows else lambda: opened
-    clocks: dict[Any, Clock] = {}
+    clocks: dict[Any, Clock | None] = {}
     channels = []
     for group in opened.groups():
         for channel in group.channels():
@@ -86,7 +88,7 @@ def _structure(mapped: _Mapped) -> tuple[dict[str, list[Change]], bool]:
     changes: dict[str, list[Change]] = {}
     segments = []
 
-    class Reader(TdmsReader):  # type: ignore[misc]
+    class Reader(TdmsReader):
         def _read_segment_metadata(self, *arguments: Any) -> Any:
             segment, properties = super()._read_segment_metadata(*arguments)
             segments.append(segment)
