@@ -1,5 +1,6 @@
 """Text files of LabVIEW measurements (.lvm)."""
 
+import contextlib
 import re
 from dataclasses import dataclass, field
 from decimal import Decimal
@@ -60,11 +61,11 @@ def contents(file: Path, wanted: list[Key], *, encoding: str | None = None, deci
 def _decoded(content: bytes, encoding: str | None) -> tuple[str, str]:
     """Return the text, in UTF-8 or else in the encoding of Windows in Western Europe, and the encoding."""
     for name in [encoding] if encoding else ["utf-8-sig", "cp1252"]:
-        try:
+        with contextlib.suppress(UnicodeDecodeError, LookupError):
             return content.decode(name), name.removesuffix("-sig")
-        except (UnicodeDecodeError, LookupError) as error:
-            reason = error
-    raise ValueError(f"encoding: must be that of the file, got {encoding!r} ({reason}).")
+    if encoding:
+        raise ValueError(f"encoding: must be Python's name of that of the file, got {encoding!r}; leave it out.")
+    raise ValueError("its encoding is neither UTF-8 nor that of Windows; see encoding, such as encoding='utf-16'")
 
 
 def _prepared(text: str, separator: str, decimal: str | None) -> tuple[list[str], list[_Segment]]:
