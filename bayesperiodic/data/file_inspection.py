@@ -169,7 +169,11 @@ def _summary(channel: StoredChannel) -> FileChannel:
             remarks.append(f"times are refused: {clock.refusal}")
             refused = True
         elif channel.samples:
-            rate, first, last = _times(clock, channel.samples)
+            try:
+                rate, first, last = _times(clock, channel.samples)
+            except ValueError as error:
+                remarks.append(str(error))
+                refused = True
             if clock.error:
                 remarks.append(
                     f"the interval has few digits: rate {rate:.9g} Hz with an error of up to "

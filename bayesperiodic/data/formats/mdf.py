@@ -1,7 +1,9 @@
 """MDF files, versions 2 to 4, of measurements in vehicles."""
 
 import functools
+import gc
 import io
+import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -15,6 +17,10 @@ from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChan
 # Kinds of channels that are masters, and of what, in version 4; in version 3, the kind 1 is a time.
 MASTERS, TIME, VIRTUAL = {4: (2, 3), 3: (1,)}, 1, 3
 AXES = {0: "an unknown quantity", 2: "angles", 3: "distances", 4: "indices"}
+# Place of the data of groups whose records stood in turn in the file, and which asammdf has sorted.
+SORTED = 1
+# Channels of version 4 with samples of any length, of which asammdf reads beyond the end of a damaged file.
+VARIABLE = (1, 5, 7)
 # Flags of channels of version 4: all samples are invalid, or those with a bit.
 ALL_INVALID, INVALID_BIT = 1, 2
 # Conversions of numbers by few coefficients, and those that are refused: by a formula, which asammdf evaluates as code,
@@ -29,14 +35,32 @@ def contents(file: Path, wanted: list[Key]) -> Contents:
     asammdf = package("asammdf", "asammdf", "MDF files")
     content = file.read_bytes()
     mdf_blocks.check(content)
-    with silenced("asammdf"):
-        # It gets no name, as it deletes a file whose name ends in .bz2 or .gzip. Bus messages remain as they are:
-        # databases that decode them may be attached.
-        mdf = asammdf.MDF(io.BytesIO(content), process_bus_logging=False, use_display_names=False)
+    mdf = _opened(asammdf, content)
     version = 4 if mdf.version >= "4" else 3
     labels = [*unique_names(_group_name(group, k, len(mdf.groups)) for k, group in enumerate(mdf.groups, 1))]
     channels = [channel for k, label in enumerate(labels) for channel in _channels(mdf, version, k, label)]
     return Contents("MDF file", tuple(channels), (f"version {mdf.version}",))
+
+
+def _opened(asammdf: Any, content: bytes) -> Any:
+    """Return the file as asammdf reads it.
+
+    It gets no name, as it deletes a file whose name ends in .bz2 or .gzip. Bus messages remain as they are: databases
+    that decode them may be attached.
+    """
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        try:
+            with silenced("asammdf"):
+                return asammdf.MDF(
+                    io.BytesIO(content), process_bus_logging=False, use_display_names=False, add_array_components=False
+                )
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+        gc.collect()  # its object of a damaged file prints an error when it is deleted
+    finally:
+        sys.unraisablehook = hook
+    raise ValueError(reason)
 
 
 def _group_name(group: Any, number: int, count: int) -> str:
@@ -55,7 +79,12 @@ def _origin(mdf: Any) -> np.datetime64 | None:
 def _channels(mdf: Any, version: int, k: int, label: str) -> Iterator[StoredChannel]:
     """Yield the channels of a group, of its masters those that are no times."""
     group = mdf.groups[k]
-    clock, samples = _clock(mdf, version, k), int(group.channel_group.cycles_nr)
+    inner = group.channel_group
+    clock, samples = _clock(mdf, version, k), int(inner.cycles_nr)
+    if version == 4 and group.data_location == SORTED and not inner.flags & mdf_blocks.VLSD:
+        length = sum(block.original_size for block in group.get_data_blocks())
+        if length != samples * (inner.samples_byte_nr + inner.invalidation_bytes_nr):
+            raise ValueError(f"{mdf_blocks.CUT}: group {label!r} has not the {samples} samples of its header")
     listed = [
         (i, channel)
         for i, channel in enumerate(group.channels)
@@ -84,10 +113,16 @@ def _refusal(version: int, group: Any, channel: Any) -> str:
     for conversion in _conversions(channel.conversion):
         if how := REFUSED[version].get(conversion.conversion_type):
             return f"a conversion {how}; read it by asammdf with raw=True, and convert it for from_arrays"
+    if version == 4 and channel.channel_type in VARIABLE:
+        return "texts or bytes of any length, which are not read"
+    virtual = channel.channel_type in (VIRTUAL, 6) if version == 4 else channel.bit_count == 0
     if version == 4:
         bits = 8 * channel.byte_offset + channel.bit_offset + channel.bit_count
-        if channel.channel_type not in (VIRTUAL, 6) and bits > 8 * group.channel_group.samples_byte_nr:
-            return "samples that lie beyond the end of the records"
+    else:
+        bits = channel.start_offset + 8 * getattr(channel, "additional_byte_offset", 0) + channel.bit_count
+    if not virtual and bits > 8 * group.channel_group.samples_byte_nr:
+        return "samples that lie beyond the end of the records"
+    if version == 4:
         if channel.flags & ALL_INVALID and not channel.flags & INVALID_BIT:
             return "samples that are all marked as invalid"
     return ""
@@ -138,6 +173,8 @@ def _clock(mdf: Any, version: int, k: int) -> Clock | None:
     conversion = master.conversion
     if len(times) > 1:
         refusal = f"{len(times)} channels of time"
+    elif version == 3 and master.bit_count == 0 and not master.sampling_rate:
+        refusal = "no sampling rate"
     elif conversion and conversion.conversion_type not in (*NUMERIC[version][:1], 0, 65535):
         refusal = "a conversion that is not linear"
     elif (unit := _unit(master)) not in ("", "s", "sec", "Sec", "seconds"):

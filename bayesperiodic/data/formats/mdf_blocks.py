@@ -82,7 +82,7 @@ def _walk(content: Any) -> Iterator[tuple[int, bytes, tuple[int, ...]]]:
 def _check_data_group(content: Any, address: int, links: tuple[int, ...]) -> None:
     """Raise a ValueError if a data group has fewer samples than its channel groups say, or more."""
     _, place, _ = _block(content, address)
-    identifier, needed, width, exact, group, seen = content[place], 0, 1, True, links[1], set()
+    identifier, needed, least, exact, group, seen = content[place], 0, 2**62, True, links[1], set()
     while group:
         if group in seen:
             raise ValueError(CIRCLE)
@@ -94,11 +94,12 @@ def _check_data_group(content: Any, address: int, links: tuple[int, ...]) -> Non
         exact &= not flags & VLSD
         width = identifier + size + (0 if flags & REMOTE_MASTER else invalid)
         needed += 0 if flags & VLSD else cycles * width
+        least = min(least, max(width, 1))
         if cycles * width > LARGEST_ARRAY and cycles * width > DEFLATE_RATIO * len(content):
             raise ValueError(CUT)
         group = group_links[0]
     length = _length(content, links[2]) if links[2] else 0
-    if length < needed or (exact and len(seen) == 1 and length >= needed + width):
+    if length < needed or (exact and length >= needed + least):
         raise ValueError(f"{CUT}: a data group has {length} bytes and not {needed}")
 
 
@@ -141,32 +142,33 @@ def _check_conversion(content: Any, address: int, depth: int) -> None:
 
 def _check_3(content: Any) -> None:
     """Raise a ValueError unless the blocks of version 2 or 3 form a tree, and all samples are there."""
-    order = "<" if content[24:26] == b"\0\0" else ">"
+    if content[24:26] != b"\0\0":
+        raise ValueError("its numbers begin with the highest byte (Motorola), which asammdf does not read")
     seen, waiting = {0}, [(FIRST_BLOCK, b"HD")]
     while waiting:
         address, expected = waiting.pop()
         if address in seen:
             raise ValueError(CIRCLE)
         seen.add(address)
-        kind, length = struct.unpack_from(f"{order}2sH", content, address)
+        kind, length = struct.unpack_from("<2sH", content, address)
         if kind != expected or length < max(TREE_3[kind]) + 4 or address + length > len(content):
             raise ValueError(CUT)
-        links = [struct.unpack_from(f"{order}I", content, address + place)[0] for place in TREE_3[kind]]
+        links = [struct.unpack_from("<I", content, address + place)[0] for place in TREE_3[kind]]
         below = {b"HD": [b"DG"], b"DG": [b"DG", b"CG"], b"CG": [b"CG", b"CN"], b"CN": [b"CN"]}[kind]
         waiting += [(link, name) for link, name in zip(links, below, strict=True) if link]
         if kind == b"DG":
-            _check_data_group_3(content, order, address, links[1])
+            _check_data_group_3(content, address, links[1])
 
 
-def _check_data_group_3(content: Any, order: str, address: int, group: int) -> None:
-    data, _, identifiers = struct.unpack_from(f"{order}IHH", content, address + 16)
+def _check_data_group_3(content: Any, address: int, group: int) -> None:
+    data, _, identifiers = struct.unpack_from("<IHH", content, address + 16)
     needed, seen = 0, set()
     while group:
         if group in seen:
             raise ValueError(CIRCLE)
         seen.add(group)
-        size, cycles = struct.unpack_from(f"{order}HI", content, group + 20)
+        size, cycles = struct.unpack_from("<HI", content, group + 20)
         needed += cycles * (size + identifiers)
-        group = struct.unpack_from(f"{order}I", content, group + 4)[0]
+        group = struct.unpack_from("<I", content, group + 4)[0]
     if data + needed > len(content):
         raise ValueError(f"{CUT}: a data group has {max(len(content) - data, 0)} bytes and not {needed}")
