@@ -2,7 +2,9 @@
 
 import functools
 import gc
+import html
 import io
+import re
 import sys
 from collections.abc import Iterator
 from functools import partial
@@ -27,6 +29,7 @@ ALL_INVALID, INVALID_BIT = 1, 2
 # and in version 3 exponential ones, which programs compute in different ways.
 NUMERIC = {4: (1, 2), 3: (0, 6, 9)}
 REFUSED = {4: {3: "by a formula"}, 3: {10: "by a formula", 7: "that is exponential", 8: "that is logarithmic"}}
+IN_XML = re.compile(r"<TX[^>]*>(.*?)</TX>", re.DOTALL)
 BY_RATE = "sampling_rate= gives it"
 
 
@@ -66,7 +69,7 @@ def _opened(asammdf: Any, content: bytes) -> Any:
 def _group_name(group: Any, number: int, count: int) -> str:
     """Return the name of a group: that of the acquisition or the comment, or a number if there are several."""
     stated = getattr(group.channel_group, "acq_name", "") or getattr(group.channel_group, "comment", "")
-    line = next(iter(str(stated or "").strip().splitlines()), "")
+    line = next(iter(_text(stated).splitlines()), "")
     return line if line and not line.startswith("<") else f"group {number}" if count > 1 else ""
 
 
@@ -105,7 +108,14 @@ def _channels(mdf: Any, version: int, k: int, label: str) -> Iterator[StoredChan
 def _unit(channel: Any) -> str:
     """Return the unit of a channel, before that of its conversion."""
     conversion = channel.conversion
-    return str(getattr(channel, "unit", "") or (conversion.unit if conversion else "") or "").strip(" \0")
+    return _text(getattr(channel, "unit", "") or (conversion.unit if conversion else ""))
+
+
+def _text(stated: Any) -> str:
+    """Return a text that may be within XML."""
+    text = str(stated or "").strip(" \0\r\n\t")
+    inner = IN_XML.search(text) if text.startswith("<") else None
+    return html.unescape(inner.group(1)).strip() if inner else text
 
 
 def _refusal(version: int, group: Any, channel: Any) -> str:

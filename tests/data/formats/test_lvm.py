@@ -164,8 +164,9 @@ def test_spectrum_is_refused_as_times(tmp_path):
 
 
 def test_special_blocks_are_left_out(tmp_path):
-    special = "***Start_Special***\tWiring\n1\t2\t3\nChannels\t9\n***End_Special***\n\n"
+    special = "***Start_Special***\tWiring\nChannels\t1\nX_Value\tq\n1\t2\n***End_Special***\n\n"
     assert_read(read(tmp_path, head() + special + segment()))
+    assert [(one.group, one.name) for one in bp.inspect(tmp_path / "run.lvm").channels] == [("", "a"), ("", "b")]
 
 
 def test_one_heading_for_several_packets(tmp_path):
@@ -198,6 +199,8 @@ def test_empty_cell_is_a_missing_sample(tmp_path):
 
 @pytest.mark.parametrize("lost", [1, 5, 12, 30, 500])
 def test_file_that_is_cut_off_is_refused(tmp_path, lost):
+    rows = "".join((head() + segment()).splitlines(keepends=True)[:-3])
+    refused(tmp_path, rows, "it is cut off: it has 47 rows, and 50 samples by its header")
     refused(tmp_path, (head() + segment(comment=False))[:-lost].rstrip("\n")[:-1], "it (is|seems to be) cut off|fields")
 
 

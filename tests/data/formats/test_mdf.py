@@ -114,6 +114,22 @@ def test_channel_of_version_4_with_its_master_and_unit(tmp_path):
     assert [one.name for one in bp.inspect(tmp_path / "run.mf4").channels] == ["x", "c"]
 
 
+def test_units_in_xml_and_of_the_conversion(tmp_path):
+    """The unit of the channel precedes that of its conversion."""
+    blocks = Blocks()
+    scale = conversion(blocks, LINEAR, [0.0, 1.0], unit="cm")
+    xml = blocks.add(b"MD", data=b"<CNunit xmlns='http://www.asam.net/mdf/v4'><TX>mm</TX></CNunit>\0")
+    last = channel(blocks, 0, "cc", "", F8, 24, conversion=scale)
+    third = channel(blocks, last, "both", "mm", F8, 16, conversion=scale)
+    second = channel(blocks, third, "x", "", F8, 8)
+    blocks.blocks[second - 1][1][6] = xml
+    first = channel(blocks, second, "t", "s", F8, 0, master=MASTER, sync=1)
+    header(blocks, group(blocks, 0, first, 32, 200, np.array([TIME, X, X, X]).T.tobytes()))
+    run = read(tmp_path, blocks.bytes(), outputs={"x": "x", "both": "both", "cc": "cc"})
+    for name, factor in (("x", 1e-3), ("both", 1e-3), ("cc", 1e-2)):
+        np.testing.assert_allclose(run.outputs[name], X * factor, rtol=1e-14)
+
+
 RAW = COUNTS.astype(float)
 
 

@@ -150,6 +150,15 @@ def test_raw_data_of_daqmx_are_scaled(tmp_path):
     np.testing.assert_allclose(run.outputs["y"], 0.5 * counts[:, 1] + 3.0)
 
 
+def test_last_chunk_of_daqmx_with_fewer_rows(tmp_path):
+    """As DAQmx writes it when the measurement is stopped: the segment has a chunk of ten rows, and one of two."""
+    counts = np.arange(24, dtype="<i2").reshape(12, 2)
+    whole = raw_daqmx("Linear", counts[:10]) + counts[10:].tobytes()
+    whole = whole[:12] + struct.pack("<Q", len(whole) - 28) + whole[20:]
+    run = read(tmp_path, whole, outputs={"x": "x", "y": "y"})
+    np.testing.assert_allclose(run.outputs["y"], 0.5 * counts[:, 1] + 3.0)
+
+
 def test_scale_that_is_not_applied_is_refused(tmp_path):
     """The package npTDMS returns counts for a scale that it does not know."""
     counts = np.ones((10, 2), dtype="<i2")
