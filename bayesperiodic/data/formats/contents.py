@@ -15,6 +15,8 @@ from bayesperiodic import _checks
 
 # Bytes of an array, against files that unpack to more than the memory.
 LARGEST_ARRAY = 2**31
+# Ends of messages.
+BY_RATE = "sampling_rate= gives it"
 OTHERWISE = "read the part that you need with h5py or NumPy, and give it to from_arrays"
 
 Key = str | int | tuple[str, str]

@@ -10,20 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChannel, package, silenced
+from bayesperiodic.data.formats.contents import BY_RATE, Clock, Contents, Key, StoredChannel, package, silenced
 
 # Lines that begin parts of the file, and first characters of rows of numbers.
-CHANNELS, NAMES, COMMENT = "Channels", "X_Value", "Comment"
-SPECIAL, SPECIAL_END = "***Start_Special***", "***End_Special***"
+CHANNEL_LINE, NAME_LINE, COMMENT_NAME = "Channels", "X_Value", "Comment"
+SPECIAL_START, SPECIAL_END = "***Start_Special***", "***End_Special***"
 ROW_START = frozenset("0123456789+-.,")
 # Texts of missing samples.
 LOST = ("", "nan", "-nan", "1.#qnan", "-1.#ind", "inf", "-inf")
 # Rows at the end from which the digits of the times are taken, and relative error of a step that is none.
-LAST_ROWS, EXACT = 20, 1e-6
-DATE, TIME = re.compile(r"(\d{4})/(\d\d?)/(\d\d?)$"), re.compile(r"(\d\d?):(\d\d?):(\d\d?)(?:[.,](\d+))?$")
+LAST_ROWS, EXACT_STEP = 20, 1e-6
+DATE, TIME_OF_DAY = re.compile(r"(\d{4})/(\d\d?)/(\d\d?)$"), re.compile(r"(\d\d?):(\d\d?):(\d\d?)(?:[.,](\d+))?$")
 # Numbers as LabVIEW writes them by default.
 SIX_DECIMALS = re.compile(r"\d+[.,]\d{6}")
-BY_RATE = "sampling_rate= gives it"
 
 
 @dataclass
@@ -80,16 +79,16 @@ def _prepared(text: str, separator: str, decimal: str | None) -> tuple[list[str]
         if data and (line[:1] in ROW_START or (line[:1] == separator and line.strip(separator))):
             segments[-1].rows.append(line)
             lines.append(line)
-        elif special or line.startswith(SPECIAL):
+        elif special or line.startswith(SPECIAL_START):
             special = not line.startswith(SPECIAL_END)
         elif line.strip(separator + " \t"):
             cells = [cell.strip() for cell in line.split(separator)]
-            if data or (cells[0] == CHANNELS and not opened):
+            if data or (cells[0] == CHANNEL_LINE and not opened):
                 lines.append("\n")
                 opened, data = True, False
-            if cells[0] == CHANNELS:
+            if cells[0] == CHANNEL_LINE:
                 at = len(lines)
-            elif cells[0] == NAMES and at >= 0:
+            elif cells[0] == NAME_LINE and at >= 0:
                 lines[at] = separator.join([*lines[at].strip().split(separator)[:2], *[""] * (len(cells) - 2)]) + "\n"
                 segments.append(_Segment(number, len(cells), steps))
                 data, opened, at, steps = True, False, -1, [""]
@@ -115,13 +114,13 @@ def _is_shorter(rows: list[str], separator: str) -> bool:
 def _channels(whole: Any, segment: Any, rows: _Segment, group: str, separator: str) -> list[StoredChannel]:
     """Return the channels of a segment."""
     kind, table, names = whole.get("X_Columns", "One"), segment["data"], segment["Channel names"]
-    count, width = int(segment[CHANNELS]), len(segment["Channel names"])
+    count, width = int(segment[CHANNEL_LINE]), len(segment["Channel names"])
     first = {"No": 0, "One": 1, "Multi": 1}.get(kind)
     if first is None:
         raise ValueError(f"its X_Columns is {kind!r} and not No, One or Multi")
     columns = range(first, first + count * (2 if kind == "Multi" else 1), 2 if kind == "Multi" else 1)
     needed = columns[-1] + 1 if count > 0 else 0
-    if count < 1 or not needed <= width <= needed + 1 or (width > needed and names[-1] != COMMENT):
+    if count < 1 or not needed <= width <= needed + 1 or (width > needed and names[-1] != COMMENT_NAME):
         raise ValueError(f"it has {count} channels by its header, and the names {names} from line {rows.first} on")
     offset = 1 if kind == "No" else 0
     _check_rows(rows, table[:, :needed], offset, separator, whole.get("Decimal_Separator", "."))
@@ -223,7 +222,7 @@ def _clock(
     if times is None or np.isnan(times).all() or samples < 2:
         if not step or step < 0:
             return None
-        return Clock(float(start or 0.0), float(step), origin=origin, error=error if error > EXACT * step else 0.0)
+        return Clock(float(start or 0.0), float(step), origin=origin, error=error if error > EXACT_STEP * step else 0.0)
     if np.isnan(times).any():
         return Clock(refusal=f"some of whose times are missing; {BY_RATE}")
     texts = [row.split(separator)[place] for row in rows.rows[:samples][-LAST_ROWS:]]
@@ -232,11 +231,11 @@ def _clock(
     if np.abs(times - times[0] - mean * np.arange(samples)).max() > digit:
         return Clock(stored=partial(np.array, times), origin=origin)
     uncertain = digit / (samples - 1)
-    if step and abs(step - mean) > uncertain + error + EXACT * mean:
+    if step and abs(step - mean) > uncertain + error + EXACT_STEP * mean:
         return Clock(refusal=f"whose times are {mean:.9g} s apart, while Delta_X is {step!r} s; {BY_RATE}")
     if step and error < uncertain:
         mean, uncertain = float(step), error
-    return Clock(float(times[0]), mean, origin=origin, error=uncertain if uncertain > EXACT * mean else 0.0)
+    return Clock(float(times[0]), mean, origin=origin, error=uncertain if uncertain > EXACT_STEP * mean else 0.0)
 
 
 def _digit(texts: list[str], decimal: str) -> float:
@@ -247,7 +246,7 @@ def _digit(texts: list[str], decimal: str) -> float:
 
 def _origin(date: Any, time: Any) -> np.datetime64 | None:
     """Return date and time of a segment, which LabVIEW writes with up to 19 decimals of a second."""
-    day, clock = DATE.match(str(date).strip()), TIME.match(str(time).strip())
+    day, clock = DATE.match(str(date).strip()), TIME_OF_DAY.match(str(time).strip())
     if not day or not clock:
         return None
     year, month, dom = map(int, day.groups())

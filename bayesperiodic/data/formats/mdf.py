@@ -14,10 +14,19 @@ from typing import Any
 import numpy as np
 
 from bayesperiodic.data.formats import mdf_blocks
-from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChannel, package, silenced, unique_names
+from bayesperiodic.data.formats.contents import (
+    BY_RATE,
+    Clock,
+    Contents,
+    Key,
+    StoredChannel,
+    package,
+    silenced,
+    unique_names,
+)
 
 # Kinds of channels that are masters, and of what, in version 4; in version 3, the kind 1 is a time.
-MASTERS, TIME, VIRTUAL = {4: (2, 3), 3: (1,)}, 1, 3
+MASTERS, TIME_AXIS, VIRTUAL = {4: (2, 3), 3: (1,)}, 1, 3
 AXES = {0: "an unknown quantity", 2: "angles", 3: "distances", 4: "indices"}
 # Place of the data of groups whose records stood in turn in the file, and which asammdf has sorted.
 SORTED = 1
@@ -27,10 +36,9 @@ VARIABLE = (1, 5, 7)
 ALL_INVALID, INVALID_BIT = 1, 2
 # Conversions of numbers by few coefficients, and those that are refused: by a formula, which asammdf evaluates as code,
 # and in version 3 exponential ones, which programs compute in different ways.
-NUMERIC = {4: (1, 2), 3: (0, 6, 9)}
+COEFFICIENTS = {4: (1, 2), 3: (0, 6, 9)}
 REFUSED = {4: {3: "by a formula"}, 3: {10: "by a formula", 7: "that is exponential", 8: "that is logarithmic"}}
 IN_XML = re.compile(r"<TX[^>]*>(.*?)</TX>", re.DOTALL)
-BY_RATE = "sampling_rate= gives it"
 
 
 def contents(file: Path, wanted: list[Key]) -> Contents:
@@ -87,11 +95,11 @@ def _channels(mdf: Any, version: int, k: int, label: str) -> Iterator[StoredChan
     if version == 4 and group.data_location == SORTED and not inner.flags & mdf_blocks.VLSD:
         length = sum(block.original_size for block in group.get_data_blocks())
         if length != samples * (inner.samples_byte_nr + inner.invalidation_bytes_nr):
-            raise ValueError(f"{mdf_blocks.CUT}: group {label!r} has not the {samples} samples of its header")
+            raise ValueError(f"{mdf_blocks.CUT_OFF}: group {label!r} has not the {samples} samples of its header")
     listed = [
         (i, channel)
         for i, channel in enumerate(group.channels)
-        if channel.channel_type not in MASTERS[version] or (version == 4 and channel.sync_type != TIME)
+        if channel.channel_type not in MASTERS[version] or (version == 4 and channel.sync_type != TIME_AXIS)
     ]
     for name, (i, channel) in zip(unique_names(channel.name for _, channel in listed), listed, strict=True):
         yield StoredChannel(
@@ -154,7 +162,7 @@ def _values(mdf: Any, version: int, k: int, i: int) -> Any:
         values, invalid = mdf.get(group=k, index=i, raw=True, samples_only=True, ignore_invalidation_bits=True)
         if conversion := channel.conversion:
             # asammdf computes squares of integers in 32 bits, and products of short floats in those.
-            if conversion.conversion_type in NUMERIC[version] and values.dtype.kind in "fiu":
+            if conversion.conversion_type in COEFFICIENTS[version] and values.dtype.kind in "fiu":
                 values = values.astype(float)
             values = conversion.convert(values)
     if len(values) != mdf.groups[k].channel_group.cycles_nr:
@@ -175,7 +183,7 @@ def _clock(mdf: Any, version: int, k: int) -> Clock | None:
     masters = [(i, one) for i, one in enumerate(mdf.groups[k].channels) if one.channel_type in MASTERS[version]]
     if not masters:
         return None
-    times = [(i, one) for i, one in masters if version == 3 or one.sync_type == TIME]
+    times = [(i, one) for i, one in masters if version == 3 or one.sync_type == TIME_AXIS]
     if not times:
         axis = AXES.get(masters[0][1].sync_type, "an unknown quantity")
         return Clock(refusal=f"which is recorded over {axis} ({masters[0][1].name!r}) and not over time; {BY_RATE}")
@@ -185,7 +193,7 @@ def _clock(mdf: Any, version: int, k: int) -> Clock | None:
         refusal = f"{len(times)} channels of time"
     elif version == 3 and master.bit_count == 0 and not master.sampling_rate:
         refusal = "no sampling rate"
-    elif conversion and conversion.conversion_type not in (*NUMERIC[version][:1], 0, 65535):
+    elif conversion and conversion.conversion_type not in (*COEFFICIENTS[version][:1], 0, 65535):
         refusal = "a conversion that is not linear"
     elif (unit := _unit(master)) not in ("", "s", "sec", "Sec", "seconds"):
         refusal = f"the unit {unit!r}"

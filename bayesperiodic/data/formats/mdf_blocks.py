@@ -19,14 +19,14 @@ TREE = {
 }  # fmt: skip
 # The same of version 3: byte offsets of the links.
 TREE_3 = {b"HD": (4,), b"DG": (4, 8), b"CG": (4, 8), b"CN": (4,)}
-DATA = (b"##DT", b"##SD", b"##RD", b"##DV", b"##DI")
+DATA_BLOCKS = (b"##DT", b"##SD", b"##RD", b"##DV", b"##DI")
 # Flags of channel groups whose records have any length, and whose master is in another group.
 VLSD, REMOTE_MASTER = 1, 8
 # Largest ratio of the lengths of data before and after their compression (deflate).
 DEFLATE_RATIO = 1100
 # Conversions that refer to conversions, at most.
 CONVERSIONS = 10
-CUT, CIRCLE = "it is cut off or damaged", "it is damaged: its blocks form a circle"
+CUT_OFF, CIRCLE = "it is cut off or damaged", "it is damaged: its blocks form a circle"
 
 
 def check(content: Any) -> None:
@@ -39,7 +39,7 @@ def check(content: Any) -> None:
     try:
         _check_4(content) if content[8:9] == b"4" else _check_3(content)
     except struct.error:  # a link beyond the end
-        raise ValueError(CUT) from None
+        raise ValueError(CUT_OFF) from None
 
 
 def _check_4(content: Any) -> None:
@@ -51,16 +51,16 @@ def _check_4(content: Any) -> None:
                 _length(content, links[5])
             _check_conversion(content, links[4], 0)
     if content[FIRST_BLOCK : FIRST_BLOCK + 4] != b"##HD":
-        raise ValueError(CUT)
+        raise ValueError(CUT_OFF)
 
 
 def _block(content: Any, address: int) -> tuple[bytes, int, tuple[int, ...]]:
     """Return identifier, place of the data, and links of a block of version 4."""
     if not 0 < address <= len(content) - 24:
-        raise ValueError(CUT)
+        raise ValueError(CUT_OFF)
     kind, _, length, count = struct.unpack_from("<4sIQQ", content, address)
     if not kind.startswith(b"##") or length < 24 + 8 * count or address + length > len(content):
-        raise ValueError(CUT)
+        raise ValueError(CUT_OFF)
     return kind, address + 24 + 8 * count, struct.unpack_from(f"<{count}Q", content, address + 24)
 
 
@@ -74,7 +74,7 @@ def _walk(content: Any) -> Iterator[tuple[int, bytes, tuple[int, ...]]]:
         seen.add(address)
         kind, _, links = _block(content, address)
         if kind in TREE and len(links) <= max(TREE[kind]):
-            raise ValueError(CUT)
+            raise ValueError(CUT_OFF)
         yield address, kind, links
         waiting += [links[place] for place in TREE.get(kind, ()) if links[place]]
 
@@ -89,18 +89,18 @@ def _check_data_group(content: Any, address: int, links: tuple[int, ...]) -> Non
         seen.add(group)
         kind, place, group_links = _block(content, group)
         if kind != b"##CG" or len(group_links) < 6:
-            raise ValueError(CUT)
+            raise ValueError(CUT_OFF)
         _, cycles, flags, _, _, size, invalid = struct.unpack_from("<QQHHIII", content, place)
         exact &= not flags & VLSD
         width = identifier + size + (0 if flags & REMOTE_MASTER else invalid)
         needed += 0 if flags & VLSD else cycles * width
         least = min(least, max(width, 1))
         if cycles * width > LARGEST_ARRAY and cycles * width > DEFLATE_RATIO * len(content):
-            raise ValueError(CUT)
+            raise ValueError(CUT_OFF)
         group = group_links[0]
     length = _length(content, links[2]) if links[2] else 0
     if length < needed or (exact and length >= needed + least):
-        raise ValueError(f"{CUT}: a data group has {length} bytes and not {needed}")
+        raise ValueError(f"{CUT_OFF}: a data group has {length} bytes and not {needed}")
 
 
 def _length(content: Any, address: int) -> int:
@@ -116,14 +116,14 @@ def _length(content: Any, address: int) -> int:
         if kind == b"##DZ":
             original, _, _, _, size, packed = struct.unpack_from("<2sBBIQQ", content, place)
             if place + 24 + packed > len(content) or size > min(LARGEST_ARRAY, DEFLATE_RATIO * (packed + 100)):
-                raise ValueError(CUT)
+                raise ValueError(CUT_OFF)
             kind = b"##" + original
         if kind in (b"##DL", b"##HL", b"##LD"):
             waiting += [link for link in links if link]
-        elif kind in DATA:
+        elif kind in DATA_BLOCKS:
             total += size if kind != b"##DI" else 0
         else:
-            raise ValueError(CUT)
+            raise ValueError(CUT_OFF)
     return total
 
 
@@ -152,7 +152,7 @@ def _check_3(content: Any) -> None:
         seen.add(address)
         kind, length = struct.unpack_from("<2sH", content, address)
         if kind != expected or length < max(TREE_3[kind]) + 4 or address + length > len(content):
-            raise ValueError(CUT)
+            raise ValueError(CUT_OFF)
         links = [struct.unpack_from("<I", content, address + place)[0] for place in TREE_3[kind]]
         below = {b"HD": [b"DG"], b"DG": [b"DG", b"CG"], b"CG": [b"CG", b"CN"], b"CN": [b"CN"]}[kind]
         waiting += [(link, name) for link, name in zip(links, below, strict=True) if link]
@@ -171,4 +171,4 @@ def _check_data_group_3(content: Any, address: int, group: int) -> None:
         needed += cycles * (size + identifiers)
         group = struct.unpack_from("<I", content, group + 4)[0]
     if data + needed > len(content):
-        raise ValueError(f"{CUT}: a data group has {max(len(content) - data, 0)} bytes and not {needed}")
+        raise ValueError(f"{CUT_OFF}: a data group has {max(len(content) - data, 0)} bytes and not {needed}")

@@ -10,20 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChannel, package, silenced
+from bayesperiodic.data.formats.contents import BY_RATE, Clock, Contents, Key, StoredChannel, package, silenced
 
 # Flags of segments whose samples stand in rows: interleaved data and raw data of DAQmx.
 INTERLEAVED, DAQMX = 1 << 5, 1 << 7
-STEP, START, OFFSET, AXIS = "wf_increment", "wf_start_time", "wf_start_offset", "wf_xunit_string"
+INCREMENT, WAVE_START, WAVE_OFFSET, WAVE_AXIS = "wf_increment", "wf_start_time", "wf_start_offset", "wf_xunit_string"
 # Scales that npTDMS applies; for others it returns the raw values.
-SCALES = (
+SCALES_READ = (
     "Polynomial", "Linear", "RTD", "Strain", "Table", "Thermistor", "Thermocouple", "Add", "Subtract", "AdvancedAPI",
 )  # fmt: skip
-SCALE = re.compile(r"NI_Scal|NI_Number_Of_Scales|unit_string|NI_UnitDescription")
+SCALE_PROPERTY = re.compile(r"NI_Scal|NI_Number_Of_Scales|unit_string|NI_UnitDescription")
 SCALE_TYPE = re.compile(r"NI_Scale\[\d+\]_Scale_Type")
 # Dates of TDMS files count from 1904; those of NumPy in nanoseconds end in 2262.
 EPOCH, LAST_SECOND = np.datetime64("1904-01-01", "ns"), 358 * 365 * 86_400
-BY_RATE = "sampling_rate= gives it"
 
 Change = tuple[int, str, Any, Any]  # samples before it, name, and both values of a property
 
@@ -117,7 +116,7 @@ def _properties(opened: Any, group: Any, channel: Any) -> Mapping[str, Any]:
     """Return the properties of a channel, with the scales of its group or file where it has none."""
     for other in (group.properties, opened.properties):
         if any(map(SCALE_TYPE.match, other)) and not any(map(SCALE_TYPE.match, channel.properties)):
-            return {key: value for key, value in other.items() if SCALE.match(key)} | channel.properties
+            return {key: value for key, value in other.items() if SCALE_PROPERTY.match(key)} | channel.properties
     return dict(channel.properties)
 
 
@@ -142,26 +141,28 @@ def _dates(stamp: Any) -> Any:
 
 def _clock(properties: Mapping[str, Any], changes: list[Change]) -> Clock | None:
     """Return the times of a waveform, None for a channel without them."""
-    step, offset = properties.get(STEP), properties.get(OFFSET, 0.0)
+    step, offset = properties.get(INCREMENT), properties.get(WAVE_OFFSET, 0.0)
     if step is None or step == 0:
         return None
     if not all(isinstance(number, int | float) and np.isfinite(number) for number in (step, offset)) or step < 0:
-        return Clock(refusal=f"whose {STEP} is {step!r} and {OFFSET} {offset!r}; {BY_RATE}")
-    axis = str(properties.get(AXIS, "")).strip()
+        return Clock(refusal=f"whose {INCREMENT} is {step!r} and {WAVE_OFFSET} {offset!r}; {BY_RATE}")
+    axis = str(properties.get(WAVE_AXIS, "")).strip()
     if axis not in ("", "s", "sec", "Sec", "seconds"):
         return Clock(refusal=f"whose axis is in {axis!r}, no time in seconds; {BY_RATE}")
     for samples, name, before, value in changes:
-        if name == STEP:
-            return Clock(refusal=f"whose {STEP} changes from {before!r} to {value!r} s at sample {samples}; {BY_RATE}")
-    starts = {name: _first(name, properties, changes) for name in (START, OFFSET)}
-    start, offset = starts[START], float(starts[OFFSET] or 0.0)
+        if name == INCREMENT:
+            return Clock(
+                refusal=f"whose {INCREMENT} changes from {before!r} to {value!r} s at sample {samples}; {BY_RATE}"
+            )
+    starts = {name: _first(name, properties, changes) for name in (WAVE_START, WAVE_OFFSET)}
+    start, offset = starts[WAVE_START], float(starts[WAVE_OFFSET] or 0.0)
     if start is not None and not hasattr(start, "second_fractions"):
-        return Clock(refusal=f"whose {START} is no timestamp, but {start!r}; {BY_RATE}")
+        return Clock(refusal=f"whose {WAVE_START} is no timestamp, but {start!r}; {BY_RATE}")
     if start is not None and start.seconds == 0 and start.second_fractions == 0:
         start = None  # as of a waveform without it
     if step == 1 and start is None and offset == 0.0:
         return Clock(
-            refusal=f"whose {STEP} of 1 without a {START} is also that of samples without a waveform; {BY_RATE}"
+            refusal=f"whose {INCREMENT} of 1 without {WAVE_START} is also that of samples without a waveform; {BY_RATE}"
         )
     if gap := _gap(start, float(step), offset, changes):
         return Clock(refusal=gap)
@@ -175,12 +176,12 @@ def _first(name: str, properties: Mapping[str, Any], changes: list[Change]) -> A
 
 def _gap(start: Any, step: float, offset: float, changes: list[Change]) -> str:
     """Return the refusal of a channel whose later segments do not continue the first one."""
-    now = {START: start, OFFSET: offset}
+    now = {WAVE_START: start, WAVE_OFFSET: offset}
     for samples in sorted({samples for samples, name, *_ in changes if name in now}):
         now |= {name: value for place, name, _, value in changes if place == samples and name in now}
-        passed = np.nan if start is None and now[START] is not None else float(now[OFFSET] or 0.0) - offset
+        passed = np.nan if start is None and now[WAVE_START] is not None else float(now[WAVE_OFFSET] or 0.0) - offset
         if start is not None:
-            passed += (_dates(now[START]) - _dates(start)) / np.timedelta64(1, "ns") * 1e-9
+            passed += (_dates(now[WAVE_START]) - _dates(start)) / np.timedelta64(1, "ns") * 1e-9
         if not abs(passed - samples * step) <= 0.5 * step:
             return (
                 f"whose segment from sample {samples} starts {passed:.9g} s after the first one and not "
@@ -192,10 +193,10 @@ def _gap(start: Any, step: float, offset: float, changes: list[Change]) -> str:
 def _refusal(properties: Mapping[str, Any], changes: list[Change]) -> str:
     """Return why the values of a channel are not those that npTDMS returns."""
     for key, value in properties.items():
-        if SCALE_TYPE.match(key) and value not in SCALES:
+        if SCALE_TYPE.match(key) and value not in SCALES_READ:
             return f"a scale of type {value!r} ({key}), which npTDMS does not apply"
     for samples, name, before, value in changes:
-        if SCALE.match(name):
+        if SCALE_PROPERTY.match(name):
             return f"a {name} that changes from {before!r} to {value!r} at sample {samples}; split the file there"
     return ""
 
