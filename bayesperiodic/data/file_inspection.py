@@ -169,7 +169,11 @@ def _summary(channel: StoredChannel) -> FileChannel:
             remarks.append(f"times are refused: {clock.refusal}")
             refused = True
         elif channel.samples:
-            rate, first, last = _times(clock, channel.samples)
+            try:
+                rate, first, last = _times(clock, channel.samples)
+            except ValueError as error:
+                remarks.append(str(error))
+                refused = True
             if clock.error:
                 remarks.append(
                     f"the interval has few digits: rate {rate:.9g} Hz with an error of up to "
@@ -224,7 +228,7 @@ def _code(path: str | Path, whole: Contents, channels: tuple[FileChannel, ...], 
     pairs = []
     for name, channel in zip(unique_names(_identifier(one.name) for one in usable), usable, strict=True):
         key = channel.name if names.count(channel.name) == 1 else (channel.group, channel.name)
-        pairs.append(f"{_identifier(name)!r}: {key!r}")
+        pairs.append(f"{re.sub(r'[^0-9A-Za-z_]+', '_', name).strip('_')!r}: {key!r}")
     shown = ", ".join(pairs[:MOST_SUGGESTED])
     arguments = [repr(str(path)), f"inputs={{}}, outputs={{{shown}}}"]
     if whole.suggested_time:

@@ -124,7 +124,7 @@ def numbers(argument: str, values: Any, *, text: bool = False, time: bool = Fals
         raise ValueError(
             f"{argument}: must be one column of real numbers, got shape {np.shape(values)} and type {array.dtype}."
         )
-    return array if text or time else array.astype(float)
+    return array if text or time else array.astype(float, copy=False)
 
 
 def _label(layout: Layout, contents: Contents, split: Key, columns: Mapping[str, _Column], times: Times) -> np.ndarray:

@@ -1,6 +1,9 @@
 """Contents of a file of measurements: channels with units and times, and what a user would not guess about them."""
 
+import contextlib
 import importlib
+import logging
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +15,8 @@ from bayesperiodic import _checks
 
 # Bytes of an array, against files that unpack to more than the memory.
 LARGEST_ARRAY = 2**31
+# Ends of messages.
+BY_RATE = "sampling_rate= gives it"
 OTHERWISE = "read the part that you need with h5py or NumPy, and give it to from_arrays"
 
 Key = str | int | tuple[str, str]
@@ -111,6 +116,22 @@ def package(module: str, distribution: str, kind: str) -> Any:
             f"format: must be one whose package is installed, got {kind}, which is read by {distribution} ({error}); "
             'pip install "bayesperiodic[files]".'
         ) from None
+
+
+@contextlib.contextmanager
+def silenced(name: str) -> Iterator[None]:
+    """Let a package write no messages and warn of nothing; what they would say is found out and said here."""
+    names = [one for one in [*logging.root.manager.loggerDict] if one.split(".")[0] == name]
+    before = {one: one.disabled for one in map(logging.getLogger, names)}
+    try:
+        for one in before:
+            one.disabled = True
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for one, disabled in before.items():
+            one.disabled = disabled
 
 
 def existing(path: str | Path) -> Path:

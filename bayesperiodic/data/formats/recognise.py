@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bayesperiodic import _checks
-from bayesperiodic.data.formats.contents import Contents, Key, existing
+from bayesperiodic.data.formats.contents import Clock, Contents, Key, existing
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,11 @@ def contents(path: str | Path, form: str | None, wanted: Iterable[Key], options:
     module = importlib.import_module(f"bayesperiodic.data.formats.{chosen.module}")
     with one_error(chosen.kind, path):
         whole: Contents = module.contents(file, [*wanted], **given)
-    channels = [replace(one, values=partial(_guarded, chosen.kind, path, one.values)) for one in whole.channels]
+    clocks = {id(one.clock): _clock(chosen.kind, path, one.clock) for one in whole.channels}
+    channels = [
+        replace(one, values=partial(_guarded, chosen.kind, path, one.values), clock=clocks[id(one.clock)])
+        for one in whole.channels
+    ]
     return replace(whole, channels=tuple(channels))
 
 
@@ -124,6 +128,13 @@ def _zipped(file: Path) -> str:
         f"path: must be a file of measurements, got {str(file)!r}, a ZIP archive that is no workbook and has no arrays "
         "of NumPy; unpack it first."
     )
+
+
+def _clock(kind: str, path: str | Path, clock: Clock | None) -> Clock | None:
+    """Return a clock, of whose stored times any error is one of the file."""
+    if clock is None or clock.stored is None:
+        return clock
+    return replace(clock, stored=partial(_guarded, kind, path, clock.stored))
 
 
 def _guarded(kind: str, path: str | Path, read: Callable[[], Any]) -> Any:

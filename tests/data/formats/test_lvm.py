@@ -1,0 +1,262 @@
+"""LabVIEW measurement files, written here after NI's specification."""
+
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.data.formats import lvm
+from tests.data.test_damaged_files import Payload, damaged
+
+STEP = "1.0000000000000000E-3"
+A, B = 3.0 * np.sin(np.arange(50) / 7), np.cos(np.arange(50) / 5)
+
+
+def head(columns="One", decimal=".", separator="\t", preference="Relative", headings="Yes"):
+    name = {"\t": "Tab", ",": "Comma"}[separator]
+    pairs = {
+        "LabVIEW Measurement": "", "Writer_Version": "2", "Reader_Version": "2", "Separator": name,
+        "Decimal_Separator": decimal, "Multi_Headings": headings, "X_Columns": columns, "Time_Pref": preference,
+        "Operator": "someone", "Date": "2026/01/31", "Time": f"12:00:00{decimal}25", "***End_of_Header***": "",
+    }  # fmt: skip
+    return "".join(f"{key}{separator}{value}\n" for key, value in pairs.items()) + f"{separator}\n"
+
+
+def segment(
+    values=(A, B), columns="One", decimal=".", separator="\t", step=STEP, start="0.0000000000000000E+0",
+    units=("mm", "N"), when="12:00:00.2500000000000000000", axis="Time", names=("a", "b"), trailing=True, comment=True,
+    places=6, x=None, samples=None,
+):  # fmt: skip
+    """Return header and rows of a segment, with a comment in its third row."""
+    gap = [""] if columns == "Multi" else []
+    count, rows = len(values), len(values[0])
+
+    def line(key, cells):
+        joined = [part for cell in cells for part in (*gap, str(cell))][len(gap) :]
+        return separator.join([key, *joined]) + "\n"
+
+    def number(value):
+        return f"{value:.{places}f}".replace(".", decimal)
+
+    each = {
+        "Samples": samples or rows, "Date": "2026/01/31", "Time": when.replace(".", decimal),
+        "X_Dimension": axis, "X0": start.replace(".", decimal), "Delta_X": step.replace(".", decimal),
+    }  # fmt: skip
+    text = f"Channels{separator}{count}{separator * (count + 1) if trailing else ''}\n"
+    text += "".join(line(key, [value] * count) for key, value in each.items() if value is not None)
+    text += line("Y_Unit_Label", units) + f"***End_of_Header***{separator * 3}\n"
+    text += separator.join(
+        ["X_Value", *([part for name in names for part in (name, "X_Value")][:-1] if gap else names)]
+    )
+    text += f"{separator}Comment\n" if comment else "\n"
+    for k in range(rows):
+        at = "" if columns == "No" else number(k * float(step) if x is None else x[k])
+        cells = (
+            [part for one in values for part in (at, number(one[k]))] if gap else [at, *(number(v[k]) for v in values)]
+        )
+        text += separator.join([*cells, *(["a remark"] if k == 2 and comment else [])]) + "\n"
+    return text
+
+
+def read(folder, text, encoding="latin-1", **arguments):
+    file = folder / "run.lvm"
+    file.write_bytes(text if isinstance(text, bytes) else text.encode(encoding))
+    return bp.Recording.from_file(file, **({"outputs": {"a": "a", "b": "b"}} | arguments))
+
+
+def refused(folder, text, reason, **arguments):
+    with pytest.raises(ValueError, match=reason) as error:
+        read(folder, text, **arguments)
+    assert "run.lvm" in str(error.value)
+
+
+def assert_read(run, scale=1e-3):
+    np.testing.assert_allclose(run.outputs["a"], A * scale, atol=0.6e-6)
+    np.testing.assert_allclose(run.outputs["b"], B, atol=0.6e-6)
+    np.testing.assert_allclose(run.time, np.arange(50) / 1000, rtol=1e-12)
+
+
+@pytest.mark.parametrize("columns", ["No", "One", "Multi"])
+@pytest.mark.parametrize("decimal, separator", [(".", "\t"), (",", "\t"), (".", ",")])
+@pytest.mark.parametrize("trailing", [True, False])
+def test_columns_of_times_and_separators(tmp_path, columns, decimal, separator, trailing):
+    """Without tabs at the end of the line Channels, lvm-read drops the last channel of Multi."""
+    kind = {"columns": columns, "decimal": decimal, "separator": separator}
+    assert_read(read(tmp_path, head(**kind) + segment(**kind, trailing=trailing)))
+
+
+def test_times_of_multi_columns_are_those_of_each_channel(tmp_path):
+    text = head("Multi") + segment((A, B), "Multi")
+    lines = text.split("\n")
+    start = next(k for k, line in enumerate(lines) if line.startswith("X_Value")) + 1
+    for k in range(50):  # the second channel is sampled half as fast
+        cells = lines[start + k].split("\t")
+        cells[2] = f"{k * 2e-3:.6f}"
+        lines[start + k] = "\t".join(cells[:4])
+    text = "\n".join(lines).replace(f"{STEP}\t\t{STEP}", f"{STEP}\t\t2.0000000000000000E-3")
+    run = read(tmp_path, text)
+    np.testing.assert_allclose(run.times["a"], np.arange(50) / 1000, rtol=1e-12)
+    np.testing.assert_allclose(run.times["b"], np.arange(50) / 500, rtol=1e-12)
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8"])
+def test_micrometres_are_not_metres(tmp_path, encoding):
+    """The package lvm-read leaves out bytes that are no UTF-8."""
+    run = read(tmp_path, head() + segment(units=("µm", "N")), encoding)
+    assert_read(run, 1e-6)
+
+
+def test_segments_that_restart_are_groups_with_their_instants(tmp_path):
+    text = head() + segment() + "\t\n" + segment((2 * A, B), when="12:00:05.7500000000000000000")
+    refused(tmp_path, text, r"the name of 2; give the group too: \('segment 1', 'a'\), \('segment 2', 'a'\)")
+    run = read(tmp_path, text, outputs={"a": ("segment 1", "a"), "b": ("segment 2", "a")})
+    np.testing.assert_allclose(run.outputs["b"], 2e-3 * A, atol=1e-6)
+    np.testing.assert_allclose(run.times["a"], np.arange(50) / 1000, rtol=1e-12)
+    np.testing.assert_allclose(run.times["b"], 5.5 + np.arange(50) / 1000, rtol=1e-12)
+
+
+def test_times_with_six_decimals_are_as_exact_as_their_number(tmp_path):
+    """51.2 kHz with six decimals: a staircase, whose mean step is known to 1 µs over its length."""
+    rate, rows = 51_200.0, 5000
+    values = (np.sin(np.arange(rows)), np.cos(np.arange(rows)))
+    text = head() + segment(values, step="0.000020", x=np.arange(rows) / rate)
+    with pytest.warns(
+        UserWarning, match=r"rate is 5\d+\.?\d* Hz with an error of up to \d+ ppm; 51200 Hz has the same"
+    ):
+        run = read(tmp_path, text)
+    assert run.sampling_rate == pytest.approx(rate, rel=1.1e-5)
+    assert read(tmp_path, text, sampling_rate=rate).sampling_rate == pytest.approx(rate, rel=1e-12)
+
+
+def test_step_with_few_digits_is_named_with_its_error(tmp_path):
+    text = head("No") + segment(columns="No", step="0.000020")
+    with pytest.warns(UserWarning, match=r"50000 Hz with an error of up to 2.5e\+04 ppm"):
+        read(tmp_path, text)
+    with pytest.warns(UserWarning, match=r"44100\.\d+ Hz with an error of up to 2.2 ppm; 44100 Hz has the same digits"):
+        read(tmp_path, head("No") + segment(columns="No", step="2.26757E-5"))
+    text = head("No") + segment(columns="No", step="1.953125E-5")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read(tmp_path, text).sampling_rate == pytest.approx(51_200, rel=1e-12)
+
+
+def test_times_and_step_that_differ_are_refused(tmp_path):
+    refused(tmp_path, head() + segment(x=np.arange(50) / 500), "times are 0.002 s apart, while Delta_X is 0.001 s")
+
+
+def test_uneven_times_are_kept(tmp_path):
+    x = (np.arange(50) / 1000) ** 2 + np.arange(50)
+    np.testing.assert_allclose(read(tmp_path, head() + segment(x=x)).time, x, atol=0.6e-6)
+
+
+def test_absolute_times_and_x0(tmp_path):
+    run = read(tmp_path, head("No") + segment(columns="No", start="2.5000000000000000E+0"))
+    np.testing.assert_allclose(run.time, 2.5 + np.arange(50) / 1000, rtol=1e-12)
+    seconds = 3_852_619_200.0 + np.arange(50) / 1000
+    run = read(tmp_path, head(preference="Absolute") + segment(x=seconds))
+    np.testing.assert_allclose(run.time - run.time[0], np.arange(50) / 1000, atol=1e-6)
+
+
+def test_spectrum_is_refused_as_times(tmp_path):
+    refused(tmp_path, head() + segment(axis="Frequency"), "whose axis is 'Frequency' and not time")
+
+
+def test_special_blocks_are_left_out(tmp_path):
+    special = "***Start_Special***\tWiring\nChannels\t1\nX_Value\tq\n1\t2\n***End_Special***\n\n"
+    assert_read(read(tmp_path, head() + special + segment()))
+    assert [(one.group, one.name) for one in bp.inspect(tmp_path / "run.lvm").channels] == [("", "a"), ("", "b")]
+
+
+def test_one_heading_for_several_packets(tmp_path):
+    """The rows of later packets follow after an empty line, or without."""
+    text = head(headings="No") + segment((A[:25], B[:25]), comment=False)
+    more = "".join(f"{k / 1000:.6f}\t{A[k]:.6f}\t{B[k]:.6f}\n" for k in range(25, 50))
+    assert_read(read(tmp_path, text + "\n" + more))
+
+
+def test_wrong_decimal_sign_is_refused_and_changed_by_its_argument(tmp_path):
+    """The package lvm-read returns NaN."""
+    text = head(decimal=".") + segment(decimal=",")
+    refused(tmp_path, text, "must be .*(Delta_X|no number with the decimal sign|lvm)")
+    assert_read(read(tmp_path, text, decimal=","))
+
+
+def test_text_in_place_of_a_number_is_refused(tmp_path):
+    lines = (head() + segment()).split("\n")
+    lines[-5] = lines[-5].replace("\t", "\tx", 1)
+    refused(tmp_path, "\n".join(lines), r"row 47 after line \d+ has 'x-?\d")
+
+
+def test_empty_cell_is_a_missing_sample(tmp_path):
+    lines = (head() + segment()).split("\n")
+    cells = lines[-5].split("\t")
+    lines[-5] = "\t".join([cells[0], "", cells[2]])
+    refused(tmp_path, "\n".join(lines), "must be finite, got nan at index 46")
+    assert read(tmp_path, "\n".join(lines), missing="drop").times["a"].size == 49
+
+
+@pytest.mark.parametrize("lost", [1, 5, 12, 30, 500])
+def test_file_that_is_cut_off_is_refused(tmp_path, lost):
+    rows = "".join((head() + segment()).splitlines(keepends=True)[:-3])
+    refused(tmp_path, rows, "it is cut off: it has 47 rows, and 50 samples by its header")
+    refused(tmp_path, (head() + segment(comment=False))[:-lost].rstrip("\n")[:-1], "it (is|seems to be) cut off|fields")
+
+
+def test_channel_with_fewer_samples_ends_earlier(tmp_path):
+    lines = (head("Multi") + segment(columns="Multi")).split("\n")
+    lines = [line.replace("Samples\t50\t\t50", "Samples\t50\t\t20") for line in lines]
+    for k in range(-31, -1):
+        cells = lines[k].split("\t")
+        lines[k] = "\t".join([*cells[:2], "", ""])
+    run = read(tmp_path, "\n".join(lines))
+    assert run.times["b"].size == 20 and run.times["a"].size == 50
+
+
+def test_no_pickled_file_is_read_or_written(tmp_path):
+    """The package lvm-read prefers one beside the file that is newer."""
+    trace = tmp_path / "executed"
+    read(tmp_path, head() + segment())
+    assert [one.name for one in tmp_path.iterdir()] == ["run.lvm"]
+    (tmp_path / "run.lvm.pkl").write_bytes(pickle.dumps(Payload(trace)))
+    assert_read(bp.Recording.from_file(tmp_path / "run.lvm", outputs={"a": "a", "b": "b"}))
+    assert not trace.exists()
+
+
+def test_names_and_their_number(tmp_path):
+    text = head() + segment()
+    refused(tmp_path, text.replace("Channels\t2", "Channels\t3"), "3 fields, and 4 have names")
+    refused(tmp_path, text.replace("Channels\t2", "Channels\t1"), "1 channels by its header, and the names")
+    refused(tmp_path, head() + segment(names=("a", "a")), "several channels 'a'")
+    assert_read(read(tmp_path, head() + segment(comment=False)))
+
+
+def test_last_line_without_an_end_is_read_if_it_is_complete(tmp_path):
+    assert_read(read(tmp_path, (head() + segment()).rstrip("\n")))
+
+
+def test_digits_of_a_step():
+    for text, error in (
+        ("0.001000", 0.0),
+        ("0.000020", 5e-7),
+        ("2.26757E-5", 5e-11),
+        ("1.953125E-5", 0.0),
+        ("0.001", 0.0),
+        ("2E-3", 0.0),
+    ):
+        assert lvm._error(text, ".") == pytest.approx(error, rel=1e-9)
+
+
+def test_damaged_file_is_read_or_refused_by_one_error(tmp_path, capfd):
+    generator, file = np.random.default_rng(2), tmp_path / "run.lvm"
+    whole = (head() + segment(units=("µm", "N")) + "\t\n" + segment()).encode("latin-1")
+    for _ in range(200):
+        file.write_bytes(damaged(whole, generator))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                bp.inspect(file, format="lvm")
+            except ValueError as error:
+                assert "run.lvm" in str(error)
+    assert capfd.readouterr() == ("", "")

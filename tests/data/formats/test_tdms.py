@@ -1,0 +1,293 @@
+"""TDMS files, written here after NI's description of their internal structure."""
+
+import logging
+import struct
+import warnings
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from tests.data.test_damaged_files import damaged
+
+META, NEW, RAW, INTERLEAVED, DAQMX = 2, 4, 8, 32, 128
+RATE = 51_200.0
+X = 3.0 * np.sin(np.arange(300) / 7)
+# Numbers of types of values.
+TYPES = {"<f8": 10, "<i2": 2, "<i4": 3, "<f4": 9, "|u1": 5, "stamp": 0x44}
+EPOCH = np.datetime64("1904-01-01", "s")
+
+
+def stamp(text):
+    """Return seconds since 1904 and fractions of a second of an instant."""
+    whole, _, fraction = text.partition(".")
+    return int((np.datetime64(whole, "s") - EPOCH) / np.timedelta64(1, "s")), int(fraction or "0") * 2**64 // 10 ** len(
+        fraction or "0"
+    )
+
+
+def text(value):
+    return struct.pack("<I", len(value.encode())) + value.encode()
+
+
+def prop(name, value):
+    if isinstance(value, str):
+        return text(name) + struct.pack("<I", 0x20) + text(value)
+    if isinstance(value, tuple):
+        return text(name) + struct.pack("<IQq", 0x44, value[1], value[0])
+    if isinstance(value, int):
+        return text(name) + struct.pack("<Ii", 3, value)
+    return text(name) + struct.pack("<Id", 10, value)
+
+
+def path(*names):
+    return "".join("/'" + name.replace("'", "''") + "'" for name in names)
+
+
+def index(kind, count):
+    return struct.pack("<IIIQ", 20, TYPES[kind], 1, count)
+
+
+def segment(objects, data, flags=META | NEW | RAW, length=None):
+    """Return a segment of objects, each a path, the bytes of its index, and properties."""
+    meta = struct.pack("<I", len(objects))
+    for name, where, properties in objects:
+        meta += text(name) + where + struct.pack("<I", len(properties))
+        meta += b"".join(prop(key, value) for key, value in properties.items())
+    total = len(meta) + len(data) if length is None else length
+    return b"TDSm" + struct.pack("<iiQQ", flags, 4713, total, len(meta)) + meta + data
+
+
+def channel(values, name="x", group="g", **properties):
+    """Return a segment of one channel."""
+    return segment([(path(group, name), index(values.dtype.str, len(values)), properties)], values.tobytes())
+
+
+def read(folder, content, **arguments):
+    file = folder / "run.tdms"
+    file.write_bytes(content)
+    return bp.Recording.from_file(file, **({"outputs": {"x": "x"}} | arguments))
+
+
+def refused(folder, content, reason, **arguments):
+    with pytest.raises(ValueError, match=reason) as error:
+        read(folder, content, **arguments)
+    assert "run.tdms" in str(error.value)
+
+
+def test_waveform_has_its_rate_without_a_start_offset(tmp_path):
+    """`time_track` of npTDMS needs both properties."""
+    run = read(tmp_path, channel(X, wf_increment=1 / RATE, unit_string="mm"))
+    np.testing.assert_allclose(run.time, np.arange(300) / RATE, rtol=1e-15)
+    np.testing.assert_allclose(run.outputs["x"], X * 1e-3, rtol=1e-15)
+
+
+def test_start_offset_shifts_the_times(tmp_path):
+    run = read(tmp_path, channel(X, wf_increment=0.5, wf_start_offset=-2.0))
+    np.testing.assert_allclose(run.time, np.arange(300) / 2 - 2.0)
+
+
+def test_segments_are_joined(tmp_path):
+    parts = [channel(X[:100], wf_increment=0.01), channel(X[100:150]), channel(X[150:])]
+    run = read(tmp_path, b"".join(parts))
+    np.testing.assert_array_equal(run.outputs["x"], X)
+    np.testing.assert_allclose(run.time, np.arange(300) / 100)
+
+
+def test_changed_increment_is_refused(tmp_path):
+    """The package npTDMS applies the last increment to all samples."""
+    content = channel(X, wf_increment=0.01) + channel(X, wf_increment=0.02)
+    refused(tmp_path, content, r"whose wf_increment changes from 0.01 to 0.02 s at sample 300; sampling_rate=")
+    assert read(tmp_path, content, sampling_rate=100.0).time.size == 600
+    assert "changes from 0.01 to 0.02" in str(bp.inspect(tmp_path / "run.tdms"))
+
+
+def test_slow_channel_keeps_its_clock_and_start_times_are_told_apart(tmp_path):
+    start, later = stamp("2026-01-31T12:00:00.25"), stamp("2026-01-31T12:00:01.75")
+    content = channel(X, "x", wf_increment=0.01, wf_start_time=start) + channel(
+        X[:7], "slow", wf_increment=0.5, wf_start_time=later
+    )
+    run = read(tmp_path, content, outputs={"x": "x", "slow": "slow"})
+    np.testing.assert_allclose(run.times["x"], np.arange(300) / 100)
+    np.testing.assert_allclose(run.times["slow"], 1.5 + np.arange(7) / 2, atol=1e-9)
+
+
+def test_restarted_measurement_is_refused_and_a_continued_one_is_read(tmp_path):
+    first, gap, joined = (stamp(f"2026-01-31T12:00:{second}") for second in ("00.0", "09.0", "03.0"))
+    one = channel(X, wf_increment=0.01, wf_start_time=first)
+    refused(tmp_path, one + channel(X, wf_start_time=gap), "from sample 300 starts 9 s after the first one and not 3 s")
+    run = read(tmp_path, one + channel(X, wf_start_time=joined))
+    np.testing.assert_allclose(run.time, np.arange(600) / 100, atol=1e-12)
+
+
+def scaled(scale):
+    return {
+        "NI_Scaling_Status": "unscaled",
+        "NI_Number_Of_Scales": 2,
+        "NI_Scale[1]_Scale_Type": scale,
+        "NI_Scale[1]_Linear_Slope": 0.5,
+        "NI_Scale[1]_Linear_Y_Intercept": 3.0,
+        "NI_Scale[1]_Linear_Input_Source": 0,
+        "wf_increment": 0.01,
+    }
+
+
+def raw_daqmx(scale, counts):
+    """Return a file of two channels of 16 bits as DAQmx writes them, in rows without scaling."""
+    places = {"x": 0, "y": 2}
+    objects = []
+    for name, place in places.items():
+        where = struct.pack("<IIIQI", 0x1269, 0xFFFFFFFF, 1, len(counts), 1)
+        where += struct.pack("<IIIII", 3, 0, place, 0, 0) + struct.pack("<II", 1, 4)
+        objects.append((path("g", name), where, scaled(scale)))
+    return segment(objects, counts.tobytes(), META | NEW | RAW | DAQMX)
+
+
+def test_raw_data_of_daqmx_are_scaled(tmp_path):
+    counts = np.arange(20, dtype="<i2").reshape(10, 2) * 100
+    run = read(tmp_path, raw_daqmx("Linear", counts), outputs={"x": "x", "y": "y"})
+    np.testing.assert_allclose(run.outputs["x"], 0.5 * counts[:, 0] + 3.0)
+    np.testing.assert_allclose(run.outputs["y"], 0.5 * counts[:, 1] + 3.0)
+
+
+def test_last_chunk_of_daqmx_with_fewer_rows(tmp_path):
+    """As DAQmx writes it when the measurement is stopped: the segment has a chunk of ten rows, and one of two."""
+    counts = np.arange(24, dtype="<i2").reshape(12, 2)
+    whole = raw_daqmx("Linear", counts[:10]) + counts[10:].tobytes()
+    whole = whole[:12] + struct.pack("<Q", len(whole) - 28) + whole[20:]
+    run = read(tmp_path, whole, outputs={"x": "x", "y": "y"})
+    np.testing.assert_allclose(run.outputs["y"], 0.5 * counts[:, 1] + 3.0)
+
+
+def test_scale_that_is_not_applied_is_refused(tmp_path):
+    """The package npTDMS returns counts for a scale that it does not know."""
+    counts = np.ones((10, 2), dtype="<i2")
+    refused(tmp_path, raw_daqmx("Wheatstone", counts), r"a scale of type 'Wheatstone' \(NI_Scale\[1\]_Scale_Type\)")
+
+
+def test_scale_or_unit_that_changes_is_refused(tmp_path):
+    for old, new in (
+        ({"unit_string": "mm"}, {"unit_string": "m"}),
+        (scaled("Linear"), {"NI_Scale[1]_Linear_Slope": 2.0}),
+    ):
+        name = next(iter(new))
+        content = channel(X, **({"wf_increment": 0.01} | old)) + channel(X, **new)
+        refused(tmp_path, content, name.replace("[", r"\[").replace("]", r"\]") + " that changes from .* at sample 300")
+
+
+def test_property_set_after_the_data_applies(tmp_path):
+    """LabVIEW appends a segment without data to do so."""
+    late = segment([(path("g", "x"), struct.pack("<I", 0xFFFFFFFF), {"unit_string": "mm"})], b"", META | NEW)
+    run = read(tmp_path, channel(X, wf_increment=0.01) + late)
+    np.testing.assert_allclose(run.outputs["x"], X * 1e-3)
+
+
+def test_interleaved_data(tmp_path):
+    table = np.array([X[:40], -X[:40]]).T.copy()
+    objects = [(path("g", name), index("<f8", 40), {"wf_increment": 0.01}) for name in "xy"]
+    run = read(
+        tmp_path, segment(objects, table.tobytes(), META | NEW | RAW | INTERLEAVED), outputs={"x": "x", "y": "y"}
+    )
+    np.testing.assert_array_equal(run.outputs["x"], X[:40])
+    np.testing.assert_array_equal(run.outputs["y"], -X[:40])
+
+
+def test_timestamps_keep_nanoseconds(tmp_path):
+    """The package npTDMS cuts them off at microseconds, 5 % of a step at 51.2 kHz."""
+    whole = stamp("2026-01-31T12:00:00")[0]
+    stamps = b"".join(struct.pack("<Qq", int(k * 2**64 / RATE), whole) for k in range(300))
+    content = segment(
+        [(path("g", "x"), index("<f8", 300), {}), (path("g", "when"), index("stamp", 300), {})], X.tobytes() + stamps
+    )
+    run = read(tmp_path, content, time="when")
+    np.testing.assert_allclose(run.time, np.arange(300) / RATE, atol=1.1e-9)
+
+
+def test_channel_without_a_waveform_needs_a_rate(tmp_path):
+    for properties in (
+        {},
+        {"wf_increment": 0.0},
+        {"wf_increment": 1.0},
+        {"wf_increment": 1.0, "wf_start_time": (0, 0)},
+    ):
+        refused(
+            tmp_path,
+            channel(X, **properties),
+            "time: must be ",
+        )
+        assert read(tmp_path, channel(X, **properties), sampling_rate=10.0).sampling_rate == pytest.approx(10.0)
+    slow = channel(X, wf_increment=1.0, wf_start_time=stamp("2026-01-31T12:00:00"))
+    assert read(tmp_path, slow).sampling_rate == pytest.approx(1.0)
+
+
+def test_axis_that_is_no_time_is_refused(tmp_path):
+    refused(tmp_path, channel(X, wf_increment=2.0, wf_xunit_string="Hz"), "whose axis is in 'Hz', no time")
+
+
+def test_names_with_quotes_and_slashes(tmp_path):
+    content = channel(X, "it's x/y", "g'1", wf_increment=0.01) + channel(-X, "it's x/y", "g2", wf_increment=0.01)
+    run = read(tmp_path, content, outputs={"x": ("g'1", "it's x/y")})
+    np.testing.assert_array_equal(run.outputs["x"], X)
+    refused(
+        tmp_path, content, r"the name of 2; give the group too: \(\"g'1\", \"it's x/y\"\)", outputs={"x": "it's x/y"}
+    )
+
+
+def test_texts_are_listed_and_refused_as_numbers(tmp_path):
+    words = ["on", "µ-off"]
+    ends = np.cumsum([len(word.encode()) for word in words]).astype("<u4").tobytes()
+    data = ends + "".join(words).encode()
+    where = struct.pack("<IIIQQ", 28, 0x20, 1, 2, len(data))
+    content = segment([(path("g", "x"), where, {"wf_increment": 0.01})], data)
+    refused(tmp_path, content, "must contain numbers")
+    assert "texts" in str(bp.inspect(tmp_path / "run.tdms"))
+
+
+def test_number_of_samples_other_than_announced_is_remarked(tmp_path):
+    read(tmp_path, channel(X, wf_increment=0.01, wf_samples=299))
+    assert "wf_samples announces 299 samples, there are 300" in str(bp.inspect(tmp_path / "run.tdms"))
+
+
+@pytest.mark.parametrize("lost", [1, 8, 100, 2400, 2500])
+def test_file_that_is_cut_off_is_refused(tmp_path, lost):
+    """The package npTDMS reads what there is, or drops the last segment."""
+    whole = channel(X, wf_increment=0.01) * 2
+    refused(tmp_path, whole[:-lost], "must be a TDMS file, .* is cut off")
+    refused(tmp_path, whole + whole[:20], "must be a TDMS file, .* is cut off")
+    open_end = segment([(path("g", "x"), index("<f8", 300), {})], X.tobytes()[:-lost], length=2**64 - 1)
+    refused(tmp_path, open_end, "must be a TDMS file, .* is cut off")
+
+
+def test_index_beside_the_file_is_not_read(tmp_path):
+    """The package npTDMS takes it in place of the file's own metadata, also if it is that of another file."""
+    (tmp_path / "run.tdms_index").write_bytes(channel(X[:10], "other", wf_increment=9.0).replace(b"TDSm", b"TDSh"))
+    np.testing.assert_array_equal(read(tmp_path, channel(X, wf_increment=0.01)).outputs["x"], X)
+
+
+def test_big_endian_file(tmp_path):
+    meta = struct.pack(">I", 1) + struct.pack(">I", 8) + b"/'g'/'x'" + struct.pack(">IIIQ", 20, 10, 1, 300)
+    meta += struct.pack(">II", 1, 12) + b"wf_increment" + struct.pack(">Id", 10, 0.01)
+    data = X.astype(">f8").tobytes()
+    head = (
+        b"TDSm" + struct.pack("<I", META | NEW | RAW | 64) + struct.pack(">IQQ", 4713, len(meta) + len(data), len(meta))
+    )
+    run = read(tmp_path, head + meta + data)
+    np.testing.assert_array_equal(run.outputs["x"], X)
+    assert run.sampling_rate == pytest.approx(100.0)
+
+
+def test_damaged_file_is_read_or_refused_by_one_error(tmp_path, capfd):
+    start = stamp("2026-01-31T12:00:00")
+    whole = channel(X, wf_increment=0.01, wf_start_time=start, unit_string="mm") + raw_daqmx(
+        "Linear", np.ones((50, 2), dtype="<i2")
+    )
+    generator, file, levels = np.random.default_rng(1), tmp_path / "run.tdms", logging.getLogger("nptdms").level
+    for _ in range(200):
+        file.write_bytes(damaged(whole, generator))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                bp.inspect(file)
+            except ValueError as error:
+                assert "run.tdms" in str(error)
+    assert capfd.readouterr() == ("", "") and logging.getLogger("nptdms").level == levels
