@@ -95,7 +95,8 @@ def contents(file: Path, wanted: list[Key]) -> Contents:
 
 def _blocks(file: Path) -> list[tuple[int, list[bytes]]]:
     """Return number and first lines of each data set, between lines that are -1 in columns 5 and 6."""
-    content, places, place = file.read_bytes(), [], -1
+    places: list[int] = []
+    content, place = file.read_bytes(), -1
     while (place := content.find(MARK, place + 1)) >= 0:
         end = place + len(MARK)
         line = content[end : end + 80].splitlines()

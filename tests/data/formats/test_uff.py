@@ -118,9 +118,7 @@ def test_exact_interval_gives_no_warning(saved, text):
 def test_uneven_times_that_became_a_staircase_are_refused(saved):
     """1 kHz from 1000 s on: six digits are 10 ms."""
     path = saved(function(np.arange(200.0), x=1000.0 + 1e-3 * np.arange(200), double=False))
-    with pytest.raises(
-        ValueError, match="time: must be known, .*rounded to 0.01 s, .*sampling_rate="):
-    ):
+    with pytest.raises(ValueError, match="time: must be known, .*rounded to 0.01 s, .*sampling_rate="):
         read(path)
     assert read(path, sampling_rate=1000.0).time[-1] == pytest.approx(1000.199, abs=1e-9)
     assert bp.inspect(path).channels[0].refused
