@@ -7,6 +7,7 @@ unpacks some kilobytes to gigabytes. Here such arrays are refused.
 import io
 import itertools
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import h5py
@@ -53,6 +54,37 @@ def _member(group: h5py.Group, name: str) -> h5py.Dataset | h5py.Group:
     return item
 
 
+def walk(file: h5py.File) -> Iterator[tuple[str, str, h5py.Dataset | None]]:
+    """Yield group, name and array of all members of a file but groups, None for those that are not in the file.
+
+    Each group is visited once, also if several names lead to it.
+    """
+    groups, seen = [("", file["/"])], {h5py.h5o.get_info(file["/"].id).addr}
+    while groups:
+        path, group = groups.pop(0)
+        for name in group:
+            if not isinstance(name, str):  # bytes are no text
+                continue
+            try:
+                item = _member(group, name)
+            except ValueError:
+                yield path, name, None
+                continue
+            if isinstance(item, h5py.Dataset):
+                yield path, name, item
+            elif (address := h5py.h5o.get_info(item.id).addr) not in seen:
+                seen.add(address)
+                groups.append((f"{path}/{name}" if path else name, item))
+
+
+def at(file: h5py.File, path: str, name: str) -> h5py.Dataset:
+    """Return an array of a file by the path of its group."""
+    group = file["/"]
+    for part in path.split("/") if path else ():
+        group = _member(group, part)
+    return dataset(group, name)
+
+
 def values(item: h5py.Dataset, largest: float, remedy: str) -> Any:
     """Return the values of an array from `dataset`; raise a ValueError if some are missing, or they are too large."""
     _check(item, largest, f"than {largest / 1e9:.3g} GB; {remedy}")
@@ -82,7 +114,12 @@ def _check(item: h5py.Dataset, largest: float, limit: str) -> float:
     if size > largest:
         raise ValueError(f"its array {name!r} has more {limit}")
     packed = {plan.get_filter(k)[0] for k in range(plan.get_nfilters())}
-    if not packed <= FILTERS or size > DEFLATION * item.id.get_storage_size() or not _is_stored(item):
+    if not packed <= FILTERS:
+        raise ValueError(
+            f"parts of its variable {name!r} are missing or packed by a filter that is not read here ({packed}); "
+            "h5repack -f GZIP=4 converts the file"
+        )
+    if size > DEFLATION * item.id.get_storage_size() or not _is_stored(item):
         raise ValueError(f"parts of its variable {name!r} are missing")
     if item.dtype.hasobject:
         size = 0.0

@@ -85,7 +85,15 @@ def contents(path: str | Path, form: str | None, wanted: Iterable[Key], options:
     module = importlib.import_module(f"bayesperiodic.data.formats.{chosen.module}")
     with one_error(chosen.kind, path):
         whole: Contents = module.contents(file, [*wanted], **given)
-    channels = [replace(one, values=partial(_guarded, chosen.kind, path, one.values)) for one in whole.channels]
+    guard = partial(partial, _guarded, chosen.kind, path)
+    clocks = {
+        id(one.clock): replace(one.clock, stored=guard(one.clock.stored))
+        for one in whole.channels
+        if one.clock and one.clock.stored
+    }
+    channels = [
+        replace(one, values=guard(one.values), clock=clocks.get(id(one.clock), one.clock)) for one in whole.channels
+    ]
     return replace(whole, channels=tuple(channels))
 
 
