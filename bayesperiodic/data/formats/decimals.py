@@ -6,14 +6,14 @@ from decimal import Decimal
 # Significant digits of a step that is taken as exact, and of the rate of one whose reciprocal is.
 SHORT_STEP, SHORT_RATE = 3, 6
 # Half a unit, with the rounding of its comparison.
-HALF = 0.5001
-NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([EeDd][+-]?\d+)?\s*")
+HALF_UNIT = 0.5001
+DECIMAL_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([EeDd][+-]?\d+)?\s*")
 
 
 def decimal_error(text: str) -> float:
     """Return half a unit of the last digit of a decimal number."""
     exponent = _decimal(text).as_tuple().exponent
-    return HALF * 10.0 ** int(exponent)
+    return HALF_UNIT * 10.0 ** int(exponent)
 
 
 def step_error(text: str) -> float:
@@ -31,7 +31,7 @@ def step_error(text: str) -> float:
 
 
 def _decimal(text: str) -> Decimal:
-    if not NUMBER.fullmatch(text):
+    if not DECIMAL_NUMBER.fullmatch(text):
         raise ValueError(f"{text.strip()!r} is no number")
     return Decimal(re.sub("[Dd]", "e", text.strip()))
 

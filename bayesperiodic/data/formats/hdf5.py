@@ -11,7 +11,7 @@ import numpy as np
 
 from bayesperiodic import _hdf5
 from bayesperiodic.data.formats.contents import LARGEST_ARRAY, OTHERWISE, Clock, Contents, Key, StoredChannel
-from bayesperiodic.data.formats.hdf5_attributes import UNITS, Packing, Since, attributes, sampling, unused_scale
+from bayesperiodic.data.formats.hdf5_attributes import UNIT_NAMES, Packing, Since, attributes, sampling, unused_scale
 
 # Columns of tables: at most so many, and a table is so many times longer than wide.
 MOST_COLUMNS, SLENDER = 64, 10
@@ -90,7 +90,7 @@ def _channels(
 
 def _units(item: h5py.Dataset, stored: dict[str, Any], columns: int) -> list[str]:
     """Return the unit of each column of an array, of one for all or a list."""
-    key = next((key for key in UNITS if key in item.attrs), None)
+    key = next((key for key in UNIT_NAMES if key in item.attrs), None)
     if key is None or item.dtype.names:
         return [""] * columns
     if key in stored:

@@ -12,13 +12,13 @@ from bayesperiodic.data.formats.contents import Clock
 from bayesperiodic.data.formats.decimals import step_error
 
 # Types of attributes that are read: h5py crashes on some damaged lists and references.
-PLAIN = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING)
-UNITS = ("units", "unit", "Unit", "Units", "UNIT", "UNITS", "unit_string")
-RATES = ("samplingrate", "samplerate", "samplingfrequency", "samplefrequency", "fs")
-STEPS = ("dt", "deltat", "samplinginterval", "sampleinterval", "samplingperiod", "wfincrement")
-STARTS = ("t0", "starttime", "tstart", "wfstartoffset", "wfstarttime")
+PLAIN_TYPES = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING)
+UNIT_NAMES = ("units", "unit", "Unit", "Units", "UNIT", "UNIT_NAMES", "unit_string")
+RATE_NAMES = ("samplingrate", "samplerate", "samplingfrequency", "samplefrequency", "fs")
+STEP_NAMES = ("dt", "deltat", "samplinginterval", "sampleinterval", "samplingperiod", "wfincrement")
+START_NAMES = ("t0", "starttime", "tstart", "wfstartoffset", "wfstarttime")
 # Scales that are no convention, with the values that change nothing.
-SCALES = {
+OTHER_SCALES = {
     "gain": 1.0, "scale": 1.0, "scaling": 1.0, "slope": 1.0, "conversion": 1.0, "calibration": 1.0,
     "sensitivity": 1.0, "factor": 1.0, "offset": 0.0, "intercept": 0.0,
 }  # fmt: skip
@@ -30,12 +30,12 @@ DURATIONS = {
     r"seconds?|secs?|s": 10**9, r"milliseconds?|millisecs?|msecs?|ms": 10**6,
     r"microseconds?|microsecs?|usecs?|us": 10**3, r"nanoseconds?|nanosecs?|nsecs?|ns": 1,
 }  # fmt: skip
-SINCE = re.compile(r"\s*(\w+)\s+since\s+(.+?)\s*", re.IGNORECASE)
+SINCE_TEXT = re.compile(r"\s*(\w+)\s+since\s+(.+?)\s*", re.IGNORECASE)
 # pandas takes a year 1 as 2001.
 DATE = re.compile(r"\d{4}-\d")
 CALENDARS = ("standard", "gregorian", "proleptic_gregorian")
 # Numbers from which a start is seconds since 1970; years that nanoseconds since 1970 reach.
-SINCE_1970, YEARS = 1e8, (1678, 2262)
+LEAST_EPOCH, YEARS = 1e8, (1678, 2262)
 # Rounding of dates to nanoseconds, of a step.
 LARGEST_ROUNDING = 1e-3
 
@@ -46,7 +46,7 @@ def attributes(item: h5py.Dataset | h5py.Group) -> dict[str, Any]:
     for key in item.attrs:
         try:
             kind = item.attrs.get_id(key)
-            if kind.get_type().get_class() not in PLAIN:
+            if kind.get_type().get_class() not in PLAIN_TYPES:
                 continue
             if kind.shape not in ((), (1,)) and not (key == "valid_range" and kind.shape == (2,)):
                 continue
@@ -103,12 +103,11 @@ class Packing:
             return values
         if self.unsigned and values.dtype.kind == "i":
             values = values.view(values.dtype.str.replace("i", "u"))
-        if self.missing or np.isfinite((self.low, self.high)).any():
-            lost = (values < self.low) | (values > self.high)
-            for value in self.missing:
-                lost |= values == value
-            if lost.any():
-                values = np.where(lost, np.nan, values)
+        lost = [values == value for value in self.missing]
+        lost += [values < self.low] if self.low > -np.inf else []
+        lost += [values > self.high] if self.high < np.inf else []
+        if lost and (missing := np.any(lost, axis=0)).any():
+            values = np.where(missing, np.nan, values)
         if self.scale != 1.0 or self.offset != 0.0:
             return values * self.scale + self.offset
         return values
@@ -129,7 +128,7 @@ class Since:
     @classmethod
     def of(cls, unit: str, stored: Mapping[str, Any]) -> "Since | None":
         """Return a unit of time with or without a date; None for other units."""
-        match = SINCE.fullmatch(unit)
+        match = SINCE_TEXT.fullmatch(unit)
         word = match.group(1) if match else unit.strip()
         size = next((size for names, size in DURATIONS.items() if re.fullmatch(names, word, re.IGNORECASE)), 0)
         if not match:
@@ -177,7 +176,7 @@ READ_BY_XARRAY = "read it by xarray.open_dataset, and give seconds to from_array
 def unused_scale(stored: Mapping[str, Any]) -> str:
     """Return the attribute that may be a scale of no convention, such as "gain = 0.5"."""
     for key, value in stored.items():
-        neutral = SCALES.get(_plain(key))
+        neutral = OTHER_SCALES.get(_plain(key))
         if neutral is not None and not (_number(value) and float(value) == neutral):
             return f"{key} = {value}"
     return ""
@@ -189,7 +188,7 @@ def _plain(key: str) -> str:
 
 def sampling(stored: Mapping[str, Any]) -> Clock | None:
     """Return the times that attributes say; refused if they are several or no numbers."""
-    given = {key: value for key, value in stored.items() if _plain(key) in (*RATES, *STEPS)}
+    given = {key: value for key, value in stored.items() if _plain(key) in (*RATE_NAMES, *STEP_NAMES)}
     if not given:
         return None
     shown = ", ".join(f"{key} = {value}" for key, value in given.items())
@@ -198,16 +197,16 @@ def sampling(stored: Mapping[str, Any]) -> Clock | None:
         if not _number(value) or not np.isfinite(value) or value <= 0.0:
             return Clock(refusal=f"whose attributes say {shown}")
         number = float(str(value))  # of single precision, the decimal number that was written
-        is_step = _plain(key) in STEPS
+        is_step = _plain(key) in STEP_NAMES
         steps.append(number if is_step else 1.0 / number)
         if is_step and isinstance(value, np.float32 | np.float16):
             error = step_error(str(value))
     if max(steps) - min(steps) > 1e-12 * max(steps):
         return Clock(refusal=f"whose attributes {shown} contradict each other")
-    starts = [(key, value) for key, value in stored.items() if _plain(key) in STARTS]
+    starts = [(key, value) for key, value in stored.items() if _plain(key) in START_NAMES]
     start, origin = 0.0, None
     for key, value in starts:
-        if _number(value) and np.isfinite(value) and abs(value) < SINCE_1970:
+        if _number(value) and np.isfinite(value) and abs(value) < LEAST_EPOCH:
             start += float(value)
         elif isinstance(value, str) and re.match(r"\d{4}-\d\d-\d\d", value):
             import pandas as pd

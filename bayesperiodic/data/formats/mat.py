@@ -21,13 +21,13 @@ INT32, MAT_MATRIX, COMPRESSED, COMPLEX, HEADER_BYTES = 5, 14, 15, 0x800, 4096
 # Classes: those of the flags, of structures and of objects such as tables.
 CLASS, STRUCTURE, OPAQUE = 0xFF, 2, 17
 # Structures in structures that are searched.
-DEEPEST = 8
+DEEPEST_STRUCTURE = 8
 STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", INT32: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 NUMERIC = {
     6: "double", 7: "single", 8: "int8", 9: "uint8", 10: "int16", 11: "uint16", 12: "int32", 13: "uint32", 14: "int64",
     15: "uint64",
 }  # fmt: skip
-KINDS = (*NUMERIC.values(), "logical")
+NUMERIC_KINDS = (*NUMERIC.values(), "logical")
 # What to type in MATLAB for objects, whose format MathWorks does not document.
 REMEDIES = {
     "table": "s = table2struct({0}, 'ToScalar', true); save('run.mat', '-struct', 's')",
@@ -78,7 +78,7 @@ def _hdf5_channel(file: Path, group: str, name: str, item: Any) -> StoredChannel
     stored = attributes(item)
     whole = ".".join([*group.split("/"), name]) if group else name
     kind = str(stored.get("MATLAB_class", "double"))
-    refusal = object_refusal(kind, whole) if "MATLAB_object_decode" in stored and kind not in KINDS else ""
+    refusal = object_refusal(kind, whole) if "MATLAB_object_decode" in stored and kind not in NUMERIC_KINDS else ""
     return StoredChannel(whole, int(item.size or 0), partial(_hdf5_values, file, group, name), refusal=refusal)
 
 
@@ -90,7 +90,7 @@ def _hdf5_values(file: Path, group: str, name: str) -> Any:
         item = _hdf5.at(archive, group, name)
         stored = attributes(item)
         kind = str(stored.get("MATLAB_class", "double"))
-        if kind not in KINDS or stored.get("MATLAB_empty"):
+        if kind not in NUMERIC_KINDS or stored.get("MATLAB_empty"):
             raise ValueError(f"its variable {name!r} is empty or no array of numbers, but {kind}")
         return _hdf5.values(item, LARGEST_ARRAY, OTHERWISE)
 
@@ -170,7 +170,7 @@ def _fields(name: str, data: memoryview, order: str) -> Iterator[tuple[str, int,
             yield path, math.prod(shape), ""
         elif flags & CLASS == OPAQUE:
             yield path, 0, object_refusal(_class_of(parts), path)
-        elif flags & CLASS == STRUCTURE and path.count(".") < DEEPEST:
+        elif flags & CLASS == STRUCTURE and path.count(".") < DEEPEST_STRUCTURE:
             yield from _fields(path, member, order)
 
 

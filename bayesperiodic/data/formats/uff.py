@@ -12,12 +12,12 @@ from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChan
 from bayesperiodic.data.formats.decimals import step_error
 from bayesperiodic.data.formats.uff_units import Units164, seconds_of, unit_of
 
-MARK = b"    -1"
+SET_MARK = b"    -1"
 BINARY_START = re.compile(rb" {4}-1 *[\r\n]+ *58[bB]")
-FUNCTION, UNITS = 58, 164
+FUNCTION_SET, UNIT_SET = 58, 164
 # Lines of the header of a function, after the mark and with the number of the set.
 HEADER_LINES = 13
-FUNCTIONS = {
+FUNCTION_TYPES = {
     0: "a function of unknown type", 2: "an auto spectrum", 3: "a cross spectrum", 4: "a frequency response function",
     5: "a transmissibility", 6: "a coherence", 7: "an auto correlation", 8: "a cross correlation",
     9: "a power spectral density", 10: "an energy spectral density", 12: "a spectrum", 17: "an orbit",
@@ -28,8 +28,8 @@ UNKNOWN_FUNCTION, TIME_RESPONSE = 0, 1
 UNKNOWN_DATA, GENERAL_DATA, TIME_ABSCISSA = 0, 1, 17
 DIRECTIONS = {1: "+X", 2: "+Y", 3: "+Z", 4: "+RX", 5: "+RY", 6: "+RZ"}
 DIRECTIONS |= {-key: value.replace("+", "-") for key, value in DIRECTIONS.items()}
-COMPLEX, SINGLE, REAL = (5, 6), (2, 5), (2, 4)
-IEEE = 2
+COMPLEX_DATA, SINGLE_DATA, REAL_DATA = (5, 6), (2, 5), (2, 4)
+IEEE_754 = 2
 # Bytes that may follow the values of a binary set: the end of its last line of 80.
 MOST_PADDING = 80
 # Errors of times that are refused, of the step.
@@ -68,7 +68,7 @@ def contents(file: Path, wanted: list[Key]) -> Contents:
     """Return the functions of a universal file; those that are no time signals are refused as channels."""
     pyuff = package("pyuff", "pyuff", "universal files")
     blocks = _blocks(file)
-    if not any(kind == FUNCTION for kind, _ in blocks):
+    if not any(kind == FUNCTION_SET for kind, _ in blocks):
         kinds = ", ".join(sorted({str(kind) for kind, _ in blocks})) or "none"
         raise ValueError(f"it has no data set 58, but {kinds}")
     reader = pyuff.UFF(str(file))
@@ -97,8 +97,8 @@ def _blocks(file: Path) -> list[tuple[int, list[bytes]]]:
     """Return number and first lines of each data set, between lines that are -1 in columns 5 and 6."""
     places: list[int] = []
     content, place = file.read_bytes(), -1
-    while (place := content.find(MARK, place + 1)) >= 0:
-        end = place + len(MARK)
+    while (place := content.find(SET_MARK, place + 1)) >= 0:
+        end = place + len(SET_MARK)
         line = content[end : end + 80].splitlines()
         if line and line[0].strip():
             continue
@@ -120,10 +120,10 @@ def _blocks(file: Path) -> list[tuple[int, list[bytes]]]:
 
 def _sets(reader: Any, blocks: list[tuple[int, list[bytes]]]) -> list[_Set]:
     """Return the functions of a file, with the units that precede them, or else the first ones."""
-    known = {k: Units164.of(_read(reader, k)) for k, (kind, _) in enumerate(blocks) if kind == UNITS}
+    known = {k: Units164.of(_read(reader, k)) for k, (kind, _) in enumerate(blocks) if kind == UNIT_SET}
     sets = []
     for k, (kind, lines) in enumerate(blocks):
-        if kind != FUNCTION:
+        if kind != FUNCTION_SET:
             continue
         head = _read(reader, k, header_only=True)
         _check_head(k + 1, head)
@@ -152,12 +152,16 @@ def _read(reader: Any, place: int, *, header_only: bool = False) -> dict[str, An
 
 def _check_head(number: int, head: dict[str, Any]) -> None:
     """Raise a ValueError for a function that pyuff misreads without an error."""
-    if head["ord_data_type"] not in (*REAL, *COMPLEX) or head["abscissa_spacing"] not in (0, 1) or head["num_pts"] < 0:
+    if (
+        head["ord_data_type"] not in (*REAL_DATA, *COMPLEX_DATA)
+        or head["abscissa_spacing"] not in (0, 1)
+        or head["num_pts"] < 0
+    ):
         raise ValueError(f"its data set {number} has an unknown form of data")
-    if head["binary"] and (head["fp_format"] != IEEE or head["byte_ordering"] not in (1, 2)):
+    if head["binary"] and (head["fp_format"] != IEEE_754 or head["byte_ordering"] not in (1, 2)):
         raise ValueError(
             f"its data set {number} has numbers of format {head['fp_format']} and byte order {head['byte_ordering']}, "
-            "not those of IEEE 754"
+            "not those of IEEE_754 754"
         )
     if head["binary"] and head["n_ascii_lines"] != HEADER_LINES - 2:
         raise ValueError(f"its data set {number} has {head['n_ascii_lines']} lines before its values, not 11")
@@ -170,8 +174,8 @@ def _data(reader: Any, one: _Set) -> tuple[np.ndarray, np.ndarray]:
     data = _read(reader, one.number - 1)
     x, y, size = data["x"], data["data"], int(one.head["num_pts"])
     # Of a text, the last line is filled with further values.
-    parts = (2 if one.head["ord_data_type"] in COMPLEX else 1) + (not one.even)
-    width = 4 if one.head["ord_data_type"] in SINGLE else 8
+    parts = (2 if one.head["ord_data_type"] in COMPLEX_DATA else 1) + (not one.even)
+    width = 4 if one.head["ord_data_type"] in SINGLE_DATA else 8
     spare = MOST_PADDING // (width * parts) if one.head["binary"] else 6 // parts - 1
     if not size <= y.size <= size + spare or x.size < size:
         raise ValueError(
@@ -189,8 +193,8 @@ def _refusal(one: _Set) -> str:
     kind = one.head["func_type"]
     how = f"read it by pyuff.UFF(path).read_sets({one.number - 1})"
     if kind != TIME_RESPONSE and (kind != UNKNOWN_FUNCTION or one.head["abscissa_spec_data_type"] != TIME_ABSCISSA):
-        return f"{FUNCTIONS.get(kind, 'a function')} (type {kind}), which is no time signal; {how}"
-    if one.head["ord_data_type"] in COMPLEX:
+        return f"{FUNCTION_TYPES.get(kind, 'a function')} (type {kind}), which is no time signal; {how}"
+    if one.head["ord_data_type"] in COMPLEX_DATA:
         return f"a complex time signal; {how}"
     return ""
 
@@ -240,7 +244,7 @@ def _uneven_clock(reader: Any, one: _Set, factor: float) -> Clock:
     if one.head["num_pts"] < 2:
         return Clock(refusal="of fewer than two samples")
     times, largest = _times(reader, one, factor), 0.0
-    single = one.head["binary"] and one.head["ord_data_type"] in SINGLE
+    single = one.head["binary"] and one.head["ord_data_type"] in SINGLE_DATA
     end = float(np.abs(times).max())
     if single:
         largest = 0.5 * float(np.spacing(np.float32(end)))

@@ -9,8 +9,8 @@ import numpy as np
 from bayesperiodic.data import units
 
 # Units of data set 164 by their factors, "to convert to SI, divide", and those of its codes.
-LENGTHS = {"m": 1.0, "mm": 1e3, "cm": 1e2, "ft": 1 / 0.3048, "in": 1 / 0.0254}
-FORCES = {
+LENGTH_FACTORS = {"m": 1.0, "mm": 1e3, "cm": 1e2, "ft": 1 / 0.3048, "in": 1 / 0.0254}
+FORCE_FACTORS = {
     "N": 1.0, "mN": 1e3, "cN": 1e2, "kN": 1e-3, "daN": 0.1, "lbf": 1 / 4.4482216152605, "kgf": 1 / 9.80665,
     "poundal": 1 / 0.138254954376,
 }  # fmt: skip
@@ -40,7 +40,7 @@ class Units164:
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> "Units164":
         """Return the units of a data set 164, by its factors; its code must be theirs."""
-        length, force = _nearest(LENGTHS, stored["length"]), _nearest(FORCES, stored["force"])
+        length, force = _nearest(LENGTH_FACTORS, stored["length"]), _nearest(FORCE_FACTORS, stored["force"])
         code = CODES.get(stored["units_code"])
         if not length or not force:
             return cls(length, force, f"data set 164 with factors {stored['length']:g} and {stored['force']:g}")
