@@ -161,7 +161,7 @@ def _check_head(number: int, head: dict[str, Any]) -> None:
     if head["binary"] and (head["fp_format"] != IEEE_754 or head["byte_ordering"] not in (1, 2)):
         raise ValueError(
             f"its data set {number} has numbers of format {head['fp_format']} and byte order {head['byte_ordering']}, "
-            "not those of IEEE_754 754"
+            "not those of IEEE 754"
         )
     if head["binary"] and head["n_ascii_lines"] != HEADER_LINES - 2:
         raise ValueError(f"its data set {number} has {head['n_ascii_lines']} lines before its values, not 11")
