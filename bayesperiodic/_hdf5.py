@@ -7,7 +7,10 @@ unpacks some kilobytes to gigabytes. Here such arrays are refused.
 import io
 import itertools
 import math
+import mmap
+import struct
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -15,6 +18,8 @@ import numpy as np
 
 # Filters of chunks: deflate, shuffle, Fletcher's checksum. Deflate packs at most so many bytes into one.
 FILTERS, DEFLATION = {1, 2, 3}, 1032
+# First bytes of a heap of texts of different lengths.
+HEAP = b"GCOL\x01"
 # How netCDF marks dimensions without values.
 DIMENSION_ONLY = b"This is a netCDF dimension but not a netCDF variable"
 
@@ -52,6 +57,23 @@ def _member(group: h5py.Group, name: str) -> h5py.Dataset | h5py.Group:
     if not isinstance(item, h5py.Dataset) or item.is_virtual or item.external:
         raise ValueError(f"its variable {name!r} is not an array in this file, but refers to other data")
     return item
+
+
+def check_heaps(path: Path) -> None:
+    """Raise a ValueError for a damaged heap of texts, with some of which HDF5 2.0 does not come to an end.
+
+    A heap is a list of objects after a head of 16 bytes; an object is its number, counts and size, and its bytes.
+    """
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        start = -1
+        while (start := content.find(HEAP, start + 1)) >= 0:
+            size = int.from_bytes(content[start + 8 : start + 16], "little")
+            place, end = start + 16, start + size
+            while place + 16 <= end:
+                number, length = struct.unpack("<H6xQ", content[place : place + 16].ljust(16))
+                place += 16 + length + -length % 8 if number else length
+                if not (16 <= length or number) or place > end or end > len(content):
+                    raise ValueError("a heap of its texts is damaged")
 
 
 def walk(file: h5py.File) -> Iterator[tuple[str, str, h5py.Dataset | None]]:

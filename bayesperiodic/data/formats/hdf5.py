@@ -27,6 +27,7 @@ def contents(file: Path, wanted: list[Key]) -> Contents:
     numbers: list[str] = []
     clocks: dict[Any, Clock] = {}
     read = functools.lru_cache(maxsize=1)(partial(_array, file))
+    _hdf5.check_heaps(file)
     with h5py.File(file, "r") as archive:
         scales = [
             (group, name)

@@ -61,6 +61,7 @@ def object_refusal(kind: str, name: str) -> str:
 def _hdf5_channels(file: Path) -> Iterator[StoredChannel]:
     import h5py
 
+    _hdf5.check_heaps(file)
     with h5py.File(file, "r") as archive:
         for name in archive:
             if isinstance(name, str) and not name.startswith("#"):  # bytes are no text; objects are in "#refs#"
