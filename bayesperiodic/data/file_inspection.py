@@ -224,7 +224,8 @@ def _code(path: str | Path, whole: Contents, channels: tuple[FileChannel, ...], 
     pairs = []
     for name, channel in zip(unique_names(_identifier(one.name) for one in usable), usable, strict=True):
         key = channel.name if names.count(channel.name) == 1 else (channel.group, channel.name)
-        pairs.append(f"{_identifier(name)!r}: {key!r}")
+        numbered = re.sub(r" \((\d+)\)$", r"_\1", name)
+        pairs.append(f"{numbered!r}: {key!r}")
     shown = ", ".join(pairs[:MOST_SUGGESTED])
     arguments = [repr(str(path)), f"inputs={{}}, outputs={{{shown}}}"]
     if whole.suggested_time:

@@ -45,8 +45,8 @@ AMBIGUOUS = {
     "G": "('g_0', 'm/s**2') for the acceleration of gravity, ('G', 'T') for the gauss",
     "rpm": "('rpm', 'Hz') for a frequency, ('rpm', 'rad/s') for an angular velocity",
 }
-# A unit with an exponent that has no sign of its own, such as m/s2.
-BARE_EXPONENT = re.compile(r"(?<=[A-Za-z])([234])(?![\w.])")
+# A unit with an exponent that has no sign of its own, such as m/s2, and those of netCDF, such as m s-2.
+BARE_EXPONENT = re.compile(r"(?<=[A-Za-z])([234]|-[1-4])(?![\w.])")
 
 
 def from_file(name: str, values: np.ndarray, unit: float | str | Sequence[str] | None, stored: str) -> np.ndarray:

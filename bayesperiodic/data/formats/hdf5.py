@@ -66,6 +66,14 @@ def _channels(
     """Yield the columns of an array, or the array with the reason why it has none."""
     columns = dict(_columns(name, item))
     samples = max(item.shape)
+    if skipped := [
+        field
+        for field in item.dtype.names or ()
+        if columns and not any(label.startswith(f"{name}.{field}") for label in columns)
+    ]:
+        yield StoredChannel(
+            f"{name}.{skipped[0]}", samples, _nothing, group, refusal=f"fields {skipped}, which are no numbers"
+        )
     if not columns:
         shape = " x ".join(map(str, item.shape))
         refusal = f"of shape {shape} and type {item.dtype}, which is no table of columns of numbers; {OTHERWISE}"
@@ -106,10 +114,8 @@ def _columns(name: str, item: h5py.Dataset) -> Iterator[tuple[str, Column]]:
     kind = item.dtype
     longest = max(item.shape)
     if kind.names:
-        if np.prod(item.shape) == longest and not item.dtype.hasobject and set(kind.names) != {"r", "i"}:
-            for field in kind.names:
-                if kind[field].kind in "fiub" and np.prod(kind[field].shape) == 1:
-                    yield f"{name}.{field}", partial(_field, field=field)
+        if np.prod(item.shape) == longest and not kind.hasobject and set(kind.names) != {"r", "i"}:
+            yield from _field_columns(name, kind)
         return
     if kind.kind not in "fiub" and not h5py.check_string_dtype(kind):
         return
@@ -128,8 +134,21 @@ def _columns(name: str, item: h5py.Dataset) -> Iterator[tuple[str, Column]]:
             yield f"{name}[{k}, :]", partial(_row, k=k)
 
 
-def _field(array: np.ndarray, field: str) -> np.ndarray:
-    return np.ravel(array[field])
+def _field_columns(name: str, kind: np.dtype[Any]) -> Iterator[tuple[str, Column]]:
+    """Yield names and columns of the fields of a structure that are numbers, or a few numbers."""
+    for field in kind.names or ():
+        base, shape = kind[field].base, kind[field].shape
+        if base.kind not in "fiub" or len(shape) > 1 or np.prod(shape) > MOST_COLUMNS:
+            continue
+        if np.prod(shape) == 1:
+            yield f"{name}.{field}", partial(_field, field=field, k=0)
+        else:
+            for k in range(shape[0]):
+                yield f"{name}.{field}[:, {k}]", partial(_field, field=field, k=k)
+
+
+def _field(array: np.ndarray, field: str, k: int) -> np.ndarray:
+    return array[field].reshape(array.size, -1)[:, k]
 
 
 def _column(array: np.ndarray, k: int) -> np.ndarray:

@@ -178,14 +178,27 @@ def test_scale_that_changes_nothing_is_ignored(made):
 def test_columns_of_tables_and_fields_of_structures(made):
     table = np.stack([TIME, SWING, 2 * SWING], axis=1)
     fields = np.array([*zip(TIME, SWING, range(60), strict=True)], dtype=[("t", "f8"), ("x", ">f4"), ("n", "i2")])
+    block = np.zeros(60, dtype=[("index", "i8"), ("block", "f8", (2,)), ("note", "S4")])  # as pandas.to_hdf writes them
+    block["block"] = table[:, 1:]
     units = {"units": np.array(["s", "mm", "cm"], dtype=h5py.string_dtype())}
-    path = made(data=(table, units), rows=table.T, fields=fields, cube=np.zeros((20, 3, 2)), square=np.zeros((9, 9)))
+    path = made(
+        data=(table, units),
+        rows=table.T,
+        fields=fields,
+        block=block,
+        cube=np.zeros((20, 3, 2)),
+        square=np.zeros((9, 9)),
+    )
     run = read(path, "data[:, 2]", time="data[:, 0]")
     np.testing.assert_allclose(run.outputs["x"], 0.02 * SWING)
     assert np.array_equal(read(path, "rows[1, :]", time="rows[0, :]").outputs["x"], SWING)
     run = bp.Recording.from_file(path, time="fields.t", outputs={"x": "fields.x", "n": "fields.n"})
     np.testing.assert_allclose(run.outputs["x"], SWING, rtol=1e-6)
     assert run.outputs["n"].tolist() == [*range(60)] and np.array_equal(run.time, TIME)
+    assert np.array_equal(read(path, "block.block[:, 1]", time="fields.t").outputs["x"], 2 * SWING)
+    with pytest.raises(ValueError, match=r"must be usable, got fields \['note'\], which are no numbers"):
+        read(path, "block.note", time="fields.t")
+    assert "'data': 'data[:, 0]', 'data_2': 'data[:, 1]'" in bp.inspect(path).code
     for name in ("cube", "square"):
         with pytest.raises(
             ValueError, match=f"'{name}' of run.h5: must be usable, got of shape .* no table of columns"
@@ -222,6 +235,18 @@ def test_array_with_parts_that_were_not_written_is_refused(tmp_path):
         file.create_dataset("x", (60,), "f8", chunks=(20,))[:40] = 1.0
     with pytest.raises(ValueError, match="path: must be an HDF5 file, got .*parts of its variable 'x' are missing"):
         read(tmp_path / "run.h5", sampling_rate=1.0)
+
+
+def test_units_with_the_exponents_of_netcdf(made):
+    path = made(x=(SWING, {"units": "mm s-2"}))
+    np.testing.assert_allclose(read(path, sampling_rate=100.0).outputs["x"], 1e-3 * SWING)
+
+
+@pytest.mark.parametrize("start", [b"CDF\x01", b"CDF\x02", b"CDF\x05"])
+def test_netcdf_of_version_3_is_refused_with_its_conversion(tmp_path, start):
+    (tmp_path / "run.nc").write_bytes(start + bytes(100))
+    with pytest.raises(ValueError, match="a netCDF file of version 3; nccopy -k nc4 converts it"):
+        bp.inspect(tmp_path / "run.nc")
 
 
 def test_single_numbers_are_named(made):

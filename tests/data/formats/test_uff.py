@@ -124,6 +124,13 @@ def test_uneven_times_that_became_a_staircase_are_refused(saved):
     assert bp.inspect(path).channels[0].refused
 
 
+def test_uneven_times_that_are_displaced_by_a_part_of_a_step_are_refused(saved):
+    """600 Hz from 100 s on: six digits are 1 ms, so that steps of 1.67 ms become 1 or 2 ms."""
+    path = saved(function(x=100.0 + np.arange(50) / 600))
+    with pytest.raises(ValueError, match="time: must be known, .*rounded to 0.001 s, with a mean step of 0.00167 s"):
+        read(path)
+
+
 def test_uneven_times_with_sufficient_digits_are_taken(saved):
     times = np.cumsum(0.01 + 0.002 * np.sin(np.arange(50)))
     run = read(saved(function(x=times)))
