@@ -85,6 +85,13 @@ def test_other_chunks_are_skipped(read):
     assert read(wav(extra=extra, after=after)).outputs["x"].tolist() == FRACTIONS.tolist()
 
 
+def test_bytes_after_the_last_chunk_are_refused_unless_they_are_zero(read):
+    """A part of a chunk shows that the file is cut off; some recorders fill the file with zeros."""
+    assert read(wav() + bytes(5)).outputs["x"].tolist() == FRACTIONS.tolist()
+    with pytest.raises(ValueError, match="it has bytes after its last chunk"):
+        read(wav() + b"LIST")
+
+
 def test_size_in_a_chunk_of_64_bits_is_used(read):
     """RF64, as of files beyond 4 GB."""
     body = wav()[12:]
