@@ -249,6 +249,18 @@ def test_netcdf_of_version_3_is_refused_with_its_conversion(tmp_path, start):
         bp.inspect(tmp_path / "run.nc")
 
 
+@pytest.mark.parametrize("name", ["run.h5", "run.mat"])
+def test_damaged_heap_of_texts_is_refused_before_it_is_read(made, tmp_path, name):
+    """HDF5 2.0 does not come to an end for some of them."""
+    whole = bytearray(made(x=(SWING, {"units": "mm"})).read_bytes())
+    place = whole.index(b"GCOL")
+    assert whole[place + 16 : place + 18] == b"\1\0" and whole[place + 24 : place + 26] == b"\2\0"  # number and size
+    whole[place + 30] = 1
+    (tmp_path / name).write_bytes(whole)
+    with pytest.raises(ValueError, match="path: must be .*a heap of its texts is damaged"):
+        bp.inspect(tmp_path / name)
+
+
 def test_single_numbers_are_named(made):
     assert "single numbers, which are not used: fs" in str(bp.inspect(made(fs=100.0, x=SWING)))
 
