@@ -7,6 +7,10 @@ unpacks some kilobytes to gigabytes. Here such arrays are refused.
 import io
 import itertools
 import math
+import mmap
+import struct
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -14,6 +18,8 @@ import numpy as np
 
 # Filters of chunks: deflate, shuffle, Fletcher's checksum. Deflate packs at most so many bytes into one.
 FILTERS, DEFLATION = {1, 2, 3}, 1032
+# First bytes of a heap of texts of different lengths.
+HEAP = b"GCOL\x01"
 # How netCDF marks dimensions without values.
 DIMENSION_ONLY = b"This is a netCDF dimension but not a netCDF variable"
 
@@ -53,6 +59,54 @@ def _member(group: h5py.Group, name: str) -> h5py.Dataset | h5py.Group:
     return item
 
 
+def check_heaps(path: Path) -> None:
+    """Raise a ValueError for a damaged heap of texts, with some of which HDF5 2.0 does not come to an end.
+
+    A heap is a list of objects after a head of 16 bytes; an object is its number, counts and size, and its bytes.
+    """
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        start = -1
+        while (start := content.find(HEAP, start + 1)) >= 0:
+            size = int.from_bytes(content[start + 8 : start + 16], "little")
+            place, end = start + 16, start + size
+            while place + 16 <= end:
+                number, length = struct.unpack("<H6xQ", content[place : place + 16].ljust(16))
+                place += 16 + length + -length % 8 if number else length
+                if not (16 <= length or number) or place > end or end > len(content):
+                    raise ValueError("a heap of its texts is damaged")
+
+
+def walk(file: h5py.File) -> Iterator[tuple[str, str, h5py.Dataset | None]]:
+    """Yield group, name and array of all members of a file but groups, None for those that are not in the file.
+
+    Each group is visited once, also if several names lead to it.
+    """
+    groups, seen = [("", file["/"])], {h5py.h5o.get_info(file["/"].id).addr}
+    while groups:
+        path, group = groups.pop(0)
+        for name in group:
+            if not isinstance(name, str):  # bytes are no text
+                continue
+            try:
+                item = _member(group, name)
+            except ValueError:
+                yield path, name, None
+                continue
+            if isinstance(item, h5py.Dataset):
+                yield path, name, item
+            elif (address := h5py.h5o.get_info(item.id).addr) not in seen:
+                seen.add(address)
+                groups.append((f"{path}/{name}" if path else name, item))
+
+
+def at(file: h5py.File, path: str, name: str) -> h5py.Dataset:
+    """Return an array of a file by the path of its group."""
+    group = file["/"]
+    for part in path.split("/") if path else ():
+        group = _member(group, part)
+    return dataset(group, name)
+
+
 def values(item: h5py.Dataset, largest: float, remedy: str) -> Any:
     """Return the values of an array from `dataset`; raise a ValueError if some are missing, or they are too large."""
     _check(item, largest, f"than {largest / 1e9:.3g} GB; {remedy}")
@@ -82,7 +136,12 @@ def _check(item: h5py.Dataset, largest: float, limit: str) -> float:
     if size > largest:
         raise ValueError(f"its array {name!r} has more {limit}")
     packed = {plan.get_filter(k)[0] for k in range(plan.get_nfilters())}
-    if not packed <= FILTERS or size > DEFLATION * item.id.get_storage_size() or not _is_stored(item):
+    if not packed <= FILTERS:
+        raise ValueError(
+            f"parts of its variable {name!r} are missing or packed by a filter that is not read here ({packed}); "
+            "h5repack -f GZIP=4 converts the file"
+        )
+    if size > DEFLATION * item.id.get_storage_size() or not _is_stored(item):
         raise ValueError(f"parts of its variable {name!r} are missing")
     if item.dtype.hasobject:
         size = 0.0

@@ -50,8 +50,8 @@ AMBIGUOUS = {
 A_FACTOR = "a factor, such as 1.0 for values as they are"
 # Single letters that are no doubt the unit, and other texts that are no units but would be taken for some.
 LETTERS, NO_UNITS = set("msNVAKWJTHLlhΩ°%"), ("EU", "AU", "au", "cts", "units", "unit", "pk", "rms", "lin")
-# A unit with an exponent that has no sign of its own, such as m/s2.
-BARE_EXPONENT = re.compile(r"(?<=[A-Za-z])([234])(?![\w.])")
+# A unit with an exponent that has no sign of its own, such as m/s2, and those of netCDF, such as m s-2.
+BARE_EXPONENT = re.compile(r"(?<=[A-Za-z])([234]|-[1-4])(?![\w.])")
 
 
 def from_file(name: str, values: np.ndarray, unit: float | str | Sequence[str] | None, stored: str) -> np.ndarray:

@@ -48,6 +48,7 @@ SIGNATURES = {
     b"TDSm": "tdms", b"MDF     ": "mdf", b"UnFinMF ": "mdf", b"PAR1": "parquet", b"RIFF": "wav", b"RIFX": "wav",
     b"RF64": "wav", b"MATLAB 5.0": "mat", b"LabVIEW Measurement": "lvm",
 }  # fmt: skip
+NETCDF3 = "a netCDF file of version 3; nccopy -k nc4 converts it"
 # Files that no package of the extra `files` reads, and what to do with them.
 OTHERS = {
     b"\xd0\xcf\x11\xe0": "an old Excel file (.xls); save it as .xlsx",
@@ -58,6 +59,11 @@ OTHERS = {
     b"ARROW1": "an Arrow or Feather file; read it by pandas.read_feather for from_dataframe",
     b"\x93NUMPY": "one array (.npy); read it by numpy.load for from_arrays",
     b"%PDF": "a PDF file",
+    b"CDF\x01": NETCDF3,
+    b"CDF\x02": NETCDF3,
+    b"CDF\x05": NETCDF3,
+    b"riff\x2e\x91\xcf\x11": "a Wave64 file (.w64); save it as .wav",
+    b"fLaC": "a FLAC file; save it as .wav",
 }
 HDF5_SIGNATURE, MAT73 = b"\x89HDF\r\n\x1a\n", b"MATLAB 7.3"
 # Universal files begin with a line that has -1 in columns 5 and 6.

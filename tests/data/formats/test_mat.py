@@ -1,0 +1,129 @@
+"""MAT files: fields of structures by their path, objects refused with what to type in MATLAB."""
+
+import io
+import pathlib
+import struct
+import warnings
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+
+import bayesperiodic as bp
+from tests.data.test_damaged_files import damaged
+
+TIME = 0.01 * np.arange(50)
+SWING = np.sin(5 * TIME)
+NESTED = {
+    "data": {"t": TIME, "x": SWING, "deep": {"n": np.arange(50, dtype=np.int16), "note": "text"}, "z": SWING + 1j},
+    "y": 2 * SWING,
+}
+# Files that MATLAB 6.1 to 7.4 has written on several systems.
+MATLAB = pathlib.Path(scipy.io.__file__).parent / "matlab/tests/data"
+
+
+def element(kind, content, order="<"):
+    return struct.pack(f"{order}II", kind, len(content)) + content + bytes(-len(content) % 8)
+
+
+def opaque(name, kind, order="<"):
+    """Return an object as MATLAB stores it: flags, name, system of types, class and a reference."""
+    reference = element(6, struct.pack(f"{order}II", 13, 0), order) + element(5, struct.pack(f"{order}ii", 2, 1), order)
+    reference += element(1, b"", order) + element(6, struct.pack(f"{order}II", 0xDD000000, 2), order)
+    parts = element(6, struct.pack(f"{order}II", 17, 0), order)
+    for text in (name, "MCOS", kind):
+        parts += element(1, text.encode(), order)
+    return element(14, parts + element(14, reference, order), order)
+
+
+@pytest.fixture
+def saved(tmp_path):
+    def save(columns, compressed=False, more=b""):
+        content = io.BytesIO()
+        scipy.io.savemat(content, columns, do_compression=compressed)
+        (tmp_path / "run.mat").write_bytes(content.getvalue() + more)
+        return tmp_path / "run.mat"
+
+    return save
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_fields_of_structures_are_read_by_their_path(saved, compressed):
+    path = saved(NESTED, compressed)
+    run = bp.Recording.from_file(path, time="data.t", outputs={"x": "data.x", "n": "data.deep.n"}, inputs={"y": "y"})
+    assert np.array_equal(run.time, TIME) and np.array_equal(run.outputs["x"], SWING)
+    assert run.outputs["n"].tolist() == [*range(50)] and np.array_equal(run.inputs["y"], 2 * SWING)
+    with pytest.raises(ValueError, match=r"its variable 'data.z' is no array of real numbers, but complex"):
+        bp.Recording.from_file(path, time="data.t", outputs={"z": "data.z"})
+    with pytest.raises(ValueError, match=r"column of run.mat: must be one of .*Did you mean 'data.x'"):
+        bp.Recording.from_file(path, time="data.t", outputs={"x": "data.X"})
+
+
+def test_fields_of_structures_of_version_7_3(tmp_path):
+    with h5py.File(tmp_path / "run.mat", "w", userblock_size=512) as file:
+        for name, values in {"data/t": TIME, "data/deep/x": SWING, "#refs#/a": TIME, "y": SWING}.items():
+            file[name] = values[None]
+            file[name].attrs["MATLAB_class"] = np.bytes_("double")
+        file["data"].attrs["MATLAB_class"] = file["data/deep"].attrs["MATLAB_class"] = np.bytes_("struct")
+    run = bp.Recording.from_file(tmp_path / "run.mat", time="data.t", outputs={"x": "data.deep.x"})
+    assert np.array_equal(run.time, TIME) and np.array_equal(run.outputs["x"], SWING)
+    assert [one.name for one in bp.inspect(tmp_path / "run.mat").channels] == ["data", "y", "data.t", "data.deep.x"]
+
+
+@pytest.mark.parametrize(
+    "kind, typed",
+    [
+        ("table", "s = table2struct(T, 'ToScalar', true)"), ("timetable", "seconds(T.Properties.RowTimes"),
+        ("timeseries", "t = T.Time"), ("datetime", "t = seconds(T - T(1))"), ("MyClass", "x = double(T.x)"),
+    ],
+)  # fmt: skip
+def test_objects_are_refused_with_what_to_type_in_matlab(saved, tmp_path, kind, typed):
+    path = saved({"y": SWING}, more=opaque("T", kind))
+    with pytest.raises(
+        ValueError, match=f"column 'T' of run.mat: must be usable, got a MATLAB object .{kind}."
+    ) as error:
+        bp.Recording.from_file(path, sampling_rate=1.0, outputs={"x": "T"})
+    assert typed in str(error.value) and typed in str(bp.inspect(path))
+    assert np.array_equal(bp.Recording.from_file(path, sampling_rate=1.0, outputs={"y": "y"}).outputs["y"], SWING)
+    with h5py.File(tmp_path / "new.mat", "w", userblock_size=512) as file:
+        file["T"] = np.array([[0xDD000000, 2, 1, 1, 1, 1]], dtype=np.uint32)
+        file["T"].attrs.update({"MATLAB_class": np.bytes_(kind), "MATLAB_object_decode": 3})
+    with pytest.raises(ValueError, match=f"must be usable, got a MATLAB object .{kind}."):
+        bp.Recording.from_file(tmp_path / "new.mat", sampling_rate=1.0, outputs={"x": "T"})
+
+
+@pytest.mark.parametrize("path", sorted(MATLAB.glob("*.mat")), ids=lambda path: path.stem)
+def test_files_that_matlab_has_written_are_shown_or_refused(path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            shown = bp.inspect(path)
+        except ValueError as error:
+            assert "must be" in str(error)
+            return
+    str(shown).encode("cp1252")
+    stored = {}
+    if not path.name.startswith(("testhdf5", "bad", "malformed", "corrupted")):
+        stored = scipy.io.loadmat(path, struct_as_record=False, squeeze_me=True, mat_dtype=False)
+    for channel in shown.channels:
+        value = stored.get(channel.name)
+        if not channel.refused and isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.ndim == 1:
+            assert (channel.low, channel.high) == (value.min(), value.max())
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_damaged_file_is_refused_or_read_as_a_whole(saved, tmp_path, compressed):
+    whole, generator = saved(NESTED, compressed, opaque("T", "table")).read_bytes(), np.random.default_rng(3)
+    path = tmp_path / "run 7"
+    for _ in range(200):
+        path.write_bytes(damaged(whole, generator))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                bp.inspect(path, format="mat")
+                run = bp.Recording.from_file(path, time="data.t", outputs={"x": "data.x", "y": "y"}, format="mat")
+            except ValueError as error:
+                assert "must" in str(error)
+                continue
+        assert run.time.size == 50

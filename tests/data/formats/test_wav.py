@@ -1,0 +1,154 @@
+"""WAV files, written after their specification: samples at the right scale, or refused."""
+
+import struct
+import warnings
+import wave
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from tests.data.test_damaged_files import damaged
+
+# What follows the format in the identifier of an extensible header.
+GUID = {"<": bytes.fromhex("00001000800000aa00389b71"), ">": bytes.fromhex("00000010800000aa00389b71")}
+FRACTIONS = np.array([0.0, 0.25, -0.5, 0.75, -1.0, 0.125])
+
+
+def chunk(name, content, order="<", size=None):
+    return name + struct.pack(f"{order}I", len(content) if size is None else size) + content + bytes(len(content) % 2)
+
+
+def packed(values, kind, bits, order):
+    """Return the bytes of fractions of the full scale."""
+    if kind == 3:
+        return np.asarray(values, dtype=f"{order}f{bits // 8}").tobytes()
+    whole = [round(value * 2 ** (bits - 1)) for value in np.ravel(values)]
+    if bits == 8:
+        return bytes(128 + value for value in whole)
+    return b"".join(value.to_bytes(bits // 8, "little" if order == "<" else "big", signed=True) for value in whole)
+
+
+def wav(
+    values=FRACTIONS, kind=1, bits=16, order="<", *, channels=1, rate=51200, valid=None, extra=b"", after=b"",
+    data_size=None, file_size=None, form_bits=None, block=None, tag=None,
+):  # fmt: skip
+    block = block or channels * bits // 8
+    stated = form_bits or bits
+    form = struct.pack(f"{order}HHIIHH", tag or kind, channels, rate, rate * block, block, stated)
+    if valid:
+        form = struct.pack(f"{order}H", 0xFFFE) + form[2:]
+        form += struct.pack(f"{order}HHII", 22, valid, 0, kind) + GUID[order]
+    data = chunk(b"data", packed(values, kind, bits, order), order, data_size)
+    body = b"WAVE" + extra + chunk(b"fmt ", form, order) + data + after
+    start = b"RIFF" if order == "<" else b"RIFX"
+    return start + struct.pack(f"{order}I", len(body) if file_size is None else file_size) + body
+
+
+@pytest.fixture
+def read(tmp_path):
+    def reader(content, key="channel 1", **arguments):
+        path = tmp_path / "run.wav"
+        path.write_bytes(content)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            return bp.Recording.from_file(path, outputs={"x": key}, **arguments)
+
+    return reader
+
+
+@pytest.mark.parametrize("kind, bits", [(1, 8), (1, 16), (1, 24), (1, 32), (1, 64), (3, 32), (3, 64)])
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("extensible", [False, True])
+def test_samples_are_fractions_of_the_full_scale(read, kind, bits, order, extensible):
+    run = read(wav(kind=kind, bits=bits, order=order, valid=bits if extensible else None))
+    assert run.outputs["x"].tolist() == FRACTIONS.tolist()
+    np.testing.assert_allclose(run.time, np.arange(6) / 51200, rtol=1e-15)
+
+
+def test_24_bits_written_by_python_are_read_at_their_scale(tmp_path):
+    with wave.open(str(tmp_path / "run.wav"), "wb") as file:
+        file.setnchannels(2)
+        file.setsampwidth(3)
+        file.setframerate(48000)
+        file.writeframes(packed(np.transpose([FRACTIONS, FRACTIONS / 2]), 1, 24, "<"))
+    run = bp.Recording.from_file(
+        tmp_path / "run.wav", outputs={"x": "channel 2"}, inputs={"u": "channel 1"}, units={"u": 20.0}
+    )
+    assert run.outputs["x"].tolist() == (FRACTIONS / 2).tolist()
+    assert run.inputs["u"].tolist() == (20.0 * FRACTIONS).tolist()
+
+
+def test_other_chunks_are_skipped(read):
+    """A broadcast header before the format, a list of odd length and an index after the samples."""
+    extra, after = chunk(b"bext", bytes(603)), chunk(b"LIST", b"INFOabc") + chunk(b"smpl", bytes(36))
+    assert read(wav(extra=extra, after=after)).outputs["x"].tolist() == FRACTIONS.tolist()
+
+
+def test_bytes_after_the_last_chunk_are_refused_unless_they_are_zero(read):
+    """A part of a chunk shows that the file is cut off; some recorders fill the file with zeros."""
+    assert read(wav() + bytes(5)).outputs["x"].tolist() == FRACTIONS.tolist()
+    with pytest.raises(ValueError, match="it has bytes after its last chunk"):
+        read(wav() + b"LIST")
+
+
+def test_size_in_a_chunk_of_64_bits_is_used(read):
+    """RF64, as of files beyond 4 GB."""
+    body = wav()[12:]
+    body = body.replace(b"data" + struct.pack("<I", 12), b"data" + b"\xff" * 4)
+    long = chunk(b"ds64", struct.pack("<QQQI", len(body) + 40, 12, 6, 0))
+    assert read(b"RF64" + b"\xff" * 4 + b"WAVE" + long + body).outputs["x"].tolist() == FRACTIONS.tolist()
+
+
+def test_valid_bits_are_the_upper_ones_and_others_are_refused(read):
+    """20 bits in 24, as the specification says; lower ones would be 16 times too small."""
+    assert read(wav(bits=24, valid=20)).outputs["x"].tolist() == FRACTIONS.tolist()
+    assert read(wav(bits=16, form_bits=12)).outputs["x"].tolist() == FRACTIONS.tolist()
+    with pytest.raises(ValueError, match="samples of 24 bits have more than the 20 that its header says"):
+        read(wav(FRACTIONS / 2**18, bits=24, valid=20))
+    with pytest.raises(ValueError, match="have 24 of 24 bits in 4 bytes, which has several meanings"):
+        read(wav(bits=32, form_bits=24))
+
+
+@pytest.mark.parametrize("lost", [1, 2, 5, 11])
+def test_file_that_is_cut_off_is_refused(read, lost):
+    whole = wav()
+    with pytest.raises(ValueError, match="path: must be a WAV file .*cut off"):
+        read(whole[:-lost])
+    resized = whole[:4] + struct.pack("<I", len(whole) - 8 - lost) + whole[8:-lost]
+    with pytest.raises(ValueError, match="path: must be a WAV file .*cut off"):
+        read(resized)
+
+
+@pytest.mark.parametrize("size", [0, 4, 6, 11, 13, 14, 2**31, 2**32 - 1])
+def test_wrong_size_of_the_samples_is_refused(read, size):
+    with pytest.raises(ValueError, match="must be a WAV file"):
+        read(wav(data_size=size))
+
+
+def test_two_chunks_of_samples_are_refused(read):
+    with pytest.raises(ValueError, match="it has 2 chunks of samples"):
+        read(wav(after=chunk(b"data", bytes(12))))
+
+
+@pytest.mark.parametrize("tag", [2, 6, 7, 0x11, 0x55, 0])
+def test_compressed_samples_are_refused(read, tag):
+    with pytest.raises(ValueError, match="must be a WAV file of samples without compression"):
+        read(wav(tag=tag or 0x50))
+
+
+@pytest.mark.parametrize("arguments", [{}, {"bits": 24, "valid": 24}, {"kind": 3, "bits": 32, "channels": 2}])
+def test_damaged_file_is_refused_or_read_as_a_whole(tmp_path, arguments):
+    whole, generator = wav(np.tile(FRACTIONS, 20), after=chunk(b"LIST", b"INFOabc"), **arguments), None
+    path, generator = tmp_path / "run 7", np.random.default_rng(3)
+    for _ in range(200):
+        path.write_bytes(damaged(whole, generator))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                bp.inspect(path, format="wav")
+                run = bp.Recording.from_file(path, outputs={"x": "channel 1"}, format="wav", missing="drop")
+            except ValueError as error:
+                assert "must" in str(error)
+                continue
+        assert 2 <= run.time.size <= 120
