@@ -72,7 +72,7 @@ def unit_row(cells: list[str]) -> list[str] | None:
     """Return the units in the row below the names, or None if it is none."""
     texts = [unbracketed(cell) for cell in cells]
     given = [text for text in texts if text]
-    if not given or sum(map(known, given)) * 2 < len(given) or all(text == "-" for text in given):
+    if not given or sum(map(known, given)) * 2 <= len(given) or all(text == "-" for text in given):
         return None
     return texts
 

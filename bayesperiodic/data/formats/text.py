@@ -168,7 +168,8 @@ def _columns(file: Text, top: Head, places: list[int], notation: _Notation) -> t
             f"date_format: must be that of all cells of a column of {file.path.name!r}, got {notation.date_format!r}, and "
             f"cells such as {cell!r}."
         )
-    return result, decimal if evidence.decimal | evidence.either | evidence.thousands else "", rows
+    shown = sign or ("." if "," not in evidence.decimal | evidence.either else "")
+    return result, shown if evidence.decimal | evidence.either | evidence.thousands else "", rows
 
 
 def _converted(
@@ -207,7 +208,7 @@ def _suggested_time(channels: list[StoredChannel], read: Read) -> str:
         if refusal:
             continue
         if values.dtype.kind in "mM" or texts:
-            dated.append(channel.name)
+            dated += [channel.name] if values.size > 1 and values[0] != values[-1] else []
         elif name and values.dtype.kind in "fiu" and values.size > 1 and (np.diff(values) > 0).all():
             return channel.name
     return dated[0] if dated else ""
@@ -232,7 +233,7 @@ def _table(file: Text, top: Head, places: list[int], decimal: str) -> tuple[dict
             if alone:
                 source = io.StringIO(source.read().rstrip())
             elif len(places) * UNWANTED_RATIO < width or separator == BLANKS and top.more > 0:
-                source = _narrowed(rows_of(source, separator), places, width, width + surplus)
+                source = _narrowed(rows_of(source, separator, strict=True), places, width, width + surplus)
                 at = {place: k for k, place in enumerate(places)}
                 width, surplus, separator = len(places) + 1, 1, NARROW
             missing: Any = dict(enumerate([MISSING] * width + [[""]] * surplus))
@@ -312,7 +313,7 @@ def _refuse_summaries(file: Text, top: Head) -> None:
             ending = content.read().decode(file.encoding, errors="replace")
     columns = [
         place for place in range(len(top.names))
-        if all(USABLE.fullmatch(row[place]) for row in top.sample[:5] if place < len(row) and row[place] not in MISSING)
+        if 2 * sum(place < len(row) and USABLE.fullmatch(row[place]) is not None for row in top.sample) >= len(top.sample)
     ]  # fmt: skip
     try:
         rows = [*rows_of(ending.splitlines()[1:], top.separator)]

@@ -40,8 +40,7 @@ class Evidence:
                 decimal.add("," if "," in cell else ".")
             elif match := GROUPED.fullmatch(cell):
                 thousands.add(match["mark"])
-                if match["mark"] in ",." and (other := {",": ".", ".": ","}[match["mark"]]) in cell:
-                    decimal.add(other)
+                decimal |= {other for other in ",." if other in cell and other != match["mark"]}
         return cls(frozenset(decimal), frozenset(thousands), frozenset(either))
 
     def __or__(self, other: "Evidence") -> "Evidence":

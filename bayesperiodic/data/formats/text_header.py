@@ -47,6 +47,7 @@ class Head:
     units: list[str] = field(default_factory=list)
     titled: bool = True  # whether there is a line of names
     sample: list[list[str]] = field(default_factory=list)  # first rows of the data
+    even: bool = True  # whether the row below the names has as many fields, apart from empty ones
 
     @property
     def remark(self) -> str:
@@ -57,11 +58,11 @@ class Head:
         )
 
 
-def rows_of(text: Iterable[str], separator: str) -> Iterator[list[str]]:
+def rows_of(text: Iterable[str], separator: str, *, strict: bool = False) -> Iterator[list[str]]:
     """Return the fields of the rows of a text."""
     if separator == BLANKS:
         return (line.split() for line in text)
-    return csv.reader(text, delimiter=separator, skipinitialspace=True)
+    return csv.reader(text, delimiter=separator, skipinitialspace=True, strict=strict)
 
 
 def skip(text: TextIO, lines: int, separator: str) -> Iterator[list[str]]:
@@ -87,7 +88,8 @@ def head(file: Text, wanted: list[str], separator: str | None, line: int | None)
     if best and (seen is None or {*wanted} & {*best.names}):
         if seen is None and not {*wanted} & {*best.names}:
             _refuse_others(file)
-        return _with_units(file, best)
+        if best.separator != BLANKS or {*wanted} & {*best.names}:
+            return _with_units(file, best)
     if seen is None:
         _refuse_others(file)
         raise ValueError(
@@ -134,7 +136,7 @@ def _by_names(file: Text, wanted: list[str], separator: str | None) -> Head:
             if not headers and candidate == candidates[-1]:
                 raise
     complete = [one for one in headers if {*wanted} <= {*one.names, *numbered(one.names)}]
-    even = [one for one in complete if one.more == 0]
+    even = [one for one in complete if one.even]
     if even or complete:
         return (even or complete)[0]
     return max(headers, key=lambda one: (len({*wanted} & {*one.names}), len(one.names)))
@@ -145,7 +147,7 @@ def _line_of_names(file: Text, wanted: list[str], separator: str) -> Head:
 
     Without a line of all names, that with most of them tells what is missing.
     """
-    most, names, number, more, following = -1, [""], 0, 0, False
+    most, names, number, more, following, even = -1, [""], 0, 0, False, True
     with file.open() as text:
         for line, row in _numbered_rows(text, separator):
             if line > PREAMBLE and not following:
@@ -153,16 +155,18 @@ def _line_of_names(file: Text, wanted: list[str], separator: str) -> Head:
             if not row:
                 continue
             if following:
+                row = row[0].split() if separator == BLANKS else row
                 more, following = len(row) - len(names), False
+                even = more >= 0 and not any(map(str.strip, row[len(names) :]))
                 if most == len({*wanted}):
                     break
             for fields in _names_in(row, separator):
                 if (count := len({*wanted} & {*fields, *numbered(fields)})) > most:
-                    most, number, more, following = count, line, 0, True
+                    most, number, more, following, even = count, line, 0, True, True
                     names = fields[: max((i for i, name in enumerate(fields, 1) if name), default=len(fields))]
     if most < 0:
         raise ValueError(f"path: must be a CSV file with a header line, got {file!r}, which is empty.")
-    return Head(names, number, more, separator)
+    return Head(names, number, more, separator, even=even)
 
 
 def _numbered_rows(text: TextIO, separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -178,7 +182,7 @@ def _names_in(row: list[str], separator: str) -> Iterator[list[str]]:
     """Yield the names that a row may contain."""
     if separator == BLANKS:
         line = row[0].strip()
-        for text in {line: 0, COMMENT_MARK.sub("", line): 0}:
+        for text in {COMMENT_MARK.sub("", line): 0, line: 0}:
             yield from (re.split(blanks, text) for blanks in NAME_BLANKS)
         return
     fields = [name.strip() for name in row]
@@ -256,7 +260,7 @@ def _block(lines: list[str], separator: str, start: int) -> _Block | None:
     rows: list[tuple[int, list[str]]] = []
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=True) if separator != BLANKS else None
     try:
-        for number, row in enumerate(reader, 1) if reader else enumerate(map(str.split, lines), 1):
+        for number, row in enumerate(reader or (COMMENT_MARK.sub("", line).split() for line in lines), 1):
             if any(map(str.strip, row)):
                 rows.append((reader.line_num if reader else number, [cell.strip() for cell in row]))
     except csv.Error:
@@ -302,6 +306,12 @@ def _by_evidence(file: Text, separator: str | None, line: int | None) -> Head | 
     best = max(usable, key=lambda block: block.covered)
     if best.width == 1 and not separator:
         best = _one_or_several(file, best, usable, line)
+    others = [row for number, row in best.rows[: best.first] if number > start and len(row) > 1]
+    if sum(all(map(USABLE.fullmatch, row)) for row in others) > 1:
+        raise ValueError(
+            f"path: must be a CSV file with one table, got {file!r}, which has rows of {best.width} fields after rows of "
+            "numbers with other ones; save each table as a file of its own."
+        )
     names, names_line, units = _names_above(best, line)
     data = best.rows[best.first :]
     real = max((k + 1 for _, row in data for k, cell in enumerate(row[: best.width]) if cell), default=best.width)
@@ -355,8 +365,9 @@ def _names_above(block: _Block, line: int | None) -> tuple[list[str], int, list[
         below = [row for number, row in block.rows[: block.first] if number > line]
         if below:
             units = _units_of(below[-1], following, block.width, block.separator) or []
-    elif len(above) > 1 and (below_units := _units_of(above[-1][1], following, block.width, block.separator)):
-        units, above = below_units, above[:-1]
+    elif len(above) > 1 and len(above[-2][1]) >= len(_trimmed(above[-1][1])) > 0:
+        if below_units := _units_of(above[-1][1], following, block.width, block.separator):
+            units, above = below_units, above[:-1]
     if not above or (line and above[-1][0] != line):
         raise ValueError(f"header: must be the number of the line of the names, or 0 for none, got {line!r}.")
     names = above[-1][1]
@@ -365,10 +376,15 @@ def _names_above(block: _Block, line: int | None) -> tuple[list[str], int, list[
         names = _blank_names(text, names, block.width)
     elif names[0][:1] in ("#", "%"):
         names = [COMMENT_MARK.sub("", names[0]), *names[1:]]
-    names = names[: max((i for i, name in enumerate(names, 1) if name), default=0)]
+    names = _trimmed(names)
     if line is None and any(NUMBER.fullmatch(name) or re.fullmatch(DATE, name) for name in names if name):
         return [], 0, []
     return names, last, units
+
+
+def _trimmed(row: list[str]) -> list[str]:
+    """Return fields without empty ones at the end."""
+    return row[: max((i for i, field in enumerate(row, 1) if field), default=0)]
 
 
 def _blank_names(text: str, fields: list[str], width: int) -> list[str]:
