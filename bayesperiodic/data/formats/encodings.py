@@ -51,8 +51,11 @@ def opened(path: Path, encoding: str | None) -> Text:
     marked = next((name for mark, name in MARKS.items() if head.startswith(mark)), "")
     if marked:
         return Text(path, marked, f"encoding {marked!r}, by its byte order mark", _check(path, marked))
-    if (other := _other_bytes(path)) is None:
+    try:
         return Text(path, "utf-8", "", _check(path, "utf-8"))
+    except _Undecoded as error:
+        if (other := _other_bytes(path)) is None:
+            raise ValueError(str(error)) from None
     last, shown = _check(path, "cp1252"), ", ".join(repr(one) for one in other.decode("cp1252")[:8])
     return Text(
         path,
@@ -64,17 +67,7 @@ def opened(path: Path, encoding: str | None) -> Text:
 
 
 def _other_bytes(path: Path) -> bytes | None:
-    """Return the bytes above 127 of a text that may be in cp1252; None of one that is in UTF-8, perhaps damaged."""
-    try:
-        decoder = codecs.getincrementaldecoder("utf-8")()
-        with path.open("rb") as content:
-            for part in iter(lambda: content.read(PART_BYTES), b""):
-                decoder.decode(part)
-        if decoder.getstate()[0]:  # it ends within a letter
-            return None
-        return None
-    except UnicodeDecodeError:
-        pass
+    """Return the bytes above 127 of a text that may be in cp1252; None of one in UTF-8 that was damaged."""
     used: set[int] = set()
     ascii_bytes = bytes(range(128))
     with path.open("rb") as content:
@@ -90,21 +83,24 @@ def _other_bytes(path: Path) -> bytes | None:
     return other
 
 
+class _Undecoded(ValueError):
+    """A byte is not in the encoding."""
+
+
 def _check(path: Path, encoding: str) -> int:
     """Return the last line that begins with a number sign.
 
     Raise a ValueError if the file is not in its encoding, or contains characters 0, at which numbers end.
     """
     name = "UTF-8" if encoding == "utf-8" else encoding
-    line, last, decoder = 1, 0, codecs.getincrementaldecoder(encoding)()
-    before = "\n"
+    comment, before, decoder = (0, 0), "\n", codecs.getincrementaldecoder(encoding)()
     with path.open("rb") as content:
-        for part in itertools.chain(iter(lambda: content.read(PART_BYTES), b""), [b""]):
+        for number, part in enumerate(itertools.chain(iter(lambda: content.read(PART_BYTES), b""), [b""])):
             try:
                 text = decoder.decode(part, final=not part)
             except UnicodeDecodeError as error:
-                line += error.object[: error.start].count(b"\n")
-                raise ValueError(
+                line = _lines(path, number * PART_BYTES) + error.object[: error.start].count(b"\n") + 1
+                raise _Undecoded(
                     f"path: must be a CSV file in {name}, got {str(path)!r}, whose line {line} has the byte "
                     f"0x{error.object[error.start]:02x}; it may be in Latin-1, encoding='latin-1', or in that of the "
                     "program which wrote it, such as encoding='cp1252' of Windows."
@@ -116,7 +112,12 @@ def _check(path: Path, encoding: str) -> int:
                 )
             if "#" in text:
                 for match in COMMENT.finditer(before + text):
-                    last = line + text.count("\n", 0, match.end() - 1)
-            line += text.count("\n")
+                    comment = number, text.count("\n", 0, match.end() - 1)
             before = text[-1:] or before
-    return last
+    return _lines(path, comment[0] * PART_BYTES) + comment[1] + 1 if comment != (0, 0) else 0
+
+
+def _lines(path: Path, size: int) -> int:
+    """Return the ends of lines in the first bytes of a file."""
+    with path.open("rb") as content:
+        return sum(content.read(PART_BYTES).count(b"\n") for _ in range(0, size, PART_BYTES))

@@ -32,6 +32,8 @@ from bayesperiodic.data.formats.text_header import (
 
 # Columns per wanted column above which the others are not made numbers, and the separator of the wanted ones.
 UNWANTED_RATIO, NARROW = 2, "\x1f"
+# Rows that pandas reads at once.
+PART_ROWS = 100_000
 # Bytes at the end of a file among which rows of summaries are searched for, and their first words.
 TAIL_BYTES = 2**14
 SUMMARY = re.compile(
@@ -165,8 +167,8 @@ def _columns(file: Text, top: Head, places: list[int], notation: _Notation) -> t
     if notation.date_format and not any(values.dtype.kind in "mM" for values, _, _ in result.values()):
         cell = next((cell for values in texts.values() for cell in values if isinstance(cell, str)), "numbers")
         raise ValueError(
-            f"date_format: must be that of all cells of a column of {file.path.name!r}, got {notation.date_format!r}, and "
-            f"cells such as {cell!r}."
+            f"date_format: must be that of all cells of a column of {file.path.name!r}, got {notation.date_format!r}, "
+            f"and cells such as {cell!r}."
         )
     shown = sign or ("." if "," not in evidence.decimal | evidence.either else "")
     return result, shown if evidence.decimal | evidence.either | evidence.thousands else "", rows
@@ -237,29 +239,64 @@ def _table(file: Text, top: Head, places: list[int], decimal: str) -> tuple[dict
                 at = {place: k for k, place in enumerate(places)}
                 width, surplus, separator = len(places) + 1, 1, NARROW
             missing: Any = dict(enumerate([MISSING] * width + [[""]] * surplus))
-            table = pd.read_csv(
-                source,
-                skip_blank_lines=not alone,
-                sep=r"\s+" if separator == BLANKS else separator,
-                decimal=decimal,
-                header=None,
-                names=range(width + surplus),
-                index_col=False,
-                skipinitialspace=True,
-                low_memory=False,
-                keep_default_na=False,
-                na_values=missing,
-            )
+            options: dict[str, Any] = {
+                "skip_blank_lines": not alone,
+                "sep": r"\s+" if separator == BLANKS else separator,
+                "decimal": decimal,
+                "header": None,
+                "names": range(width + surplus),
+                "index_col": False,
+                "skipinitialspace": True,
+                "low_memory": False,
+                "keep_default_na": False,
+                "na_values": missing,
+            }
+            start = source.tell() if source is not text else None
+            table = _in_parts(source, options)
+            if table is None:
+                if start is None:
+                    text.seek(0)
+                    skip(text, lines, top.separator)
+                else:
+                    source.seek(start)
+                table = _frame(pd.read_csv(source, **options))
     except (pd.errors.ParserError, pd.errors.ParserWarning, _OtherFields) as error:
         _check_fields(file, top)
         raise ValueError(f"path: must be a CSV file with a header line, got {file!r} ({error}).") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"path: must be a CSV file with a header line, got {file!r} ({error}).") from None
-    if table.empty:
+    if not table[0].size:
         raise ValueError(f"path: must be a CSV file with rows of data, got {file!r}, which has none.")
-    if table.iloc[:, width:].notna().any(axis=None) or table[width - 1].isna().any():
+    if any(pd.notna(table[k]).any() for k in range(width, width + surplus)) or pd.isna(table[width - 1]).any():
         _check_fields(file, top)
-    return {place: table[k].to_numpy() for place, k in at.items()}, len(table)
+    return {place: table[k] for place, k in at.items()}, table[0].size
+
+
+def _frame(table: Any) -> dict[int, np.ndarray]:
+    return {k: table[k].to_numpy() for k in table}
+
+
+def _in_parts(source: Any, options: dict[str, Any]) -> dict[int, np.ndarray] | None:
+    """Return columns that pandas reads part by part, or None if parts of a column are of different kinds.
+
+    It takes two thirds of the time of the whole at once.
+    """
+    import pandas as pd
+
+    try:
+        with pd.read_csv(source, chunksize=PART_ROWS, **options) as parts:
+            tables = [_frame(part) for part in parts]
+    except pd.errors.EmptyDataError:
+        return {k: np.empty(0) for k in options["names"]}
+    if not tables:
+        return {k: np.empty(0) for k in options["names"]}
+    columns = {}
+    for k in [*tables[0]]:
+        kinds = {table[k].dtype.str for table in tables}
+        if len(kinds) > 1 and not kinds <= {"<i8", "<f8"}:
+            return None
+        columns[k] = tables[0][k] if len(tables) == 1 else np.concatenate([table.pop(k) for table in tables])
+    return columns
 
 
 class _OtherFields(Exception):
@@ -313,7 +350,7 @@ def _refuse_summaries(file: Text, top: Head) -> None:
             ending = content.read().decode(file.encoding, errors="replace")
     columns = [
         place for place in range(len(top.names))
-        if 2 * sum(place < len(row) and USABLE.fullmatch(row[place]) is not None for row in top.sample) >= len(top.sample)
+        if 2 * sum(place < len(row) and bool(USABLE.fullmatch(row[place])) for row in top.sample) >= len(top.sample)
     ]  # fmt: skip
     try:
         rows = [*rows_of(ending.splitlines()[1:], top.separator)]

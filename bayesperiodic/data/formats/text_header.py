@@ -135,10 +135,12 @@ def _by_names(file: Text, wanted: list[str], separator: str | None) -> Head:
         except csv.Error:  # a long line is one field for another separator than its own
             if not headers and candidate == candidates[-1]:
                 raise
+            continue
+        if headers[-1].even and {*wanted} <= {*headers[-1].names}:
+            return headers[-1]
     complete = [one for one in headers if {*wanted} <= {*one.names, *numbered(one.names)}]
-    even = [one for one in complete if one.even]
-    if even or complete:
-        return (even or complete)[0]
+    if complete:
+        return next((one for one in complete if one.even), complete[0])
     return max(headers, key=lambda one: (len({*wanted} & {*one.names}), len(one.names)))
 
 
@@ -309,8 +311,8 @@ def _by_evidence(file: Text, separator: str | None, line: int | None) -> Head | 
     others = [row for number, row in best.rows[: best.first] if number > start and len(row) > 1]
     if sum(all(map(USABLE.fullmatch, row)) for row in others) > 1:
         raise ValueError(
-            f"path: must be a CSV file with one table, got {file!r}, which has rows of {best.width} fields after rows of "
-            "numbers with other ones; save each table as a file of its own."
+            f"path: must be a CSV file with one table, got {file!r}, which has rows of {best.width} fields after "
+            "rows of numbers with other ones; save each table as a file of its own."
         )
     names, names_line, units = _names_above(best, line)
     data = best.rows[best.first :]
@@ -319,8 +321,8 @@ def _by_evidence(file: Text, separator: str | None, line: int | None) -> Head | 
         real = max(i for i, name in enumerate(names, 1) if name)
     if len(names) != real and len(names) > 1:
         raise ValueError(
-            f"header: must be given for {file.path.name!r}, in which the line above the data has {len(names)} fields for "
-            f"{real} columns; give the number of the line of names, or header=0 for none."
+            f"header: must be given for {file.path.name!r}, in which the line above the data has {len(names)} "
+            f"fields for {real} columns; give the number of the line of names, or header=0 for none."
         )
     if len(names) != real:
         previous = best.rows[best.first - 1][0] if best.first else 0
