@@ -79,7 +79,7 @@ def test_error_for_other_files_names_the_rightreader(csv, tmp_path):
 @pytest.mark.parametrize("text", ["0.0,1.5\n0.1,2.5\n", "0.0;1.5\n0.1;2.5\n", "0.0\t1.5\n0.1\t2.5\n"])
 def test_columns_of_a_csv_file_without_header_have_numbers(tmp_path, text):
     (tmp_path / "run.csv").write_text(text)
-    with pytest.raises(ValueError, match=r"column of run.csv: must be 'column 1' or 'column 2', got 't'"):
+    with pytest.raises(ValueError, match=r"column of run.csv: must be one of 'column 1', 'column 2', got 't'"):
         bp.Recording.from_csv(tmp_path / "run.csv", time="t", outputs={"x": "x"})
     assert bp.Recording.from_csv(tmp_path / "run.csv", time=1, outputs={"x": 2}).outputs["x"].tolist() == [1.5, 2.5]
 

@@ -100,7 +100,8 @@ def _check(path: Path, encoding: str) -> int:
                 text = decoder.decode(part, final=not part)
             except UnicodeDecodeError as error:
                 line = _lines(path, number * PART_BYTES) + error.object[: error.start].count(b"\n") + 1
-                raise _Undecoded(
+                cut_off = not part  # within a letter
+                raise (ValueError if cut_off else _Undecoded)(
                     f"path: must be a CSV file in {name}, got {str(path)!r}, whose line {line} has the byte "
                     f"0x{error.object[error.start]:02x}; it may be in Latin-1, encoding='latin-1', or in that of the "
                     "program which wrote it, such as encoding='cp1252' of Windows."

@@ -122,7 +122,7 @@ def _formatted(texts: Any, date_format: str) -> tuple[np.ndarray | None, str, st
     values = (read.dt.tz_convert(None) if "%z" in date_format else read).to_numpy()
     remark = f"dates in the format {date_format!r}, as given"
     if not any(part in date_format for part in ("%d", "%j", "%D", "%c", "%x", "%y", "%Y", "%m")):
-        return *_rolled(values - np.datetime64("1900-01-01")), ""
+        return *rolled(values - np.datetime64("1900-01-01")), ""
     return values, remark, ""
 
 
@@ -152,10 +152,10 @@ def _times_of_day(texts: Any) -> tuple[np.ndarray | None, str, str]:
         values = pd.to_timedelta(texts).to_numpy()
     except (ValueError, OverflowError):
         return None, "", ""
-    return *_rolled(values), ""
+    return *rolled(values), ""
 
 
-def _rolled(values: np.ndarray) -> tuple[np.ndarray, str]:
+def rolled(values: np.ndarray) -> tuple[np.ndarray, str]:
     """Return times of day with a day added after each midnight."""
     known = ~np.isnat(values)
     steps = np.diff(values[known])

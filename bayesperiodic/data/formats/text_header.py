@@ -159,7 +159,7 @@ def _line_of_names(file: Text, wanted: list[str], separator: str) -> Head:
             if following:
                 row = row[0].split() if separator == BLANKS else row
                 more, following = len(row) - len(names), False
-                even = more >= 0 and not any(map(str.strip, row[len(names) :]))
+                even = more >= 0 and not any(map(str.strip, row[len(names) :])) and row[0][:1] != ","
                 if most == len({*wanted}):
                     break
             for fields in _names_in(row, separator):
