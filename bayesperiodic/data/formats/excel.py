@@ -120,6 +120,7 @@ def _table(rows: list[tuple[Any, ...]], line: int | None, sheet: str) -> _Table 
     start = line or 0
     width = max(map(len, rows))
     part = rows[start : start + PREAMBLE + 400]
+    part = part[-max(len(part) // 3, 3) :]  # below what may stand above the table
     values = [sum(_is_value(row[k]) for row in part if k < len(row)) for k in range(width)]
     filled = [sum(not _is_empty(row[k]) for row in part if k < len(row)) for k in range(width)]
     columns = [k for k in range(width) if values[k] and 2 * values[k] >= filled[k]]

@@ -157,9 +157,9 @@ def _line_of_names(file: Text, wanted: list[str], separator: str) -> Head:
             if not row:
                 continue
             if following:
-                row = row[0].split() if separator == BLANKS else row
-                more, following = len(row) - len(names), False
-                even = more >= 0 and not any(map(str.strip, row[len(names) :])) and row[0][:1] != ","
+                below = row[0].split() if separator == BLANKS else row
+                more, following = len(below) - len(names), False
+                even = more >= 0 and not any(map(str.strip, below[len(names) :])) and below[0][:1] != ","
                 if most == len({*wanted}):
                     break
             for fields in _names_in(row, separator):
@@ -283,7 +283,7 @@ def _of_width(
     data = [row for number, row in rows if len(row) == width and number > start]
     columns, covered = [], 0
     for place in range(width):
-        cells = [row[place] for row in data if row[place] not in MISSING]
+        cells = [row[place] for row in data[-max(len(data) // 3, 3) :] if row[place] not in MISSING]
         usable = [cell for cell in cells if USABLE.fullmatch(cell)]
         if usable and 2 * len(usable) >= len(cells):
             columns.append(place)
@@ -291,8 +291,9 @@ def _of_width(
     if not columns:
         return None
     for first, (number, row) in enumerate(rows):
-        if number > start and len(row) == width and all(_is_value(row[k]) for k in columns):
-            if any(row[k] not in MISSING for k in columns):
+        if number > start and len(row) == width:
+            given = [row[k] for k in columns if row[k] not in MISSING]
+            if 2 * sum(map(bool, map(USABLE.fullmatch, given))) > len(given):
                 return _Block(separator, lines, rows, width, columns, first, covered)
     return None
 
@@ -319,7 +320,8 @@ def _by_evidence(file: Text, separator: str | None, line: int | None) -> Head | 
     real = max((k + 1 for _, row in data for k, cell in enumerate(row[: best.width]) if cell), default=best.width)
     if line and names:
         real = max(i for i, name in enumerate(names, 1) if name)
-    if len(names) != real and len(names) > 1:
+    commented = best.first > 0 and best.lines[best.rows[best.first - 1][0] - 1].lstrip()[:1] in ("#", "%")
+    if len(names) != real and len(names) > 1 and not commented:
         raise ValueError(
             f"header: must be given for {file.path.name!r}, in which the line above the data has {len(names)} "
             f"fields for {real} columns; give the number of the line of names, or header=0 for none."
@@ -380,6 +382,11 @@ def _names_above(block: _Block, line: int | None) -> tuple[list[str], int, list[
         names = [COMMENT_MARK.sub("", names[0]), *names[1:]]
     names = _trimmed(names)
     if line is None and any(NUMBER.fullmatch(name) or re.fullmatch(DATE, name) for name in names if name):
+        if len(above[-1][1]) == block.width and USABLE.fullmatch(above[-1][1][block.columns[0]]):
+            raise ValueError(
+                f"header: must be given, got None, as line {above[-1][0]} has neither names nor only numbers, "
+                f"{_checks.shortened(above[-1][1])}; give the number of the line of names, or header=0 for none."
+            )
         return [], 0, []
     return names, last, units
 

@@ -60,7 +60,7 @@ def test_any_combination_of_signs_is_recognised(write, seed):
     form = draw.choice(["{:.3f}", "{:.6e}", "{:+.4f}", "{:.12g}"])
     table = [[0.01 * k, draw.uniform(-2e3, 2e3), draw.uniform(-1, 1)] for k in range(draw.randint(3, 40))]
     rows = [[quote + form.format(x).replace(".", decimal) + quote for x in row] for row in table]
-    lines = [draw.choice(["Rig 3", "# made by hand", ""]) for _ in range(draw.randint(0, 4))]
+    lines = [draw.choice(["Rig 3", "# by hand", ""]) for _ in range(draw.randint(0, 4))]
     titled = draw.random() < 0.7
     if titled:
         lines.append(draw.choice(["", "# "]) + blank.join(["time", "x [mm]", "F [N]"]))
