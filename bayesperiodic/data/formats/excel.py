@@ -1,7 +1,11 @@
 """Excel workbooks: the table of each sheet, with dates and times of day."""
 
+import contextlib
 import datetime
+import itertools
+import warnings
 import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,7 +16,7 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.formats import header_units, text_cells
 from bayesperiodic.data.formats.contents import LARGEST_ARRAY, Contents, Key, StoredChannel, package, unique_names
-from bayesperiodic.data.formats.text_header import NUMBER, PREAMBLE
+from bayesperiodic.data.formats.text_header import NUMBER, PREAMBLE, TIME_NAME
 
 # Unpacked bytes per packed byte above which a member of a workbook is no sheet, if it is larger than this.
 LARGEST_RATIO, SMALL_MEMBER = 250, 2**25
@@ -39,22 +43,22 @@ def contents(file: Path, wanted: list[Key], *, header: int | None = None, date_f
     """Return the columns of the tables of all sheets."""
     line = None if header is None else int(_checks.integer("header", header, 0))
     _refuse_bombs(file)
-    book = _opened(file)
     channels: list[StoredChannel] = []
     remarks: list[str] = []
     times: list[str] = []
-    for sheet in book.worksheets:
-        rows = _rows(sheet)
-        table = _table(rows, line, sheet.title) if rows else None
+    with _opened(file) as book:
+        sheets = {sheet.title: _rows(sheet) for sheet in book.worksheets}
+    for sheet, rows in sheets.items():
+        table = _table(rows, line, sheet) if rows else None
         if table is None:
-            remarks.append(f"sheet {sheet.title!r} has no table of numbers")
+            remarks.append(f"sheet {sheet!r} has no table of numbers")
             continue
-        remarks.append(f"sheet {sheet.title!r}: {table.remark}")
+        remarks.append(f"sheet {sheet!r}: {table.remark}")
+        formulas = _formulas(file, sheet, table)
         for place, name in enumerate(unique_names(table.names)):
-            channels.append(_channel(file, sheet.title, name, place, table, date_format))
-            if not times and name.lower().split()[0] in ("t", "time", "zeit", "date", "datum", "timestamp"):
+            channels.append(_channel(file, sheet, name, place, table, formulas.get(place), date_format))
+            if not times and TIME_NAME.fullmatch(name):
                 times.append(name)
-    book.close()
     if not channels:
         raise ValueError("none of its sheets has a table of numbers")
     one = len({channel.group for channel in channels}) == 1
@@ -67,17 +71,16 @@ def contents(file: Path, wanted: list[Key], *, header: int | None = None, date_f
     )
 
 
-def _opened(file: Path, *, formulas: bool = False, raw: bool = False) -> Any:
-    """Return a workbook that is read row by row; with `raw`, dates are the numbers that are stored."""
+@contextlib.contextmanager
+def _opened(file: Path, *, formulas: bool = False, raw: bool = False) -> Iterator[Any]:
+    """Open a workbook that is read row by row; with `raw`, dates are the numbers that are stored."""
     openpyxl = package("openpyxl", "openpyxl", "Excel workbooks")
-    import warnings
-
-    with warnings.catch_warnings():
+    with file.open("rb") as content, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # on styles and extensions, which have no values
-        book = openpyxl.load_workbook(file, read_only=True, data_only=not formulas, keep_links=False)
-    if raw:
-        book._date_formats, book._timedelta_formats = set(), set()
-    return book
+        book = openpyxl.load_workbook(content, read_only=True, data_only=not formulas, keep_links=False)
+        if raw:
+            book._date_formats, book._timedelta_formats = set(), set()
+        yield book
 
 
 def _refuse_bombs(file: Path) -> None:
@@ -91,8 +94,6 @@ def _refuse_bombs(file: Path) -> None:
 
 def _rows(sheet: Any) -> list[tuple[Any, ...]]:
     """Return all rows of a sheet, without empty ones at the end; the size that it states is not relied on."""
-    import warnings
-
     sheet.reset_dimensions()
     rows: list[tuple[Any, ...]] = []
     with warnings.catch_warnings():
@@ -163,18 +164,20 @@ def _texts(row: tuple[Any, ...], count: int) -> list[str]:
     return [str(row[k]).strip() if k < len(row) and row[k] is not None else "" for k in range(count)]
 
 
-def _channel(file: Path, sheet: str, name: str, place: int, table: _Table, date_format: str | None) -> StoredChannel:
+def _channel(
+    file: Path, sheet: str, name: str, place: int, table: _Table, formula: int | None, date_format: str | None
+) -> StoredChannel:
     """Return a column of a table."""
     cells = [row[place] if place < len(row) else None for row in table.rows[table.first :]]
     kinds = {type(cell) for cell in cells if not _is_empty(cell)}
-    remark, refusal, empty = "", "", any(map(_is_empty, cells))
+    remark, refusal = "", ""
     if bad := next((cell for cell in cells if isinstance(cell, str) and NUMBER.fullmatch(cell.strip())), None):
         refusal = (
             f"numbers that are stored as texts, such as {bad!r} in row {table.first + cells.index(bad) + 1}; convert "
         )
         refusal += "them in Excel (Data, Text to Columns)"
-    elif empty and (row := _formula(file, sheet, place, table)) is not None:
-        refusal = f"a formula without a value in row {row}; open and save the file in Excel, which computes it"
+    elif formula is not None:
+        refusal = f"a formula without a value in row {formula}; open and save the file in Excel, which computes it"
     elif any(issubclass(kind, STAMPS) for kind in kinds) and len(kinds) > 1 and kinds & {*CLOCKS, int, float, str}:
         refusal = "dates among other values, or times beyond 24 h among times of day; format the column as numbers"
     elif any(issubclass(kind, STAMPS) for kind in kinds):
@@ -205,11 +208,10 @@ def _values(file: Path, sheet: str, place: int, first: int, cells: list[Any]) ->
 
 def _moments(file: Path, sheet: str, place: int, first: int, cells: list[Any], dated: bool) -> np.ndarray:
     """Return dates or times of day by the days that are stored, as openpyxl 3.1 rounds them to milliseconds."""
-    book = _opened(file, raw=True)
-    rows = _rows(book[sheet])[first:]
+    with _opened(file, raw=True) as book:
+        rows = _rows(book[sheet])[first:]
+        epoch = np.datetime64(book.epoch, "us") if book.epoch.year == 1904 else np.datetime64("1899-12-30", "us")
     days = [row[place] if place < len(row) else None for row in rows]
-    epoch = np.datetime64(book.epoch, "us") if book.epoch.year == 1904 else np.datetime64("1899-12-30", "us")
-    book.close()
     result = np.full(len(cells), np.timedelta64("NaT"), "timedelta64[us]")
     for k, (day, cell) in enumerate(zip(days, cells, strict=True)):
         if _is_empty(cell):
@@ -237,17 +239,17 @@ def _on_grid(times: np.ndarray) -> np.ndarray:
     return times
 
 
-def _formula(file: Path, sheet: str, place: int, table: _Table) -> int | None:
-    """Return the first row (from 1) of a column with a formula whose value is not stored."""
-    book = _opened(file, formulas=True)
-    try:
-        for k, row in enumerate(_rows(book[sheet])[table.first :]):
-            cell = row[place] if place < len(row) else None
-            value = table.rows[table.first + k][place] if table.first + k < len(table.rows) else None
-            if value is None and (
-                isinstance(cell, str) and cell.startswith("=") or type(cell).__name__.endswith("Formula")
-            ):
-                return table.first + k + 1
-    finally:
-        book.close()
-    return None
+def _formulas(file: Path, sheet: str, table: _Table) -> dict[int, int]:
+    """Return the first row (from 1) with a formula whose value is not stored, by the place of its column."""
+    size = len(table.names)
+    if not any(len(row) < size or None in row[:size] for row in table.rows[table.first :]):
+        return {}
+    with _opened(file, formulas=True) as book:
+        rows = _rows(book[sheet])
+    result: dict[int, int] = {}
+    for number, (row, values) in enumerate(itertools.zip_longest(rows, table.rows, fillvalue=()), 1):
+        for place, cell in enumerate(row if number > table.first else ()):
+            formula = (isinstance(cell, str) and cell.startswith("=")) or type(cell).__name__.endswith("Formula")
+            if formula and (place >= len(values) or values[place] is None):
+                result.setdefault(place, number)
+    return result

@@ -20,6 +20,7 @@ from bayesperiodic.data.formats.text_cells import Evidence
 from bayesperiodic.data.formats.text_header import (
     BLANKS,
     MISSING,
+    TIME_NAME,
     USABLE,
     Head,
     head,
@@ -41,10 +42,7 @@ SUMMARY = re.compile(
     r"|end( of .*)?|ende)\W*",
     re.IGNORECASE,
 )
-TIME_NAME = re.compile(
-    r"\W*(t|time|zeit|temps|tiempo|tempo|timestamp|zeitstempel|date|datum|datetime|uhrzeit|elapsed)\b.*", re.IGNORECASE
-)
-WORDS = {".": "decimal point", ",": "decimal comma"}
+SIGNS = {".": "decimal point", ",": "decimal comma"}
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,7 @@ def contents(
                 refusal=refusals.get(place, "") or refusal,
             )
         )
-    remarks = [top.remark + (f", {WORDS.get(sign, f'decimal {sign!r}')}" if sign else "")]
+    remarks = [top.remark + (f", {SIGNS.get(sign, f'decimal {sign!r}')}" if sign else "")]
     return Contents(
         "CSV file",
         tuple(channels),

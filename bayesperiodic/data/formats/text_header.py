@@ -31,6 +31,9 @@ TIME_OF_DAY = r"[0-9]{1,2}:[0-9]{2}(?::[0-9]{2})?(?:[.,][0-9]+)?"
 DATE = rf"[0-9]{{1,4}}[-./][0-9]{{1,2}}[-./][0-9]{{1,4}}(?:[T ]+{TIME_OF_DAY})?(?:Z|[+-][0-9]{{2}}:?[0-9]{{2}})?"
 NUMBER = re.compile(rf"[+-]?(?:{PLAIN}|{GROUPS})")
 USABLE = re.compile(rf"[+-]?(?:{PLAIN}|{GROUPS})|{TIME_OF_DAY}|{DATE}")
+TIME_NAME = re.compile(
+    r"\W*(t|time|zeit|temps|tiempo|tempo|timestamp|zeitstempel|date|datum|datetime|uhrzeit|elapsed)\b.*", re.IGNORECASE
+)
 # Blanks between names of a line of names, from the finest division on.
 NAME_BLANKS = (r"\s+", r"\s+(?![\[(/]|\S+[\])])", r"\s{2,}|\t")
 COMMENT_MARK = re.compile(r"^\s*[#%]+\s*")
