@@ -5,7 +5,7 @@ import re
 
 from bayesperiodic.data.units import AMBIGUOUS, LOGARITHMIC, is_known
 
-LONGEST_UNIT_TEXT = 30
+LONGEST_UNIT_TEXT, LONGEST_NAME = 30, 300
 # "Force [N]", "Force (N)" and "Force / N"; in the last two a letter may be a variable or a divisor.
 STYLES = {
     "[": re.compile(r".*?\[\s*([^\[\]]*?)\s*\]\s*", re.DOTALL),
@@ -18,6 +18,8 @@ EVIDENT = re.compile(
     r".*[/^²³°%·*].*|(?:[nuµμmcdkMGh]|da)(?:m|s|N|Nm|V|A|Hz|Pa|rad|W|J|Ω|[oO]hm|g|ε|bar)|Nm|Hz|Pa|rad|deg|degC|rpm|RPM|bar|psi"
     r"|lbf|sec|Volts?|g_n|dB|ppm|rev|strain|ustrain|microstrain|[µuμ]e"
 )
+# What may stand in the first cell of a row of units.
+ROW_TITLES = ("unit", "units", "einheit", "einheiten", "unité", "unités")
 # Quantities whose unit is one letter.
 QUANTITIES = {
     "N": r"force|kraft|load|last|F", "V": r"volt|spannung|U", "A": r"current|strom|I", "m": r"displ|weg|pos|length",
@@ -33,7 +35,11 @@ def in_names(names: list[str], *, guessed: bool = False) -> tuple[list[str], dic
     """
     units, refusals = [""] * len(names), dict[int, str]()
     for style, pattern in STYLES.items():
-        texts = {place: match[1] for place, name in enumerate(names) if (match := pattern.fullmatch(name)) and match[1]}
+        texts = {
+            place: match[1]
+            for place, name in enumerate(names)
+            if name[LONGEST_NAME:] == "" and (match := pattern.fullmatch(name)) and match[1]
+        }
         if not texts:
             continue
         if guessed:
@@ -78,8 +84,8 @@ def unit_row(cells: list[str]) -> list[str] | None:
 
 
 def unbracketed(cell: str) -> str:
-    """Return a unit without the brackets around it."""
-    cell = cell.strip()
+    """Return a unit without the brackets around it; none for the title of the row."""
+    cell = "" if cell.strip().lower().rstrip(":") in ROW_TITLES else cell.strip()
     return cell[1:-1].strip() if cell[:1] + cell[-1:] in ("[]", "()") else cell
 
 

@@ -42,6 +42,7 @@ SUMMARY = re.compile(
     r"|end( of .*)?|ende)\W*",
     re.IGNORECASE,
 )
+TIME_UNITS = ("s", "ms", "us", "µs", "min", "h", "sec", "second", "Second")
 SIGNS = {".": "decimal point", ",": "decimal comma"}
 
 
@@ -209,8 +210,10 @@ def _suggested_time(channels: list[StoredChannel], read: Read) -> str:
             continue
         if values.dtype.kind in "mM" or texts:
             dated += [channel.name] if values.size > 1 and values[0] != values[-1] else []
-        elif name and values.dtype.kind in "fiu" and values.size > 1 and (np.diff(values) > 0).all():
-            return channel.name
+        elif values.dtype.kind in "fiu" and values.size > 1 and (np.diff(values) > 0).all():
+            if name:
+                return channel.name
+            dated += [channel.name] if channel.unit in TIME_UNITS else []
     return dated[0] if dated else ""
 
 

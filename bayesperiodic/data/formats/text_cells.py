@@ -131,6 +131,8 @@ def _times_of_day(texts: Any) -> tuple[np.ndarray | None, str, str]:
     import pandas as pd
 
     given = texts[texts.notna()]
+    if given.str.lower().str.endswith("m").any():
+        return None, "", "times of twelve hours; give date_format='%I:%M:%S %p'"
     short = given.str.count(":") == 1
     if short.any():
         if not given.str.fullmatch(r"[0-9]{1,2}:[0-9]{2}([.,][0-9]+)?").all():
@@ -193,7 +195,10 @@ def _dates(texts: Any, parts: re.Match[str]) -> tuple[np.ndarray | None, str, st
     suffix = ""
     if clock.strip():
         suffix = " %H:%M" if clock.count(":") == 1 else " %H:%M:%S"
-        if clock.count(":") == 2 and (fraction := texts.str.contains(r":[0-9]{1,2}\.[0-9]")).fillna(False).any():
+        if clock[-2:].lower() in ("am", "pm"):
+            texts = texts.str.replace(r" ?([AaPp][Mm])$", r" \1", regex=True)
+            suffix = suffix.replace("%H", "%I") + " %p"
+        elif clock.count(":") == 2 and (fraction := texts.str.contains(r":[0-9]{1,2}\.[0-9]")).fillna(False).any():
             texts = texts.where(fraction.fillna(True).astype(bool), texts + ".0")
             suffix += ".%f"
     if texts.str.contains(rf"\.[0-9]{{{MOST_DECIMALS + 1}}}").fillna(False).any():

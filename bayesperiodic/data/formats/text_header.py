@@ -22,12 +22,14 @@ MISSING = [
 PREAMBLE, SEPARATORS, BLANKS = 1000, (",", ";", "\t", "|"), " "
 # Lines and characters that are looked at for evidence, and rows below a header.
 SAMPLE_LINES, SAMPLE_CHARACTERS, SAMPLE_ROWS = 1400, 2**20, 100
+# Characters of a line of names that are divided in several ways.
+LONGEST_LINE = 2**14
 WORDS = {",": "','", ";": "';'", "\t": "tab", "|": "'|'", BLANKS: "blanks"}
 
 EXPONENT = r"(?:[eE][+-]?[0-9]+|[dD][+-][0-9]{2,3})?"
 GROUPS = r"[0-9]{1,3}(?:(?P<mark>[.,'’ \u00a0\u202f])[0-9]{3})(?:(?P=mark)[0-9]{3})*(?:[.,][0-9]+)?"
 PLAIN = rf"(?:[0-9]+(?:\.[0-9]*|,[0-9]+)?|[.,][0-9]+){EXPONENT}|[Ii]nf(?:inity)?"
-TIME_OF_DAY = r"[0-9]{1,2}:[0-9]{2}(?::[0-9]{2})?(?:[.,][0-9]+)?"
+TIME_OF_DAY = r"[0-9]{1,2}:[0-9]{2}(?::[0-9]{2})?(?:[.,][0-9]+)?(?: ?[AaPp][Mm])?"
 DATE = rf"[0-9]{{1,4}}[-./][0-9]{{1,2}}[-./][0-9]{{1,4}}(?:[T ]+{TIME_OF_DAY})?(?:Z|[+-][0-9]{{2}}:?[0-9]{{2}})?"
 NUMBER = re.compile(rf"[+-]?(?:{PLAIN}|{GROUPS})")
 USABLE = re.compile(rf"[+-]?(?:{PLAIN}|{GROUPS})|{TIME_OF_DAY}|{DATE}")
@@ -188,7 +190,7 @@ def _names_in(row: list[str], separator: str) -> Iterator[list[str]]:
     if separator == BLANKS:
         line = row[0].strip()
         for text in {COMMENT_MARK.sub("", line): 0, line: 0}:
-            yield from (re.split(blanks, text) for blanks in NAME_BLANKS)
+            yield from (re.split(blanks, text) for blanks in NAME_BLANKS[: None if len(text) < LONGEST_LINE else 1])
         return
     fields = [name.strip() for name in row]
     yield fields
@@ -296,7 +298,8 @@ def _of_width(
     for first, (number, row) in enumerate(rows):
         if number > start and len(row) == width:
             given = [row[k] for k in columns if row[k] not in MISSING]
-            if 2 * sum(map(bool, map(USABLE.fullmatch, given))) > len(given):
+            usable = sum(map(bool, map(USABLE.fullmatch, given)))
+            if given and 2 * usable >= len(given) and (usable == len(given) or _is_value(row[columns[0]])):
                 return _Block(separator, lines, rows, width, columns, first, covered)
     return None
 
@@ -323,6 +326,8 @@ def _by_evidence(file: Text, separator: str | None, line: int | None) -> Head | 
     real = max((k + 1 for _, row in data for k, cell in enumerate(row[: best.width]) if cell), default=best.width)
     if line and names:
         real = max(i for i, name in enumerate(names, 1) if name)
+    elif real < len(names) <= best.width:  # the last columns are empty
+        real = len(names)
     commented = best.first > 0 and best.lines[best.rows[best.first - 1][0] - 1].lstrip()[:1] in ("#", "%")
     if len(names) != real and len(names) > 1 and not commented:
         raise ValueError(
@@ -384,8 +389,8 @@ def _names_above(block: _Block, line: int | None) -> tuple[list[str], int, list[
     elif names[0][:1] in ("#", "%"):
         names = [COMMENT_MARK.sub("", names[0]), *names[1:]]
     names = _trimmed(names)
-    if line is None and any(NUMBER.fullmatch(name) or re.fullmatch(DATE, name) for name in names if name):
-        if len(above[-1][1]) == block.width and USABLE.fullmatch(above[-1][1][block.columns[0]]):
+    if line is None and not units and any(NUMBER.fullmatch(name) or re.fullmatch(DATE, name) for name in names if name):
+        if len(above[-1][1]) == block.width and 2 * sum(map(_is_value, filter(None, names))) > len(block.columns):
             raise ValueError(
                 f"header: must be given, got None, as line {above[-1][0]} has neither names nor only numbers, "
                 f"{_checks.shortened(above[-1][1])}; give the number of the line of names, or header=0 for none."
@@ -401,7 +406,7 @@ def _trimmed(row: list[str]) -> list[str]:
 
 def _blank_names(text: str, fields: list[str], width: int) -> list[str]:
     """Return the names in a line of blanks, of which there are as many as columns if that is possible."""
-    for blanks in NAME_BLANKS:
+    for blanks in NAME_BLANKS[: None if len(text) < LONGEST_LINE else 1]:
         if len(names := re.split(blanks, text)) == width:
             return names
     return fields

@@ -251,6 +251,46 @@ def test_what_is_no_table_is_refused(write, content):
         read(path)
 
 
+INSTRUMENTS = {
+    "oscilloscope": ("Source,CH1\nSecond,Volt\n-1e-3,0.5\n0,0.6\n", "Source", "CH1", "V"),
+    "oscilloscope with numbers as names": ("x-axis,1\nsecond,Volt\n-1e-3,0.5\n0,0.6\n", "x-axis", "1", "V"),
+    "logger": ("Channel,1,2\nName,U,w\nUnit,V,mm\n-0.001,0.5,1\n0,0.6,2\n", "Name", "U", "V"),
+    "preamble beside the data": (
+        "Length,2500,,-1e-3,0.5,\nInterval,1e-3,,0,0.6,\n,,,1e-3,0.7,\n,,,2e-3,0.8,\n,,,3e-3,0.9,\n",
+        4,
+        5,
+        "",
+    ),
+    "excel": ("sep=;\nt;U\n-0,001;0,5\n0;0,6\n", "t", "U", ""),
+    "empty last column": ("t\tU\tComment\n-0.001\t0.5\t\n0\t0.6\t\n", "t", "U", ""),
+}
+
+
+@pytest.mark.parametrize("case", INSTRUMENTS)
+def test_files_of_instruments(write, case):
+    content, time, channel, unit = INSTRUMENTS[case]
+    path = write(content)
+    run = bp.Recording.from_file(path, time=time, outputs={"x": channel})
+    assert run.time[:2] == pytest.approx([-1e-3, 0.0]) and run.outputs["x"][:2] == pytest.approx([0.5, 0.6])
+    assert unit in " ".join(one.unit for one in bp.inspect(path).channels)
+
+
+def test_twelve_hours(write):
+    path = write("t,x\n03/13/2026 11:59:59 AM,1\n03/13/2026 12:00:00 PM,2\n")
+    assert read(path)[0] == [0.0, 1.0]
+    path = write("t,x\n11:59:59 AM,1\n12:00:00 PM,2\n")
+    with pytest.raises(ValueError, match="must be usable, got times of twelve hours; give date_format='%I:%M:%S %p'"):
+        read(path)
+    assert read(path, date_format="%I:%M:%S %p")[0] == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("header", ["", "t,x,y\n"])
+def test_row_with_a_broken_cell_above_numbers_is_not_left_out(write, header):
+    path = write(header + "err,1.5,2\n1,2,3\n2,3,4\n3,4,5\n")
+    with pytest.raises(ValueError, match="header: must be given, got None, as line . has neither names nor only numb"):
+        bp.inspect(path)
+
+
 def test_header_and_separator_may_be_given(write):
     path = write("a;b\nt;x\n0;1\n1;2\n")
     assert read(path, header=2) == ([0.0, 1.0], [1.0, 2.0])
