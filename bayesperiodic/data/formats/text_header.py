@@ -298,8 +298,8 @@ def _of_width(
     for first, (number, row) in enumerate(rows):
         if number > start and len(row) == width:
             given = [row[k] for k in columns if row[k] not in MISSING]
-            usable = sum(map(bool, map(USABLE.fullmatch, given)))
-            if given and 2 * usable >= len(given) and (usable == len(given) or _is_value(row[columns[0]])):
+            count = sum(map(bool, map(USABLE.fullmatch, given)))
+            if given and 2 * count >= len(given) and (count == len(given) or _is_value(row[columns[0]])):
                 return _Block(separator, lines, rows, width, columns, first, covered)
     return None
 
