@@ -115,6 +115,12 @@ def test_comma_that_may_stand_between_thousands_is_refused_with_the_argument_tha
     assert read(path, decimal=",")[1] == [1.234, 2.345] and read(path, decimal=".")[1] == [1234.0, 2345.0]
 
 
+def test_comma_of_a_late_row_is_refused_like_one_of_the_first(write):
+    path = write("t;x\n" + "".join(f"{k};{k}\n" for k in range(2000)) + "2000;1,234\n")
+    with pytest.raises(ValueError, match="column 'x' of run.csv: must be usable, .*'1,234'.*give decimal=',' or dec"):
+        read(path)
+
+
 def test_thousands_of_a_file_with_decimal_points_never_turn_1_25_into_125(write):
     """`pandas.read_csv` does it without a word."""
     assert pd.read_csv(write("t;x\n0;1.25\n1;2.5\n"), sep=";", thousands=".")["x"].tolist() == [125, 25]
@@ -311,8 +317,8 @@ def test_header_and_separator_may_be_given(write):
 
 def test_parts_and_the_whole_are_read_alike(write, monkeypatch):
     """A column whose parts are numbers, texts and truth values is one of texts."""
-    rows = [f"{k},{k / 8},{'True' if k < 6 else k},{'' if k < 6 else 'a'}\n" for k in range(12)]
-    path = write("t,x,b,n\n" + "".join(rows))
+    rows = [f"{k},{k / 8},{'True' if k < 6 else k}\n" for k in range(12)]
+    path = write("t,x,b\n" + "".join(rows))
     whole = bp.inspect(path)
     monkeypatch.setattr(text, "PART_ROWS", 3)
     assert str(bp.inspect(path)) == str(whole) and whole.channels[2].remarks == ("texts, or not only numbers",)
