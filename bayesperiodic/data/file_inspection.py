@@ -207,7 +207,14 @@ def _range(values: Any) -> tuple[float, float, str]:
     """Return the range of the values of a channel, and a remark on them."""
     array = np.squeeze(np.asarray(values))
     if (times := dates("values", array) if array.dtype.kind in "OUTmM" else None) is not None:
-        return np.nan, np.nan, f"dates or durations from {times.flat[0]} to {times.flat[-1]}"
+        ends = [times.flat[0], times.flat[-1]]
+        if times.dtype.kind == "m":
+            return (
+                np.nan,
+                np.nan,
+                "durations from {:.9g} to {:.9g} s".format(*(one / np.timedelta64(1, "s") for one in ends)),
+            )
+        return np.nan, np.nan, f"dates from {ends[0]} to {ends[1]}"
     if array.dtype.kind not in "fiub":
         return np.nan, np.nan, "texts, or not only numbers" if array.dtype.kind in "OUT" else f"of type {array.dtype}"
     if array.ndim > 1:

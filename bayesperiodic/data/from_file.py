@@ -60,9 +60,9 @@ class FromFile(Channels):
             Channel in the file by channel of the model, such as ``{"force": "Force [N]"}``, or the number of a column
             from 1.
         time : str, int or (group, name), optional
-            Channel of times [s], or of dates after ISO 8601, such as 2026-01-31T12:00:00.01, which are converted to
-            seconds from the first one. By default the times that the file has for each channel; channels with
-            different ones keep them.
+            Channel of times [s], or of dates or times of day, such as 2026-01-31T12:00:00.01, 31.01.2026 12:00:00,01
+            or 12:00:00.01, which are converted to seconds from the first one. By default the times that the file has
+            for each channel; channels with different ones keep them.
         sampling_rate : float or mapping of channel to float, optional
             Sampling rate [Hz], if the file does not say it, or with too few digits.
         units : mapping of str to float, unit or (from, to), optional

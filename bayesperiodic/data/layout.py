@@ -116,9 +116,7 @@ def numbers(argument: str, values: Any, *, text: bool = False, time: bool = Fals
         cells = np.atleast_1d(array)
         rows = np.flatnonzero(pd.isna(pd.to_numeric(cells, errors="coerce")) & pd.notna(cells))
         got = f"{cells[rows[0]]!r} in data row {rows[0] + 1}" if rows.size else "numbers too long to be read"
-        hint = (
-            "; dates must be those of ISO 8601, others are read by pandas.to_datetime for from_arrays" if time else ""
-        )
+        hint = "; dates must be those of ISO 8601, give date_format= for others in a text" if time else ""
         raise ValueError(f"{argument}: must contain numbers, with a decimal point, got {got}{hint}.")
     if array.ndim != 1 or (array.dtype.kind not in ("fiubmM" if time else "fiub") and not text):
         raise ValueError(

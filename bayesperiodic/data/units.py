@@ -32,7 +32,8 @@ LOGARITHMIC = {
 }
 # Spellings of measurement programs.
 SPELLINGS = {
-    "sec": "s", "Sec": "s", "seconds": "s", "Seconds": "s", "msec": "ms", "usec": "us", "Volt": "V", "Volts": "V",
+    "sec": "s", "Sec": "s", "Second": "s", "seconds": "s", "Seconds": "s", "msec": "ms", "usec": "us",
+    "Volt": "V", "Volts": "V",
     "volts": "V", "Newton": "N", "Newtons": "N", "Nm": "N*m", "kNm": "kN*m", "Nmm": "N*mm", "gn": "g_0", "g_n": "g_0",
     "RPM": "rpm", "HZ": "Hz", "hz": "Hz", "Ampere": "A", "Amps": "A", "Deg": "deg", "Rad": "rad",
     "inch": "in", "C°": "degC", "°C": "degC", "Celsius": "degC", "Ohm": "ohm", "Pascal": "Pa", "PA": "Pa",

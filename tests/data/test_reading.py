@@ -15,7 +15,7 @@ NUMBER = re.compile(r"[ \t]*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?[ \
 # What pandas and the documentation take for a missing value.
 MISSING = {"", "nan", "NaN", "NA", "N/A", "null", "-nan"}
 JUNK = [
-    "x", "1,5", "1;5", "1_000", "0x1F", "\u0661", "1d3", "True", "false", "inf", "-Infinity", "--1", "1e", "1 2",
+    "x", "1;5", "1_000", "0x1F", "\u0661", "1d3", "True", "false", "inf", "-Infinity", "--1", "1e", "1 2",
     "\u22121", "1e400", "'1'", "#N/A!", "1.2.3", "\ufeff1", "1\u00a0", "\u20281",
 ]  # fmt: skip
 floats = st.floats(-1e99, 1e99, allow_nan=False).filter(lambda x: x == 0.0 or abs(x) > 1e-90)

@@ -213,14 +213,14 @@ def test_iso_dates_of_a_file_are_times(tmp_path, separator, zone):
         bp.Recording.from_csv(tmp_path / "run.csv", **columns)
 
 
-def test_other_dates_of_a_file_are_refused_with_the_way_to_read_them(tmp_path):
-    pd.DataFrame({"date": ["31.01.2026 12:00", "31.01.2026 12:01"], "x": [1, 2]}).to_csv(
+def test_dates_without_a_known_order_are_refused_with_the_way_to_read_them(tmp_path):
+    pd.DataFrame({"date": ["31 Jan 2026 12:00", "31 Jan 2026 12:01"], "x": [1, 2]}).to_csv(
         tmp_path / "run.csv", index=False
     )
-    with pytest.raises(
-        ValueError, match="got '31.01.2026 12:00' in data row 1; dates must be those of ISO 8601, other"
-    ):
+    with pytest.raises(ValueError, match="got '31 Jan 2026 12:00' in data row 1; .*date_format="):
         bp.Recording.from_csv(tmp_path / "run.csv", time="date", outputs={"x": "x"})
+    run = bp.Recording.from_csv(tmp_path / "run.csv", time="date", outputs={"x": "x"}, date_format="%d %b %Y %H:%M")
+    assert run.time.tolist() == [0.0, 60.0]
 
 
 def test_dates_and_large_integers_of_an_npz_file_are_times(tmp_path):

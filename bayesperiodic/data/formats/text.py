@@ -1,133 +1,303 @@
-"""Texts of columns, such as CSV."""
+"""Texts of columns, such as CSV, as they come: separator, decimal sign, encoding and header are recognised."""
 
-import codecs
 import csv
 import io
-import itertools
+import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
+import numpy as np
+
 from bayesperiodic import _checks
+from bayesperiodic.data.formats import header_units, text_cells
 from bayesperiodic.data.formats.contents import Contents, Key, StoredChannel
+from bayesperiodic.data.formats.encodings import Text, opened
+from bayesperiodic.data.formats.text_cells import Evidence
+from bayesperiodic.data.formats.text_header import (
+    BLANKS,
+    MISSING,
+    TIME_NAME,
+    USABLE,
+    Head,
+    head,
+    known_separator,
+    line_number,
+    numbered,
+    rows_of,
+    skip,
+)  # fmt: skip
 
-# Texts of missing values.
-MISSING = [
-    "", "nan", "NaN", "NAN", "-nan", "-NaN", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None", "1.#IND",
-    "-1.#IND", "1.#QNAN", "-1.#QNAN",
-]  # fmt: skip
-# Lines among which the header is searched for, and separators of fields, in the order in which they are tried.
-PREAMBLE, SEPARATORS = 1000, (",", ";", "\t")
-# Bytes that are decoded at once, and columns per wanted column above which the others are not made numbers.
-PART_BYTES, UNWANTED_RATIO = 2**20, 2
-
-
-Stored = tuple[list[str], dict[str, Any]]
+# Columns per wanted column above which the others are not made numbers, and the separator of the wanted ones.
+UNWANTED_RATIO, NARROW = 2, "\x1f"
+# Rows that pandas reads at once.
+PART_ROWS = 100_000
+# Bytes at the end of a file among which rows of summaries are searched for, and their first words.
+TAIL_BYTES = 2**14
+SUMMARY = re.compile(
+    r"\W*(mean|average|avg\.?|min(imum)?|max(imum)?|sum|total|std(ev)?\.?|st\.?dev\.?|rms|median|count|mittel(wert)?|summe"
+    r"|end( of .*)?|ende)\W*",
+    re.IGNORECASE,
+)
+TIME_UNITS = ("s", "ms", "us", "µs", "min", "h", "sec", "second", "Second")
+SIGNS = {".": "decimal point", ",": "decimal comma"}
 
 
 @dataclass(frozen=True)
-class _Text:
-    """A text file and its encoding."""
+class _Notation:
+    """Decimal sign, the sign between thousands and the format of dates, None where they are recognised."""
 
-    path: Path
-    encoding: str
-
-    def __repr__(self) -> str:
-        return repr(str(self.path))
-
-    def open(self) -> TextIO:
-        """Return the opened file, with the ends of its lines as they are and without a byte order mark."""
-        marked = codecs.lookup(self.encoding).name == "utf-8"
-        return self.path.open(encoding="utf-8-sig" if marked else self.encoding, newline="")
-
-    def check(self) -> None:
-        """Raise a ValueError if the file is not in its encoding, or contains characters 0, at which numbers end."""
-        name = "UTF-8" if self.encoding == "utf-8" else self.encoding
-        line, decoder = 1, codecs.getincrementaldecoder(self.encoding)()
-        with self.path.open("rb") as content:
-            marked = content.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-            content.seek(0)
-            for part in itertools.chain(iter(lambda: content.read(PART_BYTES), b""), [b""]):
-                try:
-                    text = decoder.decode(part, final=not part)
-                except UnicodeDecodeError as error:
-                    line += error.object[: error.start].count(b"\n")
-                    other = "UTF-16, encoding='utf-16'" if marked else "Latin-1, encoding='latin-1'"
-                    raise ValueError(
-                        f"path: must be a CSV file in {name}, got {self!r}, whose line {line} has the byte "
-                        f"0x{error.object[error.start]:02x}; it may be in {other}, or in that of the program which "
-                        "wrote it, such as encoding='cp1252' of Windows."
-                    ) from None
-                if "\0" in text:
-                    raise ValueError(
-                        f"path: must be a CSV file in {name}, got {self!r}, which contains bytes 0; it was damaged "
-                        f"when it was written, or is no text in {name}; see encoding, such as encoding='utf-16'."
-                    )
-                line += text.count("\n")
+    decimal: str | None
+    thousands: str | None
+    date_format: str | None
 
 
-def contents(file: Path, wanted: list[Key], *, encoding: str = "utf-8") -> Contents:
-    """Return the columns of a text; those that are `wanted` are read at once."""
+def contents(
+    file: Path,
+    wanted: list[Key],
+    *,
+    encoding: str | None = None,
+    separator: str | None = None,
+    decimal: str | None = None,
+    thousands: str | None = None,
+    header: int | None = None,
+    date_format: str | None = None,
+) -> Contents:
+    """Return the columns of a text; those that are `wanted` are read at once, or all if there are none."""
+    notation = _notation(decimal, thousands, date_format)
+    given = None if separator is None else known_separator(separator)
+    text, line = opened(file, encoding), line_number(header)
+    keys: list[Any] = [key[1] if isinstance(key, tuple) and len(key) == 2 and not key[0] else key for key in wanted]
     try:
-        "".encode(encoding)
-    except (LookupError, TypeError, ValueError):
+        top = head(text, [key for key in keys if isinstance(key, str)], given, line)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"path: must be a CSV file with a header line, got {text!r} ({error}).") from None
+    names = numbered([name or f"column {k}" for k, name in enumerate(top.names, 1)])
+    places = {}
+    for key in keys:
+        if isinstance(key, str):
+            places[_place(file, top.names, names, key)] = key
+        elif isinstance(key, int) and not isinstance(key, bool) and 1 <= key <= len(names):
+            places[key - 1] = str(key)
+    _refuse_summaries(text, top)
+    read, sign, rows = _columns(text, top, [*places] or [*range(len(names))], notation)
+    units, refusals = header_units.in_names(top.names, guessed=text.remark.startswith("encoding 'cp1252' of"))
+    channels = []
+    for place, name in enumerate(names):
+        unit = (top.units[place] if place < len(top.units) else "") or units[place]
+        values, remark, refusal = read.get(place) or (partial(_later, text, top, place, notation), "", "")
+        channels.append(
+            StoredChannel(
+                name,
+                rows,
+                values if callable(values) else partial(_given, values),
+                unit=unit,
+                remarks=(remark,) if remark else (),
+                refusal=refusals.get(place, "") or refusal,
+            )
+        )
+    remarks = [top.remark + (f", {SIGNS.get(sign, f'decimal {sign!r}')}" if sign else "")]
+    return Contents(
+        "CSV file",
+        tuple(channels),
+        (*remarks, *([text.remark] if text.remark else [])),
+        word="column",
+        suggested_time="" if places else _suggested_time(channels, read),
+    )
+
+
+def _given(values: np.ndarray) -> np.ndarray:
+    return values
+
+
+def _later(file: Text, top: Head, place: int, notation: _Notation) -> np.ndarray:
+    """Return the values of a column that was not wanted at once."""
+    values, _, refusal = _columns(file, top, [place], notation)[0][place]
+    if refusal:
+        raise ValueError(f"its column {place + 1} has {refusal}")
+    return values
+
+
+def _notation(decimal: str | None, thousands: str | None, date_format: str | None) -> _Notation:
+    """Return the notation that was given; a sign between thousands leaves the other one for decimals."""
+    if decimal is not None:
+        _checks.one_of("decimal", decimal, (".", ","))
+    if thousands is not None:
+        _checks.one_of("thousands", thousands, (".", ",", "'", "’", " ", "\u00a0", "\u202f"))
+        if thousands == decimal:
+            raise ValueError(f"thousands: must differ from decimal, got {thousands!r} for both.")
+        if decimal is None and thousands in ",.":
+            decimal = "," if thousands == "." else "."
+    if date_format is not None:
+        _checks.text("date_format", date_format)
+        if "%" not in date_format:
+            raise ValueError(f"date_format: must be a format such as '%d.%m.%Y %H:%M:%S.%f', got {date_format!r}.")
+    return _Notation(decimal, thousands, date_format)
+
+
+Read = dict[int, tuple[np.ndarray, str, str]]
+
+
+def _columns(file: Text, top: Head, places: list[int], notation: _Notation) -> tuple[Read, str, int]:
+    """Return columns with a remark and a refusal, the decimal sign if there are any, and the number of rows."""
+    evidence = Evidence.of(cell for row in top.sample for cell in row[: len(top.names)])
+    decimal = notation.decimal or evidence.sign or "."
+    table, rows = _table(file, top, places, decimal)
+    texts = {place: values for place, values in table.items() if values.dtype == object}
+    for values in texts.values():
+        evidence |= Evidence.of(cell.strip(" \t") for cell in values if isinstance(cell, str))
+    sign = notation.decimal or evidence.sign
+    if not sign and {",", "."} <= evidence.either and not evidence.decimal:
         raise ValueError(
-            f"encoding: must be one of Python's, such as 'utf-8', 'latin-1' or 'cp1252', got {encoding!r}."
-        ) from None
-    names, columns = _csv_columns(_Text(file, encoding), [str(key) for key in wanted])
-    rows = len(next(iter(columns.values()), ()))
-    channels = [StoredChannel(name, rows, partial(columns.__getitem__, name)) for name in names if name in columns]
-    return Contents("CSV file with a header line", tuple(channels), word="column")
+            f"decimal: must be given for {file.path.name!r}, whose numbers have points and commas before three digits; "
+            "give decimal='.' or decimal=','."
+        )
+    if (sign or ".") != decimal:
+        decimal = sign or "."
+        table, rows = _table(file, top, places, decimal)
+    result: Read = {}
+    for place, values in table.items():
+        result[place] = (
+            _converted(values, decimal, bool(sign), notation, top) if values.dtype == object else (values, "", "")
+        )
+    if notation.date_format and not any(values.dtype.kind in "mM" for values, _, _ in result.values()):
+        cell = next((cell for values in texts.values() for cell in values if isinstance(cell, str)), "numbers")
+        raise ValueError(
+            f"date_format: must be that of all cells of a column of {file.path.name!r}, got {notation.date_format!r}, "
+            f"and cells such as {cell!r}."
+        )
+    shown = sign or ("." if "," not in evidence.decimal | evidence.either else "")
+    return result, shown if evidence.decimal | evidence.either | evidence.thousands else "", rows
 
 
-def _csv_columns(file: _Text, wanted: list[str]) -> Stored:
-    """Return names and wanted columns of a CSV file; the header is the first line with all of these names."""
+def _converted(
+    values: np.ndarray, decimal: str, sure: bool, notation: _Notation, top: Head
+) -> tuple[np.ndarray, str, str]:
+    """Return a column of texts as numbers, dates or durations if all of its cells are, with a remark and a refusal."""
+    cells = [cell.strip(" \t") for cell in values if isinstance(cell, str)]
+    if sure or not any("," in cell for cell in cells) or not text_cells.refusal(cells, decimal, sure):
+        if (read := text_cells.numbers(values, decimal, notation.thousands)) is not None:
+            return read, "numbers with signs between thousands, or exponents of Fortran", ""
+    dates, remark, refusal = text_cells.times(values, notation.date_format)
+    if dates is not None or refusal:
+        return (values if dates is None else dates), remark, refusal
+    if (
+        top.titled
+        and (row := next((k for k, cell in enumerate(values) if cell in top.names and cell), None)) is not None
+    ):
+        if all(USABLE.fullmatch(cell) for cell in cells[:row] if cell not in MISSING) and row:
+            return (
+                values,
+                "",
+                f"the name {values[row]!r} again in data row {row + 1}: the file has several tables; save each",
+            )
+    return values, "", text_cells.refusal(cells, decimal, sure)
+
+
+def _suggested_time(channels: list[StoredChannel], read: Read) -> str:
+    """Return the name of the column that seems to hold the times: by its name or its dates, and increasing."""
+    named = [TIME_NAME.fullmatch(channel.name) is not None for channel in channels]
+    dated = []
+    for place, (channel, name) in enumerate(zip(channels, named, strict=True)):
+        values, _, refusal = read[place]
+        texts = values.dtype == object and any(
+            isinstance(one, str) and USABLE.fullmatch(one.strip()) for one in values[:1]
+        )
+        if refusal:
+            continue
+        if values.dtype.kind in "mM" or texts:
+            dated += [channel.name] if values.size > 1 and values[0] != values[-1] else []
+        elif values.dtype.kind in "fiu" and values.size > 1 and (np.diff(values) > 0).all():
+            if name:
+                return channel.name
+            dated += [channel.name] if channel.unit in TIME_UNITS else []
+    return dated[0] if dated else ""
+
+
+def _table(file: Text, top: Head, places: list[int], decimal: str) -> tuple[dict[int, np.ndarray], int]:
+    """Return wanted columns of a text as pandas reads them, and the number of rows."""
     import pandas as pd
 
-    file.check()
+    names, separator, lines = top.names, top.separator, top.lines
     try:
-        names, lines, more, separator = _header(file, wanted)
-        places = {column: _place(file.path, names, column) for column in wanted}
         with file.open() as text, warnings.catch_warnings():
-            _skip(text, lines, separator)
+            skip(text, lines, separator)
             warnings.simplefilter("error", pd.errors.ParserWarning)
-            width, source = len(names), text
-            # More columns than names hold the fields after trailing commas.
+            source: Any = text
+            if file.last_comment > lines:
+                source = io.StringIO("".join(line for line in text if not line.lstrip().startswith("#")))
+            width, surplus = len(names), max(top.more, 0) + 1
+            at = {place: place for place in places}
             # The only column of a file may have empty cells, which are empty lines, but not at the end.
-            alone, surplus = width == 1, max(more, 0) + 1
+            alone = width == 1
             if alone:
-                source = io.StringIO(text.read().rstrip())
-            elif UNWANTED_RATIO * len(places) < width:
-                rows = csv.reader(text, delimiter=separator, skipinitialspace=True, strict=True)
-                source = _narrowed(rows, [*places.values()], width, width + surplus)
-                width, surplus = len(places) + 1, 1
-                places, separator = {column: place for place, column in enumerate(places)}, ","
+                source = io.StringIO(source.read().rstrip())
+            elif len(places) * UNWANTED_RATIO < width or separator == BLANKS and top.more > 0:
+                source = _narrowed(rows_of(source, separator, strict=True), places, width, width + surplus)
+                at = {place: k for k, place in enumerate(places)}
+                width, surplus, separator = len(places) + 1, 1, NARROW
             missing: Any = dict(enumerate([MISSING] * width + [[""]] * surplus))
-            table = pd.read_csv(
-                source,
-                skip_blank_lines=not alone,
-                sep=separator,
-                header=None,
-                names=range(width + surplus),
-                index_col=False,
-                skipinitialspace=True,
-                low_memory=False,
-                keep_default_na=False,
-                na_values=missing,
-            )
+            options: dict[str, Any] = {
+                "skip_blank_lines": not alone,
+                "sep": r"\s+" if separator == BLANKS else separator,
+                "decimal": decimal,
+                "header": None,
+                "names": range(width + surplus),
+                "index_col": False,
+                "skipinitialspace": True,
+                "low_memory": False,
+                "keep_default_na": False,
+                "na_values": missing,
+            }
+            start = source.tell() if source is not text else None
+            table = _in_parts(source, options)
+            if table is None:
+                if start is None:
+                    text.seek(0)
+                    skip(text, lines, top.separator)
+                else:
+                    source.seek(start)
+                table = _frame(pd.read_csv(source, **options))
     except (pd.errors.ParserError, pd.errors.ParserWarning, _OtherFields) as error:
-        _check_fields(file, names, lines, separator)
+        _check_fields(file, top)
         raise ValueError(f"path: must be a CSV file with a header line, got {file!r} ({error}).") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"path: must be a CSV file with a header line, got {file!r} ({error}).") from None
-    if table.empty:
+    if not table[0].size:
         raise ValueError(f"path: must be a CSV file with rows of data, got {file!r}, which has none.")
-    if table.iloc[:, width:].notna().any(axis=None) or table[width - 1].isna().any():
-        _check_fields(file, names, lines, separator)
-    return names, {column: table[place].to_numpy() for column, place in places.items()}
+    if any(pd.notna(table[k]).any() for k in range(width, width + surplus)) or pd.isna(table[width - 1]).any():
+        _check_fields(file, top)
+    return {place: table[k] for place, k in at.items()}, table[0].size
+
+
+def _frame(table: Any) -> dict[int, np.ndarray]:
+    return {k: table[k].to_numpy() for k in table}
+
+
+def _in_parts(source: Any, options: dict[str, Any]) -> dict[int, np.ndarray] | None:
+    """Return columns that pandas reads part by part, or None if parts of a column are of different kinds.
+
+    It takes two thirds of the time of the whole at once.
+    """
+    import pandas as pd
+
+    try:
+        with pd.read_csv(source, chunksize=PART_ROWS, **options) as parts:
+            tables = [_frame(part) for part in parts]
+    except pd.errors.EmptyDataError:
+        return {k: np.empty(0) for k in options["names"]}
+    if not tables:
+        return {k: np.empty(0) for k in options["names"]}
+    columns = {}
+    for k in [*tables[0]]:
+        kinds = {table[k].dtype.str for table in tables}
+        if len(kinds) > 1 and not kinds <= {"<i8", "<f8"}:
+            return None
+        columns[k] = tables[0][k] if len(tables) == 1 else np.concatenate([table.pop(k) for table in tables])
+    return columns
 
 
 class _OtherFields(Exception):
@@ -140,7 +310,7 @@ def _narrowed(rows: Iterable[list[str]], places: list[int], width: int, most: in
     The table of all columns of a wide file would take several times the memory of the file.
     """
     narrow = io.TextIOWrapper(io.BytesIO(), "utf-8", newline="")
-    writer = csv.writer(narrow)
+    writer = csv.writer(narrow, delimiter=NARROW)
     for row in rows:
         if len(row) < 2 and not any(map(str.strip, row)):
             continue
@@ -152,58 +322,15 @@ def _narrowed(rows: Iterable[list[str]], places: list[int], width: int, most: in
     return narrow
 
 
-def _header(file: _Text, columns: list[str]) -> tuple[list[str], int, int, str]:
-    """Return the names of the columns of a CSV file and three facts: lines up to there, surplus fields, separator.
-
-    The separator is the first one for which a line contains all columns, or else that with most of them.
-    """
-    headers: list[tuple[list[str], int, int, str]] = []
-    for separator in SEPARATORS:
-        try:
-            headers.append((*_line_of_names(file, columns, separator), separator))
-        except csv.Error:  # a long line is one field for another separator than its own
-            if not headers and separator == SEPARATORS[-1]:
-                raise
-            continue
-        if {*columns} <= {*headers[-1][0]}:
-            return headers[-1]
-    best = max(headers, key=lambda header: len({*columns} & {*header[0]}))
-    if _is_no_header(best[0]):
-        raise ValueError(
-            "path: must be a CSV file whose first line names the columns, separated by commas, semicolons or tabs, got "
-            f"{file!r}, whose first line is read as {_checks.shortened(best[0])}. Numbers must have a decimal point."
-        )
-    return best
-
-
-def _line_of_names(file: _Text, columns: list[str], separator: str) -> tuple[list[str], int, int]:
-    """Return the names in the line with most columns, the number of lines up to there, and of fields that follow.
-
-    Without a line of all names, that with most of them tells what is missing.
-    """
-    most, names, number, more, following = -1, [""], 0, 0, False
-    with file.open() as text:
-        rows = csv.reader(text, delimiter=separator, skipinitialspace=True)
-        for row in filter(None, itertools.islice(rows, PREAMBLE)):
-            if following:
-                more, following = len(row) - len(names), False
-                if most == len({*columns}):
-                    break
-            fields = [name.strip() for name in row]
-            if (count := len({*columns} & {*fields})) > most:
-                most, number, more, following = count, rows.line_num, 0, True
-                names = fields[: max((i for i, name in enumerate(fields, 1) if name), default=len(fields))]
-    if most < 0:
-        raise ValueError(f"path: must be a CSV file with a header line, got {file!r}, which is empty.")
-    return names, number, more
-
-
-def _check_fields(file: _Text, names: list[str], lines: int, separator: str) -> None:
+def _check_fields(file: Text, top: Head) -> None:
     """Raise a ValueError unless each row has one field per name, and equally many empty ones after them."""
+    names = top.names
     with file.open() as text:
-        fields, rows = None, _skip(text, lines, separator)
+        fields, rows = None, skip(text, top.lines, top.separator)
         data = (row for row in rows if any(field.strip() for field in row))
         for number, row in enumerate(data, 1):
+            if row[0].lstrip().startswith("#") and file.last_comment > top.lines:
+                continue
             fields = fields or len(row)
             if len(row) < len(names) or len(row) != fields or any(field.strip() for field in row[len(names) :]):
                 raise ValueError(
@@ -212,30 +339,39 @@ def _check_fields(file: _Text, names: list[str], lines: int, separator: str) -> 
                 )
 
 
-def _skip(text: TextIO, lines: int, separator: str) -> Iterator[list[str]]:
-    """Read a file up to the end of its header, and return an iterator over the rows that follow."""
-    rows = csv.reader(text, delimiter=separator, skipinitialspace=True)
-    while rows.line_num < lines:
-        next(rows)
-    return rows
-
-
-def _place(file: Path, names: list[str], column: str) -> int:
-    _checks.one_of(f"column of {file.name}", column, names)
-    if (count := names.count(column)) > 1:
-        places = [i + 1 for i, name in enumerate(names) if name == column]
-        raise ValueError(
-            f"column of {file.name}: must be the name of one column, got {column!r}, the name of {count} "
-            f"(columns {', '.join(map(str, places))}); rename them in the file."
-        )
-    return names.index(column)
-
-
-def _is_no_header(names: list[str]) -> bool:
-    """Return whether a first line contains numbers, or separators other than commas."""
-    if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
-        return True
+def _refuse_summaries(file: Text, top: Head) -> None:
+    """Raise a ValueError if the last rows are no samples but summaries of them, such as "Mean;1.5"."""
+    if file.encoding.lower().replace("-", "").startswith(("utf16", "utf32")):
+        with file.open() as text:
+            ending = text.read()[-TAIL_BYTES:]
+    else:
+        with file.path.open("rb") as content:
+            content.seek(0, 2)
+            content.seek(max(content.tell() - TAIL_BYTES, 0))
+            ending = content.read().decode(file.encoding, errors="replace")
+    columns = [
+        place for place in range(len(top.names))
+        if 2 * sum(place < len(row) and bool(USABLE.fullmatch(row[place])) for row in top.sample) >= len(top.sample)
+    ]  # fmt: skip
     try:
-        return bool([float(name) for name in names])
-    except ValueError:
-        return False
+        rows = [*rows_of(ending.splitlines()[1:], top.separator)]
+    except csv.Error:
+        return
+    for row in rows[-20:]:
+        cell = next((row[k] for k in columns if k < len(row) and SUMMARY.fullmatch(row[k])), None)
+        if cell is not None and any(map(USABLE.fullmatch, map(str.strip, row))):
+            raise ValueError(
+                f"path: must be a CSV file with a sample in each row, got {file!r}, whose row {_checks.shortened(row)} "
+                "after the data seems to be a summary; remove it."
+            )
+
+
+def _place(file: Path, raw: list[str], names: list[str], column: str) -> int:
+    if raw.count(column) <= 1:
+        _checks.one_of(f"column of {file.name}", column, [*names, *raw] if column in raw else names)
+        return raw.index(column) if column in raw else names.index(column)
+    places = [i + 1 for i, name in enumerate(raw) if name == column]
+    raise ValueError(
+        f"column of {file.name}: must be the name of one column, got {column!r}, the name of {len(places)} "
+        f"(columns {', '.join(map(str, places))}); give its number, or rename them in the file."
+    )

@@ -1,0 +1,98 @@
+"""Units in the names of columns, such as "Force [N]", and in the row below them."""
+
+import functools
+import re
+
+from bayesperiodic.data.units import AMBIGUOUS, LOGARITHMIC, is_known
+
+LONGEST_UNIT_TEXT, LONGEST_NAME = 30, 300
+# "Force [N]", "Force (N)" and "Force / N"; in the last two a letter may be a variable or a divisor.
+STYLES = {
+    "[": re.compile(r".*?\[\s*([^\[\]]*?)\s*\]\s*", re.DOTALL),
+    "(": re.compile(r".*?\S\s*\(\s*([^()]*(?:\([^()]*\)[^()]*)?)\s*\)\s*", re.DOTALL),
+    "/": re.compile(r".*?\S\s+/\s+\(?([^\s()]+)\)?\s*", re.DOTALL),
+}
+INDEX = re.compile(r"[\d:, ]*")
+# What is a unit also in parentheses, where "(t)", "(h)" or "(in)" may be something else.
+EVIDENT = re.compile(
+    r".*[/^²³°%·*].*|(?:[nuµμmcdkMGh]|da)(?:m|s|N|Nm|V|A|Hz|Pa|rad|W|J|Ω|[oO]hm|g|ε|bar)|Nm|Hz|Pa|rad|deg|degC|rpm|RPM|bar|psi"
+    r"|lbf|sec|Volts?|g_n|dB|ppm|rev|strain|ustrain|microstrain|[µuμ]e"
+)
+# What may stand in the first cell of a row of units.
+ROW_TITLES = ("unit", "units", "einheit", "einheiten", "unité", "unités")
+# Quantities whose unit is one letter.
+QUANTITIES = {
+    "N": r"force|kraft|load|last|F", "V": r"volt|spannung|U", "A": r"current|strom|I", "m": r"displ|weg|pos|length",
+    "K": r"temp|T", "g": r"acc|beschl|a", "s": r"t|time|zeit|temps|dur|elapsed", "h": r"time|zeit|dur|elapsed",
+    "min": r"time|zeit|dur|elapsed", "d": r"time|zeit|elapsed", "W": r"power|leistung|P", "J": r"energ|work",
+}  # fmt: skip
+
+
+def in_names(names: list[str], *, guessed: bool = False) -> tuple[list[str], dict[int, str]]:
+    """Return the unit in each name, "" where there is none, and refusals by the place of the name.
+
+    With a `guessed` encoding, a unit with letters beyond ASCII that is not known is refused.
+    """
+    units, refusals = [""] * len(names), dict[int, str]()
+    for style, pattern in STYLES.items():
+        texts = {
+            place: match[1]
+            for place, name in enumerate(names)
+            if name[LONGEST_NAME:] == "" and (match := pattern.fullmatch(name)) and match[1]
+        }
+        if not texts:
+            continue
+        if guessed:
+            for place, text in texts.items():
+                if not text.isascii() and not known(text):
+                    refusals[place] = f"its unit {text!r} in an encoding that is not known; give encoding="
+        for place, text in texts.items():
+            if not units[place] and _is_meant(style, place, texts, names):
+                units[place] = text
+    return units, refusals
+
+
+def _is_meant(style: str, place: int, texts: dict[int, str], names: list[str]) -> bool:
+    """Return whether a text in the name of a column is its unit."""
+    text = texts[place]
+    if style == "[":
+        if INDEX.fullmatch(text):
+            return False
+        return known(text) or any(known(other) for k, other in texts.items() if k != place)
+    if not known(text):
+        return False
+    if EVIDENT.fullmatch(text):
+        return True
+    name = re.split(r"[(/]", names[place])[0].strip()
+    quantity = QUANTITIES.get(text, "")
+    for word in quantity.split("|") if quantity else ():
+        if name == word or (len(word) > 1 and name.lower().startswith(word)):
+            return True
+    others = [other for k, other in texts.items() if k != place]
+    # A column of another unit in the same style shows that the letter is no variable of which all are functions.
+    different = any(other != text for other in others) and all(map(known, others))
+    return len(name) > 1 and different and (len(texts) == len(names) or any(map(EVIDENT.fullmatch, others)))
+
+
+def unit_row(cells: list[str]) -> list[str] | None:
+    """Return the units in the row below the names, or None if it is none."""
+    texts = [unbracketed(cell) for cell in cells]
+    given = [text for text in texts if text]
+    if not given or sum(map(known, given)) * 2 <= len(given) or all(text == "-" for text in given):
+        return None
+    return texts
+
+
+def unbracketed(cell: str) -> str:
+    """Return a unit without the brackets around it; none for the title of the row."""
+    cell = "" if cell.strip().lower().rstrip(":") in ROW_TITLES else cell.strip()
+    return cell[1:-1].strip() if cell[:1] + cell[-1:] in ("[]", "()") else cell
+
+
+@functools.cache
+def known(text: str) -> bool:
+    """Return whether a text is a unit, or several."""
+    if not 0 < len(text) <= LONGEST_UNIT_TEXT or text[0].isdigit() and not text.startswith("1/"):
+        return False
+    logarithmic = any(re.fullmatch(names, text) for names in LOGARITHMIC)
+    return text in AMBIGUOUS or logarithmic or is_known(text)

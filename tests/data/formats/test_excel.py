@@ -1,0 +1,223 @@
+"""Excel workbooks, written by hand after ECMA-376: dates, times of day, units, formulas and what spreadsheets hide."""
+
+import datetime
+import io
+import warnings
+import zipfile
+from xml.sax.saxutils import escape
+
+import numpy as np
+import openpyxl
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.data.formats import excel
+from tests.data.test_damaged_files import damaged
+
+MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
+RELATED = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
+PACKAGE = "http://schemas.openxmlformats.org/package/2006"
+# Formats of cells: general, date and time, time of day.
+STYLES = (
+    f'<styleSheet xmlns="{MAIN}"><fonts count="1"><font/></fonts><fills count="1"><fill><patternFill/></fill></fills>'
+    '<borders count="1"><border/></borders><cellStyleXfs count="1"><xf/></cellStyleXfs><cellXfs count="3">'
+    '<xf numFmtId="0"/><xf numFmtId="22"/><xf numFmtId="21"/></cellXfs></styleSheet>'
+)
+
+
+def cell(value, place):
+    """Return the XML of a cell: a number, a text, a pair of number and format, or a formula with its value."""
+    if value is None:
+        return ""
+    if isinstance(value, str) and value.startswith("="):
+        formula, _, result = value[1:].partition("→")
+        return f'<c r="{place}"><f>{formula}</f>{f"<v>{result}</v>" if result else ""}</c>'
+    if isinstance(value, str):
+        return f'<c r="{place}" t="inlineStr"><is><t>{escape(value)}</t></is></c>'
+    number, style = value if isinstance(value, tuple) else (value, 0)
+    return f'<c r="{place}" s="{style}"><v>{number!r}</v></c>'
+
+
+def workbook(sheets, *, mac=False, dimension="A1"):
+    """Return the bytes of a workbook of rows by sheet; the stated dimension may be wrong, as of some exporters."""
+    content = io.BytesIO()
+    names = [*sheets]
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        kinds = "".join(
+            f'<Override PartName="/xl/worksheets/sheet{k}.xml" '
+            'ContentType="application/vnd.openxmlformats-officedocument.spreadsheetml.worksheet+xml"/>'
+            for k in range(1, len(names) + 1)
+        )
+        archive.writestr(
+            "[Content_Types].xml",
+            f'<Types xmlns="{PACKAGE}/content-types"><Default Extension="rels" '
+            'ContentType="application/vnd.openxmlformats-package.relationships+xml"/><Default Extension="xml" '
+            'ContentType="application/xml"/><Override PartName="/xl/workbook.xml" '
+            'ContentType="application/vnd.openxmlformats-officedocument.spreadsheetml.sheet.main+xml"/><Override '
+            'PartName="/xl/styles.xml" '
+            f'ContentType="application/vnd.openxmlformats-officedocument.spreadsheetml.styles+xml"/>{kinds}</Types>',
+        )
+        archive.writestr(
+            "_rels/.rels",
+            f'<Relationships xmlns="{PACKAGE}/relationships"><Relationship Id="rId1" '
+            f'Type="{RELATED}/officeDocument" Target="xl/workbook.xml"/></Relationships>',
+        )
+        listed = "".join(f'<sheet name="{name}" sheetId="{k}" r:id="rId{k}"/>' for k, name in enumerate(names, 1))
+        archive.writestr(
+            "xl/workbook.xml",
+            f'<workbook xmlns="{MAIN}" xmlns:r="{RELATED}"><workbookPr date1904="{int(mac)}"/>'
+            f"<sheets>{listed}</sheets></workbook>",
+        )
+        links = "".join(
+            f'<Relationship Id="rId{k}" Type="{RELATED}/worksheet" Target="worksheets/sheet{k}.xml"/>'
+            for k in range(1, len(names) + 1)
+        )
+        archive.writestr(
+            "xl/_rels/workbook.xml.rels",
+            f'<Relationships xmlns="{PACKAGE}/relationships">{links}<Relationship Id="rId99" '
+            f'Type="{RELATED}/styles" Target="styles.xml"/></Relationships>',
+        )
+        archive.writestr("xl/styles.xml", STYLES)
+        for k, rows in enumerate(sheets.values(), 1):
+            lines = "".join(
+                f'<row r="{r}">{"".join(cell(v, f"{chr(64 + c)}{r}") for c, v in enumerate(row, 1))}</row>'
+                for r, row in enumerate(rows, 1)
+            )
+            archive.writestr(
+                f"xl/worksheets/sheet{k}.xml",
+                f'<worksheet xmlns="{MAIN}"><dimension ref="{dimension}"/><sheetData>{lines}</sheetData></worksheet>',
+            )
+    return content.getvalue()
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Return a function that writes a workbook."""
+
+    def written(rows, **options):
+        path = tmp_path / "run.xlsx"
+        sheets = rows if isinstance(rows, dict) else {"Run": rows}
+        path.write_bytes(rows if isinstance(rows, bytes) else workbook(sheets, **options))
+        return path
+
+    return written
+
+
+def read(path, **arguments):
+    """Return times and values of x."""
+    run = bp.Recording.from_file(path, **{"time": "t", "outputs": {"x": "x"}} | arguments)
+    return run.time.tolist(), run.outputs["x"].tolist()
+
+
+def test_sheets_are_groups_with_titles_units_and_empty_cells(write):
+    rows = [["Rig 3"], [], ["t", "x", "note"], ["ms", "mm"], [0, 1.5, "ok"], [1, None, "ok"], [2, 2.5, "#N/A"]]
+    path = write({"Run 1": rows, "Notes": [["only texts"]], "Run 2": [[0.0, 2.0], [0.5, 3.0]]})
+    seen = bp.inspect(path)
+    assert [(c.group, c.name, c.unit) for c in seen.channels] == [
+        ("Run 1", "t", "ms"), ("Run 1", "x", "mm"), ("Run 1", "note", ""), ("Run 2", "column 1", ""),
+        ("Run 2", "column 2", ""),
+    ]  # fmt: skip
+    assert "sheet 'Notes' has no table of numbers" in seen.remarks
+    assert read(path, missing="drop") == ([0.0, 0.002], [0.0015, 0.0025])
+    second = {"time": ("Run 2", "column 1"), "outputs": {"x": ("Run 2", "column 2")}}
+    assert read(path, **second) == ([0.0, 0.5], [2.0, 3.0])
+
+
+@pytest.mark.parametrize("mac", [False, True])
+@pytest.mark.parametrize("rate", [10.0, 51_200.0, 3.0])
+def test_dates_keep_the_resolution_of_the_file(write, mac, rate):
+    """The package openpyxl rounds to milliseconds, so that samples at 51.2 kHz become a staircase."""
+    epoch = datetime.datetime(1904, 1, 1) if mac else datetime.datetime(1899, 12, 30)
+    start = (datetime.datetime(2026, 3, 12) - epoch).days
+    rows = [["t", "x"], *([(start + 0.5 + k / rate / 86_400, 1), float(k)] for k in range(50))]
+    path = write(rows, mac=mac)
+    assert np.asarray(read(path)[0]) == pytest.approx(np.arange(50) / rate, abs=1.5e-6)
+    assert "dates from 2026-03-12T12:00:00.000000" in str(bp.inspect(path))
+    if rate > 1000:
+        with pytest.warns(UserWarning, match="no default style"):
+            typed = openpyxl.load_workbook(path)["Run"]
+        assert len({typed.cell(k, 1).value for k in range(2, 52)}) <= 2
+
+
+def test_times_of_day_go_on_after_midnight(write):
+    rows = [["t", "x"], *([((86_399 + k / 2) / 86_400 % 1.0, 2), float(k)] for k in range(5))]
+    assert read(write(rows)) == ([0.0, 0.5, 1.0, 1.5, 2.0], [0.0, 1.0, 2.0, 3.0, 4.0])
+
+
+def test_times_beyond_a_day_among_times_of_day_are_refused(write):
+    """The package openpyxl returns the former as dates of 1900."""
+    rows = [["t", "x"], [(0.9, 2), 1.0], [(1.1, 2), 2.0]]
+    with pytest.raises(ValueError, match="column 'Run/t' of run.xlsx: must be usable, got dates among other values"):
+        read(write(rows))
+
+
+def test_formulas_without_values_are_refused_and_with_values_read(write):
+    rows = [["t", "x"], [0, "=A2*2→1.5"], [1, "=A3*2→2.5"]]
+    assert read(write(rows))[1] == [1.5, 2.5]
+    with pytest.raises(ValueError, match="must be usable, got a formula without a value in row 3; open and save"):
+        read(write([*rows[:2], [1, "=A3*2"]]))
+    with pytest.raises(ValueError, match="must be usable, got a formula without a value in row 2"):
+        read(write([["t", "x"], [0, "=A2*2"], [1, "=A3*2"]]))
+
+
+@pytest.mark.parametrize("text", ["1,5", "2.5", "1e3"])
+def test_numbers_stored_as_texts_are_refused(write, text):
+    with pytest.raises(ValueError, match=f"got numbers that are stored as texts, such as '{text}' in row 3; convert"):
+        read(write([["t", "x"], [0, 1.5], [1, text], [2, 2.5]]))
+
+
+def test_errors_of_formulas_are_no_numbers(write):
+    with pytest.raises(ValueError, match="must contain numbers, .*got '#DIV/0!' in data row 2"):
+        read(write([["t", "x"], [0, 1.5], [1, "#DIV/0!"], [2, 2.5]]))
+
+
+def test_texts_of_dates_are_read_by_their_format(write):
+    rows = [["t", "x"], ["12.03.2026 10:00", 1.0], ["12.03.2026 10:01", 2.0]]
+    assert read(write(rows), date_format="%d.%m.%Y %H:%M")[0] == [0.0, 60.0]
+
+
+def test_row_of_the_names_may_be_given(write):
+    rows = [["a", "b"], ["t", "x"], [0, 1.5], [1, 2.5]]
+    assert read(write(rows), header=2) == ([0.0, 1.0], [1.5, 2.5])
+    assert read(write(rows), header=0, time=1, outputs={"x": 2}) == ([0.0, 1.0], [1.5, 2.5])
+
+
+def test_stated_size_of_a_sheet_is_not_relied_on(write):
+    rows = [["t", "x"], [0, 1.5], [1, 2.5]]
+    for dimension in ("A1", "A1:XFD1048576"):
+        assert read(write(rows, dimension=dimension))[1] == [1.5, 2.5]
+
+
+def test_sheet_that_unpacks_to_much_more_is_refused(write, monkeypatch):
+    monkeypatch.setattr(excel, "SMALL_MEMBER", 2**16)
+    path = write([["t", "x"], [0, 1.5], [1, "a" * 200_000]])
+    with pytest.raises(ValueError, match="path: must be an Excel workbook .*unpacks to 0.0002 GB"):
+        read(path)
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_damaged_workbooks_are_read_or_refused(write, packed):
+    """Damage of the packed file, and of the XML in it, which the checksums of the file do not show."""
+    rows = [["t", "x"], ["s", "mm"], *([(46_000 + k / 86_400, 1), k / 8] for k in range(40))]
+    whole, generator = workbook({"Run": rows}), np.random.default_rng(5)
+    for k in range(200):
+        content = damaged(whole, generator) if packed else repacked(whole, generator, k)
+        path = write(content)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            for call in (lambda path: bp.inspect(path, format="excel"), lambda path: read(path, format="excel")):
+                try:
+                    call(path)
+                except ValueError as error:
+                    assert "must" in str(error)
+
+
+def repacked(whole, generator, turn):
+    """Return a workbook of which one member is damaged."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(whole)) as source, zipfile.ZipFile(content, "w") as target:
+        names = source.namelist()
+        for name in names:
+            member = source.read(name)
+            target.writestr(name, damaged(member, generator) if name == names[turn % len(names)] else member)
+    return content.getvalue()
