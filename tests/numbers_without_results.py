@@ -107,10 +107,23 @@ WITHOUT_RESULTS = {
     "docs/how_to/noise_model.md": {
         UNSTORED: ("90 % intervals contain the truth in 82 to 86 %; with three and more in 89 to 94 %",),
     },
-    "docs/how_to/read_my_data.md": {
-        SETTING: ("version 5 and 7.3", "grid points per period, 800 by default"),
+    "docs/how_to/files.md": {
+        SETTING: ("or by its number from 1", "given by their number, from 1", "more than 1 ppm"),
         ELSEWHERE: (
-            "dates after ISO 8601", "Text is read as UTF-8", '(or "cp1252", "utf-16")', "milliseconds since 1970",
+            "UTF-8 with or without byte order mark, UTF-16 with one, cp1252", "which is 2.6 ppm long",
+            "51.2 kHz is written as 1.95313E-05 s", "Excel stores (1 µs)", "of data set 164", "one data set 58",
+            "ID line 1", "MDF files, versions 2 to 4", "the lists of SEP 005",
+        ),
+        DEFINITION: (
+            "numbers such as 1,234, for dates such as 03/12/2026,", '"12:+Z"', "Intervals such as 0.0025 s",
+            "the reciprocal of 256 Hz", "so that 8, 16, 24 and 32 bits", '"channel 1", "channel 2"', '"data[:, 2]"',
+            '"segment 1", "segment 2"', '"group 2"',
+        ),
+    },
+    "docs/how_to/read_my_data.md": {
+        SETTING: ("version 5 and 7.3", "grid points per period, 800 by default", "or their numbers from 1"),
+        ELSEWHERE: (
+            "dates after ISO 8601", "milliseconds since 1970",
         ),
         DEFINITION: (
             "divided by 60, multiplied by 2π, by π/180", "multiplied by 9.80665", "steps of 1000 or more",

@@ -747,6 +747,19 @@ def span(values):
     return low if low == high else f"{low} to {high}"
 
 
+@on("docs/reference/files.md")
+def formats():
+    """The number of damaged files, and each row of the table with the tests that show it."""
+    sources = [path.read_text("utf-8") for path in sorted((ROOT / "tests/data/formats").glob("test_*.py"))]
+    known = {name for source in sources for name in re.findall(r"^def (test_\w+)", source, re.MULTILINE)}
+    yield "with one error: 200 and more of each"
+    rows = [line for line in (ROOT / "docs/reference/files.md").read_text("utf-8").splitlines() if line[:2] == "| "]
+    for row in rows[1:]:
+        tests = re.findall(r"`(test_\w+)`", row)
+        assert tests and known.issuperset(tests), row
+        yield row
+
+
 @pytest.mark.parametrize(("page", "subject"), SUBJECTS, ids=[subject.__name__ for _, subject in SUBJECTS])
 def test_numbers_of_a_page_are_those_of_the_results(page, subject):
     printed = text(page)

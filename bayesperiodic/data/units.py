@@ -122,18 +122,20 @@ def is_duration(text: str) -> bool:
 
 def _is_same(one: str, other: str) -> bool:
     """Return whether two texts are one unit."""
-    registry = _registry()
-    try:
-        return bool(registry.Unit(_spelled(one)) == registry.Unit(_spelled(other)))
-    except Exception:  # pint raises errors of many kinds for what is no unit
+    if not (is_known(one) and is_known(other)):
         return False
+    registry = _registry()
+    return bool(registry.Unit(_spelled(one)) == registry.Unit(_spelled(other)))
 
 
 def in_si(text: str) -> str:
     """Return the SI unit of a unit of pint; angles in radians."""
+    spelled = _spelled(text)
+    if len(spelled) > LONGEST_UNIT or not _is_unit(spelled):
+        raise ValueError(f"{text[:LONGEST_UNIT]!r} is no known unit")
     registry = _registry()
     try:
-        return f"{registry.Quantity(1.0, registry.Unit(_spelled(text))).to_base_units().units:~}" or "dimensionless"
+        return f"{registry.Quantity(1.0, registry.Unit(spelled)).to_base_units().units:~}" or "dimensionless"
     except Exception:  # pint raises errors of many kinds for what is no unit
         raise ValueError(f"{text!r} is no known unit") from None
 

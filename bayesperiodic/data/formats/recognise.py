@@ -92,8 +92,14 @@ def contents(path: str | Path, form: str | None, wanted: Iterable[Key], options:
     with one_error(chosen.kind, path):
         whole: Contents = module.contents(file, [*wanted], **given)
     clocks = {id(one.clock): _clock(chosen.kind, path, one.clock) for one in whole.channels}
+    guard = partial(partial, _guarded, chosen.kind, path)
     channels = [
-        replace(one, values=partial(_guarded, chosen.kind, path, one.values), clock=clocks[id(one.clock)])
+        replace(
+            one,
+            values=guard(one.values),
+            clock=clocks[id(one.clock)],
+            frequencies=guard(one.frequencies) if one.frequencies else None,
+        )
         for one in whole.channels
     ]
     return replace(whole, channels=tuple(channels))

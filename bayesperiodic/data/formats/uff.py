@@ -10,7 +10,7 @@ import numpy as np
 
 from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChannel, package, unique_names
 from bayesperiodic.data.formats.decimals import step_error
-from bayesperiodic.data.formats.uff_units import Units164, seconds_of, unit_of
+from bayesperiodic.data.formats.uff_units import Units164, quotient, seconds_of, unit_of
 
 SET_MARK = b"    -1"
 BINARY_START = re.compile(rb" {4}-1 *[\r\n]+ *58[bB]")
@@ -23,9 +23,9 @@ FUNCTION_TYPES = {
     9: "a power spectral density", 10: "an energy spectral density", 12: "a spectrum", 17: "an orbit",
     24: "a shock response spectrum", 27: "an order function",
 }  # fmt: skip
-UNKNOWN_FUNCTION, TIME_RESPONSE = 0, 1
+UNKNOWN_FUNCTION, TIME_RESPONSE, FREQUENCY_RESPONSE = 0, 1, 4
 # Specific data types of abscissas.
-UNKNOWN_DATA, GENERAL_DATA, TIME_ABSCISSA = 0, 1, 17
+UNKNOWN_DATA, GENERAL_DATA, TIME_ABSCISSA, FREQUENCY_ABSCISSA = 0, 1, 17, 18
 DIRECTIONS = {1: "+X", 2: "+Y", 3: "+Z", 4: "+RX", 5: "+RY", 6: "+RZ"}
 DIRECTIONS |= {-key: value.replace("+", "-") for key, value in DIRECTIONS.items()}
 COMPLEX_DATA, SINGLE_DATA, REAL_DATA = (5, 6), (2, 5), (2, 4)
@@ -44,7 +44,7 @@ class _Set:
     head: dict[str, Any]
     step: str
     start: str
-    labels: tuple[str, str]  # of the units of abscissa and ordinate
+    labels: tuple[str, str, str]  # of the units of abscissa, ordinate and denominator
     units: Units164 | None
 
     @property
@@ -83,10 +83,13 @@ def contents(file: Path, wanted: list[Key]) -> Contents:
             int(one.head["num_pts"]),
             partial(_values, reader, one),
             group,
-            "" if (refusal := _refusal(one)) else unit_of(one.head, one.labels[1], one.units),
+            quotient(*one.labels[1:], one.units)
+            if (refusal := _refusal(one))
+            else unit_of(one.head, one.labels[1], one.units),
             clock,
             _remarks(one),
             refusal,
+            partial(_frequencies, reader, one) if one.head["func_type"] == FREQUENCY_RESPONSE else None,
         )
         for one, name, group, clock in zip(sets, names, groups, clocks, strict=True)
     ]
@@ -129,8 +132,8 @@ def _sets(reader: Any, blocks: list[tuple[int, list[bytes]]]) -> list[_Set]:
         _check_head(k + 1, head)
         before = [place for place in known if place < k]
         units = known[before[-1]] if before else next(iter(known.values()), None)
-        form, abscissa, ordinate = (_text(lines[line]) for line in (7, 8, 9))
-        labels = (abscissa[46:66].strip(), ordinate[46:66].strip())
+        form, abscissa, ordinate, denominator = (_text(lines[line]) for line in (7, 8, 9, 10))
+        labels = (abscissa[46:66].strip(), ordinate[46:66].strip(), denominator[46:66].strip())
         sets.append(_Set(k + 1, head, form[43:56], form[30:43], labels, units))
     return sets
 
@@ -186,6 +189,14 @@ def _data(reader: Any, one: _Set) -> tuple[np.ndarray, np.ndarray]:
 
 def _values(reader: Any, one: _Set) -> np.ndarray:
     return _data(reader, one)[1]
+
+
+def _frequencies(reader: Any, one: _Set) -> np.ndarray:
+    """Return the abscissa of a frequency response function [Hz]."""
+    kind, label = one.head["abscissa_spec_data_type"], one.labels[0]
+    if kind not in (UNKNOWN_DATA, GENERAL_DATA, FREQUENCY_ABSCISSA) or label.strip().lower() not in ("", "none", "hz"):
+        raise ValueError(f"its data set {one.number} has an abscissa that is no frequency in Hz, but {label!r}")
+    return _data(reader, one)[0]
 
 
 def _refusal(one: _Set) -> str:

@@ -81,6 +81,15 @@ def unit_of(head: Mapping[str, Any], label: str, stored: Units164 | None) -> str
     return f"{label} (label) or {stored.problem or derived + ' (data set 164)'}"
 
 
+def quotient(label: str, denominator: str, stored: Units164 | None) -> str:
+    """Return the unit of a frequency response function; a text that is no unit if the file leaves it open."""
+    above, below = _plain(label), _plain(denominator)
+    named = f"({above})/({below})" if above and below else f"{above or '?'} per {below or '?'}"
+    if stored is not None and not stored.in_si:
+        return f"{named} (and data set 164)"
+    return named if above or below else ""
+
+
 def _plain(label: str) -> str:
     """Return a label of a unit without brackets; empty without."""
     label = label.strip()

@@ -355,3 +355,34 @@ def test_damaged_file_is_refused_or_read_as_a_whole(tmp_path, arguments):
 def test_package_is_imported_by_no_other_format():
     code = "import sys, bayesperiodic as bp; bp.Recording; bp.inspect; assert 'pyuff' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("binary", ["", "<"])
+@pytest.mark.parametrize("even", [True, False])
+def test_frequency_response_functions_are_a_table_of_responses(saved, binary, even):
+    f = 0.05 + 0.05 * np.arange(5)
+    omega = 2 * np.pi * f
+    h = 1.0 / (1.0 - omega**2 + 0.2j * omega)
+    axis = {"step": 0.05, "start": 0.05} if even else {"x": f}
+    settings = {"function": 4, "abscissa": 18, "time_unit": "Hz", "unit": "mm", "denominator": (13, "N"), **axis}
+    path = saved(function(1e3 * h, title="H", binary=binary, **settings), function(1e3 * h, title="G", **settings))
+    runs = bp.response_table(path, outputs={"x": "H"}, inputs={"force": 0.5}, per="force")
+    assert [run.frequency for run in runs] == pytest.approx(f.tolist())
+    c = [2 / run.samples * np.fft.rfft(run.outputs["x"])[1] for run in runs]
+    assert c == pytest.approx((0.5 * h).tolist(), rel=2e-5)
+    with pytest.raises(ValueError, match="H.*must be usable, got a frequency response function .type 4., which is no"):
+        read(path, "H")
+
+
+def test_frequency_response_whose_units_are_open_needs_them(saved):
+    h = np.exp(-1j * np.arange(1.0, 5.0))
+    settings = {"function": 4, "abscissa": 18, "time_unit": "Hz", "start": 1.0, "step": 1.0}
+    path = saved(units164(), function(h, unit="mm", denominator=(13, "N"), title="H", **settings))
+    arguments = {"outputs": {"x": "H"}, "inputs": {"force": 1.0}, "per": "force"}
+    with pytest.raises(ValueError, match=r"units\['x'\]: must say what '\(mm\)/\(N\) \(and data set 164\)'"):
+        bp.response_table(path, **arguments)
+    first = bp.response_table(path, units={"x": 1e-3}, **arguments)[0]
+    assert 2 / first.samples * np.fft.rfft(first.outputs["x"])[1] == pytest.approx(1e-3 * h[0], rel=1e-6)
+    path = saved(function(h, time_unit="rad/s", unit="m", denominator=(13, "N"), title="H", function=4, abscissa=18))
+    with pytest.raises(ValueError, match="an abscissa that is no frequency in Hz, but 'rad/s'"):
+        bp.response_table(path, **arguments)
