@@ -168,25 +168,38 @@ def finite_vector(argument: str, values: Any, length: int | None = None, meaning
     if length is not None and array.size != length:
         explained = f" ({meaning})" if meaning else ""
         raise ValueError(f"{argument}: must have {length} values{explained}, got {array.size}.")
-    bad = np.flatnonzero(~np.isfinite(array))
-    if bad.size:
-        raise ValueError(
-            f"{argument}: must be finite, got {array[bad[0]]} at index {bad[0]} ({bad.size} of {array.size} values are "
-            "masked, NaN or infinite)."
-        )
+    _size(argument, array)
     return array
 
 
 def measured_vector(argument: str, values: Any, length: int | None = None, meaning: str = "") -> np.ndarray:
     """Return `values` as by `finite_vector`; raise a ValueError if its values are too small or too large."""
-    array = finite_vector(argument, values, length, meaning)
-    size = float(np.max(np.abs(array), initial=0.0))
+    return measured(argument, finite_vector(argument, values, length, meaning))
+
+
+def measured(argument: str, array: np.ndarray) -> np.ndarray:
+    """Return an array of floats itself; raise a ValueError unless it is finite, and not too small or too large."""
+    size = _size(argument, array)
     if size and not SMALLEST_VALUE < size < LARGEST_VALUE:
         raise ValueError(
             f"{argument}: must be between {SMALLEST_VALUE:g} and {LARGEST_VALUE:g} in size, got up to {size:g}; choose "
             "another unit."
         )
     return array
+
+
+def _size(argument: str, array: np.ndarray) -> float:
+    """Return the largest size in an array, without temporary arrays; raise a ValueError if one is not finite."""
+    if not array.size:
+        return 0.0
+    low, high = float(array.min()), float(array.max())
+    if not np.isfinite(low) or not np.isfinite(high):  # NaN is both
+        bad = np.flatnonzero(~np.isfinite(array))
+        raise ValueError(
+            f"{argument}: must be finite, got {array.flat[bad[0]]} at index {bad[0]} ({bad.size} of {array.size} "
+            "values are masked, NaN or infinite)."
+        )
+    return max(-low, high)
 
 
 class ReadOnly(dict[Any, Any]):

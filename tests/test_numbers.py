@@ -749,7 +749,7 @@ def span(values):
 
 @on("docs/reference/files.md")
 def formats():
-    """The number of damaged files, and each row of the table with the tests that show it."""
+    """Yield the number of damaged files, and each row of the table, whose tests must exist."""
     sources = [path.read_text("utf-8") for path in sorted((ROOT / "tests/data/formats").glob("test_*.py"))]
     known = {name for source in sources for name in re.findall(r"^def (test_\w+)", source, re.MULTILINE)}
     yield "with one error: 200 and more of each"

@@ -117,9 +117,9 @@ def _increasing(argument: str, values: Any, name: str) -> np.ndarray:
     time = _checks.measured_vector(argument, values)
     if time.size < 2:
         raise ValueError(f"{argument}: must have at least 2 samples, got {time.size} in {name!r}.")
-    step = np.diff(time)
-    if np.any(step <= 0):
-        index = int(np.flatnonzero(step <= 0)[0])
+    later = time[1:] > time[:-1]
+    if not later.all():
+        index = int(np.argmin(later))
         raise ValueError(
             f"{argument}: must increase, got {time[index + 1]:g} s after {time[index]:g} s at index {index + 1} of "
             f"{name!r}; a file of several records is divided by `from_csv(split=…)`."

@@ -257,12 +257,12 @@ def _signals(
     kept, present = without_missing(at, each, given, layout.missing)
     timed: Times
     if isinstance(kept, dict):
-        timed = {labels[argument]: _checks.measured_vector(at, time) for argument, time in kept.items()}
+        timed = {labels[argument]: _checks.measured(at, time) for argument, time in kept.items()}
     else:
-        timed = _checks.measured_vector(at, kept)
+        timed = _checks.measured(at, kept)
     values = {
         key: from_file(
-            key, _checks.measured_vector(argument, present[argument]), layout.units.get(key), columns[key].stored.unit
+            key, _checks.measured(argument, present[argument]), layout.units.get(key), columns[key].stored.unit
         )
         for argument, key in labels.items()
     }
@@ -282,7 +282,8 @@ def without_missing(
         {f"{argument}[{key!r}]": values for key, values in time.items()} if isinstance(time, dict) else {argument: time}
     )
     for name, values in {**times, **channels}.items():
-        if missing is None and values.ndim == 1 and (lost := np.flatnonzero(np.isnan(values))).size:
+        if missing is None and values.ndim == 1 and values.size and np.isnan(values.min()):
+            lost = np.flatnonzero(np.isnan(values))
             raise ValueError(
                 f"{name}: must be finite, got nan at index {lost[0]} ({lost.size} of {values.size} values are NaN "
                 f"or masked); missing={DROP!r} leaves such samples out, missing={INTERPOLATE!r} fills in single values."
