@@ -20,7 +20,7 @@ MOST_PRINTED, MOST_SUGGESTED = 60, 6
 
 @dataclass(frozen=True)
 class FileChannel(Storable):
-    """A channel of a file.
+    r"""A channel of a file.
 
     Attributes
     ----------
@@ -37,6 +37,15 @@ class FileChannel(Storable):
         What a user would not guess.
     refused : bool
         Whether the channel cannot be read, or not without `sampling_rate` for its times; the last remark says why.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile, numpy as np
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
+    >>> _ = path.write_text("t [s];x [mm]\n0,0;1,5\n0,1;1,7\n0,2;1,6\n")
+    >>> channel = bp.inspect(path).channels[1]
+    >>> channel.name, channel.unit, channel.samples, channel.low, channel.high
+    ('x [mm]', 'mm', 3, 1.5, 1.7)
     """
 
     group: str
@@ -54,7 +63,7 @@ class FileChannel(Storable):
 
 @dataclass(frozen=True, repr=False)
 class FileInspection(Result):
-    """Channels of a file, remarks, and the call that reads it, from `inspect`.
+    r"""Channels of a file, remarks, and the call that reads it, from `inspect`.
 
     Attributes
     ----------
@@ -64,6 +73,15 @@ class FileInspection(Result):
         On the whole file.
     code : str
         A call of `Recording.from_file`, in which inputs and outputs are still to be told apart.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile, numpy as np
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
+    >>> _ = path.write_text("t [s];x [mm]\n0,0;1,5\n0,1;1,7\n0,2;1,6\n")
+    >>> seen = bp.inspect(path)
+    >>> seen.kind, [channel.name for channel in seen.channels]
+    ('CSV file', ['t [s]', 'x [mm]'])
     """
 
     path: str

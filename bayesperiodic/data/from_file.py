@@ -236,7 +236,7 @@ class FromFile(Channels):
 
         Parameters
         ----------
-        dataset : xarray.Dataset or xarray.DataArray
+        dataset : Dataset or DataArray of xarray (samples,)
             Variables and coordinates with one dimension are channels. A coordinate of dates or durations, or of numbers
             whose ``attrs["units"]`` is a unit of time, has the times of the variables along its dimension; variables
             along others keep their own. Units are those of ``attrs["units"]``.

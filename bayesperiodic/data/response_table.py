@@ -41,7 +41,7 @@ def response_table(
 
     Parameters
     ----------
-    table : pandas.DataFrame, mapping of str to array, or path
+    table : pandas.DataFrame, mapping of str to array (rows,), or path
         Of a file in any format of `Recording.from_file`; of a universal file with frequency response functions these,
         whose abscissa is the frequency.
     outputs : mapping of str to str, int or (group, name)
@@ -99,7 +99,7 @@ def response_table(
     columns: list[Any] = [*outputs.values(), *inputs.values(), *(phases or {}).values(), frequency]
     wanted: list[Key] = [key for key in columns if isinstance(key, str | tuple)]
     label, contents = _contents(table, wanted)
-    source = _Table(label, contents, units or {})
+    source = _Columns(label, contents, units or {})
     at = source.frequencies([contents.find(label, key) for key in outputs.values()], frequency)
     drive = {name: source.drive(name, value, at.size) / AMPLITUDES_IN[size] for name, value in inputs.items()}
     responses = {}
@@ -117,7 +117,7 @@ def response_table(
     ]  # fmt: skip
 
 
-class _Table:
+class _Columns:
     """Columns of a table, in SI."""
 
     def __init__(self, label: str, contents: Contents, units: Units):

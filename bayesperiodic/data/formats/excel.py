@@ -16,12 +16,12 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.formats import header_units, text_cells
 from bayesperiodic.data.formats.contents import LARGEST_ARRAY, Contents, Key, StoredChannel, package, unique_names
-from bayesperiodic.data.formats.text_header import NUMBER, PREAMBLE, TIME_NAME
+from bayesperiodic.data.formats.text_header import NUMBER_CELL, PREAMBLE, TIME_NAME
 
 # Unpacked bytes per packed byte above which a member of a workbook is no sheet, if it is larger than this.
 LARGEST_RATIO, SMALL_MEMBER = 250, 2**25
 # Rows and columns that a table may have, those of Excel.
-MOST_ROWS, MOST_COLUMNS = 2**20, 2**14
+MOST_ROWS, MOST_SHEET_COLUMNS = 2**20, 2**14
 STAMPS = (datetime.datetime, datetime.date)
 CLOCKS = (datetime.time, datetime.timedelta)
 NO_VALUE = ("", "#N/A", "#N/A N/A")
@@ -29,7 +29,7 @@ MICROSECONDS = 86_400e6  # in a day
 
 
 @dataclass(frozen=True)
-class _Table:
+class _Sheet:
     """Table of a sheet: names, units, the first row of its data (from 0) and the rows."""
 
     names: list[str]
@@ -99,7 +99,7 @@ def _rows(sheet: Any) -> list[tuple[Any, ...]]:
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # such as of a date beyond those of Excel
         for row in sheet.iter_rows(values_only=True):
-            if len(rows) >= MOST_ROWS or len(row) > MOST_COLUMNS:
+            if len(rows) >= MOST_ROWS or len(row) > MOST_SHEET_COLUMNS:
                 raise ValueError(f"its sheet {sheet.title!r} has more rows or columns than Excel allows")
             rows.append(row)
     while rows and all(cell is None for cell in rows[-1]):
@@ -116,7 +116,7 @@ def _is_empty(cell: Any) -> bool:
     return cell is None or (isinstance(cell, str) and cell.strip() in NO_VALUE)
 
 
-def _table(rows: list[tuple[Any, ...]], line: int | None, sheet: str) -> _Table | None:
+def _table(rows: list[tuple[Any, ...]], line: int | None, sheet: str) -> _Sheet | None:
     """Return the table of a sheet: its columns of values, and the names and units above them."""
     start = line or 0
     width = max(map(len, rows))
@@ -143,14 +143,14 @@ def _table(rows: list[tuple[Any, ...]], line: int | None, sheet: str) -> _Table 
         if named and (read := header_units.unit_row(below)):
             units, above = read, above if line else above[:-1]
     if not above or line == 0:
-        return _Table([f"column {k + 1}" for k in range(real)], units, first, rows, "no names: columns by number")
+        return _Sheet([f"column {k + 1}" for k in range(real)], units, first, rows, "no names: columns by number")
     texts = _texts(rows[above[-1]], real)
     if real > 1 and sum(map(bool, texts)) == 1 and line is None:
-        return _Table([f"column {k + 1}" for k in range(real)], units, first, rows, "no names: columns by number")
+        return _Sheet([f"column {k + 1}" for k in range(real)], units, first, rows, "no names: columns by number")
     names = [text or f"column {k}" for k, text in enumerate(texts, 1)]
     given, _ = header_units.in_names(names)
     units = [one or other for one, other in zip(units, given, strict=True)]
-    return _Table(names, units, first, rows, f"names in row {above[-1] + 1}")
+    return _Sheet(names, units, first, rows, f"names in row {above[-1] + 1}")
 
 
 def _is_data(row: tuple[Any, ...], columns: list[int]) -> bool:
@@ -165,13 +165,13 @@ def _texts(row: tuple[Any, ...], count: int) -> list[str]:
 
 
 def _channel(
-    file: Path, sheet: str, name: str, place: int, table: _Table, formula: int | None, date_format: str | None
+    file: Path, sheet: str, name: str, place: int, table: _Sheet, formula: int | None, date_format: str | None
 ) -> StoredChannel:
     """Return a column of a table."""
     cells = [row[place] if place < len(row) else None for row in table.rows[table.first :]]
     kinds = {type(cell) for cell in cells if not _is_empty(cell)}
     remark, refusal = "", ""
-    if bad := next((cell for cell in cells if isinstance(cell, str) and NUMBER.fullmatch(cell.strip())), None):
+    if bad := next((cell for cell in cells if isinstance(cell, str) and NUMBER_CELL.fullmatch(cell.strip())), None):
         refusal = (
             f"numbers that are stored as texts, such as {bad!r} in row {table.first + cells.index(bad) + 1}; convert "
         )
@@ -239,7 +239,7 @@ def _on_grid(times: np.ndarray) -> np.ndarray:
     return times
 
 
-def _formulas(file: Path, sheet: str, table: _Table) -> dict[int, int]:
+def _formulas(file: Path, sheet: str, table: _Sheet) -> dict[int, int]:
     """Return the first row (from 1) with a formula whose value is not stored, by the place of its column."""
     size = len(table.names)
     if not any(len(row) < size or None in row[:size] for row in table.rows[table.first :]):

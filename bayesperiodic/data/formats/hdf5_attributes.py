@@ -32,7 +32,7 @@ DURATIONS = {
 }  # fmt: skip
 SINCE_TEXT = re.compile(r"\s*(\w+)\s+since\s+(.+?)\s*", re.IGNORECASE)
 # pandas takes a year 1 as 2001.
-DATE = re.compile(r"\d{4}-\d")
+DATE_START = re.compile(r"\d{4}-\d")
 CALENDARS = ("standard", "gregorian", "proleptic_gregorian")
 # Numbers from which a start is seconds since 1970; years that nanoseconds since 1970 reach.
 LEAST_EPOCH, YEARS = 1e8, (1678, 2262)
@@ -139,7 +139,7 @@ class Since:
         import pandas as pd
 
         try:
-            date = pd.Timestamp(match.group(2)) if DATE.match(match.group(2)) else None
+            date = pd.Timestamp(match.group(2)) if DATE_START.match(match.group(2)) else None
         except ValueError:
             date = None
         if date is None or pd.isna(date) or not YEARS[0] <= date.year < YEARS[1]:

@@ -5,7 +5,7 @@ import re
 
 from bayesperiodic.data.units import AMBIGUOUS, LOGARITHMIC, is_known
 
-LONGEST_UNIT_TEXT, LONGEST_NAME = 30, 300
+LONGEST_UNIT_TEXT, LONGEST_UNIT_NAME = 30, 300
 # "Force [N]", "Force (N)" and "Force / N"; in the last two a letter may be a variable or a divisor.
 STYLES = {
     "[": re.compile(r".*?\[\s*([^\[\]]*?)\s*\]\s*", re.DOTALL),
@@ -38,7 +38,7 @@ def in_names(names: list[str], *, guessed: bool = False) -> tuple[list[str], dic
         texts = {
             place: match[1]
             for place, name in enumerate(names)
-            if name[LONGEST_NAME:] == "" and (match := pattern.fullmatch(name)) and match[1]
+            if name[LONGEST_UNIT_NAME:] == "" and (match := pattern.fullmatch(name)) and match[1]
         }
         if not texts:
             continue

@@ -20,7 +20,7 @@ ROW_START = frozenset("0123456789+-.,")
 LOST = ("", "nan", "-nan", "1.#qnan", "-1.#ind", "inf", "-inf")
 # Rows at the end from which the digits of the times are taken, and relative error of a step that is none.
 LAST_ROWS, EXACT_STEP = 20, 1e-6
-DATE, TIME_OF_DAY = re.compile(r"(\d{4})/(\d\d?)/(\d\d?)$"), re.compile(r"(\d\d?):(\d\d?):(\d\d?)(?:[.,](\d+))?$")
+SLASHED_DATE, LVM_TIME = re.compile(r"(\d{4})/(\d\d?)/(\d\d?)$"), re.compile(r"(\d\d?):(\d\d?):(\d\d?)(?:[.,](\d+))?$")
 # Numbers as LabVIEW writes them by default.
 SIX_DECIMALS = re.compile(r"\d+[.,]\d{6}")
 
@@ -246,7 +246,7 @@ def _digit(texts: list[str], decimal: str) -> float:
 
 def _origin(date: Any, time: Any) -> np.datetime64 | None:
     """Return date and time of a segment, which LabVIEW writes with up to 19 decimals of a second."""
-    day, clock = DATE.match(str(date).strip()), TIME_OF_DAY.match(str(time).strip())
+    day, clock = SLASHED_DATE.match(str(date).strip()), LVM_TIME.match(str(time).strip())
     if not day or not clock:
         return None
     year, month, dom = map(int, day.groups())

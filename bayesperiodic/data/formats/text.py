@@ -16,7 +16,7 @@ from bayesperiodic import _checks
 from bayesperiodic.data.formats import header_units, text_cells
 from bayesperiodic.data.formats.contents import Contents, Key, StoredChannel
 from bayesperiodic.data.formats.encodings import Text, opened
-from bayesperiodic.data.formats.text_cells import Evidence
+from bayesperiodic.data.formats.text_cells import CellEvidence
 from bayesperiodic.data.formats.text_header import (
     BLANKS,
     MISSING,
@@ -32,7 +32,7 @@ from bayesperiodic.data.formats.text_header import (
 )  # fmt: skip
 
 # Columns per wanted column above which the others are not made numbers, and the separator of the wanted ones.
-UNWANTED_RATIO, NARROW = 2, "\x1f"
+UNWANTED_RATIO, UNIT_SEPARATOR = 2, "\x1f"
 # Rows that pandas reads at once.
 PART_ROWS = 100_000
 # Bytes at the end of a file among which rows of summaries are searched for, and their first words.
@@ -43,7 +43,7 @@ SUMMARY = re.compile(
     re.IGNORECASE,
 )
 TIME_UNITS = ("s", "ms", "us", "µs", "min", "h", "sec", "second", "Second")
-SIGNS = {".": "decimal point", ",": "decimal comma"}
+DECIMAL_SIGNS = {".": "decimal point", ",": "decimal comma"}
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def contents(
                 refusal=refusals.get(place, "") or refusal,
             )
         )
-    remarks = [top.remark + (f", {SIGNS.get(sign, f'decimal {sign!r}')}" if sign else "")]
+    remarks = [top.remark + (f", {DECIMAL_SIGNS.get(sign, f'decimal {sign!r}')}" if sign else "")]
     return Contents(
         "CSV file",
         tuple(channels),
@@ -143,12 +143,12 @@ Read = dict[int, tuple[np.ndarray, str, str]]
 
 def _columns(file: Text, top: Head, places: list[int], notation: _Notation) -> tuple[Read, str, int]:
     """Return columns with a remark and a refusal, the decimal sign if there are any, and the number of rows."""
-    evidence = Evidence.of(cell for row in top.sample for cell in row[: len(top.names)])
+    evidence = CellEvidence.of(cell for row in top.sample for cell in row[: len(top.names)])
     decimal = notation.decimal or evidence.sign or "."
     table, rows = _table(file, top, places, decimal)
     texts = {place: values for place, values in table.items() if values.dtype == object}
     for values in texts.values():
-        evidence |= Evidence.of(cell.strip(" \t") for cell in values if isinstance(cell, str))
+        evidence |= CellEvidence.of(cell.strip(" \t") for cell in values if isinstance(cell, str))
     sign = notation.decimal or evidence.sign
     if not sign and {",", "."} <= evidence.either and not evidence.decimal:
         raise ValueError(
@@ -238,7 +238,7 @@ def _table(file: Text, top: Head, places: list[int], decimal: str) -> tuple[dict
             elif len(places) * UNWANTED_RATIO < width or separator == BLANKS and top.more > 0:
                 source = _narrowed(rows_of(source, separator, strict=True), places, width, width + surplus)
                 at = {place: k for k, place in enumerate(places)}
-                width, surplus, separator = len(places) + 1, 1, NARROW
+                width, surplus, separator = len(places) + 1, 1, UNIT_SEPARATOR
             missing: Any = dict(enumerate([MISSING] * width + [[""]] * surplus))
             options: dict[str, Any] = {
                 "skip_blank_lines": not alone,
@@ -310,7 +310,7 @@ def _narrowed(rows: Iterable[list[str]], places: list[int], width: int, most: in
     The table of all columns of a wide file would take several times the memory of the file.
     """
     narrow = io.TextIOWrapper(io.BytesIO(), "utf-8", newline="")
-    writer = csv.writer(narrow, delimiter=NARROW)
+    writer = csv.writer(narrow, delimiter=UNIT_SEPARATOR)
     for row in rows:
         if len(row) < 2 and not any(map(str.strip, row)):
             continue

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesperiodic.data.formats.text_header import DATE, EXPONENT, GROUPS, MISSING, NUMBER, TIME_OF_DAY
+from bayesperiodic.data.formats.text_header import DATE, EXPONENT, GROUPS, MISSING, NUMBER_CELL, TIME_OF_DAY
 
 GROUPED, PLAIN_COMMA = re.compile(rf"[+-]?{GROUPS}"), re.compile(rf"[+-]?[0-9]*,[0-9]+{EXPONENT}")
 PLAIN_POINT = re.compile(rf"[+-]?(?:[0-9]+\.[0-9]*|\.[0-9]+){EXPONENT}")
@@ -20,7 +20,7 @@ MOST_DECIMALS = 9  # of a second, which nanoseconds hold
 
 
 @dataclass(frozen=True)
-class Evidence:
+class CellEvidence:
     """Which signs numbers show: proofs of a decimal sign and of one between thousands, and what may be either."""
 
     decimal: frozenset[str] = frozenset()
@@ -28,11 +28,11 @@ class Evidence:
     either: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, cells: Iterable[str]) -> "Evidence":
+    def of(cls, cells: Iterable[str]) -> "CellEvidence":
         """Return the evidence of cells of a text."""
         decimal, thousands, either = set[str](), set[str](), set[str]()
         for cell in cells:
-            if not ("," in cell or "." in cell) or not NUMBER.fullmatch(cell):
+            if not ("," in cell or "." in cell) or not NUMBER_CELL.fullmatch(cell):
                 continue
             if EITHER.fullmatch(cell):
                 either.add("," if "," in cell else ".")
@@ -43,8 +43,8 @@ class Evidence:
                 decimal |= {other for other in ",." if other in cell and other != match["mark"]}
         return cls(frozenset(decimal), frozenset(thousands), frozenset(either))
 
-    def __or__(self, other: "Evidence") -> "Evidence":
-        return Evidence(self.decimal | other.decimal, self.thousands | other.thousands, self.either | other.either)
+    def __or__(self, other: "CellEvidence") -> "CellEvidence":
+        return CellEvidence(self.decimal | other.decimal, self.thousands | other.thousands, self.either | other.either)
 
     @property
     def sign(self) -> str:
@@ -55,7 +55,7 @@ class Evidence:
 
 def refusal(cells: list[str], decimal: str, sure: bool) -> str:
     """Return why numbers with commas cannot be read, if they are not dates or texts."""
-    numbers = [cell for cell in cells if NUMBER.fullmatch(cell)]
+    numbers = [cell for cell in cells if NUMBER_CELL.fullmatch(cell)]
     if len(numbers) < len(cells) or not numbers:
         return ""
     shown = next((cell for cell in numbers if "," in cell), numbers[0])

@@ -28,11 +28,11 @@ WORDS = {",": "','", ";": "';'", "\t": "tab", "|": "'|'", BLANKS: "blanks"}
 
 EXPONENT = r"(?:[eE][+-]?[0-9]+|[dD][+-][0-9]{2,3})?"
 GROUPS = r"[0-9]{1,3}(?:(?P<mark>[.,'’ \u00a0\u202f])[0-9]{3})(?:(?P=mark)[0-9]{3})*(?:[.,][0-9]+)?"
-PLAIN = rf"(?:[0-9]+(?:\.[0-9]*|,[0-9]+)?|[.,][0-9]+){EXPONENT}|[Ii]nf(?:inity)?"
+PLAIN_NUMBER = rf"(?:[0-9]+(?:\.[0-9]*|,[0-9]+)?|[.,][0-9]+){EXPONENT}|[Ii]nf(?:inity)?"
 TIME_OF_DAY = r"[0-9]{1,2}:[0-9]{2}(?::[0-9]{2})?(?:[.,][0-9]+)?(?: ?[AaPp][Mm])?"
 DATE = rf"[0-9]{{1,4}}[-./][0-9]{{1,2}}[-./][0-9]{{1,4}}(?:[T ]+{TIME_OF_DAY})?(?:Z|[+-][0-9]{{2}}:?[0-9]{{2}})?"
-NUMBER = re.compile(rf"[+-]?(?:{PLAIN}|{GROUPS})")
-USABLE = re.compile(rf"[+-]?(?:{PLAIN}|{GROUPS})|{TIME_OF_DAY}|{DATE}")
+NUMBER_CELL = re.compile(rf"[+-]?(?:{PLAIN_NUMBER}|{GROUPS})")
+USABLE = re.compile(rf"[+-]?(?:{PLAIN_NUMBER}|{GROUPS})|{TIME_OF_DAY}|{DATE}")
 TIME_NAME = re.compile(
     r"\W*(t|time|zeit|temps|tiempo|tempo|timestamp|zeitstempel|date|datum|datetime|uhrzeit|elapsed)\b.*", re.IGNORECASE
 )
@@ -389,7 +389,11 @@ def _names_above(block: _Block, line: int | None) -> tuple[list[str], int, list[
     elif names[0][:1] in ("#", "%"):
         names = [COMMENT_MARK.sub("", names[0]), *names[1:]]
     names = _trimmed(names)
-    if line is None and not units and any(NUMBER.fullmatch(name) or re.fullmatch(DATE, name) for name in names if name):
+    if (
+        line is None
+        and not units
+        and any(NUMBER_CELL.fullmatch(name) or re.fullmatch(DATE, name) for name in names if name)
+    ):
         if len(above[-1][1]) == block.width and 2 * sum(map(_is_value, filter(None, names))) > len(block.columns):
             raise ValueError(
                 f"header: must be given, got None, as line {above[-1][0]} has neither names nor only numbers, "
