@@ -10,7 +10,7 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChannel
 from bayesperiodic.data.times import dates, seconds
-from bayesperiodic.data.units import Units, from_file
+from bayesperiodic.data.units import Units, from_file, is_duration
 
 DROP, INTERPOLATE = "drop", "interpolate"
 # Successive samples that may be interpolated.
@@ -44,6 +44,10 @@ class Layout:
             )
         for key in self.units:
             _checks.one_of("units", key, ("time", *self.sources))
+        if "time" in self.units and "time" in self.sources:
+            raise ValueError(
+                "units: must be those of the times by the name 'time', got a channel of this name too; rename it."
+            )
         if isinstance(self.sampling_rate, Mapping):
             for key in self.sampling_rate:
                 _checks.one_of("sampling_rate", key, self.sources)
@@ -114,6 +118,11 @@ def numbers(argument: str, values: Any, *, text: bool = False, time: bool = Fals
         import pandas as pd
 
         cells = np.atleast_1d(array)
+        if not any(isinstance(cell, str | bytes) for cell in cells.flat):
+            try:  # Decimal, and Python's numbers among missing ones
+                return np.array([np.nan if pd.isna(cell) else float(cell) for cell in cells])
+            except (TypeError, ValueError):
+                pass
         rows = np.flatnonzero(pd.isna(pd.to_numeric(cells, errors="coerce")) & pd.notna(cells))
         got = f"{cells[rows[0]]!r} in data row {rows[0] + 1}" if rows.size else "numbers too long to be read"
         hint = "; dates must be those of ISO 8601, give date_format= for others in a text" if time else ""
@@ -128,7 +137,9 @@ def numbers(argument: str, values: Any, *, text: bool = False, time: bool = Fals
 def _label(layout: Layout, contents: Contents, split: Key, columns: Mapping[str, _Column], times: Times) -> np.ndarray:
     """Return the column that distinguishes records, which has one value per sample."""
     label = _Column.of(layout, contents, split, text=True).values
-    if any(lost := [value != value for value in label]):
+    import pandas as pd
+
+    if any(lost := pd.isna(label).tolist()):
         row = lost.index(True) + 1
         raise ValueError(f"split: must be a column without empty cells, got {split!r}, empty in data row {row}.")
     sizes = {column.stored.label: column.values.size for column in columns.values()}
@@ -152,7 +163,7 @@ def _times(layout: Layout, contents: Contents, columns: Mapping[str, _Column]) -
         else dict.fromkeys(columns, layout.sampling_rate)
     )
     distinct = {id(clock) for clock in clocks.values() if clock}
-    if isinstance(layout.sampling_rate, int | float) and len(distinct) > 1:
+    if isinstance(layout.sampling_rate, int | float | np.number) and len(distinct) > 1:
         different = {(clock.start, clock.step, clock.stored) for clock in clocks.values() if clock}
         if len(different) > 1:
             raise ValueError(
@@ -187,7 +198,28 @@ def _time_column(layout: Layout, contents: Contents) -> np.ndarray:
     stored = "" if column.values.dtype.kind in "mM" else column.stored.unit
     given = "time" in layout.units or bool(stored)
     time = _checks.real_array(argument, seconds(argument, column.values, unit=given))
-    return from_file("time", time, layout.units.get("time"), stored)
+    return in_seconds(argument, time, layout.units.get("time"), stored)
+
+
+def in_seconds(argument: str, time: np.ndarray, unit: Any, stored: str) -> np.ndarray:
+    """Return times in seconds; raise a ValueError if the unit of the file or of the user is none of time."""
+    if isinstance(unit, str) and unit != "s":
+        raise ValueError(
+            f"units['time']: must be a factor or a pair such as ('ms', 's'), as times are in s, got {unit!r}."
+        )
+    pair = (
+        [unit]
+        if isinstance(unit, str)
+        else []
+        if unit is None or isinstance(unit, int | float | np.number)
+        else [*unit]
+    )
+    if (stored.strip() and not pair and unit is None and not is_duration(stored)) or not all(map(is_duration, pair)):
+        raise ValueError(
+            f"{argument}: must be in a unit of time, got {(*pair, stored) if pair else stored!r}; give the column of "
+            "times, or units={'time': …} as a factor."
+        )
+    return from_file("time", time, unit, stored)
 
 
 def _offsets(layout: Layout, clocks: Mapping[str, Clock | None]) -> dict[str, float]:

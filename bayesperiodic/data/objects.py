@@ -13,6 +13,8 @@ from bayesperiodic.data.units import from_file, is_duration
 
 # Relative difference of "fs" and "time" that is no rounding.
 CONTRADICTION = 1e-4
+# Attributes of netCDF by which values are decoded.
+PACKED = ("scale_factor", "add_offset", "_FillValue", "missing_value")
 # Seconds from a start beyond which they are counted from another one, such as 1970.
 LONGEST_DELAY = 1e8
 
@@ -39,7 +41,7 @@ def dataframe(table: Any) -> Contents:
         channels.append(StoredChannel(str(name), len(table), values, group, unit, clock))
     if table.index.name is not None and str(table.index.name) not in [channel.name for channel in channels]:
         channels.append(StoredChannel(str(table.index.name), len(table), table.index.to_numpy, clock=clock))
-    return Contents("DataFrame", tuple(_distinct("table", channels)), word="column")
+    return Contents("DataFrame", tuple(_distinct("table", channels)), word="column", numbered=False)
 
 
 def dataset(data: Any) -> Contents:
@@ -60,6 +62,8 @@ def dataset(data: Any) -> Contents:
     for name, variable in data.variables.items():
         dimensions = tuple(map(str, variable.dims))
         refusal = f"dimensions {dimensions}; choose one column by isel or sel" if len(dimensions) != 1 else ""
+        if packed := [key for key in PACKED if key in variable.attrs]:
+            refusal = f"packed values, with {packed[0]!r} in attrs; decode them first by xarray.decode_cf(dataset)"
         clock = clocks.get(variable.dims[0]) if dimensions else None
         read, size, unit = variable.to_numpy, int(variable.size), _unit(variable)
         channels.append(StoredChannel(str(name), size, read, unit=unit, clock=clock, refusal=refusal))
@@ -79,7 +83,7 @@ def sep005(series: Any) -> Contents:
 def _sep005(place: int, one: Mapping[str, Any]) -> StoredChannel:
     argument = f"channels[{place}]"
     _checks.contains(argument, one, ("data", "name", "unit_str"), "SEP 005 requires them")
-    data = np.asarray(one["data"])
+    data = np.array(one["data"], dtype=object) if _is_ragged(one["data"]) else np.asarray(one["data"])
     if data.ndim != 1:
         raise ValueError(
             f"{argument}: must have data of one dimension, got shape {data.shape}; give each column as a channel."
@@ -92,7 +96,13 @@ def _sep005(place: int, one: Mapping[str, Any]) -> StoredChannel:
     if time is None:
         clock = Clock(step=1.0 / _checks.positive(f"{argument}['fs']", rate), origin=origin)
     else:
-        times = _checks.real_array(f"{argument}['time']", seconds(f"{argument}['time']", time))
+        stamped = _of_coordinate(f"{argument}['time']", np.asarray(time), "")
+        if stamped is not None and stamped.stored is not None:
+            if origin is not None and stamped.origin is not None:
+                raise ValueError(f"{argument}: must have dates or 'start_timestamp', and not both, got both.")
+            times, origin = stamped.stored(), origin if stamped.origin is None else stamped.origin
+        else:
+            times = _checks.real_array(f"{argument}['time']", seconds(f"{argument}['time']", time))
         if times.shape != data.shape:
             raise ValueError(f"{argument}: must have one time per value, got {times.size} and {data.size} values.")
         if origin is not None and times.size and abs(times[0]) > LONGEST_DELAY:
@@ -101,7 +111,8 @@ def _sep005(place: int, one: Mapping[str, Any]) -> StoredChannel:
                 "leave one of them out."
             )
         if rate is not None:
-            mean = (times.size - 1) / (times[-1] - times[0]) if times.size > 1 else float(rate)
+            length = float(times[-1] - times[0]) if times.size > 1 else 0.0
+            mean = (times.size - 1) / length if length else np.inf if times.size > 1 else float(rate)
             if not abs(mean / _checks.positive(f"{argument}['fs']", rate) - 1.0) < CONTRADICTION:
                 raise ValueError(
                     f"{argument}: must have 'fs' and 'time' that agree, got {rate!r} Hz and times of {mean:.6g} Hz; "
@@ -110,6 +121,11 @@ def _sep005(place: int, one: Mapping[str, Any]) -> StoredChannel:
         clock = Clock(stored=lambda: times, origin=origin)
     group = str(one.get("group") or "")
     return StoredChannel(str(one["name"]), data.size, lambda: data, group, str(one["unit_str"] or ""), clock)
+
+
+def _is_ragged(values: Any) -> bool:
+    """Return whether values are sequences of different lengths, which NumPy makes no array of."""
+    return isinstance(values, list | tuple) and len({np.size(value) for value in values}) > 1
 
 
 def _instant(argument: str, stamp: Any) -> np.datetime64:
@@ -124,9 +140,10 @@ def _of_coordinate(argument: str, values: Any, unit: str) -> Clock | None:
     """Return a clock of dates, durations, or numbers with a unit of time; None for other coordinates."""
     array = np.asarray(values) if getattr(values, "dtype", None) is None else values
     times = dates(argument, array) if np.asarray(array).dtype.kind in "mMO" else None
-    if times is not None and times.ndim == 1 and times.size:
-        origin = np.datetime64(times[0], "ns") if times.dtype.kind == "M" else None
-        shift = 0.0 if origin is not None else times[0] / np.timedelta64(1, "ns") * 1e-9
+    if times is not None and times.ndim == 1 and not np.isnat(times).all():
+        first = times[~np.isnat(times)][0]
+        origin = np.datetime64(first, "ns") if times.dtype.kind == "M" else None
+        shift = 0.0 if origin is not None else first / np.timedelta64(1, "ns") * 1e-9
         return Clock(stored=lambda: seconds(argument, times) + shift, origin=origin)
     if np.asarray(array).dtype.kind in "fiu" and is_duration(unit):
         return Clock(stored=partial(_in_seconds, np.asarray(array), unit))

@@ -1,5 +1,6 @@
 """Experiments from a table of frequencies, amplitudes and phases, or from frequency response functions."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.formats import recognise
 from bayesperiodic.data.formats.contents import Contents, Key, StoredChannel
 from bayesperiodic.data.layout import numbers
-from bayesperiodic.data.units import Units, from_file
+from bayesperiodic.data.units import Units, from_file, kind_of
 
 # Values in the table over the amplitude of the fundamental.
 AMPLITUDES_IN = {"peak": 1.0, "rms": np.sqrt(0.5), "peak to peak": 2.0}
@@ -106,7 +107,7 @@ def response_table(
     for channel, column in outputs.items():
         phase = (phases or {}).get(channel)
         angles = None if phase is None else source.angles(phase, PHASE_UNITS[phase_unit])
-        c = source.response(channel, column, angles, at.size)
+        c = source.response(channel, column, angles, at.size, per)
         responses[channel] = c * drive[per] if per is not None else c / AMPLITUDES_IN[size]
     return [
         Experiment.from_harmonics(
@@ -141,7 +142,12 @@ class _Columns:
         """Return the frequencies [Hz]: a column, or the abscissa of frequency response functions."""
         if key is not None:
             stored, values = self.column(key)
-            values = from_file("frequency", values, self.units.get("frequency"), stored.unit)
+            unit = self.units.get("frequency")
+            if stored.unit and unit is None and kind_of(stored.unit) != kind_of("Hz"):
+                raise ValueError(
+                    f"frequency: must be in Hz, got {stored.unit!r} of {stored.label!r}; give units={{'frequency': …}}."
+                )
+            values = from_file("frequency", values, unit, stored.unit)
         else:
             axes = [channel.frequencies() for channel in channels if channel.frequencies is not None]
             if len(axes) < len(channels):
@@ -170,7 +176,10 @@ class _Columns:
     def angles(self, key: Key, radian: float) -> np.ndarray:
         """Return phases [rad]; a unit of the file counts."""
         stored, values = self.column(key)
-        angles = from_file("phase", values, None, stored.unit) if stored.unit else values * radian
+        kind = kind_of(stored.unit)
+        if kind not in ("", "rad") or (stored.unit and not kind and stored.unit.strip() != "-"):
+            raise ValueError(f"phases: must be in degrees or radians, got {stored.unit!r} of {stored.label!r}.")
+        angles = from_file("phase", values, None, stored.unit) if kind else values * radian
         if np.any(np.abs(angles) > np.radians(LARGEST_PHASE)):
             raise ValueError(
                 f"phases: must be within {LARGEST_PHASE:g}°, got {np.degrees(np.abs(angles).max()):.4g}° in "
@@ -178,12 +187,16 @@ class _Columns:
             )
         return angles
 
-    def response(self, name: str, key: Key, angles: np.ndarray | None, rows: int) -> np.ndarray:
+    def response(self, name: str, key: Key, angles: np.ndarray | None, rows: int, per: str | None) -> np.ndarray:
         """Return the complex amplitudes of an output."""
         argument = f"outputs[{name!r}]"
         stored, values = self.column(key)
         values = self.sized(argument, values, rows)
         unit = self.units.get(name)
+        if per is None and unit is None and re.search(r"/ kg|/ \(.*kg|^1 / kg", kind_of(stored.unit)):
+            raise ValueError(
+                f"per: must be the input per which {name!r} is given, got None and values in {stored.unit!r}."
+            )
         if values.dtype.kind == "c":
             if angles is not None:
                 raise ValueError(f"phases: must be left out for complex amplitudes, got one for {name!r}.")
@@ -221,7 +234,11 @@ def _contents(table: Any, wanted: list[Key]) -> tuple[str, Contents]:
     if isinstance(table, str | Path):
         return Path(table).name, recognise.contents(table, None, wanted, {})
     if isinstance(table, Mapping):
-        table = pd.DataFrame({name: np.asarray(values) for name, values in table.items()})
+        columns = {name: np.atleast_1d(np.asarray(values)) for name, values in table.items()}
+        sizes = {name: values.size for name, values in columns.items()}
+        if len({*sizes.values()}) != 1 or any(values.ndim != 1 for values in columns.values()):
+            raise ValueError(f"table: must have columns of one length, got {sizes}.")
+        table = pd.DataFrame(columns)
     return "the table", objects.dataframe(table)
 
 

@@ -34,23 +34,39 @@ LOGARITHMIC = {
 SPELLINGS = {
     "sec": "s", "Sec": "s", "Second": "s", "seconds": "s", "Seconds": "s", "msec": "ms", "usec": "us",
     "Volt": "V", "Volts": "V",
-    "volts": "V", "Newton": "N", "Newtons": "N", "Nm": "N*m", "kNm": "kN*m", "Nmm": "N*mm", "gn": "g_0", "g_n": "g_0",
+    "volts": "V", "Newton": "N", "Newtons": "N", "gn": "g_0", "g_n": "g_0",
     "RPM": "rpm", "HZ": "Hz", "hz": "Hz", "Ampere": "A", "Amps": "A", "Deg": "deg", "Rad": "rad",
     "inch": "in", "C°": "degC", "°C": "degC", "Celsius": "degC", "Ohm": "ohm", "Pascal": "Pa", "PA": "Pa",
     "µe": "um/m", "ue": "um/m", "µε": "um/m", "με": "um/m", "µm/m": "um/m", "ustrain": "um/m", "microstrain": "um/m",
     "-": "", "1": "", "none": "", "None": "", "NONE": "",
 }  # fmt: skip
-# Units that stand for two things, or that pint takes for other ones than measurement programs, and what to write.
+# Units that stand for two things: what to write, and the first units of pairs that decide.
 AMBIGUOUS = {
-    "g": "('g_0', 'm/s**2') for the acceleration of gravity, ('g', 'kg') for the gram",
-    "rpm": "('rpm', 'Hz') for a frequency, ('rpm', 'rad/s') for an angular velocity",
-    "C": "('degC', 'K') for a temperature, ('C', 'C') for the coulomb",
-    "F": "('degF', 'K') for a temperature, ('F', 'F') for the farad",
-    "lb": "('lbf', 'N') for a force, ('lb', 'kg') for a mass",
-}
-A_FACTOR = "a factor, such as 1.0 for values as they are"
-# Single letters that are no doubt the unit, and other texts that are no units but would be taken for some.
-LETTERS, NO_UNITS = set("msNVAKWJTHLlhΩ°%"), ("EU", "AU", "au", "cts", "units", "unit", "pk", "rms", "lin")
+    "g": (
+        "('g_0', 'm/s**2') for the acceleration of gravity, ('g', 'kg') for the gram", ("g_0", "gram"),
+    ),
+    "rpm": ("('rpm', 'Hz') for a frequency, ('rpm', 'rad/s') for an angular velocity", ("rpm",)),
+    "C": ("('degC', 'K') for a temperature, ('C', 'C') for the coulomb", ("degC", "delta_degC", "coulomb")),
+    "F": ("('degF', 'K') for a temperature, ('F', 'F') for the farad", ("degF", "delta_degF", "farad")),
+    "lb": ("('lbf', 'N') for a force, ('lb', 'kg') for a mass", ("lbf", "pound")),
+}  # fmt: skip
+A_FACTOR = "a pair such as ('mm', 'm'), or a factor, such as 1.0 for values as they are"
+# Units of files that are converted without a question, with their prefixes. pint knows many more, of which some are not
+# what a measurement program means: "Nm" within a product is its number metric, "mil" an angle, "kn" a knot.
+PREFIXED = {
+    "m": "n u µ μ m c d k", "s": "n u µ μ m", "rad": "u µ μ m", "Hz": "m k M G", "N": "u µ μ m c d da k M",
+    "Pa": "m h k M G", "bar": "m", "J": "m k M", "W": "u µ μ m k M", "V": "n u µ μ m k", "A": "n u µ μ m k",
+    "ohm": "m k M", "Ω": "m k M", "F": "p n u µ μ m", "C": "p n u µ μ m", "H": "n u µ μ m", "T": "n u µ μ m", "K": "m",
+    "l": "m", "L": "m", "degC": "", "°C": "", "degF": "", "delta_degC": "", "delta_degF": "", "g_0": "", "kg": "",
+    "in": "", "ft": "", "lbf": "", "psi": "", "min": "", "h": "", "deg": "", "°": "", "%": "", "ppm": "", "atm": "",
+    "rev": "", "turn": "", "dimensionless": "",
+}  # fmt: skip
+CERTAIN = {prefix + unit for unit, prefixes in PREFIXED.items() for prefix in ("", *prefixes.split())} - {*AMBIGUOUS}
+WORD = re.compile(rf"[^\W\d_{SUPERSCRIPT_DIGITS}][^\W{SUPERSCRIPT_DIGITS}]*|[°%]\w*")
+# Moments, as they are written without a sign between newton and metre.
+MOMENT = re.compile(r"(?<!\w)((?:[nuµμmcdkM]|da)?N)([mc]?m)(?!\w)")
+# Metres per second, or inverse milliseconds.
+MS_TO_A_POWER = re.compile(r"(?<!\w)ms\s*(?:(?:\*\*|\^)?\s*-[1-4]|⁻)")
 # A unit with an exponent that has no sign of its own, such as m/s2, and those of netCDF, such as m s-2.
 BARE_EXPONENT = re.compile(r"(?<=[A-Za-z])([234]|-[1-4])(?![\w.])")
 
@@ -68,7 +84,7 @@ def from_file(name: str, values: np.ndarray, unit: float | str | Sequence[str] |
                 "say the unit."
             )
         return values if unit is None else convert(name, values, unit)
-    if isinstance(unit, int | float):
+    if isinstance(unit, int | float | np.number):
         return convert(name, values, unit)
     text = _spelled(stored)
     if isinstance(unit, str) or unit is None:
@@ -82,7 +98,7 @@ def from_file(name: str, values: np.ndarray, unit: float | str | Sequence[str] |
                     f"{argument}: must say what {stored!r} in the file is, got None; give {A_FACTOR} ({error})"
                 ) from None
             raise
-    if len(unit) == 2 and not _doubt(text) and is_known(text) and not _is_same(unit[0], text):
+    if len(unit) == 2 and not _decides(unit[0], text):
         raise ValueError(
             f"{argument}: must begin with the unit {stored!r} of the file, got {tuple(unit)!r}; give a factor if the "
             "file is wrong."
@@ -91,19 +107,27 @@ def from_file(name: str, values: np.ndarray, unit: float | str | Sequence[str] |
 
 
 def _doubt(text: str) -> str:
-    """Return what to write for a unit that can be misunderstood; empty if it cannot."""
-    for word in re.findall(r"[^\W\d_]\w*", text):
-        if word in AMBIGUOUS:
-            return AMBIGUOUS[word] if word == text else A_FACTOR
-        if word in NO_UNITS or (len(word) == 1 and word not in LETTERS):
-            return A_FACTOR
+    """Return what to write for a unit that is not certain; empty if it is."""
+    if text in AMBIGUOUS:
+        return AMBIGUOUS[text][0]
+    if MS_TO_A_POWER.search(text) or not {*WORD.findall(text)} <= CERTAIN:
+        return A_FACTOR
     return ""
+
+
+def _decides(first: str, text: str) -> bool:
+    """Return whether the first unit of a pair can be the unit of a file."""
+    if text in AMBIGUOUS:
+        return any(_is_same(first, meaning) for meaning in AMBIGUOUS[text][1])
+    return bool(_doubt(text)) or not is_known(text) or _is_same(first, text)
 
 
 def _spelled(text: str) -> str:
     """Return a unit as pint writes it."""
     text = text.strip()
-    return SPELLINGS.get(text) if text in SPELLINGS else BARE_EXPONENT.sub(r"**\1", text)  # type: ignore[return-value]
+    if text in SPELLINGS:
+        return SPELLINGS[text]
+    return MOMENT.sub(r"(\1*\2)", BARE_EXPONENT.sub(r"**\1", text))
 
 
 def is_known(text: str) -> bool:
@@ -115,9 +139,17 @@ def is_known(text: str) -> bool:
     return True
 
 
+def kind_of(text: str) -> str:
+    """Return the SI unit of a certain unit of a file, empty for others and for what has no dimension."""
+    text = _spelled(text)
+    if not text or _doubt(text) or not is_known(text):
+        return ""
+    return in_si(text).replace("dimensionless", "")
+
+
 def is_duration(text: str) -> bool:
     """Return whether a text is a unit of time."""
-    return bool(text.strip()) and is_known(_spelled(text)) and in_si(_spelled(text)) == "s"
+    return kind_of(text) == "s"
 
 
 def _is_same(one: str, other: str) -> bool:
@@ -143,7 +175,7 @@ def in_si(text: str) -> str:
 def convert(name: str, values: np.ndarray, unit: float | Sequence[str]) -> np.ndarray:
     """Return the values of a channel, multiplied by a factor or converted by a pair of units such as ("mm", "m")."""
     argument = f"units[{name!r}]"
-    if isinstance(unit, int | float):
+    if isinstance(unit, int | float | np.number):
         factor = _checks.finite_number(argument, unit)
         if factor == 0.0:
             raise ValueError(f"{argument}: must not be zero, got {unit!r}.")

@@ -60,14 +60,18 @@ def test_unit_wanted_is_given_alone_where_the_file_says_the_unit():
 @pytest.mark.parametrize(
     "unit, factor",
     [("deg", np.pi / 180), ("m/s2", 1.0), ("gn", 9.80665), ("N/mm", 1e3), ("bar", 1e5), ("%", 0.01), ("Nm", 1.0),
-     ("µm/m", 1e-6), ("", 1.0), ("-", 1.0), ("lbf", 4.4482216152605), ("kHz", 1e3)],
+     ("µm/m", 1e-6), ("", 1.0), ("-", 1.0), ("lbf", 4.4482216152605), ("kHz", 1e3),
+     ("mNm", 1e-3), ("kNm/m", 1e3), ("Nm/rad", 1.0), ("V/Nm", 1.0), ("Ncm", 0.01), ("1/min", 1 / 60)],
 )  # fmt: skip
 def test_units_are_converted_to_si(unit, factor):
     run = bp.Recording.from_sep005([SERIES | {"unit_str": unit}], outputs={"x": "F"})
     assert run.outputs["x"] == pytest.approx(factor * X)
 
 
-@pytest.mark.parametrize("unit", ["g", "rpm", "EU", "dB", "counts/div", "C", "V/g", "k", "Mm/EU"])
+@pytest.mark.parametrize(
+    "unit",
+    ["g", "rpm", "EU", "dB", "counts/div", "C", "V/g", "k", "Mm/EU", "ms-2", "mil", "mg", "%RH", "PS", "kn", "Nms"],
+)
 def test_units_that_are_unknown_or_mean_two_things_are_refused(unit):
     with pytest.raises(ValueError, match=rf"units\['x'\]: must say what '{unit}' in the file is, got None; give"):
         bp.Recording.from_sep005([SERIES | {"unit_str": unit}], outputs={"x": "F"})
@@ -145,3 +149,71 @@ def test_what_is_no_series_is_refused():
         bp.Recording.from_sep005([{"data": X}], outputs={"x": "F"})
     with pytest.raises(ValueError, match="channels: must have channels of different names, got 'F' 2 times"):
         bp.Recording.from_sep005([SERIES, SERIES], outputs={"x": "F"})
+
+
+@pytest.mark.parametrize("kind", ["datetime64[us]", "timedelta64[us]"])
+def test_series_with_dates_keep_their_starts(kind):
+    start = np.datetime64("2024-01-01T10:00:00") if kind[0] == "d" else np.timedelta64(0, "s")
+    time = start + (np.arange(400) * 10_000).astype("m8[us]")
+    later = SERIES | {"name": "x", "unit_str": "m", "fs": None, "time": time + np.timedelta64(5, "s")}
+    run = bp.Recording.from_sep005([SERIES | {"fs": None, "time": time}, later], outputs={"x": "x"}, inputs={"F": "F"})
+    assert run.times["F"] == pytest.approx(TIME) and run.times["x"] == pytest.approx(5.0 + TIME)
+
+
+@pytest.mark.parametrize("rate", [100, 100.0, np.int64(100), np.float32(100)])
+def test_one_rate_for_channels_with_times_of_their_own_is_refused(rate):
+    other = SERIES | {"name": "x", "fs": 50.0}
+    with pytest.raises(ValueError, match="sampling_rate: must be given by channel"):
+        bp.Recording.from_sep005([SERIES, other], outputs={"x": "x"}, inputs={"F": "F"}, sampling_rate=rate)
+
+
+@pytest.mark.parametrize(
+    "stored, pair", [("g", ("mm", "m")), ("rpm", ("mm", "m")), ("C", ("V", "V")), ("lb", ("V", "mV"))]
+)
+def test_pair_that_contradicts_a_doubtful_unit_is_refused(stored, pair):
+    with pytest.raises(ValueError, match="must begin with the unit"):
+        bp.Recording.from_sep005([SERIES | {"unit_str": stored}], outputs={"x": "F"}, units={"x": pair})
+
+
+def test_packed_values_of_netcdf_are_decoded_first():
+    data = xr.Dataset({"x": ("t", X, {"units": "mm", "scale_factor": 0.1})}, coords={"t": ("t", TIME, {"units": "s"})})
+    with pytest.raises(
+        ValueError, match="variable 'x' of Dataset: must be usable, got packed values, with 'scale_factor'"
+    ):
+        bp.Recording.from_xarray(data, outputs={"x": "x"})
+
+
+def test_integer_labels_of_columns_are_names():
+    table = pd.DataFrame(np.column_stack([TIME, 7 + TIME, 9 + TIME]))
+    assert bp.Recording.from_dataframe(table, outputs={"x": 1}, sampling_rate=100.0).outputs["x"][0] == 7.0
+
+
+@pytest.mark.parametrize(
+    "unit, units, message",
+    [
+        ("mm", {}, "must be in a unit of time, got 'mm'"),
+        ("", {"time": ("mm", "m")}, "must be in a unit of time"),
+        ("s", {"time": "ms"}, "must be a factor or a pair such as"),
+        ("", {"time": "ms"}, "must be a factor or a pair such as"),
+    ],
+)
+def test_times_in_another_unit_are_refused(unit, units, message):
+    table = pd.DataFrame({"t": TIME, "x": X})
+    table.attrs["units"] = {"t": unit}
+    with pytest.raises(ValueError, match=message):
+        bp.Recording.from_dataframe(table, time="t", outputs={"x": "x"}, units=units)
+
+
+def test_objects_that_are_numbers_are_read_and_empty_labels_refused():
+    table = pd.DataFrame({"t": TIME, "x": pd.Series([*X], dtype=object), "label": ["a"] * 200 + [None] * 200})
+    assert np.array_equal(bp.Recording.from_dataframe(table, time="t", outputs={"x": "x"}).outputs["x"], X)
+    with pytest.raises(
+        ValueError, match="split: must be a column without empty cells, got 'label', empty in data row 201"
+    ):
+        bp.Recording.from_dataframe(table, time="t", outputs={"x": "x"}, split="label")
+
+
+def test_missing_date_at_the_start_is_left_out():
+    index = pd.DatetimeIndex([pd.NaT, *pd.date_range("2024", periods=399, freq="10ms")])
+    run = bp.Recording.from_dataframe(pd.DataFrame({"x": X}, index=index), outputs={"x": "x"}, missing="drop")
+    assert run.time == pytest.approx(TIME[:-1]) and np.array_equal(run.outputs["x"], X[1:])

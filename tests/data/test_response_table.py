@@ -90,3 +90,29 @@ def test_an_estimate_from_a_table_has_the_truth_in_its_interval():
 def test_tables_that_cannot_be_what_they_say_are_refused(table, arguments, message):
     with pytest.raises(ValueError, match=message):
         bp.response_table(table, **(COLUMNS | arguments))
+
+
+@pytest.mark.parametrize(
+    "units, message",
+    [
+        ({"phi": "s"}, "phases: must be in degrees or radians, got 's'"),
+        ({"f": "ms"}, "frequency: must be in Hz, got 'ms'"),
+        ({"A": "mm/N"}, "per: must be the input per which 'x' is given, got None and values in 'mm/N'"),
+    ],
+)
+def test_units_of_another_kind_are_refused(units, message):
+    table = pd.DataFrame({key: TABLE[key] for key in ("f", "A", "phi", "F")})
+    table.attrs["units"] = units
+    with pytest.raises(ValueError, match=message):
+        bp.response_table(table, **COLUMNS)
+
+
+def test_unit_of_phases_counts():
+    table = pd.DataFrame({"f": F, "A": TABLE["A"], "phi": np.angle(H), "F": FORCE})
+    table.attrs["units"] = {"phi": "rad"}
+    assert amplitudes(bp.response_table(table, **COLUMNS)) == pytest.approx(FORCE * H)
+
+
+def test_columns_of_different_lengths_are_refused():
+    with pytest.raises(ValueError, match="table: must have columns of one length, got"):
+        bp.response_table({"f": [1.0, 2.0], "A": 1.0}, frequency="f", outputs={"x": "A"}, inputs={"force": 1.0})

@@ -80,11 +80,14 @@ class Contents:
     remarks: tuple[str, ...] = ()
     word: str = "channel"
     suggested_time: str = ""
+    numbered: bool = True  # whether a channel is also found by its number; else numbers are names
     options: dict[str, Any] = field(default_factory=dict)  # arguments of `from_file` by which it was read so
 
     def find(self, file: str, key: Key) -> StoredChannel:
         """Return the channel of a name, a number from 1, or a pair of group and name; the error names those there."""
         argument = f"{self.word} of {file}"
+        if isinstance(key, int) and not self.numbered:
+            key = str(key)
         if isinstance(key, int) and not isinstance(key, bool):
             if not 1 <= key <= len(self.channels):
                 raise ValueError(f"{argument}: must be a number from 1 to {len(self.channels)}, got {key!r}.")
