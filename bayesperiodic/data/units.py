@@ -61,7 +61,14 @@ PREFIXED = {
     "in": "", "ft": "", "lbf": "", "psi": "", "min": "", "h": "", "deg": "", "°": "", "%": "", "ppm": "", "atm": "",
     "rev": "", "turn": "", "dimensionless": "",
 }  # fmt: skip
+NAMES = (
+    "second millisecond microsecond nanosecond minute hour meter metre millimeter millimetre micrometer micrometre "
+    "centimeter centimetre kilometer kilometre newton millinewton kilonewton volt millivolt microvolt ampere "
+    "milliampere hertz kilohertz megahertz degree radian kelvin pascal kilopascal megapascal bar percent joule watt kilowatt "
+    "kilogram ohm tesla foot feet"
+).split()
 CERTAIN = {prefix + unit for unit, prefixes in PREFIXED.items() for prefix in ("", *prefixes.split())} - {*AMBIGUOUS}
+CERTAIN |= {name + plural for name in NAMES for plural in ("", "s")}
 WORD = re.compile(rf"[^\W\d_{SUPERSCRIPT_DIGITS}][^\W{SUPERSCRIPT_DIGITS}]*|[°%]\w*")
 # Moments, as they are written without a sign between newton and metre.
 MOMENT = re.compile(r"(?<!\w)((?:[nuµμmcdkM]|da)?N)([mc]?m)(?!\w)")
