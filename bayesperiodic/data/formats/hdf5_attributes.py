@@ -5,6 +5,7 @@ import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import h5py
@@ -29,7 +30,7 @@ UNITS_OF = {
     "": ("time", "times", "t", "timebase", "timeaxis", "x", "xaxis", "wfx", "wftime", "sampling", "sample"),
 }
 # Hertz of units of rates; a mHz that may be MHz is none.
-FREQUENCIES = {
+HERTZ = {
     **dict.fromkeys(("Hz", "hz", "HZ", "hertz", "Hertz", "1/s", "s-1", "s^-1", "s**-1", "S/s", "Sa/s", "sps"), 1.0),
     **dict.fromkeys(("samples/s", "samples/sec", "samples/second", "samples per second"), 1.0),
     **dict.fromkeys(("kHz", "khz", "KHz", "KHZ", "kilohertz", "1/ms", "kS/s", "kSa/s", "ksps"), 1e3),
@@ -272,19 +273,20 @@ def sampling(stored: Mapping[str, Any]) -> Clock | None:
     steps, error = [], 0.0
     is_step = {key: _plain(key) in STEP_NAMES for key in given}
     factors = _factors(units)
+    start, origin, refusal = _start(stored, factors["start"] if factors else None)
+    refused = partial(Clock, start, origin=origin)  # the start is used with sampling_rate=
     if factors is None or (factors["other"] and any(is_step.values()) == (factors["other"] == "rate")):
-        return Clock(refusal=f"whose attributes {shown} do not say one unit")
+        return refused(refusal=f"whose attributes {shown} do not say one unit")
     for key, value in given.items():
         if not _number(value) or not np.isfinite(value) or value <= 0.0:
-            return Clock(refusal=f"whose attributes say {shown}")
+            return refused(refusal=f"whose attributes say {shown}")
         number = float(str(value))  # of single precision, the decimal number that was written
         seconds = Since(factors["step"]).seconds
         steps.append(seconds(number) if is_step[key] else 1.0 / (number * factors["rate"]))
         if is_step[key] and isinstance(value, np.float32 | np.float16):
             error = seconds(step_error(str(value)))
     if max(steps) - min(steps) > 1e-12 * max(steps):
-        return Clock(refusal=f"whose attributes {shown} contradict each other")
-    start, origin, refusal = _start(stored, factors["start"])
+        return refused(refusal=f"whose attributes {shown} contradict each other")
     if refusal:
         return Clock(refusal=refusal)
     remark = (f"times are those of its attributes {shown}",)
@@ -308,7 +310,7 @@ def _factors(units: Mapping[str, Any]) -> dict[str, Any] | None:
         of, text = _unit_of(key), str(value).strip()
         since = Since.of(text, {})
         duration = since.nanoseconds if since and not SINCE_TEXT.fullmatch(text) else 0
-        rate = FREQUENCIES.get(text, 0.0)
+        rate = HERTZ.get(text, 0.0)
         if not (rate if of == "rate" else duration if of else rate or duration):
             return None
         if not of:

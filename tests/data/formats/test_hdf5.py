@@ -116,6 +116,12 @@ def test_equal_starts_count_once_and_different_ones_are_refused(made):
         read(made(x=(SWING, {"dt": 0.01} | dates)))
 
 
+def test_start_is_used_with_a_rate_that_is_given(made):
+    path = made(x=(SWING, {"dt": 0.01}), y=(SWING, {"fs": "fast", "t0": 0.5}))
+    run = bp.Recording.from_file(path, outputs={"x": "x", "y": "y"}, sampling_rate={"x": 100.0, "y": 50.0})
+    assert run.times["y"][:2].tolist() == [0.5, 0.52] and run.times["x"][0] == 0.0
+
+
 def test_interval_of_single_precision_is_named_with_its_error(made):
     with pytest.warns(UserWarning, match="48000 Hz has the same digits"):
         read(made(x=(SWING, {"dt": np.float32(1 / 48000)})))
