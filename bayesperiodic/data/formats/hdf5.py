@@ -16,6 +16,7 @@ from bayesperiodic.data.formats.hdf5_attributes import UNIT_NAMES, Packing, Sinc
 # Columns of tables: at most so many, and a table is so many times longer than wide.
 MOST_COLUMNS, SLENDER = 64, 10
 MOST_NUMBERS = 10
+UNREAD = "(unit of a type that is not read)"
 
 Column = Callable[[np.ndarray], np.ndarray]
 Scales = list[tuple[str, str]]
@@ -88,13 +89,18 @@ def _channels(
     for key, value in attributes(archive[group]).items() if group and clock is None else ():
         if sampling({key: value}) is not None:
             remarks += (f"its group has an attribute {key} = {value}, which is not used; give sampling_rate=",)
-    scale = "" if since else unused_scale(stored)
+    scale = packing.unused or unused_scale(stored)
+    refusal = packing.refusal or (since.refusal or _scaled_dates(scale) if since else "")
     for (label, column), unit in zip(columns.items(), units, strict=True):
         shown = "" if since else f"{unit or 'stored values'} ({scale} not applied)" if scale else unit
         yield StoredChannel(
             label, samples, partial(_values, read, group, name, column, packing, since), group, shown, clock,
-            remarks, since.refusal if since else "",
+            remarks, refusal,
         )  # fmt: skip
+
+
+def _scaled_dates(scale: str) -> str:
+    return f"dates with an attribute {scale}, which is not applied; {OTHERWISE}" if scale else ""
 
 
 def _units(item: h5py.Dataset, stored: dict[str, Any], columns: int) -> list[str]:
@@ -102,9 +108,14 @@ def _units(item: h5py.Dataset, stored: dict[str, Any], columns: int) -> list[str
     key = next((key for key in UNIT_NAMES if key in item.attrs), None)
     if key is None or item.dtype.names:
         return [""] * columns
-    if key in stored:
+    if np.prod(item.attrs.get_id(key).shape) == 1:
+        if key not in stored:
+            return [UNREAD] * columns
         return [str(stored[key]) if isinstance(stored[key], str) else ""] * columns
-    given = [one.decode("utf-8", "replace") if isinstance(one, bytes) else one for one in np.ravel(item.attrs[key])]
+    try:
+        given = [one.decode("utf-8", "replace") if isinstance(one, bytes) else one for one in np.ravel(item.attrs[key])]
+    except Exception:  # of types that h5py does not know, and of damaged files
+        return [UNREAD] * columns
     texts = len(given) == columns and all(isinstance(one, str) for one in given)
     return [str(one) for one in given] if texts else [""] * columns
 
@@ -192,11 +203,12 @@ def _coordinate(
     packing, since = Packing.of(stored, scale), Since.of(str(stored.get("units", "")), stored)
     if since is None or scale.dtype.kind not in "fiu" or _is_dimension_only(scale):
         return None
+    refusal = packing.refusal or since.refusal or _scaled_dates(packing.unused or unused_scale(stored))
     if (place, label) not in clocks:
         clocks[place, label] = Clock(
             stored=lambda: since.seconds(packing.unpacked(read(place, label))),
             origin=since.origin,
-            refusal=since.refusal,
+            refusal=refusal,
             remarks=(f"times are those of its coordinate {label!r}",),
         )
     return clocks[place, label]

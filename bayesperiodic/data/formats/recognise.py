@@ -3,6 +3,7 @@
 import contextlib
 import importlib
 import re
+import struct
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -48,6 +49,7 @@ SIGNATURES = {
     b"TDSm": "tdms", b"MDF     ": "mdf", b"UnFinMF ": "mdf", b"PAR1": "parquet", b"RIFF": "wav", b"RIFX": "wav",
     b"RF64": "wav", b"MATLAB 5.0": "mat", b"LabVIEW Measurement": "lvm",
 }  # fmt: skip
+PICKLE = "a pickle of Python; load it by the program that wrote it, for from_arrays, as it is never unpickled here"
 NETCDF3 = "a netCDF file of version 3; nccopy -k nc4 converts it"
 # Files that no package of the extra `files` reads, and what to do with them.
 OTHERS = {
@@ -64,6 +66,10 @@ OTHERS = {
     b"CDF\x05": NETCDF3,
     b"riff\x2e\x91\xcf\x11": "a Wave64 file (.w64); save it as .wav",
     b"fLaC": "a FLAC file; save it as .wav",
+    b"\x80\x02": PICKLE,
+    b"\x80\x03": PICKLE,
+    b"\x80\x04": PICKLE,
+    b"\x80\x05": PICKLE,
 }
 HDF5_SIGNATURE, MAT73 = b"\x89HDF\r\n\x1a\n", b"MATLAB 7.3"
 # Universal files begin with a line that has -1 in columns 5 and 6.
@@ -117,6 +123,11 @@ def recognised(file: Path) -> str:
     for start, name in SIGNATURES.items():
         if head.startswith(start):
             return name
+    if file.suffix.lower() == ".mat" and _is_mat4(head):
+        raise ValueError(
+            f"path: must be a file of measurements, got {str(file)!r}, a MAT file of version 4; load it in MATLAB, and "
+            "save it by save('run.mat', '-v7')."
+        )
     if head.startswith(MAT73):
         return "mat"
     if any(head[place : place + 8] == HDF5_SIGNATURE for place in (0, 512, 1024, 2048)):
@@ -126,6 +137,23 @@ def recognised(file: Path) -> str:
     if UFF_START.match(head):
         return "uff"
     return "lvm" if LVM_START.match(head) else "csv"
+
+
+def _is_mat4(head: bytes) -> bool:
+    """Return whether a file begins with a matrix of a MAT file of version 4, in either order of bytes.
+
+    Its head is the type, the numbers of rows and columns, whether it is complex, and the length of its name.
+    """
+    if len(head) < 20:
+        return False
+    for order, machine in (("<", 0), (">", 1)):
+        kind, rows, columns, is_complex, length = struct.unpack(f"{order}5i", head[:20])
+        name = head[20 : 20 + length]
+        plausible = kind // 1000 == machine and kind // 100 % 10 == 0 and kind // 10 % 10 <= 5 and kind % 10 <= 2
+        plausible &= min(rows, columns) >= 0 and is_complex in (0, 1) and length >= 2
+        if plausible and name[-1:] == b"\0":
+            return True
+    return False
 
 
 def _zipped(file: Path) -> str:

@@ -70,6 +70,58 @@ def test_unclear_rates_are_refused_and_overridden(made, stored):
     assert read(path, sampling_rate=50.0).time[1] == 0.02
 
 
+@pytest.mark.parametrize(
+    "stored, step",
+    [
+        ({"sampling_rate": 1.0, "sampling_rate_unit": "kHz"}, 1e-3), ({"dt": 1.0, "dt_units": "ms"}, 1e-3),
+        ({"dt": 1.0, "time_unit": "ms"}, 1e-3), ({"dt": 20, "wf_xunit_string": "us"}, 20e-6),
+        ({"fs": 2.0, "sampling_unit": "kS/s"}, 5e-4), ({"dt": 0.01, "time_unit": "s", "fs": 100.0}, 0.01),
+        ({"dt": 10.0, "fs": 0.1, "dt_unit": "ms", "fs_unit": "kHz"}, 0.01), ({"fs": 100.0, "unit": "ms"}, 0.01),
+        ({"fs": 100.0, "y_unit": "mm", "Sample Rate Units": np.bytes_("Hz")}, 0.01),
+    ],
+)  # fmt: skip
+def test_units_of_rates_and_intervals_are_converted(made, stored, step):
+    np.testing.assert_allclose(read(made(x=(SWING, stored))).time, step * np.arange(60), rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [
+        {"dt": 1.0, "dt_units": "ticks"}, {"fs": 1.0, "fs_unit": "mHz"}, {"fs": 1.0, "fs_unit": "ms"},
+        {"fs": 1.0, "time_unit": "ms"}, {"dt": 1.0, "sampling_unit": "kHz"}, {"dt": 1.0, "dt_unit": 3},
+        {"dt": 1.0, "dt_unit": "ms", "time_unit": "s"}, {"dt": 1.0, "time_unit": "ms since 2026-01-01"},
+    ],
+)  # fmt: skip
+def test_unclear_units_of_rates_and_intervals_are_refused(made, stored):
+    path = made(x=(SWING, stored))
+    with pytest.raises(ValueError, match="got channel 'x' of run.h5, whose attributes .* do not say one unit"):
+        read(path)
+    assert read(path, sampling_rate=50.0).time[1] == 0.02
+
+
+def starts_at(made, **stored):
+    path = made(x=(SWING, {"dt": 0.01}), y=(SWING, {"dt": 10.0, "dt_unit": "ms"} | stored))
+    return bp.Recording.from_file(path, outputs={"x": "x", "y": "y"}).times["y"][0]
+
+
+def test_equal_starts_count_once_and_different_ones_are_refused(made):
+    assert starts_at(made, t0=0.5, start_time=0.5, t0_unit="s") == 0.5
+    assert starts_at(made, t0=500.0, time_unit="ms") == 0.5
+    with pytest.raises(ValueError, match="whose attributes start_time = 0.25, t0 = 0.5 contradict each other"):
+        read(made(x=(SWING, {"dt": 0.01, "t0": 0.5, "start_time": 0.25})))
+    with pytest.raises(ValueError, match="whose attribute t0 = 0.5 has no unit"):
+        read(made(x=(SWING, {"dt": 10.0, "dt_unit": "ms", "t0": 0.5})))
+    dates = {"t0": "2026-01-31T12:00:00", "start_time": "2026-01-31T13:00:00"}
+    with pytest.raises(ValueError, match="start_time = .* contradict each other"):
+        read(made(x=(SWING, {"dt": 0.01} | dates)))
+
+
+def test_start_is_used_with_a_rate_that_is_given(made):
+    path = made(x=(SWING, {"dt": 0.01}), y=(SWING, {"fs": "fast", "t0": 0.5}))
+    run = bp.Recording.from_file(path, outputs={"x": "x", "y": "y"}, sampling_rate={"x": 100.0, "y": 50.0})
+    assert run.times["y"][:2].tolist() == [0.5, 0.52] and run.times["x"][0] == 0.0
+
+
 def test_interval_of_single_precision_is_named_with_its_error(made):
     with pytest.warns(UserWarning, match="48000 Hz has the same digits"):
         read(made(x=(SWING, {"dt": np.float32(1 / 48000)})))
@@ -120,6 +172,43 @@ def test_unsigned_and_valid_numbers_of_netcdf(made):
     assert read(path, sampling_rate=1.0, missing="drop").outputs["x"].tolist() == [1.0, 2.0, 3.0]
 
 
+def test_several_missing_values_of_netcdf(made):
+    path = made(x=(np.array([1.0, -99.0, 2.0, -98.0, 3.0]), {"missing_value": np.array([-99.0, -98.0])}))
+    assert read(path, sampling_rate=1.0, missing="drop").outputs["x"].tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    "key, value",
+    [
+        ("valid_range", "0 to 5"), ("valid_min", "zero"), ("valid_max", [1.0, 2.0]), ("missing_value", "-99"),
+        ("valid_range", 5.0),
+    ],
+)  # fmt: skip
+def test_odd_limits_concern_their_array_only(made, key, value):
+    path = made(x=(SWING, {key: value}), y=(SWING, {"units": "mm"}))
+    assert np.array_equal(read(path, "y", sampling_rate=1.0).outputs["x"], 1e-3 * SWING)
+    assert [one.refused for one in bp.inspect(path).channels] == [True, False]
+    assert f"an attribute {key} = " in str(bp.inspect(path))
+    with pytest.raises(ValueError, match=f"'x' of run.h5: must be usable, got an attribute {key} = .*, which is no "):
+        read(path, sampling_rate=1.0)
+
+
+@pytest.mark.parametrize("start", ["2024-03-05_10-00-00", "2024-03-05 10-00-00", "2024-13-05", "9999-01-01"])
+def test_odd_start_concerns_its_array_only(made, start):
+    path = made(x=(SWING, {"dt": 0.01, "start_time": start}), y=(SWING, {"dt": 0.02}))
+    assert read(path, "y").time[1] == 0.02
+    assert f"whose attribute start_time = {start} is no start" in str(bp.inspect(path))
+    with pytest.raises(ValueError, match="is no start in seconds or after ISO 8601"):
+        read(path)
+    assert read(path, sampling_rate=50.0).time[1] == 0.02
+
+
+def test_dates_with_a_scale_are_refused(made):
+    path = made(time=(TIME, {"units": "seconds since 2026-01-01", "scale_factor": "1/100"}), x=SWING)
+    with pytest.raises(ValueError, match="must be usable, got dates with an attribute scale_factor = 1/100"):
+        read(path, time="time")
+
+
 def test_values_of_netcdf_that_were_not_written_are_missing(tmp_path):
     with h5py.File(tmp_path / "run.h5", "w") as file:
         item = file.create_dataset("x", (5,), "f4", fillvalue=np.float32(9.969209968386869e36))
@@ -162,7 +251,16 @@ def test_dates_finer_than_nanoseconds_are_refused(made):
         read(path, time="time")
 
 
-@pytest.mark.parametrize("stored", [{"gain": 0.5}, {"Sensitivity": "10 mV/g"}, {"offset": 3}, {"conversion": 1e-6}])
+@pytest.mark.parametrize(
+    "stored",
+    [
+        {"gain": 0.5}, {"Sensitivity": "10 mV/g"}, {"offset": 3}, {"conversion": 1e-6}, {"multiplier": 0.01},
+        {"resolution": 3e-4}, {"LSB": 3e-4}, {"gain_factor": 2.0}, {"full_scale": 1.0}, {"counts_per_volt": 3276.8},
+        {"zero_level": 1.0}, {"ADC bias": 0.5}, {"Coefficients": [0.0, 0.01]}, {"cal_multiplier": "0.01 V"},
+        {"Scale_Factor": 0.01}, {"scale_factor": [0.01, 0.01]}, {"scale_factor": "1/100"}, {"scale_factor": np.nan},
+        {"add_offset": "2", "scale_factor": 0.1}, {"scale_factor": np.full(100, 0.1)}, {"gain": np.full((1, 1), 0.5)},
+    ],
+)  # fmt: skip
 def test_scale_of_no_convention_is_decided_by_the_user(made, stored):
     path = made(x=(SWING, stored | {"units": "V"}))
     with pytest.raises(ValueError, match=r"units\['x'\]: must say what 'V \(.* not applied\)' in the file is"):
@@ -171,7 +269,10 @@ def test_scale_of_no_convention_is_decided_by_the_user(made, stored):
 
 
 def test_scale_that_changes_nothing_is_ignored(made):
-    path = made(x=(SWING, {"gain": 1.0, "offset": 0, "units": "V"}))
+    path = made(x=(SWING, {"gain": 1.0, "offset": 0, "units": "V", "zero_level": 0.0, "multiplier": 1}))
+    assert np.array_equal(read(path, sampling_rate=100.0).outputs["x"], SWING)
+    other = {"calibration_date": "2024-03-05", "sensor_id": 7, "resolution": -1.0, "scale_type": "linear"}
+    path = made(x=(SWING, other | {"units": "V", "valid_range": np.array([-2.0, 2.0]), "factory": 3}))
     assert np.array_equal(read(path, sampling_rate=100.0).outputs["x"], SWING)
 
 

@@ -2,6 +2,7 @@
 
 import io
 import pathlib
+import pickle
 import struct
 import warnings
 
@@ -127,3 +128,22 @@ def test_damaged_file_is_refused_or_read_as_a_whole(saved, tmp_path, compressed)
                 assert "must" in str(error)
                 continue
         assert run.time.size == 50
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_version_4_is_named_with_its_conversion(tmp_path, order):
+    """Written after MathWorks' "MAT-File Format": type, rows, columns, real numbers, length of the name."""
+    path = tmp_path / "run.mat"
+    head = struct.pack(f"{order}5i", {"<": 0, ">": 1000}[order], 50, 1, 0, 2)
+    path.write_bytes(head + b"x\0" + SWING.astype(f"{order}f8").tobytes())
+    assert np.allclose(scipy.io.loadmat(path)["x"].ravel(), SWING)
+    with pytest.raises(ValueError, match=r"got '.*run.mat', a MAT file of version 4; .*save\('run.mat', '-v7'\)"):
+        bp.inspect(path)
+
+
+@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+def test_pickle_is_named_and_never_unpickled(tmp_path, protocol):
+    path = tmp_path / "run.mat"
+    path.write_bytes(pickle.dumps({"x": SWING}, protocol))
+    with pytest.raises(ValueError, match="a pickle of Python; load it by the program that wrote it, for from_arrays"):
+        bp.inspect(path)
