@@ -64,8 +64,8 @@ PREFIXED = {
 NAMES = (
     "second millisecond microsecond nanosecond minute hour meter metre millimeter millimetre micrometer micrometre "
     "centimeter centimetre kilometer kilometre newton millinewton kilonewton volt millivolt microvolt ampere "
-    "milliampere hertz kilohertz megahertz degree radian kelvin pascal kilopascal megapascal bar percent joule watt kilowatt "
-    "kilogram ohm tesla foot feet"
+    "milliampere hertz kilohertz megahertz degree radian kelvin pascal kilopascal megapascal bar percent joule watt "
+    "kilowatt kilogram ohm tesla foot feet"
 ).split()
 CERTAIN = {prefix + unit for unit, prefixes in PREFIXED.items() for prefix in ("", *prefixes.split())} - {*AMBIGUOUS}
 CERTAIN |= {name + plural for name in NAMES for plural in ("", "s")}
