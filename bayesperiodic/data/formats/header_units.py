@@ -3,7 +3,7 @@
 import functools
 import re
 
-from bayesperiodic.data.units import AMBIGUOUS, LOGARITHMIC, is_known
+from bayesperiodic.data.units import AMBIGUOUS, LETTERS, LOGARITHMIC, is_known
 
 LONGEST_UNIT_TEXT, LONGEST_UNIT_NAME = 30, 300
 # "Force [N]", "Force (N)" and "Force / N"; in the last two a letter may be a variable or a divisor.
@@ -43,13 +43,20 @@ def in_names(names: list[str], *, guessed: bool = False) -> tuple[list[str], dic
         if not texts:
             continue
         if guessed:
-            for place, text in texts.items():
-                if not text.isascii() and not known(text):
-                    refusals[place] = f"its unit {text!r} in an encoding that is not known; give encoding="
+            refusals |= in_other_encoding(texts)
         for place, text in texts.items():
             if not units[place] and _is_meant(style, place, texts, names):
                 units[place] = text
     return units, refusals
+
+
+def in_other_encoding(texts: dict[int, str]) -> dict[int, str]:
+    """Return refusals of units with letters that the encoding does not seem to have."""
+    return {
+        place: f"its unit {text!r} in an encoding that is not known; give encoding="
+        for place, text in texts.items()
+        if not text.isascii() and not known(text)
+    }
 
 
 def _is_meant(style: str, place: int, texts: dict[int, str], names: list[str]) -> bool:
@@ -75,12 +82,25 @@ def _is_meant(style: str, place: int, texts: dict[int, str], names: list[str]) -
 
 
 def unit_row(cells: list[str]) -> list[str] | None:
-    """Return the units in the row below the names, or None if it is none."""
+    """Return the units in the row below the names, or None if it is none; one evident unit makes it a row of units."""
     texts = [unbracketed(cell) for cell in cells]
+    return texts if mostly_known(texts) or any(map(is_evident, texts)) else None
+
+
+def mostly_known(texts: list[str]) -> bool:
+    """Return whether most of the texts are units."""
     given = [text for text in texts if text]
-    if not given or sum(map(known, given)) * 2 <= len(given) or all(text == "-" for text in given):
-        return None
-    return texts
+    return sum(map(known, given)) * 2 > len(given) and any(text != "-" for text in given)
+
+
+def is_evident(text: str) -> bool:
+    """Return whether a text is a unit, and hardly a name."""
+    return (text == "s" or bool(EVIDENT.fullmatch(text))) and known(text)
+
+
+def is_possible(text: str) -> bool:
+    """Return whether a text is a unit that is not ambiguous."""
+    return text not in AMBIGUOUS and (len(text) > 1 or text in LETTERS) and known(text)
 
 
 def unbracketed(cell: str) -> str:

@@ -84,7 +84,9 @@ def contents(
             places[key - 1] = str(key)
     _refuse_summaries(text, top)
     read, sign, rows = _columns(text, top, [*places] or [*range(len(names))], notation)
-    units, refusals = header_units.in_names(top.names, guessed=text.remark.startswith("encoding 'cp1252' of"))
+    guessed = text.remark.startswith("encoding 'cp1252' of")
+    units, refusals = header_units.in_names(top.names, guessed=guessed)
+    refusals |= header_units.in_other_encoding(dict(enumerate(top.units))) if guessed else {}
     channels = []
     for place, name in enumerate(names):
         unit = (top.units[place] if place < len(top.units) else "") or units[place]

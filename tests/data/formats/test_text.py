@@ -348,3 +348,72 @@ def test_damaged_texts_are_read_as_they_are_or_refused(write, encoding):
                     call(path)
                 except ValueError as error:
                     assert "must" in str(error) and str(error).encode("cp1252", "backslashreplace")
+
+
+UNIT_ROWS = {
+    "half of the units unknown": (
+        "Zeit;Kraft;Takt;Status\nms;kN;Impulse;Digits\n{}",
+        ["ms", "kN", "Impulse", "Digits"],
+    ),
+    "with a description": (
+        "Zeit;Kraft;Takt;Status\nms;kN;Impulse;Digits\nZeit des Laufs;Lager;Geber;Wort\n{}",
+        ["ms", "kN", "Impulse", "Digits"],
+    ),
+    "above": ("ms;kN;Nm;V\nZeit;Kraft;Takt;Status\n{}", ["ms", "kN", "Nm", "V"]),
+    "above, below a preamble": ("Rig 3;;;\nms;kN;Nm;V\nZeit;Kraft;Takt;Status\n{}", ["ms", "kN", "Nm", "V"]),
+}
+ROWS = "0,5;1,5;1;2\n1,5;2,5;3;4\n2,5;3;5;6\n"
+
+
+@pytest.mark.parametrize("case", UNIT_ROWS)
+@pytest.mark.parametrize("way", ["names", "header", "numbers"])
+def test_row_of_units_is_seen_wherever_it_stands(write, case, way):
+    """Some of the units are unknown; a description may follow; without names or header= the latter is refused."""
+    content, units = UNIT_ROWS[case]
+    path = write(content.format(ROWS))
+    line = content.split("\n").index("Zeit;Kraft;Takt;Status") + 1
+    given = {"header": line} if way == "header" else {}
+    keys = {"time": "Zeit", "outputs": {"x": "Kraft"}} if way != "numbers" else {"time": 1, "outputs": {"x": 2}}
+    if way == "numbers" and case == "with a description":
+        with pytest.raises(ValueError, match="header: must be given, got None, as line 2 may be units"):
+            read(path, **keys)
+        return
+    assert read(path, **keys, **given)[0] == pytest.approx([0.0005, 0.0015, 0.0025])
+    assert read(path, **keys, **given)[1] == pytest.approx([1500.0, 2500.0, 3000.0])
+    if way == "header":
+        assert [channel.unit for channel in bp.inspect(path, **given).channels] == units
+
+
+def test_text_between_names_and_numbers_that_is_no_unit_is_refused(write):
+    path = write("t;x\nTakte;Impulse\n0;1\n1;2\n")
+    with pytest.raises(ValueError, match="header: must be the number of the line above the data, .*got 1, and line 2"):
+        read(path, header=1)
+    with pytest.raises(ValueError, match="must contain numbers, .*got 'Takte' in data row 1"):
+        read(path)
+
+
+def test_units_in_a_code_page_that_is_not_known_are_not_the_names(write):
+    path = write("t;x\ns;µm\n0,5;1,5\n1,5;2\n", "cp850")
+    assert [channel.name for channel in bp.inspect(path).channels] == ["t", "x"]
+    for key in ("x", 2):
+        with pytest.raises(ValueError, match="must be usable, got its unit 'æm' in an encoding that is not known"):
+            read(path, outputs={"x": key})
+    assert read(path, encoding="cp850")[1] == pytest.approx([1.5e-6, 2e-6])
+
+
+@pytest.mark.parametrize("row", ["-00:00:0{};{}", "OL;{}{}"])
+@pytest.mark.parametrize("line", [None, 0, 1])
+def test_first_rows_that_are_no_numbers_are_no_preamble(write, row, line):
+    first = "".join(row.format(k, k) + "\n" for k in range(5))
+    path = write("a;b\n" + first + "".join(f"00:00:0{k};{k}\n" for k in range(9)))
+    cell = "OL" if row[0] == "O" else "-00:00:0"
+    with pytest.raises(ValueError, match=f"header: must be .*got {line}.*{cell}"):
+        read(path, time=1, outputs={"x": 2}, header=line)
+    with pytest.raises(ValueError, match="header: must be"):
+        bp.inspect(path, header=line)
+
+
+def test_first_rows_without_any_number_are_no_preamble(write):
+    path = write("a;b\n" + "OL;OL\n" * 5 + "1;2\n" * 9)
+    with pytest.raises(ValueError, match="header: must be given, got None, as lines 5 and 6 are alike"):
+        bp.inspect(path)
