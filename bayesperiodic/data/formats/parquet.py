@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from bayesperiodic.data.formats import header_units
-from bayesperiodic.data.formats.contents import LARGEST_ARRAY, Contents, Key, StoredChannel, package, unique_names
+from bayesperiodic.data.formats.contents import LARGEST_ARRAY, Contents, Key, StoredChannel, package
+from bayesperiodic.data.formats.text_header import numbered
 
 # Keys of units in the metadata of a field, in lower case.
 UNIT_KEYS = (b"unit", b"units", b"uom", b"unit_string")
@@ -30,10 +31,11 @@ def contents(file: Path, wanted: list[Key]) -> Contents:
     pandas, index = _pandas(schema.metadata)
     units, _ = header_units.in_names(schema.names)
     channels, remarks = [], []
-    for place, name in enumerate(unique_names(schema.names)):
+    plain = "index" not in schema.names
+    names = ["index" if plain and one in index and one.startswith("__index_level_") else one for one in schema.names]
+    for place, name in enumerate(numbered(names)):
         kind, remark = schema.field(place).type, []
         if schema.names[place] in index:
-            name = "index" if name.startswith("__index_level_") and "index" not in schema.names else name
             remark.append("the index of the table in pandas")
         unit = _unit(schema.field(place).metadata) or pandas.get(schema.names[place], "")
         channels.append(

@@ -371,7 +371,7 @@ def _by_evidence(file: Text, separator: str | None, line: int | None) -> Head | 
 
 
 def _refuse_lost(block: _Block, titled: bool, line: int | None) -> None:
-    """Raise a ValueError for rows between header and numbers that are rows of the table, with a cell that is no number."""
+    """Raise a ValueError for rows of the table, one cell of which is no number, between the header and the numbers."""
     above = [(number, row) for number, row in block.rows[: block.first] if number > (line or 0)]
     if titled and not line:
         if len(above) > 1 and above[-1][1] == above[-2][1] and len(_filled(above[-1][1])) == block.width:
@@ -428,8 +428,8 @@ def _names_above(block: _Block, line: int | None) -> tuple[list[str], int, list[
         above = [(number, row) for number, row in above if number <= line]
     elif len(above) > 1 and len(above[-2][1]) >= len(_trimmed(above[-1][1])) > 0:
         units = _units_of(above[-1][1], following, block.width, block.separator) or []
-        names = dict(zip(above[-2][1], units, strict=False))
-        if units and not any(unit == "t" and TIME_NAME.fullmatch(name) for name, unit in names.items()):
+        pairs = zip(above[-2][1], units, strict=False)
+        if units and not any(unit == "t" and TIME_NAME.fullmatch(name) for name, unit in pairs):
             below, above = above[-1:], above[:-1]
     if not above or (line and above[-1][0] != line):
         raise ValueError(f"header: must be the number of the line of the names, or 0 for none, got {line!r}.")
