@@ -240,7 +240,7 @@ def _channel(
         if dates is not None:
             return StoredChannel(name, len(cells), dates.copy, sheet, table.units[place], remarks=(remark,))
     read = partial(_values, file, sheet, place, table.first, cells)
-    remarks = (remark,) if remark else ()
+    remarks = (*((remark,) if remark else ()), *header_units.remarks(name, table.units[place]))
     return StoredChannel(name, len(cells), read, sheet, table.units[place], remarks=remarks, refusal=refusal)
 
 

@@ -18,6 +18,18 @@ EVIDENT = re.compile(
     r".*[/^²³°%·*].*|(?:[nuµμmcdkMGh]|da)(?:m|s|N|Nm|V|A|Hz|Pa|rad|W|J|Ω|[oO]hm|g|ε|bar)|Nm|Hz|Pa|rad|deg|degC|rpm|RPM|bar|psi"
     r"|lbf|sec|Volts?|g_n|dB|ppm|rev|strain|ustrain|microstrain|[µuμ]e"
 )
+# Other places of a unit in a name: in other brackets, in front, or as the last word.
+BRACKETED = re.compile(
+    r".*\S\s*(?:<\s*([^<>]+?)\s*>|\{\s*([^{}]+?)\s*\})\s*|\s*[\[(<{]\s*([^\[\](){}<>]+?)\s*[\])>}]\s*\S.*"
+)
+LAST_WORD = re.compile(r".*[^\W_].*?[\W_]([^\W_]+)\W*", re.DOTALL)
+TIME_WORD = re.compile(
+    r"[\W_]*(?:[\[(<{].*?[\])>}]\W*)?(?:(?-i:t)|time|zeit|temps|tiempo|tempo|timestamp|zeitstempel|elapsed|dauer|duration)"
+    r"(?![^\W_]).*", re.IGNORECASE | re.DOTALL,
+)  # fmt: skip
+PARTS_OF_SECONDS, LONG_TIMES = ("ms", "us", "µs", "μs", "ns", "msec", "usec"), ("min", "mins", "minutes", "h", "hours")
+# What may be something else than a unit also in brackets, such as "U [in]" and "F [min]".
+DOUBTFUL = ("in", "min", "h", "d", "a", "at", "as")
 # What may stand in the first cell of a row of units.
 ROW_TITLES = ("unit", "units", "einheit", "einheiten", "unité", "unités")
 # Quantities whose unit is one letter.
@@ -46,8 +58,40 @@ def in_names(names: list[str], *, guessed: bool = False) -> tuple[list[str], dic
             refusals |= in_other_encoding(texts)
         for place, text in texts.items():
             if not units[place] and _is_meant(style, place, texts, names):
-                units[place] = text
-    return units, refusals
+                doubtful = style == "[" and text in DOUBTFUL and not _is_quantity(text, names[place])
+                units[place] = f"{text}?" if doubtful and not TIME_WORD.fullmatch(names[place]) else text
+    return [unit or _possible(name) for unit, name in zip(units, names, strict=True)], refusals
+
+
+def _possible(name: str) -> str:
+    """Return a unit that a name may say, with a question mark, which makes the user say what it is; else ""."""
+    if name[LONGEST_UNIT_NAME:]:
+        return ""
+    timed = TIME_WORD.fullmatch(name) is not None
+    if match := BRACKETED.fullmatch(name):
+        text = match[1] or match[2] or match[3]
+        return f"{text}?" if is_evident(text) or (timed and text in LONG_TIMES) else ""
+    text = match[1] if (match := LAST_WORD.fullmatch(name)) else ""
+    return f"{text}?" if text in PARTS_OF_SECONDS or (timed and text in LONG_TIMES) else ""
+
+
+def remarks(name: str, unit: str) -> tuple[str, ...]:
+    """Return what to say about a unit that a name may say."""
+    if unit.endswith("?"):
+        return (f"the name may say the unit {unit[:-1]!r}; units= decides, such as a factor or a pair of units",)
+    match = LAST_WORD.fullmatch(name) if not unit and not name[LONGEST_UNIT_NAME:] else None
+    if match and is_evident(match[1]):
+        return (f"the name may say the unit {match[1]!r}, which is not used; units= converts",)
+    return ()
+
+
+def _is_quantity(text: str, name: str) -> bool:
+    """Return whether a name is that of a quantity of a unit."""
+    plain, quantity = re.split(r"[(/\[]", name)[0].strip(), QUANTITIES.get(text, "")
+    return any(
+        plain == word or (len(word) > 1 and plain.lower().startswith(word))
+        for word in (quantity.split("|") if quantity else ())
+    )
 
 
 def in_other_encoding(texts: dict[int, str]) -> dict[int, str]:
@@ -71,10 +115,8 @@ def _is_meant(style: str, place: int, texts: dict[int, str], names: list[str]) -
     if EVIDENT.fullmatch(text):
         return True
     name = re.split(r"[(/]", names[place])[0].strip()
-    quantity = QUANTITIES.get(text, "")
-    for word in quantity.split("|") if quantity else ():
-        if name == word or (len(word) > 1 and name.lower().startswith(word)):
-            return True
+    if _is_quantity(text, name):
+        return True
     others = [other for k, other in texts.items() if k != place]
     # A column of another unit in the same style shows that the letter is no variable of which all are functions.
     different = any(other != text for other in others) and all(map(known, others))

@@ -238,3 +238,9 @@ def test_repeated_names_get_numbers_and_none_is_taken_silently(path):
     with pytest.raises(ValueError, match="column of run.parquet: must be one of"):
         read(path)
     assert read(path, outputs={"x": "x (2)"})[1] == [5.0, 6.0]
+
+
+def test_columns_of_texts_and_of_one_date_are_not_the_time(path):
+    date = pa.array([datetime.datetime(2026, 3, 12)] * 2)
+    write(path, date=date, time=pa.array(["a", "b"]), zeit=pa.array([0.0, 1.0]), x=pa.array([1.0, 2.0]))
+    assert "time='zeit'" in bp.inspect(path).code

@@ -87,7 +87,7 @@ NUMBERS = {
     "Fortran": ("   t   x\n 0.0 1.25D-03\n 1.0 -2.50D+00\n", [1.25e-3, -2.5]),
     "bare": ("t,x\n0,.5\n1,+1e3\n", [0.5, 1000.0]),
     "quoted decimals": ('"t","x"\n"0,5","1,5"\n"1,5","2,25"\n', [1.5, 2.25]),
-    "points only": ("t;x\n0;1.234\n1;2.345\n", [1.234, 2.345]),
+    "points only": ("t,x\n0,1.234\n1,2.345\n", [1.234, 2.345]),
     "one column": ("x\n0,5\n1,5\n", [0.5, 1.5]),
     "names that are numbers": ("0,1\n0.5,1.5\n1.5,2.5\n", [1.5, 2.5]),
 }
@@ -417,3 +417,54 @@ def test_first_rows_without_any_number_are_no_preamble(write):
     path = write("a;b\n" + "OL;OL\n" * 5 + "1;2\n" * 9)
     with pytest.raises(ValueError, match="header: must be given, got None, as lines 5 and 6 are alike"):
         bp.inspect(path)
+
+
+@pytest.mark.parametrize(
+    "name", ["Time, ms", "Time_ms", "Time in ms", "Time <ms>", "Time {ms}", "[ms] Time", "Zeit/ms", "Time ms", "t.msec"]
+)
+def test_unit_that_the_name_of_the_time_may_say_is_asked_for(write, name):
+    path = write(f"{name};x\n0,5;1,5\n1,5;2,5\n")
+    unit = "msec" if "msec" in name else "ms"
+    with pytest.raises(ValueError, match=rf"units\['time'\]: must say what '{unit}\?' in the file is, got None"):
+        read(path, time=name)
+    assert read(path, time=name, units={"time": ("ms", "s")})[0] == pytest.approx([0.0005, 0.0015])
+    assert read(path, time=name, units={"time": 1.0})[0] == [0.5, 1.5]
+    assert f"the name may say the unit '{unit}'; units= decides" in str(bp.inspect(path))
+
+
+@pytest.mark.parametrize(
+    ("header", "units"),
+    [
+        ("t [min];U [in];F [min]", ["min", "in?", "min?"]),
+        ("Time [h];Length [in];<mm> x", ["h", "in?", "mm?"]),
+        ("t_min;x_min;T [a]", ["min?", "", "a?"]),
+        ("Time, s;F {kN};x_h", ["", "kN?", ""]),
+        ("time;run <2>;F, kN", ["", "", ""]),
+    ],
+)
+def test_words_that_may_be_units_have_a_question_mark(write, header, units):
+    seen = bp.inspect(write(header + "\n0;1;2\n1;2;3\n"))
+    assert [channel.unit for channel in seen.channels] == units
+    assert ("the name may say the unit 'kN', which is not used; units= converts" in str(seen)) == ("F, kN" in header)
+
+
+def test_points_that_all_stand_before_three_digits_are_refused(write):
+    path = write("n;x\n1;1.100\n2;1.200\n")
+    with pytest.raises(ValueError, match="decimal: must be given for 'run.csv', in whose numbers such as '1.100' the"):
+        read(path, time="n")
+    assert read(path, time="n", decimal=".")[1] == [1.1, 1.2] and read(path, time="n", decimal=",")[1] == [1100, 1200]
+    path = write("n;x\n" + "".join(f"{k};1.100\n" for k in range(500)) + "500;0.900\n")
+    assert read(path, time="n")[1][-2:] == [1.1, 0.9]
+
+
+@pytest.mark.parametrize("cell", ["∞", "OL"])
+def test_cell_that_is_no_number_is_named_also_among_decimal_commas(write, cell):
+    path = write(f"t;x\n0,5;1,5\n1,5;2,5\n2,5;{cell}\n3,5;2,5\n")
+    with pytest.raises(ValueError, match=f"column 'x' of run.csv: must be usable, got '{cell}' in data row 3, which"):
+        read(path)
+
+
+def test_columns_of_texts_and_of_one_date_are_not_the_time(write):
+    path = write("a,b,Datum,Zeit\n1,2500,12.03.2026,0.5\n5,Volt,12.03.2026,1.5\n3,s,12.03.2026,2.5\n")
+    assert "time='Zeit'" in bp.inspect(path).code
+    assert "time=" not in bp.inspect(write("a,b\n3,2500\n2,Volt\n1,s\n")).code
