@@ -28,6 +28,8 @@ TIME_WORD = re.compile(
     r"(?![^\W_]).*", re.IGNORECASE | re.DOTALL,
 )  # fmt: skip
 PARTS_OF_SECONDS, LONG_TIMES = ("ms", "us", "µs", "μs", "ns", "msec", "usec"), ("min", "mins", "minutes", "h", "hours")
+# Units that are not known but are no names either.
+UNIT_WORDS = re.compile(r"(?:milli|mikro|nano|m|µ)?(?:sekunden?|sek)\.?|minuten?|stunden?", re.IGNORECASE)
 # What may be something else than a unit also in brackets, such as "U [in]" and "F [min]".
 DOUBTFUL = ("in", "min", "h", "d", "a", "at", "as")
 # What may stand in the first cell of a row of units.
@@ -137,7 +139,7 @@ def mostly_known(texts: list[str]) -> bool:
 
 def is_evident(text: str) -> bool:
     """Return whether a text is a unit, and hardly a name."""
-    return (text == "s" or bool(EVIDENT.fullmatch(text))) and known(text)
+    return bool(UNIT_WORDS.fullmatch(text)) or (text == "s" or bool(EVIDENT.fullmatch(text))) and known(text)
 
 
 def is_possible(text: str) -> bool:

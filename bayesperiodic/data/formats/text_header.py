@@ -33,6 +33,7 @@ TIME_OF_DAY = r"[0-9]{1,2}:[0-9]{2}(?::[0-9]{2})?(?:[.,][0-9]+)?(?: ?[AaPp][Mm])
 DATE = rf"[0-9]{{1,4}}[-./][0-9]{{1,2}}[-./][0-9]{{1,4}}(?:[T ]+{TIME_OF_DAY})?(?:Z|[+-][0-9]{{2}}:?[0-9]{{2}})?"
 NUMBER_CELL = re.compile(rf"[+-]?(?:{PLAIN_NUMBER}|{GROUPS})")
 USABLE = re.compile(rf"[+-]?(?:{PLAIN_NUMBER}|{GROUPS})|{TIME_OF_DAY}|{DATE}")
+NEARLY_A_NUMBER = re.compile(r"[+-][0-9]+:[0-9:.,]+")  # such as a negative time of day
 TIME_NAME = re.compile(
     r"\W*(t|time|zeit|temps|tiempo|tempo|timestamp|zeitstempel|date|datum|datetime|uhrzeit|elapsed)\b.*", re.IGNORECASE
 )
@@ -374,6 +375,11 @@ def _refuse_lost(block: _Block, titled: bool, line: int | None) -> None:
     """Raise a ValueError for rows of the table, one cell of which is no number, between the header and the numbers."""
     above = [(number, row) for number, row in block.rows[: block.first] if number > (line or 0)]
     if titled and not line:
+        if above and any(map(NEARLY_A_NUMBER.fullmatch, filter(None, above[-1][1]))):
+            raise ValueError(
+                f"header: must be given, got {line!r}, as line {above[-1][0]} has neither names nor only numbers, "
+                f"{_checks.shortened(above[-1][1])}; give the number of the line of names, or header=0 for none."
+            )
         if len(above) > 1 and above[-1][1] == above[-2][1] and len(_filled(above[-1][1])) == block.width:
             raise ValueError(
                 f"header: must be given, got {line!r}, as lines {above[-2][0]} and {above[-1][0]} are alike, "
@@ -429,6 +435,13 @@ def _names_above(block: _Block, line: int | None) -> tuple[list[str], int, list[
     elif len(above) > 1 and len(above[-2][1]) >= len(_trimmed(above[-1][1])) > 0:
         units = _units_of(above[-1][1], following, block.width, block.separator) or []
         pairs = zip(above[-2][1], units, strict=False)
+        full = len(_filled(above[-2][1])) == len(_filled(above[-1][1]))
+        timed = any(map(TIME_NAME.fullmatch, above[-2][1]))
+        if full and "t" in units and not timed and not any(map(is_evident, units)):
+            raise ValueError(
+                f"header: must be given, got None, as line {above[-1][0]} may be names or units, "
+                f"{_checks.shortened(above[-1][1])}; give the number of the line of names."
+            )
         if units and not any(unit == "t" and TIME_NAME.fullmatch(name) for name, unit in pairs):
             below, above = above[-1:], above[:-1]
     if not above or (line and above[-1][0] != line):
@@ -481,8 +494,10 @@ def _units_around(block: _Block, above: Rows, below: Rows, line: int | None) -> 
             )
         if texts and any(map(is_evident, units)):
             return units
-    if line is None and full and any(map(is_possible, map(unbracketed, names))) and not any(map(known, upper)):
-        if not any(map(_is_value, upper)) and not any(map(TIME_NAME.fullmatch, names)) and len(_filled(names)) == width:
+    timed = any(map(TIME_NAME.fullmatch, upper))
+    if line is None and full and (timed or any(map(is_possible, map(unbracketed, names)))):
+        texts = not any(map(_is_value, [*upper, *names])) and (timed or not any(map(known, upper)))
+        if texts and not any(map(TIME_NAME.fullmatch, names)) and len(_filled(names)) == width:
             raise ValueError(
                 f"header: must be given, got None, as line {above[-1][0]} may be names or units, "
                 f"{_checks.shortened(names)}; give the number of the line of names."

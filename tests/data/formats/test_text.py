@@ -468,3 +468,25 @@ def test_columns_of_texts_and_of_one_date_are_not_the_time(write):
     path = write("a,b,Datum,Zeit\n1,2500,12.03.2026,0.5\n5,Volt,12.03.2026,1.5\n3,s,12.03.2026,2.5\n")
     assert "time='Zeit'" in bp.inspect(path).code
     assert "time=" not in bp.inspect(write("a,b\n3,2500\n2,Volt\n1,s\n")).code
+
+
+@pytest.mark.parametrize(
+    "upper, lower", [("CH1;CH2", "t;F"), ("Zeit;Kraft", "Takte;Impulse"), ("CH1;CH2", "Takte;mm Hg")]
+)
+def test_second_row_of_texts_that_may_be_units_is_refused_without_its_meaning(write, upper, lower):
+    path = write(f"{upper};CH3\n{lower};V\n0,5;1;2\n1,5;2;3\n")
+    with pytest.raises(ValueError, match="header: must be given, got None, as line 2 may be names or units"):
+        bp.inspect(path)
+    assert [channel.name for channel in bp.inspect(path, header=2).channels] == [*lower.split(";"), "V"]
+
+
+def test_row_of_units_in_words_is_one(write):
+    path = write("Zeit;Kraft\nMillisekunden;Digits\n0;1\n1;2\n")
+    with pytest.raises(ValueError, match=r"units\['time'\]: must say what 'Millisekunden' in the file is"):
+        read(path, time=1, outputs={"x": 2})
+
+
+def test_first_negative_times_of_the_only_column_are_no_names(write):
+    path = write("t\n-00:00:02\n-00:00:01\n" + "".join(f"00:00:0{k}\n" for k in range(9)))
+    with pytest.raises(ValueError, match="header: must be given, got None, as line 3 has neither names nor only num"):
+        bp.inspect(path)
