@@ -244,7 +244,7 @@ def _units_of(row: list[str], following: list[str], count: int, separator: str) 
     if row and row[0][:1] in ("#", "%") and len(row[0]) > 1:
         row = [COMMENT_MARK.sub("", row[0]), *row[1:]]
     elif row and row[0] == "#":
-        row = row[1:]
+        row = row[1:] if len(row) > count or separator == BLANKS else ["", *row[1:]]
     if len([cell for cell in row if cell]) > count or len(row) < (count if separator != BLANKS else count):
         return None
     if any(USABLE.fullmatch(cell) for cell in row if cell) or not any(map(USABLE.fullmatch, following)):

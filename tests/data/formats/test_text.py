@@ -490,3 +490,13 @@ def test_first_negative_times_of_the_only_column_are_no_names(write):
     path = write("t\n-00:00:02\n-00:00:01\n" + "".join(f"00:00:0{k}\n" for k in range(9)))
     with pytest.raises(ValueError, match="header: must be given, got None, as line 3 has neither names nor only num"):
         bp.inspect(path)
+
+
+def test_unit_of_the_time_that_is_none_of_time_is_asked_for(write):
+    with pytest.raises(ValueError, match=r"units\['time'\]: must say what 'm\?' in the file is, got None"):
+        read(write("t;x\nm;mm\n0;1\n1;2\n"))
+    assert read(write("t;x\nm;mm\n0;1\n1;2\n"), units={"time": ("min", "s")})[0] == [0.0, 60.0]
+
+
+def test_row_of_units_behind_a_mark_of_comments_in_a_field_is_seen(write):
+    assert read(write("#,t,x\n#,ms,mm\n0,0,1\n1,1,2\n")) == ([0.0, 0.001], [0.001, 0.002])
