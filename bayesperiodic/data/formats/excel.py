@@ -148,6 +148,7 @@ def _table(rows: list[tuple[Any, ...]], line: int | None, sheet: str) -> _Sheet 
     _refuse_lost(rows, first, line, columns)
     between = [r for r in range(line, first) if any(not _is_empty(c) for c in rows[r])] if line else []
     if line is None and len(above) > 1 and len(_given(rows[above[-2]])) >= len(_given(rows[above[-1]])):
+        _refuse_doubtful(_texts(rows[above[-2]], real), _texts(rows[above[-1]], real), above[-1] + 1)
         if header_units.unit_row(_texts(rows[above[-1]], real)):
             between, above = above[-1:], above[:-1]
     units = _units_around(rows, above, between, real, line) if line != 0 else [""] * real
@@ -176,6 +177,18 @@ def _refuse_lost(rows: list[tuple[Any, ...]], first: int, line: int | None, colu
                 f"header: must be the number of a row with only rows of numbers below it, got {line!r}, and row "
                 f"{r + 1} has the cell {str(text)!r} beside numbers; correct the cell, or give the row of names."
             )
+
+
+def _refuse_doubtful(upper: list[str], lower: list[str], row: int) -> None:
+    """Raise a ValueError for a row of texts that may be names or units."""
+    units = header_units.unit_row(lower) or []
+    evident, timed = any(map(header_units.is_evident, units)), any(map(TIME_NAME.fullmatch, upper))
+    unknown = timed and not units and not any(map(TIME_NAME.fullmatch, lower)) and all(upper) and all(lower)
+    if upper == lower or unknown or ("t" in units and not timed and not evident):
+        raise ValueError(
+            f"header: must be given, got None, as row {row} may be names or units, {_checks.shortened(lower)}; give "
+            "the number of the row of names."
+        )
 
 
 def _units_around(

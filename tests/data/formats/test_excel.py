@@ -276,3 +276,14 @@ def test_first_rows_with_a_text_among_numbers_are_no_preamble(write, line):
 def test_column_of_one_date_is_not_the_time(write):
     rows = [["Datum", "Zeit", "x"], *([(46_000, 1), k, 2 * k] for k in range(5))]
     assert "time='Zeit'" in bp.inspect(write(rows)).code
+
+
+@pytest.mark.parametrize(
+    ("upper", "lower"),
+    [(["CH1", "CH2"], ["t", "F"]), (NAMES, ["Takte", "Impulse", "Digits"]), (["OL"] * 2, ["OL"] * 2)],
+)
+def test_second_row_of_texts_that_may_be_units_is_refused_without_its_meaning(write, upper, lower):
+    path = write([upper, lower, *([k] * len(upper) for k in range(5))])
+    with pytest.raises(ValueError, match="header: must be given, got None, as row 2 may be names or units"):
+        bp.inspect(path)
+    assert bp.inspect(path, header=2).channels[0].name.startswith(lower[0])
