@@ -3,10 +3,11 @@
 import contextlib
 import datetime
 import itertools
+import re
 import warnings
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic.data.formats import header_units, text_cells
-from bayesperiodic.data.formats.contents import LARGEST_ARRAY, Contents, Key, StoredChannel, package, unique_names
-from bayesperiodic.data.formats.text_header import NUMBER_CELL, PREAMBLE, TIME_NAME
+from bayesperiodic.data.formats.contents import LARGEST_ARRAY, Contents, Key, StoredChannel, package
+from bayesperiodic.data.formats.text_header import NUMBER_CELL, PREAMBLE, TIME_NAME, numbered
 
 # Unpacked bytes per packed byte above which a member of a workbook is no sheet, if it is larger than this.
 LARGEST_RATIO, SMALL_MEMBER = 250, 2**25
@@ -25,6 +26,7 @@ MOST_ROWS, MOST_SHEET_COLUMNS = 2**20, 2**14
 STAMPS = (datetime.datetime, datetime.date)
 CLOCKS = (datetime.time, datetime.timedelta)
 NO_VALUE = ("", "#N/A", "#N/A N/A")
+LITERAL = re.compile(r'"[^"]*"|\\.')  # in a format of cells
 MICROSECONDS = 86_400e6  # in a day
 
 
@@ -55,9 +57,11 @@ def contents(file: Path, wanted: list[Key], *, header: int | None = None, date_f
             continue
         remarks.append(f"sheet {sheet!r}: {table.remark}")
         formulas = _formulas(file, sheet, table)
-        for place, name in enumerate(unique_names(table.names)):
-            channels.append(_channel(file, sheet, name, place, table, formulas.get(place), date_format))
-            if not times and TIME_NAME.fullmatch(name):
+        percents = _percents(file, sheet, table)
+        for place, name in enumerate(numbered(table.names)):
+            channel = _channel(file, sheet, name, place, table, formulas.get(place), date_format)
+            channels.append(_without_percent(channel, percents.get(place, set())))
+            if not times and TIME_NAME.fullmatch(name) and _may_be_times(table, place):
                 times.append(name)
     if not channels:
         raise ValueError("none of its sheets has a table of numbers")
@@ -69,6 +73,12 @@ def contents(file: Path, wanted: list[Key], *, header: int | None = None, date_f
         word="column",
         suggested_time=times[0] if times and one else "",
     )
+
+
+def _may_be_times(table: _Sheet, place: int) -> bool:
+    """Return whether a column has no texts, and does not end as it begins."""
+    cells = [row[place] for row in table.rows[table.first :] if place < len(row) and not _is_empty(row[place])]
+    return len(cells) > 1 and not any(isinstance(cell, str) for cell in cells) and cells[0] != cells[-1]
 
 
 @contextlib.contextmanager
@@ -135,13 +145,13 @@ def _table(rows: list[tuple[Any, ...]], line: int | None, sheet: str) -> _Sheet 
         above = []
     tops = [rows[r] for r in above[-1:] if sum(isinstance(cell, str) for cell in rows[r]) > 1]
     real = max(k + 1 for row in [*rows[first:], *tops] for k, cell in enumerate(row) if not _is_empty(cell))
-    units = [""] * real
-    between = [r for r in range(line, first) if any(not _is_empty(c) for c in rows[r])] if line else above[1:][-1:]
-    if between:
-        below = _texts(rows[between[-1]], real)
-        named = line or sum(map(bool, _texts(rows[above[-2]], real))) >= sum(map(bool, below))
-        if named and (read := header_units.unit_row(below)):
-            units, above = read, above if line else above[:-1]
+    _refuse_lost(rows, first, line, columns)
+    between = [r for r in range(line, first) if any(not _is_empty(c) for c in rows[r])] if line else []
+    if line is None and len(above) > 1 and len(_given(rows[above[-2]])) >= len(_given(rows[above[-1]])):
+        _refuse_doubtful(_texts(rows[above[-2]], real), _texts(rows[above[-1]], real), above[-1] + 1)
+        if header_units.unit_row(_texts(rows[above[-1]], real)):
+            between, above = above[-1:], above[:-1]
+    units = _units_around(rows, above, between, real, line) if line != 0 else [""] * real
     if not above or line == 0:
         return _Sheet([f"column {k + 1}" for k in range(real)], units, first, rows, "no names: columns by number")
     texts = _texts(rows[above[-1]], real)
@@ -149,8 +159,61 @@ def _table(rows: list[tuple[Any, ...]], line: int | None, sheet: str) -> _Sheet 
         return _Sheet([f"column {k + 1}" for k in range(real)], units, first, rows, "no names: columns by number")
     names = [text or f"column {k}" for k, text in enumerate(texts, 1)]
     given, _ = header_units.in_names(names)
-    units = [one or other for one, other in zip(units, given, strict=True)]
+    units = [header_units.of_times(name, one or other) for name, one, other in zip(names, units, given, strict=True)]
     return _Sheet(names, units, first, rows, f"names in row {above[-1] + 1}")
+
+
+def _given(row: tuple[Any, ...]) -> list[Any]:
+    return [cell for cell in row if not _is_empty(cell)]
+
+
+def _refuse_lost(rows: list[tuple[Any, ...]], first: int, line: int | None, columns: list[int]) -> None:
+    """Raise a ValueError for rows above the data that are rows of the table with a cell that is no number."""
+    for r in range(line, first) if line else range(max(first - 1, 0), first):
+        cells = [rows[r][k] for k in columns if k < len(rows[r]) and not _is_empty(rows[r][k])]
+        text = next((cell for cell in cells if not _is_value(cell)), None)
+        if text is not None and any(map(_is_value, cells)):
+            raise ValueError(
+                f"header: must be the number of a row with only rows of numbers below it, got {line!r}, and row "
+                f"{r + 1} has the cell {str(text)!r} beside numbers; correct the cell, or give the row of names."
+            )
+
+
+def _refuse_doubtful(upper: list[str], lower: list[str], row: int) -> None:
+    """Raise a ValueError for a row of texts that may be names or units."""
+    units = header_units.unit_row(lower) or []
+    evident, timed = any(map(header_units.is_evident, units)), any(map(TIME_NAME.fullmatch, upper))
+    unknown = timed and not units and not any(map(TIME_NAME.fullmatch, lower)) and all(upper) and all(lower)
+    if upper == lower or unknown or ("t" in units and not timed and not evident):
+        raise ValueError(
+            f"header: must be given, got None, as row {row} may be names or units, {_checks.shortened(lower)}; give "
+            "the number of the row of names."
+        )
+
+
+def _units_around(
+    rows: list[tuple[Any, ...]], above: list[int], between: list[int], real: int, line: int | None
+) -> list[str]:
+    """Return the units in the rows below the names, or in the row above them, which is the last one `above`."""
+    for r in between:
+        if units := header_units.unit_row(_texts(rows[r], real)):
+            return units
+    if between:
+        raise ValueError(
+            f"header: must be the number of the row above the data, or of one above units, got {line!r}, and row "
+            f"{between[-1] + 1} has neither numbers nor known units."
+        )
+    if len(above) > 1 and len(_given(rows[above[-2]])) >= len(_given(rows[above[-1]])):
+        units = header_units.unit_row(_texts(rows[above[-2]], real)) or []
+        third = len(above) > 2 and len(_given(rows[above[-3]])) >= len(_given(rows[above[-2]]))
+        if any(map(header_units.is_evident, units)):
+            if third and line is None:
+                raise ValueError(
+                    f"header: must be given, got None, as row {above[-2] + 1} may be units, and it is not the one "
+                    "below the names; give the number of the row of names."
+                )
+            return units
+    return [""] * real
 
 
 def _is_data(row: tuple[Any, ...], columns: list[int]) -> bool:
@@ -190,8 +253,38 @@ def _channel(
         if dates is not None:
             return StoredChannel(name, len(cells), dates.copy, sheet, table.units[place], remarks=(remark,))
     read = partial(_values, file, sheet, place, table.first, cells)
-    remarks = (remark,) if remark else ()
+    remarks = (*((remark,) if remark else ()), *header_units.remarks(name, table.units[place]))
     return StoredChannel(name, len(cells), read, sheet, table.units[place], remarks=remarks, refusal=refusal)
+
+
+def _percents(file: Path, sheet: str, table: _Sheet) -> dict[int, set[bool]]:
+    """Return whether numbers are shown in percent, by the place of columns with this unit."""
+    places = [place for place, unit in enumerate(table.units) if "%" in unit]
+    result: dict[int, set[bool]] = {place: set() for place in places}
+    if places:
+        with _opened(file) as book, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            book[sheet].reset_dimensions()
+            for row in book[sheet].iter_rows(min_row=table.first + 1):
+                for place in places:
+                    if place < len(row) and isinstance(row[place].value, int | float):
+                        result[place].add("%" in LITERAL.sub("", row[place].number_format or ""))
+    return result
+
+
+def _without_percent(channel: StoredChannel, percents: set[bool]) -> StoredChannel:
+    """Return a channel without the unit of percents if its cells show them, as these store a hundredth."""
+    if True not in percents:
+        return channel
+    if len(percents) > 1 or channel.unit != "%":
+        return replace(
+            channel,
+            refusal=channel.refusal
+            or f"the unit {channel.unit!r} and cells in the format of percents, which store a hundredth; format all "
+            "cells as numbers",
+        )
+    remark = "cells in the format of percents, which store a hundredth: a ratio without a unit"
+    return replace(channel, unit="", remarks=(*channel.remarks, remark))
 
 
 def _values(file: Path, sheet: str, place: int, first: int, cells: list[Any]) -> np.ndarray:

@@ -3,7 +3,7 @@
 import functools
 import re
 
-from bayesperiodic.data.units import AMBIGUOUS, LOGARITHMIC, is_known
+from bayesperiodic.data.units import AMBIGUOUS, LETTERS, LOGARITHMIC, is_duration, is_known
 
 LONGEST_UNIT_TEXT, LONGEST_UNIT_NAME = 30, 300
 # "Force [N]", "Force (N)" and "Force / N"; in the last two a letter may be a variable or a divisor.
@@ -18,6 +18,20 @@ EVIDENT = re.compile(
     r".*[/^²³°%·*].*|(?:[nuµμmcdkMGh]|da)(?:m|s|N|Nm|V|A|Hz|Pa|rad|W|J|Ω|[oO]hm|g|ε|bar)|Nm|Hz|Pa|rad|deg|degC|rpm|RPM|bar|psi"
     r"|lbf|sec|Volts?|g_n|dB|ppm|rev|strain|ustrain|microstrain|[µuμ]e"
 )
+# Other places of a unit in a name: in other brackets, in front, or as the last word.
+BRACKETED = re.compile(
+    r".*\S\s*(?:<\s*([^<>]+?)\s*>|\{\s*([^{}]+?)\s*\})\s*|\s*[\[(<{]\s*([^\[\](){}<>]+?)\s*[\])>}]\s*\S.*"
+)
+LAST_WORD = re.compile(r".*[^\W_].*?[\W_]([^\W_]+)\W*", re.DOTALL)
+TIME_WORD = re.compile(
+    r"[\W_]*(?:[\[(<{].*?[\])>}]\W*)?(?:(?-i:t)|time|zeit|temps|tiempo|tempo|timestamp|zeitstempel|elapsed|dauer|duration)"
+    r"(?![^\W_]).*", re.IGNORECASE | re.DOTALL,
+)  # fmt: skip
+PARTS_OF_SECONDS, LONG_TIMES = ("ms", "us", "µs", "μs", "ns", "msec", "usec"), ("min", "mins", "minutes", "h", "hours")
+# Units that are not known but are no names either.
+UNIT_WORDS = re.compile(r"(?:milli|mikro|nano|m|µ)?(?:sekunden?|sek)\.?|minuten?|stunden?", re.IGNORECASE)
+# What may be something else than a unit also in brackets, such as "U [in]" and "F [min]".
+DOUBTFUL = ("in", "min", "h", "d", "a", "at", "as")
 # What may stand in the first cell of a row of units.
 ROW_TITLES = ("unit", "units", "einheit", "einheiten", "unité", "unités")
 # Quantities whose unit is one letter.
@@ -43,13 +57,58 @@ def in_names(names: list[str], *, guessed: bool = False) -> tuple[list[str], dic
         if not texts:
             continue
         if guessed:
-            for place, text in texts.items():
-                if not text.isascii() and not known(text):
-                    refusals[place] = f"its unit {text!r} in an encoding that is not known; give encoding="
+            refusals |= in_other_encoding(texts)
         for place, text in texts.items():
             if not units[place] and _is_meant(style, place, texts, names):
-                units[place] = text
-    return units, refusals
+                doubtful = style == "[" and text in DOUBTFUL and not _is_quantity(text, names[place])
+                units[place] = f"{text}?" if doubtful and not TIME_WORD.fullmatch(names[place]) else text
+    return [unit or _possible(name) for unit, name in zip(units, names, strict=True)], refusals
+
+
+def _possible(name: str) -> str:
+    """Return a unit that a name may say, with a question mark, which makes the user say what it is; else ""."""
+    if name[LONGEST_UNIT_NAME:]:
+        return ""
+    timed = TIME_WORD.fullmatch(name) is not None
+    if match := BRACKETED.fullmatch(name):
+        text = match[1] or match[2] or match[3]
+        return f"{text}?" if is_evident(text) or (timed and text in LONG_TIMES) else ""
+    text = match[1] if (match := LAST_WORD.fullmatch(name)) else ""
+    return f"{text}?" if text in PARTS_OF_SECONDS or (timed and text in LONG_TIMES) else ""
+
+
+def of_times(name: str, unit: str) -> str:
+    """Return a unit, with a question mark if it is none of time and the name is that of times."""
+    wrong = TIME_WORD.fullmatch(name) and unit not in ("", "-") and known(unit) and not is_duration(unit)
+    return f"{unit}?" if wrong else unit
+
+
+def remarks(name: str, unit: str) -> tuple[str, ...]:
+    """Return what to say about a unit that a name may say."""
+    if unit.endswith("?"):
+        return (f"the name may say the unit {unit[:-1]!r}; units= decides, such as a factor or a pair of units",)
+    match = LAST_WORD.fullmatch(name) if not unit and not name[LONGEST_UNIT_NAME:] else None
+    if match and is_evident(match[1]):
+        return (f"the name may say the unit {match[1]!r}, which is not used; units= converts",)
+    return ()
+
+
+def _is_quantity(text: str, name: str) -> bool:
+    """Return whether a name is that of a quantity of a unit."""
+    plain, quantity = re.split(r"[(/\[]", name)[0].strip(), QUANTITIES.get(text, "")
+    return any(
+        plain == word or (len(word) > 1 and plain.lower().startswith(word))
+        for word in (quantity.split("|") if quantity else ())
+    )
+
+
+def in_other_encoding(texts: dict[int, str]) -> dict[int, str]:
+    """Return refusals of units with letters that the encoding does not seem to have."""
+    return {
+        place: f"its unit {text!r} in an encoding that is not known; give encoding="
+        for place, text in texts.items()
+        if not text.isascii() and not known(text)
+    }
 
 
 def _is_meant(style: str, place: int, texts: dict[int, str], names: list[str]) -> bool:
@@ -64,10 +123,8 @@ def _is_meant(style: str, place: int, texts: dict[int, str], names: list[str]) -
     if EVIDENT.fullmatch(text):
         return True
     name = re.split(r"[(/]", names[place])[0].strip()
-    quantity = QUANTITIES.get(text, "")
-    for word in quantity.split("|") if quantity else ():
-        if name == word or (len(word) > 1 and name.lower().startswith(word)):
-            return True
+    if _is_quantity(text, name):
+        return True
     others = [other for k, other in texts.items() if k != place]
     # A column of another unit in the same style shows that the letter is no variable of which all are functions.
     different = any(other != text for other in others) and all(map(known, others))
@@ -75,12 +132,25 @@ def _is_meant(style: str, place: int, texts: dict[int, str], names: list[str]) -
 
 
 def unit_row(cells: list[str]) -> list[str] | None:
-    """Return the units in the row below the names, or None if it is none."""
+    """Return the units in the row below the names, or None if it is none; one evident unit makes it a row of units."""
     texts = [unbracketed(cell) for cell in cells]
+    return texts if mostly_known(texts) or any(map(is_evident, texts)) else None
+
+
+def mostly_known(texts: list[str]) -> bool:
+    """Return whether most of the texts are units."""
     given = [text for text in texts if text]
-    if not given or sum(map(known, given)) * 2 <= len(given) or all(text == "-" for text in given):
-        return None
-    return texts
+    return sum(map(known, given)) * 2 > len(given) and any(text != "-" for text in given)
+
+
+def is_evident(text: str) -> bool:
+    """Return whether a text is a unit, and hardly a name."""
+    return bool(UNIT_WORDS.fullmatch(text)) or (text == "s" or bool(EVIDENT.fullmatch(text))) and known(text)
+
+
+def is_possible(text: str) -> bool:
+    """Return whether a text is a unit that is not ambiguous."""
+    return text not in AMBIGUOUS and (len(text) > 1 or text in LETTERS) and known(text)
 
 
 def unbracketed(cell: str) -> str:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from bayesperiodic.data.formats import header_units
-from bayesperiodic.data.formats.contents import LARGEST_ARRAY, Contents, Key, StoredChannel, package, unique_names
+from bayesperiodic.data.formats.contents import LARGEST_ARRAY, Contents, Key, StoredChannel, package
+from bayesperiodic.data.formats.text_header import numbered
 
 # Keys of units in the metadata of a field, in lower case.
 UNIT_KEYS = (b"unit", b"units", b"uom", b"unit_string")
@@ -30,10 +31,11 @@ def contents(file: Path, wanted: list[Key]) -> Contents:
     pandas, index = _pandas(schema.metadata)
     units, _ = header_units.in_names(schema.names)
     channels, remarks = [], []
-    for place, name in enumerate(unique_names(schema.names)):
+    plain = "index" not in schema.names
+    names = ["index" if plain and one in index and one.startswith("__index_level_") else one for one in schema.names]
+    for place, name in enumerate(numbered(names)):
         kind, remark = schema.field(place).type, []
         if schema.names[place] in index:
-            name = "index" if name.startswith("__index_level_") and "index" not in schema.names else name
             remark.append("the index of the table in pandas")
         unit = _unit(schema.field(place).metadata) or pandas.get(schema.names[place], "")
         channels.append(
@@ -42,22 +44,30 @@ def contents(file: Path, wanted: list[Key]) -> Contents:
                 rows,
                 partial(_values, file, place),
                 unit=unit or units[place],
-                remarks=(*remark, *_remarks(kind)),
+                remarks=(*remark, *_remarks(kind), *header_units.remarks(name, unit or units[place])),
                 refusal=_refusal(kind),
             )
         )
     remarks += [
         f"the index of the table in pandas, {index_range}, is not stored" for index_range in _ranges(schema.metadata)
     ]
-    times = [channel.name for channel in channels if channel.name.lower() in ("t", "time", "zeit", "timestamp", "date")]
-    dated = [c.name for c, f in zip(channels, schema, strict=True) if _is_time(f.type)]
-    suggested = next(iter([*dated, *times]), "")
+    named = [c for c in channels if c.name.lower() in ("t", "time", "zeit", "timestamp", "date")]
+    dated = [c for c, f in zip(channels, schema, strict=True) if _is_time(f.type)]
+    suggested = next((c.name for c in [*dated, *named] if not wanted and _may_be_times(c)), "")
     return Contents("Parquet file", tuple(channels), tuple(remarks), word="column", suggested_time=suggested)
 
 
 def _is_time(kind: Any) -> bool:
     types = package("pyarrow.types", "PyArrow", "Parquet files")
     return bool(types.is_timestamp(kind) or types.is_duration(kind) or types.is_time(kind))
+
+
+def _may_be_times(channel: StoredChannel) -> bool:
+    """Return whether a column has no texts, and does not end as it begins."""
+    if channel.refusal:
+        return False
+    values = channel.values()
+    return values.dtype.kind in "fiumM" and values.size > 1 and bool(values[0] != values[-1])
 
 
 def _unit(metadata: dict[bytes, bytes] | None) -> str:

@@ -84,10 +84,13 @@ def contents(
             places[key - 1] = str(key)
     _refuse_summaries(text, top)
     read, sign, rows = _columns(text, top, [*places] or [*range(len(names))], notation)
-    units, refusals = header_units.in_names(top.names, guessed=text.remark.startswith("encoding 'cp1252' of"))
+    guessed = text.remark.startswith("encoding 'cp1252' of")
+    units, refusals = header_units.in_names(top.names, guessed=guessed)
+    refusals |= header_units.in_other_encoding(dict(enumerate(top.units))) if guessed else {}
     channels = []
     for place, name in enumerate(names):
         unit = (top.units[place] if place < len(top.units) else "") or units[place]
+        unit = header_units.of_times(name, unit)
         values, remark, refusal = read.get(place) or (partial(_later, text, top, place, notation), "", "")
         channels.append(
             StoredChannel(
@@ -95,7 +98,7 @@ def contents(
                 rows,
                 values if callable(values) else partial(_given, values),
                 unit=unit,
-                remarks=(remark,) if remark else (),
+                remarks=(*((remark,) if remark else ()), *header_units.remarks(name, unit)),
                 refusal=refusals.get(place, "") or refusal,
             )
         )
@@ -146,6 +149,8 @@ def _columns(file: Text, top: Head, places: list[int], notation: _Notation) -> t
     evidence = CellEvidence.of(cell for row in top.sample for cell in row[: len(top.names)])
     decimal = notation.decimal or evidence.sign or "."
     table, rows = _table(file, top, places, decimal)
+    if top.separator == ";" and notation.decimal is None and not evidence.sign and evidence.either == {"."}:
+        _refuse_groups(file, top)
     texts = {place: values for place, values in table.items() if values.dtype == object}
     for values in texts.values():
         evidence |= CellEvidence.of(cell.strip(" \t") for cell in values if isinstance(cell, str))
@@ -173,6 +178,22 @@ def _columns(file: Text, top: Head, places: list[int], notation: _Notation) -> t
     return result, shown if evidence.decimal | evidence.either | evidence.thousands else "", rows
 
 
+def _refuse_groups(file: Text, top: Head) -> None:
+    """Raise a ValueError if all points of a text stand before three digits and after no zero."""
+    evidence, shown = CellEvidence(), ""
+    with file.open() as text:
+        for row in skip(text, top.lines, top.separator):
+            cells = [cell.strip() for cell in row]
+            evidence |= CellEvidence.of(cells)
+            shown = shown or next((cell for cell in cells if text_cells.EITHER.fullmatch(cell)), "")
+            if evidence.sign or "," in evidence.either:
+                return
+    raise ValueError(
+        f"decimal: must be given for {file.path.name!r}, in whose numbers such as {shown!r} the points may be decimal "
+        "or stand between thousands; give decimal='.' or decimal=','."
+    )
+
+
 def _converted(
     values: np.ndarray, decimal: str, sure: bool, notation: _Notation, top: Head
 ) -> tuple[np.ndarray, str, str]:
@@ -194,6 +215,8 @@ def _converted(
                 "",
                 f"the name {values[row]!r} again in data row {row + 1}: the file has several tables; save each",
             )
+    if decimal == "," and (bad := text_cells.other_than_numbers(values)):
+        return values, "", bad
     return values, "", text_cells.refusal(cells, decimal, sure)
 
 
@@ -203,9 +226,7 @@ def _suggested_time(channels: list[StoredChannel], read: Read) -> str:
     dated = []
     for place, (channel, name) in enumerate(zip(channels, named, strict=True)):
         values, _, refusal = read[place]
-        texts = values.dtype == object and any(
-            isinstance(one, str) and USABLE.fullmatch(one.strip()) for one in values[:1]
-        )
+        texts = values.dtype == object and all(map(text_cells.is_moment, (*values[:100], *values[-100:])))
         if refusal:
             continue
         if values.dtype.kind in "mM" or texts:

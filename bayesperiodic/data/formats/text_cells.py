@@ -67,6 +67,20 @@ def refusal(cells: list[str], decimal: str, sure: bool) -> str:
     return f"numbers such as {shown!r}, which do not all have one decimal sign; give decimal= and thousands="
 
 
+def other_than_numbers(values: np.ndarray) -> str:
+    """Return why texts most of which are numbers cannot be read: the first of the others."""
+    others = [k for k, cell in enumerate(values) if isinstance(cell, str) and not NUMBER_CELL.fullmatch(cell.strip())]
+    given = sum(isinstance(cell, str) for cell in values)
+    if not others or 2 * len(others) >= given:
+        return ""
+    return f"{values[others[0]]!r} in data row {others[0] + 1}, which is no number, as {given - len(others)} others are"
+
+
+def is_moment(cell: object) -> bool:
+    """Return whether a cell is a date or a time of day."""
+    return isinstance(cell, str) and bool(TIME.fullmatch(cell.strip()) or DATED.fullmatch(cell.strip()))
+
+
 def numbers(values: np.ndarray, decimal: str, thousands: str | None) -> np.ndarray | None:
     """Return texts as numbers, if all of them are numbers with a decimal sign and one sign between thousands."""
     import pandas as pd

@@ -10,7 +10,7 @@ from typing import TextIO
 
 from bayesperiodic import _checks
 from bayesperiodic.data.formats.encodings import Text
-from bayesperiodic.data.formats.header_units import unit_row
+from bayesperiodic.data.formats.header_units import is_evident, is_possible, known, mostly_known, unbracketed, unit_row
 
 # Texts of missing values.
 MISSING = [
@@ -33,6 +33,7 @@ TIME_OF_DAY = r"[0-9]{1,2}:[0-9]{2}(?::[0-9]{2})?(?:[.,][0-9]+)?(?: ?[AaPp][Mm])
 DATE = rf"[0-9]{{1,4}}[-./][0-9]{{1,2}}[-./][0-9]{{1,4}}(?:[T ]+{TIME_OF_DAY})?(?:Z|[+-][0-9]{{2}}:?[0-9]{{2}})?"
 NUMBER_CELL = re.compile(rf"[+-]?(?:{PLAIN_NUMBER}|{GROUPS})")
 USABLE = re.compile(rf"[+-]?(?:{PLAIN_NUMBER}|{GROUPS})|{TIME_OF_DAY}|{DATE}")
+NEARLY_A_NUMBER = re.compile(r"[+-][0-9]+:[0-9:.,]+")  # such as a negative time of day
 TIME_NAME = re.compile(
     r"\W*(t|time|zeit|temps|tiempo|tempo|timestamp|zeitstempel|date|datum|datetime|uhrzeit|elapsed)\b.*", re.IGNORECASE
 )
@@ -211,10 +212,31 @@ def _with_units(file: Text, best: Head) -> Head:
                 if len(rows) > 3 and len(rows) * sum(map(len, row)) > SAMPLE_CHARACTERS // 8:
                     break
     units: list[str] = []
-    if len(rows) > 1 and (below := _units_of(rows[0][1], rows[1][1], len(best.names), best.separator)):
-        units, best = below, Head(best.names, rows[0][0], len(rows[1][1]) - len(best.names), best.separator)
-        rows = rows[1:]
+    first = next((k for k, (_, row) in enumerate(rows[:3]) if any(map(USABLE.fullmatch, row))), 0)
+    for _, row in rows[:first]:
+        units = units or _units_of(row, rows[first][1], len(best.names), best.separator) or []
+    if units:
+        best = Head(best.names, rows[first - 1][0], len(rows[first][1]) - len(best.names), best.separator)
+        rows = rows[first:]
+    elif rows and not first:
+        units = _units_above(file, best, rows[0][1])
     return Head(best.names, best.lines, best.more, best.separator, units, True, [row for _, row in rows])
+
+
+def _units_above(file: Text, best: Head, following: list[str]) -> list[str]:
+    """Return the units in the row above names that were found."""
+    upper: list[str] = []
+    with file.open() as text:
+        for number, row in _numbered_rows(text, best.separator):
+            if number >= best.lines:
+                break
+            cells = row[0].split() if row and best.separator == BLANKS else row
+            upper = [cell.strip() for cell in cells] if any(map(str.strip, cells)) else upper
+    upper = _as_row(upper, len(best.names), best.separator)
+    units = _units_of(upper, following, len(best.names), best.separator) if upper else None
+    if units and len(_filled(upper)) >= len(_filled(best.names)) and any(map(is_evident, units)):
+        return units
+    return []
 
 
 def _units_of(row: list[str], following: list[str], count: int, separator: str) -> list[str] | None:
@@ -222,13 +244,17 @@ def _units_of(row: list[str], following: list[str], count: int, separator: str) 
     if row and row[0][:1] in ("#", "%") and len(row[0]) > 1:
         row = [COMMENT_MARK.sub("", row[0]), *row[1:]]
     elif row and row[0] == "#":
-        row = row[1:]
+        row = row[1:] if len(row) > count or separator == BLANKS else ["", *row[1:]]
     if len([cell for cell in row if cell]) > count or len(row) < (count if separator != BLANKS else count):
         return None
     if any(USABLE.fullmatch(cell) for cell in row if cell) or not any(map(USABLE.fullmatch, following)):
         return None
     units = unit_row(row[:count])
-    if units and any(unit and not _is_value(cell) for unit, cell in zip(units, following, strict=False) if unit != "-"):
+    if units and any(
+        known(unit) and not _is_value(cell) for unit, cell in zip(units, following, strict=False) if unit != "-"
+    ):
+        return None
+    if units and not mostly_known(units) and any(map(TIME_NAME.fullmatch, filter(None, units))):
         return None
     return units
 
@@ -247,6 +273,9 @@ def _sample(file: Text) -> list[str]:
             if size > SAMPLE_CHARACTERS and len(lines) >= 8:
                 break
     return lines
+
+
+Rows = list[tuple[int, list[str]]]
 
 
 @dataclass(frozen=True)
@@ -322,6 +351,7 @@ def _by_evidence(file: Text, separator: str | None, line: int | None) -> Head | 
             "rows of numbers with other ones; save each table as a file of its own."
         )
     names, names_line, units = _names_above(best, line)
+    _refuse_lost(best, bool(names), line)
     data = best.rows[best.first :]
     real = max((k + 1 for _, row in data for k, cell in enumerate(row[: best.width]) if cell), default=best.width)
     if line and names:
@@ -339,6 +369,33 @@ def _by_evidence(file: Text, separator: str | None, line: int | None) -> Head | 
         names = [f"column {k + 1}" for k in range(real)]
         return Head(names, previous, best.width - real, best.separator, [], False, [row for _, row in data])
     return Head(names, names_line, best.width - real, best.separator, units, True, [row for _, row in data])
+
+
+def _refuse_lost(block: _Block, titled: bool, line: int | None) -> None:
+    """Raise a ValueError for rows of the table, one cell of which is no number, between the header and the numbers."""
+    above = [(number, row) for number, row in block.rows[: block.first] if number > (line or 0)]
+    if titled and not line:
+        if above and any(map(NEARLY_A_NUMBER.fullmatch, filter(None, above[-1][1]))):
+            raise ValueError(
+                f"header: must be given, got {line!r}, as line {above[-1][0]} has neither names nor only numbers, "
+                f"{_checks.shortened(above[-1][1])}; give the number of the line of names, or header=0 for none."
+            )
+        if len(above) > 1 and above[-1][1] == above[-2][1] and len(_filled(above[-1][1])) == block.width:
+            raise ValueError(
+                f"header: must be given, got {line!r}, as lines {above[-2][0]} and {above[-1][0]} are alike, "
+                f"{_checks.shortened(above[-1][1])}; give the number of the line of names."
+            )
+        return
+    for number, row in above if line else above[-1:]:
+        if len(row) != block.width or block.lines[number - 1].lstrip()[:1] in ("#", "%"):
+            continue
+        if any(USABLE.fullmatch(row[k]) for k in block.columns):
+            cell = next((row[k] for k in block.columns if not _is_value(row[k])), row[0])
+            raise ValueError(
+                f"header: must be the number of a line with only rows of numbers below it, got {line!r}, and line "
+                f"{number} has the cell {cell!r} above numbers, {_checks.shortened(row)}; correct the cell, or leave "
+                "out the rows before it by header= and give columns by number."
+            )
 
 
 def _one_or_several(file: Text, best: _Block, blocks: list[_Block], line: int | None) -> _Block:
@@ -370,18 +427,26 @@ def _names_above(block: _Block, line: int | None) -> tuple[list[str], int, list[
         if block.width > 1 and following in (numbers[:-1], numbers[1:]) and len(block.rows) > 1:
             return following, block.rows[0][0], []
         return [], 0, []
-    units: list[str] = []
     last = above[-1][0] if above else 0
+    below: list[tuple[int, list[str]]] = []
     if line:
+        below = [(number, row) for number, row in above if number > line]
         above = [(number, row) for number, row in above if number <= line]
-        below = [row for number, row in block.rows[: block.first] if number > line]
-        if below:
-            units = _units_of(below[-1], following, block.width, block.separator) or []
     elif len(above) > 1 and len(above[-2][1]) >= len(_trimmed(above[-1][1])) > 0:
-        if below_units := _units_of(above[-1][1], following, block.width, block.separator):
-            units, above = below_units, above[:-1]
+        units = _units_of(above[-1][1], following, block.width, block.separator) or []
+        pairs = zip(above[-2][1], units, strict=False)
+        full = len(_filled(above[-2][1])) == len(_filled(above[-1][1]))
+        timed = any(map(TIME_NAME.fullmatch, above[-2][1]))
+        if full and "t" in units and not timed and not any(map(is_evident, units)):
+            raise ValueError(
+                f"header: must be given, got None, as line {above[-1][0]} may be names or units, "
+                f"{_checks.shortened(above[-1][1])}; give the number of the line of names."
+            )
+        if units and not any(unit == "t" and TIME_NAME.fullmatch(name) for name, unit in pairs):
+            below, above = above[-1:], above[:-1]
     if not above or (line and above[-1][0] != line):
         raise ValueError(f"header: must be the number of the line of the names, or 0 for none, got {line!r}.")
+    units = _units_around(block, above, below, line)
     names = above[-1][1]
     if block.separator == BLANKS:
         text = COMMENT_MARK.sub("", block.lines[above[-1][0] - 1]).strip()
@@ -401,6 +466,54 @@ def _names_above(block: _Block, line: int | None) -> tuple[list[str], int, list[
             )
         return [], 0, []
     return names, last, units
+
+
+def _units_around(block: _Block, above: Rows, below: Rows, line: int | None) -> list[str]:
+    """Return the units in the rows below the names, or in the row above them, which is the last one `above`."""
+    following, width = block.rows[block.first][1], block.width
+    for _, row in below:
+        if units := _units_of(row, following, width, block.separator):
+            return units
+    if below:
+        raise ValueError(
+            f"header: must be the number of the line above the data, or of one above units, got {line!r}, and line "
+            f"{below[-1][0]} is {_checks.shortened(below[-1][1])}, which are neither numbers nor known units."
+        )
+    names = above[-1][1]
+    upper = _as_row(above[-2][1], width, block.separator) if len(above) > 1 else []
+    full = len(_filled(upper)) >= len(_filled(names)) > 0
+    if full and (units := _units_of(upper, following, width, block.separator)):
+        third = len(above) > 2 and len(_filled(above[-3][1])) >= len(_filled(upper))
+        texts = third and not any(map(_is_value, _filled(above[-3][1])))
+        if not texts and mostly_known(units) and any(map(is_evident, units)):
+            return units
+        if line is None and (any(map(is_evident, units)) or all(map(is_possible, filter(None, units)))):
+            raise ValueError(
+                f"header: must be given, got None, as line {above[-2][0]} may be units, {_checks.shortened(upper)}, "
+                "and it is not the one below the names; give the number of the line of names."
+            )
+        if texts and any(map(is_evident, units)):
+            return units
+    timed = any(map(TIME_NAME.fullmatch, upper))
+    if line is None and full and (timed or any(map(is_possible, map(unbracketed, names)))):
+        texts = not any(map(_is_value, [*upper, *names])) and (timed or not any(map(known, upper)))
+        if texts and not any(map(TIME_NAME.fullmatch, names)) and len(_filled(names)) == width:
+            raise ValueError(
+                f"header: must be given, got None, as line {above[-1][0]} may be names or units, "
+                f"{_checks.shortened(names)}; give the number of the line of names."
+            )
+    return []
+
+
+def _filled(row: list[str]) -> list[str]:
+    return [cell for cell in row if cell]
+
+
+def _as_row(row: list[str], count: int, separator: str) -> list[str]:
+    """Return the fields of a row without a mark of comments."""
+    if row and row[0] == "#" and len(row) > 1 and (separator == BLANKS or len(row) > count):
+        return row[1:]
+    return [COMMENT_MARK.sub("", row[0]), *row[1:]] if row and row[0][:1] in ("#", "%") else row
 
 
 def _trimmed(row: list[str]) -> list[str]:

@@ -17,11 +17,13 @@ from tests.data.test_damaged_files import damaged
 MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
 RELATED = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
 PACKAGE = "http://schemas.openxmlformats.org/package/2006"
-# Formats of cells: general, date and time, time of day.
+# Formats of cells: general, date and time, time of day, percent, and a number with a percent sign behind it.
 STYLES = (
-    f'<styleSheet xmlns="{MAIN}"><fonts count="1"><font/></fonts><fills count="1"><fill><patternFill/></fill></fills>'
-    '<borders count="1"><border/></borders><cellStyleXfs count="1"><xf/></cellStyleXfs><cellXfs count="3">'
-    '<xf numFmtId="0"/><xf numFmtId="22"/><xf numFmtId="21"/></cellXfs></styleSheet>'
+    f'<styleSheet xmlns="{MAIN}"><numFmts count="1"><numFmt numFmtId="164" formatCode="0.0&quot; %&quot;"/></numFmts>'
+    '<fonts count="1"><font/></fonts><fills count="1"><fill><patternFill/></fill></fills>'
+    '<borders count="1"><border/></borders><cellStyleXfs count="1"><xf/></cellStyleXfs><cellXfs count="5">'
+    '<xf numFmtId="0"/><xf numFmtId="22"/><xf numFmtId="21"/>'
+    '<xf numFmtId="9"/><xf numFmtId="164"/></cellXfs></styleSheet>'
 )
 
 
@@ -221,3 +223,67 @@ def repacked(whole, generator, turn):
             member = source.read(name)
             target.writestr(name, damaged(member, generator) if name == names[turn % len(names)] else member)
     return content.getvalue()
+
+
+def test_cells_in_percent_are_ratios_already(write):
+    rows = [["t", "x [%]"], [0, (0.5, 3)], [1, (0.25, 3)]]
+    keys = {"outputs": {"x": "x [%]"}}
+    assert read(write(rows), **keys)[1] == [0.5, 0.25]
+    assert "a ratio without a unit" in str(bp.inspect(write(rows)))
+    assert read(write([["t", "x [%]"], [0, 50], [1, (25, 4)]]), **keys)[1] == [0.5, 0.25]
+    with pytest.raises(ValueError, match="must be usable, got the unit '%' and cells in the format of percents"):
+        read(write([*rows, [2, 50]]), **keys)
+
+
+def test_repeated_names_get_numbers_and_none_is_taken_silently(write):
+    path = write([["t", "x", "x", "x (2)"], [0, 1, 3, 5], [1, 2, 4, 6]])
+    assert [channel.name for channel in bp.inspect(path).channels] == ["t", "x (1)", "x (2)'", "x (2)"]
+    with pytest.raises(ValueError, match="column of run.xlsx: must be one of"):
+        read(path)
+    assert read(path, outputs={"x": "x (2)"})[1] == [5.0, 6.0]
+
+
+NAMES, UNITS, WORDS = ["Zeit", "Kraft", "Takt"], ["ms", "kN", "Impulse"], ["Zeit des Laufs", "Lager", "Geber"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "line"),
+    [([NAMES, UNITS], None), ([NAMES, UNITS], 1), ([NAMES, UNITS, WORDS], 1), ([UNITS, NAMES], None),
+     ([UNITS, NAMES], 2), ([["Rig"], UNITS, NAMES], None)],
+)  # fmt: skip
+def test_row_of_units_is_seen_wherever_it_stands(write, rows, line):
+    path = write([*rows, [0, 1, 2], [1, 2, 3]])
+    keys = {"time": "Zeit", "outputs": {"x": "Kraft"}, "header": line}
+    assert read(path, **keys) == ([0.0, 0.001], [1000.0, 2000.0])
+    assert [channel.unit for channel in bp.inspect(path, header=line).channels] == UNITS
+
+
+@pytest.mark.parametrize(
+    ("rows", "line"), [([NAMES, UNITS, WORDS], None), ([NAMES, WORDS], 1), ([WORDS, UNITS, NAMES], None)]
+)
+def test_rows_of_texts_that_may_be_units_are_refused(write, rows, line):
+    with pytest.raises(ValueError, match="header: must be"):
+        bp.inspect(write([*rows, [0, 1, 2], [1, 2, 3]]), header=line)
+
+
+@pytest.mark.parametrize("line", [None, 0, 1])
+def test_first_rows_with_a_text_among_numbers_are_no_preamble(write, line):
+    rows = [["t", "x"], *([k, "OL"] for k in range(5)), *([k, k] for k in range(5, 40))]
+    with pytest.raises(ValueError, match="header: must be the number of a row .*has the cell 'OL' beside numbers"):
+        bp.inspect(write(rows), header=line)
+
+
+def test_column_of_one_date_is_not_the_time(write):
+    rows = [["Datum", "Zeit", "x"], *([(46_000, 1), k, 2 * k] for k in range(5))]
+    assert "time='Zeit'" in bp.inspect(write(rows)).code
+
+
+@pytest.mark.parametrize(
+    ("upper", "lower"),
+    [(["CH1", "CH2"], ["t", "F"]), (NAMES, ["Takte", "Impulse", "Digits"]), (["OL"] * 2, ["OL"] * 2)],
+)
+def test_second_row_of_texts_that_may_be_units_is_refused_without_its_meaning(write, upper, lower):
+    path = write([upper, lower, *([k] * len(upper) for k in range(5))])
+    with pytest.raises(ValueError, match="header: must be given, got None, as row 2 may be names or units"):
+        bp.inspect(path)
+    assert bp.inspect(path, header=2).channels[0].name.startswith(lower[0])

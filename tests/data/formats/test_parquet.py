@@ -229,3 +229,18 @@ def test_damage_is_refused_here(path):
     path.write_bytes(damaged(by_hand({b"t": TIME, b"x": X}), np.random.default_rng(0))[:-9])
     with pytest.raises(ValueError, match="path: must be a Parquet file, got"):
         read(path, format="parquet")
+
+
+def test_repeated_names_get_numbers_and_none_is_taken_silently(path):
+    columns = [pa.array([0.0, 1.0]), pa.array([1.0, 2.0]), pa.array([3.0, 4.0]), pa.array([5.0, 6.0])]
+    pq.write_table(pa.Table.from_arrays(columns, ["t", "x", "x", "x (2)"]), path)
+    assert [channel.name for channel in bp.inspect(path).channels] == ["t", "x (1)", "x (2)'", "x (2)"]
+    with pytest.raises(ValueError, match="column of run.parquet: must be one of"):
+        read(path)
+    assert read(path, outputs={"x": "x (2)"})[1] == [5.0, 6.0]
+
+
+def test_columns_of_texts_and_of_one_date_are_not_the_time(path):
+    date = pa.array([datetime.datetime(2026, 3, 12)] * 2)
+    write(path, date=date, time=pa.array(["a", "b"]), zeit=pa.array([0.0, 1.0]), x=pa.array([1.0, 2.0]))
+    assert "time='zeit'" in bp.inspect(path).code

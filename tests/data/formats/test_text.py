@@ -87,7 +87,7 @@ NUMBERS = {
     "Fortran": ("   t   x\n 0.0 1.25D-03\n 1.0 -2.50D+00\n", [1.25e-3, -2.5]),
     "bare": ("t,x\n0,.5\n1,+1e3\n", [0.5, 1000.0]),
     "quoted decimals": ('"t","x"\n"0,5","1,5"\n"1,5","2,25"\n', [1.5, 2.25]),
-    "points only": ("t;x\n0;1.234\n1;2.345\n", [1.234, 2.345]),
+    "points only": ("t,x\n0,1.234\n1,2.345\n", [1.234, 2.345]),
     "one column": ("x\n0,5\n1,5\n", [0.5, 1.5]),
     "names that are numbers": ("0,1\n0.5,1.5\n1.5,2.5\n", [1.5, 2.5]),
 }
@@ -348,3 +348,155 @@ def test_damaged_texts_are_read_as_they_are_or_refused(write, encoding):
                     call(path)
                 except ValueError as error:
                     assert "must" in str(error) and str(error).encode("cp1252", "backslashreplace")
+
+
+UNIT_ROWS = {
+    "half of the units unknown": (
+        "Zeit;Kraft;Takt;Status\nms;kN;Impulse;Digits\n{}",
+        ["ms", "kN", "Impulse", "Digits"],
+    ),
+    "with a description": (
+        "Zeit;Kraft;Takt;Status\nms;kN;Impulse;Digits\nZeit des Laufs;Lager;Geber;Wort\n{}",
+        ["ms", "kN", "Impulse", "Digits"],
+    ),
+    "above": ("ms;kN;Nm;V\nZeit;Kraft;Takt;Status\n{}", ["ms", "kN", "Nm", "V"]),
+    "above, below a preamble": ("Rig 3;;;\nms;kN;Nm;V\nZeit;Kraft;Takt;Status\n{}", ["ms", "kN", "Nm", "V"]),
+}
+ROWS = "0,5;1,5;1;2\n1,5;2,5;3;4\n2,5;3;5;6\n"
+
+
+@pytest.mark.parametrize("case", UNIT_ROWS)
+@pytest.mark.parametrize("way", ["names", "header", "numbers"])
+def test_row_of_units_is_seen_wherever_it_stands(write, case, way):
+    """Some of the units are unknown; a description may follow; without names or header= the latter is refused."""
+    content, units = UNIT_ROWS[case]
+    path = write(content.format(ROWS))
+    line = content.split("\n").index("Zeit;Kraft;Takt;Status") + 1
+    given = {"header": line} if way == "header" else {}
+    keys = {"time": "Zeit", "outputs": {"x": "Kraft"}} if way != "numbers" else {"time": 1, "outputs": {"x": 2}}
+    if way == "numbers" and case == "with a description":
+        with pytest.raises(ValueError, match="header: must be given, got None, as line 2 may be units"):
+            read(path, **keys)
+        return
+    assert read(path, **keys, **given)[0] == pytest.approx([0.0005, 0.0015, 0.0025])
+    assert read(path, **keys, **given)[1] == pytest.approx([1500.0, 2500.0, 3000.0])
+    if way == "header":
+        assert [channel.unit for channel in bp.inspect(path, **given).channels] == units
+
+
+def test_text_between_names_and_numbers_that_is_no_unit_is_refused(write):
+    path = write("t;x\nTakte;Impulse\n0;1\n1;2\n")
+    with pytest.raises(ValueError, match="header: must be the number of the line above the data, .*got 1, and line 2"):
+        read(path, header=1)
+    with pytest.raises(ValueError, match="must contain numbers, .*got 'Takte' in data row 1"):
+        read(path)
+
+
+def test_units_in_a_code_page_that_is_not_known_are_not_the_names(write):
+    path = write("t;x\ns;µm\n0,5;1,5\n1,5;2\n", "cp850")
+    assert [channel.name for channel in bp.inspect(path).channels] == ["t", "x"]
+    for key in ("x", 2):
+        with pytest.raises(ValueError, match="must be usable, got its unit 'æm' in an encoding that is not known"):
+            read(path, outputs={"x": key})
+    assert read(path, encoding="cp850")[1] == pytest.approx([1.5e-6, 2e-6])
+
+
+@pytest.mark.parametrize("row", ["-00:00:0{};{}", "OL;{}{}"])
+@pytest.mark.parametrize("line", [None, 0, 1])
+def test_first_rows_that_are_no_numbers_are_no_preamble(write, row, line):
+    first = "".join(row.format(k, k) + "\n" for k in range(5))
+    path = write("a;b\n" + first + "".join(f"00:00:0{k};{k}\n" for k in range(9)))
+    cell = "OL" if row[0] == "O" else "-00:00:0"
+    with pytest.raises(ValueError, match=f"header: must be .*got {line}.*{cell}"):
+        read(path, time=1, outputs={"x": 2}, header=line)
+    with pytest.raises(ValueError, match="header: must be"):
+        bp.inspect(path, header=line)
+
+
+def test_first_rows_without_any_number_are_no_preamble(write):
+    path = write("a;b\n" + "OL;OL\n" * 5 + "1;2\n" * 9)
+    with pytest.raises(ValueError, match="header: must be given, got None, as lines 5 and 6 are alike"):
+        bp.inspect(path)
+
+
+@pytest.mark.parametrize(
+    "name", ["Time, ms", "Time_ms", "Time in ms", "Time <ms>", "Time {ms}", "[ms] Time", "Zeit/ms", "Time ms", "t.msec"]
+)
+def test_unit_that_the_name_of_the_time_may_say_is_asked_for(write, name):
+    path = write(f"{name};x\n0,5;1,5\n1,5;2,5\n")
+    unit = "msec" if "msec" in name else "ms"
+    with pytest.raises(ValueError, match=rf"units\['time'\]: must say what '{unit}\?' in the file is, got None"):
+        read(path, time=name)
+    assert read(path, time=name, units={"time": ("ms", "s")})[0] == pytest.approx([0.0005, 0.0015])
+    assert read(path, time=name, units={"time": 1.0})[0] == [0.5, 1.5]
+    assert f"the name may say the unit '{unit}'; units= decides" in str(bp.inspect(path))
+
+
+@pytest.mark.parametrize(
+    ("header", "units"),
+    [
+        ("t [min];U [in];F [min]", ["min", "in?", "min?"]),
+        ("Time [h];Length [in];<mm> x", ["h", "in?", "mm?"]),
+        ("t_min;x_min;T [a]", ["min?", "", "a?"]),
+        ("Time, s;F {kN};x_h", ["", "kN?", ""]),
+        ("time;run <2>;F, kN", ["", "", ""]),
+    ],
+)
+def test_words_that_may_be_units_have_a_question_mark(write, header, units):
+    seen = bp.inspect(write(header + "\n0;1;2\n1;2;3\n"))
+    assert [channel.unit for channel in seen.channels] == units
+    assert ("the name may say the unit 'kN', which is not used; units= converts" in str(seen)) == ("F, kN" in header)
+
+
+def test_points_that_all_stand_before_three_digits_are_refused(write):
+    path = write("n;x\n1;1.100\n2;1.200\n")
+    with pytest.raises(ValueError, match="decimal: must be given for 'run.csv', in whose numbers such as '1.100' the"):
+        read(path, time="n")
+    assert read(path, time="n", decimal=".")[1] == [1.1, 1.2] and read(path, time="n", decimal=",")[1] == [1100, 1200]
+    path = write("n;x\n" + "".join(f"{k};1.100\n" for k in range(500)) + "500;0.900\n")
+    assert read(path, time="n")[1][-2:] == [1.1, 0.9]
+
+
+@pytest.mark.parametrize("cell", ["∞", "OL"])
+def test_cell_that_is_no_number_is_named_also_among_decimal_commas(write, cell):
+    path = write(f"t;x\n0,5;1,5\n1,5;2,5\n2,5;{cell}\n3,5;2,5\n")
+    with pytest.raises(ValueError, match=f"column 'x' of run.csv: must be usable, got '{cell}' in data row 3, which"):
+        read(path)
+
+
+def test_columns_of_texts_and_of_one_date_are_not_the_time(write):
+    path = write("a,b,Datum,Zeit\n1,2500,12.03.2026,0.5\n5,Volt,12.03.2026,1.5\n3,s,12.03.2026,2.5\n")
+    assert "time='Zeit'" in bp.inspect(path).code
+    assert "time=" not in bp.inspect(write("a,b\n3,2500\n2,Volt\n1,s\n")).code
+
+
+@pytest.mark.parametrize(
+    "upper, lower", [("CH1;CH2", "t;F"), ("Zeit;Kraft", "Takte;Impulse"), ("CH1;CH2", "Takte;mm Hg")]
+)
+def test_second_row_of_texts_that_may_be_units_is_refused_without_its_meaning(write, upper, lower):
+    path = write(f"{upper};CH3\n{lower};V\n0,5;1;2\n1,5;2;3\n")
+    with pytest.raises(ValueError, match="header: must be given, got None, as line 2 may be names or units"):
+        bp.inspect(path)
+    assert [channel.name for channel in bp.inspect(path, header=2).channels] == [*lower.split(";"), "V"]
+
+
+def test_row_of_units_in_words_is_one(write):
+    path = write("Zeit;Kraft\nMillisekunden;Digits\n0;1\n1;2\n")
+    with pytest.raises(ValueError, match=r"units\['time'\]: must say what 'Millisekunden' in the file is"):
+        read(path, time=1, outputs={"x": 2})
+
+
+def test_first_negative_times_of_the_only_column_are_no_names(write):
+    path = write("t\n-00:00:02\n-00:00:01\n" + "".join(f"00:00:0{k}\n" for k in range(9)))
+    with pytest.raises(ValueError, match="header: must be given, got None, as line 3 has neither names nor only num"):
+        bp.inspect(path)
+
+
+def test_unit_of_the_time_that_is_none_of_time_is_asked_for(write):
+    with pytest.raises(ValueError, match=r"units\['time'\]: must say what 'm\?' in the file is, got None"):
+        read(write("t;x\nm;mm\n0;1\n1;2\n"))
+    assert read(write("t;x\nm;mm\n0;1\n1;2\n"), units={"time": ("min", "s")})[0] == [0.0, 60.0]
+
+
+def test_row_of_units_behind_a_mark_of_comments_in_a_field_is_seen(write):
+    assert read(write("#,t,x\n#,ms,mm\n0,0,1\n1,1,2\n")) == ([0.0, 0.001], [0.001, 0.002])
