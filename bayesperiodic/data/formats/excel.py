@@ -159,7 +159,7 @@ def _table(rows: list[tuple[Any, ...]], line: int | None, sheet: str) -> _Sheet 
         return _Sheet([f"column {k + 1}" for k in range(real)], units, first, rows, "no names: columns by number")
     names = [text or f"column {k}" for k, text in enumerate(texts, 1)]
     given, _ = header_units.in_names(names)
-    units = [header_units.of_times(name, one or other) for name, one, other in zip(names, units, given, strict=True)]
+    units = [one or other for one, other in zip(units, given, strict=True)]
     return _Sheet(names, units, first, rows, f"names in row {above[-1] + 1}")
 
 

@@ -3,9 +3,11 @@
 import functools
 import re
 
-from bayesperiodic.data.units import AMBIGUOUS, LETTERS, LOGARITHMIC, is_duration, is_known
+from bayesperiodic.data.units import AMBIGUOUS, LOGARITHMIC, is_known
 
 LONGEST_UNIT_TEXT, LONGEST_UNIT_NAME = 30, 300
+# Letters that are units, and seldom names.
+LETTERS = set("msNVAKWJTHLlhΩ°%")
 # "Force [N]", "Force (N)" and "Force / N"; in the last two a letter may be a variable or a divisor.
 STYLES = {
     "[": re.compile(r".*?\[\s*([^\[\]]*?)\s*\]\s*", re.DOTALL),
@@ -75,12 +77,6 @@ def _possible(name: str) -> str:
         return f"{text}?" if is_evident(text) or (timed and text in LONG_TIMES) else ""
     text = match[1] if (match := LAST_WORD.fullmatch(name)) else ""
     return f"{text}?" if text in PARTS_OF_SECONDS or (timed and text in LONG_TIMES) else ""
-
-
-def of_times(name: str, unit: str) -> str:
-    """Return a unit, with a question mark if it is none of time and the name is that of times."""
-    wrong = TIME_WORD.fullmatch(name) and unit not in ("", "-") and known(unit) and not is_duration(unit)
-    return f"{unit}?" if wrong else unit
 
 
 def remarks(name: str, unit: str) -> tuple[str, ...]:

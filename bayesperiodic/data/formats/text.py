@@ -90,7 +90,6 @@ def contents(
     channels = []
     for place, name in enumerate(names):
         unit = (top.units[place] if place < len(top.units) else "") or units[place]
-        unit = header_units.of_times(name, unit)
         values, remark, refusal = read.get(place) or (partial(_later, text, top, place, notation), "", "")
         channels.append(
             StoredChannel(
