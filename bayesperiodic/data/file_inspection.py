@@ -13,6 +13,7 @@ from bayesperiodic._printing import printable
 from bayesperiodic.data.formats import recognise
 from bayesperiodic.data.formats.contents import Clock, Contents, StoredChannel, unique_names
 from bayesperiodic.data.times import dates
+from bayesperiodic.data.units import question
 
 # Channels that are printed, and that the suggested call names.
 MOST_PRINTED, MOST_SUGGESTED = 60, 6
@@ -180,6 +181,8 @@ def _summary(channel: StoredChannel) -> FileChannel:
         except ValueError as error:
             note, refused = str(error), True
         remarks += [note] if note else []
+    if hint := question(channel.unit):
+        remarks.append(f"units= must say what {channel.unit!r} is: {hint}")
     rate, first, last = np.nan, np.nan, np.nan
     if clock := channel.clock:
         remarks += clock.remarks

@@ -122,6 +122,11 @@ def _doubt(text: str) -> str:
     return ""
 
 
+def question(stored: str) -> str:
+    """Return what `units` must say for the unit of a file; empty if it is converted without a question."""
+    return _doubt(_spelled(stored)) if stored.strip() else ""
+
+
 def _decides(first: str, text: str) -> bool:
     """Return whether the first unit of a pair can be the unit of a file."""
     if text in AMBIGUOUS:

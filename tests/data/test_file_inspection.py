@@ -34,6 +34,13 @@ def test_table_has_channels_units_ranges_remarks_and_a_call_that_runs(path):
     assert names["recording"].time == pytest.approx([0.0, 1e-3, 2e-3])
 
 
+def test_doubtful_unit_is_remarked(tmp_path):
+    (tmp_path / "run.csv").write_text("t [s],a [g],F [N]\n0,1,2\n1,2,3\n2,3,5\n")
+    t, a, force = bp.inspect(tmp_path / "run.csv").channels
+    assert any("units= must say what 'g' is: ('g_0', 'm/s**2')" in remark for remark in a.remarks)
+    assert not any("units=" in remark for remark in (*t.remarks, *force.remarks))
+
+
 def test_result_is_stored_and_loaded(path, tmp_path):
     seen = bp.inspect(path)
     seen.save(tmp_path / "seen.h5")
