@@ -258,7 +258,7 @@ def _clocked(layout: Layout, contents: Contents, column: _Column, rate: float | 
             f"sampling_rate: {layout.file} gives the interval of {contents.word} {column.stored.label!r} with few "
             f"digits, so that its rate is {1.0 / clock.step:.9g} Hz with an error of up to "
             f"{1e6 * clock.error / clock.step:.2g} ppm; {rounded_rate(clock)}give sampling_rate= if you know it.",
-            stacklevel=6,
+            stacklevel=5,
         )
     return clock.times(size)
 

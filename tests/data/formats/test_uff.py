@@ -89,8 +89,9 @@ def test_values_and_times_of_all_forms(saved, double, binary, even):
 @pytest.mark.parametrize("rate", [51_200, 44_100, 48_000, 65_536, 512])
 def test_interval_of_six_digits_is_named_with_its_error_and_the_round_rate(saved, rate):
     path = saved(function(step=1.0 / rate))
-    with pytest.warns(UserWarning, match=rf"few digits.* ppm; {rate} Hz has the same digits"):
-        run = read(path)
+    with pytest.warns(UserWarning, match=rf"few digits.* ppm; {rate} Hz has the same digits") as raised:
+        run = bp.Recording.from_file(path, outputs={"x": "top"})
+    assert raised[0].filename == __file__
     assert abs(run.time[-1] * rate / 49 - 1.0) < 3e-6
     exact = read(path, sampling_rate=rate)
     np.testing.assert_allclose(exact.time, np.arange(50) / rate, rtol=1e-14)
