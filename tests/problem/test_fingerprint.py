@@ -214,7 +214,7 @@ def test_truths_are_marked_in_corner_plots(two):
         ({"scheme": "backward"}, "scheme: must be one of .*got 'backward'. Did you mean 'backward2'"),
         ({"priors": PRIORS | {"K": PRIORS["k"]}}, "priors: must be .*got 'K'. Did you mean 'k'"),
         ({"priors": PRIORS | {"c": (1.0, 0.5)}}, r"priors\['c'\]: must be .*Normal.*got \(1.0, 0.5\)"),
-        ({"priors": PRIORS | {"c": bp.Normal(0.05, 1e-300)}}, r"priors\['c'\]: must be wider than .*fixed="),
+        ({"priors": PRIORS | {"c": bp.Normal(0.05, 1e-100)}}, r"priors\['c'\]: must be wider than .*fixed="),
         ({"priors": PRIORS | {"c": bp.Normal(0.05, 1e-18)}}, r"priors\['c'\]: must be wider than .*fixed="),
     ],
 )
