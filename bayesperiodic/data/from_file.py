@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, Self, overload
 
 from bayesperiodic import _checks
 from bayesperiodic.data import objects
@@ -20,11 +20,11 @@ class FromFile(Channels):
 
     @overload
     @classmethod
-    def from_file(cls, path: str | Path, *, split: None = None, **arguments: Any) -> "FromFile": ...
+    def from_file(cls, path: str | Path, *, split: None = None, **arguments: Any) -> Self: ...
 
     @overload
     @classmethod
-    def from_file(cls, path: str | Path, *, split: Key, **arguments: Any) -> "list[FromFile]": ...
+    def from_file(cls, path: str | Path, *, split: Key, **arguments: Any) -> list[Self]: ...
 
     @classmethod  # type: ignore[misc]
     def from_file(
@@ -46,7 +46,7 @@ class FromFile(Channels):
         thousands: str | None = None,
         header: int | None = None,
         date_format: str | None = None,
-    ) -> "FromFile | list[FromFile]":
+    ) -> Self | list[Self]:
         """Read a recording from a file of one of eleven formats.
 
         `bayesperiodic.inspect` prints what is in a file, and the call that reads it. The formats are CSV and other
@@ -286,12 +286,7 @@ class FromFile(Channels):
         return _from_object(cls, "the list", objects.sep005(channels), arguments)
 
 
-def _from_object(
-    cls: Any,
-    label: str,
-    contents: Contents,
-    arguments: dict[str, Any],
-) -> Any:
+def _from_object(cls: Any, label: str, contents: Contents, arguments: dict[str, Any]) -> Any:
     """Return the recording in an object in memory."""
     known = ("outputs", "inputs", "time", "sampling_rate", "units", "missing", "split", "name")
     for argument in arguments:
