@@ -4,6 +4,7 @@ from . import models as models
 from . import plot as plot
 from ._io import load as load
 from ._versions import show_versions as show_versions
+from .data import measurements as measurements
 from .data.experiment import Experiment as Experiment
 from .data.file_inspection import FileChannel as FileChannel
 from .data.file_inspection import FileInspection as FileInspection

@@ -82,8 +82,9 @@ class Linearisation:
         return result
 
     def compared(self) -> dict[str, dict[str, np.ndarray]]:
-        """Return y − ŷ (points,) by experiment and channel, within the harmonics kept."""
-        return {name: o.compared(self._responses[name]) for name, o in self._observations.items()}
+        """Return y − ŷ (points,) by experiment and channel, within the harmonics kept, and of measured quantities."""
+        each = ((name, o, self._responses[name]) for name, o in self._observations.items())
+        return {name: o.compared(response) | o.quantities(response) for name, o, response in each}
 
     def left_out(self) -> dict[str, dict[str, np.ndarray]]:
         """Return measured less predicted amplitudes of harmonics that were left out, by experiment and channel."""
