@@ -1,6 +1,7 @@
 """What instruments tell of a periodic response in place of its time history: amplitudes, phases, sizes."""
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -206,7 +207,7 @@ class RootMeanSquare(Measurement):
     word: ClassVar[str] = "rms value"
 
 
-def checked(given: object, outputs: dict[str, object]) -> tuple[Measurement, ...]:
+def checked(given: object, outputs: Collection[str]) -> tuple[Measurement, ...]:
     """Return the measurements of an experiment with these outputs, in groups of one kind and channel.
 
     A ValueError is raised if two are of the same quantity, or a group has known and unknown standard deviations.

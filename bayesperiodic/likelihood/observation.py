@@ -101,7 +101,8 @@ class Observation:
     compared_channels : tuple of str
         These, and then the others of which something was measured.
     picked : slice or list of int
-        The indices of all compared channels among the model's outputs, a slice, which does not copy, where they are consecutive.
+        The indices of all compared channels among the model's outputs, a slice, which does not copy, where they are
+        consecutive.
     angles : list of bool
         Which of the channels are angles.
     blocks : tuple of Block
