@@ -12,6 +12,7 @@ from bayesperiodic._io import Result, Storable
 from bayesperiodic._linalg import covariance_cholesky
 from bayesperiodic.data.recording_check import Finding
 from bayesperiodic.data.response_period import summary
+from bayesperiodic.data.sweep import Sweep
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -103,6 +104,8 @@ class Experiment(Result):
         be a parameter of a `Problem`.
     synthetic : bool
         True if the data were simulated.
+    sweep : Sweep, optional
+        The table of responses that the experiment is a point of; see `response_table`.
     mask : bool array (samples·periods,), optional
         True at the points where the outputs were measured, such as the points of a Poincaré section; other entries
         are ignored.
@@ -166,6 +169,7 @@ class Experiment(Result):
     findings: tuple[Finding, ...] = field(default=(), kw_only=True)
     clocks: Mapping[str, tuple[str, ...]] = field(default_factory=dict, kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
+    sweep: Sweep | None = field(default=None, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
     covariance: np.ndarray | None = field(default=None, kw_only=True)
     multipliers: np.ndarray | None = field(default=None, kw_only=True)
@@ -195,6 +199,8 @@ class Experiment(Result):
                 for key, values in (self.guess or {}).items()
             }
             object.__setattr__(self, "guess", guess)
+        if self.sweep is not None:
+            _checks.instance("sweep", self.sweep, Sweep)
         if not (np.isfinite(self.frequency_se) and self.frequency_se >= 0.0):
             raise ValueError(f"frequency_se: must be a finite number, at least 0 [Hz], got {self.frequency_se!r}.")
         for argument in CHANNEL_MAPPINGS:
