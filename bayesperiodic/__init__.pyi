@@ -13,6 +13,7 @@ from .data.recording import Recording as Recording
 from .data.recording_check import Finding as Finding
 from .data.recording_check import RecordingCheck as RecordingCheck
 from .data.response_table import response_table as response_table
+from .data.sweep import Sweep as Sweep
 from .density.problem import Problem as Problem
 from .diagnostics.branch_prediction import BranchPrediction as BranchPrediction
 from .diagnostics.branch_prediction import predict_branch as predict_branch

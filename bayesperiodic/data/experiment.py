@@ -14,6 +14,7 @@ from bayesperiodic.data import measurements as kinds
 from bayesperiodic.data.measurements import Measurement
 from bayesperiodic.data.recording_check import Finding
 from bayesperiodic.data.response_period import summary
+from bayesperiodic.data.sweep import Sweep
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -108,6 +109,8 @@ class Experiment(Result):
     measurements : sequence of Measurement, optional
         What instruments tell of channels without a time history, see `bp.measurements`: amplitudes, phases,
         peak-to-peak and rms values. Then `outputs` may be empty.
+    sweep : Sweep, optional
+        The table of responses that the experiment is a point of; see `response_table`.
     mask : bool array (samples·periods,), optional
         True at the points where the outputs were measured, such as the points of a Poincaré section; other entries
         are ignored.
@@ -172,6 +175,7 @@ class Experiment(Result):
     clocks: Mapping[str, tuple[str, ...]] = field(default_factory=dict, kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
     measurements: Sequence[Measurement] = field(default=(), kw_only=True)
+    sweep: Sweep | None = field(default=None, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
     covariance: np.ndarray | None = field(default=None, kw_only=True)
     multipliers: np.ndarray | None = field(default=None, kw_only=True)
@@ -201,6 +205,8 @@ class Experiment(Result):
                 for key, values in (self.guess or {}).items()
             }
             object.__setattr__(self, "guess", guess)
+        if self.sweep is not None:
+            _checks.instance("sweep", self.sweep, Sweep)
         if not (np.isfinite(self.frequency_se) and self.frequency_se >= 0.0):
             raise ValueError(f"frequency_se: must be a finite number, at least 0 [Hz], got {self.frequency_se!r}.")
         for argument in CHANNEL_MAPPINGS:

@@ -54,6 +54,11 @@ class Linearisation:
         return {name: STATUSES[int(self._simulation.statuses(name)[0])] for name in self._observations}
 
     @property
+    def beyond(self) -> bool:
+        """Whether a branch does not reach the frequency of a point of its table."""
+        return bool(self.solver.beyond(self._simulation))
+
+    @property
     def converged(self) -> bool:
         """Whether all solves converged."""
         return self.status == CONVERGED
@@ -304,6 +309,7 @@ class LogPosterior(SamplingCoordinates):
         value, by_residual, by_noise = self.problem.likelihood.value_and_gradients(here.residuals, noise)
         if not np.isfinite(value):
             return -np.inf, *zeros, CONVERGED
+        forward = forward or here.beyond
         if forward or any(o.multipliers for o in self.problem.observations.values()):
             here = here.anchored()
         by_theta = np.add.reduce(list(here.vjp(by_residual, adjoint=not forward).values()))

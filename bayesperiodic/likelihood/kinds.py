@@ -6,6 +6,7 @@ from bayesperiodic.likelihood.mean_period import MeanPeriod
 from bayesperiodic.likelihood.multipliers import Multipliers
 from bayesperiodic.likelihood.orbit_frequency import OrbitFrequency
 from bayesperiodic.likelihood.quantities import Amplitudes, PeakToPeaks, Phases, RootMeanSquares
+from bayesperiodic.likelihood.reach import Reach
 from bayesperiodic.likelihood.samples import Samples
 from bayesperiodic.likelihood.section_points import SectionPoints
 from bayesperiodic.models.model import Model
@@ -21,6 +22,7 @@ KINDS: list[type[Block]] = [
     Phases,
     PeakToPeaks,
     RootMeanSquares,
+    Reach,
 ]
 
 

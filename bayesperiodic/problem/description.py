@@ -90,7 +90,7 @@ class Description(Printed):
             local = (*local,) + tuple(name for name in model.parameters if name not in plain)
         self.sensors = Sensors(sensors, model, self.experiments, joint=self.input_noise == JOINT)
         self.model = model = self.sensors.model
-        self.scheme = scheme or default_scheme(model)
+        self.scheme = scheme or default_scheme(model, tables=all(e.sweep is not None for e in self.experiments))
         find_scheme(self.scheme)
         if any(b.is_dense(self.noise) for e in self.experiments for b in blocks_of(e, model)):
             if isinstance(self.input_noise, Mapping):
