@@ -127,6 +127,11 @@ class ResponseSolver:
             for group in self.groups
         ]
 
+    @property
+    def sheets(self) -> dict[str, int | None]:
+        """Sheet of the branch of each point of a table, None for other experiments."""
+        return {name: orbit.sheet for name, orbit in self.anchors.items()}
+
     @cached_property
     def _sheets(self) -> list[list[Point]]:
         """The points of each sheet of the tables' branches, in the order of the sweep."""

@@ -62,9 +62,7 @@ def places(problem: Description, theta: np.ndarray, near: Mapping[str, np.ndarra
     """
     result: dict[str, Place] = {}
     for sweep, table in tables(problem).items():
-        with np.errstate(all="ignore"):
-            passages = _branch(problem, theta, table)
-        choices = [_choices(passages, k) for k in range(len(table))]
+        choices = _all_choices(problem, theta, table)
         if not all(choices):
             continue
         if near is not None:
@@ -77,6 +75,26 @@ def places(problem: Description, theta: np.ndarray, near: Mapping[str, np.ndarra
         best = _sheets(choices, costs, jumps=sweep.direction is not None)
         result |= {e.name: places_of[b] for e, places_of, b in zip(table, choices, best, strict=True)}
     return result
+
+
+def early_jumps(problem: Description, theta: np.ndarray, sheets: Mapping[str, int]) -> dict[Sweep, list[str]]:
+    """Return the points of each sweep after a jump, on `sheets`, at which the sheet before it still exists at θ."""
+    result: dict[Sweep, list[str]] = {}
+    for sweep, table in tables(problem).items():
+        if sweep.direction is None or len({sheets.get(e.name) for e in table}) == 1:
+            continue
+        for e, choices in zip(table, _all_choices(problem, theta, table), strict=True):
+            now = sheets.get(e.name)
+            if now is not None and any(place.sheet < now and place.reached for place in choices):
+                result.setdefault(sweep, []).append(e.name)
+    return result
+
+
+def _all_choices(problem: Description, theta: np.ndarray, table: Sequence[Experiment]) -> list[list[Place]]:
+    """Return the choices of every point of a table."""
+    with np.errstate(all="ignore"):
+        passages = _branch(problem, theta, table)
+    return [_choices(passages, k) for k in range(len(table))]
 
 
 def _branch(problem: Description, theta: np.ndarray, table: Sequence[Experiment]) -> list[Passage]:

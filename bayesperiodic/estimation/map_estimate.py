@@ -17,6 +17,7 @@ from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Line
 from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import ResponseSolver
+from bayesperiodic.density.sweeps import tables
 from bayesperiodic.estimation.check import check_warnings, checked
 from bayesperiodic.estimation.covariance import (
     degrees_of_freedom,
@@ -39,6 +40,7 @@ from bayesperiodic.estimation.gauss_newton import (
 from bayesperiodic.estimation.laplace import joint_laplace
 from bayesperiodic.estimation.modes import default_starts, notable, weighed, with_images
 from bayesperiodic.estimation.result import MapEstimate, NoiseEstimate, Search, TrueInputs
+from bayesperiodic.estimation.table_orbits import table_warnings
 from bayesperiodic.estimation.units import compared_with_data, not_isolated, singular_start, unit_error
 from bayesperiodic.likelihood.noise import Relative
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
@@ -54,6 +56,8 @@ INFORMED = 0.01
 MOST_LINEARISATIONS, STEPS_BETWEEN, SETTLED_INPUTS = 40, 5, 1e-5
 # Seconds after which the progress bar is shown.
 SHOWN_AFTER = 2.0
+# Choices of the sheets of tables' branches that are tried after the first.
+MOST_SHEET_CHANGES = 5
 
 
 @in_one_thread
@@ -89,6 +93,8 @@ def map_estimate(
     Prime period, turns of angles and order of the forcing periods of every fitted orbit are compared with those of the
     recording. If they differ, the fit is repeated from orbits that the measured outputs show; if an orbit remains
     another one, the status is "other orbit".
+
+    Points of response tables are fitted on the sheets of the model's branch that fit them best at the estimate.
 
     The iteration starts at several points where its solves are cheap, and at the images of an optimum under changes of
     signs and exchanges of two parameters, if their density is at least a thousandth of the optimum's. Ends further
@@ -127,7 +133,7 @@ def map_estimate(
     UserWarning
         If an estimate lies at the end of its prior's support, if another optimum has more than 1 % of the posterior
         mass by its Laplace approximation, if data contain no noise, if the orbit of an experiment is not the measured
-        one, and as `check` does.
+        one, if the branch of a response table does not reach a point or is unstable there, and as `check` does.
 
     References
     ----------
@@ -153,7 +159,8 @@ def map_estimate(
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
     objective = _objective(problem, first.here)
-    end = _on_measured_orbits(problem, theta, _climb(objective, first, progress), progress)
+    end = _on_best_sheets(problem, _climb(objective, first, progress), progress)
+    end = _on_measured_orbits(problem, theta, end, progress)
     ends: list[End | None] = [end]
     for draw in problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0))):
         ends.append(_from_draw(objective, end.iterate, draw, progress))
@@ -283,6 +290,25 @@ def _climb(objective: Objective, first: Iterate, progress: bool, most: int = MAX
         return climb(objective, first, report=report, most=most)
 
 
+def _on_best_sheets(problem: Problem, end: End, progress: bool) -> End:
+    """Return the end of a climb; where tables fit better on other sheets of their branches, the best from there."""
+    for _ in range(MOST_SHEET_CHANGES if tables(problem) else 0):
+        theta = end.iterate.theta
+        solver = ResponseSolver.start(problem, theta)
+        if solver.sheets == end.iterate.here.solver.sheets:
+            break
+        near = LogPosterior(problem, solver).linearise(theta)
+        objective = _objective(problem, near)
+        first = objective.iterate(near, problem.likelihood.guess())
+        if first is None:
+            break
+        other = _climb(objective, first, progress)
+        if preference(other) <= preference(end):
+            break
+        end = other
+    return end
+
+
 def _on_measured_orbits(problem: Problem, start: np.ndarray, end: End, progress: bool) -> End:
     """Return the end of a climb; if its orbits are not the measured ones, the best of those from the measured orbits.
 
@@ -382,6 +408,7 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             "valid. Give the experiment a guess of its states (Experiment.guess), start={…} nearer to the truth, or "
             "another model."
         )
+    yield from table_warnings(problem, fit)
     for channel in fit.without_noise:
         named = [n for n in problem.free_noise if _short(n).partition(", ")[0] in (channel, Relative.pooled)]
         variance = (named or problem.noise_names)[0]
