@@ -75,7 +75,7 @@ def follow(
             arrived, back = None, False
             for point in _between(here, there, parameters[at], z, 1 if inside else BEYOND_STEPS):
                 if point.kind == FOLD:
-                    yield Passage(sheet, point.z, here_at(here, there, parameters[at], point))
+                    yield Passage(sheet, point.z, _equations_at(here, there, parameters[at], point))
                     sheet += 1
                 elif point.distance > 0.0:
                     back = bool(point.values[0] == here.frequency)
@@ -91,7 +91,14 @@ def follow(
         yield Passage(sheet, z, table[at], at)
 
 
-def here_at(
+def between(here: PeriodicEquations, there: PeriodicEquations, share: float) -> PeriodicEquations:
+    """Return the equations of a further point, a share of the way from a point of the table to another."""
+    frequency = here.frequency + share * (there.frequency - here.frequency)
+    inputs = here.inputs + share * (there.at_frequency(here.frequency).inputs - here.inputs)
+    return replace(here, inputs=inputs).at_frequency(frequency)
+
+
+def _equations_at(
     here: PeriodicEquations, there: PeriodicEquations, parameters: np.ndarray, point: BranchPoint
 ) -> PeriodicEquations:
     """Return the equations at a point of the branch between two points of the table."""

@@ -9,10 +9,11 @@ from bayesperiodic.plot.estimates import fit, loops, traces
 from bayesperiodic.plot.overview import summary
 from bayesperiodic.plot.pairs import corner, marginals
 from bayesperiodic.plot.recording import recording
+from bayesperiodic.plot.response import response
 from bayesperiodic.plot.style import COLOURS
 from bayesperiodic.plot.terms import missing_terms
 
 __all__ = [
     "COLOURS", "branch", "comparison", "corner", "fit", "loops", "marginals", "missing_terms", "models", "orbits",
-    "profile", "ranks", "recording", "section", "summary", "traces",
+    "profile", "ranks", "recording", "response", "section", "summary", "traces",
 ]  # fmt: skip
