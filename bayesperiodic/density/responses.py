@@ -10,7 +10,7 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.initial_orbits import Guesses, experiments_guesses
-from bayesperiodic.density.sweeps import Place, Point, places, reach_further, tables
+from bayesperiodic.density.sweeps import SAME_ORBIT, Place, Point, distance, places, reach_further, tables
 from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
 from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
@@ -131,6 +131,14 @@ class ResponseSolver:
     def sheets(self) -> dict[str, int | None]:
         """Sheet of the branch of each point of a table, None for other experiments."""
         return {name: orbit.sheet for name, orbit in self.anchors.items()}
+
+    def on_same_orbits(self, other: "ResponseSolver") -> bool:
+        """Return whether another solver at the same θ has the same orbits of points of tables, on the same sheets.
+
+        Sheets are counted anew where the branch is followed: folds may have come into being since.
+        """
+        pairs = [(orbit.anchor.z, other.anchors[n].anchor.z) for n, orbit in self.anchors.items() if orbit.sheet is not None]
+        return self.sheets == other.sheets and all(distance(z, there) < SAME_ORBIT for z, there in pairs)
 
     @cached_property
     def _sheets(self) -> list[list[Point]]:

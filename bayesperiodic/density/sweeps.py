@@ -67,7 +67,7 @@ def places(problem: Description, theta: np.ndarray, near: Mapping[str, np.ndarra
             continue
         if near is not None:
             for e, places_of in zip(table, choices, strict=True):
-                distances = [_distance(place.z, near[e.name]) for place in places_of]
+                distances = [distance(place.z, near[e.name]) for place in places_of]
                 if min(distances) < SAME_ORBIT:
                     result[e.name] = places_of[int(np.argmin(distances))]
             continue
@@ -151,7 +151,7 @@ def _sheets(choices: Sequence[Sequence[Place]], costs: Sequence[np.ndarray], *, 
     return best[::-1]
 
 
-def _distance(z: np.ndarray, other: np.ndarray) -> float:
+def distance(z: np.ndarray, other: np.ndarray) -> float:
     """Return the largest square of the distance of two orbits (points, states), in units of their ranges."""
     if z.shape != other.shape:
         return np.inf

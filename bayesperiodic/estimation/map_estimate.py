@@ -298,7 +298,7 @@ def _on_best_sheets(problem: Problem, end: End, progress: bool) -> End:
     for _ in range(MOST_SHEET_CHANGES if tables(problem) else 0):
         theta = end.iterate.theta
         solver = ResponseSolver.start(problem, theta)
-        if solver.sheets == end.iterate.here.solver.sheets:
+        if end.iterate.here.solver.on_same_orbits(solver):
             break
         near = LogPosterior(problem, solver).linearise(theta)
         objective = _objective(problem, near)
