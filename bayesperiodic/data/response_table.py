@@ -42,7 +42,7 @@ def response_table(
     units: Units | None = None,
     sweep: str | None = None,
     resolution: float = RESOLUTION,
-    samples: int = 128,
+    samples: int = 96,
 ) -> list[Experiment]:
     """Return one experiment for each frequency of a table of measured responses.
 

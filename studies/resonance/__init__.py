@@ -1,0 +1,1 @@
+"""Response tables of nonlinear resonances."""
