@@ -29,6 +29,13 @@ class Measurement(Storable):
     ------
     ValueError
         For a value that is not finite, or ≤ 0 where it is a size, and for an sd ≤ 0.
+
+    Examples
+    --------
+    Only its kinds are made; each says what it is of a channel:
+
+    >>> [kind.word for kind in bp.measurements.Measurement.__subclasses__() if hasattr(kind, "word")]
+    ['peak-to-peak value', 'rms value']
     """
 
     channel: str
