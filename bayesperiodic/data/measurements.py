@@ -29,6 +29,13 @@ class Measurement(Storable):
     ------
     ValueError
         For a value that is not finite, or ≤ 0 where it is a size, and for an sd ≤ 0.
+
+    Examples
+    --------
+    Measurements are made as one of its kinds:
+
+    >>> isinstance(bp.measurements.PeakToPeak("acceleration", 3.1), bp.measurements.Measurement)
+    True
     """
 
     channel: str

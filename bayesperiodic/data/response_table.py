@@ -18,7 +18,7 @@ from bayesperiodic.data.units import Units
 AMPLITUDES_IN = {"peak": 1.0, "rms": np.sqrt(0.5), "peak to peak": 2.0}
 # Values that are of the whole signal, and what inputs, which are sines, are divided by.
 OF_SIGNAL = {"rms of signal": (RootMeanSquare, "rms"), "peak to peak of signal": (PeakToPeak, "peak to peak")}
-SIZES = (*AMPLITUDES_IN, *OF_SIGNAL)
+SIZE_KINDS = (*AMPLITUDES_IN, *OF_SIGNAL)
 PHASE_UNITS = {"deg": np.pi / 180.0, "rad": 1.0}
 # A column, or columns by harmonic.
 Columns = Key | Mapping[int, Key]
@@ -131,7 +131,7 @@ def response_table(
     _checks.mapping("outputs", outputs, EXAMPLE)
     amplitudes, angles = ({n: _by_harmonic(one) for n, one in (given or {}).items()} for given in (outputs, phases))
     _checks.mapping("inputs", inputs, "{'force': 0.5}")
-    _checks.one_of("size", size, SIZES)
+    _checks.one_of("size", size, SIZE_KINDS)
     _checks.one_of("phase_unit", phase_unit, PHASE_UNITS)
     if per is not None:
         _checks.one_of("per", per, inputs)

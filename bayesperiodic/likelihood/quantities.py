@@ -247,8 +247,8 @@ class Amplitudes(OfHarmonics):
 
 
 @dataclass(frozen=True, eq=False)
-class Phases(OfHarmonics):
-    """Phases of harmonics against those of other channels, within half a turn of the measured ones."""
+class RelativePhases(OfHarmonics):
+    """RelativePhases of harmonics against those of other channels, within half a turn of the measured ones."""
 
     against: tuple[int, ...] = ()  # place of the other channel, -1 for an input
     of_inputs: np.ndarray = field(default_factory=lambda: np.empty(0))  # (size,), phase of the input

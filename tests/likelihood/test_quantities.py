@@ -22,7 +22,7 @@ MODEL = bp.Model(
 )  # fmt: skip
 THETA = {"a": 1.3, "b": 0.2}
 FREQUENCY = 0.8
-PRIORS = {"a": bp.Normal(1.0, 1.0), "b": bp.LogNormal(0.3, 1.0)}
+PRIORS = {"a": bp.LogNormal(1.0, 1.0), "b": bp.LogNormal(0.3, 1.0)}
 
 
 def run(*measurements, name="run", frequency=FREQUENCY, outputs=None):
