@@ -42,7 +42,7 @@ def response_table(
     units: Units | None = None,
     sweep: str | None = None,
     resolution: float = RESOLUTION,
-    samples: int = 96,
+    samples: int | None = None,
 ) -> list[Experiment]:
     """Return one experiment for each frequency of a table of measured responses.
 
@@ -91,9 +91,9 @@ def response_table(
         Standard deviation of the frequencies, relative to them. A row that was measured beyond the fold of the model's
         branch is compared with the orbit at the fold, and the distance to it, over this standard deviation, is one
         more residual.
-    samples : int
-        Grid points per period. The default, with the scheme "central4", is enough for responses in which harmonics
-        above the fifth do not matter; `check` tells what twice as many would change.
+    samples : int, optional
+        Grid points per period, by default 64, or 32 for each harmonic up to the highest in the table. With the default
+        scheme of tables, "central4", this is enough for smooth responses; `check` tells what twice as many change.
 
     Returns
     -------
@@ -159,6 +159,9 @@ def response_table(
         for name, columns in amplitudes.items()
     }  # fmt: skip
     of_table = Sweep(_table_name(label, amplitudes, inputs), sweep, resolution)
+    samples = samples or max(
+        FEWEST_TABLE_POINTS, POINTS_A_HARMONIC * max(h for each in amplitudes.values() for h in each)
+    )
     return [
         replace(
             Experiment.from_harmonics(
@@ -172,6 +175,8 @@ def response_table(
     ]  # fmt: skip
 
 
+# Default numbers of grid points: least, and for each harmonic up to the highest one in a table.
+FEWEST_TABLE_POINTS, POINTS_A_HARMONIC = 64, 32
 EXAMPLE = "{'displacement': 'the column of its amplitudes'}"
 
 
@@ -298,8 +303,8 @@ def _by_harmonic(columns: Columns) -> dict[int, Key]:
 
 def _table_name(label: str, outputs: Mapping[str, Mapping[int, Key]], inputs: Mapping[str, float | Key]) -> str:
     """Return a name of the table that tells it from others: its file, columns and levels."""
-    parts = [f"{name} {column}" for name, each in outputs.items() for column in each.values()]
-    return f"{label}: {', '.join([*parts, *(f'{name} {value}' for name, value in inputs.items())])}"
+    parts = [f"{name} {', '.join(map(str, columns.values()))}" for name, columns in outputs.items()]
+    return f"{label}: {'; '.join([*parts, *(f'{name} {level}' for name, level in inputs.items())])}"
 
 
 def _names(frequencies: np.ndarray) -> list[str]:

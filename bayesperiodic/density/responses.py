@@ -10,7 +10,7 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.initial_orbits import Guesses, experiments_guesses
-from bayesperiodic.density.sweeps import SAME_ORBIT, Place, Point, distance, places, reach_further, tables
+from bayesperiodic.density.sweeps import SAME_ORBIT, Place, TablePoint, distance, places, reach_further, tables
 from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
 from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
@@ -25,7 +25,7 @@ from bayesperiodic.problem.parameters import ParameterMaps
 
 NO_HISTORY = np.empty((0, 3))
 # Relative step of differences of orbits at folds.
-DIFFERENCE = 1e-5
+FOLD_DIFFERENCE = 1e-5
 
 
 class InitialOrbit(NamedTuple):
@@ -137,19 +137,20 @@ class ResponseSolver:
 
         Sheets are counted anew where the branch is followed: folds may have come into being since.
         """
-        pairs = [(orbit.anchor.z, other.anchors[n].anchor.z) for n, orbit in self.anchors.items() if orbit.sheet is not None]
-        return self.sheets == other.sheets and all(distance(z, there) < SAME_ORBIT for z, there in pairs)
+        placed = {name: orbit.anchor.z for name, orbit in self.anchors.items() if orbit.sheet is not None}
+        same = (distance(z, other.anchors[name].anchor.z) < SAME_ORBIT for name, z in placed.items())
+        return self.sheets == other.sheets and all(same)
 
     @cached_property
-    def _sheets(self) -> list[list[Point]]:
+    def _sheets(self) -> list[list[TablePoint]]:
         """The points of each sheet of the tables' branches, in the order of the sweep."""
-        result: dict[Any, list[Point]] = {}
+        result: dict[Any, list[TablePoint]] = {}
         for sweep, table in tables(self.problem).items():
             for name in (e.name for e in table):
                 orbit = self.anchors[name]
                 if orbit.sheet is not None:
                     known = orbit.anchor.sensitivities is not None
-                    result.setdefault((sweep, orbit.sheet), []).append(Point(name, *self._places[name], known))
+                    result.setdefault((sweep, orbit.sheet), []).append(TablePoint(name, *self._places[name], known))
         return list(result.values())
 
     def solve(
@@ -254,7 +255,7 @@ class ResponseSolver:
 
     def _changes_at_fold(self, theta: np.ndarray, experiment: str) -> Response:
         """Return the derivatives of a response that is that at a fold, by differences."""
-        steps = DIFFERENCE * np.where(theta != 0.0, np.abs(theta), self.problem.joint_prior.widths)
+        steps = FOLD_DIFFERENCE * np.where(theta != 0.0, np.abs(theta), self.problem.joint_prior.widths)
         if self._changes is None or not np.array_equal(self._changes[0], theta):
             around = np.concatenate([theta[None], theta + np.diag(steps), theta - np.diag(steps)])
             self._changes = theta, self.solve(around, polish=True)

@@ -37,7 +37,7 @@ class Place(NamedTuple):
     reached: bool
 
 
-class Point(NamedTuple):
+class TablePoint(NamedTuple):
     """A point of a table among the solves of all experiments."""
 
     name: str
@@ -159,7 +159,7 @@ def distance(z: np.ndarray, other: np.ndarray) -> float:
     return float(np.max(np.abs(z - other) / size) ** 2)
 
 
-def reach_further(problem: Description, points: Sequence[Point], groups: Sequence[GroupSolution]) -> None:
+def reach_further(problem: Description, points: Sequence[TablePoint], groups: Sequence[GroupSolution]) -> None:
     """Solve the points of one sheet, in the order of the sweep, whose solves have failed, from their neighbours.
 
     Points beyond a fold get the orbit there, with its frequency. The solutions are changed in place.

@@ -1,6 +1,6 @@
 """Response curves: what a table shows, and the model's branch through it at an estimate."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +9,7 @@ from bayesperiodic import _fourier
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.measurements import Amplitude, PeakToPeak, Phase, RootMeanSquare
 from bayesperiodic.data.sweep import Sweep
+from bayesperiodic.density.log_posterior import Linearisation, LogPosterior
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import ResponseSolver, orbit_multipliers
 from bayesperiodic.density.sweeps import tables
@@ -19,7 +20,7 @@ from bayesperiodic.periodic.solve import solve_driven
 from bayesperiodic.periodic.table_branch import between, follow
 
 # Points of a branch for each passage of its table, about.
-FINE = 150
+POINTS_A_PASSAGE = 150
 Waves = Mapping[str, np.ndarray]  # signals (…, points) by channel
 
 
@@ -67,7 +68,8 @@ class Curve(NamedTuple):
 
 def quantities(experiment: Experiment) -> dict[Quantity, float]:
     """Return what an experiment shows of its table, with the measured values."""
-    waves, result = {**experiment.inputs, **experiment.outputs}, {}
+    waves: Waves = {**experiment.inputs, **experiment.outputs}
+    result: dict[Quantity, float] = {}
     for channel in experiment.outputs:
         shown = [Quantity(Amplitude.word, channel)]
         shown += [Quantity(Phase.word, channel, to=name) for name in [*experiment.inputs][:1]]
@@ -89,8 +91,8 @@ def predicted(problem: Problem, solver: ResponseSolver, theta: np.ndarray) -> di
         waves = {**e.inputs, **observation.predicted(response)} if e.outputs else {}
         off = observation.quantities(response)
         values, place = {}, dict.fromkeys(off, 0)
-        for one in [q for q in quantities(e) if q.channel in e.outputs and q.channel in waves]:
-            values[one] = one.of(waves)
+        if e.outputs:
+            values = {shown: shown.of(waves) for shown in quantities(e) if shown.channel in e.outputs}
         for one in e.measurements:
             to = one.to if isinstance(one, Phase) else ""
             key = Quantity(one.word, one.channel, getattr(one, "harmonic", 1), to)
@@ -113,7 +115,7 @@ def curves(problem: Problem, fit: MapEstimate) -> dict[Sweep, Curve]:
     for sweep, table in tables(problem).items():
         parameters = [problem.parameters(theta[None], e.name)[0] for e in table]
         rows = [problem.equations[e.name] for e in table]
-        parts = max(1, FINE // len(rows))
+        parts = max(1, POINTS_A_PASSAGE // len(rows))
         fine, at = [rows[0]], [parameters[0]]
         for k in range(1, len(rows)):
             fine += [between(rows[k - 1], rows[k], part / parts) for part in range(1, parts)] + [rows[k]]
@@ -139,14 +141,13 @@ def _stable(equations: object, parameters: np.ndarray, z: np.ndarray) -> bool:
     return bool(np.abs(largest).max(initial=0.0) < 1.0)
 
 
-def residuals(problem: Problem, fit: MapEstimate, solver: ResponseSolver) -> dict[str, Sequence[tuple[str, np.ndarray]]]:
-    """Return the whitened residuals (size,) of every point of a table, with what they are of."""
-    from bayesperiodic.density.log_posterior import Linearisation, LogPosterior
-
+def residuals(problem: Problem, fit: MapEstimate, solver: ResponseSolver) -> dict[str, list[tuple[str, np.ndarray]]]:
+    """Return the whitened residuals (size,) of every experiment, with what they are of."""
     density = LogPosterior(problem, solver)
     here = Linearisation(problem.vector(fit.theta), solver, density.comparisons)
     noise = np.array([fit.noise[name] for name in problem.noise_names])
-    white, result = problem.likelihood.whitened(list(here.residuals), noise), {}
+    white = problem.likelihood.whitened(list(here.residuals), noise)
+    result: dict[str, list[tuple[str, np.ndarray]]] = {}
     for block, values in zip(problem.likelihood.blocks, white, strict=True):
         result.setdefault(block.experiment, []).append((block.channel, values))
     return result

@@ -2,14 +2,18 @@
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from bayesperiodic.density.sweeps import early_jumps, places, tables
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.periodic.solution import as_guess
+from bayesperiodic.periodic.solution import PeriodicSolution, as_guess
 from bayesperiodic.problem.description import Description
 
 MOST_NAMED = 4
 # Points of a sweep that may have jumped before the fold without a warning.
 MOST_EARLY = 1
+# Distance of a multiplier from 1 within which a point is close to a fold.
+NEAR_FOLD = 0.1
 
 
 def table_warnings(problem: Description, fit: MapEstimate) -> Iterator[str]:
@@ -35,12 +39,24 @@ def table_warnings(problem: Description, fit: MapEstimate) -> Iterator[str]:
                     "before the branch ends at the estimate. The sweep may have had the other direction, or a "
                     "disturbance ended it early."
                 )
+    close = [e.name for e, s in points if e.name not in unstable and s.frequency == e.frequency and _is_near_fold(s)]
+    if close:
+        yield (
+            f"{len(close)} points of response tables are close to a fold of the model at the estimate: {_listed(close)}. "
+            "The posterior may end there, which standard deviations do not describe; sample it, or take profiles."
+        )
     if unstable:
         yield (
             f"{len(unstable)} points of response tables are fitted by unstable orbits: {_listed(unstable)}. They "
             "cannot be measured without control. Look at bp.plot.response(problem, fit); the model may lack a term, or "
             "the sweep may have had another direction."
         )
+
+
+def _is_near_fold(solution: PeriodicSolution) -> bool:
+    """Return whether a multiplier is close to 1."""
+    multipliers = solution.multipliers
+    return bool(solution.converged and np.any(np.abs(multipliers - 1.0) < NEAR_FOLD))
 
 
 def _listed(names: list[str]) -> str:

@@ -16,7 +16,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.block import ComparedSignals, LinearBlock, common
 from bayesperiodic.models.model import Model
 
-REACH = "reach of the branch"
+REACH_OF_BRANCH = "reach of the branch"
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Reach(LinearBlock):
     measured_frequency: float = 1.0  # [Hz]
     resolution: float = 1.0  # [Hz]
 
-    words: ClassVar[str] = REACH
+    words: ClassVar[str] = REACH_OF_BRANCH
 
     @classmethod
     def of(cls, experiment: Experiment, model: Model) -> "list[Reach]":
@@ -34,7 +34,7 @@ class Reach(LinearBlock):
         if experiment.sweep is None or model.autonomous:
             return []
         f = experiment.frequency
-        given = common(experiment, REACH, count=0.0, size=1)
+        given = common(experiment, REACH_OF_BRANCH, count=0.0, size=1)
         return [cls(measured_frequency=f, resolution=experiment.sweep.resolution * f, **given)]
 
     @property

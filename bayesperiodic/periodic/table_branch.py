@@ -69,10 +69,10 @@ def follow(
             return
         here = table[at]
         there = table[at + heading] if inside else _beyond(table, at, heading)
-        if there.frequency == here.frequency:
-            arrived, back = z, False
-        else:
-            arrived, back = None, False
+        arrived: np.ndarray | None = z
+        back = False
+        if there.frequency != here.frequency:
+            arrived = None
             for point in _between(here, there, parameters[at], z, 1 if inside else BEYOND_STEPS):
                 if point.kind == FOLD:
                     yield Passage(sheet, point.z, _equations_at(here, there, parameters[at], point))
@@ -86,8 +86,10 @@ def follow(
             heading = -heading
         else:
             at += heading
-        if (z := _polished(table[at], parameters[at], arrived)) is None:
+        polished = _polished(table[at], parameters[at], arrived)
+        if polished is None:
             return
+        z = polished
         yield Passage(sheet, z, table[at], at)
 
 

@@ -24,7 +24,7 @@ from bayesperiodic.diagnostics.response_curves import (
     residuals,
 )
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.likelihood.reach import REACH
+from bayesperiodic.likelihood.reach import REACH_OF_BRANCH
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, legend_entries, styled
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.sampling.draws import Posterior
@@ -165,7 +165,7 @@ def _draw_branch(
     for begin, end in pairwise(starts):
         stable = bool(curve.stable[begin])
         part = slice(max(begin - 1, 0), end)
-        style = {"ls": "-", "label": "MAP"} if stable else {"ls": "--", "label": "MAP, unstable"}
+        style: dict[str, Any] = {"ls": "-", "label": "MAP"} if stable else {"ls": "--", "label": "MAP, unstable"}
         axes.plot(curve.frequency[part], values[part], color=colour, lw=1.4, zorder=3, **style)
     at = curve.folds
     if at.any():
@@ -231,7 +231,7 @@ def _draw_residuals(axes: Axes, channel: str, every: Any, left: Any) -> None:
     for table, colour, marker in zip(every.values(), _colours(len(every)), MARKERS * 9, strict=False):
         for e in table:
             for label, values in left[e.name]:
-                if label != REACH and label.split(" of ")[-1].split(",")[0] == channel:
+                if label != REACH_OF_BRANCH and label.split(" of ")[-1].split(",")[0] == channel:
                     at = np.full(values.size, e.frequency)
                     axes.plot(at, values, ls="", marker=marker, ms=3, color=colour, mfc="none")
     axes.axhline(0.0, lw=1.0, color="black")

@@ -18,6 +18,7 @@ from bayesperiodic import _checks
 from bayesperiodic._verdicts import CAUTION, TONES
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
+from bayesperiodic.density.sweeps import tables
 from bayesperiodic.diagnostics.comparison import Comparison, compare
 from bayesperiodic.diagnostics.identifiability import identifiability
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
@@ -160,6 +161,11 @@ def drawn(given: ReportInputs) -> list[Experiment]:
     deviations = [max(rms(left) / whole[c] for c, left in residuals[e.name].items()) for e in every]
     kept = np.sort(np.argsort(np.negative(deviations), kind="stable")[:MOST_DRAWN])
     return [every[i] for i in kept.tolist()]
+
+
+def has_tables(problem: Problem) -> bool:
+    """Return whether there are points of response tables, which `plot.response` draws."""
+    return bool(tables(problem))
 
 
 def embedded(drawing: Figure, name: str) -> str:

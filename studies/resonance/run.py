@@ -44,7 +44,8 @@ def run(options: argparse.Namespace) -> None:
         if systems.AVERAGED not in case
         for p, share in of_case["coverage"].items()
     ]
-    checks.append(common.row("64 densities: time as harmonics with free delays over that as a table", speed["ratio"], 5.0, None))
+    faster = "64 densities: time as harmonics with free delays over that as a table"
+    checks.append(common.row(faster, speed["ratio"], 5.0, None))
     print("\n" + common.table_of_rows(checks) + "\n\n" + common.shown("by kind of data", found, ["coverage", "bias"]))
     with watch.part("figures", "drawing"):
         figures = {"kinds": draw(found)} | {name.replace(" ", "_"): _response(name, options.seed) for name in names}

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 import bayesperiodic as bp
 
-SAMPLES, NOISE, POINTS = 96, 0.01, 40
+SAMPLES, NOISE, POINTS = 64, 0.01, 40
 AMPLITUDE, PHASE, BOTH = "amplitude", "amplitude and phase", "amplitude, both sweeps"
 AVERAGED = "amplitude, averaged equation"
 KINDS = (AMPLITUDE, PHASE, BOTH)
@@ -59,8 +59,10 @@ def exact(name: str, direction: str) -> tuple[np.ndarray, np.ndarray]:
     """Return frequencies, in the order of a sweep, and complex amplitudes of the output at the truth."""
     system = SYSTEMS[name]
     ends = system.span if direction == "up" else system.span[::-1]
-    at, settings = system.truth | system.fixed, {"samples": SAMPLES, "scheme": "fourier"}
-    first = bp.solve_periodic(system.model, at, {"force": force(system)}, frequency=ends[0], **settings)
+    first = bp.solve_periodic(
+        system.model, system.truth | system.fixed, {"force": force(system)}, frequency=ends[0], samples=SAMPLES,
+        scheme="fourier",
+    )  # fmt: skip
     branch = bp.continue_periodic(system.model, first, "frequency", until=ends[1], progress=False)
     frequencies, amplitudes = np.linspace(*ends, POINTS), []
     for f in frequencies:
@@ -93,8 +95,12 @@ def problem(name: str, kind: str, seed: int) -> bp.Problem:
     return bp.Problem(system.model, runs, priors=priors, fixed=system.fixed)
 
 
-def replicate(name: str, kind: str, number: int, seed: int) -> dict[str, Any]:
-    """Return deviations from the truth in standard deviations, and these relative to those of the priors."""
+def replicate(task: tuple[str, str, int, int]) -> dict[str, Any]:
+    """Return deviations from the truth in standard deviations, and these relative to those of the priors.
+
+    The task is a system, a kind of data, the number of the replicate, and the seed.
+    """
+    name, kind, number, seed = task
     truth = SYSTEMS[name].truth
     began = time.process_time()
     if kind == AVERAGED:
@@ -137,7 +143,7 @@ def averaged(
             result.append((a - real[np.argmin(np.abs(real - a))]) / sd)
         return np.array(result)
 
-    found = least_squares(residuals, np.log([start[name] for name in names]), x_scale=1e-2)
+    found: Any = least_squares(residuals, np.log([start[name] for name in names]), x_scale=1e-2)
     values = np.exp(found.x)
     sds = values * np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
     return dict(zip(names, values.tolist(), strict=True)), dict(zip(names, sds.tolist(), strict=True))
@@ -151,9 +157,10 @@ def speed(seed: int, repeats: int = 3) -> dict[str, float]:
     tabled = problem("duffing", AMPLITUDE, seed)
     given, system = table("duffing", "up", [seed, 0]), SYSTEMS["duffing"]
     wave = {"force": [0.0, system.force]}
+    amplitudes = given["A"] * np.exp(1j * np.radians(given["phi"]))
     runs = [
-        bp.Experiment.from_harmonics(f"{f:.6g} Hz", float(f), {system.output: [None, a * np.exp(1j * np.radians(phi))]}, wave)
-        for f, a, phi in zip(given["f"], given["A"], given["phi"], strict=True)
+        bp.Experiment.from_harmonics(f"{f:.6g} Hz", float(f), {system.output: [None, c]}, wave)
+        for f, c in zip(given["f"], amplitudes, strict=True)
     ]
     delays = {"shift": bp.Normal(0.0, 0.01)}
     improvised = bp.Problem(

@@ -23,7 +23,9 @@ def test_quick_run_covers_the_truth_and_is_faster_than_free_delays(tmp_path):
 
 
 def test_phases_determine_more_than_amplitudes_alone():
-    sds = {kind: systems.replicate("duffing", kind, 0, 1)["contraction"] for kind in (systems.AMPLITUDE, systems.PHASE)}
+    sds = {
+        kind: systems.replicate(("duffing", kind, 0, 1))["contraction"] for kind in (systems.AMPLITUDE, systems.PHASE)
+    }
     assert all(sds[systems.PHASE][p] < sds[systems.AMPLITUDE][p] for p in ("c", "k", "k3"))
 
 
