@@ -42,7 +42,8 @@ def table_warnings(problem: Description, fit: MapEstimate) -> Iterator[str]:
     close = [e.name for e, s in points if e.name not in unstable and s.frequency == e.frequency and _is_near_fold(s)]
     if close:
         yield (
-            f"{len(close)} points of response tables are close to a fold of the model at the estimate: {_listed(close)}. "
+            f"{len(close)} points of response tables are close to a fold of the model at the estimate: "
+            f"{_listed(close)}. "
             "The posterior may end there, which standard deviations do not describe; sample it, or take profiles."
         )
     if unstable:

@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
     ]
     faster = "64 densities: time as harmonics with free delays over that as a table"
     checks.append(common.row(faster, speed["ratio"], 5.0, None))
-    print("\n" + common.table_of_rows(checks) + "\n\n" + common.shown("by kind of data", found, ["coverage", "bias"]))
+    print("\n" + common.table_of_rows(checks) + "\n\n" + common.shown("by kind of data", _flat(found)))
     with watch.part("figures", "drawing"):
         figures = {"kinds": draw(found)} | {name.replace(" ", "_"): _response(name, options.seed) for name in names}
         paths = common.save_figures(options.out, figures)
@@ -66,6 +66,15 @@ def summary(lines: list[dict[str, Any]], name: str, kind: str) -> dict[str, Any]
         "rms of z": {p: float(np.sqrt(np.mean(values**2))) for p, values in z.items()},
         "sd over that of the prior": {p: float(np.median([line["contraction"][p] for line in of_case])) for p in names},
         "seconds": float(np.median([line["seconds"] for line in of_case])),
+    }
+
+
+def _flat(found: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return coverage and bias of every parameter by case."""
+    return {
+        f"{case}, {p}": {"coverage": share, "bias [sd]": of_case["bias"][p], "rms of z": of_case["rms of z"][p]}
+        for case, of_case in found.items()
+        for p, share in of_case["coverage"].items()
     }
 
 
