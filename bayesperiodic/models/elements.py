@@ -10,13 +10,12 @@ from collections.abc import Mapping
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic.models.hysteresis import Hysteretic, bouc_wen, dahl, iwan, iwan_states, jenkins
+from bayesperiodic.models.hysteresis import Hysteretic, Number, bouc_wen, dahl, iwan, iwan_states, jenkins
 
 __all__ = [
     "Hysteretic", "bouc_wen", "contact", "coulomb", "cubic", "dahl", "gap", "iwan", "iwan_states", "jenkins",
     "polynomial", "quadratic_damping", "ramp", "stribeck", "two_sided_gap",
 ]  # fmt: skip
-Number = sp.Expr | float
 
 
 def cubic(d: sp.Expr, k3: Number) -> sp.Expr:
@@ -76,7 +75,7 @@ def polynomial(d: sp.Expr, coefficients: Mapping[int, Number]) -> sp.Expr:
 def quadratic_damping(v: sp.Expr, c2: Number) -> sp.Expr:
     """Return the force of quadratic damping, c2·v·``|v|``, as of a body in a turbulent flow.
 
-    It is not rounded: its first derivative is continuous. A cycle of a displacement X·cos(ωt) dissipates (8/3)·c2·ω²·X³.
+    It is not rounded: its first derivative is continuous. A cycle of X·cos(ωt) dissipates (8/3)·c2·ω²·X³.
 
     Parameters
     ----------

@@ -5,7 +5,7 @@ depends on the path and not on its speed.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import sympy as sp
@@ -19,7 +19,7 @@ MICROSLIP = 1e-3
 SMALLEST_TRAVEL = 0.02
 # Added to squares, so that derivatives by an exponent exist at zero.
 NEARLY_ZERO = 1e-20
-Number = sp.Expr | float
+Number: TypeAlias = "sp.Expr | float"
 
 
 class Hysteretic(NamedTuple):
@@ -152,9 +152,7 @@ def bouc_wen(
     return Hysteretic(limit * z, (dz - stiffness / limit * (v - slip),))
 
 
-def jenkins(
-    s: Names, name: str, v: sp.Expr, stiffness: Number, limit: Number, width: Number
-) -> Hysteretic:
+def jenkins(s: Names, name: str, v: sp.Expr, stiffness: Number, limit: Number, width: Number) -> Hysteretic:
     """Return elastic dry friction: a spring in series with a slider of a limit force, a Jenkins element.
 
     With the state z of this name the force is F = limit·z. It is elastic, dF/dt = stiffness·v, where ``|z|`` is below

@@ -15,8 +15,8 @@ from bayesperiodic.models.model import Names
 from bayesperiodic.plot.style import ENSEMBLES, axis_label, styled
 
 Element = Callable[..., Any]
-POINTS, CYCLES = 1000, 3
-LINES = ("-", "--", ":", "-.")
+LOOP_POINTS, LOOP_CYCLES = 1000, 3
+STYLES_OF_LINES = ("-", "--", ":", "-.")
 
 
 class Loop(NamedTuple):
@@ -94,7 +94,7 @@ def elements(
             parts = [axis_label(label)] * bool(label) + [f"{amplitude:.3g} m"] * (len(wanted) > 1 or not label)
             look = {
                 "color": ENSEMBLES[(row if len(shown) > 1 else column) % len(ENSEMBLES)],
-                "ls": LINES[column % len(LINES)] if len(shown) > 1 else "-",
+                "ls": STYLES_OF_LINES[column % len(STYLES_OF_LINES)] if len(shown) > 1 else "-",
                 "lw": 1.4,
                 "label": f"{', '.join(parts)}: {_written(loop)}",
             }
@@ -130,7 +130,7 @@ def cycle(element: Element, amplitude: float, frequency: float) -> Loop:
     def motion(phase: float) -> tuple[float, float]:
         return amplitude * np.sin(phase), 2 * np.pi * frequency * amplitude * np.cos(phase)
 
-    phases = 2 * np.pi * (CYCLES - 1 + np.linspace(0.0, 1.0, POINTS + 1))
+    phases = 2 * np.pi * (LOOP_CYCLES - 1 + np.linspace(0.0, 1.0, LOOP_POINTS + 1))
     values = np.empty((0, phases.size))
     if rates:
         values = solve_ivp(
@@ -138,7 +138,8 @@ def cycle(element: Element, amplitude: float, frequency: float) -> Loop:
             (0.0, phases[-1]), np.zeros(len(rates)), t_eval=phases, max_step=0.03, rtol=1e-6, atol=1e-9,
         ).y  # fmt: skip
     moved = np.array([motion(phase) for phase in phases])
-    return Loop(*moved.T, np.array([forces(*at, *z) for at, z in zip(moved, values.T, strict=True)], dtype=float))
+    force_values = np.array([forces(*at, *z) for at, z in zip(moved, values.T, strict=True)], dtype=float)
+    return Loop(moved[:, 0], moved[:, 1], force_values)
 
 
 def _written(loop: Loop) -> str:
