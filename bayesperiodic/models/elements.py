@@ -11,9 +11,10 @@ import sympy as sp
 
 from bayesperiodic import _checks
 from bayesperiodic.models.hysteresis import Hysteretic, Number, bouc_wen, dahl, iwan, iwan_states, jenkins
+from bayesperiodic.models.matrices import Element
 
 __all__ = [
-    "Hysteretic", "bouc_wen", "contact", "coulomb", "cubic", "dahl", "gap", "iwan", "iwan_states", "jenkins",
+    "Element", "Hysteretic", "bouc_wen", "contact", "coulomb", "cubic", "dahl", "gap", "iwan", "iwan_states", "jenkins",
     "polynomial", "quadratic_damping", "ramp", "stribeck", "two_sided_gap",
 ]  # fmt: skip
 

@@ -11,7 +11,7 @@ import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic.models.model import Names
+from bayesperiodic.models.names import Names
 
 # Slope of the slip of a Jenkins element below its limit: of a motion without sliding the mean force follows from it.
 MICROSLIP = 1e-3

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from bayesperiodic import _checks
 from bayesperiodic.models.elements import Hysteretic
-from bayesperiodic.models.model import Names
+from bayesperiodic.models.names import Names
 from bayesperiodic.plot.style import ENSEMBLES, axis_label, styled
 
 Element = Callable[..., Any]
