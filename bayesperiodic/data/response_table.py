@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.formats import recognise
 from bayesperiodic.data.formats.contents import Contents, Key, StoredChannel
 from bayesperiodic.data.layout import numbers
+from bayesperiodic.data.sweep import RESOLUTION, Sweep
 from bayesperiodic.data.units import Units, from_file, kind_of
 
 # Values in the table over the amplitude of the fundamental.
@@ -33,7 +35,9 @@ def response_table(
     size: str = "peak",
     phase_unit: str = "deg",
     units: Units | None = None,
-    samples: int = 800,
+    sweep: str | None = None,
+    resolution: float = RESOLUTION,
+    samples: int = 128,
 ) -> list[Experiment]:
     """Return one experiment for each frequency of a table of measured responses.
 
@@ -60,13 +64,21 @@ def response_table(
     phase_unit : "deg" or "rad"
     units : mapping of str to float, unit or (from, to), optional
         As for `Recording.from_file`, by channel or "frequency"; of outputs with `per` for the quotient.
+    sweep : "up", "down" or None
+        Direction in which the frequency was stepped: the response stays on its branch up to a fold, and jumps there.
+        None: each row was measured by itself. Of a sweep up and one down make a table each. See `Sweep`.
+    resolution : float
+        Standard deviation of the frequencies, relative to them. A row that was measured beyond the fold of the model's
+        branch is compared with the orbit at the fold, and the distance to it, over this standard deviation, is one
+        more residual.
     samples : int
-        Grid points per period.
+        Grid points per period. The default, with the scheme "central4", is enough for responses in which harmonics
+        above the fifth do not matter; `check` tells what twice as many would change.
 
     Returns
     -------
     list of Experiment
-        In the order of the table.
+        In the order of the table, each with its `sweep`.
 
     Raises
     ------
@@ -109,10 +121,14 @@ def response_table(
         angles = None if phase is None else source.angles(phase, PHASE_UNITS[phase_unit])
         c = source.response(channel, column, angles, at.size, per)
         responses[channel] = c * drive[per] if per is not None else c / AMPLITUDES_IN[size]
+    of_table = Sweep(_table_name(label, outputs, inputs), sweep, resolution)
     return [
-        Experiment.from_harmonics(
-            name, float(at[k]), {channel: [None, c[k]] for channel, c in responses.items()},
-            {channel: [0.0, level[k]] for channel, level in drive.items()}, samples=samples,
+        replace(
+            Experiment.from_harmonics(
+                name, float(at[k]), {channel: [None, c[k]] for channel, c in responses.items()},
+                {channel: [0.0, level[k]] for channel, level in drive.items()}, samples=samples,
+            ),
+            sweep=of_table,
         )
         for k, name in enumerate(_names(at))
     ]  # fmt: skip
@@ -240,6 +256,12 @@ def _contents(table: Any, wanted: list[Key]) -> tuple[str, Contents]:
             raise ValueError(f"table: must have columns of one length, got {sizes}.")
         table = pd.DataFrame(columns)
     return "the table", objects.dataframe(table)
+
+
+def _table_name(label: str, outputs: Mapping[str, Key], inputs: Mapping[str, float | Key]) -> str:
+    """Return a name of the table that tells it from others: its file, columns and levels."""
+    parts = [f"{name} {column}" for name, column in (*outputs.items(), *inputs.items())]
+    return f"{label}: {', '.join(parts)}"
 
 
 def _is_number(value: Any) -> bool:
