@@ -215,7 +215,7 @@ def contact(d: sp.Expr, v: sp.Expr, k: Number, damping: Number, width: Number) -
 
 
 def coulomb(v: sp.Expr, limit: Number, width: Number) -> sp.Expr:
-    """Return Coulomb friction, limit·sgn(v) with the sign rounded by `smooth_sign`.
+    """Return Coulomb friction, limit·sgn(v) with the sign rounded by `bayesperiodic.smooth_sign`.
 
     A cycle with the amplitude X and the largest speed V dissipates 4·limit·X·(1 − 0.41·(width/V)²) for small widths.
     A body does not stick: under a force below the limit it creeps, with less than 0.55·width under half of it.
@@ -251,7 +251,7 @@ def coulomb(v: sp.Expr, limit: Number, width: Number) -> sp.Expr:
 def stribeck(v: sp.Expr, static: Number, sliding: Number, speed: Number, width: Number) -> sp.Expr:
     """Return friction that falls with the speed, (sliding + (static − sliding)·exp(−(v/speed)²))·sgn(v).
 
-    The sign is rounded by `smooth_sign`, which lowers the maximum. The form is one of those in [1]_.
+    The sign is rounded by `bayesperiodic.smooth_sign`, which lowers the maximum. The form is among those in [1]_.
 
     Parameters
     ----------

@@ -179,7 +179,7 @@ def jenkins(s: Names, name: str, v: sp.Expr, stiffness: Number, limit: Number, w
         Force of sliding.
     width : number > 0 and at most 1, or sympy expression
         Part of the limit force that is rounded. The displacement has to take several grid steps for a travel of
-        width·limit/stiffness; 0.1 is a fair value.
+        width·limit/stiffness. Start with 0.05; precise data need less.
 
     Returns
     -------

@@ -118,6 +118,12 @@ def test_force_of_a_jenkins_element_that_never_slides_is_elastic_with_mean_zero(
     assert solution.stable
 
 
+def test_periodic_state_of_bouc_and_wen_with_a_large_exponent_is_not_determined_without_sliding():
+    values = {"k": K, "limit": LIMIT, "exponent": 20.0, "shape": 0.5}
+    solution = bp.solve_periodic(BOUC_WEN, values, {"d": sine(0.02 * TRAVEL)}, frequency=1.0, samples=800)
+    assert solution.status != "converged"
+
+
 def test_small_motions_do_not_shift_the_force_of_a_jenkins_element_but_that_of_bouc_and_wen():
     """A hundred small cycles at 70 % of the limit; the ideal element is elastic there."""
     s = {"z": sp.Symbol("z", real=True), "dz": sp.Symbol("dz", real=True)}
