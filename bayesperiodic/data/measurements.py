@@ -28,7 +28,14 @@ class Measurement(Storable):
     Raises
     ------
     ValueError
-        For a value that is not finite, or negative where it is a size, and for an sd ≤ 0.
+        For a value that is not finite, or ≤ 0 where it is a size, and for an sd ≤ 0.
+
+    Examples
+    --------
+    Only its kinds are made; each says what it is of a channel:
+
+    >>> [kind.word for kind in bp.measurements.Measurement.__subclasses__() if hasattr(kind, "word")]
+    ['peak-to-peak value', 'rms value']
     """
 
     channel: str
@@ -41,9 +48,7 @@ class Measurement(Storable):
     def __post_init__(self) -> None:
         _checks.text("channel", self.channel)
         value = _checks.finite_number("value", self.value)
-        if not self.signed and value < 0.0:
-            raise ValueError(f"value: must be at least 0, as every {self.word} is, got {value:g}.")
-        object.__setattr__(self, "value", value)
+        object.__setattr__(self, "value", value if self.signed else _checks.positive("value", value))
         if self.sd is not None:
             object.__setattr__(self, "sd", _checks.positive("sd", self.sd))
 
@@ -219,7 +224,7 @@ def checked(given: object, outputs: Collection[str]) -> tuple[Measurement, ...]:
         )
     groups: dict[tuple[type, str], list[Measurement]] = {}
     for one in given:
-        if one.channel in outputs and not one.signed:
+        if one.channel in outputs:
             raise ValueError(
                 f"measurements: must be of channels without a time history, got the {one.label}; harmonics of it that "
                 "were not measured are left out by `unmeasured`."

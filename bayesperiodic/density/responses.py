@@ -257,7 +257,9 @@ class ResponseSolver:
             ends.append((outputs, np.where(at_fold, frequency, centre[1]), width))
         (y_up, f_up, up), (y_down, f_down, down) = ends
         width = np.where(up > down, up - down, np.inf)
-        of_sensors = self.problem.parameter_maps[experiment].slopes(theta)[self.problem.parameter_maps[experiment].count :]
+        of_sensors = self.problem.parameter_maps[experiment].slopes(theta)[
+            self.problem.parameter_maps[experiment].count :
+        ]
         by_outputs = (y_up - y_down) / width[:, None, None]
         return Response(by_outputs, (f_up - f_down) / width, np.zeros((count, 0)), of_sensors.T)
 

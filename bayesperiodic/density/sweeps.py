@@ -141,9 +141,7 @@ def _distance(z: np.ndarray, other: np.ndarray) -> float:
     return float(np.max(np.abs(z - other) / size) ** 2)
 
 
-def reach_further(
-    problem: Description, points: Sequence[Point], groups: Sequence[GroupSolution]
-) -> None:
+def reach_further(problem: Description, points: Sequence[Point], groups: Sequence[GroupSolution]) -> None:
     """Solve the points of one sheet, in the order of the sweep, whose solves have failed, from their neighbours.
 
     Points beyond a fold get the orbit there, with its frequency. The solutions are changed in place.

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.data.measurements import Amplitude, Measurement
 from bayesperiodic.density.initial_orbits import InitialEstimate, measured_orbits, simultaneous_fit
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
 from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
@@ -46,6 +47,8 @@ from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.problem.model_inputs import model_inputs
 
 MOST_SHOWN_MODES = 3
+# Standard deviations from which on an amplitude of a noisy harmonic is nearly normal.
+LEAST_NORMAL = 4.0
 # Standard deviation of a phase of which nothing is known [rad].
 RANDOM_PHASE = np.pi / np.sqrt(3.0)
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
@@ -396,6 +399,15 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             f"The estimate of {name!r}, {fit.theta[name]:.6g}, lies at the end of its prior's support ({low:g}, "
             f"{high:g}); standard deviations do not describe the posterior there. Sample it, or widen the prior."
         )
+    unknown = {one.label: one for e in problem.experiments for one in e.measurements if _is_unknown_amplitude(one)}
+    for label in unknown:
+        smallest = min(one.value for e in problem.experiments for one in e.measurements if one.label == label)
+        if smallest < LEAST_NORMAL * fit.rms[label] and label not in fit.without_noise:
+            yield (
+                f"The smallest {label}, {smallest:.3g}, is {smallest / fit.rms[label]:.2g} times the rms of the "
+                "residuals. Noise makes such amplitudes larger on average, which the normal distribution of unknown "
+                "variance does not take into account; give their standard deviation, sd=…, or leave them out."
+            )
     if others := notable(fit.other_modes):
         shown = "; ".join(map(repr, others[:MOST_SHOWN_MODES]))
         yield (
@@ -426,6 +438,10 @@ def _fractions_left(problem: Problem, residuals: Mapping[str, Mapping[str, np.nd
     compared = (*problem.channels, *problem.quantities)
     power = {c: max(_pooled(problem, c, measured) ** 2, np.finfo(float).tiny) for c in compared}
     return {c: _pooled(problem, c, residuals) ** 2 / whole for c, whole in power.items()}
+
+
+def _is_unknown_amplitude(one: Measurement) -> bool:
+    return isinstance(one, Amplitude) and one.sd is None
 
 
 def _scales(experiment: Experiment) -> dict[str, np.ndarray]:

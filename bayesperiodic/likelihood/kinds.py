@@ -5,7 +5,7 @@ from bayesperiodic.likelihood.block import Block
 from bayesperiodic.likelihood.mean_period import MeanPeriod
 from bayesperiodic.likelihood.multipliers import Multipliers
 from bayesperiodic.likelihood.orbit_frequency import OrbitFrequency
-from bayesperiodic.likelihood.quantities import Amplitudes, PeakToPeaks, Phases, RootMeanSquares
+from bayesperiodic.likelihood.quantities import Amplitudes, PeakToPeaks, RelativePhases, RootMeanSquares
 from bayesperiodic.likelihood.reach import Reach
 from bayesperiodic.likelihood.samples import Samples
 from bayesperiodic.likelihood.section_points import SectionPoints
@@ -19,7 +19,7 @@ KINDS: list[type[Block]] = [
     Multipliers,
     OrbitFrequency,
     Amplitudes,
-    Phases,
+    RelativePhases,
     PeakToPeaks,
     RootMeanSquares,
     Reach,

@@ -58,11 +58,13 @@ class Quantities(Block):
         first, size = given[0], len(given)
         values = np.array([one.value for one in given])
         known = np.empty(0) if first.sd is None else np.array([one.sd for one in given])
+        # A relative error of a phase is one of the complex amplitude, in rad.
+        mean_square = 1.0 if first.signed else float(np.mean(values**2))
         more: dict[str, Any] = {"values": values, "known": known, **cls.arguments(experiment, model, given)}
         if known.size:
             more |= {"count": 0.0, "log_scale": cls.normalisation(values, known)}
         else:
-            more |= {"count": float(size), "mean_square": float(np.mean(values**2)), "measured": 0.0}
+            more |= {"count": float(size), "mean_square": mean_square, "measured": 0.0}
         place = compared_channels(experiment, model).index(first.channel)
         return cls(**{**common(experiment, first.label, place, size=size), "averaged": float(size), **more})
 
@@ -245,8 +247,8 @@ class Amplitudes(OfHarmonics):
 
 
 @dataclass(frozen=True, eq=False)
-class Phases(OfHarmonics):
-    """Phases of harmonics against those of other channels, within half a turn of the measured ones."""
+class RelativePhases(OfHarmonics):
+    """RelativePhases of harmonics against those of other channels, within half a turn of the measured ones."""
 
     against: tuple[int, ...] = ()  # place of the other channel, -1 for an input
     of_inputs: np.ndarray = field(default_factory=lambda: np.empty(0))  # (size,), phase of the input

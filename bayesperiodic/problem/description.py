@@ -100,7 +100,6 @@ class Description(Printed):
                 )
             self.input_noise = EXACT if self.input_noise == FROM_CYCLES else self.input_noise
         self.channels = tuple(c for c in self.sensors.channels if any(c in e.outputs for e in self.experiments))
-        self.quantities = tuple(dict.fromkeys(one.label for e in self.experiments for one in e.measurements))
         runs = [e.name for e in self.experiments]
         tied, every = dict(tied or {}), (*model.parameters, *self.sensors.names, SHIFT)
         priors, fixed = self.sensors.with_entries(priors, fixed or {})
@@ -302,15 +301,10 @@ class Description(Printed):
         return sum(self.likelihood.counts.values())
 
     @property
-    def quantity_units(self) -> dict[str, str]:
+    def quantities(self) -> dict[str, str]:
         """Units of what was measured without a time history, by label."""
         every = (one for e in self.experiments for one in e.measurements)
         return {one.label: "rad" if one.signed else self.model.units.get(one.channel, "") for one in every}
-
-    @property
-    def values(self) -> float:
-        """The independent values of all data."""
-        return sum(block.count if block.counted else block.size for block in self.likelihood.blocks)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -585,7 +579,7 @@ class Description(Printed):
         noisy = ", ".join(dict.fromkeys(name for inputs in self.noisy_inputs.values() for name in inputs))
         return (
             f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
-            f"data: {', '.join((*self.channels, *self.quantities))} with {self.values:.0f} independent values, "
+            f"data: {', '.join((*self.channels, *self.quantities))} with {self.likelihood.values:.0f} independent values, "
             f"{self.noise.name} noise"
             f"{f', noise of {noisy} integrated out' if noisy else ''}"
             f"{f', sensors: {sensors}' if sensors else ''})"
