@@ -761,8 +761,8 @@ def rounded_slider():
         f"{wide['limit']:.1f} % too large, and the damping {-wide['c']:.1f} % too small."
     )
     yield (
-        f"With 0.1 these errors are {middle['stiffness']:.1f}, {middle['limit']:.1f} and {-middle['c']:.1f} %, with 0.02 "
-        f"at most {max(map(abs, errors[0.02].values())):.2f} %."
+        f"With 0.1 these errors are {middle['stiffness']:.1f}, {middle['limit']:.1f} and {-middle['c']:.1f} %, "
+        f"with 0.02 at most {max(map(abs, errors[0.02].values())):.2f} %."
     )
 
 
