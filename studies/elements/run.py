@@ -1,6 +1,8 @@
 """Elements: loops of friction, and what the rounding of an ideal slider does to the estimates."""
 
 import argparse
+from collections.abc import Callable
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -31,7 +33,7 @@ def run(options: argparse.Namespace) -> None:
     common.finish(options.out, {"widths": rows, "truth": TRUTH, "seed": options.seed}, watch, paths, synthetic=True)
 
 
-def frictions() -> dict[str, object]:
+def frictions() -> dict[str, Callable[..., Any]]:
     """Return elements of dry friction with the same limit force, by label."""
     elements = bp.elements
     return {
@@ -56,8 +58,8 @@ def recorded(rate: float, amplitude: float, seed: int) -> bp.Experiment:
         return [v, amplitude * np.cos(rate * t) - TRUTH["c"] * v - TRUTH["k"] * x - friction, elastic]
 
     time = np.arange(1000) * period / 50
-    accuracy = {"max_step": period / 100, "rtol": 1e-6}
-    path = solve_ivp(rates, (0, 60 * period), np.zeros(3), t_eval=40 * period + time, **accuracy)
+    seen = 40 * period + time
+    path = solve_ivp(rates, (0, 60 * period), np.zeros(3), t_eval=seen, max_step=period / 100, rtol=1e-6)
     x = path.y[0] + NOISE * np.random.default_rng(seed).standard_normal(time.size)
     recording = bp.Recording.from_arrays(time, {"x": x}, {"force": amplitude * np.cos(rate * time)})
     return recording.fold(SAMPLES, frequency=rate / (2 * np.pi), name=f"{amplitude:g} N, {rate / (2 * np.pi):.3f} Hz")
