@@ -10,8 +10,8 @@ from bayesperiodic.plot.estimates import fit, loops, traces
 from bayesperiodic.plot.overview import summary
 from bayesperiodic.plot.pairs import corner, marginals
 from bayesperiodic.plot.recording import recording
-from bayesperiodic.plot.response import response
 from bayesperiodic.plot.style import COLOURS
+from bayesperiodic.plot.tables import response
 from bayesperiodic.plot.terms import missing_terms
 
 __all__ = [

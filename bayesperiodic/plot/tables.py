@@ -67,7 +67,7 @@ def response(
     ...                    fixed={"m": 1, "k3": 0})
     >>> figure = bp.plot.response(table, bp.map_estimate(table, progress=False))
     >>> [axes.get_ylabel() for axes in figure.axes]
-    ['amplitude of displacement [m]', 'phase of displacement against force [°]', 'residual [sd]']
+    ['residual [sd]', 'amplitude of displacement [m]', 'phase of displacement against force [°]']
     """
     given: dict[str, Any] = {} if posterior is None else {"posterior": posterior}
     problem = check_results(problem, fit=fit, **given)
