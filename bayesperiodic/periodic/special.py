@@ -222,6 +222,19 @@ class SpecialEquations:
             ends.append(np.einsum("neq,nq->ne", columns.reshape(len(columns), here.count, -1), states))
         return (ends[0] - ends[1]) / (2.0 * step)
 
+    def bend_along(self, point: SpecialPoint, parameters: np.ndarray) -> np.ndarray:
+        """Return the derivative (points, states) of ∂g/∂z · v along v at a fold."""
+        null = SpecialPoint(point.vector, np.zeros(1), point.vector)
+        return self._bend(point, point.vector, parameters, null)
+
+    def bends(self, point: SpecialPoint, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives at a fold of `residual_jacobian` along v, and of ∂g/∂z · v by the value."""
+        still, here = np.zeros_like(point.z), self.at(point.values)
+        step = SMALL_STEP / self.size(SpecialPoint(point.vector, np.zeros(1), still), point)
+        ends = [here.residual_jacobian(point.z + by * point.vector, parameters) for by in (step, -step)]
+        by_value = self._bend(point, point.vector, parameters, SpecialPoint(still, np.ones(1), still))
+        return (ends[0] - ends[1]) / (2.0 * step), by_value
+
     def size(self, change: SpecialPoint, point: SpecialPoint) -> float:
         """Return the largest change in units of each state's largest value, and of the values."""
         sizes = [np.max(np.abs(change.values) / np.abs(point.values))]
@@ -246,8 +259,7 @@ class SpecialEquations:
         z, values = solved
         vector = np.zeros_like(z)
         if self.is_fold:
-            null = SpecialPoint(point.vector, np.zeros(1), point.vector)
-            bends = [self._bend(point, point.vector, parameters, null)]
+            bends = [self.bend_along(point, parameters)]
             for one, by, direction in zip(z, values, directions, strict=True):
                 bends.append(self._bend(point, point.vector, parameters, SpecialPoint(one, by, one), direction))
             bent = linear.factors.solve_bordered(-np.stack(bends), np.zeros((len(bends), 1)))
