@@ -9,7 +9,7 @@ import numpy as np
 from bayesperiodic import _fourier
 from bayesperiodic._parallel import available_cores, in_threads
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.block import ComparedSignals, measured_channels, measured_variance
+from bayesperiodic.likelihood.block import NO_SCALE, ComparedSignals, measured_channels, measured_variance
 from bayesperiodic.likelihood.kinds import blocks_of
 from bayesperiodic.likelihood.likelihood import Residuals
 from bayesperiodic.likelihood.sensing import Sensing, SensorNames
@@ -26,6 +26,7 @@ class Response(NamedTuple):
     frequency: np.ndarray  # (…,) [Hz]
     log_multipliers: np.ndarray  # (…, multipliers), log|μ|, largest first, as many as were measured
     sensors: np.ndarray  # (…, names) of the sensors' parameters, the delay of all outputs [s] last
+    scale: np.ndarray = NO_SCALE  # (…,) of an input, where that is an unknown
 
 
 class GroupSolution(NamedTuple):
@@ -38,12 +39,13 @@ class GroupSolution(NamedTuple):
     log_multipliers: list[np.ndarray]  # (solves, multipliers) of each experiment, log|μ|, largest first
     z: np.ndarray  # (experiments, solves, points, states), periodic parts of the states
     status: np.ndarray  # int (experiments, solves), index into `compiled.STATUSES`
+    scale: np.ndarray  # (experiments, solves) of an input, where that is an unknown, else 1
 
     def response(self, members: Any, solves: Any = ...) -> Response:
         """Return the responses of one experiment (an index), θ on the leading axis; of several without multipliers."""
         at = members, solves
         multipliers = self.log_multipliers[members][solves] if isinstance(members, int) else np.empty(0)
-        return Response(self.outputs[at], self.frequency[at], multipliers, self.sensors[at])
+        return Response(self.outputs[at], self.frequency[at], multipliers, self.sensors[at], self.scale[at])
 
     def at(self, solves: Any) -> "GroupSolution":
         """Return the solutions at some of the θ."""
@@ -55,6 +57,7 @@ class GroupSolution(NamedTuple):
             [values[solves] for values in self.log_multipliers],
             self.z[:, solves],
             self.status[:, solves],
+            self.scale[:, solves],
         )
 
 
@@ -117,13 +120,15 @@ class Observation:
         self.experiment, self.caused = experiment, caused
         self.channels, self.blocks = measured_channels(experiment, model), blocks_of(experiment, model)
         columns = [model.outputs.index(channel) for channel in self.channels]
-        between = slice(columns[0], columns[-1] + 1)
+        between = slice(columns[0], columns[-1] + 1) if columns else slice(0, 0)
         self.picked = between if len(columns) == between.stop - between.start else columns
         self.angles = [channel in model.angles for channel in self.channels]
         self._angle_places = [c for c, angle in enumerate(self.angles) if angle]
         self._free_phase = model.autonomous
         self.sensing = Sensing(self.channels, sensors, experiment.periods, delayed=model.autonomous)
-        self.data = np.stack([experiment.outputs[channel] for channel in self.channels], axis=-1)
+        self.data = np.empty((experiment.samples * experiment.periods, len(self.channels)))
+        for c, channel in enumerate(self.channels):
+            self.data[:, c] = experiment.outputs[channel]
         logarithms = np.log(np.abs(experiment.measured_multipliers))
         self._measured = ComparedSignals(self.data, logarithms, np.array(experiment.frequency))
         self._points = len(self.data)
@@ -143,6 +148,7 @@ class Observation:
             self._difference(predicted.values),
             measured.log_multipliers - predicted.log_multipliers,
             measured.frequency - predicted.frequency,
+            measured.scale - predicted.scale,
         )
         return self._less_caused([block.compare(predicted, difference) for block in self.blocks])
 
@@ -181,7 +187,7 @@ class Observation:
         predicted, moved = self._signals(response), directions.outputs[..., self.picked]
         if self.sensing.active:
             moved = self._sensed_changes(moved, response, directions)
-        along = ComparedSignals(moved, directions.log_multipliers, directions.frequency)
+        along = ComparedSignals(moved, directions.log_multipliers, directions.frequency, directions.scale)
         return [block.changes(predicted, along) for block in self.blocks]
 
     def vjp(self, response: Response, weights: list[np.ndarray], shown: Sequence[np.ndarray]) -> Response:
@@ -256,7 +262,7 @@ class Observation:
         values = response.outputs[..., self.picked]
         if self.sensing.active:
             values = self._sensed(values, response)
-        return ComparedSignals(values, response.log_multipliers, response.frequency)
+        return ComparedSignals(values, response.log_multipliers, response.frequency, response.scale)
 
     def _difference(self, predicted: np.ndarray) -> np.ndarray:
         """Return y − ŷ (…, points, channels), angles within half a turn."""

@@ -87,6 +87,7 @@ class SpecialEquations:
     sign: float = 0.0  # of a fold: −1 where λ is largest along the branch, 1 where it is smallest
     rows: np.ndarray | None = None  # (unknowns, points, channels) of the conditions Σ rows·ŷ = targets; None for a fold
     targets: np.ndarray | None = None  # (unknowns,)
+    forward: np.ndarray | None = None  # (points, channels), of the turned amplitude, positive at the lag
 
     @property
     def is_fold(self) -> bool:
@@ -126,6 +127,12 @@ class SpecialEquations:
     def row(self, vector: np.ndarray) -> np.ndarray:
         """Return the row l (points, states) of a null vector."""
         return vector / np.sum(vector**2)
+
+    def null_vector(self, point: SpecialPoint, parameters: np.ndarray, row: np.ndarray) -> SpecialPoint:
+        """Return a fold with the null vector v that has l·v = 1."""
+        linear = self.linear(point, parameters, row)
+        solved = linear.factors.solve_bordered(np.zeros((1, *point.z.shape)), np.ones((1, 1)))
+        return point if solved is None else point._replace(vector=solved[0][0])
 
     def linear(self, point: SpecialPoint, parameters: np.ndarray, row: np.ndarray) -> _Linear:
         """Return the equations linearised at a point, with the row l of a fold."""

@@ -120,6 +120,17 @@ class SpecialBatch:
         in_blocks(part, sets * solves, SMALLEST_BLOCK, threads)
         return solution
 
+    def frequency(self, solution: SpecialSolution) -> np.ndarray:
+        """Return the frequencies (sets, solves) of solutions [Hz]."""
+        if self._frequency >= 0:
+            return solution.values[..., self._frequency]
+        return np.tile(self._sets.frequency[:, None], (1, solution.values.shape[1]))
+
+    def scale(self, solution: SpecialSolution) -> np.ndarray:
+        """Return the scales (sets, solves) of the input whose level is unknown; 1 where there is none."""
+        scaled = [k for k in range(solution.values.shape[2]) if k != self._frequency]
+        return solution.values[..., scaled[0]] if scaled else np.ones(solution.values.shape[:2])
+
     def _follow(self, e: int, b: int, parameters: np.ndarray, solution: SpecialSolution) -> None:
         """Fill in the solution that follows from the anchor in steps."""
         special, anchor = self._specials[e], self._anchors[e]

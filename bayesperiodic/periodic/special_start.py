@@ -42,12 +42,12 @@ def phase_equations(
     first = np.exp(-2j * np.pi * tau) @ equations.inputs[:, model.inputs.index(drive)]
     turn = np.exp(1j * (lag - harmonic * np.angle(first)))
     wave = 2.0 / len(tau) * turn * np.exp(-2j * np.pi * harmonic * tau)
-    rows = np.zeros((1 if amplitude is None else 2, len(tau), len(model.outputs)))
-    rows[0, :, list(model.outputs).index(output)] = wave.imag
+    rows = np.zeros((2, len(tau), len(model.outputs)))
+    rows[:, :, list(model.outputs).index(output)] = wave.imag, wave.real
+    forward = rows[1]
     if amplitude is None:
-        return SpecialEquations(equations, (FREQUENCY,), rows=rows, targets=np.zeros(1))
-    rows[1, :, list(model.outputs).index(output)] = wave.real
-    return SpecialEquations(equations, (FREQUENCY, drive), rows=rows, targets=np.array([0.0, amplitude]))
+        return SpecialEquations(equations, (FREQUENCY,), rows=rows[:1], targets=np.zeros(1), forward=forward)
+    return SpecialEquations(equations, (FREQUENCY, drive), 0.0, rows, np.array([0.0, amplitude]), forward)
 
 
 def find_special(special: SpecialEquations, parameters: np.ndarray) -> SolvedPoint:
@@ -127,30 +127,17 @@ def _find_phase(special: SpecialEquations, parameters: np.ndarray) -> SolvedPoin
     return _nothing(special)
 
 
-def turned_amplitude(special: SpecialEquations, outputs: np.ndarray) -> np.ndarray:
-    """Return Re of the amplitude, turned by the lag, of outputs (…, points, channels): that of the harmonic, signed."""
-    assert special.rows is not None
-    row = special.rows[0]
-    channel = int(np.flatnonzero(row.any(axis=0))[0])
-    tau, h = special.equations.grid.tau, 0
-    amplitudes = np.abs(np.fft.rfft(row[:, channel]))
-    h = int(np.argmax(amplitudes))
-    first = np.exp(2j * np.pi * h * tau) @ row[:, channel]
-    wave = np.exp(-2j * np.pi * h * tau) * (first * 1j)
-    return np.asarray(outputs[..., channel] @ wave.real * (2.0 / len(tau)))
-
-
 def _lags(special: SpecialEquations, parameters: np.ndarray, solved: SolvedPoint) -> bool:
     """Return whether an output lags by the angle, and not by half a turn more."""
     outputs = special.at(solved.point.values).outputs(solved.point.z, parameters)
-    return bool(turned_amplitude(special, outputs) > 0.0)
+    return bool(np.sum(special.forward * outputs) > 0.0)
 
 
 def _climb(special: SpecialEquations, parameters: np.ndarray) -> SolvedPoint:
     """Return the point of a given amplitude, along the backbone from the resonance of a tiny input."""
     assert special.rows is not None and special.targets is not None
     equations = special.at(np.array([special.start_values[0], TINY_SCALE]))
-    linear = SpecialEquations(equations, (FREQUENCY,), rows=special.rows[:1], targets=np.zeros(1))
+    linear = replace(special, equations=equations, free=(FREQUENCY,), rows=special.rows[:1], targets=np.zeros(1))
     solved = _find_phase(linear, parameters)
     if solved.code != CONVERGED:
         return solved

@@ -8,6 +8,7 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import DATA, Experiment
 from bayesperiodic.data.recording import Recording
+from bayesperiodic.data.special_points import Fold
 from bayesperiodic.models.model import Model
 from bayesperiodic.models.sensed import SHIFT
 
@@ -74,10 +75,15 @@ def checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tupl
         raise ValueError(f"experiments: names must differ, got {names}. Name them with fold(name=…).")
     for e in result:
         _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
-        if not e.outputs:
+        if not e.outputs and not isinstance(e.condition, Fold):
             raise ValueError(f"outputs of experiment {e.name!r}: must have at least one channel, got {{}}.")
         for channel in e.outputs:
             _checks.one_of(f"outputs of experiment {e.name!r}", channel, model.outputs)
+        if e.condition is not None and model.autonomous:
+            raise ValueError(
+                f"condition of experiment {e.name!r}: must be None for {model.name!r}, which is autonomous, got "
+                f"{e.condition!r}."
+            )
         if e.guess == DATA and model.autonomous:
             raise ValueError(
                 f"guess of experiment {e.name!r}: must be states for {model.name!r}, which is autonomous, got {DATA!r}."

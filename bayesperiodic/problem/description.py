@@ -295,6 +295,11 @@ class Description(Printed):
         return self.likelihood.free
 
     @property
+    def forward(self) -> bool:
+        """Whether gradients take one solve a parameter, as of orbits of unknown frequency and special points."""
+        return self.model.autonomous or any(e.condition is not None for e in self.experiments)
+
+    @property
     def counted(self) -> float:
         """Σn, the independent values behind all unknown and known variances."""
         return sum(self.likelihood.counts.values())
