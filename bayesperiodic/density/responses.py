@@ -20,7 +20,7 @@ from bayesperiodic.likelihood.observation import GroupSolution, Response, Simula
 from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
-from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved, directional_sensitivities
+from bayesperiodic.periodic.equations import PeriodicEquations, Solved, directional_sensitivities
 from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
 from bayesperiodic.periodic.solution import PeriodicSolution, describe, logarithmic_jacobian
 from bayesperiodic.periodic.solve import solve_driven, solve_free

@@ -6,8 +6,11 @@ import numpy as np
 
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.special_points import FREQUENCY, Fold
+from bayesperiodic.likelihood.observation import Response
 from bayesperiodic.periodic.compiled import CONVERGED
-from bayesperiodic.periodic.equations import PeriodicEquations
+from bayesperiodic.periodic.equations import PeriodicEquations, null_vector
+from bayesperiodic.periodic.solution import PeriodicSolution
+from bayesperiodic.periodic.solve import as_guess
 from bayesperiodic.periodic.special import SpecialEquations, SpecialPoint
 from bayesperiodic.periodic.special_batch import SpecialAnchor
 from bayesperiodic.periodic.special_start import find_special, fold_equations, phase_equations
@@ -54,3 +57,33 @@ def special_anchor(
     by = {name: slopes.point.values[:, k] for k, name in enumerate(special.free)}
     frequency, none = by.pop(FREQUENCY, np.zeros(parameters.size)), np.zeros(parameters.size)
     return anchor, PointDerivatives(slopes.outputs, frequency, next(iter(by.values()), none))
+
+
+def again_special(
+    experiment: Experiment,
+    equations: PeriodicEquations,
+    values: tuple[np.ndarray, np.ndarray],
+    near: PeriodicSolution,
+    finer: int,
+) -> Response | None:
+    """Return the response at a special point, solved on a finer grid from a near solution; None if that fails.
+
+    The equations are those of the experiment on that grid, `values` the parameters of the model and of the sensors.
+    """
+    (parameters, sensors), special = values, special_equations(experiment, equations)
+    scaled = [name for name in special.free if name != FREQUENCY]
+    scale = float(np.ptp(near.inputs[scaled[0]]) / np.ptp(experiment.inputs[scaled[0]])) if scaled else 1.0
+    unknowns, z = special_values(special, near.frequency, scale), as_guess(equations, near)
+    here, vector = special.at(unknowns), np.zeros_like(z)
+    if special.is_fold:
+        columns = here.residual_jacobian(z, parameters)
+        vector = null_vector(here.grid, columns, here.count, here.frequency)
+    guess = SpecialPoint(z, unknowns, vector)
+    solved = special.newton(guess, parameters, special.row(vector) if special.is_fold else vector)
+    if solved.code != CONVERGED:
+        return None
+    here, none = special.at(solved.point.values), np.empty(0)
+    by = dict(zip(special.free, solved.point.values, strict=True))
+    level = np.array(next((by[name] for name in scaled), 1.0))
+    outputs = here.outputs(solved.point.z, parameters)[::finer]
+    return Response(outputs, np.array(here.frequency), none, sensors, level)

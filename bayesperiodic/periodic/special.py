@@ -31,9 +31,10 @@ from bayesperiodic.periodic.equations import (
     frequency_derivatives,
 )
 
-MOST_STEPS, LARGEST_STEP = 20, 0.5  # of Newton's iteration; a longer step, in units of the orbit, is shortened
+MOST_STEPS, FREE_STEPS = 15, 3  # of Newton's iteration; those during which a step may be longer than the one before
+LARGEST_STEP = 0.5  # in units of the orbit; a longer one is shortened
 SMALL_STEP = 1e-5  # of the differences along a direction, in units of the orbit
-SMALLEST_PART = 1.0 / 256.0  # of the way from an anchor
+SMALLEST_PART = 1.0 / 64.0  # of the way from an anchor
 LEAPT = 0.3  # largest error of a prediction, in units of the orbit and of the predicted change
 
 
@@ -126,7 +127,8 @@ class SpecialEquations:
 
     def row(self, vector: np.ndarray) -> np.ndarray:
         """Return the row l (points, states) of a null vector."""
-        return vector / np.sum(vector**2)
+        square = np.sum(vector**2)
+        return vector / (square if square > 0.0 else 1.0)
 
     def null_vector(self, point: SpecialPoint, parameters: np.ndarray, row: np.ndarray) -> SpecialPoint:
         """Return a fold with the null vector v that has l·v = 1."""
@@ -166,6 +168,7 @@ class SpecialEquations:
 
     def newton(self, point: SpecialPoint, parameters: np.ndarray, row: np.ndarray) -> SolvedPoint:
         """Run Newton's iteration from a guess; a fold of the other direction is another orbit."""
+        previous = np.inf
         for step in range(1, MOST_STEPS + 1):
             linear = self.linear(point, parameters, row)
             found = self._newton_step(linear, point, parameters) if np.isfinite(linear.columns).all() else None
@@ -176,8 +179,9 @@ class SpecialEquations:
             if not size < np.inf:
                 return SolvedPoint(point, NOT_FINITE, step)
             point = point.moved(change, min(1.0, LARGEST_STEP / max(size, LARGEST_STEP)))
-            if not np.all(point.values > 0.0):
+            if not np.all(point.values > 0.0) or (step > FREE_STEPS and size > previous > STEP_TOLERANCE):
                 return SolvedPoint(point, STALLED, step)
+            previous = size
             if size <= STEP_TOLERANCE:
                 return SolvedPoint(point, CONVERGED if curvature * self.sign >= 0.0 else OTHER_ORBIT, step)
         return SolvedPoint(point, STALLED, MOST_STEPS)

@@ -159,7 +159,9 @@ def _anchored(special: SpecialEquations, anchor: SpecialAnchor) -> _Anchored:
         known = solved is not None and solved[1][0, 0] != 0.0
         if solved is not None:
             bent, curvature = solved[0][0], float(solved[1][0, 0])
-    return _Anchored(factors.band, factors.pivots, factors.border, bends, bend, bent, curvature, known and factors.regular)
+    return _Anchored(
+        factors.band, factors.pivots, factors.border, bends, bend, bent, curvature, known and factors.regular
+    )
 
 
 def _slopes(anchor: SpecialAnchor) -> SpecialPoint:

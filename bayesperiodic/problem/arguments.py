@@ -8,13 +8,15 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import DATA, Experiment
 from bayesperiodic.data.recording import Recording
-from bayesperiodic.data.special_points import Fold
+from bayesperiodic.data.special_points import Fold, PhaseLag
 from bayesperiodic.models.model import Model
 from bayesperiodic.models.sensed import SHIFT
 
 
 def values_by_name(argument: str, given: Any, names: tuple[str, ...]) -> np.ndarray:
     """Return the values (…, names) of an argument that is a mapping or such an array; raise a ValueError otherwise."""
+    if isinstance(given, Mapping) and not names:
+        return np.empty(0)
     if isinstance(given, Mapping):
         _checks.same_names(argument, given, names)
         given = np.stack(np.broadcast_arrays(*(_checks.real_array(argument, given[name]) for name in names)), -1)
@@ -22,6 +24,33 @@ def values_by_name(argument: str, given: Any, names: tuple[str, ...]) -> np.ndar
     if values.shape[-1:] != (len(names),):
         raise ValueError(f"{argument}: last axis must be {list(names)}, got shape {values.shape}.")
     return values
+
+
+def check_special_point(experiment: Experiment, sensors: Mapping[str, Any], noisy: list[str], late: bool) -> None:
+    """Refuse sensors, delays and errors of inputs that the solver of an experiment's special point does not know of."""
+    point = experiment.condition
+    if point is None:
+        return
+    if noisy:
+        raise ValueError(
+            f"input_noise: must not be of {noisy} in {experiment.name!r}, a jump or resonance point, whose inputs are "
+            "exact. Give their error in its sd."
+        )
+    if isinstance(point, PhaseLag) and (late or point.output in sensors):
+        given = "unknown delays" if late else repr(sensors[point.output])
+        raise ValueError(
+            f"sensors: must be without one of {point.output!r} and without unknown delays for the phase in "
+            f"{experiment.name!r}, got {given}. Correct frequency, amplitude and lag before."
+        )
+
+
+def refuse_special_points(experiments: Iterable[Experiment], purpose: str) -> None:
+    """Raise a ValueError if experiments are jumps or resonance points, of which a purpose cannot make use."""
+    if special := [e.name for e in experiments if e.condition is not None]:
+        raise ValueError(
+            f"problem: must be without jumps and resonance points for {purpose}, got {special}; leave them out by "
+            "problem.with_experiments."
+        )
 
 
 def checked_local(

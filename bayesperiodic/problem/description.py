@@ -33,7 +33,13 @@ from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.priors.joint import JointPrior
 from bayesperiodic.priors.single import Uniform
-from bayesperiodic.problem.arguments import checked_experiments, checked_local, fixed_values, values_by_name
+from bayesperiodic.problem.arguments import (
+    check_special_point,
+    checked_experiments,
+    checked_local,
+    fixed_values,
+    values_by_name,
+)
 from bayesperiodic.problem.parameters import (
     SHIFT,
     ParameterMap,
@@ -116,6 +122,9 @@ class Description(Printed):
         check_delays(self.experiments, (*self.names, *fixed, *tied, *self.sensors.known_delays))
         kinds = model.parameters, self.sensors.names, self.names
         self.parameter_maps = {run: ParameterMap.of(*kinds, run, self.fixed, tied) for run in runs}
+        for e in self.experiments:
+            noisy, late = noisy_inputs(e, self.input_noise), self.parameter_maps[e.name].delayed
+            check_special_point(e, self.sensors.given, noisy, late or bool(self.sensors.late_inputs))
         self.ties = self._ties()
         self.frequency_errors = self._known_frequency_errors()
         self.input_errors = self._checked_input_errors(input_errors or {})
