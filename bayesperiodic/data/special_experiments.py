@@ -160,8 +160,8 @@ def resonance_point(
         raise ValueError(f"inputs[{drive!r}]: must not be zero, got 0; the lag is that against this input.")
     if unknown and amplitude_sd:
         raise ValueError(
-            f"amplitude_sd: must be 0 with an unknown level of {drive!r}, got {amplitude_sd!r}; add its square times that "
-            "of the slope of the backbone to the square of frequency_sd."
+            f"amplitude_sd: must be 0 with an unknown level of {drive!r}, got {amplitude_sd!r}; add its square times "
+            "that of the slope of the backbone to the square of frequency_sd."
         )
     error = 0.0 if unknown else _checks.positive("amplitude_sd", amplitude_sd)
     lag, harmonic = _checks.finite_number("lag", lag), _checks.integer("harmonic", harmonic, 1)

@@ -84,7 +84,7 @@ class ResponseSolver:
         return self.problem.equations[experiment].at_frequency(frequency), simulation.z(experiment)[i]
 
     def _special_orbit(self, experiment: str, theta: np.ndarray, simulation: Simulation | None) -> InitialOrbit:
-        """Return the anchor of a special point at θ (names,): that of a solve from the present anchor, or found anew."""
+        """Return the anchor of a special point at θ (names,): that of a solve from the anchor, or found anew."""
         special, guess = self._specials[experiment], None
         if simulation is not None:
             response, before = simulation.response(experiment), self.anchors[experiment].anchor

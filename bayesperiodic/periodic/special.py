@@ -1,8 +1,8 @@
 """Equations of special points of driven models: folds, and points where an output lags the input by a given phase.
 
 A fold in a quantity λ, the frequency or the scale of an input, is a solution of g(z, λ; θ) = 0, ∂g/∂z·v = 0, l·v = 1,
-with a fixed row l ([1]_, [2]_). All linear systems are those of [∂g/∂z, ∂g/∂λ; l, 0], which is regular at a fold. Second
-derivatives are differences of the Jacobian along the null vector v.
+with a fixed row l ([1]_, [2]_). All linear systems are those of [∂g/∂z, ∂g/∂λ; l, 0], which is regular at a fold.
+Second derivatives are differences of the Jacobian along the null vector v.
 
 At a point of given phase the unknowns are z and the frequency, and if the amplitude is given too, the scale of the
 input. The conditions are linear in the outputs: Im and Re of a complex amplitude, turned by the phase.
@@ -34,7 +34,7 @@ from bayesperiodic.periodic.equations import (
 MOST_STEPS, FREE_STEPS = 15, 3  # of Newton's iteration; those during which a step may be longer than the one before
 LARGEST_STEP = 0.5  # in units of the orbit; a longer one is shortened
 SMALL_STEP = 1e-5  # of the differences along a direction, in units of the orbit
-SMALLEST_PART = 1.0 / 64.0  # of the way from an anchor
+SMALLEST_PART = 1.0 / 32.0  # of the way from an anchor
 LEAPT = 0.3  # largest error of a prediction, in units of the orbit and of the predicted change
 
 
@@ -283,7 +283,8 @@ class SpecialEquations:
 
     def follow(self, start: SpecialPoint, before: np.ndarray, after: np.ndarray) -> SolvedPoint:
         """Follow a solved point from parameters `before` to `after`, in steps that are halved where one fails."""
-        here, done, step, used, row = start, 0.0, 1.0, 0, self.row(start.vector) if self.is_fold else start.vector
+        here, done, step, used, failed = start, 0.0, 1.0, 0, False
+        row = self.row(start.vector) if self.is_fold else start.vector
         while done < 1.0:
             slope = self.sensitivities(here, before + done * (after - before), row, (after - before)[None])
             if slope is None:
@@ -296,7 +297,7 @@ class SpecialEquations:
                     used, code = used + solved.steps, solved.code
                     if code == CONVERGED and not self.leapt(solved.point, guess, here):
                         break
-                step *= 0.5
+                step, failed = 0.5 * step, True
             else:
                 return SolvedPoint(here, OTHER_ORBIT if code == CONVERGED or code == STALLED else code, used)
             assert solved is not None
@@ -304,7 +305,7 @@ class SpecialEquations:
             row = self.row(here.vector) if self.is_fold else row
             if self.is_fold:
                 here = here._replace(vector=here.vector / np.sum(row * here.vector))
-            step = min(2.0 * step, 1.0 - done)
+            step = min(step if failed else 2.0 * step, 1.0 - done)
         return SolvedPoint(here, CONVERGED, used)
 
     def leapt(self, point: SpecialPoint, predicted: SpecialPoint, start: SpecialPoint) -> bool:

@@ -37,7 +37,7 @@ def fill_units(z, unit):
 
 @inlined(NUMBER(ADDRESSES, GRID, SETTING, MATRIX, MATRIX, NUMBER, MATRIX, MATRIX, MATRIX, MATRIX), **INNER)
 def add_bend(functions, grid, setting, z, vector, step, states, rates, columns, bend):
-    """Add ∂g/∂z · vector at z + step·vector over twice the step to `bend`; the others are work arrays, `rates` known."""
+    """Add ∂g/∂z · vector at z + step·vector over twice the step to `bend`, given the rates of the vector."""
     moved, product = z + step * vector, np.empty_like(z)
     differentiate(moved, setting.drift, grid, setting.frequency, states)
     grid_function_at(functions.residual_jacobian)(
@@ -238,7 +238,8 @@ def reach_many(functions, grid, sets, anchors, frequency, parameters, start, sto
         if positive:
             close, used = broyden(
                 functions, grid, setting, unknowns, anchors.band[e], anchors.pivots[e], border, anchors.rows[e],
-                anchors.bends[e], anchors.bend[e], anchors.bent[e], curvature, z, vector, values, inputs, theta, solution.outputs[e, b],
+                anchors.bends[e], anchors.bend[e],
+                anchors.bent[e], curvature, z, vector, values, inputs, theta, solution.outputs[e, b],
             )  # fmt: skip
         close = close and not is_far(z, predicted, anchors.z[e])
         if close and curvature != 0.0:
