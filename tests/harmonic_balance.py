@@ -62,7 +62,7 @@ def solved(function: Callable, start: np.ndarray) -> np.ndarray:
 
 
 def fold(theta: Theta, force: float, direction: str, *, omega: float | None = None) -> float:
-    """Return the frequency [Hz] of the fold of a sweep up or down; or, at a given ω, the force of that of a level sweep."""
+    """Return the frequency [Hz] of the fold of a sweep up or down; or at a given ω the force, of a level sweep."""
     a = np.linspace(0.02, 1.5 * force / (theta[1] * np.sqrt(theta[2] / theta[0])), 4000)
     if omega is None:
         rates = one_harmonic(a, theta, force, 1.0)

@@ -99,10 +99,10 @@ def resonance_point(
     """Make an experiment from a resonance: the frequency at which an output lags the input by a given angle.
 
     Such points come from phase-locked loops. With a known level of the input both frequency and amplitude are
-    compared. Without it the level is an unknown of the point, which the amplitude determines, and the frequency alone is
-    compared: a point of a backbone. The backbone of a free decay is that of the undamped, unforced system; at a lag of
-    90° damping and force nearly balance, so that it is a good approximation where the damping is light and the harmonics
-    are small.
+    compared. Without it the level is an unknown of the point, which the amplitude determines, and the frequency alone
+    is compared: a point of a backbone. The backbone of a free decay is that of the undamped, unforced system; at a lag
+    of 90° damping and force nearly balance, so that it is a good approximation where the damping is light and the
+    harmonics are small.
 
     Parameters
     ----------

@@ -141,23 +141,30 @@ def _climb(special: SpecialEquations, parameters: np.ndarray) -> SolvedPoint:
     solved = _find_phase(linear, parameters)
     if solved.code != CONVERGED:
         return solved
-    z, values = solved.point.z, np.array([solved.point.values[0], TINY_SCALE])
-    reached = float(special.missed(special.at(values).outputs(z, parameters))[1] + special.targets[1])
-    point, target, growth = SpecialPoint(z, values, np.zeros_like(z)), reached, GROWTH
-    goal = float(special.targets[1])
-    if not reached > 0.0:
-        return solved._replace(code=STALLED)
-    first = True
+    z, goal = solved.point.z, float(special.targets[1])
+    point = SpecialPoint(z, np.array([solved.point.values[0], TINY_SCALE]), np.zeros_like(z))
+    target = float(np.sum(special.forward * special.at(point.values).outputs(z, parameters)))
+    growth, first = GROWTH, target < SMALL_AMPLITUDE * goal
     while target != goal:
-        factor = SMALL_AMPLITUDE * goal / target if first else min(np.exp(growth), goal / target)
-        wanted = goal if factor == goal / target else target * factor
+        ratio = float(np.clip(np.log(goal / target), -growth, growth))
+        wanted = SMALL_AMPLITUDE * goal if first else target * np.exp(ratio) if abs(ratio) == growth else goal
+        guess = _towards(special, parameters, point, wanted - target)
         there = replace(special, targets=np.array([0.0, wanted]))
-        guess = SpecialPoint(point.z * factor, point.values * np.array([1.0, factor]), point.vector)
-        solved = there.newton(guess, parameters, point.vector)
-        if solved.code == CONVERGED and not special.leapt(solved.point, guess, guess):
+        if guess is not None and np.all(guess.values > 0.0):
+            solved = there.newton(guess, parameters, point.vector)
+        if guess is not None and solved.code == CONVERGED and not special.leapt(solved.point, guess, point):
             point, target, growth, first = solved.point, wanted, min(GROWTH, 1.5 * growth), False
-        else:
-            growth *= 0.5
-            if first or growth < LEAST_GROWTH:
-                return SolvedPoint(point, STALLED, solved.steps)
+            continue
+        growth *= 0.5
+        if first or growth < LEAST_GROWTH:
+            return SolvedPoint(point, STALLED, solved.steps)
     return SolvedPoint(point, CONVERGED, solved.steps)
+
+
+def _towards(
+    special: SpecialEquations, parameters: np.ndarray, point: SpecialPoint, more: float
+) -> SpecialPoint | None:
+    """Return the linear prediction of the point whose amplitude is larger; None if the equations are singular."""
+    factors = special.linear(point, parameters, point.vector).factors
+    solved = factors.solve_bordered(np.zeros((1, *point.z.shape)), np.array([[0.0, more]]))
+    return solved and point.moved(SpecialPoint(solved[0][0], solved[1][0], point.vector))

@@ -182,4 +182,5 @@ def test_an_input_of_known_level_stays_as_it_is_where_another_is_scaled():
     )
     special = phase_equations(equations, "x", "f", np.pi / 2, amplitude=2.0)
     found = find_special(special, np.array([0.2, 1.0]))
+    assert found.code == CONVERGED
     np.testing.assert_allclose(found.point.values, [0.5 / np.pi, 2.0 * 0.2 - 0.1], rtol=1e-8)
