@@ -173,8 +173,7 @@ class ResponseSolver:
                     for i, e in enumerate(experiments)
                 ]
             of_all = solved.outputs, solved.frequency, parameters, sensors, logarithms, solved.z, status
-            of_all = *of_all, np.ones(status.shape)
-            groups.append(GroupSolution(*of_all))
+            groups.append(GroupSolution(*of_all, np.ones(status.shape)))
         return Simulation(groups, self._places)
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:

@@ -34,7 +34,7 @@ class Resonance(Block):
         place = measured_channels(experiment, model).index(lag.output)
         size = 2 if lag.level_known else 1
         given = common(experiment, "resonance", place, count=0.0, size=size, log_scale=scale)
-        measured = {"amplitude": lag.amplitude, "amplitude_sd": lag.amplitude_sd, "line": lag.harmonic}
+        measured: dict[str, Any] = {"amplitude": lag.amplitude, "amplitude_sd": lag.amplitude_sd, "line": lag.harmonic}
         return [cls(frequency=experiment.frequency, frequency_sd=lag.frequency_sd, **measured, **given)]
 
     def compare(self, predicted: ComparedSignals, difference: ComparedSignals) -> np.ndarray:

@@ -322,6 +322,5 @@ def _pulled_back(here: PeriodicEquations, d: Derivatives, rows: np.ndarray) -> n
     for order, scheme in ((1, packed.first), (2, packed.second)):
         for offset, weight in enumerate(scheme):
             if weight != 0.0:
-                pulled = here.frequency**order * weight * weights[:, :, order]
-                np.add.at(result, (slice(None), packed.neighbours[:, offset]), pulled)
+                result[:, packed.neighbours[:, offset]] += here.frequency**order * weight * weights[:, :, order]
     return result

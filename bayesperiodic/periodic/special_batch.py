@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -79,20 +79,17 @@ class SpecialBatch:
         of_points = [a.point for a in anchors]
         slopes = [_slopes(anchor) for anchor in anchors]
         border = Border(*(np.stack(each) for each in zip(*(part.border for part in parts), strict=True)))
-        self._packed = SpecialAnchors(
-            np.stack([a.parameters for a in anchors]),
-            *(np.stack([point[k] for point in of_points]) for k in range(3)),
-            *(np.stack([slope[k] for slope in slopes]) for k in range(3)),
-            np.stack([part.band for part in parts]),
-            np.stack([part.pivots for part in parts]),
-            border,
-            *(np.stack(each) for each in zip(*((part.bends, part.bend, part.bent) for part in parts), strict=True)),
-            np.array([part.curvature for part in parts]),
-            rows,
-            targets,
-            np.stack(inputs),
-            np.array([int(part.known) for part in parts]),
-        )
+        # The order is that of the fields: point, its slopes, factors of the equations, bends of a fold, conditions.
+        stacked: list[Any] = [np.stack([a.parameters for a in anchors])]
+        stacked += [np.stack([point[k] for point in of_points]) for k in range(3)]
+        stacked += [np.stack([slope[k] for slope in slopes]) for k in range(3)]
+        stacked += [np.stack([part.band for part in parts]), np.stack([part.pivots for part in parts]), border]
+        stacked += [
+            np.stack(each) for each in zip(*((part.bends, part.bend, part.bent) for part in parts), strict=True)
+        ]
+        stacked += [np.array([part.curvature for part in parts]), rows, targets, np.stack(inputs)]
+        stacked += [np.array([int(part.known) for part in parts])]
+        self._packed = SpecialAnchors(*stacked)
         self._sets = Sets(
             np.stack([s.equations.inputs - s.scaled_inputs for s in specials]),
             np.array([s.equations.frequency for s in specials]),
