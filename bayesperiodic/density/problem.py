@@ -204,7 +204,8 @@ class Problem(Description):
         values, noise = self.vector(theta), self.noise_values(variances)
         if noise.shape[:-1] != values.shape[:-1]:
             noise = np.broadcast_to(noise, (*values.shape[:-1], noise.shape[-1]))
-        flat = values.reshape(-1, values.shape[-1]), noise.reshape(-1, noise.shape[-1])
+        count = int(np.prod(values.shape[:-1]))
+        flat = values.reshape(count, values.shape[-1]), noise.reshape(count, noise.shape[-1])
         evaluation: Evaluation = getattr(self.density(coordinates=NATURAL), evaluate)(*flat, threads)
         return evaluation.log_prob.reshape(values.shape[:-1])
 

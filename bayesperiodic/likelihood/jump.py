@@ -12,7 +12,7 @@ from bayesperiodic.data.special_points import FREQUENCY, Fold
 from bayesperiodic.likelihood.block import Block, ComparedSignals, common
 from bayesperiodic.models.model import Model
 
-LEAST_RESIDUAL = 1e-3  # below which its derivative is that at the middle of the interval
+LEAST_RESIDUAL = 1e-5  # below which its derivative is that at the middle of the interval
 ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
 
 

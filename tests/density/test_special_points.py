@@ -179,7 +179,7 @@ def test_intervals_from_jumps_and_backbones_cover_the_truth():
     those of the estimate. Fixed seed.
     """
     generator, inside, count = np.random.default_rng(64), np.zeros(3), 200
-    wide = {"c": bp.LogNormal(0.1, 1.1), "k": bp.LogNormal(1.0, 1.05), "k3": bp.LogNormal(0.5, 1.15)}
+    wide = {"c": bp.LogNormal(0.08, 1.1), "k": bp.LogNormal(1.0, 1.05), "k3": bp.LogNormal(0.5, 1.15)}
     for _ in range(count):
         truth = {name: float(prior.quantile(generator.uniform())) for name, prior in wide.items()}
         data = places(**truth) + SDS * generator.standard_normal(SDS.size)
