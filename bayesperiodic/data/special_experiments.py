@@ -9,8 +9,8 @@ from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.special_points import FREQUENCY, Fold, PhaseLag
 
-JITTER = 0.1  # standard deviation of the places of a sweep, in steps
-SAMPLES = 400
+JITTER_OF_PLACES = 0.1  # standard deviation of the places of a sweep, in steps
+POINT_SAMPLES = 400
 
 
 def jump(
@@ -22,7 +22,7 @@ def jump(
     vary: str = FREQUENCY,
     step: float | None = None,
     sd: float | None = None,
-    samples: int = SAMPLES,
+    samples: int = POINT_SAMPLES,
 ) -> Experiment:
     """Make an experiment from the place where the response jumped in a sweep.
 
@@ -78,7 +78,7 @@ def jump(
     width = 0.0 if step is None else _checks.positive("step", step) / unit
     if width * unit >= place:
         raise ValueError(f"step: must be less than the measured {vary}, {place:g}, got {step!r}.")
-    error = JITTER * width if sd is None else _checks.positive("sd", sd) / unit
+    error = JITTER_OF_PLACES * width if sd is None else _checks.positive("sd", sd) / unit
     return Experiment(
         name, frequency, {}, _waves(given, samples), samples=samples, condition=Fold(direction, vary, width, error)
     )
@@ -94,7 +94,7 @@ def resonance_point(
     amplitude_sd: float = 0.0,
     lag: float = np.pi / 2,
     harmonic: int = 1,
-    samples: int = SAMPLES,
+    samples: int = POINT_SAMPLES,
 ) -> Experiment:
     """Make an experiment from a resonance: the frequency at which an output lags the input by a given angle.
 

@@ -22,6 +22,13 @@ class Fold(Storable):
         if `sd` is given.
     sd : float
         Standard deviation of the place [Hz, or relative to the level]; with a step that of an error of each place.
+
+    Examples
+    --------
+    >>> bp.jump("down", 0.19, {"force": 0.2}, direction="down", sd=0.001).condition
+    Fold(direction='down', vary='frequency', step=0.0, sd=0.001)
+    >>> bp.Fold("up", "force", 0.05, 0.005).free
+    ('force',)
     """
 
     direction: str
@@ -46,11 +53,17 @@ class PhaseLag(Storable):
     lag : float
         Angle [rad].
     harmonic : int
+        Of the forcing frequency.
     frequency_sd : float
         Standard deviation of the frequency [Hz].
     amplitude, amplitude_sd : float
         Of the harmonic of the output [its unit], and its standard deviation; that is zero if the level of the input is
         unknown.
+
+    Examples
+    --------
+    >>> bp.PhaseLag("x", "force", 1.57, 1, frequency_sd=0.01, amplitude=0.002, amplitude_sd=0.0).level_known
+    False
     """
 
     output: str

@@ -31,11 +31,14 @@ from bayesperiodic.periodic.equations import (
     frequency_derivatives,
 )
 
-MOST_STEPS, FREE_STEPS = 15, 3  # of Newton's iteration; those during which a step may be longer than the one before
-LARGEST_STEP = 0.5  # in units of the orbit; a longer one is shortened
-SMALL_STEP = 1e-5  # of the differences along a direction, in units of the orbit
-SMALLEST_PART = 1.0 / 32.0  # of the way from an anchor
-LEAPT = 0.3  # largest error of a prediction, in units of the orbit and of the predicted change
+MOST_SPECIAL_STEPS, FREE_STEPS = (
+    15,
+    3,
+)  # of Newton's iteration; those during which a step may be longer than the one before
+LONGEST_CHANGE = 0.5  # in units of the orbit; a longer one is shortened
+BEND_DISTANCE = 1e-5  # of the differences along a direction, in units of the orbit
+SMALLEST_SHARE_OF_WAY = 1.0 / 32.0  # of the way from an anchor
+LARGEST_LEAP = 0.3  # largest error of a prediction, in units of the orbit and of the predicted change
 
 
 class SpecialPoint(NamedTuple):
@@ -65,7 +68,7 @@ class SolvedPoint(NamedTuple):
     steps: int
 
 
-class _Linear(NamedTuple):
+class _LinearPoint(NamedTuple):
     """The equations at a point, with the derivatives by the unknowns."""
 
     equations: PeriodicEquations
@@ -136,7 +139,7 @@ class SpecialEquations:
         solved = linear.factors.solve_bordered(np.zeros((1, *point.z.shape)), np.ones((1, 1)))
         return point if solved is None else point._replace(vector=solved[0][0])
 
-    def linear(self, point: SpecialPoint, parameters: np.ndarray, row: np.ndarray) -> _Linear:
+    def linear(self, point: SpecialPoint, parameters: np.ndarray, row: np.ndarray) -> _LinearPoint:
         """Return the equations linearised at a point, with the row l of a fold."""
         here = self.at(point.values)
         columns, d = here.residual_jacobian(point.z, parameters), here.derivatives(point.z, parameters)
@@ -148,7 +151,7 @@ class SpecialEquations:
             else:
                 corner = np.tensordot(self.rows, f, ((1, 2), (1, 2)))
                 factors = here.bordered(columns, g, _pulled_back(here, d, self.rows), corner)
-        return _Linear(here, columns, d, g, f, factors)
+        return _LinearPoint(here, columns, d, g, f, factors)
 
     def _slopes(
         self, name: str, here: PeriodicEquations, z: np.ndarray, columns: np.ndarray, d: Derivatives
@@ -169,25 +172,25 @@ class SpecialEquations:
     def newton(self, point: SpecialPoint, parameters: np.ndarray, row: np.ndarray) -> SolvedPoint:
         """Run Newton's iteration from a guess; a fold of the other direction is another orbit."""
         previous = np.inf
-        for step in range(1, MOST_STEPS + 1):
+        for step in range(1, MOST_SPECIAL_STEPS + 1):
             linear = self.linear(point, parameters, row)
-            found = self._newton_step(linear, point, parameters) if np.isfinite(linear.columns).all() else None
-            if found is None:
+            taken = self._newton_step(linear, point, parameters) if np.isfinite(linear.columns).all() else None
+            if taken is None:
                 return SolvedPoint(point, SINGULAR if np.isfinite(linear.columns).all() else NOT_FINITE, step)
-            change, curvature = found
+            change, curvature = taken
             size = self.size(change, point)
             if not size < np.inf:
                 return SolvedPoint(point, NOT_FINITE, step)
-            point = point.moved(change, min(1.0, LARGEST_STEP / max(size, LARGEST_STEP)))
+            point = point.moved(change, min(1.0, LONGEST_CHANGE / max(size, LONGEST_CHANGE)))
             if not np.all(point.values > 0.0) or (step > FREE_STEPS and size > previous > STEP_TOLERANCE):
                 return SolvedPoint(point, STALLED, step)
             previous = size
             if size <= STEP_TOLERANCE:
                 return SolvedPoint(point, CONVERGED if curvature * self.sign >= 0.0 else OTHER_ORBIT, step)
-        return SolvedPoint(point, STALLED, MOST_STEPS)
+        return SolvedPoint(point, STALLED, MOST_SPECIAL_STEPS)
 
     def _newton_step(
-        self, linear: _Linear, point: SpecialPoint, parameters: np.ndarray
+        self, linear: _LinearPoint, point: SpecialPoint, parameters: np.ndarray
     ) -> tuple[SpecialPoint, float] | None:
         """Return the Newton step, and d²λ/ds² of a fold; None where the system is singular."""
         count = linear.equations.count
@@ -224,7 +227,7 @@ class SpecialEquations:
             size = max(size, float(np.max(np.abs(direction) / np.where(parameters != 0.0, np.abs(parameters), 1.0))))
         if not 0.0 < size < np.inf:
             return np.zeros_like(point.z)
-        step, ends = SMALL_STEP / size, []
+        step, ends = BEND_DISTANCE / size, []
         for by in (step, -step):
             here = self.at(point.values + by * change.values)
             moved = parameters if direction is None else parameters + by * direction
@@ -241,7 +244,7 @@ class SpecialEquations:
     def bends(self, point: SpecialPoint, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivatives at a fold of `residual_jacobian` along v, and of ∂g/∂z · v by the value."""
         still, here = np.zeros_like(point.z), self.at(point.values)
-        step = SMALL_STEP / self.size(SpecialPoint(point.vector, np.zeros(1), still), point)
+        step = BEND_DISTANCE / self.size(SpecialPoint(point.vector, np.zeros(1), still), point)
         ends = [here.residual_jacobian(point.z + by * point.vector, parameters) for by in (step, -step)]
         by_value = self._bend(point, point.vector, parameters, SpecialPoint(still, np.ones(1), still))
         return (ends[0] - ends[1]) / (2.0 * step), by_value
@@ -290,7 +293,7 @@ class SpecialEquations:
             if slope is None:
                 return SolvedPoint(here, SINGULAR, used)
             change, code, solved = SpecialPoint(*(part[0] for part in slope.point)), STALLED, None
-            while step >= SMALLEST_PART:
+            while step >= SMALLEST_SHARE_OF_WAY:
                 guess = here.moved(change, step)
                 if np.all(guess.values > 0.0):
                     solved = self.newton(guess, before + (done + step) * (after - before), row)
@@ -312,7 +315,7 @@ class SpecialEquations:
         """Return whether a point is too far from its prediction to be a continuation of `start`."""
         off = SpecialPoint(*(a - b for a, b in zip(point, predicted, strict=True)))
         change = SpecialPoint(*(a - b for a, b in zip(predicted, start, strict=True)))
-        return self.size(off, start) > LEAPT * max(1.0, self.size(change, start))
+        return self.size(off, start) > LARGEST_LEAP * max(1.0, self.size(change, start))
 
 
 def _pulled_back(here: PeriodicEquations, d: Derivatives, rows: np.ndarray) -> np.ndarray:

@@ -12,11 +12,11 @@ from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations
 from bayesperiodic.periodic.solve import solve_driven
 from bayesperiodic.periodic.special import SolvedPoint, SpecialEquations, SpecialPoint
 
-SPANS = (2.0, 5.0)  # the branch is followed from the measured value over this factor to that times it
+BRANCH_SPANS = (2.0, 5.0)  # the branch is followed from the measured value over this factor to that times it
 LOWEST_SCALE = 0.01  # of an input at which a branch in its scale starts
-STEPS, MOST_BRANCH_POINTS = 100, 600
+RESPONSE_STEPS, MOST_BRANCH_POINTS = 100, 600
 TINY_SCALE, SMALL_AMPLITUDE = 1e-9, 1e-3  # of an unknown input; of the amplitude from which the backbone is followed
-GROWTH, LEAST_GROWTH = 0.5, 0.01  # of the logarithm of the amplitude
+CLIMB, LEAST_CLIMB = 0.5, 0.01  # of the logarithm of the amplitude
 
 
 def fold_equations(equations: PeriodicEquations, vary: str, direction: str) -> SpecialEquations:
@@ -62,7 +62,7 @@ def find_special(special: SpecialEquations, parameters: np.ndarray) -> SolvedPoi
 def _branches(special: SpecialEquations, parameters: np.ndarray) -> Iterator[Iterator[BranchPoint]]:
     """Yield branches in the first unknown, wider and wider ones, from where the response is not resonant."""
     measured = special.start_values[0]
-    for span in SPANS:
+    for span in BRANCH_SPANS:
         low, high = measured / span, measured * span
         if special.free[0] != FREQUENCY:
             low = LOWEST_SCALE * measured
@@ -72,15 +72,15 @@ def _branches(special: SpecialEquations, parameters: np.ndarray) -> Iterator[Ite
         solved = solve_driven(here, parameters, "static")[0]
         if solved.code != CONVERGED:
             continue
-        parametrised, step = special.parametrised(parameters), abs(high - low) / STEPS
+        parametrised, step = special.parametrised(parameters), abs(high - low) / RESPONSE_STEPS
         branch = trace(parametrised, solved.z, np.array([low]), until=high, step=step)
         yield islice(branch, MOST_BRANCH_POINTS)
 
 
-def _nearest(special: SpecialEquations, found: list[SolvedPoint]) -> SolvedPoint:
+def _nearest(special: SpecialEquations, solutions: list[SolvedPoint]) -> SolvedPoint:
     """Return the point whose first unknown is nearest to the measured one."""
     measured = special.start_values[0]
-    return min(found, key=lambda solved: abs(float(np.log(solved.point.values[0] / measured))))
+    return min(solutions, key=lambda solved: abs(float(np.log(solved.point.values[0] / measured))))
 
 
 def _nothing(special: SpecialEquations) -> SolvedPoint:
@@ -91,7 +91,7 @@ def _nothing(special: SpecialEquations) -> SolvedPoint:
 def _find_fold(special: SpecialEquations, parameters: np.ndarray) -> SolvedPoint:
     with np.errstate(all="ignore"):
         for branch in _branches(special, parameters):
-            found = []
+            solutions = []
             for before, after in pairwise(branch):
                 slopes = float(before.tangent[1][0]), float(after.tangent[1][0])
                 if not (slopes[0] * special.sign < 0.0 <= slopes[1] * special.sign):
@@ -99,16 +99,16 @@ def _find_fold(special: SpecialEquations, parameters: np.ndarray) -> SolvedPoint
                 near = before if abs(slopes[0]) < abs(slopes[1]) else after
                 guess = SpecialPoint(near.z, near.values, near.tangent[0])
                 solved = special.newton(guess, parameters, special.row(guess.vector))
-                found += [solved] if solved.code == CONVERGED else []
-            if found:
-                return _nearest(special, found)
+                solutions += [solved] if solved.code == CONVERGED else []
+            if solutions:
+                return _nearest(special, solutions)
     return _nothing(special)
 
 
 def _find_phase(special: SpecialEquations, parameters: np.ndarray) -> SolvedPoint:
     with np.errstate(all="ignore"):
         for branch in _branches(special, parameters):
-            found, last = [], None
+            solutions, last = [], None
             for point in branch:
                 missed = special.missed(special.at(point.values).outputs(point.z, parameters))[0]
                 if last is not None and missed * last[1] <= 0.0:
@@ -120,10 +120,10 @@ def _find_phase(special: SpecialEquations, parameters: np.ndarray) -> SolvedPoin
                         np.zeros_like(point.z),
                     )
                     solved = special.newton(guess, parameters, guess.vector)
-                    found += [solved] if solved.code == CONVERGED and _lags(special, parameters, solved) else []
+                    solutions += [solved] if solved.code == CONVERGED and _lags(special, parameters, solved) else []
                 last = point, missed
-            if found:
-                return _nearest(special, found)
+            if solutions:
+                return _nearest(special, solutions)
     return _nothing(special)
 
 
@@ -144,7 +144,7 @@ def _climb(special: SpecialEquations, parameters: np.ndarray) -> SolvedPoint:
     z, goal = solved.point.z, float(special.targets[1])
     point = SpecialPoint(z, np.array([solved.point.values[0], TINY_SCALE]), np.zeros_like(z))
     target = float(np.sum(special.forward * special.at(point.values).outputs(z, parameters)))
-    growth, first = GROWTH, target < SMALL_AMPLITUDE * goal
+    growth, first = CLIMB, target < SMALL_AMPLITUDE * goal
     while target != goal:
         ratio = float(np.clip(np.log(goal / target), -growth, growth))
         wanted = SMALL_AMPLITUDE * goal if first else target * np.exp(ratio) if abs(ratio) == growth else goal
@@ -153,10 +153,10 @@ def _climb(special: SpecialEquations, parameters: np.ndarray) -> SolvedPoint:
         if guess is not None and np.all(guess.values > 0.0):
             solved = there.newton(guess, parameters, point.vector)
         if guess is not None and solved.code == CONVERGED and not special.leapt(solved.point, guess, point):
-            point, target, growth, first = solved.point, wanted, min(GROWTH, 1.5 * growth), False
+            point, target, growth, first = solved.point, wanted, min(CLIMB, 1.5 * growth), False
             continue
         growth *= 0.5
-        if first or growth < LEAST_GROWTH:
+        if first or growth < LEAST_CLIMB:
             return SolvedPoint(point, STALLED, solved.steps)
     return SolvedPoint(point, CONVERGED, solved.steps)
 

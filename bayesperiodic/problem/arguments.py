@@ -26,22 +26,29 @@ def values_by_name(argument: str, given: Any, names: tuple[str, ...]) -> np.ndar
     return values
 
 
-def check_special_point(experiment: Experiment, sensors: Mapping[str, Any], noisy: list[str], late: bool) -> None:
-    """Refuse sensors, delays and errors of inputs that the solver of an experiment's special point does not know of."""
-    point = experiment.condition
-    if point is None:
-        return
-    if noisy:
-        raise ValueError(
-            f"input_noise: must not be of {noisy} in {experiment.name!r}, a jump or resonance point, whose inputs are "
-            "exact. Give their error in its sd."
-        )
-    if isinstance(point, PhaseLag) and (late or point.output in sensors):
-        given = "unknown delays" if late else repr(sensors[point.output])
-        raise ValueError(
-            f"sensors: must be without one of {point.output!r} and without unknown delays for the phase in "
-            f"{experiment.name!r}, got {given}. Correct frequency, amplitude and lag before."
-        )
+def check_special_points(
+    experiments: Iterable[Experiment],
+    sensors: Mapping[str, Any],
+    noisy: Mapping[str, list[str]],
+    late: Mapping[str, bool],
+) -> None:
+    """Refuse sensors, unknown delays and errors of inputs that the solver of special points does not know of.
+
+    The noisy inputs, and whether signals may be late, are given by experiment.
+    """
+    for e in experiments:
+        point = e.condition
+        if point is not None and noisy.get(e.name):
+            raise ValueError(
+                f"input_noise: must not be of {noisy[e.name]} in {e.name!r}, a jump or resonance point, whose inputs "
+                "are exact. Give their error in its sd."
+            )
+        if isinstance(point, PhaseLag) and (late[e.name] or point.output in sensors):
+            given = "unknown delays" if late[e.name] else repr(sensors[point.output])
+            raise ValueError(
+                f"sensors: must be without one of {point.output!r} and without unknown delays for the phase in "
+                f"{e.name!r}, got {given}. Correct frequency, amplitude and lag before."
+            )
 
 
 def refuse_special_points(experiments: Iterable[Experiment], purpose: str) -> None:

@@ -33,13 +33,8 @@ from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.priors.joint import JointPrior
 from bayesperiodic.priors.single import Uniform
-from bayesperiodic.problem.arguments import (
-    check_special_point,
-    checked_experiments,
-    checked_local,
-    fixed_values,
-    values_by_name,
-)
+from bayesperiodic.problem import arguments
+from bayesperiodic.problem.arguments import checked_experiments, checked_local, fixed_values, values_by_name
 from bayesperiodic.problem.parameters import (
     SHIFT,
     ParameterMap,
@@ -56,7 +51,10 @@ LEAST_WIDTH = 1e-12
 
 
 class Description(Printed):
-    """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction and immutable."""
+    """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction and immutable.
+
+    If `forward`, gradients take one solve a parameter, as those of orbits of unknown frequency and of special points.
+    """
 
     def __init__(
         self,
@@ -122,9 +120,9 @@ class Description(Printed):
         check_delays(self.experiments, (*self.names, *fixed, *tied, *self.sensors.known_delays))
         kinds = model.parameters, self.sensors.names, self.names
         self.parameter_maps = {run: ParameterMap.of(*kinds, run, self.fixed, tied) for run in runs}
-        for e in self.experiments:
-            noisy, late = noisy_inputs(e, self.input_noise), self.parameter_maps[e.name].delayed
-            check_special_point(e, self.sensors.given, noisy, late or bool(self.sensors.late_inputs))
+        late = {run: one.delayed or bool(self.sensors.late_inputs) for run, one in self.parameter_maps.items()}
+        arguments.check_special_points(self.experiments, self.sensors.given, self.noisy_inputs, late)
+        self.forward = model.autonomous or any(e.condition is not None for e in self.experiments)
         self.ties = self._ties()
         self.frequency_errors = self._known_frequency_errors()
         self.input_errors = self._checked_input_errors(input_errors or {})
@@ -302,11 +300,6 @@ class Description(Printed):
     def free_noise(self) -> tuple[str, ...]:
         """Noise parameters without a known value."""
         return self.likelihood.free
-
-    @property
-    def forward(self) -> bool:
-        """Whether gradients take one solve a parameter, as of orbits of unknown frequency and special points."""
-        return self.model.autonomous or any(e.condition is not None for e in self.experiments)
 
     @property
     def counted(self) -> float:

@@ -12,7 +12,7 @@ from tests import harmonic_balance
 from tests.known import grid
 
 TRUTH = {"c": 0.1, "k": 1.0, "k3": 0.5}
-PRIORS = {"c": bp.LogNormal(0.105, 1.2), "k": bp.LogNormal(1.02, 1.1), "k3": bp.LogNormal(0.48, 1.3)}
+PRIORS = {"c": bp.LogNormal(0.105, 0.2), "k": bp.LogNormal(1.02, 0.1), "k3": bp.LogNormal(0.48, 0.3)}
 PLACE_SD, LEVEL_SD, AMPLITUDE_SD, SAMPLES = 2e-4, 1e-3, 0.01, 32
 UNKNOWN_LEVELS = (0.5, 1.0)
 
@@ -140,7 +140,7 @@ def test_a_force_known_up_to_a_factor_is_a_gain_of_its_sensor():
     )  # fmt: skip
     given = {"priors": PRIORS, "fixed": {"m": 1.0}, "scheme": "fourier"}
     plain = bp.Problem(bp.models.duffing, [peak], **given)
-    gained = bp.Problem(bp.models.duffing, [twice], sensors={"force": bp.Sensor(gain=bp.LogNormal(2.0, 1.1))}, **given)
+    gained = bp.Problem(bp.models.duffing, [twice], sensors={"force": bp.Sensor(gain=bp.LogNormal(2.0, 0.1))}, **given)
     theta = {"c": 0.103, "k": 1.01, "k3": 0.45}
     expected = float(plain.log_likelihood(theta, {}) - plain.log_likelihood(TRUTH, {}))
     one, other = ({**values, "gain[force]": 2.0} for values in (theta, TRUTH))
@@ -148,7 +148,7 @@ def test_a_force_known_up_to_a_factor_is_a_gain_of_its_sensor():
 
 
 def test_a_start_without_the_jump_is_refused_by_name():
-    problem = problem_of(places(**TRUTH), priors=PRIORS | {"k3": bp.LogNormal(1e-4, 1.1)})
+    problem = problem_of(places(**TRUTH), priors=PRIORS | {"k3": bp.LogNormal(1e-4, 0.1)})
     with pytest.raises(ValueError, match=r"start: must have a finite log-posterior.*'up'"):
         bp.map_estimate(problem, progress=False)
 
@@ -179,7 +179,7 @@ def test_intervals_from_jumps_and_backbones_cover_the_truth():
     those of the estimate. Fixed seed.
     """
     generator, inside, count = np.random.default_rng(64), np.zeros(3), 200
-    wide = {"c": bp.LogNormal(0.08, 1.1), "k": bp.LogNormal(1.0, 1.05), "k3": bp.LogNormal(0.5, 1.15)}
+    wide = {"c": bp.LogNormal(0.08, 0.1), "k": bp.LogNormal(1.0, 0.03), "k3": bp.LogNormal(0.5, 0.1)}
     for _ in range(count):
         truth = {name: float(prior.quantile(generator.uniform())) for name, prior in wide.items()}
         data = places(**truth) + SDS * generator.standard_normal(SDS.size)

@@ -10,7 +10,7 @@ from bayesperiodic._compile.functions import grid_function_at
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
     from bayesperiodic.periodic._kernels.newton import *
 
-MAX_SECANTS, SECANT_RATE = 16, 1.0
+MAX_POINT_STEPS = 16
 SAFETY = 0.01  # of the prediction that the next step will be below the tolerance
 BEND_STEP, LEAST_BEND = 1e-4, 0.2
 
@@ -96,10 +96,15 @@ def broyden(
     right, below = np.empty((1, size)), np.empty((1, unknown))
     product, across = np.empty((points, count)), np.empty((points, count))
     total = size + unknown + (size if is_fold else 0)
-    taken, squares, first, previous = np.empty((MAX_SECANTS, total)), np.empty(MAX_SECANTS), values.copy(), np.inf
+    taken, squares, first, previous = (
+        np.empty((MAX_POINT_STEPS, total)),
+        np.empty(MAX_POINT_STEPS),
+        values.copy(),
+        np.inf,
+    )
     fill_units(z, unit)
     fill_units(vector, vector_unit)
-    for iteration in range(MAX_SECANTS):
+    for iteration in range(MAX_POINT_STEPS):
         frequency = fill_setting(setting, unknowns, values, inputs, parameters)
         differentiate(z, setting.drift, grid, frequency, states)
         for k in range(unknown):
@@ -143,7 +148,7 @@ def broyden(
         for i in range(points):
             for s in range(count):
                 step[i * count + s] = (share * vector[i, s] - change[i, s]) / unit[s]
-        if iteration > 0 and not dot(step, step) < SECANT_RATE**2 * squares[iteration - 1]:
+        if iteration > 0 and not dot(step, step) < squares[iteration - 1]:
             return False, iteration + 1
         for k in range(iteration):
             part = dot(taken[k], step) / squares[k]
@@ -176,7 +181,7 @@ def broyden(
             observe(states, inputs, parameters, grid.tau, frequency, outputs)
             return True, iteration + 1
         previous = full
-    return False, MAX_SECANTS
+    return False, MAX_POINT_STEPS
 
 
 @inlined(NUMBER(ADDRESSES, GRID, SETTING, MATRIX, PLACES, BORDER, MATRIX, MATRIX), **INNER)
