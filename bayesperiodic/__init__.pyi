@@ -13,6 +13,10 @@ from .data.recording import Recording as Recording
 from .data.recording_check import Finding as Finding
 from .data.recording_check import RecordingCheck as RecordingCheck
 from .data.response_table import response_table as response_table
+from .data.special_experiments import jump as jump
+from .data.special_experiments import resonance_point as resonance_point
+from .data.special_points import Fold as Fold
+from .data.special_points import PhaseLag as PhaseLag
 from .data.sweep import Sweep as Sweep
 from .density.problem import Problem as Problem
 from .diagnostics.branch_prediction import BranchPrediction as BranchPrediction

@@ -14,6 +14,7 @@ from bayesperiodic.data import measurements as kinds
 from bayesperiodic.data.measurements import Measurement
 from bayesperiodic.data.recording_check import Finding
 from bayesperiodic.data.response_period import summary
+from bayesperiodic.data.special_points import Fold, PhaseLag
 from bayesperiodic.data.sweep import Sweep
 
 if TYPE_CHECKING:
@@ -126,6 +127,9 @@ class Experiment(Result):
         the states that give the measured outputs and, where the outputs leave them free, solve the equations best at
         the parameters of the start.
 
+    condition : Fold or PhaseLag, optional
+        The special point at which the response is, see `jump` and `resonance_point`; its place is the data.
+
     Raises
     ------
     ValueError
@@ -181,6 +185,7 @@ class Experiment(Result):
     multipliers: np.ndarray | None = field(default=None, kw_only=True)
     multiplier_sd: np.ndarray | None = field(default=None, kw_only=True)
     guess: str | Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+    condition: Fold | PhaseLag | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if not _checks.text("name", self.name) or any(c in self.name for c in "/[]"):
@@ -239,6 +244,12 @@ class Experiment(Result):
             kept = min(points, 2 * self.harmonics.get(key, points) + 1)
             counts[key] = min(counts[key], kept - 2 * len(without) + (0 in without))
         object.__setattr__(self, "independent", counts)
+        whole = self.mask is None and self.covariance is None and self.multipliers is None and self.frequency_se == 0.0
+        if self.condition is not None and not (whole and self.periods == 1):
+            raise ValueError(
+                "condition: must be None for experiments with several periods, a mask, a covariance, multipliers, or "
+                f"a frequency_se, got {self.condition!r}."
+            )
         self._check_multipliers()
         self._check_covariance(measured * len(self.outputs))
         for member in fields(self):
@@ -481,6 +492,7 @@ class Experiment(Result):
         counts = ", ".join(shown)
         without = (f"{k} without harmonics {', '.join(map(str, h))}" for k, h in self.unmeasured.items())
         text = "".join(f"; {each}" for each in without)
+        text += f"; {self.condition!r}" if self.condition else ""
         error = f" ± {self.frequency_se:.2g} Hz" if self.frequency_se else ""
         if self.phase_diffusion:
             error += f" with a phase diffusion of {self.phase_diffusion:.2g} rad²/s"

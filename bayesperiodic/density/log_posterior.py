@@ -302,7 +302,7 @@ class LogPosterior(SamplingCoordinates):
         prior = float(self.log_prior(theta, noise))
         if not np.isfinite(prior):
             return -np.inf, *zeros, CONVERGED
-        forward = forward or self.problem.model.autonomous
+        forward = forward or self.problem.forward
         here = Linearisation(theta, self.solver, self.comparisons, polish=forward)
         if not here.converged:
             return -np.inf, *zeros, here.status

@@ -10,15 +10,23 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.initial_orbits import Guesses, experiments_guesses
+from bayesperiodic.density.special_points import (
+    PointDerivatives,
+    special_anchor,
+    special_equations,
+    special_values,
+)
 from bayesperiodic.density.sweeps import SAME_ORBIT, Place, TablePoint, distance, places, reach_further, tables
 from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
 from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
-from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved, directional_sensitivities
+from bayesperiodic.periodic.equations import PeriodicEquations, Solved, directional_sensitivities
 from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
 from bayesperiodic.periodic.solution import PeriodicSolution, as_guess, describe, logarithmic_jacobian
 from bayesperiodic.periodic.solve import solve_driven, solve_free
+from bayesperiodic.periodic.special import SpecialEquations, SpecialPoint
+from bayesperiodic.periodic.special_batch import SpecialAnchor, SpecialBatch
 from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.model_inputs import without_sensors
 from bayesperiodic.problem.parameters import ParameterMaps
@@ -32,8 +40,8 @@ class InitialOrbit(NamedTuple):
     """Orbit from which the periodic solves of an experiment start."""
 
     guess: Any  # states (points,) by name, or "static", from which to solve where the anchor fails
-    anchor: Anchor
-    derivatives: Sensitivities | None  # of outputs and frequency by all parameters; None where they do not exist
+    anchor: Anchor | SpecialAnchor
+    derivatives: PointDerivatives | None  # by all parameters; None where they do not exist
     sheet: int | None = None  # of the branch of a table, see `sweeps`; None if it is not known
 
 
@@ -67,7 +75,8 @@ class ResponseSolver:
 
     def __getstate__(self) -> dict[str, Any]:
         # The factors at the anchors are computed again; the anchors are kept to the last bit.
-        return {key: value for key, value in self.__dict__.items() if key != "_batches"} | {"_changes": None}
+        kept = {key: value for key, value in self.__dict__.items() if key not in ("_batches", "_specials")}
+        return kept | {"_changes": None}
 
     def anchored(self, theta: np.ndarray) -> "ResponseSolver":
         """Return the solver anchored at θ (names,), solved from the present anchors, else from the guesses."""
@@ -75,9 +84,13 @@ class ResponseSolver:
         lost = [name for name, orbit in self.anchors.items() if simulation.statuses(name)[0] != CONVERGED]
         again = {}
         if any(self.anchors[name].sheet is not None for name in lost):
-            again = places(self.problem, theta, {name: orbit.anchor.z for name, orbit in self.anchors.items()})
+            near = {name: orbit.anchor for name, orbit in self.anchors.items() if orbit.sheet is not None}
+            z = {name: anchor.z for name, anchor in near.items() if isinstance(anchor, Anchor)}
+            again = places(self.problem, theta, z)
         for name, orbit in self.anchors.items():
-            if name in lost and name in again:
+            if name in self._specials:
+                anchors[name] = self._special_orbit(name, theta, None if name in lost else simulation)
+            elif name in lost and name in again:
                 anchors[name] = _placed(self.problem, name, theta, orbit.guess, again[name])
             elif name in lost or orbit.sheet is None:
                 solved = None if name in lost else self._solved(simulation, name)
@@ -96,16 +109,41 @@ class ResponseSolver:
         ]
 
     def _solved(self, simulation: Simulation, experiment: str, i: int = 0) -> tuple[PeriodicEquations, np.ndarray]:
-        """Return the equations at the frequency of one of the solves, and its z."""
-        frequency = float(simulation.response(experiment).frequency[i])
+        """Return the equations at the frequency, and the scale of the input, of one of the solves, and its z."""
+        response = simulation.response(experiment)
+        frequency = float(response.frequency[i])
+        if experiment in self._specials:
+            special = self._specials[experiment]
+            values = special_values(special, frequency, float(response.scale[i]))
+            return special.at(values), simulation.z(experiment)[i]
         return self.problem.equations[experiment].at_frequency(frequency), simulation.z(experiment)[i]
+
+    def _special_orbit(self, experiment: str, theta: np.ndarray, simulation: Simulation | None) -> InitialOrbit:
+        """Return the anchor of a special point at θ (names,): that of a solve from the anchor, or found anew."""
+        special, guess = self._specials[experiment], None
+        if simulation is not None:
+            response, before = simulation.response(experiment), self.anchors[experiment].anchor
+            assert isinstance(before, SpecialAnchor)
+            values = special_values(special, float(response.frequency[0]), float(response.scale[0]))
+            guess = SpecialPoint(simulation.z(experiment)[0], values, before.point.vector)
+            if special.is_fold:
+                parameters = self.problem.parameters(theta[None], experiment)[0]
+                guess = special.null_vector(guess, parameters, special.row(guess.vector))
+        return _special_orbit(self.problem, experiment, theta, special, guess)
+
+    @cached_property
+    def _specials(self) -> dict[str, SpecialEquations]:
+        """The equations of the special points, by experiment."""
+        return _specials(self.problem)
 
     @cached_property
     def groups(self) -> list[tuple[Experiment, ...]]:
         """Experiments on the same grid and with the same parameters free, which are solved together."""
         groups: dict[tuple[Any, ...], list[Experiment]] = {}
         for e in self.problem.experiments:
-            groups.setdefault((e.samples, e.periods, *self.problem.parameter_maps[e.name].columns), []).append(e)
+            kind = () if e.condition is None else (type(e.condition).__name__, e.condition.free)
+            columns = self.problem.parameter_maps[e.name].columns
+            groups.setdefault((kind, e.samples, e.periods, *columns), []).append(e)
         return [tuple(group) for group in groups.values()]
 
     @cached_property
@@ -114,14 +152,15 @@ class ResponseSolver:
         return {e.name: (g, m) for g, group in enumerate(self.groups) for m, e in enumerate(group)}
 
     @cached_property
-    def _batches(self) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch, bool]]:
+    def _batches(
+        self,
+    ) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch | SpecialBatch, bool]]:
         """The groups, their parameters, their solver, and whether multipliers were measured."""
-        kind = AutonomousBatch if self.problem.model.autonomous else Batch
         return [
             (
                 group,
                 ParameterMaps([self.problem.parameter_maps[e.name] for e in group]),
-                kind([self.problem.equations[e.name] for e in group], [self.anchors[e.name].anchor for e in group]),
+                self._batch([e.name for e in group]),
                 any(self.problem.observations[e.name].multipliers for e in group),
             )
             for group in self.groups
@@ -137,9 +176,11 @@ class ResponseSolver:
 
         Sheets are counted anew where the branch is followed: folds may have come into being since.
         """
-        placed = {name: orbit.anchor.z for name, orbit in self.anchors.items() if orbit.sheet is not None}
-        same = (distance(z, other.anchors[name].anchor.z) < SAME_ORBIT for name, z in placed.items())
-        return self.sheets == other.sheets and all(same)
+        pairs = [
+            (orbit.anchor, other.anchors[n].anchor) for n, orbit in self.anchors.items() if orbit.sheet is not None
+        ]
+        orbits = ((a.z, b.z) for a, b in pairs if isinstance(a, Anchor) and isinstance(b, Anchor))
+        return self.sheets == other.sheets and all(distance(z, there) < SAME_ORBIT for z, there in orbits)
 
     @cached_property
     def _sheets(self) -> list[list[TablePoint]]:
@@ -152,6 +193,14 @@ class ResponseSolver:
                     known = orbit.anchor.sensitivities is not None
                     result.setdefault((sweep, orbit.sheet), []).append(TablePoint(name, *self._places[name], known))
         return list(result.values())
+
+    def _batch(self, names: list[str]) -> Batch | AutonomousBatch | SpecialBatch:
+        """Return the solver of experiments of one group."""
+        anchors: list[Any] = [self.anchors[name].anchor for name in names]
+        if names[0] in self._specials:
+            return SpecialBatch([self._specials[name] for name in names], anchors)
+        kind = AutonomousBatch if self.problem.model.autonomous else Batch
+        return kind([self.problem.equations[name] for name in names], anchors)
 
     def solve(
         self,
@@ -172,6 +221,9 @@ class ResponseSolver:
         for experiments, maps, batch, multipliers in self._batches:
             values = maps.values(theta)
             parameters, sensors = values[..., : maps.count], values[..., maps.count :]
+            if isinstance(batch, SpecialBatch):
+                groups.append(_special_solution(batch, parameters, sensors, threads))
+                continue
             if isinstance(batch, AutonomousBatch):
                 solved = batch.solve(parameters, threads, keep=keep or multipliers, whole=whole)
             else:
@@ -184,7 +236,7 @@ class ResponseSolver:
                     for i, e in enumerate(experiments)
                 ]
             of_all = solved.outputs, solved.frequency, parameters, sensors, logarithms, solved.z, status
-            groups.append(GroupSolution(*of_all))
+            groups.append(GroupSolution(*of_all, np.ones(status.shape)))
         for points in self._sheets:
             reach_further(self.problem, points, groups)
         return Simulation(groups, self._places)
@@ -192,7 +244,7 @@ class ResponseSolver:
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
         """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""
         anchor = self.anchors[experiment].anchor
-        if anchor.sensitivities is None:
+        if isinstance(anchor, SpecialAnchor) or anchor.sensitivities is None:
             return PATH_LOST
         parameters = self.problem.parameters(theta[None], experiment)[0]
         return path_outcome(self.problem.equations[experiment], anchor, parameters)
@@ -232,9 +284,17 @@ class ResponseSolver:
         simulation, solutions = self.solve(theta[None], keep=True, polish=True), {}
         for e in self.problem.experiments:
             (here, z), code = self._solved(simulation, e.name), int(simulation.statuses(e.name)[0])
-            here, parameters = without_sensors(self.problem, here, e, theta)
+            here, parameters = without_sensors(self.problem, here, self._at_scale(e, simulation), theta)
             solutions[e.name] = describe(here, parameters, Solved(z, code, NO_HISTORY))
         return solutions
+
+    def _at_scale(self, experiment: Experiment, simulation: Simulation) -> Experiment:
+        """Return an experiment with the level of the input that is an unknown of its special point."""
+        special, scale = self._specials.get(experiment.name), float(simulation.response(experiment.name).scale[0])
+        if special is None or scale == 1.0:
+            return experiment
+        inputs = {name: (scale if name in special.free else 1.0) * u for name, u in experiment.inputs.items()}
+        return replace(experiment, inputs=inputs)
 
     def jacobian(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:
         """Return the derivatives of a response at the anchor by θ, (names, …); None where they do not exist."""
@@ -248,7 +308,8 @@ class ResponseSolver:
         multipliers = np.zeros((theta.size, 0))
         if response.log_multipliers.size:
             multipliers = self._multiplier_jacobian(theta, experiment, z, response)
-        return Response(outputs, of_model.T @ derivative.frequency, multipliers, of_sensors.T)
+        scale = of_model.T @ derivative.scale
+        return Response(outputs, of_model.T @ derivative.frequency, multipliers, of_sensors.T, scale)
 
     def _measured_frequency(self, experiment: str) -> float:
         return self.problem.equations[experiment].frequency
@@ -282,7 +343,8 @@ class ResponseSolver:
         anchor = self.anchors[experiment].anchor
         parameter_map = self.problem.parameter_maps[experiment]
         directions = parameter_map.slopes(theta)[: parameter_map.count].T
-        assert anchor.sensitivities is not None and anchor.frequency_sensitivities is not None
+        assert isinstance(anchor, Anchor) and anchor.sensitivities is not None
+        assert anchor.frequency_sensitivities is not None
         equations = self.problem.equations[experiment].at_frequency(float(response.frequency))
         parameters, count = self.problem.parameters(theta[None], experiment)[0], response.log_multipliers.size
         solution = _described(equations, parameters, z)
@@ -337,6 +399,9 @@ def _initial_orbit(
     solved: tuple[PeriodicEquations, np.ndarray] | None = None,
 ) -> InitialOrbit:
     """Return the orbit at θ (names,): one that is solved, or solved from the guess with all fallbacks."""
+    specials = _specials(problem)
+    if experiment in specials:
+        return _special_orbit(problem, experiment, theta, specials[experiment], None)
     equations, parameters = problem.equations[experiment], problem.parameters(theta[None], experiment)[0]
     if solved is None:
         if problem.model.autonomous:
@@ -351,8 +416,10 @@ def _initial_orbit(
     moving = np.flatnonzero(parameter_map.slopes(theta)[: parameter_map.count].any(axis=1))
     directions = np.eye(parameters.size)[moving]
     derivative = directional_sensitivities(here, z, parameters, directions)
-    by_all = derivative and derivative._replace(
-        outputs=np.tensordot(directions, derivative.outputs, (0, 0)), frequency=directions.T @ derivative.frequency
+    by_all = derivative and PointDerivatives(
+        np.tensordot(directions, derivative.outputs, (0, 0)),
+        directions.T @ derivative.frequency,
+        np.zeros(parameters.size),
     )
     return InitialOrbit(guess, Anchor.of(here, parameters, z, derivative, moving), by_all)
 
@@ -364,6 +431,32 @@ def _placed(problem: Description, experiment: str, theta: np.ndarray, guess: Any
     parameters = problem.parameters(theta[None], experiment)[0]
     measured = problem.equations[experiment].frequency
     return InitialOrbit(guess, Anchor(parameters, place.z, measured), None, place.sheet)
+
+
+def _specials(problem: Description) -> dict[str, SpecialEquations]:
+    """Return the equations of the special points of a problem, by experiment."""
+    of_points = [e for e in problem.experiments if e.condition is not None]
+    return {e.name: special_equations(e, problem.equations[e.name]) for e in of_points}
+
+
+def _special_orbit(
+    problem: Description, experiment: str, theta: np.ndarray, special: SpecialEquations, guess: SpecialPoint | None
+) -> InitialOrbit:
+    """Return the anchor of a special point at θ (names,), from a guess or found along a branch."""
+    parameter_map = problem.parameter_maps[experiment]
+    moving = np.flatnonzero(parameter_map.slopes(theta)[: parameter_map.count].any(axis=1))
+    parameters = problem.parameters(theta[None], experiment)[0]
+    return InitialOrbit("static", *special_anchor(special, parameters, moving, guess))
+
+
+def _special_solution(
+    batch: SpecialBatch, parameters: np.ndarray, sensors: np.ndarray, threads: int | None
+) -> GroupSolution:
+    """Return the solutions of experiments at special points."""
+    solved = batch.solve(parameters, threads)
+    logarithms = [np.empty((parameters.shape[1], 0))] * len(parameters)
+    given = parameters, sensors, logarithms, solved.z, solved.status, batch.scale(solved)
+    return GroupSolution(solved.outputs, batch.frequency(solved), *given)
 
 
 def orbit_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int) -> np.ndarray:

@@ -67,6 +67,8 @@ def places(problem: Description, theta: np.ndarray, near: Mapping[str, np.ndarra
             continue
         if near is not None:
             for e, places_of in zip(table, choices, strict=True):
+                if e.name not in near:
+                    continue
                 distances = [distance(place.z, near[e.name]) for place in places_of]
                 if min(distances) < SAME_ORBIT:
                     result[e.name] = places_of[int(np.argmin(distances))]

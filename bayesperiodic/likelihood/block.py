@@ -19,12 +19,16 @@ from bayesperiodic.models.model import Model
 PROPORTIONAL, NO_PARAMETERS = np.ones((1, 1)), np.ones((1, 0))
 
 
+NO_SCALE = np.zeros(())
+
+
 class ComparedSignals(NamedTuple):
     """What is compared: responses, their differences from the data, or derivatives along directions."""
 
     values: np.ndarray  # (…, points, channels) of the measured channels, turned and delayed
     log_multipliers: np.ndarray  # (…, multipliers), log|μ|, largest first
     frequency: np.ndarray  # (…,) [Hz]
+    scale: np.ndarray = NO_SCALE  # (…,) of an input, where that is an unknown
 
 
 def _nothing() -> np.ndarray:

@@ -9,7 +9,13 @@ import numpy as np
 from bayesperiodic import _fourier
 from bayesperiodic._parallel import available_cores, in_threads
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.block import ComparedSignals, compared_channels, measured_channels, measured_variance
+from bayesperiodic.likelihood.block import (
+    NO_SCALE,
+    ComparedSignals,
+    compared_channels,
+    measured_channels,
+    measured_variance,
+)
 from bayesperiodic.likelihood.kinds import blocks_of
 from bayesperiodic.likelihood.likelihood import Residuals
 from bayesperiodic.likelihood.quantities import Quantities
@@ -27,6 +33,7 @@ class Response(NamedTuple):
     frequency: np.ndarray  # (…,) [Hz]
     log_multipliers: np.ndarray  # (…, multipliers), log|μ|, largest first, as many as were measured
     sensors: np.ndarray  # (…, names) of the sensors' parameters, the delay of all outputs [s] last
+    scale: np.ndarray = NO_SCALE  # (…,) of an input, where that is an unknown
 
 
 class GroupSolution(NamedTuple):
@@ -39,12 +46,13 @@ class GroupSolution(NamedTuple):
     log_multipliers: list[np.ndarray]  # (solves, multipliers) of each experiment, log|μ|, largest first
     z: np.ndarray  # (experiments, solves, points, states), periodic parts of the states
     status: np.ndarray  # int (experiments, solves), index into `compiled.STATUSES`
+    scale: np.ndarray  # (experiments, solves) of an input, where that is an unknown, else 1
 
     def response(self, members: Any, solves: Any = ...) -> Response:
         """Return the responses of one experiment (an index), θ on the leading axis; of several without multipliers."""
         at = members, solves
         multipliers = self.log_multipliers[members][solves] if isinstance(members, int) else np.empty(0)
-        return Response(self.outputs[at], self.frequency[at], multipliers, self.sensors[at])
+        return Response(self.outputs[at], self.frequency[at], multipliers, self.sensors[at], self.scale[at])
 
     def at(self, solves: Any) -> "GroupSolution":
         """Return the solutions at some of the θ."""
@@ -56,6 +64,7 @@ class GroupSolution(NamedTuple):
             [values[solves] for values in self.log_multipliers],
             self.z[:, solves],
             self.status[:, solves],
+            self.scale[:, solves],
         )
 
 
@@ -122,7 +131,7 @@ class Observation:
         self.channels, self.blocks = measured_channels(experiment, model), blocks_of(experiment, model)
         self.compared_channels = compared_channels(experiment, model)
         columns = [model.outputs.index(channel) for channel in self.compared_channels]
-        between = slice(columns[0], columns[-1] + 1)
+        between = slice(columns[0], columns[-1] + 1) if columns else slice(0, 0)
         self.picked = between if columns == list(range(between.start, between.stop)) else columns
         self.angles = [c in model.angles and c in self.channels for c in self.compared_channels]
         self._angle_places = [c for c, angle in enumerate(self.angles) if angle]
@@ -149,6 +158,7 @@ class Observation:
             self._difference(predicted.values),
             measured.log_multipliers - predicted.log_multipliers,
             measured.frequency - predicted.frequency,
+            measured.scale - predicted.scale,
         )
         return self._less_caused([block.compare(predicted, difference) for block in self.blocks])
 
@@ -187,7 +197,7 @@ class Observation:
         predicted, moved = self._signals(response), directions.outputs[..., self.picked]
         if self.sensing.active:
             moved = self._sensed_changes(moved, response, directions)
-        along = ComparedSignals(moved, directions.log_multipliers, directions.frequency)
+        along = ComparedSignals(moved, directions.log_multipliers, directions.frequency, directions.scale)
         return [block.changes(predicted, along) for block in self.blocks]
 
     def vjp(self, response: Response, weights: list[np.ndarray], shown: Sequence[np.ndarray]) -> Response:
@@ -276,7 +286,7 @@ class Observation:
         values = response.outputs[..., self.picked]
         if self.sensing.active:
             values = self._sensed(values, response)
-        return ComparedSignals(values, response.log_multipliers, response.frequency)
+        return ComparedSignals(values, response.log_multipliers, response.frequency, response.scale)
 
     def _difference(self, predicted: np.ndarray) -> np.ndarray:
         """Return y − ŷ (…, points, channels), angles within half a turn."""

@@ -33,6 +33,7 @@ from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.priors.joint import JointPrior
 from bayesperiodic.priors.single import Uniform
+from bayesperiodic.problem import arguments
 from bayesperiodic.problem.arguments import checked_experiments, checked_local, fixed_values, values_by_name
 from bayesperiodic.problem.parameters import (
     SHIFT,
@@ -50,7 +51,10 @@ LEAST_WIDTH = 1e-12
 
 
 class Description(Printed):
-    """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction and immutable."""
+    """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction and immutable.
+
+    If `forward`, gradients take one solve a parameter, as those of orbits of unknown frequency and of special points.
+    """
 
     def __init__(
         self,
@@ -117,6 +121,9 @@ class Description(Printed):
         check_delays(self.experiments, (*self.names, *fixed, *tied, *self.sensors.known_delays))
         kinds = model.parameters, self.sensors.names, self.names
         self.parameter_maps = {run: ParameterMap.of(*kinds, run, self.fixed, tied) for run in runs}
+        late = {run: one.delayed or bool(self.sensors.late_inputs) for run, one in self.parameter_maps.items()}
+        arguments.check_special_points(self.experiments, self.sensors.given, self.noisy_inputs, late)
+        self.forward = model.autonomous or any(e.condition is not None for e in self.experiments)
         self.ties = self._ties()
         self.frequency_errors = self._known_frequency_errors()
         self.input_errors = self._checked_input_errors(input_errors or {})
@@ -579,8 +586,8 @@ class Description(Printed):
         noisy = ", ".join(dict.fromkeys(name for inputs in self.noisy_inputs.values() for name in inputs))
         return (
             f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
-            f"data: {', '.join((*self.channels, *self.quantities))} with {self.likelihood.values:.0f} independent values, "
-            f"{self.noise.name} noise"
+            f"data: {', '.join((*self.channels, *self.quantities))} with {self.likelihood.values:.0f} independent "
+            f"values, {self.noise.name} noise"
             f"{f', noise of {noisy} integrated out' if noisy else ''}"
             f"{f', sensors: {sensors}' if sensors else ''})"
         )
