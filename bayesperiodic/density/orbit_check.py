@@ -33,7 +33,7 @@ def other_orbit(observation: Observation, response: Response) -> str:
     """
     if observation.experiment.condition is not None:  # whose solver tells one special point from another
         return ""
-    reason = next(_differences(observation, response), "")
+    reason = next(_differences(observation, response), "") if observation.channels else ""
     if not reason:
         return ""
     share = max(unexplained(observation, response).values())
@@ -55,7 +55,8 @@ def unexplained(observation: Observation, response: Response) -> dict[str, float
 
 def _differences(observation: Observation, response: Response) -> Iterator[str]:
     e, outputs = observation.experiment, np.stack(list(observation.predicted(response).values()), axis=-1)
-    (model, model_turns), (data, turns) = (_unwound(x, observation.angles) for x in (outputs, observation.data))
+    angles = observation.angles[: len(observation.channels)]
+    (model, model_turns), (data, turns) = (_unwound(x, angles) for x in (outputs, observation.data))
     if observation.whole:
         for channel, predicted, measured in zip(observation.channels, model_turns, turns, strict=True):
             if predicted != measured:

@@ -6,6 +6,8 @@ from bayesperiodic.likelihood.jump import Jump
 from bayesperiodic.likelihood.mean_period import MeanPeriod
 from bayesperiodic.likelihood.multipliers import Multipliers
 from bayesperiodic.likelihood.orbit_frequency import OrbitFrequency
+from bayesperiodic.likelihood.quantities import Amplitudes, PeakToPeaks, RelativePhases, RootMeanSquares
+from bayesperiodic.likelihood.reach import Reach
 from bayesperiodic.likelihood.resonance import Resonance
 from bayesperiodic.likelihood.samples import Samples
 from bayesperiodic.likelihood.section_points import SectionPoints
@@ -20,6 +22,11 @@ KINDS: list[type[Block]] = [
     OrbitFrequency,
     Jump,
     Resonance,
+    Amplitudes,
+    RelativePhases,
+    PeakToPeaks,
+    RootMeanSquares,
+    Reach,
 ]
 
 
