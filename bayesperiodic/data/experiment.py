@@ -244,7 +244,6 @@ class Experiment(Result):
             kept = min(points, 2 * self.harmonics.get(key, points) + 1)
             counts[key] = min(counts[key], kept - 2 * len(without) + (0 in without))
         object.__setattr__(self, "independent", counts)
-        self._check_condition()
         self._check_multipliers()
         self._check_covariance(measured * len(self.outputs))
         for member in fields(self):
@@ -298,6 +297,7 @@ class Experiment(Result):
             )
 
     def _check_multipliers(self) -> None:
+        self._check_condition()
         if self.multipliers is None:
             if self.multiplier_sd is not None:
                 raise ValueError("multiplier_sd: requires `multipliers`.")
