@@ -244,12 +244,6 @@ class Experiment(Result):
             kept = min(points, 2 * self.harmonics.get(key, points) + 1)
             counts[key] = min(counts[key], kept - 2 * len(without) + (0 in without))
         object.__setattr__(self, "independent", counts)
-        whole = self.mask is None and self.covariance is None and self.multipliers is None and self.frequency_se == 0.0
-        if self.condition is not None and not (whole and self.periods == 1):
-            raise ValueError(
-                "condition: must be None for experiments with several periods, a mask, a covariance, multipliers, or "
-                f"a frequency_se, got {self.condition!r}."
-            )
         self._check_multipliers()
         self._check_covariance(measured * len(self.outputs))
         for member in fields(self):
@@ -294,7 +288,16 @@ class Experiment(Result):
                     f"amplitudes, got {freedom.tolist()}."
                 )
 
+    def _check_condition(self) -> None:
+        whole = self.mask is None and self.covariance is None and self.multipliers is None and self.frequency_se == 0.0
+        if self.condition is not None and not (whole and self.periods == 1):
+            raise ValueError(
+                "condition: must be None for experiments with several periods, a mask, a covariance, multipliers, or "
+                f"a frequency_se, got {self.condition!r}."
+            )
+
     def _check_multipliers(self) -> None:
+        self._check_condition()
         if self.multipliers is None:
             if self.multiplier_sd is not None:
                 raise ValueError("multiplier_sd: requires `multipliers`.")

@@ -138,7 +138,7 @@ class Observation:
         self._free_phase = model.autonomous and bool(self.channels)
         self.sensing = Sensing(self.compared_channels, sensors, experiment.periods, delayed=model.autonomous)
         histories = [experiment.outputs[channel] for channel in self.channels]
-        self.data = np.reshape(histories, (-1, experiment.measured_points.size)).T
+        self.data = np.reshape(histories, (len(histories), experiment.measured_points.size)).T
         logarithms = np.log(np.abs(experiment.measured_multipliers))
         self._measured = ComparedSignals(self.data, logarithms, np.array(experiment.frequency))
         self._points = len(self.data)

@@ -27,23 +27,23 @@ def values_by_name(argument: str, given: Any, names: tuple[str, ...]) -> np.ndar
 
 def check_special_points(
     experiments: Iterable[Experiment],
-    sensors: Mapping[str, Any],
+    sensors: Any,
     noisy: Mapping[str, list[str]],
-    late: Mapping[str, bool],
+    parameter_maps: Mapping[str, Any],
 ) -> None:
     """Refuse sensors, unknown delays and errors of inputs that the solver of special points does not know of.
 
-    The noisy inputs, and whether signals may be late, are given by experiment.
+    The sensors are the `Sensors` of the problem; noisy inputs and parameter maps are by experiment.
     """
     for e in experiments:
-        point = e.condition
+        point, late = e.condition, parameter_maps[e.name].delayed or bool(sensors.late_inputs)
         if point is not None and noisy.get(e.name):
             raise ValueError(
                 f"input_noise: must not be of {noisy[e.name]} in {e.name!r}, a jump or resonance point, whose inputs "
                 "are exact. Give their error in its sd."
             )
-        if isinstance(point, PhaseLag) and (late[e.name] or point.output in sensors):
-            given = "unknown delays" if late[e.name] else repr(sensors[point.output])
+        if isinstance(point, PhaseLag) and (late or point.output in sensors.given):
+            given = "unknown delays" if late else repr(sensors.given[point.output])
             raise ValueError(
                 f"sensors: must be without one of {point.output!r} and without unknown delays for the phase in "
                 f"{e.name!r}, got {given}. Correct frequency, amplitude and lag before."

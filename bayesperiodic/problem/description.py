@@ -34,7 +34,6 @@ from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.priors.joint import JointPrior
 from bayesperiodic.priors.single import Uniform
 from bayesperiodic.problem import arguments
-from bayesperiodic.problem.arguments import checked_experiments, checked_local, fixed_values, values_by_name
 from bayesperiodic.problem.parameters import (
     SHIFT,
     ParameterMap,
@@ -51,10 +50,7 @@ LEAST_WIDTH = 1e-12
 
 
 class Description(Printed):
-    """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction and immutable.
-
-    If `forward`, gradients take one solve a parameter, as those of orbits of unknown frequency and of special points.
-    """
+    """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction and immutable."""
 
     def __init__(
         self,
@@ -76,7 +72,7 @@ class Description(Printed):
             raise ValueError(f"model: must be a Model, got {_checks.shortened(model)}.")
         if not isinstance(priors, Mapping):
             raise ValueError(f"priors: must be a mapping of names to priors, got {priors!r}.")
-        self.noise, self.experiments = as_noise(noise), checked_experiments(model, experiments)
+        self.noise, self.experiments = as_noise(noise), arguments.checked_experiments(model, experiments)
         local = local if isinstance(local, str) else tuple(local)
         self.input_noise = checked(input_noise, model.inputs, self.experiments)
         self._settings: dict[str, Any] = {
@@ -107,8 +103,8 @@ class Description(Printed):
         runs = [e.name for e in self.experiments]
         tied, every = dict(tied or {}), (*model.parameters, *self.sensors.names, SHIFT)
         priors, fixed = self.sensors.with_entries(priors, fixed or {})
-        self.local = checked_local(local, every, priors, tied)
-        self.fixed = {n: fixed_values(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
+        self.local = arguments.checked_local(local, every, priors, tied)
+        self.fixed = {n: arguments.fixed_values(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
         phases = self._free_phases(priors, fixed, tied)
         given = expand_priors(priors, self.local, runs, self.fixed) | phases
         self.joint_prior = JointPrior.of(given, free_names(every[:-1], self.local, runs))
@@ -121,8 +117,7 @@ class Description(Printed):
         check_delays(self.experiments, (*self.names, *fixed, *tied, *self.sensors.known_delays))
         kinds = model.parameters, self.sensors.names, self.names
         self.parameter_maps = {run: ParameterMap.of(*kinds, run, self.fixed, tied) for run in runs}
-        late = {run: one.delayed or bool(self.sensors.late_inputs) for run, one in self.parameter_maps.items()}
-        arguments.check_special_points(self.experiments, self.sensors.given, self.noisy_inputs, late)
+        arguments.check_special_points(self.experiments, self.sensors, self.noisy_inputs, self.parameter_maps)
         self.forward = model.autonomous or any(e.condition is not None for e in self.experiments)
         self.ties = self._ties()
         self.frequency_errors = self._known_frequency_errors()
@@ -420,7 +415,7 @@ class Description(Printed):
         ValueError
             For unknown or missing names, or another last axis.
         """
-        return values_by_name("theta", theta, self.names)
+        return arguments.values_by_name("theta", theta, self.names)
 
     def completed(self, theta: Any) -> Any:
         """Return a mapping of θ with the parameters that the problem adds by itself, at their priors' medians.
@@ -465,7 +460,7 @@ class Description(Printed):
             longer = {f"variance[{name}]": name for name in variances}
             renamed = {long if long in names else short: variances[short] for long, short in longer.items()}
             variances = {**self.likelihood.fixed, **renamed}
-        return values_by_name("variances", variances, names)
+        return arguments.values_by_name("variances", variances, names)
 
     def log_prior(self, theta: Mapping[str, float] | np.ndarray) -> np.ndarray:
         """Return Σ ln p(θ_α).
