@@ -208,4 +208,14 @@ WITHOUT_RESULTS = {
     "docs/studies/noisy_inputs.md": {SETTING: ("noise of 1, 3 and 10 % of the input's rms",)},
     "docs/studies/silverbox.md": {ELSEWHERE: ("T. Wigren, J. Schoukens, 2013",)},
     "docs/studies/verdicts.md": {DATE: ("(counted on 21 November 2026)",)},
+    "docs/explanation/response_tables.md": {
+        SETTING: (
+            "by default 10⁻⁴ of", "if that is larger than 10⁻⁴",
+            "Tables take 64 points per period by default, or 32 for",
+        ),
+    },
+    "docs/studies/resonance.md": {
+        SETTING: ("are 1 % of the largest amplitude", "the share of 90 % intervals"),
+        ELSEWHERE: ("Oscillations, 1979",),
+    },
 }  # fmt: skip

@@ -210,8 +210,6 @@ class Experiment(Result):
                 for key, values in (self.guess or {}).items()
             }
             object.__setattr__(self, "guess", guess)
-        if self.sweep is not None:
-            _checks.instance("sweep", self.sweep, Sweep)
         if not (np.isfinite(self.frequency_se) and self.frequency_se >= 0.0):
             raise ValueError(f"frequency_se: must be a finite number, at least 0 [Hz], got {self.frequency_se!r}.")
         for argument in CHANNEL_MAPPINGS:
@@ -219,7 +217,7 @@ class Experiment(Result):
             object.__setattr__(self, argument, given)
             for key in given:
                 _checks.one_of(argument, key, (*self.inputs, *self.outputs))
-        self._check_amplitude_variances()
+        self._check_sweep_and_variances()
         object.__setattr__(self, "clocks", {name: tuple(channels) for name, channels in self.clocks.items()})
         for name, named in self.clocks.items():
             for channel in named:
@@ -274,7 +272,9 @@ class Experiment(Result):
         object.__setattr__(self, "unmeasured", checked)
         return checked
 
-    def _check_amplitude_variances(self) -> None:
+    def _check_sweep_and_variances(self) -> None:
+        if self.sweep is not None:
+            _checks.instance("sweep", self.sweep, Sweep)
         for key, given in self.amplitude_variance.items():
             variance = np.asarray(given, dtype=float)
             if variance.ndim != 1 or not np.all(np.isfinite(variance) & (variance >= 0.0)):

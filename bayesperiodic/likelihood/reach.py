@@ -6,7 +6,6 @@ before the measured frequency f, the point is compared with the orbit at the fol
 zero. So the density is continuous, and falls off beyond the fold over the width w.
 """
 
-from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -36,11 +35,6 @@ class Reach(LinearBlock):
         f = experiment.frequency
         given = common(experiment, REACH_OF_BRANCH, count=0.0, size=1)
         return [cls(measured_frequency=f, resolution=experiment.sweep.resolution * f, **given)]
-
-    @property
-    def layout(self) -> Hashable:
-        """What blocks have in common whose experiments are compared all at once: nothing else is needed."""
-        return None
 
     def compare(self, predicted: ComparedSignals, difference: ComparedSignals) -> np.ndarray:
         """Return the distance; the frequency of the prediction is that of its orbit."""

@@ -1,0 +1,79 @@
+"""Figures of response tables: what is drawn is the table, the branch and its folds."""
+
+from functools import cache
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.diagnostics.response_curves import curves
+from tests.known import LINEAR, linear_experiment
+from tests.response_tables import noisy, problem_of, swept, true_branch
+
+F = np.linspace(0.1, 0.26, 20)
+
+
+@cache
+def solved():
+    problem = problem_of(F, noisy(swept(F, "up"), 0.01, 5), "up")
+    return problem, bp.map_estimate(problem, checks=False, progress=False)
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+def lines(axes, label):
+    return [line for line in axes.lines if line.get_label() == label]
+
+
+def test_the_measured_table_and_both_folds_are_drawn():
+    problem, fit = solved()
+    _, amplitude, _ = bp.plot.response(problem, fit).axes
+    (points,) = lines(amplitude, "measured, sweep up")
+    assert points.get_xdata() == pytest.approx(F)
+    assert points.get_ydata() == pytest.approx(np.abs(noisy(swept(F, "up"), 0.01, 5)), rel=1e-6)
+    (folds,) = lines(amplitude, "fold")
+    frequencies, _, turns = true_branch()
+    assert folds.get_xdata() == pytest.approx(frequencies[turns], abs=2e-3)
+    assert len(lines(amplitude, "jump")) == 1 and lines(amplitude, "MAP, unstable")
+
+
+def test_the_branch_is_stable_outside_the_folds_and_unstable_between_them():
+    problem, fit = solved()
+    (curve,) = curves(problem, fit).values()
+    low, high = sorted(curve.frequency[curve.folds])
+    first, second = np.flatnonzero(curve.folds)
+    between = np.arange(curve.frequency.size)
+    between = (between > first) & (between < second)
+    assert np.all(curve.stable[~between & ~curve.folds]) and not np.any(curve.stable[between])
+    assert np.all((curve.frequency[between] > low) & (curve.frequency[between] < high))
+
+
+def test_phases_are_drawn_beside_the_branch_without_jumps_of_a_turn():
+    problem, fit = solved()
+    _, _, phase = bp.plot.response(problem, fit).axes
+    (points,) = lines(phase, "measured, sweep up")
+    branch = np.concatenate([line.get_ydata() for line in lines(phase, "MAP")])
+    assert np.ptp(points.get_ydata()) < 200.0
+    assert np.nanmin(branch) - 20.0 < points.get_ydata().min() <= points.get_ydata().max() < np.nanmax(branch) + 20.0
+
+
+def test_a_problem_without_a_table_is_refused():
+    problem = bp.Problem(
+        LINEAR, [linear_experiment(np.array([1e3, 10.0, 5.0]), 1.0, 1)], priors={"k": bp.LogNormal(1e3, 1.0)},
+        fixed={"c": 10.0, "coulomb": 5.0},
+    )  # fmt: skip
+    fit = bp.map_estimate(problem, checks=False, progress=False)
+    with pytest.raises(ValueError, match="must have experiments of a table of responses"):
+        bp.plot.response(problem, fit)
+
+
+def test_reports_show_the_table(tmp_path):
+    problem, fit = solved()
+    fit = bp.map_estimate(problem, start=fit.theta, progress=False)
+    page = bp.report(problem, fit, None, tmp_path / "report.html").read_text(encoding="utf-8")
+    assert 'id="figure-response"' in page and "Measured responses over frequency" in page
