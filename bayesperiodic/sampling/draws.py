@@ -21,6 +21,7 @@ from bayesperiodic.likelihood.input_noise import InputErrors
 from bayesperiodic.likelihood.section_points import SCALE
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 from bayesperiodic.priors.joint import MultivariateNormal
+from bayesperiodic.priors.stored import PRIORS, as_text
 from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.fingerprint import check_fingerprint, fingerprint
 from bayesperiodic.problem.parameters import (
@@ -488,7 +489,7 @@ def gather(
     """
     names = density.labels
     data = tree(density, kept, log_density, seed, modes)
-    data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason}
+    data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason, PRIORS: as_text(density.problem.priors)}
     tau, group = convergence.autocorrelation_time(kept), data["posterior"].to_dataset()
     return Posterior(
         tree=data,
