@@ -16,7 +16,7 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.priors.single import HalfNormal, Uniform
 from bayesperiodic.sampling.membership import USABLE_WEIGHTS, Expected, estimate
 from bayesperiodic.sampling.population_chains import Chains, sample_chains
-from bayesperiodic.sampling.population_density import PopulationDensity, Hierarchy
+from bayesperiodic.sampling.population_density import Hierarchy, PopulationDensity
 from bayesperiodic.sampling.population_evidence import evidence_for_spread
 from bayesperiodic.sampling.population_result import Population, coordinate_prior, gather_population
 from bayesperiodic.sampling.population_units import UnitDraws, checked_names, sampled, task_of, unit_draws

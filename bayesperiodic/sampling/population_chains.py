@@ -7,7 +7,7 @@ import emcee
 import numpy as np
 from tqdm import tqdm
 
-from bayesperiodic.sampling.convergence import PASSES, autocorrelation_time, stop_rule
+from bayesperiodic.sampling.convergence import PASSES, autocorrelation_time, unmet_criteria
 from bayesperiodic.sampling.population_density import PopulationDensity
 from bayesperiodic.sampling.proposals import (
     MIXTURE_STEPS,
@@ -79,28 +79,32 @@ class _Run:
         """Find the coordinates and the mixture."""
         chains, _ = self.advance(FIRST_ROUNDS * STEPS_A_ROUND)
         self.whiten(chains[:, chains.shape[1] // 2 :])
+        rounds: list[np.ndarray] = []
         for _ in range(FITTED_ROUNDS):
             chains, log_density = self.advance(STEPS_A_ROUND)
             points = chains.reshape(-1, chains.shape[-1])
             if self.mixture and expected_time(self.mixture, points, log_density.ravel(), MIXTURE_STEPS) <= FAST_ENOUGH:
                 return
-            if points.std(axis=0).min() > 0.0:
-                self.mixture = fit_mixture(chains.reshape(ENSEMBLES, -1, chains.shape[-1]))
+            rounds.append(chains.reshape(ENSEMBLES, -1, chains.shape[-1]))
+            self.mixture = fit_mixture(np.concatenate(rounds[len(rounds) // 2 :], axis=1))
 
 
 def sample_chains(density: PopulationDensity, seed: int, *, progress: bool) -> Chains:
-    """Return draws of the parameters of a population; the stop rule is that of `sample`."""
+    """Return draws of the parameters of a population; the stop rule is that of `sample`, but for changes of tau.
+
+    Where nearly all proposals are independent of the walkers, tau needs no further check.
+    """
     with tqdm(unit="step", desc="population", disable=not progress) as bar:
         run = _Run(density, seed, bar)
         run.adapt()
         kept: list[np.ndarray] = []
-        last, passes, following, missing = np.empty(0), 0, 2, ["no check yet"]
+        passes, following, missing = 0, 2, ["no check yet"]
         while passes < PASSES and len(kept) < MOST_ROUNDS:
             kept.append(run.advance(STEPS_A_ROUND)[0])
             if len(kept) < following:
                 continue
             chains = run.transform.unwhiten(np.concatenate(kept, axis=1))
-            last, missing = stop_rule(chains, None, last, density.labels)
+            missing = unmet_criteria(chains, tau := autocorrelation_time(chains), tau, density.labels)
             passes = 0 if missing else passes + 1
             following = len(kept) + max(1, len(kept) // 4)
     chains = run.transform.unwhiten(np.concatenate(kept, axis=1))

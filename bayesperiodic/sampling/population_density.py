@@ -70,7 +70,7 @@ class Hierarchy:
         )
 
     def parameters(self, points: np.ndarray) -> Parameters:
-        """Return the parameters at points (points, labels): means, slopes, ln spreads, artanh of partial correlations."""
+        """Return the parameters at points (points, labels): means, slopes, ln spread, artanh of correlations."""
         size, (first, second, third) = len(self.names), np.cumsum([len(self.names), len(self.sloped), len(self.free)])
         slopes = np.zeros((len(points), size, len(self.covariates)))
         for place, (name, covariate) in enumerate(self.sloped):

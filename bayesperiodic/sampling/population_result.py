@@ -56,7 +56,8 @@ class Population(Result):
         and so on, those under the population, in the parameter's unit; ``pareto_k`` and ``effective``, the k̂ of the
         weights and the effective number of the unit's draws; ``p``, the probability that a member deviates at least as
         much from the population of the others, NaN if that cannot be computed from the draws; ``again``, 1 if it was
-        sampled under the population; ``robust``, 1 if its draws are robust, as the model is misspecified; the covariates.
+        sampled under the population; ``robust``, 1 if its draws are robust, as the model is misspecified; and the
+        covariates.
     evidence : DataFrame
         One row per parameter with a free spread: ``log_bayes_factor`` of a spread against none, by the ratio of the
         densities at zero; ``bridge`` and ``bridge_error``, the same by bridge sampling where the first is within ±5.
@@ -223,10 +224,10 @@ class Population(Result):
         """Test whether a unit that is none of the population's units is a member, and in which parameters it is not.
 
         The estimate of the unit by its data alone, a normal approximation in sampling coordinates with its prior
-        divided out, is compared with estimates of such a unit that the population predicts, its own uncertainty included. Each
-        parameter has a p-value, and all together another; their levels sum to `false_alarm`. For units that are drawn
-        like those of the population that is at most the rate of false alarms, on average over populations that are as
-        probable as the draws say.
+        divided out, is compared with estimates of such a unit that the population predicts, its own uncertainty
+        included. Each parameter has a p-value, and all together another; their levels sum to `false_alarm`. For units
+        that are drawn like those of the population that is at most the rate of false alarms, on average over
+        populations that are as probable as the draws say.
 
         Parameters
         ----------
@@ -316,7 +317,9 @@ class Population(Result):
     def _verdict(self, name: str) -> str:
         row, values = self.evidence.loc[name].to_dict(), self.draws(f"spread[{name}]")
         unit = self.coordinates[name]["unit"]
-        suffix, factor = (" %", 100.0) if self.coordinates[name]["logarithmic"] else (f" {unit}" * (unit != "1"), 1.0)
+        suffix, factor = (
+            (" %", 100.0) if self.coordinates[name]["logarithmic"] else (f" {unit}" * (unit not in ("", "1")), 1.0)
+        )
         size = f"{factor * values.mean():.2g} ± {factor * values.std(ddof=1):.1g}{suffix}"
         below = f"{factor * np.quantile(values, 0.95):.2g}{suffix}"
         log = row["log_bayes_factor"]

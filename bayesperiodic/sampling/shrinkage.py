@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.membership import USABLE_WEIGHTS, UnitEstimate, Expected
+from bayesperiodic.sampling.membership import USABLE_WEIGHTS, Expected, UnitEstimate
 from bayesperiodic.sampling.population_chains import Chains
 from bayesperiodic.sampling.population_density import Members, Parameters, PopulationDensity
 
