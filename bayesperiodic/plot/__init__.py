@@ -8,11 +8,12 @@ from bayesperiodic.plot.diagnostics import comparison, models, profile, ranks
 from bayesperiodic.plot.estimates import fit, loops, traces
 from bayesperiodic.plot.overview import summary
 from bayesperiodic.plot.pairs import corner, marginals
+from bayesperiodic.plot.populations import population
 from bayesperiodic.plot.recording import recording
 from bayesperiodic.plot.style import COLOURS
 from bayesperiodic.plot.terms import missing_terms
 
 __all__ = [
     "COLOURS", "branch", "comparison", "corner", "fit", "loops", "marginals", "missing_terms", "models", "orbits",
-    "profile", "ranks", "recording", "section", "summary", "traces",
+    "population", "profile", "ranks", "recording", "section", "summary", "traces",
 ]  # fmt: skip

@@ -104,7 +104,8 @@ def sample_chains(density: PopulationDensity, seed: int, *, progress: bool) -> C
             if len(kept) < following:
                 continue
             chains = run.transform.unwhiten(np.concatenate(kept, axis=1))
-            missing = unmet_criteria(chains, tau := autocorrelation_time(chains), tau, density.labels)
+            times = autocorrelation_time(chains)
+            missing = unmet_criteria(chains, times, times, density.labels)
             passes = 0 if missing else passes + 1
             following = len(kept) + max(1, len(kept) // 4)
     chains = run.transform.unwhiten(np.concatenate(kept, axis=1))

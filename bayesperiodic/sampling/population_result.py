@@ -25,6 +25,8 @@ KEPT_STEPS = 8000
 # Log Bayes factors of strong (20 to 1) and of positive evidence (3 to 1); p-value of all units together, below which
 # units are outside.
 STRONG, POSITIVE, OUTSIDE = 3.0, 1.1, 0.01
+# Difference of two estimates of a log Bayes factor beyond their errors.
+LARGEST_DIFFERENCE = 0.7
 FALSE_ALARM = 0.01
 QUANTILES = "q05", "q50", "q95"
 
@@ -60,7 +62,8 @@ class Population(Result):
         covariates.
     evidence : DataFrame
         One row per parameter with a free spread: ``log_bayes_factor`` of a spread against none, by the ratio of the
-        densities at zero; ``bridge`` and ``bridge_error``, the same by bridge sampling where the first is within ±5.
+        densities at zero, and its ``error``; ``bridge`` and ``bridge_error``, the same by bridge sampling where the
+        first is within ±5.
     converged : bool
     reason : str
     tau : dict of str to float
@@ -317,21 +320,23 @@ class Population(Result):
     def _verdict(self, name: str) -> str:
         row, values = self.evidence.loc[name].to_dict(), self.draws(f"spread[{name}]")
         unit = self.coordinates[name]["unit"]
-        suffix, factor = (
+        suffix, scale = (
             (" %", 100.0) if self.coordinates[name]["logarithmic"] else (f" {unit}" * (unit not in ("", "1")), 1.0)
         )
-        size = f"{factor * values.mean():.2g} ± {factor * values.std(ddof=1):.1g}{suffix}"
-        below = f"{factor * np.quantile(values, 0.95):.2g}{suffix}"
+        size = f"{scale * values.mean():.2g} ± {scale * values.std(ddof=1):.1g}{suffix}"
+        below = f"{scale * np.quantile(values, 0.95):.2g}{suffix}"
         log = row["log_bayes_factor"]
         known = " beyond the covariates" if self.covariates else ""
-        if abs(log - row["bridge"]) > 3.0 * row["bridge_error"] + 0.5:
+        if abs(log - row["bridge"]) > 3.0 * row["bridge_error"] + LARGEST_DIFFERENCE:
             return (
                 f"Whether {name} differs between units is undecided: two estimates of the evidence disagree "
                 f"({log:.1f} and {row['bridge']:.1f}); spread {size}."
             )
-        if log > STRONG:
-            return f"{name} differs between units{known}: spread {size}, not explained by noise ({_factor(log)})."
-        if log < -POSITIVE:
+        # Twice the error, so that few draws in the tails decide nothing.
+        if log - 2.0 * row["error"] > STRONG:
+            factor = _factor(log - 2.0 * row["error"])
+            return f"{name} differs between units{known}: spread {size}, not explained by noise ({factor} at least)."
+        if log + 2.0 * row["error"] < -POSITIVE:
             return f"No spread of {name} is seen{known}: below {below} with 95 % probability ({_factor(log)})."
         return f"Whether {name} differs between units is undecided: spread below {below} ({_factor(log)})."
 
