@@ -14,7 +14,8 @@ from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.population_density import Parameters
 from bayesperiodic.sampling.population_units import UnitDraws
 
-USABLE_WEIGHTS = 0.7
+# Pareto k̂ above which, and effective draws below which, a unit's draws are no importance sample.
+USABLE_WEIGHTS, FEWEST_EFFECTIVE = 0.7, 50.0
 # Probability to find a deviation that is as large as estimated; most repeats that are considered; simulated units.
 REQUIRED_POWER, MOST_REPEATS, SIMULATED = 0.9, 1000, 20_000
 
@@ -49,7 +50,7 @@ class MembershipTest(Result):
     @property
     def differing(self) -> tuple[str, ...]:
         """Parameters in which the unit is no member."""
-        return tuple(str(name) for name, p in self.table["p"].items() if p < self.level and name != ALL)
+        return tuple(str(name) for name, p in self.table["p"].items() if p < self.level and name != TOGETHER)
 
     def __repr__(self) -> str:
         table = self.table.to_string(float_format="{:.4g}".format)
@@ -68,7 +69,7 @@ class MembershipTest(Result):
         return f"No difference from the population is shown ({rate}){tail}. That does not show that there is none."
 
 
-ALL = "all"
+TOGETHER = "all"
 
 
 class UnitEstimate(NamedTuple):
@@ -170,5 +171,5 @@ def membership(
     table = pd.DataFrame(columns, index=list(names))
     if several:
         row = dict.fromkeys(columns, np.nan) | {"p": expected.joint(given, np.random.default_rng(seed))}
-        table.loc[ALL] = row
+        table.loc[TOGETHER] = row
     return MembershipTest(name, bool((table["p"] >= level).all()), table, level, false_alarm)

@@ -14,7 +14,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic._parallel import TaskPool, checked_executor
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.priors.single import HalfNormal, Uniform
-from bayesperiodic.sampling.membership import USABLE_WEIGHTS, Expected, estimate
+from bayesperiodic.sampling.membership import FEWEST_EFFECTIVE, USABLE_WEIGHTS, Expected, estimate
 from bayesperiodic.sampling.population_chains import Chains, sample_chains
 from bayesperiodic.sampling.population_density import Hierarchy, PopulationDensity
 from bayesperiodic.sampling.population_evidence import evidence_for_spread
@@ -51,8 +51,9 @@ def population(
     any population [1]_ [2]_, so that the mean, the spread and the slopes are all that is sampled then, by emcee with
     proposals from a mixture. The posterior is that of the joint hierarchical model, up to the Monte Carlo error of 2000
     draws a unit, which are smoothed by a kernel that keeps their mean and covariance; so a spread of zero is no special
-    case. The prior of the mean is flat. A unit whose weights have a Pareto k̂ above 0.7 [3]_ is sampled again, with the
-    present population as its prior, if its problem was given; otherwise a warning names it.
+    case. The prior of the mean is flat. A unit whose weights have a Pareto k̂ above 0.7 [3]_, or fewer than 50 effective
+    draws, is sampled again, with the present population as its prior, if its problem was given; otherwise a warning
+    names it.
 
     Parameters
     ----------
@@ -279,7 +280,8 @@ def fitted(
         chains = sample_chains(density, seed, progress=progress)
         shrunken = shrink(density, chains, seed)
         calls += chains.calls
-        bad = {m for m, k in zip(members, shrunken.pareto_k, strict=True) if not k <= USABLE_WEIGHTS}
+        usable = (shrunken.pareto_k <= USABLE_WEIGHTS) & (shrunken.effective >= FEWEST_EFFECTIVE)
+        bad = {member for member, enough in zip(members, usable, strict=True) if not enough}
         wanted = {name: unit for name, unit in units.items() if bad & {*unit.members}}
         if not wanted or redraws is None or turn == MOST_TURNS:
             break
@@ -316,7 +318,8 @@ def _warn(chains: Chains, bad: Sequence[str]) -> None:
         warnings.warn(f"The population has not converged ({chains.reason}).", stacklevel=4)
     if bad:
         warnings.warn(
-            f"Draws of {', '.join(bad)} are no importance sample of the population (Pareto k > {USABLE_WEIGHTS}); give "
+            f"Draws of {', '.join(bad)} are no importance sample of the population (Pareto k > {USABLE_WEIGHTS} or "
+            f"fewer than {FEWEST_EFFECTIVE:.0f} effective draws); give "
             "(problem, posterior) for these units, with single priors, and they are sampled again.",
             stacklevel=4,
         )

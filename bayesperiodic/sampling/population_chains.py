@@ -19,7 +19,7 @@ from bayesperiodic.sampling.proposals import (
     moves,
 )
 
-ENSEMBLES, FEWEST_WALKERS, STEPS_A_ROUND, MOST_ROUNDS = 4, 16, 50, 200
+CHAINS, LEAST_WALKERS, STEPS_A_ROUND, MOST_ROUNDS = 4, 16, 50, 200
 # Rounds before the first mixture, and most rounds in which it is fitted; it is kept at this expected time [steps].
 FIRST_ROUNDS, FITTED_ROUNDS, FAST_ENOUGH = 2, 16, 3.0
 
@@ -41,11 +41,11 @@ class _Run:
     def __init__(self, density: PopulationDensity, seed: int, bar: Any):
         self.density, self._bar, self.calls = density, bar, 0
         dimension, (centre, scale) = density.dimension, density.start
-        self.walkers = max(FEWEST_WALKERS, 2 * (dimension + dimension % 2))
+        self.walkers = max(LEAST_WALKERS, 2 * (dimension + dimension % 2))
         self.transform = AffineTransform(centre, np.diag(scale))
         self.random = np.random.RandomState(np.random.default_rng(seed).integers(2**32, size=4))
         self.walk = emcee.State(
-            self.random.standard_normal((ENSEMBLES * self.walkers, dimension)), random_state=self.random.get_state()
+            self.random.standard_normal((CHAINS * self.walkers, dimension)), random_state=self.random.get_state()
         )
         self.mixture: StudentMixture | None = None
 
@@ -58,13 +58,13 @@ class _Run:
 
         mixture = MixtureMove(self.mixture) if self.mixture else None
         sampler = emcee.EnsembleSampler(
-            *self.walk.coords.shape, log_prob, moves=moves(ENSEMBLES, mixture), vectorize=True
+            *self.walk.coords.shape, log_prob, moves=moves(CHAINS, mixture), vectorize=True
         )  # fmt: skip
         for walk in sampler.sample(self.walk, iterations=steps, skip_initial_state_check=True):
             self.walk = walk
             self._bar.update()
         values = sampler.get_chain(), sampler.get_log_prob()
-        chains, log_density = (v.reshape(steps, ENSEMBLES, self.walkers, *v.shape[2:]).swapaxes(0, 1) for v in values)
+        chains, log_density = (v.reshape(steps, CHAINS, self.walkers, *v.shape[2:]).swapaxes(0, 1) for v in values)
         return chains, log_density
 
     def whiten(self, chains: np.ndarray) -> None:
@@ -85,7 +85,7 @@ class _Run:
             points = chains.reshape(-1, chains.shape[-1])
             if self.mixture and expected_time(self.mixture, points, log_density.ravel(), MIXTURE_STEPS) <= FAST_ENOUGH:
                 return
-            rounds.append(chains.reshape(ENSEMBLES, -1, chains.shape[-1]))
+            rounds.append(chains.reshape(CHAINS, -1, chains.shape[-1]))
             self.mixture = fit_mixture(np.concatenate(rounds[len(rounds) // 2 :], axis=1))
 
 

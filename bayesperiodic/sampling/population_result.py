@@ -15,11 +15,11 @@ from bayesperiodic.priors.single import LogNormal, Normal, TruncatedNormal
 from bayesperiodic.problem.parameters import CHAIN, DRAW
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.convergence import QUANTILE_LEVELS
-from bayesperiodic.sampling.membership import USABLE_WEIGHTS, Expected, MembershipTest, membership
+from bayesperiodic.sampling.membership import FEWEST_EFFECTIVE, USABLE_WEIGHTS, Expected, MembershipTest, membership
 from bayesperiodic.sampling.population_density import Parameters
 from bayesperiodic.sampling.population_units import Coordinate, sampled, task_of, unit_draws
 
-POPULATION_UNIT, PARAMETER, UNITS = "unit", "parameter", "units"
+POPULATION_UNIT, PARAMETER, UNIT_GROUP = "unit", "parameter", "units"
 # Draws of the population in results.
 KEPT_STEPS = 8000
 # Log Bayes factors of strong (20 to 1) and of positive evidence (3 to 1); p-value of all units together, below which
@@ -148,7 +148,7 @@ class Population(Result):
         ValueError
             For an unknown unit or parameter.
         """
-        values = self.tree[UNITS]["shrunken"]
+        values = self.tree[UNIT_GROUP]["shrunken"]
         _checks.one_of("unit", unit, values[POPULATION_UNIT].to_numpy().tolist())
         _checks.one_of("name", name, self.names)
         return values.sel({POPULATION_UNIT: unit, PARAMETER: name}).to_numpy()
@@ -349,7 +349,8 @@ class Population(Result):
                 f"The model is misspecified in {len(wrong)} units; their draws are robust, and the spread includes the "
                 "part of the error of the model that differs between units."
             )
-        if bad := sorted({*self.units[POPULATION_UNIT][~(self.units["pareto_k"] <= USABLE_WEIGHTS)]}):
+        poor = ~(self.units["pareto_k"] <= USABLE_WEIGHTS) | (self.units["effective"] < FEWEST_EFFECTIVE)
+        if bad := sorted({*self.units[POPULATION_UNIT][poor]}):
             lines.append(f"Unreliable: the draws of {', '.join(bad)} are no importance sample of the population.")
         lines += [f"{unit} is left out: {reason}." for unit, reason in self.left_out.items()]
         return lines
@@ -406,7 +407,7 @@ def gather_population(
     tree = xr.DataTree.from_dict(
         {
             "posterior": xr.Dataset({label: ((CHAIN, DRAW), x) for label, x in every.items()}),
-            UNITS: xr.Dataset({"shrunken": (dims, natural)}, coords=coords),
+            UNIT_GROUP: xr.Dataset({"shrunken": (dims, natural)}, coords=coords),
         }
     )
     return Population(

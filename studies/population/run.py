@@ -3,7 +3,8 @@
 Simulated springs with a known spread of the damping and none of the stiffness, one more like them and one that is not.
 Measured: twelve steady-sine tests of a banded rotary friction damper with backlash (github.com/ARTS-Laboratory/
 Dataset-Friction-Damper-with-Backlash, commit 0e09aa9d), friction force Kw and sharpness rho of Dahl's model by
-amplitude, frequency and band tension; each test is predicted from the others. Without the files only the springs.
+amplitude, frequency and band tension; with ``--replicates N`` the first N tests are predicted from all others. Without
+the files only the springs.
 """
 
 import argparse
@@ -53,7 +54,8 @@ def run(options: argparse.Namespace) -> None:
         with watch.part("tests", "sampling the tests of the friction damper one by one"):
             posteriors = {path.stem: sampled_test(path, options.seed) for path in paths}
         with watch.part("dampers", "sampling their population, and that of all but one"):
-            dampers, results["dampers"] = damper_population(posteriors, options.seed)
+            left_out = list(posteriors)[: options.replicates]
+            dampers, results["dampers"] = damper_population(posteriors, left_out, options.seed)
             figures["forest"] = common.titled(bp.plot.population(dampers), "Friction damper, twelve tests")
             figures["amplitude"] = common.titled(
                 bp.plot.population(dampers, covariate="amplitude"), "Friction damper, by amplitude [m]"
@@ -130,27 +132,30 @@ def sampled_test(path: Path, seed: int) -> bp.Posterior:
         return bp.sample(problem, bp.map_estimate(problem, progress=False), seed=seed, progress=False)
 
 
-def damper_population(posteriors: dict[str, bp.Posterior], seed: int) -> tuple[bp.Population, dict[str, Any]]:
-    """Return the population of all tests, and how each is predicted by the others."""
+def damper_population(
+    posteriors: dict[str, bp.Posterior], chosen: list[str], seed: int
+) -> tuple[bp.Population, dict[str, Any]]:
+    """Return the population of all tests, and how some are predicted by all others."""
 
     def fit(names: list[str]) -> bp.Population:
         covariates = {what: {name: conditions(name)[what] for name in names} for what in conditions(names[0])}
-        chosen = {name: posteriors[name] for name in names}
-        return bp.population(chosen, DAMPER_NAMES, covariates=covariates, seed=seed, progress=False)
+        units = {name: posteriors[name] for name in names}
+        return bp.population(units, DAMPER_NAMES, covariates=covariates, seed=seed, progress=False)
 
-    result, predicted = fit(list(posteriors)), {}
-    for left_out in posteriors:
+    result = fit(list(posteriors))
+    predicted: dict[str, dict[str, Any]] = {}
+    for left_out in chosen:
         others = fit([name for name in posteriors if name != left_out])
         intervals = {
             name: np.quantile(draws, [0.05, 0.95]).tolist()
             for name, draws in others.predict(conditions(left_out)).items()
         }
         medians = {name: float(np.median(posteriors[left_out].headline.draws(name))) for name in DAMPER_NAMES}
-        inside = {name: low <= medians[name] <= high for name, (low, high) in intervals.items()}
+        inside = {name: bool(low <= medians[name] <= high) for name, (low, high) in intervals.items()}
         test = others.test(posteriors[left_out], covariates=conditions(left_out))
         predicted[left_out] = {"interval_90": intervals, "median": medians, "inside": inside, "member": test.member}
-    inside = {name: sum(row["inside"][name] for row in predicted.values()) for name in DAMPER_NAMES}
-    return result, _account(result) | {"tests": len(posteriors), "predicted": predicted, "inside_90": inside}
+    counts = {name: sum(row["inside"][name] for row in predicted.values()) for name in DAMPER_NAMES}
+    return result, _account(result) | {"tests": len(posteriors), "predicted": predicted, "inside_90": counts}
 
 
 def _account(result: bp.Population) -> dict[str, Any]:

@@ -343,3 +343,22 @@ def test_draws_without_their_prior_are_refused():
     with pytest.raises(ValueError, match="draws without the prior of k"):
         bp.population(dict.fromkeys("abc", old), ["k"], seed=1)
     assert bp.population(dict.fromkeys("abc", (problem, old)), ["k"], seed=1, progress=False).names == ("k",)
+
+
+@pytest.mark.slow
+def test_units_with_few_effective_draws_are_sampled_again_under_the_population():
+    units = {f"gear {k + 1}": (problem, posterior) for k, (problem, posterior) in enumerate(gear_posteriors().values())}
+    problem, _ = units["gear 5"]
+    vague = problem.replace(
+        priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1.0, 3.0)},
+        fixed={**problem.fixed, "variance[displacement]": 1e4},
+    )
+    draws = bp.sample(vague, bp.map_estimate(vague, progress=False), seed=1, progress=False)
+    spread = {"k": bp.HalfNormal(0.1)}
+    with pytest.warns(UserWarning, match="gear 5 are no importance sample"):
+        bp.population(units | {"gear 5": draws}, ["k"], spread=spread, seed=1, progress=False)
+    result = bp.population(units | {"gear 5": (vague, draws)}, ["k"], spread=spread, seed=1, progress=False)
+    table = result.units.set_index("unit")
+    assert table["again"].to_dict() == {name: int(name == "gear 5") for name in units}
+    assert table.loc["gear 5", "effective"] > 200
+    assert result.unit_calls > sum(p.log_posterior_calls for _, p in units.values())
