@@ -10,8 +10,11 @@ from numpy.typing import ArrayLike
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result, Storable
 from bayesperiodic._linalg import covariance_cholesky
+from bayesperiodic.data import measurements as kinds
+from bayesperiodic.data.measurements import Measurement
 from bayesperiodic.data.recording_check import Finding
 from bayesperiodic.data.response_period import summary
+from bayesperiodic.data.sweep import Sweep
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -103,6 +106,11 @@ class Experiment(Result):
         be a parameter of a `Problem`.
     synthetic : bool
         True if the data were simulated.
+    measurements : sequence of Measurement, optional
+        What instruments tell of channels without a time history, see `bp.measurements`: amplitudes, phases,
+        peak-to-peak and rms values. Then `outputs` may be empty.
+    sweep : Sweep, optional
+        The table of responses that the experiment is a point of; see `response_table`.
     mask : bool array (samples·periods,), optional
         True at the points where the outputs were measured, such as the points of a Poincaré section; other entries
         are ignored.
@@ -166,6 +174,8 @@ class Experiment(Result):
     findings: tuple[Finding, ...] = field(default=(), kw_only=True)
     clocks: Mapping[str, tuple[str, ...]] = field(default_factory=dict, kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
+    measurements: Sequence[Measurement] = field(default=(), kw_only=True)
+    sweep: Sweep | None = field(default=None, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
     covariance: np.ndarray | None = field(default=None, kw_only=True)
     multipliers: np.ndarray | None = field(default=None, kw_only=True)
@@ -195,6 +205,8 @@ class Experiment(Result):
                 for key, values in (self.guess or {}).items()
             }
             object.__setattr__(self, "guess", guess)
+        if self.sweep is not None:
+            _checks.instance("sweep", self.sweep, Sweep)
         if not (np.isfinite(self.frequency_se) and self.frequency_se >= 0.0):
             raise ValueError(f"frequency_se: must be a finite number, at least 0 [Hz], got {self.frequency_se!r}.")
         for argument in CHANNEL_MAPPINGS:
@@ -211,6 +223,11 @@ class Experiment(Result):
             _checks.one_of("error_slopes", name, self.inputs)
             for channel in slopes:
                 _checks.one_of(f"error_slopes[{name!r}]", channel, self.outputs)
+        object.__setattr__(self, "measurements", kinds.checked(self.measurements, self.outputs))
+        if self.measurements and self.mask is not None:
+            raise ValueError(
+                "mask: must be left out of an experiment with measurements of amplitudes, phases or sizes."
+            )
         measured = int(self.measured_points.sum())
         _checks.integer("cycles", self.cycles, 1)
         if self.averaged is not None:
@@ -403,6 +420,12 @@ class Experiment(Result):
         """The Floquet multipliers that were measured, (multipliers,); none by default."""
         return np.empty(0) if self.multipliers is None else self.multipliers
 
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The outputs of which something was measured."""
+        of = (channel for one in self.measurements for channel in (one.channel, *one.others))
+        return tuple(dict.fromkeys((*self.outputs, *(channel for channel in of if channel not in self.inputs))))
+
     def without_multipliers(self) -> "Experiment":
         """Return the experiment without its multipliers.
 
@@ -453,7 +476,9 @@ class Experiment(Result):
         return values - _fourier.on_grid(amplitudes, points)
 
     def __repr__(self) -> str:
-        counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
+        shown = [f"{k} ({n} independent values)" for k, n in self.independent.items()]
+        shown += dict.fromkeys(one.label for one in self.measurements)
+        counts = ", ".join(shown)
         without = (f"{k} without harmonics {', '.join(map(str, h))}" for k, h in self.unmeasured.items())
         text = "".join(f"; {each}" for each in without)
         error = f" ± {self.frequency_se:.2g} Hz" if self.frequency_se else ""

@@ -10,19 +10,22 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.initial_orbits import Guesses, experiments_guesses
+from bayesperiodic.density.sweeps import Place, Point, places, reach_further, tables
 from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
 from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved, directional_sensitivities
 from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
-from bayesperiodic.periodic.solution import PeriodicSolution, describe, logarithmic_jacobian
+from bayesperiodic.periodic.solution import PeriodicSolution, as_guess, describe, logarithmic_jacobian
 from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.model_inputs import without_sensors
 from bayesperiodic.problem.parameters import ParameterMaps
 
 NO_HISTORY = np.empty((0, 3))
+# Relative step of differences of orbits at folds.
+DIFFERENCE = 1e-5
 
 
 class InitialOrbit(NamedTuple):
@@ -31,6 +34,7 @@ class InitialOrbit(NamedTuple):
     guess: Any  # states (points,) by name, or "static", from which to solve where the anchor fails
     anchor: Anchor
     derivatives: Sensitivities | None  # of outputs and frequency by all parameters; None where they do not exist
+    sheet: int | None = None  # of the branch of a table, see `sweeps`; None if it is not known
 
 
 class ResponseSolver:
@@ -38,29 +42,58 @@ class ResponseSolver:
 
     def __init__(self, problem: Description, anchors: Mapping[str, InitialOrbit]):
         self.problem, self.anchors = problem, anchors
+        self._changes: tuple[np.ndarray, Simulation] | None = None
 
     @classmethod
     def start(cls, problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> "ResponseSolver":
-        """Return the solver anchored at θ (names,), solved from guesses, the experiments' own or the equilibrium."""
+        """Return the solver anchored at θ (names,), solved from guesses, the experiments' own or the equilibrium.
+
+        Points of tables without a guess start from the branch that leads through the table.
+        """
+        near = None
         if guesses is None:
             chosen: dict[str, Any] = experiments_guesses(problem, theta)
         else:
             _checks.same_names("guesses", guesses, [e.name for e in problem.experiments])
             chosen = {e.name: replace(e, guess=guesses[e.name]).guess for e in problem.experiments}
-        return cls(problem, {name: _initial_orbit(problem, name, theta, g or "static") for name, g in chosen.items()})
+            near = {name: as_guess(problem.equations[name], guess) for name, guess in chosen.items() if guess}
+        on_branch, anchors = places(problem, theta, near), {}
+        for name, guess in chosen.items():
+            if name in on_branch:
+                anchors[name] = _placed(problem, name, theta, guess or "static", on_branch[name])
+            else:
+                anchors[name] = _initial_orbit(problem, name, theta, guess or "static")
+        return cls(problem, anchors)
 
     def __getstate__(self) -> dict[str, Any]:
         # The factors at the anchors are computed again; the anchors are kept to the last bit.
-        return {key: value for key, value in self.__dict__.items() if key != "_batches"}
+        return {key: value for key, value in self.__dict__.items() if key != "_batches"} | {"_changes": None}
 
     def anchored(self, theta: np.ndarray) -> "ResponseSolver":
         """Return the solver anchored at θ (names,), solved from the present anchors, else from the guesses."""
         simulation, anchors = self.solve(theta[None], keep=True, polish=True), {}
+        lost = [name for name, orbit in self.anchors.items() if simulation.statuses(name)[0] != CONVERGED]
+        again = {}
+        if any(self.anchors[name].sheet is not None for name in lost):
+            again = places(self.problem, theta, {name: orbit.anchor.z for name, orbit in self.anchors.items()})
         for name, orbit in self.anchors.items():
-            converged = simulation.statuses(name)[0] == CONVERGED
-            solved = self._solved(simulation, name) if converged else None
-            anchors[name] = _initial_orbit(self.problem, name, theta, orbit.guess, solved)
+            if name in lost and name in again:
+                anchors[name] = _placed(self.problem, name, theta, orbit.guess, again[name])
+            elif name in lost or orbit.sheet is None:
+                solved = None if name in lost else self._solved(simulation, name)
+                anchors[name] = _initial_orbit(self.problem, name, theta, orbit.guess, solved)
+            else:
+                here = Place(orbit.sheet, *self._solved(simulation, name), name not in self.beyond(simulation))
+                anchors[name] = _placed(self.problem, name, theta, orbit.guess, here)
         return ResponseSolver(self.problem, anchors)
+
+    def beyond(self, simulation: Simulation) -> list[str]:
+        """Return the points of tables that the branch does not reach at the first of the solves, see `sweeps`."""
+        return [
+            e.name
+            for e in self.problem.experiments
+            if self.anchors[e.name].sheet is not None and simulation.response(e.name).frequency[0] != e.frequency
+        ]
 
     def _solved(self, simulation: Simulation, experiment: str, i: int = 0) -> tuple[PeriodicEquations, np.ndarray]:
         """Return the equations at the frequency of one of the solves, and its z."""
@@ -94,6 +127,18 @@ class ResponseSolver:
             for group in self.groups
         ]
 
+    @cached_property
+    def _sheets(self) -> list[list[Point]]:
+        """The points of each sheet of the tables' branches, in the order of the sweep."""
+        result: dict[Any, list[Point]] = {}
+        for sweep, table in tables(self.problem).items():
+            for name in (e.name for e in table):
+                orbit = self.anchors[name]
+                if orbit.sheet is not None:
+                    known = orbit.anchor.sensitivities is not None
+                    result.setdefault((sweep, orbit.sheet), []).append(Point(name, *self._places[name], known))
+        return list(result.values())
+
     def solve(
         self,
         theta: np.ndarray,
@@ -109,7 +154,7 @@ class ResponseSolver:
         wherever multipliers are measured. With `whole` a θ counts only if every solve converges; where one has failed,
         other experiments may be skipped.
         """
-        groups = []
+        groups, keep = [], keep or bool(self._sheets)
         for experiments, maps, batch, multipliers in self._batches:
             values = maps.values(theta)
             parameters, sensors = values[..., : maps.count], values[..., maps.count :]
@@ -126,6 +171,8 @@ class ResponseSolver:
                 ]
             of_all = solved.outputs, solved.frequency, parameters, sensors, logarithms, solved.z, status
             groups.append(GroupSolution(*of_all))
+        for points in self._sheets:
+            reach_further(self.problem, points, groups)
         return Simulation(groups, self._places)
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
@@ -178,6 +225,8 @@ class ResponseSolver:
     def jacobian(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:
         """Return the derivatives of a response at the anchor by θ, (names, …); None where they do not exist."""
         parameter_map, derivative = self.problem.parameter_maps[experiment], self.anchors[experiment].derivatives
+        if self.anchors[experiment].sheet is not None and response.frequency != self._measured_frequency(experiment):
+            return self._changes_at_fold(theta, experiment)
         if derivative is None:
             return None
         of_model, of_sensors = np.split(parameter_map.slopes(theta), [parameter_map.count])
@@ -186,6 +235,33 @@ class ResponseSolver:
         if response.log_multipliers.size:
             multipliers = self._multiplier_jacobian(theta, experiment, z, response)
         return Response(outputs, of_model.T @ derivative.frequency, multipliers, of_sensors.T)
+
+    def _measured_frequency(self, experiment: str) -> float:
+        return self.problem.equations[experiment].frequency
+
+    def _changes_at_fold(self, theta: np.ndarray, experiment: str) -> Response:
+        """Return the derivatives of a response that is that at a fold, by differences."""
+        steps = DIFFERENCE * np.where(theta != 0.0, np.abs(theta), self.problem.joint_prior.widths)
+        if self._changes is None or not np.array_equal(self._changes[0], theta):
+            around = np.concatenate([theta[None], theta + np.diag(steps), theta - np.diag(steps)])
+            self._changes = theta, self.solve(around, polish=True)
+        response, count = self._changes[1].response(experiment), theta.size
+        measured = self._measured_frequency(experiment)
+        centre, ends = (response.outputs[0], response.frequency[0]), []
+        for sign, part in ((1.0, slice(1, count + 1)), (-1.0, slice(count + 1, None))):
+            outputs, frequency = response.outputs[part], response.frequency[part]
+            # Where the branch reaches the point on one side, the derivative is that on the other side.
+            at_fold = frequency != measured
+            width = np.where(at_fold, sign * steps, 0.0)
+            outputs = np.where(at_fold[:, None, None], outputs, centre[0])
+            ends.append((outputs, np.where(at_fold, frequency, centre[1]), width))
+        (y_up, f_up, up), (y_down, f_down, down) = ends
+        width = np.where(up > down, up - down, np.inf)
+        of_sensors = self.problem.parameter_maps[experiment].slopes(theta)[
+            self.problem.parameter_maps[experiment].count :
+        ]
+        by_outputs = (y_up - y_down) / width[:, None, None]
+        return Response(by_outputs, (f_up - f_down) / width, np.zeros((count, 0)), of_sensors.T)
 
     def _multiplier_jacobian(self, theta: np.ndarray, experiment: str, z: np.ndarray, response: Response) -> np.ndarray:
         """Return ∂ log|μ|/∂θ at the anchor, (names, multipliers)."""
@@ -265,6 +341,15 @@ def _initial_orbit(
         outputs=np.tensordot(directions, derivative.outputs, (0, 0)), frequency=directions.T @ derivative.frequency
     )
     return InitialOrbit(guess, Anchor.of(here, parameters, z, derivative, moving), by_all)
+
+
+def _placed(problem: Description, experiment: str, theta: np.ndarray, guess: Any, place: Place) -> InitialOrbit:
+    """Return the orbit of a point of a table on its branch; without derivatives if the branch does not reach it."""
+    if place.reached:
+        return _initial_orbit(problem, experiment, theta, guess, (place.equations, place.z))._replace(sheet=place.sheet)
+    parameters = problem.parameters(theta[None], experiment)[0]
+    measured = problem.equations[experiment].frequency
+    return InitialOrbit(guess, Anchor(parameters, place.z, measured), None, place.sheet)
 
 
 def orbit_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int) -> np.ndarray:

@@ -227,8 +227,14 @@ def common(experiment: Experiment, channel: str, place: int = 0, **more: Any) ->
 
 
 def measured_channels(experiment: Experiment, model: Model) -> tuple[str, ...]:
-    """Return the measured outputs, in the order of the model."""
+    """Return the outputs with a measured time history, in the order of the model."""
     return tuple(channel for channel in model.outputs if channel in experiment.outputs)
+
+
+def compared_channels(experiment: Experiment, model: Model) -> tuple[str, ...]:
+    """Return these, and then the other outputs of which something was measured."""
+    histories, every = measured_channels(experiment, model), experiment.channels
+    return *histories, *(c for c in model.outputs if c in every and c not in histories)
 
 
 def measured_variance(experiment: Experiment, channel: str) -> float:

@@ -5,6 +5,8 @@ from bayesperiodic.likelihood.block import Block
 from bayesperiodic.likelihood.mean_period import MeanPeriod
 from bayesperiodic.likelihood.multipliers import Multipliers
 from bayesperiodic.likelihood.orbit_frequency import OrbitFrequency
+from bayesperiodic.likelihood.quantities import Amplitudes, PeakToPeaks, RelativePhases, RootMeanSquares
+from bayesperiodic.likelihood.reach import Reach
 from bayesperiodic.likelihood.samples import Samples
 from bayesperiodic.likelihood.section_points import SectionPoints
 from bayesperiodic.models.model import Model
@@ -16,6 +18,11 @@ KINDS: list[type[Block]] = [
     Samples,
     Multipliers,
     OrbitFrequency,
+    Amplitudes,
+    RelativePhases,
+    PeakToPeaks,
+    RootMeanSquares,
+    Reach,
 ]
 
 

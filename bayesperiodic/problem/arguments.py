@@ -16,7 +16,8 @@ def values_by_name(argument: str, given: Any, names: tuple[str, ...]) -> np.ndar
     """Return the values (…, names) of an argument that is a mapping or such an array; raise a ValueError otherwise."""
     if isinstance(given, Mapping):
         _checks.same_names(argument, given, names)
-        given = np.stack(np.broadcast_arrays(*(_checks.real_array(argument, given[name]) for name in names)), -1)
+        each = np.broadcast_arrays(*(_checks.real_array(argument, given[name]) for name in names))
+        given = np.stack(each, -1) if names else np.empty(0)
     values = _checks.real_array(argument, given)
     if values.shape[-1:] != (len(names),):
         raise ValueError(f"{argument}: last axis must be {list(names)}, got shape {values.shape}.")
@@ -74,9 +75,9 @@ def checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tupl
         raise ValueError(f"experiments: names must differ, got {names}. Name them with fold(name=…).")
     for e in result:
         _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
-        if not e.outputs:
+        if not e.channels:
             raise ValueError(f"outputs of experiment {e.name!r}: must have at least one channel, got {{}}.")
-        for channel in e.outputs:
+        for channel in e.channels:
             _checks.one_of(f"outputs of experiment {e.name!r}", channel, model.outputs)
         if e.guess == DATA and model.autonomous:
             raise ValueError(

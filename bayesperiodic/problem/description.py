@@ -90,7 +90,7 @@ class Description(Printed):
             local = (*local,) + tuple(name for name in model.parameters if name not in plain)
         self.sensors = Sensors(sensors, model, self.experiments, joint=self.input_noise == JOINT)
         self.model = model = self.sensors.model
-        self.scheme = scheme or default_scheme(model)
+        self.scheme = scheme or default_scheme(model, tables=all(e.sweep is not None for e in self.experiments))
         find_scheme(self.scheme)
         if any(b.is_dense(self.noise) for e in self.experiments for b in blocks_of(e, model)):
             if isinstance(self.input_noise, Mapping):
@@ -99,7 +99,8 @@ class Description(Printed):
                     f"{_checks.shortened(input_noise)}; take noise='independent' or 'measured', or whole periods."
                 )
             self.input_noise = EXACT if self.input_noise == FROM_CYCLES else self.input_noise
-        self.channels, runs = self.sensors.channels, [e.name for e in self.experiments]
+        self.channels = tuple(c for c in self.sensors.channels if any(c in e.outputs for e in self.experiments))
+        runs = [e.name for e in self.experiments]
         tied, every = dict(tied or {}), (*model.parameters, *self.sensors.names, SHIFT)
         priors, fixed = self.sensors.with_entries(priors, fixed or {})
         self.local = checked_local(local, every, priors, tied)
@@ -298,6 +299,12 @@ class Description(Printed):
     def counted(self) -> float:
         """Σn, the independent values behind all unknown and known variances."""
         return sum(self.likelihood.counts.values())
+
+    @property
+    def quantities(self) -> dict[str, str]:
+        """Units of what was measured without a time history, by label."""
+        every = (one for e in self.experiments for one in e.measurements)
+        return {one.label: "rad" if one.signed else self.model.units.get(one.channel, "") for one in every}
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -572,7 +579,8 @@ class Description(Printed):
         noisy = ", ".join(dict.fromkeys(name for inputs in self.noisy_inputs.values() for name in inputs))
         return (
             f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
-            f"channels: {', '.join(self.channels)} with {self.counted:.0f} independent values, {self.noise.name} noise"
+            f"data: {', '.join((*self.channels, *self.quantities))} with {self.likelihood.values:.0f} independent values, "
+            f"{self.noise.name} noise"
             f"{f', noise of {noisy} integrated out' if noisy else ''}"
             f"{f', sensors: {sensors}' if sensors else ''})"
         )
