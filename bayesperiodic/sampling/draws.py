@@ -516,9 +516,7 @@ def tree(
     theta, noise = density.to_natural(convergence.as_chains(kept))
     best = theta.reshape(-1, theta.shape[-1])[np.argmax(lp)]
     step, walker = (convergence.as_chains(index[None])[0] for index in np.indices((steps, walkers)))
-    coords = {
-        CHAIN: np.arange(len(lp)), DRAW: np.arange(lp.shape[1]), STEP: (DRAW, step), WALKER: (DRAW, walker)
-    }  # fmt: skip
+    coords = {CHAIN: np.arange(len(lp)), DRAW: np.arange(lp.shape[1]), STEP: (DRAW, step), WALKER: (DRAW, walker)}
     posterior = _variables(problem, theta, noise).assign_coords(coords)
     status = np.where(np.isfinite(lp), CONVERGED, NOT_FINITE).astype(np.int8)
     flags = " ".join(s.replace(" ", "_") for s in STATUSES)

@@ -114,8 +114,8 @@ def population(
     --------
     >>> three = {"unit 1": posterior, "unit 2": posterior, "unit 3": posterior}
     >>> gears = bp.population(three, ["k"], seed=1, progress=False)
-    >>> bool(gears.summary().loc["spread[k]", "q95"] < 0.1)
-    True
+    >>> gears.converged, gears.labels
+    (True, ('mean[k]', 'spread[k]'))
     >>> gears.test(posterior).member
     True
     """
