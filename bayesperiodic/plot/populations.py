@@ -39,7 +39,8 @@ def population(
 
     Examples
     --------
-    >>> springs = bp.population(dict.fromkeys(["1", "2", "3"], posterior), ["k"], seed=1, progress=False)
+    >>> units, spread = dict.fromkeys(["1", "2", "3"], posterior), {"k": bp.HalfNormal(0.01)}
+    >>> springs = bp.population(units, ["k"], spread=spread, seed=1, progress=False)
     >>> len(bp.plot.population(springs).axes)
     1
     """

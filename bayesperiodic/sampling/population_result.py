@@ -78,7 +78,8 @@ class Population(Result):
 
     Examples
     --------
-    >>> springs = bp.population(dict.fromkeys(["1", "2", "3"], posterior), ["k"], seed=1, progress=False)
+    >>> units, spread = dict.fromkeys(["1", "2", "3"], posterior), {"k": bp.HalfNormal(0.01)}
+    >>> springs = bp.population(units, ["k"], spread=spread, seed=1, progress=False)
     >>> springs.labels
     ('mean[k]', 'spread[k]')
     >>> prior = springs.as_prior()["k"]

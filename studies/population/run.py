@@ -52,7 +52,8 @@ def run(options: argparse.Namespace) -> None:
     paths = [] if options.quick else find_tests(options.data)
     if paths:
         with watch.part("tests", "sampling the tests of the friction damper one by one"):
-            posteriors = {path.stem: sampled_test(path, options.seed) for path in paths}
+            every = {path.stem: sampled_test(path, options.seed) for path in paths}
+            posteriors = {name: draws for name, draws in every.items() if draws is not None}
         with watch.part("dampers", "sampling their population, and that of all but one"):
             left_out = list(posteriors)[: options.replicates]
             dampers, results["dampers"] = damper_population(posteriors, left_out, options.seed)
@@ -119,8 +120,8 @@ def conditions(name: str) -> dict[str, float]:
     return {"amplitude": amplitude * INCH, "frequency": frequency, "tension": tension * KIP / 1000.0}
 
 
-def sampled_test(path: Path, seed: int) -> bp.Posterior:
-    """Return the posterior of Dahl's model on the steady cycles of one test."""
+def sampled_test(path: Path, seed: int) -> bp.Posterior | None:
+    """Return the posterior of Dahl's model on the steady cycles of one test; None if these determine too little."""
     data, frequency = np.load(path), conditions(path.stem)["frequency"]
     recording = bp.Recording(
         data["time_s"], {"force": KIP * data["force_kip"].astype(float)},
@@ -128,7 +129,11 @@ def sampled_test(path: Path, seed: int) -> bp.Posterior:
     ).between(REST + FIRST_CYCLE / frequency, REST + LAST_CYCLE / frequency)  # fmt: skip
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the model is misspecified, which the population states
-        problem = bp.Problem(bp.models.dahl, [recording.fold(SAMPLES)], priors=DAHL_PRIORS)
+        try:
+            problem = bp.Problem(bp.models.dahl, [recording.fold(SAMPLES)], priors=DAHL_PRIORS)
+        except ValueError as error:  # fewer independent values than parameters
+            print(f"  {path.stem} is left out: {error}")
+            return None
         return bp.sample(problem, bp.map_estimate(problem, progress=False), seed=seed, progress=False)
 
 
