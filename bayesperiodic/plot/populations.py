@@ -49,7 +49,7 @@ def population(
         _checks.one_of("covariate", covariate, result.covariates)
     names = list(chosen(names, result.names))
     units = result.units[POPULATION_UNIT].nunique()
-    height = 3.2 if covariate else min(1.2 + 0.22 * units, 12.0)
+    height = 3.2 if covariate else min(1.6 + 0.25 * units, 12.0)
     figure = figure or plt.figure(figsize=(3.4 * min(len(names), 3) + 0.8, height), layout="constrained")
     grid = panels(figure, len(names), across=3)
     for axes, name in zip(grid, names, strict=True):
@@ -85,7 +85,7 @@ def _draw_forest(axes: Axes, result: Population, name: str) -> None:
         centre, ends = _intervals(result, name, start)
         place = np.arange(centre.size) + shift
         axes.errorbar(centre, place, xerr=ends, fmt="o", ms=3, lw=1.1, color=colour, label=text)
-    axes.invert_yaxis()
+    axes.set_ylim(centre.size - 0.4, -0.6)
     axes.set_yticks([])
     axes.set_xlabel(_label(result, name))
 

@@ -17,7 +17,7 @@ from bayesperiodic.sampling.population_units import UnitDraws
 # Pareto k̂ above which, and effective draws below which, a unit's draws are no importance sample.
 USABLE_WEIGHTS, FEWEST_EFFECTIVE = 0.7, 50.0
 # Probability to find a deviation that is as large as estimated; most repeats that are considered; simulated units.
-REQUIRED_POWER, MOST_REPEATS, SIMULATED = 0.9, 1000, 20_000
+REQUIRED_POWER, MOST_REPEATS, SIMULATED_UNITS = 0.9, 1000, 20_000
 
 
 @dataclass(frozen=True)
@@ -127,17 +127,17 @@ class Expected(NamedTuple):
         return np.minimum(self.weights @ (tail((size - offset) / sd) + tail((size + offset) / sd)), 1.0)
 
     def joint(self, given: UnitEstimate, generator: np.random.Generator) -> float:
-        """Return the p-value of all parameters together, by simulated units; at least 1/SIMULATED."""
+        """Return the p-value of all parameters together, by simulated units; at least 1/SIMULATED_UNITS."""
         inverse = np.linalg.inv(self.covariance + given.covariance)
-        row = generator.choice(len(self.weights), SIMULATED, p=self.weights)
+        row = generator.choice(len(self.weights), SIMULATED_UNITS, p=self.weights)
         factor = np.linalg.cholesky(self.covariances + given.covariance)[row]
-        offset = np.einsum("nab,nb->na", factor, generator.standard_normal((SIMULATED, len(self.centre))))
+        offset = np.einsum("nab,nb->na", factor, generator.standard_normal((SIMULATED_UNITS, len(self.centre))))
         if np.isfinite(self.degrees):
-            offset /= np.sqrt(generator.chisquare(self.degrees, SIMULATED) / self.degrees)[:, None]
+            offset /= np.sqrt(generator.chisquare(self.degrees, SIMULATED_UNITS) / self.degrees)[:, None]
         offset += self.means[row] - self.centre
         difference = given.mean - self.centre
         distances, distance = np.einsum("na,ab,nb->n", offset, inverse, offset), difference @ inverse @ difference
-        return float((1 + np.sum(distances >= distance)) / (1 + SIMULATED))
+        return float((1 + np.sum(distances >= distance)) / (1 + SIMULATED_UNITS))
 
 
 def _repeats(difference: float, spread: float, variance: float, level: float) -> float:
