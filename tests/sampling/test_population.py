@@ -13,8 +13,9 @@ from scipy.stats import t as student
 import bayesperiodic as bp
 from bayesperiodic.priors.stored import as_text, from_text
 from bayesperiodic.sampling.membership import Expected, UnitEstimate
-from bayesperiodic.sampling.population import Settings, fitted
+from bayesperiodic.sampling.population import Redraws, Settings, fitted
 from bayesperiodic.sampling.population_density import Hierarchy, Parameters, PopulationDensity
+from bayesperiodic.sampling.population_units import unit_draws
 from tests.known import grid
 from tests.sampling.gaussian_units import gaussian_units
 
@@ -346,19 +347,14 @@ def test_draws_without_their_prior_are_refused():
 
 
 @pytest.mark.slow
-def test_units_with_few_effective_draws_are_sampled_again_under_the_population():
-    units = {f"gear {k + 1}": (problem, posterior) for k, (problem, posterior) in enumerate(gear_posteriors().values())}
-    problem, _ = units["gear 5"]
-    vague = problem.replace(
-        priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1.0, 3.0)},
-        fixed={**problem.fixed, "variance[displacement]": 1e4},
+def test_a_unit_that_is_sampled_again_has_the_population_as_its_prior():
+    problem = gears()["gear 1"]
+    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, progress=False)
+    unit, sd = unit_draws("gear 1", (problem, posterior), ("k",)), 0.002
+    narrow = Parameters(np.zeros((1, 1)), np.zeros((1, 1, 0)), np.full((1, 1, 1), sd**2))
+    expected = Expected.of(narrow, np.zeros(0), np.inf)
+    again = Redraws({"gear 1": (problem, posterior)}, ("k",), False, 1, None).again(
+        {"gear 1": unit}, {"gear 1": expected}, 1
     )
-    draws = bp.sample(vague, bp.map_estimate(vague, progress=False), seed=1, progress=False)
-    spread = {"k": bp.HalfNormal(0.1)}
-    with pytest.warns(UserWarning, match="gear 5 are no importance sample"):
-        bp.population(units | {"gear 5": draws}, ["k"], spread=spread, seed=1, progress=False)
-    result = bp.population(units | {"gear 5": (vague, draws)}, ["k"], spread=spread, seed=1, progress=False)
-    table = result.units.set_index("unit")
-    assert table["again"].to_dict() == {name: int(name == "gear 5") for name in units}
-    assert table.loc["gear 5", "effective"] > 200
-    assert result.unit_calls > sum(p.log_posterior_calls for _, p in units.values())
+    precision = 1.0 / unit.covariance[0, 0] - 1.0 / 0.3**2 + 1.0 / (1.5 * sd) ** 2
+    assert again["gear 1"].covariance[0, 0] * precision == pytest.approx(1.0, abs=0.15)
