@@ -306,7 +306,7 @@ def joint_draws(problems, spreads, steps):
 def test_equals_the_joint_posterior_of_five_gears():
     """Means and standard deviations, within the errors of both chains (five units, two parameters)."""
     spreads = bp.HalfNormal(0.5), bp.HalfNormal(0.2)
-    joint = joint_draws(gears(), spreads, 8000)
+    joint = joint_draws(gears(), spreads, 3000)
     result = bp.population(
         gear_posteriors(), ["c", "k"], spread={"c": spreads[0], "k": spreads[1]}, seed=1, progress=False
     )
