@@ -80,6 +80,9 @@ from .reporting import report as report
 from .sampling.draws import Posterior as Posterior
 from .sampling.evidence import Evidence as Evidence
 from .sampling.evidence import evidence as evidence
+from .sampling.membership import MembershipTest as MembershipTest
+from .sampling.population import population as population
+from .sampling.population_result import Population as Population
 from .sampling.sample import sample as sample
 from .simulation import simulate as simulate
 from .symmetry.structure import Structure as Structure

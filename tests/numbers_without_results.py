@@ -60,6 +60,14 @@ WITHOUT_RESULTS = {
         DEFINITION: ("schemes of order 2 and 4", "parameters of (7)"),
     },
     "docs/explanation/why_periodic.md": {ELSEWHERE: ("used this in 1997",)},
+    "docs/how_to/populations.md": {
+        SETTING: ("Units above 0.7, or with fewer than 50 effective draws", "Of each unit 2,000 draws are kept"),
+        UNSTORED: (
+            "takes some 40,000 evaluations", "An evaluation [ms] | Draws in memory [MB] | 40,000 evaluations",
+            "10 | 0.084 | 0.48 | 3 s", "100 | 0.91 | 4.8 | 36 s", "1000 | 8.6 | 48 | 6 minutes",
+            "would need 48 GB and four days, extrapolated",
+        ),
+    },
     "docs/how_to/calibrate.md": {
         DEFINITION: ("A 90 % interval should", "(above 1: intervals too narrow)", "coverage at 50, 80, 90 and 95 %"),
     },

@@ -17,6 +17,7 @@ REASONS = {
     "Model": "the definition of a model: name, variables, equations, outputs, units; five are required",
     "Problem": "model, experiments, parameters and noise; two and the priors are required, the rest are keywords",
     "Recording.from_file": "the meaning of the channels, and what a text does not show; two arguments are required",
+    "population": "what the population is, and settings with defaults; units, names and the seed are required",
     "response_table": "what the columns of a table mean; three arguments are required",
     "FileChannel": "a row of a table; only `inspect` makes it",
     "calibrate": "the settings of a campaign and of the estimates in it; three are required",

@@ -9,6 +9,7 @@ from bayesperiodic.plot.elements import elements
 from bayesperiodic.plot.estimates import fit, loops, traces
 from bayesperiodic.plot.overview import summary
 from bayesperiodic.plot.pairs import corner, marginals
+from bayesperiodic.plot.populations import population
 from bayesperiodic.plot.recording import recording
 from bayesperiodic.plot.style import COLOURS
 from bayesperiodic.plot.tables import response
@@ -16,5 +17,5 @@ from bayesperiodic.plot.terms import missing_terms
 
 __all__ = [
     "COLOURS", "branch", "comparison", "corner", "elements", "fit", "loops", "marginals", "missing_terms", "models",
-    "orbits", "profile", "ranks", "recording", "response", "section", "summary", "traces",
+    "orbits", "population", "profile", "ranks", "recording", "response", "section", "summary", "traces",
 ]  # fmt: skip

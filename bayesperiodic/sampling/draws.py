@@ -21,6 +21,7 @@ from bayesperiodic.likelihood.input_noise import InputErrors
 from bayesperiodic.likelihood.section_points import SCALE
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 from bayesperiodic.priors.joint import MultivariateNormal
+from bayesperiodic.priors.stored import PRIORS, as_text
 from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.fingerprint import check_fingerprint, fingerprint
 from bayesperiodic.problem.parameters import (
@@ -488,7 +489,7 @@ def gather(
     """
     names = density.labels
     data = tree(density, kept, log_density, seed, modes)
-    data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason}
+    data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason, PRIORS: as_text(density.problem.priors)}
     tau, group = convergence.autocorrelation_time(kept), data["posterior"].to_dataset()
     return Posterior(
         tree=data,
@@ -515,9 +516,7 @@ def tree(
     theta, noise = density.to_natural(convergence.as_chains(kept))
     best = theta.reshape(-1, theta.shape[-1])[np.argmax(lp)]
     step, walker = (convergence.as_chains(index[None])[0] for index in np.indices((steps, walkers)))
-    coords = {
-        CHAIN: np.arange(len(lp)), DRAW: np.arange(lp.shape[1]), STEP: (DRAW, step), WALKER: (DRAW, walker)
-    }  # fmt: skip
+    coords = {CHAIN: np.arange(len(lp)), DRAW: np.arange(lp.shape[1]), STEP: (DRAW, step), WALKER: (DRAW, walker)}
     posterior = _variables(problem, theta, noise).assign_coords(coords)
     status = np.where(np.isfinite(lp), CONVERGED, NOT_FINITE).astype(np.int8)
     flags = " ".join(s.replace(" ", "_") for s in STATUSES)

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.integrate import IntegrationWarning, quad
@@ -12,7 +12,7 @@ from scipy.integrate import IntegrationWarning, quad
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import covariance_cholesky, in_one_thread
-from bayesperiodic.density.log_posterior import LogPosterior
+from bayesperiodic.density.log_posterior import Evaluation, LogPosterior
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.likelihood.noise import VARIANCE
 from bayesperiodic.likelihood.section_points import SCALE
@@ -153,7 +153,7 @@ def evidence(problem: Problem, posterior: Posterior) -> Evidence:
     density, points = _anchored(problem, posterior)
     generator, constant = np.random.default_rng(posterior.seed), _constant(problem)
     first, second = (
-        _bridge(density, points[fitted::2], points[1 - fitted :: 2], constant, generator) for fitted in (0, 1)
+        bridge(density, points[fitted::2], points[1 - fitted :: 2], constant, generator) for fitted in (0, 1)
     )
     improper = _improper(problem)
     result = Evidence(
@@ -185,8 +185,15 @@ def _anchored(problem: Problem, posterior: Posterior) -> tuple[LogPosterior, np.
     return density, np.stack([posterior.by_step(column) for column in points.T], axis=-1)
 
 
+class Evaluated(Protocol):
+    """A density that is known up to a factor."""
+
+    def evaluate(self, points: np.ndarray, threads: int | None) -> Evaluation:
+        """Return the log-density at points (points, dimension)."""
+
+
 @dataclass(frozen=True)
-class _Bridge:
+class Bridge:
     """One estimate of the log-evidence, see `Evidence`."""
 
     log: float
@@ -196,9 +203,9 @@ class _Bridge:
     failed: float
 
 
-def _bridge(
-    density: LogPosterior, fitted: np.ndarray, used: np.ndarray, constant: float, generator: np.random.Generator
-) -> _Bridge:
+def bridge(
+    density: Evaluated, fitted: np.ndarray, used: np.ndarray, constant: float, generator: np.random.Generator
+) -> Bridge:
     """Return the estimate from a mixture fitted to some draws (ensembles, steps, walkers, dimension), and from others.
 
     The mixture is fitted in coordinates u in which the draws have mean 0 and covariance 1.
@@ -229,7 +236,7 @@ def _bridge(
     return _estimate(at_draws, at_mixture, float(np.mean(status != CONVERGED)))
 
 
-def _estimate(at_draws: np.ndarray, at_mixture: np.ndarray, failed: float) -> _Bridge:
+def _estimate(at_draws: np.ndarray, at_mixture: np.ndarray, failed: float) -> Bridge:
     """Return the estimate from ln(posterior/mixture) at draws (ensembles, steps, walkers) and at those of the mixture.
 
     The posterior is not normalised. Its draws count as many as are effective.
@@ -256,7 +263,7 @@ def _estimate(at_draws: np.ndarray, at_mixture: np.ndarray, failed: float) -> _B
     by_draws = np.nan_to_num(convergence.mean_error(below)) / below.mean()
     error = float(np.hypot(above.std() / above.mean() / np.sqrt(above.size), by_draws))
     missed = float(np.mean(chains - log > np.log(RARE)))
-    return _Bridge(log, error, float(above.mean()), missed, failed)
+    return Bridge(log, error, float(above.mean()), missed, failed)
 
 
 def _data(problem: Problem) -> dict[str, float]:
