@@ -162,7 +162,7 @@ def _conversions(conversion: Any) -> Iterator[Any]:
 
 
 def _is_plain(mdf: Any, version: int, k: int) -> bool:
-    """Return whether a group has its own times, stored as the numbers that asammdf returns beside those of a channel."""
+    """Return whether a group has times of its own that are stored as they are, which asammdf returns with a channel."""
     group = mdf.groups[k]
     remote = version == 4 and group.channel_group.flags & mdf_blocks.REMOTE_MASTER
     masters = [one for one in group.channels if one.channel_type in MASTERS[version]]
