@@ -212,7 +212,7 @@ def is_named(fault: str, size: float, number: int, seed: int) -> bool:
 
 
 def hidden(fault: str, size: float, numbers: range, seed: int) -> float:
-    """Return the mean bias of the first channel's amplitudes [stated standard errors] in recordings where it is not named.
+    """Return the mean bias of the first channel's amplitudes [stated standard errors] where the fault is not named.
 
     It is the largest of both harmonics and both parts, against the folds without the fault; NaN if it is always named.
     """
