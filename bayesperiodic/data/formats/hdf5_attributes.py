@@ -262,7 +262,7 @@ def unused_scale(stored: Mapping[str, Any]) -> str:
 
 
 def meaning_of_integers(stored: Mapping[str, Any], kind: np.dtype[Any]) -> str:
-    """Return the attribute that may say what counts of a converter are, such as "range = 10", and not that of the type."""
+    """Return the attribute that may say what counts of a converter mean, such as "range = 10", and not their limits."""
     if kind.kind not in "iu":
         return ""
     limits = np.iinfo(kind)
