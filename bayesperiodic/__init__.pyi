@@ -4,6 +4,7 @@ from . import models as models
 from . import plot as plot
 from ._io import load as load
 from ._versions import show_versions as show_versions
+from .data import measurements as measurements
 from .data.experiment import Experiment as Experiment
 from .data.file_inspection import FileChannel as FileChannel
 from .data.file_inspection import FileInspection as FileInspection
@@ -12,6 +13,11 @@ from .data.recording import Recording as Recording
 from .data.recording_check import Finding as Finding
 from .data.recording_check import RecordingCheck as RecordingCheck
 from .data.response_table import response_table as response_table
+from .data.special_experiments import jump as jump
+from .data.special_experiments import resonance_point as resonance_point
+from .data.special_points import Fold as Fold
+from .data.special_points import PhaseLag as PhaseLag
+from .data.sweep import Sweep as Sweep
 from .density.problem import Problem as Problem
 from .diagnostics.branch_prediction import BranchPrediction as BranchPrediction
 from .diagnostics.branch_prediction import predict_branch as predict_branch

@@ -1,6 +1,6 @@
 """Every public name is documented in full: what it does, takes, gives back and raises, with an example that runs.
 
-Public are `bayesperiodic.__all__`, the `__all__` of `elements`, `models`, `noise` and `plot`, and the methods and
+Public are `bayesperiodic.__all__`, the `__all__` of `elements`, `measurements`, `models`, `noise` and `plot`, and the methods and
 properties of their classes without a leading underscore. The rules, in the sections of numpydoc:
 
 - Parameters (of a result: Attributes) names exactly the arguments (the fields), arrays with their shapes.
@@ -28,7 +28,14 @@ import pytest
 
 import bayesperiodic as bp
 
-MODULES = {"": bp, "elements.": bp.elements, "models.": bp.models, "noise.": bp.noise, "plot.": bp.plot}
+MODULES = {
+    "": bp,
+    "elements.": bp.elements,
+    "measurements.": bp.measurements,
+    "models.": bp.models,
+    "noise.": bp.noise,
+    "plot.": bp.plot,
+}
 NAMES = {
     f"{prefix}{name}": getattr(module, name)
     for prefix, module in MODULES.items()

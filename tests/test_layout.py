@@ -12,6 +12,7 @@ REASONS = {
     "Experiment": "one field per measured quantity; four are required, the rest are keywords with defaults",
     "Recording.fold": "the grid, the frequency, the response period, the clocks; all have defaults",
     "sample": "settings of the sampler; two arguments and the seed are required, the rest are keywords with defaults",
+    "resonance_point": "what was measured, with standard deviations; four are required, the rest have defaults",
     "Finding": "one field per fact about a fault; made by `Recording.check`",
     "Model": "the definition of a model: name, variables, equations, outputs, units; five are required",
     "Problem": "model, experiments, parameters and noise; two and the priors are required, the rest are keywords",

@@ -749,6 +749,23 @@ def span(values):
     return low if low == high else f"{low} to {high}"
 
 
+@on("docs/studies/elements.md")
+def rounded_slider():
+    errors = {
+        row["width"]: {of: 100 * error for of, error in row["error"].items()} for row in results("elements")["widths"]
+    }
+    wide, middle = errors[0.3], errors[0.1]
+    assert min(wide["stiffness"], wide["limit"], -wide["c"]) > 0.0
+    yield (
+        f"With a width of 0.3 the stiffness of the slider is estimated {wide['stiffness']:.1f} % and the limit force "
+        f"{wide['limit']:.1f} % too large, and the damping {-wide['c']:.1f} % too small."
+    )
+    yield (
+        f"With 0.1 these errors are {middle['stiffness']:.1f}, {middle['limit']:.1f} and {-middle['c']:.1f} %, "
+        f"with 0.02 at most {max(map(abs, errors[0.02].values())):.2f} %."
+    )
+
+
 @on("docs/reference/files.md")
 def formats():
     """Yield the number of damaged files, and each row of the table, whose tests must exist."""

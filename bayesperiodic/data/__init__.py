@@ -1,1 +1,3 @@
 """Recordings and experiments."""
+
+from bayesperiodic.data import measurements as measurements

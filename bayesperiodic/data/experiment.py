@@ -10,8 +10,12 @@ from numpy.typing import ArrayLike
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result, Storable
 from bayesperiodic._linalg import covariance_cholesky
+from bayesperiodic.data import measurements as kinds
+from bayesperiodic.data.measurements import Measurement
 from bayesperiodic.data.recording_check import Finding
 from bayesperiodic.data.response_period import summary
+from bayesperiodic.data.special_points import Fold, PhaseLag
+from bayesperiodic.data.sweep import Sweep
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -103,6 +107,11 @@ class Experiment(Result):
         be a parameter of a `Problem`.
     synthetic : bool
         True if the data were simulated.
+    measurements : sequence of Measurement, optional
+        What instruments tell of channels without a time history, see `bp.measurements`: amplitudes, phases,
+        peak-to-peak and rms values. Then `outputs` may be empty.
+    sweep : Sweep, optional
+        The table of responses that the experiment is a point of; see `response_table`.
     mask : bool array (samples·periods,), optional
         True at the points where the outputs were measured, such as the points of a Poincaré section; other entries
         are ignored.
@@ -117,6 +126,9 @@ class Experiment(Result):
         equilibrium. An unstable orbit needs a guess, and so does a subharmonic one. "data", for driven models, finds
         the states that give the measured outputs and, where the outputs leave them free, solve the equations best at
         the parameters of the start.
+
+    condition : Fold or PhaseLag, optional
+        The special point at which the response is, see `jump` and `resonance_point`; its place is the data.
 
     Raises
     ------
@@ -166,11 +178,14 @@ class Experiment(Result):
     findings: tuple[Finding, ...] = field(default=(), kw_only=True)
     clocks: Mapping[str, tuple[str, ...]] = field(default_factory=dict, kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
+    measurements: Sequence[Measurement] = field(default=(), kw_only=True)
+    sweep: Sweep | None = field(default=None, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
     covariance: np.ndarray | None = field(default=None, kw_only=True)
     multipliers: np.ndarray | None = field(default=None, kw_only=True)
     multiplier_sd: np.ndarray | None = field(default=None, kw_only=True)
     guess: str | Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+    condition: Fold | PhaseLag | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if not _checks.text("name", self.name) or any(c in self.name for c in "/[]"):
@@ -195,6 +210,8 @@ class Experiment(Result):
                 for key, values in (self.guess or {}).items()
             }
             object.__setattr__(self, "guess", guess)
+        if self.sweep is not None:
+            _checks.instance("sweep", self.sweep, Sweep)
         if not (np.isfinite(self.frequency_se) and self.frequency_se >= 0.0):
             raise ValueError(f"frequency_se: must be a finite number, at least 0 [Hz], got {self.frequency_se!r}.")
         for argument in CHANNEL_MAPPINGS:
@@ -211,6 +228,11 @@ class Experiment(Result):
             _checks.one_of("error_slopes", name, self.inputs)
             for channel in slopes:
                 _checks.one_of(f"error_slopes[{name!r}]", channel, self.outputs)
+        object.__setattr__(self, "measurements", kinds.checked(self.measurements, self.outputs))
+        if self.measurements and self.mask is not None:
+            raise ValueError(
+                "mask: must be left out of an experiment with measurements of amplitudes, phases or sizes."
+            )
         measured = int(self.measured_points.sum())
         _checks.integer("cycles", self.cycles, 1)
         if self.averaged is not None:
@@ -222,6 +244,12 @@ class Experiment(Result):
             kept = min(points, 2 * self.harmonics.get(key, points) + 1)
             counts[key] = min(counts[key], kept - 2 * len(without) + (0 in without))
         object.__setattr__(self, "independent", counts)
+        whole = self.mask is None and self.covariance is None and self.multipliers is None and self.frequency_se == 0.0
+        if self.condition is not None and not (whole and self.periods == 1):
+            raise ValueError(
+                "condition: must be None for experiments with several periods, a mask, a covariance, multipliers, or "
+                f"a frequency_se, got {self.condition!r}."
+            )
         self._check_multipliers()
         self._check_covariance(measured * len(self.outputs))
         for member in fields(self):
@@ -403,6 +431,12 @@ class Experiment(Result):
         """The Floquet multipliers that were measured, (multipliers,); none by default."""
         return np.empty(0) if self.multipliers is None else self.multipliers
 
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The outputs of which something was measured."""
+        of = (channel for one in self.measurements for channel in (one.channel, *one.others))
+        return tuple(dict.fromkeys((*self.outputs, *(channel for channel in of if channel not in self.inputs))))
+
     def without_multipliers(self) -> "Experiment":
         """Return the experiment without its multipliers.
 
@@ -453,9 +487,12 @@ class Experiment(Result):
         return values - _fourier.on_grid(amplitudes, points)
 
     def __repr__(self) -> str:
-        counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
+        shown = [f"{k} ({n} independent values)" for k, n in self.independent.items()]
+        shown += dict.fromkeys(one.label for one in self.measurements)
+        counts = ", ".join(shown)
         without = (f"{k} without harmonics {', '.join(map(str, h))}" for k, h in self.unmeasured.items())
         text = "".join(f"; {each}" for each in without)
+        text += f"; {self.condition!r}" if self.condition else ""
         error = f" ± {self.frequency_se:.2g} Hz" if self.frequency_se else ""
         if self.phase_diffusion:
             error += f" with a phase diffusion of {self.phase_diffusion:.2g} rad²/s"

@@ -1,78 +1,110 @@
 """Experiments from a table of frequencies, amplitudes and phases, or from frequency response functions."""
 
-import re
 from collections.abc import Mapping
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from bayesperiodic import _checks
-from bayesperiodic.data import objects
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.data.formats import recognise
-from bayesperiodic.data.formats.contents import Contents, Key, StoredChannel
-from bayesperiodic.data.layout import numbers
-from bayesperiodic.data.units import Units, from_file, kind_of
+from bayesperiodic.data.formats.contents import Key
+from bayesperiodic.data.measurements import Amplitude, Measurement, PeakToPeak, Phase, RootMeanSquare
+from bayesperiodic.data.sweep import RESOLUTION, Sweep
+from bayesperiodic.data.table_columns import TableColumns, check_phases, contents_of
+from bayesperiodic.data.units import Units
 
 # Values in the table over the amplitude of the fundamental.
 AMPLITUDES_IN = {"peak": 1.0, "rms": np.sqrt(0.5), "peak to peak": 2.0}
+# Values that are of the whole signal, and what inputs, which are sines, are divided by.
+OF_SIGNAL = {"rms of signal": (RootMeanSquare, "rms"), "peak to peak of signal": (PeakToPeak, "peak to peak")}
+SIZE_KINDS = (*AMPLITUDES_IN, *OF_SIGNAL)
 PHASE_UNITS = {"deg": np.pi / 180.0, "rad": 1.0}
-# Degrees beyond which a phase is none.
-LARGEST_PHASE = 720.0
+# A column, or columns by harmonic.
+Columns = Key | Mapping[int, Key]
 
 
 def response_table(
     table: Any,
     *,
-    outputs: Mapping[str, Key],
+    outputs: Mapping[str, Columns],
     inputs: Mapping[str, float | Key],
     frequency: Key | None = None,
-    phases: Mapping[str, Key] | None = None,
+    phases: Mapping[str, Columns] | None = None,
+    sd: Mapping[str, float | Key] | None = None,
+    phase_sd: Mapping[str, float | Key] | None = None,
     per: str | None = None,
     size: str = "peak",
     phase_unit: str = "deg",
+    lag: bool = False,
+    against: Mapping[str, str] | None = None,
+    derivatives: Mapping[str, int] | None = None,
     units: Units | None = None,
-    samples: int = 800,
+    sweep: str | None = None,
+    resolution: float = RESOLUTION,
+    samples: int = 128,
 ) -> list[Experiment]:
     """Return one experiment for each frequency of a table of measured responses.
 
-    The response is Re c exp(iωt) with the amplitude \\|c\\| and the phase arg c against the first input, whose phase is
-    zero: a phase that lags is negative. Only this harmonic is data: the mean and higher harmonics are not compared.
+    The response is Re c exp(iωt) with the amplitude \\|c\\| and the phase arg c against the first input, a cosine: a
+    phase that lags is negative. Sine inputs give the same phases. Only the harmonics in the table are data: the mean
+    and other harmonics are not compared, and an output without phases is compared by its amplitude alone.
 
     Parameters
     ----------
     table : pandas.DataFrame, mapping of str to array (rows,), or path
         Of a file in any format of `Recording.from_file`; of a universal file with frequency response functions these,
         whose abscissa is the frequency.
-    outputs : mapping of str to str, int or (group, name)
-        Column of the amplitudes of each channel, or of complex amplitudes.
+    outputs : mapping of str to str, int or (group, name), or to a mapping of int to these
+        Column of the amplitudes of each channel, or of complex amplitudes; or columns by harmonic, {1: "A1", 3: "A3"}.
     inputs : mapping of str to float, str, int or (group, name)
-        Amplitude of each input in SI, or its column. Inputs are cosines.
+        Amplitude of each input in SI, or its column. Inputs are sines.
     frequency : str, int or (group, name), optional
         Column of the frequencies [Hz]; not for frequency response functions.
-    phases : mapping of str to str, int or (group, name), optional
+    phases : mapping of str to str, int or (group, name), or to a mapping of int to these, optional
         Column of the phase of each output; not for complex amplitudes.
+    sd : mapping of str to float, str, int or (group, name), optional
+        Standard deviation of the amplitudes of an output, in their unit; its column; or a share, such as "0.5%". By
+        default it is unknown, one for each channel: with phases that of the real and imaginary parts of c.
+    phase_sd : mapping of str to float, str, int or (group, name), optional
+        Standard deviation of the phases, or its column; by default that of the amplitude over the amplitude.
     per : str, optional
         Input per whose amplitude the outputs are given, as in frequency response functions.
-    size : "peak", "rms" or "peak to peak"
-        What the amplitudes of outputs and inputs are.
+    size : str
+        What the amplitudes of outputs and inputs are: "peak", "rms" or "peak to peak", all of sines as a lock-in
+        amplifier or analyser shows them, or "rms of signal" (about the mean) or "peak to peak of signal", of outputs
+        with all of their harmonics, as a meter shows them.
     phase_unit : "deg" or "rad"
+    lag : bool
+        Whether phases are lags, positive where the response is late (complex amplitudes: of exp(−iωt)).
+    against : mapping of str to str, optional
+        Output against whose phase that of another output was measured, in place of the first input's.
+    derivatives : mapping of str to int, optional
+        How many times what is in the table is the time derivative of the output: 1 for a mobility and 2 for an
+        inertance if the output is a displacement.
     units : mapping of str to float, unit or (from, to), optional
         As for `Recording.from_file`, by channel or "frequency"; of outputs with `per` for the quotient.
+    sweep : "up", "down" or None
+        Direction in which the frequency was stepped: the response stays on its branch up to a fold, and jumps there.
+        None: each row was measured by itself. Of a sweep up and one down make a table each. See `Sweep`.
+    resolution : float
+        Standard deviation of the frequencies, relative to them. A row that was measured beyond the fold of the model's
+        branch is compared with the orbit at the fold, and the distance to it, over this standard deviation, is one
+        more residual.
     samples : int
-        Grid points per period.
+        Grid points per period. The default, with the scheme "central4", is enough for responses in which harmonics
+        above the fifth do not matter; `check` tells what twice as many would change.
 
     Returns
     -------
     list of Experiment
-        In the order of the table.
+        In the order of the table, each with its `sweep`.
 
     Raises
     ------
     FileNotFoundError, ImportError, ValueError
-        As for `Recording.from_file`, and for negative amplitudes, phases that are missing or beyond 720°, frequencies
-        ≤ 0, and levels in dB.
+        As for `Recording.from_file`, and for negative amplitudes, levels in dB, phases that are missing, beyond 720°
+        or folded into ±90°, and frequencies ≤ 0.
 
     Examples
     --------
@@ -86,165 +118,188 @@ def response_table(
     ... )
     >>> [run.name for run in runs], runs[0].independent
     (['0.1 Hz', '0.14 Hz', '0.18 Hz'], {'displacement': 2})
+
+    Amplitudes alone, known to half a per cent:
+
+    >>> runs = bp.response_table(
+    ...     table, frequency="f", outputs={"displacement": "A"}, inputs={"force": 0.5}, sd={"displacement": "0.5%"},
+    ...     units={"displacement": ("mm", "m")}, sweep="up",
+    ... )
+    >>> [one.label for one in runs[0].measurements]
+    ['amplitude of displacement']
     """  # noqa: D301
-    _checks.mapping("outputs", outputs, "{'displacement': 'the column of its amplitudes'}")
+    _checks.mapping("outputs", outputs, EXAMPLE)
+    amplitudes, angles = ({n: _by_harmonic(one) for n, one in (given or {}).items()} for given in (outputs, phases))
     _checks.mapping("inputs", inputs, "{'force': 0.5}")
-    _checks.one_of("size", size, AMPLITUDES_IN)
+    _checks.one_of("size", size, SIZE_KINDS)
     _checks.one_of("phase_unit", phase_unit, PHASE_UNITS)
     if per is not None:
         _checks.one_of("per", per, inputs)
     for key in units or {}:
         _checks.one_of("units", key, ("frequency", *outputs, *inputs))
-    for key in phases or {}:
-        _checks.one_of("phases", key, outputs)
-    columns: list[Any] = [*outputs.values(), *inputs.values(), *(phases or {}).values(), frequency]
-    wanted: list[Key] = [key for key in columns if isinstance(key, str | tuple)]
-    label, contents = _contents(table, wanted)
-    source = _Columns(label, contents, units or {})
-    at = source.frequencies([contents.find(label, key) for key in outputs.values()], frequency)
-    drive = {name: source.drive(name, value, at.size) / AMPLITUDES_IN[size] for name, value in inputs.items()}
-    responses = {}
-    for channel, column in outputs.items():
-        phase = (phases or {}).get(channel)
-        angles = None if phase is None else source.angles(phase, PHASE_UNITS[phase_unit])
-        c = source.response(channel, column, angles, at.size, per)
-        responses[channel] = c * drive[per] if per is not None else c / AMPLITUDES_IN[size]
+    given = {"phases": angles, "sd": sd, "phase_sd": phase_sd, "against": against, "derivatives": derivatives}
+    for argument, mapping in given.items():
+        for key in mapping or {}:
+            _checks.one_of(argument, key, outputs)
+    columns: list[Any] = [*inputs.values(), frequency, *(sd or {}).values(), *(phase_sd or {}).values()]
+    columns += [key for each in (*amplitudes.values(), *angles.values()) for key in each.values()]
+    columns = [key for key in columns if isinstance(key, str | tuple) and not str(key).strip().endswith("%")]
+    label, contents = contents_of(table, columns)
+    source = TableColumns(label, contents, units or {})
+    first = [contents.find(label, key) for each in amplitudes.values() for key in each.values()]
+    at, factor = source.frequencies(first, frequency), AMPLITUDES_IN[OF_SIGNAL.get(size, (None, size))[1]]
+    drive = {name: source.drive(name, value, at.size) / factor for name, value in inputs.items()}
+    reader = _Reader(source, at, drive, size, PHASE_UNITS[phase_unit], lag, per)
+    errors, orders = ((sd or {}, phase_sd or {}), derivatives or {})
+    read = {
+        name: reader.output(
+            _Output(name, to=(against or {}).get(name, "")), columns, angles.get(name, {}),
+            [each.get(name) for each in errors], orders.get(name, 0),
+        )
+        for name, columns in amplitudes.items()
+    }  # fmt: skip
+    of_table = Sweep(_table_name(label, amplitudes, inputs), sweep, resolution)
     return [
-        Experiment.from_harmonics(
-            name, float(at[k]), {channel: [None, c[k]] for channel, c in responses.items()},
-            {channel: [0.0, level[k]] for channel, level in drive.items()}, samples=samples,
+        replace(
+            Experiment.from_harmonics(
+                name, float(at[k]), {channel: each.harmonics(k) for channel, each in read.items() if each.whole},
+                {channel: [0.0, level[k]] for channel, level in drive.items()}, samples=samples,
+            ),
+            measurements=[one for each in read.values() for one in each.measurements(k)],
+            sweep=of_table,
         )
         for k, name in enumerate(_names(at))
     ]  # fmt: skip
 
 
-class _Columns:
-    """Columns of a table, in SI."""
+EXAMPLE = "{'displacement': 'the column of its amplitudes'}"
 
-    def __init__(self, label: str, contents: Contents, units: Units):
-        self.label, self.contents, self.units = label, contents, units
 
-    def column(self, key: Key) -> tuple[StoredChannel, np.ndarray]:
-        """Return a column and its values."""
-        stored = self.contents.find(self.label, key)
-        values = np.asarray(stored.values())
-        if values.dtype.kind != "c":
-            values = numbers(f"{self.contents.word} {stored.label!r} of {self.label}", values)
-        bad = np.flatnonzero(~np.isfinite(values))
-        if bad.size:
+@dataclass(frozen=True)
+class _Output:
+    """What a table says of one output, (rows,) by harmonic."""
+
+    channel: str
+    kind: Any = Amplitude
+    size: dict[int, np.ndarray] = field(default_factory=dict)  # in the channel's unit
+    phase: dict[int, np.ndarray] = field(default_factory=dict)  # [rad]
+    sd: dict[int, np.ndarray] = field(default_factory=dict)
+    phase_sd: dict[int, np.ndarray] = field(default_factory=dict)
+    to: str = ""
+
+    @property
+    def whole(self) -> bool:
+        """Whether it is compared as complex amplitudes of unknown variance."""
+        return bool(self.phase) and not self.phase_sd
+
+    def harmonics(self, row: int) -> Any:
+        """Return the complex amplitudes of harmonics 0, 1, …, None where there is none."""
+        result: list[complex | None] = [None] * (1 + max(self.size))
+        for h, sizes in self.size.items():
+            result[h] = complex(sizes[row] * np.exp(1j * self.phase[h][row]))
+        return result
+
+    def measurements(self, row: int) -> list[Measurement]:
+        """Return the measurements, none if it is compared as complex amplitudes."""
+        result: list[Measurement] = []
+        for h, sizes in {}.items() if self.whole else self.size.items():
+            more = {"harmonic": h} if self.kind is Amplitude else {}
+            sd = float(self.sd[h][row]) if self.sd else None
+            result.append(self.kind(self.channel, float(sizes[row]), sd=sd, **more))
+            if h in self.phase:
+                angle, error = float(self.phase[h][row]), float(self.phase_sd[h][row])
+                result.append(Phase(self.channel, angle, to=self.to, sd=error, harmonic=h))
+        return result
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """The conventions of a table, by which outputs are read."""
+
+    source: TableColumns
+    frequency: np.ndarray
+    drive: dict[str, np.ndarray]
+    size: str
+    radian: float
+    lag: bool
+    per: str | None
+
+    def output(
+        self, one: _Output, columns: dict[int, Key], phases: dict[int, Key], given: list[Any], order: int
+    ) -> _Output:
+        """Return what the table says of an output, with the given standard deviations of amplitudes and phases."""
+        name, rows, (sd, phase_sd) = one.channel, self.frequency.size, given
+        sizes, angles, errors = {}, {}, {}
+        kind, meant = OF_SIGNAL.get(self.size, (Amplitude, self.size))
+        _checks.integer(f"derivatives[{name!r}]", order, 0)
+        if kind is not Amplitude and (order or self.per or set(columns) != {1}):
             raise ValueError(
-                f"{self.contents.word} {stored.label!r} of {self.label}: must be finite, got {values[bad[0]]} in row "
-                f"{bad[0] + 1}; leave out the rows without a value."
+                f"size: must be of sines, {', '.join(map(repr, AMPLITUDES_IN))}, with per, derivatives or harmonics, "
+                f"got {self.size!r}."
             )
-        return stored, values
-
-    def frequencies(self, channels: list[StoredChannel], key: Key | None) -> np.ndarray:
-        """Return the frequencies [Hz]: a column, or the abscissa of frequency response functions."""
-        if key is not None:
-            stored, values = self.column(key)
-            unit = self.units.get("frequency")
-            if stored.unit and unit is None and kind_of(stored.unit) != kind_of("Hz"):
+        for h, key in columns.items():
+            values = self.source.amplitude(name, key, rows, self.per)
+            scale = self.drive[self.per] if self.per else np.full(rows, 1.0 / AMPLITUDES_IN[meant])
+            scale = scale / (2 * np.pi * h * self.frequency) ** order
+            sizes[h] = np.abs(values) * scale
+            if sd is not None:
+                errors[h] = self.source.deviations(name, sd, key, values) * scale
+            if (angle := self._angles(name, values, phases.get(h))) is not None:
+                angles[h] = angle - 0.5 * np.pi * order
+        self._check_phases(name, columns, phases, angles)
+        if phase_sd is not None and not angles:
+            raise ValueError(f"phase_sd: must be of outputs with phases, got one for {name!r}.")
+        spread = {}
+        if angles and (sd is not None or phase_sd is not None or one.to or kind is not Amplitude):
+            if phase_sd is None and (sd is None or kind is not Amplitude):
                 raise ValueError(
-                    f"frequency: must be in Hz, got {stored.unit!r} of {stored.label!r}; give units={{'frequency': …}}."
+                    f"phase_sd: must be given for {name!r}, whose phases are not those of complex amplitudes of "
+                    "unknown variance."
                 )
-            values = from_file("frequency", values, unit, stored.unit)
-        else:
-            axes = [channel.frequencies() for channel in channels if channel.frequencies is not None]
-            if len(axes) < len(channels):
-                raise ValueError(f"frequency: must be a {self.contents.word} of {self.label}, got None.")
-            values = axes[0]
-            if any(not np.array_equal(values, other) for other in axes):
-                raise ValueError(
-                    f"outputs: must be functions of the same frequencies, got {[one.label for one in channels]} of "
-                    f"{self.label}; make a table of each."
-                )
-        if not np.all(values > 0.0):
-            row = int(np.flatnonzero(~(values > 0.0))[0])
-            raise ValueError(
-                f"frequency: must be > 0 Hz, got {values[row]:g} in row {row + 1} of {self.label}; leave this row out."
-            )
-        return values
+            for h, values in sizes.items():
+                spread[h] = (
+                    errors[h] / values if phase_sd is None
+                    else self.source.phase_deviations(name, phase_sd, self.radian, rows)
+                )  # fmt: skip
+        return _Output(name, kind, sizes, angles, errors, spread, one.to or next(iter(self.drive), ""))
 
-    def drive(self, name: str, value: float | Key, rows: int) -> np.ndarray:
-        """Return the amplitudes of an input."""
-        if _is_number(value):
-            return np.full(rows, _checks.positive(f"inputs[{name!r}]", value))
-        stored, values = self.column(value)  # type: ignore[arg-type]
-        values = from_file(name, self.sized(f"inputs[{name!r}]", values, rows), self.units.get(name), stored.unit)
-        return self.amplitudes(f"inputs[{name!r}]", values)
-
-    def angles(self, key: Key, radian: float) -> np.ndarray:
-        """Return phases [rad]; a unit of the file counts."""
-        stored, values = self.column(key)
-        kind = kind_of(stored.unit)
-        if kind not in ("", "rad") or (stored.unit and not kind and stored.unit.strip() != "-"):
-            raise ValueError(f"phases: must be in degrees or radians, got {stored.unit!r} of {stored.label!r}.")
-        angles = from_file("phase", values, None, stored.unit) if kind else values * radian
-        if np.any(np.abs(angles) > np.radians(LARGEST_PHASE)):
-            raise ValueError(
-                f"phases: must be within {LARGEST_PHASE:g}°, got {np.degrees(np.abs(angles).max()):.4g}° in "
-                f"{stored.label!r} of {self.label}; see phase_unit."
-            )
-        return angles
-
-    def response(self, name: str, key: Key, angles: np.ndarray | None, rows: int, per: str | None) -> np.ndarray:
-        """Return the complex amplitudes of an output."""
-        argument = f"outputs[{name!r}]"
-        stored, values = self.column(key)
-        values = self.sized(argument, values, rows)
-        unit = self.units.get(name)
-        if per is None and unit is None and re.search(r"/ kg|/ \(.*kg|^1 / kg", kind_of(stored.unit)):
-            raise ValueError(
-                f"per: must be the input per which {name!r} is given, got None and values in {stored.unit!r}."
-            )
+    def _angles(self, name: str, values: np.ndarray, phase: Key | None) -> np.ndarray | None:
+        """Return the phases [rad] of one harmonic, those of a column or of complex amplitudes; None without any."""
+        sign = -1.0 if self.lag else 1.0
         if values.dtype.kind == "c":
-            if angles is not None:
+            if phase is not None:
                 raise ValueError(f"phases: must be left out for complex amplitudes, got one for {name!r}.")
-            return from_file(name, values.real, unit, stored.unit) + 1j * from_file(
-                name, values.imag, unit, stored.unit
-            )
-        if angles is None:
+            return sign * np.angle(values)
+        if phase is None:
+            return None
+        angles = self.source.sized(f"phases[{name!r}]", self.source.angles(phase, self.radian), values.size)
+        check_phases(f"phases[{name!r}]", self.source.label, angles[np.argsort(self.frequency, kind="stable")])
+        return sign * angles
+
+    def _check_phases(self, name: str, columns: dict[int, Key], phases: dict[int, Key], angles: dict[int, Any]) -> None:
+        """Raise a ValueError if only some harmonics have a phase."""
+        if not set(phases) <= set(columns) or (angles and set(angles) != set(columns)):
             raise ValueError(
-                f"phases: must have the phase of {name!r}, got none; amplitudes alone are no data of an experiment yet."
+                f"phases[{name!r}]: must have the harmonics of the amplitudes, {sorted(columns)}, got "
+                f"{sorted(phases or angles)}."
             )
-        size = self.amplitudes(argument, from_file(name, values, unit, stored.unit))
-        return size * np.exp(1j * self.sized(f"phases[{name!r}]", angles, rows))
-
-    def sized(self, argument: str, values: np.ndarray, rows: int) -> np.ndarray:
-        """Return values; raise a ValueError unless there is one for each frequency."""
-        if values.shape != (rows,):
-            raise ValueError(f"{argument}: must have {rows} values, one for each frequency, got {values.size}.")
-        return values
-
-    def amplitudes(self, argument: str, values: np.ndarray) -> np.ndarray:
-        """Return values; raise a ValueError unless they are positive."""
-        if not np.all(values > 0.0):
-            row = int(np.flatnonzero(~(values > 0.0))[0])
-            raise ValueError(
-                f"{argument}: must be amplitudes > 0, got {values[row]:g} in row {row + 1} of {self.label}; levels in "
-                "dB are converted first, reference*10**(level/20)."
-            )
-        return values
 
 
-def _contents(table: Any, wanted: list[Key]) -> tuple[str, Contents]:
-    """Return a name for messages and the columns of a table or a file."""
-    import pandas as pd
-
-    if isinstance(table, str | Path):
-        return Path(table).name, recognise.contents(table, None, wanted, {})
-    if isinstance(table, Mapping):
-        columns = {name: np.atleast_1d(np.asarray(values)) for name, values in table.items()}
-        sizes = {name: values.size for name, values in columns.items()}
-        if len({*sizes.values()}) != 1 or any(values.ndim != 1 for values in columns.values()):
-            raise ValueError(f"table: must have columns of one length, got {sizes}.")
-        table = pd.DataFrame(columns)
-    return "the table", objects.dataframe(table)
+def _by_harmonic(columns: Columns) -> dict[int, Key]:
+    """Return columns by harmonic; one column is that of the fundamental."""
+    if not isinstance(columns, Mapping):
+        return {1: columns}
+    for harmonic in columns:
+        _checks.integer("harmonic", harmonic, 1)
+    if not columns:
+        raise ValueError("outputs: must have a column for each channel, got {}.")
+    return dict(columns)
 
 
-def _is_number(value: Any) -> bool:
-    """Return whether the value of an input is an amplitude; an integer is, not the number of a column."""
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+def _table_name(label: str, outputs: Mapping[str, Mapping[int, Key]], inputs: Mapping[str, float | Key]) -> str:
+    """Return a name of the table that tells it from others: its file, columns and levels."""
+    parts = [f"{name} {column}" for name, each in outputs.items() for column in each.values()]
+    return f"{label}: {', '.join([*parts, *(f'{name} {value}' for name, value in inputs.items())])}"
 
 
 def _names(frequencies: np.ndarray) -> list[str]:

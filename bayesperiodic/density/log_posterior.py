@@ -54,6 +54,11 @@ class Linearisation:
         return {name: STATUSES[int(self._simulation.statuses(name)[0])] for name in self._observations}
 
     @property
+    def beyond(self) -> bool:
+        """Whether a branch does not reach the frequency of a point of its table."""
+        return bool(self.solver.beyond(self._simulation))
+
+    @property
     def converged(self) -> bool:
         """Whether all solves converged."""
         return self.status == CONVERGED
@@ -82,8 +87,9 @@ class Linearisation:
         return result
 
     def compared(self) -> dict[str, dict[str, np.ndarray]]:
-        """Return y − ŷ (points,) by experiment and channel, within the harmonics kept."""
-        return {name: o.compared(self._responses[name]) for name, o in self._observations.items()}
+        """Return y − ŷ (points,) by experiment and channel, within the harmonics kept, and of measured quantities."""
+        each = ((name, o, self._responses[name]) for name, o in self._observations.items())
+        return {name: o.compared(response) | o.quantities(response) for name, o, response in each}
 
     def left_out(self) -> dict[str, dict[str, np.ndarray]]:
         """Return measured less predicted amplitudes of harmonics that were left out, by experiment and channel."""
@@ -296,13 +302,14 @@ class LogPosterior(SamplingCoordinates):
         prior = float(self.log_prior(theta, noise))
         if not np.isfinite(prior):
             return -np.inf, *zeros, CONVERGED
-        forward = forward or self.problem.model.autonomous
+        forward = forward or self.problem.forward
         here = Linearisation(theta, self.solver, self.comparisons, polish=forward)
         if not here.converged:
             return -np.inf, *zeros, here.status
         value, by_residual, by_noise = self.problem.likelihood.value_and_gradients(here.residuals, noise)
         if not np.isfinite(value):
             return -np.inf, *zeros, CONVERGED
+        forward = forward or here.beyond
         if forward or any(o.multipliers for o in self.problem.observations.values()):
             here = here.anchored()
         by_theta = np.add.reduce(list(here.vjp(by_residual, adjoint=not forward).values()))

@@ -1,5 +1,6 @@
 """Problem: a model, experiments and priors, and the posterior density they define."""
 
+import math
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -204,7 +205,7 @@ class Problem(Description):
         values, noise = self.vector(theta), self.noise_values(variances)
         if noise.shape[:-1] != values.shape[:-1]:
             noise = np.broadcast_to(noise, (*values.shape[:-1], noise.shape[-1]))
-        flat = values.reshape(-1, values.shape[-1]), noise.reshape(-1, noise.shape[-1])
+        flat = tuple(part.reshape(math.prod(part.shape[:-1]), part.shape[-1]) for part in (values, noise))
         evaluation: Evaluation = getattr(self.density(coordinates=NATURAL), evaluate)(*flat, threads)
         return evaluation.log_prob.reshape(values.shape[:-1])
 

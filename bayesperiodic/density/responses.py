@@ -10,27 +10,39 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.initial_orbits import Guesses, experiments_guesses
+from bayesperiodic.density.special_points import (
+    PointDerivatives,
+    special_anchor,
+    special_equations,
+    special_values,
+)
+from bayesperiodic.density.sweeps import Place, Point, places, reach_further, tables
 from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
 from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
-from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved, directional_sensitivities
+from bayesperiodic.periodic.equations import PeriodicEquations, Solved, directional_sensitivities
 from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
-from bayesperiodic.periodic.solution import PeriodicSolution, describe, logarithmic_jacobian
+from bayesperiodic.periodic.solution import PeriodicSolution, as_guess, describe, logarithmic_jacobian
 from bayesperiodic.periodic.solve import solve_driven, solve_free
+from bayesperiodic.periodic.special import SpecialEquations, SpecialPoint
+from bayesperiodic.periodic.special_batch import SpecialAnchor, SpecialBatch
 from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.model_inputs import without_sensors
 from bayesperiodic.problem.parameters import ParameterMaps
 
 NO_HISTORY = np.empty((0, 3))
+# Relative step of differences of orbits at folds.
+DIFFERENCE = 1e-5
 
 
 class InitialOrbit(NamedTuple):
     """Orbit from which the periodic solves of an experiment start."""
 
     guess: Any  # states (points,) by name, or "static", from which to solve where the anchor fails
-    anchor: Anchor
-    derivatives: Sensitivities | None  # of outputs and frequency by all parameters; None where they do not exist
+    anchor: Anchor | SpecialAnchor
+    derivatives: PointDerivatives | None  # by all parameters; None where they do not exist
+    sheet: int | None = None  # of the branch of a table, see `sweeps`; None if it is not known
 
 
 class ResponseSolver:
@@ -38,41 +50,100 @@ class ResponseSolver:
 
     def __init__(self, problem: Description, anchors: Mapping[str, InitialOrbit]):
         self.problem, self.anchors = problem, anchors
+        self._changes: tuple[np.ndarray, Simulation] | None = None
 
     @classmethod
     def start(cls, problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> "ResponseSolver":
-        """Return the solver anchored at θ (names,), solved from guesses, the experiments' own or the equilibrium."""
+        """Return the solver anchored at θ (names,), solved from guesses, the experiments' own or the equilibrium.
+
+        Points of tables without a guess start from the branch that leads through the table.
+        """
+        near = None
         if guesses is None:
             chosen: dict[str, Any] = experiments_guesses(problem, theta)
         else:
             _checks.same_names("guesses", guesses, [e.name for e in problem.experiments])
             chosen = {e.name: replace(e, guess=guesses[e.name]).guess for e in problem.experiments}
-        return cls(problem, {name: _initial_orbit(problem, name, theta, g or "static") for name, g in chosen.items()})
+            near = {name: as_guess(problem.equations[name], guess) for name, guess in chosen.items() if guess}
+        on_branch, anchors = places(problem, theta, near), {}
+        for name, guess in chosen.items():
+            if name in on_branch:
+                anchors[name] = _placed(problem, name, theta, guess or "static", on_branch[name])
+            else:
+                anchors[name] = _initial_orbit(problem, name, theta, guess or "static")
+        return cls(problem, anchors)
 
     def __getstate__(self) -> dict[str, Any]:
         # The factors at the anchors are computed again; the anchors are kept to the last bit.
-        return {key: value for key, value in self.__dict__.items() if key != "_batches"}
+        kept = {key: value for key, value in self.__dict__.items() if key not in ("_batches", "_specials")}
+        return kept | {"_changes": None}
 
     def anchored(self, theta: np.ndarray) -> "ResponseSolver":
         """Return the solver anchored at θ (names,), solved from the present anchors, else from the guesses."""
         simulation, anchors = self.solve(theta[None], keep=True, polish=True), {}
+        lost = [name for name, orbit in self.anchors.items() if simulation.statuses(name)[0] != CONVERGED]
+        again = {}
+        if any(self.anchors[name].sheet is not None for name in lost):
+            near = {name: orbit.anchor for name, orbit in self.anchors.items() if orbit.sheet is not None}
+            z = {name: anchor.z for name, anchor in near.items() if isinstance(anchor, Anchor)}
+            again = places(self.problem, theta, z)
         for name, orbit in self.anchors.items():
-            converged = simulation.statuses(name)[0] == CONVERGED
-            solved = self._solved(simulation, name) if converged else None
-            anchors[name] = _initial_orbit(self.problem, name, theta, orbit.guess, solved)
+            if name in self._specials:
+                anchors[name] = self._special_orbit(name, theta, None if name in lost else simulation)
+            elif name in lost and name in again:
+                anchors[name] = _placed(self.problem, name, theta, orbit.guess, again[name])
+            elif name in lost or orbit.sheet is None:
+                solved = None if name in lost else self._solved(simulation, name)
+                anchors[name] = _initial_orbit(self.problem, name, theta, orbit.guess, solved)
+            else:
+                here = Place(orbit.sheet, *self._solved(simulation, name), name not in self.beyond(simulation))
+                anchors[name] = _placed(self.problem, name, theta, orbit.guess, here)
         return ResponseSolver(self.problem, anchors)
 
+    def beyond(self, simulation: Simulation) -> list[str]:
+        """Return the points of tables that the branch does not reach at the first of the solves, see `sweeps`."""
+        return [
+            e.name
+            for e in self.problem.experiments
+            if self.anchors[e.name].sheet is not None and simulation.response(e.name).frequency[0] != e.frequency
+        ]
+
     def _solved(self, simulation: Simulation, experiment: str, i: int = 0) -> tuple[PeriodicEquations, np.ndarray]:
-        """Return the equations at the frequency of one of the solves, and its z."""
-        frequency = float(simulation.response(experiment).frequency[i])
+        """Return the equations at the frequency, and the scale of the input, of one of the solves, and its z."""
+        response = simulation.response(experiment)
+        frequency = float(response.frequency[i])
+        if experiment in self._specials:
+            special = self._specials[experiment]
+            values = special_values(special, frequency, float(response.scale[i]))
+            return special.at(values), simulation.z(experiment)[i]
         return self.problem.equations[experiment].at_frequency(frequency), simulation.z(experiment)[i]
+
+    def _special_orbit(self, experiment: str, theta: np.ndarray, simulation: Simulation | None) -> InitialOrbit:
+        """Return the anchor of a special point at θ (names,): that of a solve from the anchor, or found anew."""
+        special, guess = self._specials[experiment], None
+        if simulation is not None:
+            response, before = simulation.response(experiment), self.anchors[experiment].anchor
+            assert isinstance(before, SpecialAnchor)
+            values = special_values(special, float(response.frequency[0]), float(response.scale[0]))
+            guess = SpecialPoint(simulation.z(experiment)[0], values, before.point.vector)
+            if special.is_fold:
+                parameters = self.problem.parameters(theta[None], experiment)[0]
+                guess = special.null_vector(guess, parameters, special.row(guess.vector))
+        return _special_orbit(self.problem, experiment, theta, special, guess)
+
+    @cached_property
+    def _specials(self) -> dict[str, SpecialEquations]:
+        """The equations of the special points, by experiment."""
+        return _specials(self.problem)
 
     @cached_property
     def groups(self) -> list[tuple[Experiment, ...]]:
         """Experiments on the same grid and with the same parameters free, which are solved together."""
         groups: dict[tuple[Any, ...], list[Experiment]] = {}
         for e in self.problem.experiments:
-            groups.setdefault((e.samples, e.periods, *self.problem.parameter_maps[e.name].columns), []).append(e)
+            kind = () if e.condition is None else (type(e.condition).__name__, e.condition.free)
+            columns = self.problem.parameter_maps[e.name].columns
+            groups.setdefault((kind, e.samples, e.periods, *columns), []).append(e)
         return [tuple(group) for group in groups.values()]
 
     @cached_property
@@ -81,18 +152,39 @@ class ResponseSolver:
         return {e.name: (g, m) for g, group in enumerate(self.groups) for m, e in enumerate(group)}
 
     @cached_property
-    def _batches(self) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch, bool]]:
+    def _batches(
+        self,
+    ) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch | SpecialBatch, bool]]:
         """The groups, their parameters, their solver, and whether multipliers were measured."""
-        kind = AutonomousBatch if self.problem.model.autonomous else Batch
         return [
             (
                 group,
                 ParameterMaps([self.problem.parameter_maps[e.name] for e in group]),
-                kind([self.problem.equations[e.name] for e in group], [self.anchors[e.name].anchor for e in group]),
+                self._batch([e.name for e in group]),
                 any(self.problem.observations[e.name].multipliers for e in group),
             )
             for group in self.groups
         ]
+
+    @cached_property
+    def _sheets(self) -> list[list[Point]]:
+        """The points of each sheet of the tables' branches, in the order of the sweep."""
+        result: dict[Any, list[Point]] = {}
+        for sweep, table in tables(self.problem).items():
+            for name in (e.name for e in table):
+                orbit = self.anchors[name]
+                if orbit.sheet is not None:
+                    known = orbit.anchor.sensitivities is not None
+                    result.setdefault((sweep, orbit.sheet), []).append(Point(name, *self._places[name], known))
+        return list(result.values())
+
+    def _batch(self, names: list[str]) -> Batch | AutonomousBatch | SpecialBatch:
+        """Return the solver of experiments of one group."""
+        anchors: list[Any] = [self.anchors[name].anchor for name in names]
+        if names[0] in self._specials:
+            return SpecialBatch([self._specials[name] for name in names], anchors)
+        kind = AutonomousBatch if self.problem.model.autonomous else Batch
+        return kind([self.problem.equations[name] for name in names], anchors)
 
     def solve(
         self,
@@ -109,10 +201,13 @@ class ResponseSolver:
         wherever multipliers are measured. With `whole` a θ counts only if every solve converges; where one has failed,
         other experiments may be skipped.
         """
-        groups = []
+        groups, keep = [], keep or bool(self._sheets)
         for experiments, maps, batch, multipliers in self._batches:
             values = maps.values(theta)
             parameters, sensors = values[..., : maps.count], values[..., maps.count :]
+            if isinstance(batch, SpecialBatch):
+                groups.append(_special_solution(batch, parameters, sensors, threads))
+                continue
             if isinstance(batch, AutonomousBatch):
                 solved = batch.solve(parameters, threads, keep=keep or multipliers, whole=whole)
             else:
@@ -125,13 +220,15 @@ class ResponseSolver:
                     for i, e in enumerate(experiments)
                 ]
             of_all = solved.outputs, solved.frequency, parameters, sensors, logarithms, solved.z, status
-            groups.append(GroupSolution(*of_all))
+            groups.append(GroupSolution(*of_all, np.ones(status.shape)))
+        for points in self._sheets:
+            reach_further(self.problem, points, groups)
         return Simulation(groups, self._places)
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
         """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""
         anchor = self.anchors[experiment].anchor
-        if anchor.sensitivities is None:
+        if isinstance(anchor, SpecialAnchor) or anchor.sensitivities is None:
             return PATH_LOST
         parameters = self.problem.parameters(theta[None], experiment)[0]
         return path_outcome(self.problem.equations[experiment], anchor, parameters)
@@ -171,13 +268,23 @@ class ResponseSolver:
         simulation, solutions = self.solve(theta[None], keep=True, polish=True), {}
         for e in self.problem.experiments:
             (here, z), code = self._solved(simulation, e.name), int(simulation.statuses(e.name)[0])
-            here, parameters = without_sensors(self.problem, here, e, theta)
+            here, parameters = without_sensors(self.problem, here, self._at_scale(e, simulation), theta)
             solutions[e.name] = describe(here, parameters, Solved(z, code, NO_HISTORY))
         return solutions
+
+    def _at_scale(self, experiment: Experiment, simulation: Simulation) -> Experiment:
+        """Return an experiment with the level of the input that is an unknown of its special point."""
+        special, scale = self._specials.get(experiment.name), float(simulation.response(experiment.name).scale[0])
+        if special is None or scale == 1.0:
+            return experiment
+        inputs = {name: (scale if name in special.free else 1.0) * u for name, u in experiment.inputs.items()}
+        return replace(experiment, inputs=inputs)
 
     def jacobian(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:
         """Return the derivatives of a response at the anchor by θ, (names, …); None where they do not exist."""
         parameter_map, derivative = self.problem.parameter_maps[experiment], self.anchors[experiment].derivatives
+        if self.anchors[experiment].sheet is not None and response.frequency != self._measured_frequency(experiment):
+            return self._changes_at_fold(theta, experiment)
         if derivative is None:
             return None
         of_model, of_sensors = np.split(parameter_map.slopes(theta), [parameter_map.count])
@@ -185,14 +292,43 @@ class ResponseSolver:
         multipliers = np.zeros((theta.size, 0))
         if response.log_multipliers.size:
             multipliers = self._multiplier_jacobian(theta, experiment, z, response)
-        return Response(outputs, of_model.T @ derivative.frequency, multipliers, of_sensors.T)
+        scale = of_model.T @ derivative.scale
+        return Response(outputs, of_model.T @ derivative.frequency, multipliers, of_sensors.T, scale)
+
+    def _measured_frequency(self, experiment: str) -> float:
+        return self.problem.equations[experiment].frequency
+
+    def _changes_at_fold(self, theta: np.ndarray, experiment: str) -> Response:
+        """Return the derivatives of a response that is that at a fold, by differences."""
+        steps = DIFFERENCE * np.where(theta != 0.0, np.abs(theta), self.problem.joint_prior.widths)
+        if self._changes is None or not np.array_equal(self._changes[0], theta):
+            around = np.concatenate([theta[None], theta + np.diag(steps), theta - np.diag(steps)])
+            self._changes = theta, self.solve(around, polish=True)
+        response, count = self._changes[1].response(experiment), theta.size
+        measured = self._measured_frequency(experiment)
+        centre, ends = (response.outputs[0], response.frequency[0]), []
+        for sign, part in ((1.0, slice(1, count + 1)), (-1.0, slice(count + 1, None))):
+            outputs, frequency = response.outputs[part], response.frequency[part]
+            # Where the branch reaches the point on one side, the derivative is that on the other side.
+            at_fold = frequency != measured
+            width = np.where(at_fold, sign * steps, 0.0)
+            outputs = np.where(at_fold[:, None, None], outputs, centre[0])
+            ends.append((outputs, np.where(at_fold, frequency, centre[1]), width))
+        (y_up, f_up, up), (y_down, f_down, down) = ends
+        width = np.where(up > down, up - down, np.inf)
+        of_sensors = self.problem.parameter_maps[experiment].slopes(theta)[
+            self.problem.parameter_maps[experiment].count :
+        ]
+        by_outputs = (y_up - y_down) / width[:, None, None]
+        return Response(by_outputs, (f_up - f_down) / width, np.zeros((count, 0)), of_sensors.T)
 
     def _multiplier_jacobian(self, theta: np.ndarray, experiment: str, z: np.ndarray, response: Response) -> np.ndarray:
         """Return ∂ log|μ|/∂θ at the anchor, (names, multipliers)."""
         anchor = self.anchors[experiment].anchor
         parameter_map = self.problem.parameter_maps[experiment]
         directions = parameter_map.slopes(theta)[: parameter_map.count].T
-        assert anchor.sensitivities is not None and anchor.frequency_sensitivities is not None
+        assert isinstance(anchor, Anchor) and anchor.sensitivities is not None
+        assert anchor.frequency_sensitivities is not None
         equations = self.problem.equations[experiment].at_frequency(float(response.frequency))
         parameters, count = self.problem.parameters(theta[None], experiment)[0], response.log_multipliers.size
         solution = _described(equations, parameters, z)
@@ -247,6 +383,9 @@ def _initial_orbit(
     solved: tuple[PeriodicEquations, np.ndarray] | None = None,
 ) -> InitialOrbit:
     """Return the orbit at θ (names,): one that is solved, or solved from the guess with all fallbacks."""
+    specials = _specials(problem)
+    if experiment in specials:
+        return _special_orbit(problem, experiment, theta, specials[experiment], None)
     equations, parameters = problem.equations[experiment], problem.parameters(theta[None], experiment)[0]
     if solved is None:
         if problem.model.autonomous:
@@ -261,10 +400,47 @@ def _initial_orbit(
     moving = np.flatnonzero(parameter_map.slopes(theta)[: parameter_map.count].any(axis=1))
     directions = np.eye(parameters.size)[moving]
     derivative = directional_sensitivities(here, z, parameters, directions)
-    by_all = derivative and derivative._replace(
-        outputs=np.tensordot(directions, derivative.outputs, (0, 0)), frequency=directions.T @ derivative.frequency
+    by_all = derivative and PointDerivatives(
+        np.tensordot(directions, derivative.outputs, (0, 0)),
+        directions.T @ derivative.frequency,
+        np.zeros(parameters.size),
     )
     return InitialOrbit(guess, Anchor.of(here, parameters, z, derivative, moving), by_all)
+
+
+def _placed(problem: Description, experiment: str, theta: np.ndarray, guess: Any, place: Place) -> InitialOrbit:
+    """Return the orbit of a point of a table on its branch; without derivatives if the branch does not reach it."""
+    if place.reached:
+        return _initial_orbit(problem, experiment, theta, guess, (place.equations, place.z))._replace(sheet=place.sheet)
+    parameters = problem.parameters(theta[None], experiment)[0]
+    measured = problem.equations[experiment].frequency
+    return InitialOrbit(guess, Anchor(parameters, place.z, measured), None, place.sheet)
+
+
+def _specials(problem: Description) -> dict[str, SpecialEquations]:
+    """Return the equations of the special points of a problem, by experiment."""
+    of_points = [e for e in problem.experiments if e.condition is not None]
+    return {e.name: special_equations(e, problem.equations[e.name]) for e in of_points}
+
+
+def _special_orbit(
+    problem: Description, experiment: str, theta: np.ndarray, special: SpecialEquations, guess: SpecialPoint | None
+) -> InitialOrbit:
+    """Return the anchor of a special point at θ (names,), from a guess or found along a branch."""
+    parameter_map = problem.parameter_maps[experiment]
+    moving = np.flatnonzero(parameter_map.slopes(theta)[: parameter_map.count].any(axis=1))
+    parameters = problem.parameters(theta[None], experiment)[0]
+    return InitialOrbit("static", *special_anchor(special, parameters, moving, guess))
+
+
+def _special_solution(
+    batch: SpecialBatch, parameters: np.ndarray, sensors: np.ndarray, threads: int | None
+) -> GroupSolution:
+    """Return the solutions of experiments at special points."""
+    solved = batch.solve(parameters, threads)
+    logarithms = [np.empty((parameters.shape[1], 0))] * len(parameters)
+    given = parameters, sensors, logarithms, solved.z, solved.status, batch.scale(solved)
+    return GroupSolution(solved.outputs, batch.frequency(solved), *given)
 
 
 def orbit_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int) -> np.ndarray:

@@ -32,6 +32,7 @@ from bayesperiodic.likelihood.input_noise import FROM_CYCLES, JOINT, error_waves
 from bayesperiodic.likelihood.noise import PER_EXPERIMENT, VARIANCE, Independent
 from bayesperiodic.likelihood.observation import Response
 from bayesperiodic.priors.joint import as_prior
+from bayesperiodic.problem.arguments import refuse_special_points
 from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.sampling.draws import Posterior
 from bayesperiodic.sampling.sample import sample
@@ -340,6 +341,7 @@ def check_supported(problem: Problem) -> None:
         raise ValueError("problem: must have another input_noise than 'joint', whose errors are no parameters to draw.")
     if problem.model.autonomous:
         raise ValueError(f"problem: must have a forced model, got the autonomous {problem.model.name!r}.")
+    refuse_special_points(problem.experiments, "simulated recordings")
     for e in problem.experiments:
         turns = [e.winding] if isinstance(e.winding, int) else [*e.winding.values()]
         excluded = {

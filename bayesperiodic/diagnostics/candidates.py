@@ -13,7 +13,8 @@ import sympy as sp
 
 from bayesperiodic import _checks
 from bayesperiodic.models.elements import smooth_abs, smooth_sign
-from bayesperiodic.models.model import DERIVATIVES, Model, Names, with_derivatives
+from bayesperiodic.models.model import Model
+from bayesperiodic.models.names import DERIVATIVES, Names, with_derivatives
 from bayesperiodic.models.units import Unit, parsed, product, unit_of, written
 
 HIGHEST_DEGREE, HIGHEST_POWER = 3, 5

@@ -15,6 +15,7 @@ from bayesperiodic._linalg import hessian_eigh
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.problem.arguments import refuse_special_points
 
 ONE_SD = float(ndtr(1.0))
 SMALLEST_EIGENVALUE, NEGLIGIBLE_COMPONENT = 1e-12, 1e-3
@@ -123,9 +124,9 @@ def default_candidates(problem: Problem) -> list[FurtherExperiment]:
 
     These are all runs if some parameters are local; none for a free-running model, which has no drive to change.
     """
-    if problem.model.autonomous:
+    if problem.model.autonomous or all(e.condition is not None for e in problem.experiments):
         return []
-    runs = sorted(problem.experiments, key=lambda e: e.frequency)
+    runs = sorted((e for e in problem.experiments if e.condition is None), key=lambda e: e.frequency)
     most = len(runs) if any("[" in name for name in problem.names) else MOST_RUNS
     chosen = [runs[i] for i in sorted({round(k) for k in np.linspace(0, len(runs) - 1, most)})]
     scales = FREQUENCY_FACTORS if problem.model.inputs else (1.0,)
@@ -147,6 +148,7 @@ def rank_candidates(
     now, rows = np.sqrt(np.diag(np.linalg.inv(before))), []
     for candidate in candidates:
         _checks.one_of("candidates", candidate.run, runs)
+        refuse_special_points([runs[candidate.run]], "further experiments")
         after = before + _added(problem, fit, runs[candidate.run], candidate) * unit
         row: dict[str, object] = {**candidate._asdict(), "gain": np.nan}
         if np.isfinite(after).all():

@@ -50,7 +50,13 @@ def structure_of(problem: Problem) -> Structure:
     sensors = tuple((channel, kinds, problem.sensors.given[channel].order) for channel, kinds in unknown.items())
     shifted = SHIFT in free and not problem.model.autonomous and any(DELAY in kinds for kinds in unknown.values())
     return _structure(
-        problem.model, problem.channels, known, zeros, tuple(problem.ties.items()), sensors=sensors, shifted=shifted
+        problem.model,
+        problem.sensors.channels,
+        known,
+        zeros,
+        tuple(problem.ties.items()),
+        sensors=sensors,
+        shifted=shifted,
     )
 
 

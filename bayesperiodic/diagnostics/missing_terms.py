@@ -38,6 +38,7 @@ from bayesperiodic.estimation.adequacy import ALL, adequacy
 from bayesperiodic.estimation.map_estimate import map_estimate, nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
+from bayesperiodic.problem.arguments import refuse_special_points
 from bayesperiodic.problem.fingerprint import check_results
 
 # Ratio of the errors in experiments that are left out from which on these tell two terms apart.
@@ -336,6 +337,7 @@ def missing_terms(
     ()
     """
     stated = check_results(problem, fit=fit)
+    refuse_special_points(problem.experiments, "a search for terms")
     if advice := orbit_advice(fit):
         raise ValueError(f"fit: must be an estimate on the measured orbits, got one on others; {advice}.")
     _checks.integer("max_terms", max_terms, 0)

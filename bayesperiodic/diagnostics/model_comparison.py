@@ -189,7 +189,17 @@ def _checked(models: Any) -> dict[str, tuple[Problem, Posterior]]:
     return given
 
 
-FIELDS = ("outputs", "frequency", "frequency_se", "samples", "mask", "covariance", "multipliers", "multiplier_sd")
+FIELDS = (
+    "outputs",
+    "frequency",
+    "frequency_se",
+    "samples",
+    "mask",
+    "covariance",
+    "multipliers",
+    "multiplier_sd",
+    "condition",
+)
 
 
 def _data(problem: Problem) -> dict[str, str]:

@@ -15,6 +15,7 @@ from bayesperiodic.density.log_posterior import Linearisation
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.estimation.table_tests import rows_of, serial_correlation
 from bayesperiodic.estimation.unexplained import NOT_TESTED, Unexplained, testable, used
 from bayesperiodic.likelihood.block import Block
 
@@ -87,7 +88,7 @@ def adequacy(
     rows: dict[str, dict[str, Any]] = {}
     white = [Whitened(problem, here, shape) for shape in shapes]
     for i, block in enumerate(problem.likelihood.blocks):
-        if not block.counted:
+        if not block.counted or block.channel in problem.quantities:
             continue
         # The spectrum of correlated noise is known from draws only: the p of the realised residual is their mean.
         whiteness, harmonics, harmonic = np.array([w.spectral_tests(i) for w in white]).T
@@ -103,6 +104,7 @@ def adequacy(
             "spectrum": ASSUMED_SPECTRUM if white[0].spectrum(i) is None else MEASURED_SPECTRUM,
             "amplitude": _amplitude(problem, block, replicates),
         }
+    rows |= {quantity: _table_row(problem, quantity, white[0]) for quantity in problem.quantities}
     consistent = np.mean([w.consistency() for w in white])
     rows[ALL] = {"experiment": ALL, "channel": ALL, "spectrum": "", "consistency": consistent}
     columns = ["experiment", "channel", *ADEQUACY_TESTS, "harmonic", "model_error_share", "spectrum"]
@@ -116,6 +118,23 @@ def adequacy(
     verdicts = [UNTESTED, MISSPECIFIED, UNSOUND]
     table["verdict"] = np.select([np.isinf(smallest), smallest < ADEQUACY_LEVEL, unsound], verdicts, ADEQUATE)
     return table
+
+
+def _table_row(problem: Problem, quantity: str, white: "Whitened") -> dict[str, Any]:
+    """Return the tests of a quantity that was measured in several experiments."""
+    members = rows_of(problem, quantity)
+    r, j, _ = (np.concatenate(parts, axis=-1) for parts in zip(*(white.parts[b] for b in members), strict=True))
+    size = NOT_TESTED
+    if white.groups[members[0]] in white.known and testable(r, j):
+        left = Unexplained(r, j, np.ones(r.size, dtype=int))
+        size = excess(left.square / left.freedom, left.freedom, 1.0, np.inf) if left.freedom else NOT_TESTED
+    return {
+        "experiment": ALL,
+        "channel": quantity,
+        "whiteness": serial_correlation(r, j),
+        "size": size,
+        "spectrum": "",
+    }
 
 
 def faulty(problem: Problem) -> set[str]:

@@ -223,7 +223,7 @@ def check_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             "does not show it. Check units, prior and data, try map_estimate(starts=8), or widen the prior."
         )
     yield from _unexplained(fit)
-    if (not fit.converged or max(fit.fvu.values()) > MOST_UNEXPLAINED) and (text := unit_error(problem)):
+    if (not fit.converged or max(fit.fvu.values(), default=0.0) > MOST_UNEXPLAINED) and (text := unit_error(problem)):
         yield text
     silent = [text for text in fit.undetermined if text.endswith(SILENT)]
     if silent:

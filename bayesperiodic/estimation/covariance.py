@@ -12,6 +12,7 @@ from bayesperiodic._linalg import TINY, covariance_eigh, hessian_scale, scaled
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import orbit_multipliers
+from bayesperiodic.density.special_points import again_special
 from bayesperiodic.estimation.gauss_newton import Iterate, information, inverse_hessian
 from bayesperiodic.estimation.noise_changes import NoiseChange, changes_by_measured, changes_by_variance
 from bayesperiodic.likelihood.block import Block
@@ -468,6 +469,8 @@ def _solved(
         winding=experiment.winding,
     )
     parameters, sensors = problem.parameter_maps[experiment.name].split(theta)
+    if experiment.condition is not None:
+        return again_special(experiment, equations, (parameters, sensors), near, finer)
     if problem.model.autonomous:
         equations, solved, _ = solve_free(equations, parameters, near)
     else:

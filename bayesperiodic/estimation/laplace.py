@@ -105,7 +105,7 @@ def _gradients(problem: Description, theta: np.ndarray, mode: Iterate) -> dict[s
     if not there.converged:
         return dict.fromkeys(problem.observations, np.full(theta.size, np.nan))
     _, by_residual, _ = problem.likelihood.value_and_gradients(there.residuals, mode.noise)
-    return there.vjp(by_residual, adjoint=not problem.model.autonomous)
+    return there.vjp(by_residual, adjoint=not problem.forward)
 
 
 SHOWN_PART = 0.05

@@ -11,6 +11,8 @@ from tqdm import tqdm
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.data.measurements import Amplitude, Measurement
 from bayesperiodic.density.initial_orbits import InitialEstimate, measured_orbits, simultaneous_fit
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
 from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
@@ -45,6 +47,10 @@ from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.problem.model_inputs import model_inputs
 
 MOST_SHOWN_MODES = 3
+# Standard deviations from which on an amplitude of a noisy harmonic is nearly normal.
+LEAST_NORMAL = 4.0
+# Standard deviation of a phase of which nothing is known [rad].
+RANDOM_PHASE = np.pi / np.sqrt(3.0)
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
 # Most linearisations of errors of the inputs, the steps between two, and the change [sds] that ends them.
@@ -308,7 +314,7 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
 
     Orbits and parameters are looked for from the start and from the estimate.
     """
-    if problem.model.autonomous:
+    if problem.model.autonomous or not all(e.outputs for e in problem.experiments):
         return
     solutions = {name: solution.states for name, solution in end.here.solver.solutions(end.theta).items()}
     for theta in (start, end.theta):
@@ -345,7 +351,7 @@ def _describe(
         ),
         solutions=solutions,
         residuals=residuals,
-        rms={c: _pooled(problem, c, residuals) for c in problem.channels},
+        rms={c: _pooled(problem, c, residuals) for c in (*problem.channels, *problem.quantities)},
         fvu=_fractions_left(problem, residuals),
         true_inputs=TrueInputs(
             {e.name: model_inputs(problem, e, best.theta) for e in problem.experiments},
@@ -393,6 +399,15 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             f"The estimate of {name!r}, {fit.theta[name]:.6g}, lies at the end of its prior's support ({low:g}, "
             f"{high:g}); standard deviations do not describe the posterior there. Sample it, or widen the prior."
         )
+    unknown = {one.label: one for e in problem.experiments for one in e.measurements if _is_unknown_amplitude(one)}
+    for label in unknown:
+        smallest = min(one.value for e in problem.experiments for one in e.measurements if one.label == label)
+        if smallest < LEAST_NORMAL * fit.rms[label] and label not in fit.without_noise:
+            yield (
+                f"The smallest {label}, {smallest:.3g}, is {smallest / fit.rms[label]:.2g} times the rms of the "
+                "residuals. Noise makes such amplitudes larger on average, which the normal distribution of unknown "
+                "variance does not take into account; give their standard deviation, sd=…, or leave them out."
+            )
     if others := notable(fit.other_modes):
         shown = "; ".join(map(repr, others[:MOST_SHOWN_MODES]))
         yield (
@@ -418,15 +433,29 @@ def _tied_slopes(problem: Problem, theta: np.ndarray) -> dict[str, dict[str, flo
 
 
 def _fractions_left(problem: Problem, residuals: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, float]:
-    """Return the fraction of each channel's variance that is left in residuals."""
-    measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} for e in problem.experiments}
-    power = {c: max(_pooled(problem, c, measured) ** 2, np.finfo(float).tiny) for c in problem.channels}
+    """Return the fraction of each channel's variance that is left in residuals, of quantities of their mean square."""
+    measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} | _scales(e) for e in problem.experiments}
+    compared = (*problem.channels, *problem.quantities)
+    power = {c: max(_pooled(problem, c, measured) ** 2, np.finfo(float).tiny) for c in compared}
     return {c: _pooled(problem, c, residuals) ** 2 / whole for c, whole in power.items()}
 
 
+def _is_unknown_amplitude(one: Measurement) -> bool:
+    return isinstance(one, Amplitude) and one.sd is None
+
+
+def _scales(experiment: Experiment) -> dict[str, np.ndarray]:
+    """Return what errors of measured quantities are compared with, by label: their values; of phases, any phase."""
+    result: dict[str, list[float]] = {}
+    for one in experiment.measurements:
+        result.setdefault(one.label, []).append(RANDOM_PHASE if one.signed else one.value)
+    return {label: np.array(values) for label, values in result.items()}
+
+
 def _pooled(problem: Problem, channel: str, signals: Mapping[str, Mapping[str, np.ndarray]]) -> float:
-    """Return the root mean square of a channel over the measured points of all experiments."""
-    values = [signals[e.name][channel][e.measured_points] for e in problem.experiments if channel in e.outputs]
+    """Return the root mean square of a channel over the measured points of all experiments, or of a quantity."""
+    having = [(e, signals[e.name][channel]) for e in problem.experiments if channel in signals[e.name]]
+    values = [part[e.measured_points] if channel in e.outputs else part for e, part in having]
     return float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
 
 

@@ -44,7 +44,7 @@ def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
             sizes = np.abs(rates[rates != 0.0]) / (2 * np.pi)
             if sizes.size:
                 modelled[FREQUENCY] = float(sizes[np.argmin(np.abs(np.log(sizes / e.frequency)))])
-            if not problem.model.autonomous:
+            if not problem.model.autonomous and e.condition is None:
                 z = z - equations.factors(columns).solve(np.ascontiguousarray(columns[:, : equations.count]))
                 response = Response(equations.outputs(z, parameters), np.array(e.frequency), np.empty(0), sensors)
                 for channel, values in problem.observations[e.name].predicted(response).items():

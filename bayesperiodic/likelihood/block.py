@@ -19,12 +19,16 @@ from bayesperiodic.models.model import Model
 PROPORTIONAL, NO_PARAMETERS = np.ones((1, 1)), np.ones((1, 0))
 
 
+NO_SCALE = np.zeros(())
+
+
 class ComparedSignals(NamedTuple):
     """What is compared: responses, their differences from the data, or derivatives along directions."""
 
     values: np.ndarray  # (…, points, channels) of the measured channels, turned and delayed
     log_multipliers: np.ndarray  # (…, multipliers), log|μ|, largest first
     frequency: np.ndarray  # (…,) [Hz]
+    scale: np.ndarray = NO_SCALE  # (…,) of an input, where that is an unknown
 
 
 def _nothing() -> np.ndarray:
@@ -227,8 +231,14 @@ def common(experiment: Experiment, channel: str, place: int = 0, **more: Any) ->
 
 
 def measured_channels(experiment: Experiment, model: Model) -> tuple[str, ...]:
-    """Return the measured outputs, in the order of the model."""
+    """Return the outputs with a measured time history, in the order of the model."""
     return tuple(channel for channel in model.outputs if channel in experiment.outputs)
+
+
+def compared_channels(experiment: Experiment, model: Model) -> tuple[str, ...]:
+    """Return these, and then the other outputs of which something was measured."""
+    histories, every = measured_channels(experiment, model), experiment.channels
+    return *histories, *(c for c in model.outputs if c in every and c not in histories)
 
 
 def measured_variance(experiment: Experiment, channel: str) -> float:

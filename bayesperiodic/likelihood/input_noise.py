@@ -24,7 +24,8 @@ from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Storable
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.noise_spectrum import NoiseSpectrum
-from bayesperiodic.models.model import DERIVATIVES, Model
+from bayesperiodic.models.model import Model
+from bayesperiodic.models.names import DERIVATIVES
 from bayesperiodic.priors.single import Normal
 
 EXACT, FROM_CYCLES, JOINT = "exact", "measured", "joint"

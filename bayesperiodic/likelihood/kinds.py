@@ -2,9 +2,13 @@
 
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.block import Block
+from bayesperiodic.likelihood.jump import Jump
 from bayesperiodic.likelihood.mean_period import MeanPeriod
 from bayesperiodic.likelihood.multipliers import Multipliers
 from bayesperiodic.likelihood.orbit_frequency import OrbitFrequency
+from bayesperiodic.likelihood.quantities import Amplitudes, PeakToPeaks, RelativePhases, RootMeanSquares
+from bayesperiodic.likelihood.reach import Reach
+from bayesperiodic.likelihood.resonance import Resonance
 from bayesperiodic.likelihood.samples import Samples
 from bayesperiodic.likelihood.section_points import SectionPoints
 from bayesperiodic.models.model import Model
@@ -16,6 +20,13 @@ KINDS: list[type[Block]] = [
     Samples,
     Multipliers,
     OrbitFrequency,
+    Amplitudes,
+    RelativePhases,
+    PeakToPeaks,
+    RootMeanSquares,
+    Reach,
+    Jump,
+    Resonance,
 ]
 
 

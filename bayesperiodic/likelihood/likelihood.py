@@ -172,6 +172,11 @@ class Likelihood:
         """Independent values behind each variance (and "scale"), by its name."""
         return self._summed(block.count for block in self.blocks)
 
+    @property
+    def values(self) -> float:
+        """The independent values of all data."""
+        return sum(block.count if block.counted else block.size for block in self.blocks)
+
     def _summed(self, values: Iterable[Any]) -> dict[str, Any]:
         """Return the sum of values, one a block, behind each variance."""
         result: dict[str, Any] = {}

@@ -27,8 +27,8 @@ class MeanPeriod(Timed):
 
     @classmethod
     def of(cls, experiment: Experiment, model: Model) -> "list[MeanPeriod]":
-        """Return one block a channel, of experiments without a mask and a covariance."""
-        if experiment.mask is not None or experiment.covariance is not None:
+        """Return one block a channel, of experiments without a mask, a covariance and a condition."""
+        if experiment.mask is not None or experiment.covariance is not None or experiment.condition is not None:
             return []
         blocks, points = [], experiment.samples * experiment.periods
         highest = _fourier.highest_harmonic(points)

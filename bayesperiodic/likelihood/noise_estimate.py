@@ -56,7 +56,7 @@ def estimate_noise(
             continue
         held = {name: values[i] for name, i in zip(group, columns, strict=True) if name in likelihood.fixed}
         part = Likelihood(likelihood.model, blocks, held)
-        units = [likelihood.model.unit(block) if block.timed else 1.0 for block in blocks]
+        units = [likelihood.model.unit(block) for block in blocks]
         total = sum(b.weight * float(r @ r) / unit for b, r, unit in zip(blocks, chosen, units, strict=True))
         size = np.where([name.startswith((VARIANCE, SCALE)) for name in group], max(total / count, TINY), part.guess())
         values[columns] = _maximise(part, chosen, values[columns], size, factor, of_total)

@@ -9,9 +9,16 @@ import numpy as np
 from bayesperiodic import _fourier
 from bayesperiodic._parallel import available_cores, in_threads
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.block import ComparedSignals, measured_channels, measured_variance
+from bayesperiodic.likelihood.block import (
+    NO_SCALE,
+    ComparedSignals,
+    compared_channels,
+    measured_channels,
+    measured_variance,
+)
 from bayesperiodic.likelihood.kinds import blocks_of
 from bayesperiodic.likelihood.likelihood import Residuals
+from bayesperiodic.likelihood.quantities import Quantities
 from bayesperiodic.likelihood.sensing import Sensing, SensorNames
 from bayesperiodic.models.model import Model
 
@@ -26,6 +33,7 @@ class Response(NamedTuple):
     frequency: np.ndarray  # (…,) [Hz]
     log_multipliers: np.ndarray  # (…, multipliers), log|μ|, largest first, as many as were measured
     sensors: np.ndarray  # (…, names) of the sensors' parameters, the delay of all outputs [s] last
+    scale: np.ndarray = NO_SCALE  # (…,) of an input, where that is an unknown
 
 
 class GroupSolution(NamedTuple):
@@ -38,12 +46,13 @@ class GroupSolution(NamedTuple):
     log_multipliers: list[np.ndarray]  # (solves, multipliers) of each experiment, log|μ|, largest first
     z: np.ndarray  # (experiments, solves, points, states), periodic parts of the states
     status: np.ndarray  # int (experiments, solves), index into `compiled.STATUSES`
+    scale: np.ndarray  # (experiments, solves) of an input, where that is an unknown, else 1
 
     def response(self, members: Any, solves: Any = ...) -> Response:
         """Return the responses of one experiment (an index), θ on the leading axis; of several without multipliers."""
         at = members, solves
         multipliers = self.log_multipliers[members][solves] if isinstance(members, int) else np.empty(0)
-        return Response(self.outputs[at], self.frequency[at], multipliers, self.sensors[at])
+        return Response(self.outputs[at], self.frequency[at], multipliers, self.sensors[at], self.scale[at])
 
     def at(self, solves: Any) -> "GroupSolution":
         """Return the solutions at some of the θ."""
@@ -55,6 +64,7 @@ class GroupSolution(NamedTuple):
             [values[solves] for values in self.log_multipliers],
             self.z[:, solves],
             self.status[:, solves],
+            self.scale[:, solves],
         )
 
 
@@ -96,9 +106,12 @@ class Observation:
     Attributes
     ----------
     channels : tuple of str
-        Those measured, in the order of the model's outputs.
+        Those with a measured time history, in the order of the model's outputs.
+    compared_channels : tuple of str
+        These, and then the others of which something was measured.
     picked : slice or list of int
-        Their indices among the model's outputs, a slice, which does not copy, where they are consecutive.
+        The indices of all compared channels among the model's outputs, a slice, which does not copy, where they are
+        consecutive.
     angles : list of bool
         Which of the channels are angles.
     blocks : tuple of Block
@@ -116,14 +129,16 @@ class Observation:
     ):
         self.experiment, self.caused = experiment, caused
         self.channels, self.blocks = measured_channels(experiment, model), blocks_of(experiment, model)
-        columns = [model.outputs.index(channel) for channel in self.channels]
-        between = slice(columns[0], columns[-1] + 1)
-        self.picked = between if len(columns) == between.stop - between.start else columns
-        self.angles = [channel in model.angles for channel in self.channels]
+        self.compared_channels = compared_channels(experiment, model)
+        columns = [model.outputs.index(channel) for channel in self.compared_channels]
+        between = slice(columns[0], columns[-1] + 1) if columns else slice(0, 0)
+        self.picked = between if columns == list(range(between.start, between.stop)) else columns
+        self.angles = [c in model.angles and c in self.channels for c in self.compared_channels]
         self._angle_places = [c for c, angle in enumerate(self.angles) if angle]
-        self._free_phase = model.autonomous
-        self.sensing = Sensing(self.channels, sensors, experiment.periods, delayed=model.autonomous)
-        self.data = np.stack([experiment.outputs[channel] for channel in self.channels], axis=-1)
+        self._free_phase = model.autonomous and bool(self.channels)
+        self.sensing = Sensing(self.compared_channels, sensors, experiment.periods, delayed=model.autonomous)
+        histories = [experiment.outputs[channel] for channel in self.channels]
+        self.data = np.reshape(histories, (-1, experiment.measured_points.size)).T
         logarithms = np.log(np.abs(experiment.measured_multipliers))
         self._measured = ComparedSignals(self.data, logarithms, np.array(experiment.frequency))
         self._points = len(self.data)
@@ -143,6 +158,7 @@ class Observation:
             self._difference(predicted.values),
             measured.log_multipliers - predicted.log_multipliers,
             measured.frequency - predicted.frequency,
+            measured.scale - predicted.scale,
         )
         return self._less_caused([block.compare(predicted, difference) for block in self.blocks])
 
@@ -181,7 +197,7 @@ class Observation:
         predicted, moved = self._signals(response), directions.outputs[..., self.picked]
         if self.sensing.active:
             moved = self._sensed_changes(moved, response, directions)
-        along = ComparedSignals(moved, directions.log_multipliers, directions.frequency)
+        along = ComparedSignals(moved, directions.log_multipliers, directions.frequency, directions.scale)
         return [block.changes(predicted, along) for block in self.blocks]
 
     def vjp(self, response: Response, weights: list[np.ndarray], shown: Sequence[np.ndarray]) -> Response:
@@ -212,7 +228,7 @@ class Observation:
 
     def predicted(self, response: Response) -> dict[str, np.ndarray]:
         """Return ŷ (…, points) of each measured channel, as its sensor shows it."""
-        return dict(zip(self.channels, np.moveaxis(self._signals(response).values, -1, 0), strict=True))
+        return dict(zip(self.channels, np.moveaxis(self._histories(response), -1, 0), strict=True))
 
     def replicates(self, response: Response, components: list[np.ndarray]) -> dict[str, np.ndarray]:
         """Return possible measurements, ŷ plus noise (draws, points), by channel; NaN outside the mask.
@@ -225,9 +241,14 @@ class Observation:
             components = [a + b for a, b in zip(components, self.caused, strict=True)]
         for block, component in zip(self.blocks, components, strict=True):
             block.simulate(component, noise)
-        values = self._signals(response).values + noise
+        values = self._histories(response) + noise
         turned = self.data - _fourier.within_half_turn(self.data - values)
         return {n: (turned if self.angles[c] else values)[..., c] for c, n in enumerate(self.channels)}
+
+    def replicated(self, response: Response, components: list[np.ndarray]) -> dict[str, np.ndarray]:
+        """Return possible values (draws, size) of what was measured without a time history, see `replicates`."""
+        values, pairs = self._signals(response).values, zip(self.blocks, components, strict=True)
+        return {b.channel: b.replicate(values, part) for b, part in pairs if isinstance(b, Quantities)}
 
     def compared(self, response: Response, ahead: int = 0) -> dict[str, np.ndarray]:
         """Return y − ŷ (points,) of each channel, within the harmonics kept and zero where nothing was measured.
@@ -237,6 +258,11 @@ class Observation:
         predicted = np.roll(self._signals(response).values, -ahead * self.experiment.samples, axis=-2)
         pairs = zip(self.channels, np.moveaxis(self._difference(predicted), -1, 0), strict=True)
         return {channel: self.experiment.compared(channel, e) for channel, e in pairs}
+
+    def quantities(self, response: Response) -> dict[str, np.ndarray]:
+        """Return measured less predicted values (size,) of what was measured without a time history, by its label."""
+        values = self._signals(response).values
+        return {b.channel: b.off(values) for b in self.blocks if isinstance(b, Quantities)}
 
     def left_out(self, response: Response) -> dict[str, np.ndarray]:
         """Return measured less predicted amplitudes (harmonics,) of the harmonics left out, by channel with any."""
@@ -251,16 +277,20 @@ class Observation:
                 result[channel] = _fourier.coefficients(e)[without[channel].harmonic]
         return result
 
+    def _histories(self, response: Response) -> np.ndarray:
+        """Return the prediction (…, points, channels) of the measured time histories."""
+        return self._signals(response).values[..., : len(self.channels)]
+
     def _signals(self, response: Response) -> ComparedSignals:
         """Return the prediction of what was measured, the outputs turned and passed through their sensors."""
         values = response.outputs[..., self.picked]
         if self.sensing.active:
             values = self._sensed(values, response)
-        return ComparedSignals(values, response.log_multipliers, response.frequency)
+        return ComparedSignals(values, response.log_multipliers, response.frequency, response.scale)
 
     def _difference(self, predicted: np.ndarray) -> np.ndarray:
         """Return y − ŷ (…, points, channels), angles within half a turn."""
-        values = self.data - predicted
+        values = self.data - predicted[..., : len(self.channels)]
         for c in self._angle_places:
             values[..., c] = _fourier.within_half_turn(values[..., c])
         return values
@@ -296,12 +326,13 @@ class Observation:
         alone would bring its noise into all others. Angles, which may wind, have no part in it unless there is nothing
         else.
         """
+        histories, others = len(self.channels), len(self.compared_channels) - len(self.channels)
         noise = np.array([measured_variance(self.experiment, channel) for channel in self.channels])
         known = bool(np.all(np.isfinite(noise) & (noise > 0.0)))
         weights = 1.0 / (noise if known else self.data.var(axis=0))
-        angles = np.array(self.angles)
+        angles = np.array(self.angles[:histories])
         weights[angles & ~angles.all()] = 0.0
-        return weights * np.conj(_fourier.coefficients(self.data.T, 1)[:, 1])
+        return np.append(weights * np.conj(_fourier.coefficients(self.data.T, 1)[:, 1]), np.zeros(others))
 
     def _phase_changes(self, response: Response, directions: Response) -> np.ndarray:
         """Return the derivatives (directions,) of the turn of an autonomous model's orbit along directions."""
@@ -320,7 +351,7 @@ class Observation:
     def _factors_between(self, response: Response) -> np.ndarray:
         """Return the factors before that of the Nyquist harmonic is made real."""
         phase, result = self._phase(response), []
-        for c in range(len(self.channels)):
+        for c in range(len(self.compared_channels)):
             factors = self.sensing.factors(c, response.sensors, response.frequency, self._harmonic, phase=phase)
             result.append(np.ones(self._harmonic.size) if factors is None else factors.complex)
         return np.stack(np.broadcast_arrays(*result), axis=-1)
@@ -339,7 +370,9 @@ class Observation:
         result = np.fft.irfft(spectrum, n=self._points, axis=-2)
         if self._angle_places:
             phase = self._phase(response)
-            lags = [self.sensing.lag(c, response.sensors, response.frequency) for c in range(len(self.channels))]
+            lags = [
+                self.sensing.lag(c, response.sensors, response.frequency) for c in range(len(self.compared_channels))
+            ]
             lag = np.stack(np.broadcast_arrays(*lags), axis=-1)[..., None, :]
             lag = lag if phase is None else lag + phase[..., None, None]
             result += trend * (self._ramp - lag)
@@ -351,7 +384,7 @@ class Observation:
         """Return the derivatives of `_factors` by all parameters, the frequency last, (parameters + 1, …)."""
         given, factors = (response.sensors, response.frequency, self._harmonic), self._factors_between(response)
         result = np.zeros((response.sensors.shape[-1] + 1, *factors.shape), dtype=complex)
-        for c in range(len(self.channels)):
+        for c in range(len(self.compared_channels)):
             for relative, by in self.sensing.slopes(c, *given):
                 slope = factors[:, c] if relative is None else factors[:, c] * relative.complex
                 for place, scale in by:
@@ -372,8 +405,8 @@ class Observation:
         every = np.fft.rfft(moved, axis=-2) * factors + spectrum * changes
         result = np.fft.irfft(every, n=self._points, axis=-2)
         if self._angle_places:
-            lag = np.zeros((len(along), len(self.channels)))
-            for c in range(len(self.channels)):
+            lag = np.zeros((len(along), len(self.compared_channels)))
+            for c in range(len(self.compared_channels)):
                 for place, slope in self.sensing.lag_slopes(c, response.sensors, response.frequency):
                     lag[:, c] += along[:, place] * slope
             result -= trend * (lag + turned[:, None])[:, None]

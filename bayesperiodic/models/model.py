@@ -18,32 +18,14 @@ from bayesperiodic._compile.code_generation import Kernels, SymbolicModel, VjpKe
 from bayesperiodic._compile.grid_function import GridFunction
 from bayesperiodic._expressions import parse
 from bayesperiodic._printing import Printed
+from bayesperiodic.models.matrices import definition
+from bayesperiodic.models.names import DERIVATIVES, Names, with_derivatives
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
-DERIVATIVES = ("", "d", "dd")
 LARGEST_FLOAT = np.finfo(float).max
 VJP_FUNCTIONS = ("outputs_vjp", "equations_vjp")
 # Texts of the TypeErrors of NumPy, math and `if` when they are given symbols.
 NUMERIC_ONLY = ("ufunc", "truth value", "expression to float", "to integer", "'Symbol'")
-
-
-class Names:
-    """Symbols as attributes or keys, such as ``s.dx``, ``p.k3`` and ``p["k3"]``."""
-
-    def __init__(self, kind: str, symbols: Mapping[str, sp.Symbol]):
-        self._kind, self._symbols = kind, dict(symbols)
-
-    def __getattr__(self, name: str) -> sp.Symbol:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        try:
-            return self[name]
-        except ValueError as error:
-            raise AttributeError(str(error)) from None
-
-    def __getitem__(self, name: str) -> sp.Symbol:
-        _checks.one_of(self._kind, name, self._symbols)
-        return self._symbols[name]
 
 
 class Model(Printed):
@@ -169,6 +151,60 @@ class Model(Printed):
         for channel, unit in self.units.items():
             _checks.text(f"units[{channel!r}]", unit)
         self.orders = {state: self._order(state) for state in self.states}
+
+    @classmethod
+    def from_matrices(
+        cls,
+        name: str,
+        *,
+        mass: Any,
+        stiffness: Any,
+        damping: Any = None,
+        forces: Mapping[str, Any],
+        outputs: Mapping[str, tuple[Any, str]],
+        elements: Iterable[Any] = (),
+    ) -> "Model":
+        """Return the model M ẍ + C ẋ + K x + elements = forces of a few degrees of freedom.
+
+        The states are x0, x1, …, in the order of the matrices, and those of the elements. The equations are symbolic:
+        the time of compilation and the cost of a solution grow with the cube of the number of states, so that some
+        ten degrees of freedom are practical; reduce larger models to the modes in the frequency range first.
+
+        Parameters
+        ----------
+        name : str
+        mass, stiffness, damping : array (n, n), sparse matrix, or mapping of str to such
+            Of a mapping, the sum of name·matrix with the name of a parameter, and of the matrix of the name "1", for
+            example ``damping={"alpha": M, "beta": K}``. No damping without `damping`.
+        forces : mapping of str to place
+            Where each input acts: the number of a degree of freedom, from 0; a tuple (i, j) of two between which it
+            acts, positive on i; or an array (n,) of weights, such as a direction or the values of modes at a point.
+        outputs : mapping of str to (place, kind)
+            What is measured: "displacement", "velocity" or "acceleration", of a place like those of `forces`; of a
+            tuple (i, j) the difference of i and j.
+        elements : sequence of elements.Element
+            Nonlinear parts. Each parameter of an element is a parameter of the model, called element_parameter.
+
+        Returns
+        -------
+        Model
+
+        Raises
+        ------
+        ValueError
+            For matrices that are not square, of different sizes or not finite, a singular mass matrix, a place that
+            does not exist, and as for `Model`.
+
+        Examples
+        --------
+        >>> model = bp.Model.from_matrices("two_masses", mass=np.eye(2), stiffness=[[2, -1], [-1, 1]],
+        ...     damping={"alpha": np.eye(2)}, forces={"force": 0}, outputs={"a": (1, "acceleration")},
+        ...     elements=[bp.elements.Element("joint", bp.elements.jenkins, (1, 0), {"width": 0.1})])
+        >>> model.states, model.parameters
+        (('x0', 'x1', 'joint'), ('alpha', 'joint_stiffness', 'joint_limit'))
+        """
+        matrices = {"mass": mass, "damping": damping, "stiffness": stiffness}
+        return cls(name, **definition(matrices, forces, outputs, elements))
 
     def _expression(self, argument: str, given: Any) -> sp.Expr:
         if isinstance(given, int | float):
@@ -358,11 +394,6 @@ def _check_derivative_names(argument: str, space: str, names: tuple[str, ...]) -
                     f"out and write {space}.{derivative}."
                 )
     _checks.identifiers(argument, [d + n for d in DERIVATIVES for n in names], RESERVED)
-
-
-def with_derivatives(space: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]:
-    """Return the symbols of names and their derivatives, by name."""
-    return {d + n: sp.Symbol(f"{space}_{d}_{n}", real=True) for d in DERIVATIVES for n in names}
 
 
 def parameter_vector(model: Model, parameters: Mapping[str, float]) -> np.ndarray:

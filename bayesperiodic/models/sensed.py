@@ -7,7 +7,8 @@ from functools import lru_cache
 
 import sympy as sp
 
-from bayesperiodic.models.model import DERIVATIVES, Model
+from bayesperiodic.models.model import Model
+from bayesperiodic.models.names import DERIVATIVES
 
 GAIN, OFFSET, DELAY, CUTOFF = "gain", "offset", "delay", "cutoff"
 SENSOR_KINDS = (GAIN, OFFSET, DELAY, CUTOFF)

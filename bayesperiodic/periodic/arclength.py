@@ -20,7 +20,9 @@ class ParametrisedEquations:
     """Periodic equations that depend on further scalar unknowns.
 
     The unknowns `free` are `FREQUENCY`, names of parameters, `INPUTS`, the factor of `input_change` (points, 3·inputs)
-    that is added to the inputs of `equations`, or `PARAMETERS`, that of `parameter_change` (parameters,).
+    that is added to the inputs of `equations`, or `PARAMETERS`, that of `parameter_change` (parameters,). Without
+    `INPUTS`, `input_change` is that per Hz, and the inputs of `equations` are those at zero frequency, as functions of
+    τ with the time derivatives at the frequency of `equations`.
     """
 
     equations: PeriodicEquations
@@ -36,13 +38,14 @@ class ParametrisedEquations:
 
     def _unknowns(self, values: np.ndarray, targets: np.ndarray, scales: np.ndarray) -> Unknowns:
         parameters = np.zeros((len(self.free), self.parameters.size))
-        inputs = np.zeros((len(self.free), *(self.equations.inputs.shape if INPUTS in self.free else (0, 0))))
+        moving = INPUTS if INPUTS in self.free else FREQUENCY
+        inputs = np.zeros((len(self.free), *self.input_change.shape))
         for k, name in enumerate(self.free):
-            if name == INPUTS:
+            if name == moving:
                 inputs[k] = self.input_change
-            elif name == PARAMETERS:
+            if name == PARAMETERS:
                 parameters[k] = self.parameter_change
-            elif name != FREQUENCY:
+            elif name not in (INPUTS, FREQUENCY):
                 parameters[k, self.equations.model.parameters.index(name)] = 1.0
         frequency = self.free.index(FREQUENCY) if FREQUENCY in self.free else -1
         return Unknowns(values.copy(), targets, scales, parameters, inputs, frequency)

@@ -135,7 +135,7 @@ class Batch:
         solve_many, functions = self._compiled
         before = functions, grid.packed, grid.periods, self._sets, self._anchors, every
         after = polish, first.model.kernels.output_rates, solution
-        _in_blocks(lambda block: solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads)
+        in_blocks(lambda block: solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads)
         return solution
 
     def vjp(self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, moving: tuple[int, ...]) -> np.ndarray:
@@ -154,11 +154,11 @@ class Batch:
             factors = empty_factors(grid, self._first.count)
             compiled.vjp_many(addresses, grid.packed, self._sets, *points, factors, *block, gradients)
 
-        _in_blocks(part, self._size, SMALLEST_BLOCK, None, each=1)
+        in_blocks(part, self._size, SMALLEST_BLOCK, None, each=1)
         return gradients
 
 
-def _in_blocks(
+def in_blocks(
     part: Callable[[tuple[int, int]], None], total: int, smallest: int, threads: int | None, each: int = PARTS_EACH
 ) -> None:
     """Call a function for blocks (start, stop) of a range, up to `each` per thread, none below the smallest size."""
@@ -206,7 +206,7 @@ class AutonomousBatch:
         def part(block: tuple[int, int]) -> None:
             follow_many(*before, *block, whole, workspace(first, bordered=True), solution)
 
-        _in_blocks(part, every.shape[1], 1, threads)
+        in_blocks(part, every.shape[1], 1, threads)
         if first.separated:
             solution.status[solution.status == CONVERGED] = NOT_RESOLVED
         return solution

@@ -181,6 +181,39 @@ class BatchSolution(NamedTuple):
     iterations: np.ndarray  # (sets, solves), steps with the anchor's factors and Newton iterations
 
 
+class SpecialAnchors(NamedTuple):
+    """Anchors of a batch of special points, arrays (sets, …); see `special_batch`."""
+
+    parameters: np.ndarray
+    z: np.ndarray
+    values: np.ndarray  # (sets, unknowns)
+    vectors: np.ndarray  # (sets, points, states), null vectors of folds
+    z_slopes: np.ndarray  # (sets, parameters, points, states)
+    value_slopes: np.ndarray  # (sets, parameters, unknowns)
+    vector_slopes: np.ndarray
+    band: np.ndarray  # with the next two, factors of the bordered equations
+    pivots: np.ndarray
+    border: Border
+    bends: np.ndarray  # (sets, points, states·(1 + 3·states)), change of ∂g/∂(q, q̇, q̈) along the null vector
+    bend: np.ndarray  # (sets, points, states), derivative of ∂g/∂z · v by the unknown of a fold
+    bent: np.ndarray  # (sets, points, states), change of the null vector along the branch
+    curvature: np.ndarray  # (sets,), of the unknown along the branch; zero if it is no fold
+    rows: np.ndarray  # (sets, unknowns, points, channels), conditions on the outputs
+    targets: np.ndarray  # (sets, unknowns)
+    inputs: np.ndarray  # (sets, unknowns, points, 3·inputs), change of the inputs per unit of each unknown
+    known: np.ndarray  # int (sets,), 0 for a guess without factors
+
+
+class SpecialSolution(NamedTuple):
+    """Solutions of a batch of special points."""
+
+    z: np.ndarray  # (sets, solves, points, states)
+    outputs: np.ndarray  # (sets, solves, points, channels)
+    values: np.ndarray  # (sets, solves, unknowns)
+    status: np.ndarray  # (sets, solves), index into `STATUSES`
+    iterations: np.ndarray  # (sets, solves)
+
+
 ADDRESSES = types.NamedUniTuple(COUNT, len(Functions._fields), Functions)
 GRID = types.NamedTuple([VECTOR, VECTOR, INDICES, INDICES, PLACES, VECTOR, COUNT, COUNT], Grid)
 SETTING = types.NamedTuple([MATRIX, VECTOR, NUMBER, VECTOR], Setting)
@@ -198,6 +231,12 @@ CYCLE_ANCHORS = types.NamedTuple(
     [MATRIX, CUBE, VECTOR, GAINS, MATRIX, CUBE, INDICES, ALL_BORDERS, VECTOR, VECTOR], CycleAnchors
 )
 SOLUTION = types.NamedTuple([GAINS, GAINS, MATRIX, INDICES, INDICES], BatchSolution)
+SPECIAL_ANCHORS = types.NamedTuple(
+    [MATRIX, CUBE, MATRIX, CUBE, GAINS, CUBE, GAINS, CUBE, INDICES, ALL_BORDERS, CUBE, CUBE, CUBE, VECTOR]
+    + [GAINS, MATRIX, GAINS, PLACES],
+    SpecialAnchors,
+)
+SPECIAL_SOLUTION = types.NamedTuple([GAINS, GAINS, CUBE, INDICES, INDICES], SpecialSolution)
 
 
 DIGEST = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()  # of the definitions above, which sources import
@@ -210,6 +249,7 @@ SOURCES = {
     "batch": ("batch", "newton"),
     "adjoint": ("adjoint", "batch"),
     "autonomous": ("autonomous", "bordered newton"),
+    "special": ("special", "bordered newton"),
 }
 
 

@@ -349,11 +349,11 @@ def _special_points(
     }
     for kind, test in tests.items():
         if test(before) * test(after) < 0.0:
-            points += _locate(tracer, before, after, kind, test)
+            points += located(tracer, before, after, kind, test)
     return sorted(points, key=lambda point: point.distance)
 
 
-def _locate(
+def located(
     tracer: Tracer, before: BranchPoint, after: BranchPoint, kind: str, test: Callable[[BranchPoint], float]
 ) -> list[BranchPoint]:
     """Return the point where a test function is zero, in a list that is empty if a correction fails."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import sympy as sp
 
-from bayesperiodic.models.model import DERIVATIVES
+from bayesperiodic.models.names import DERIVATIVES
 from bayesperiodic.periodic.equations import PeriodicEquations
 
 

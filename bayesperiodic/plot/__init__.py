@@ -5,6 +5,7 @@ Every function returns the matplotlib Figure; an empty one to draw into can be g
 
 from bayesperiodic.plot.branches import branch, orbits, section
 from bayesperiodic.plot.diagnostics import comparison, models, profile, ranks
+from bayesperiodic.plot.elements import elements
 from bayesperiodic.plot.estimates import fit, loops, traces
 from bayesperiodic.plot.overview import summary
 from bayesperiodic.plot.pairs import corner, marginals
@@ -13,6 +14,6 @@ from bayesperiodic.plot.style import COLOURS
 from bayesperiodic.plot.terms import missing_terms
 
 __all__ = [
-    "COLOURS", "branch", "comparison", "corner", "fit", "loops", "marginals", "missing_terms", "models", "orbits",
-    "profile", "ranks", "recording", "section", "summary", "traces",
+    "COLOURS", "branch", "comparison", "corner", "elements", "fit", "loops", "marginals", "missing_terms", "models",
+    "orbits", "profile", "ranks", "recording", "section", "summary", "traces",
 ]  # fmt: skip

@@ -8,6 +8,7 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import DATA, Experiment
 from bayesperiodic.data.recording import Recording
+from bayesperiodic.data.special_points import Fold, PhaseLag
 from bayesperiodic.models.model import Model
 from bayesperiodic.models.sensed import SHIFT
 
@@ -16,11 +17,46 @@ def values_by_name(argument: str, given: Any, names: tuple[str, ...]) -> np.ndar
     """Return the values (…, names) of an argument that is a mapping or such an array; raise a ValueError otherwise."""
     if isinstance(given, Mapping):
         _checks.same_names(argument, given, names)
-        given = np.stack(np.broadcast_arrays(*(_checks.real_array(argument, given[name]) for name in names)), -1)
+        each = np.broadcast_arrays(*(_checks.real_array(argument, given[name]) for name in names))
+        given = np.stack(each, -1) if names else np.empty(0)
     values = _checks.real_array(argument, given)
     if values.shape[-1:] != (len(names),):
         raise ValueError(f"{argument}: last axis must be {list(names)}, got shape {values.shape}.")
     return values
+
+
+def check_special_points(
+    experiments: Iterable[Experiment],
+    sensors: Mapping[str, Any],
+    noisy: Mapping[str, list[str]],
+    late: Mapping[str, bool],
+) -> None:
+    """Refuse sensors, unknown delays and errors of inputs that the solver of special points does not know of.
+
+    The noisy inputs, and whether signals may be late, are given by experiment.
+    """
+    for e in experiments:
+        point = e.condition
+        if point is not None and noisy.get(e.name):
+            raise ValueError(
+                f"input_noise: must not be of {noisy[e.name]} in {e.name!r}, a jump or resonance point, whose inputs "
+                "are exact. Give their error in its sd."
+            )
+        if isinstance(point, PhaseLag) and (late[e.name] or point.output in sensors):
+            given = "unknown delays" if late[e.name] else repr(sensors[point.output])
+            raise ValueError(
+                f"sensors: must be without one of {point.output!r} and without unknown delays for the phase in "
+                f"{e.name!r}, got {given}. Correct frequency, amplitude and lag before."
+            )
+
+
+def refuse_special_points(experiments: Iterable[Experiment], purpose: str) -> None:
+    """Raise a ValueError if experiments are jumps or resonance points, of which a purpose cannot make use."""
+    if special := [e.name for e in experiments if e.condition is not None]:
+        raise ValueError(
+            f"problem: must be without jumps and resonance points for {purpose}, got {special}; leave them out by "
+            "problem.with_experiments."
+        )
 
 
 def checked_local(
@@ -74,10 +110,15 @@ def checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tupl
         raise ValueError(f"experiments: names must differ, got {names}. Name them with fold(name=…).")
     for e in result:
         _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
-        if not e.outputs:
+        if not e.channels and not isinstance(e.condition, Fold):
             raise ValueError(f"outputs of experiment {e.name!r}: must have at least one channel, got {{}}.")
-        for channel in e.outputs:
+        for channel in e.channels:
             _checks.one_of(f"outputs of experiment {e.name!r}", channel, model.outputs)
+        if e.condition is not None and model.autonomous:
+            raise ValueError(
+                f"condition of experiment {e.name!r}: must be None for {model.name!r}, which is autonomous, got "
+                f"{e.condition!r}."
+            )
         if e.guess == DATA and model.autonomous:
             raise ValueError(
                 f"guess of experiment {e.name!r}: must be states for {model.name!r}, which is autonomous, got {DATA!r}."

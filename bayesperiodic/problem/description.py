@@ -33,6 +33,7 @@ from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.priors.joint import JointPrior
 from bayesperiodic.priors.single import Uniform
+from bayesperiodic.problem import arguments
 from bayesperiodic.problem.arguments import checked_experiments, checked_local, fixed_values, values_by_name
 from bayesperiodic.problem.parameters import (
     SHIFT,
@@ -50,7 +51,10 @@ LEAST_WIDTH = 1e-12
 
 
 class Description(Printed):
-    """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction and immutable."""
+    """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction and immutable.
+
+    If `forward`, gradients take one solve a parameter, as those of orbits of unknown frequency and of special points.
+    """
 
     def __init__(
         self,
@@ -90,7 +94,7 @@ class Description(Printed):
             local = (*local,) + tuple(name for name in model.parameters if name not in plain)
         self.sensors = Sensors(sensors, model, self.experiments, joint=self.input_noise == JOINT)
         self.model = model = self.sensors.model
-        self.scheme = scheme or default_scheme(model)
+        self.scheme = scheme or default_scheme(model, tables=all(e.sweep is not None for e in self.experiments))
         find_scheme(self.scheme)
         if any(b.is_dense(self.noise) for e in self.experiments for b in blocks_of(e, model)):
             if isinstance(self.input_noise, Mapping):
@@ -99,7 +103,8 @@ class Description(Printed):
                     f"{_checks.shortened(input_noise)}; take noise='independent' or 'measured', or whole periods."
                 )
             self.input_noise = EXACT if self.input_noise == FROM_CYCLES else self.input_noise
-        self.channels, runs = self.sensors.channels, [e.name for e in self.experiments]
+        self.channels = tuple(c for c in self.sensors.channels if any(c in e.outputs for e in self.experiments))
+        runs = [e.name for e in self.experiments]
         tied, every = dict(tied or {}), (*model.parameters, *self.sensors.names, SHIFT)
         priors, fixed = self.sensors.with_entries(priors, fixed or {})
         self.local = checked_local(local, every, priors, tied)
@@ -116,6 +121,9 @@ class Description(Printed):
         check_delays(self.experiments, (*self.names, *fixed, *tied, *self.sensors.known_delays))
         kinds = model.parameters, self.sensors.names, self.names
         self.parameter_maps = {run: ParameterMap.of(*kinds, run, self.fixed, tied) for run in runs}
+        late = {run: one.delayed or bool(self.sensors.late_inputs) for run, one in self.parameter_maps.items()}
+        arguments.check_special_points(self.experiments, self.sensors.given, self.noisy_inputs, late)
+        self.forward = model.autonomous or any(e.condition is not None for e in self.experiments)
         self.ties = self._ties()
         self.frequency_errors = self._known_frequency_errors()
         self.input_errors = self._checked_input_errors(input_errors or {})
@@ -298,6 +306,12 @@ class Description(Printed):
     def counted(self) -> float:
         """Σn, the independent values behind all unknown and known variances."""
         return sum(self.likelihood.counts.values())
+
+    @property
+    def quantities(self) -> dict[str, str]:
+        """Units of what was measured without a time history, by label."""
+        every = (one for e in self.experiments for one in e.measurements)
+        return {one.label: "rad" if one.signed else self.model.units.get(one.channel, "") for one in every}
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -572,7 +586,8 @@ class Description(Printed):
         noisy = ", ".join(dict.fromkeys(name for inputs in self.noisy_inputs.values() for name in inputs))
         return (
             f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
-            f"channels: {', '.join(self.channels)} with {self.counted:.0f} independent values, {self.noise.name} noise"
+            f"data: {', '.join((*self.channels, *self.quantities))} with {self.likelihood.values:.0f} independent "
+            f"values, {self.noise.name} noise"
             f"{f', noise of {noisy} integrated out' if noisy else ''}"
             f"{f', sensors: {sensors}' if sensors else ''})"
         )

@@ -139,7 +139,7 @@ class Sensors:
     Attributes
     ----------
     channels : tuple of str
-        The measured outputs, in the order of the model.
+        The outputs of which something was measured, in the order of the model.
     given : dict of str to Sensor
     plain_model, model : Model
         Of the true inputs, and of the measured ones with the known entries corrected.
@@ -153,7 +153,7 @@ class Sensors:
     def __init__(
         self, sensors: Mapping[str, Sensor] | None, model: Model, experiments: Sequence[Experiment], *, joint: bool
     ):
-        self.channels = tuple(c for c in model.outputs if any(c in e.outputs for e in experiments))
+        self.channels = tuple(c for c in model.outputs if any(c in e.channels for e in experiments))
         self.given = _checked({} if sensors is None else sensors, model, self.channels)
         self._inputs = {name: self.given[name] for name in model.inputs if name in self.given}
         if joint and self._inputs:

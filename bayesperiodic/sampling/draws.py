@@ -559,7 +559,8 @@ def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr
     columns |= {name: noise[..., i] for i, name in enumerate(problem.noise_names)}
     dims = {plain: (EXPERIMENT,) * (plain != name) for name, plain in problem.plain_names.items()}
     dims |= {name.partition("[")[0]: _noise_dims(problem, name) for name in problem.noise_names}
-    coords = {CHANNEL: list(problem.channels), EXPERIMENT: [e.name for e in problem.experiments]}
+    channels = [*problem.channels, *problem.quantities, *filter(None, [problem.noise.pooled])]
+    coords = {CHANNEL: channels, EXPERIMENT: [e.name for e in problem.experiments]}
     noises = {name.partition("[")[0] for name in problem.noise_names}
     attributes = {v: _noise_attributes(problem, v) if v in noises else _attributes(problem, v) for v in dims}
     packed = pack(columns, dims, coords)
@@ -594,6 +595,6 @@ def _attributes(problem: Description, parameter: str) -> dict[str, Any]:
 
 def _noise_attributes(problem: Description, variable: str) -> dict[str, str]:
     """Return the noise model's name, and the unit of each channel's variance."""
-    units = problem.model.units if variable == "variance" else {}
-    each = {f"units of {channel}": squared(units[channel]) for channel in problem.channels if channel in units}
-    return {NOISE: problem.noise.name} | each
+    units = {c: problem.model.units.get(c, "") for c in problem.channels} | problem.quantities
+    squares = {f"units of {c}": squared(unit) for c, unit in units.items() if unit and variable == "variance"}
+    return {NOISE: problem.noise.name} | squares

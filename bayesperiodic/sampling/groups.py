@@ -20,7 +20,8 @@ TERM_DRAWS, MOST_TERMS = (500, 2000), 10_000_000
 def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, seed: int) -> xr.Dataset:
     """Return replicates of the measured mean periods, noise included, for some draws.
 
-    Variables are ``<experiment> <channel>`` with dims (chain, draw, time axis), and ``largest_multiplier``, the modulus
+    Variables are ``<experiment> <channel>`` with dims (chain, draw, time axis), ``<experiment> <quantity>`` with dims
+    (chain, draw, number), and ``largest_multiplier``, the modulus
     of the largest Floquet multiplier, with dims (chain, draw, experiment); NaN where a solve fails.
     """
     problem = density.problem
@@ -34,6 +35,9 @@ def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, seed: int
         for channel, values in observation.replicates(simulation.response(e.name), parts).items():
             values[failed] = np.nan
             variables[f"{e.name} {channel}"] = ((CHAIN, DRAW, time_axis(e.name)), values.reshape(*shape, -1))
+        for label, values in observation.replicated(simulation.response(e.name), parts).items():
+            values[failed] = np.nan
+            variables[f"{e.name} {label}"] = ((CHAIN, DRAW, f"{e.name} {label} number"), values.reshape(*shape, -1))
         largest.append(density.solver.largest_multipliers(theta, e.name, simulation).reshape(shape))
     variables["largest_multiplier"] = ((CHAIN, DRAW, EXPERIMENT), np.stack(largest, axis=-1))
     return xr.Dataset(variables, coords=chosen.coords)

@@ -65,7 +65,15 @@ def test_an_estimate_from_a_table_has_the_truth_in_its_interval():
 @pytest.mark.parametrize(
     "table, arguments, message",
     [
-        (TABLE, {"phases": None}, "phases: must have the phase of 'x', got none"),
+        (TABLE, {"phase_sd": {"x": 1.0}, "phases": None}, "phase_sd: must be of outputs with phases, got one for 'x'"),
+        (TABLE, {"sd": {"x": "a%"}}, r"sd\['x'\]: must be a number and a % sign, such as '0.5%', got 'a%'"),
+        (TABLE, {"sd": {"x": 0.0}}, r"sd\['x'\]: must be standard deviations > 0, got 0 in row 1"),
+        (TABLE, {"size": "rms of signal"}, "phase_sd: must be given for 'x'"),
+        (TABLE, {"size": "rms of signal", "derivatives": {"x": 1}}, "size: must be of sines, 'peak', 'rms'"),
+        (TABLE, {"outputs": {"x": {0: "A"}}}, "harmonic: must be an integer .* 1"),
+        (TABLE, {"phases": {"x": {3: "phi"}}}, r"phases\['x'\]: must have the harmonics of the amplitudes, \[1\]"),
+        (TABLE | {"phi": (TABLE["phi"] + 90) % 180 - 90}, {}, r"phases\['x'\]: must be phases over the whole turn"),
+        (TABLE | {"A dB": TABLE["A"]}, {"outputs": {"x": "A dB"}}, "must be amplitudes, got levels in dB"),
         (
             TABLE | {"A": -TABLE["A"]},
             {},
@@ -116,3 +124,66 @@ def test_unit_of_phases_counts():
 def test_columns_of_different_lengths_are_refused():
     with pytest.raises(ValueError, match="table: must have columns of one length, got"):
         bp.response_table({"f": [1.0, 2.0], "A": 1.0}, frequency="f", outputs={"x": "A"}, inputs={"force": 1.0})
+
+
+@pytest.mark.parametrize(
+    "table, arguments",
+    [
+        (TABLE, {}),
+        (TABLE, {"sd": {"x": 0.02}}),
+        (
+            TABLE | {"s": 0.04 * np.ones(6), "A": 2 * TABLE["A"], "F": 2 * FORCE},
+            {"sd": {"x": "s"}, "size": "peak to peak"},
+        ),
+        (TABLE | {"A": 1e3 * TABLE["A"]}, {"sd": {"x": 20.0}, "units": {"x": ("mm", "m")}}),
+        (TABLE | {"A": TABLE["A"] * OMEGA**2}, {"sd": {"x": "2%"}, "derivatives": {"x": 2}}),
+        (TABLE | {"A": abs(H) * OMEGA}, {"sd": {"x": "2%"}, "derivatives": {"x": 1}, "per": "force"}),
+    ],
+)
+def test_amplitudes_alone_are_those_of_the_table(table, arguments):
+    runs = bp.response_table(table, **(COLUMNS | {"phases": None} | arguments))
+    measured = [run.measurements[0] for run in runs]
+    assert all(run.outputs == {} and len(run.measurements) == 1 for run in runs)
+    assert [one.value for one in measured] == pytest.approx(abs(FORCE * H))
+    given = arguments.get("sd", {}).get("x")
+    expected = [None] * 6 if given is None else 0.02 * (abs(FORCE * H) if given == "2%" else np.ones(6))
+    assert [one.sd for one in measured] == (expected if given is None else pytest.approx(expected))
+
+
+@pytest.mark.parametrize(
+    "table, arguments, sd",
+    [
+        (TABLE, {"phase_sd": {"x": 1.0}}, np.radians(1.0)),
+        (TABLE | {"phi": -TABLE["phi"]}, {"lag": True}, 0.01),
+        (TABLE | {"H": np.conj(H)}, {"outputs": {"x": "H"}, "phases": None, "per": "force", "lag": True}, 0.01),
+        (TABLE | {"A": OMEGA * TABLE["A"], "phi": TABLE["phi"] + 90.0}, {"derivatives": {"x": 1}}, 0.01),
+    ],
+)
+def test_phases_with_known_standard_deviations_are_those_of_the_table(table, arguments, sd):
+    runs = bp.response_table(table, **(COLUMNS | {"sd": {"x": "1%"}} | arguments))
+    phases = [run.measurements[1] for run in runs]
+    assert [(one.to, one.value) for one in phases] == [("force", pytest.approx(np.angle(h))) for h in H]
+    assert [one.sd for one in phases] == pytest.approx(np.full(6, sd))
+
+
+def test_harmonics_of_a_table_are_data_of_their_own():
+    table = TABLE | {"A3": 0.1 * TABLE["A"], "phi3": np.linspace(-170.0, 170.0, 6)}
+    outputs, phases = {"x": {1: "A", 3: "A3"}}, {"x": {1: "phi", 3: "phi3"}}
+    arguments = COLUMNS | {"outputs": outputs, "phases": phases}
+    c = np.array([2 / run.samples * np.fft.rfft(run.outputs["x"])[3] for run in bp.response_table(table, **arguments)])
+    assert c == pytest.approx(0.1 * abs(FORCE * H) * np.exp(1j * np.radians(table["phi3"])))
+    (first, third) = bp.response_table(table, **(arguments | {"phases": None}))[0].measurements
+    assert (first.harmonic, third.harmonic) == (1, 3) and third.value == pytest.approx(0.1 * first.value)
+
+
+def test_values_of_meters_are_of_the_whole_signal():
+    runs = bp.response_table(TABLE, **(COLUMNS | {"phases": None, "size": "rms of signal"}))
+    assert [type(run.measurements[0]).__name__ for run in runs] == ["RootMeanSquare"] * 6
+    assert amplitudes(runs, "force", "inputs") == pytest.approx(FORCE * np.sqrt(2.0))
+
+
+def test_phase_against_another_output_is_compared_with_that():
+    runs = bp.response_table(
+        TABLE, **(COLUMNS | {"outputs": {"x": "A", "v": "A"}, "against": {"x": "v"}, "phase_sd": {"x": 1.0}})
+    )
+    assert runs[0].measurements[1].to == "v"

@@ -144,7 +144,7 @@ def test_root_mean_square_is_pooled_over_the_measured_points():
         SimpleNamespace(name="two", outputs={"y": 0}, measured_points=np.array([True, False])),
         SimpleNamespace(name="three", outputs={}),
     ]
-    signals = {"one": {"y": np.array([1.0, 2.0, 3.0])}, "two": {"y": np.array([4.0, 50.0])}}
+    signals = {"one": {"y": np.array([1.0, 2.0, 3.0])}, "two": {"y": np.array([4.0, 50.0])}, "three": {}}
     found = map_estimate._pooled(SimpleNamespace(experiments=experiments), "y", signals)
     assert found == pytest.approx(np.sqrt((1 + 4 + 9 + 16) / 4))
 

@@ -1,0 +1,195 @@
+"""Periodic orbits of the points of response tables, from the branch that leads through them.
+
+The branch of a table is followed once from its first point through all frequencies and round the folds, see
+`periodic.table_branch`. Each point is on one of its stable sheets: in a sweep the sheet does not change but at jumps,
+from one sheet to a later one. Among these choices the one is taken that the measured values fit best.
+
+In solves at other θ a sheet may end at a fold before a measured frequency. The orbit of such a point is that at the
+fold, which is found from the solution of the nearest point that the sheet reaches; see `likelihood.reach`.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.data.sweep import Sweep
+from bayesperiodic.likelihood.observation import GroupSolution, Response
+from bayesperiodic.periodic.compiled import CONVERGED, STALLED
+from bayesperiodic.periodic.equations import PeriodicEquations
+from bayesperiodic.periodic.solve import solve_driven
+from bayesperiodic.periodic.table_branch import Passage, follow
+from bayesperiodic.problem.description import Description
+
+# Share of the misfit of all sheets below which a smaller one does not matter.
+SMALL_SHARE = 1e-4
+# Square of the distance, relative to that of the orbit's range, within which an orbit is the one of a guess.
+SAME_ORBIT = 1e-2
+
+
+class Place(NamedTuple):
+    """Orbit of a point of a table on the branch."""
+
+    sheet: int
+    equations: PeriodicEquations  # at its frequency, that of the fold if the branch does not reach the point
+    z: np.ndarray  # (points, states)
+    reached: bool
+
+
+class Point(NamedTuple):
+    """A point of a table among the solves of all experiments."""
+
+    name: str
+    group: int
+    member: int
+    known: bool  # whether its anchor is an orbit at its frequency
+
+
+def tables(problem: Description) -> dict[Sweep, list[Experiment]]:
+    """Return the points of each table of a driven model, in the order of the sweep; not those with a guess."""
+    result: dict[Sweep, list[Experiment]] = {}
+    for e in () if problem.model.autonomous else problem.experiments:
+        if e.sweep is not None and not e.guess and e.periods == 1:
+            result.setdefault(e.sweep, []).append(e)
+    return {sweep: sorted(table, key=lambda e: sweep.sign * e.frequency) for sweep, table in result.items()}
+
+
+def places(problem: Description, theta: np.ndarray, near: Mapping[str, np.ndarray] | None = None) -> dict[str, Place]:
+    """Return the orbits of all points of tables at θ (names,) that the branches lead to.
+
+    They are those that fit the data best or, with the z of other orbits `near`, the nearest to these, if near enough.
+    """
+    result: dict[str, Place] = {}
+    for sweep, table in tables(problem).items():
+        with np.errstate(all="ignore"):
+            passages = _branch(problem, theta, table)
+        choices = [_choices(passages, k) for k in range(len(table))]
+        if not all(choices):
+            continue
+        if near is not None:
+            for e, places_of in zip(table, choices, strict=True):
+                distances = [_distance(place.z, near[e.name]) for place in places_of]
+                if min(distances) < SAME_ORBIT:
+                    result[e.name] = places_of[int(np.argmin(distances))]
+            continue
+        costs = [_costs(problem, theta, e, places_of) for e, places_of in zip(table, choices, strict=True)]
+        best = _sheets(choices, costs, jumps=sweep.direction is not None)
+        result |= {e.name: places_of[b] for e, places_of, b in zip(table, choices, best, strict=True)}
+    return result
+
+
+def _branch(problem: Description, theta: np.ndarray, table: Sequence[Experiment]) -> list[Passage]:
+    """Return the branch through a table from its first point, which is solved from rest."""
+    equations = [problem.equations[e.name] for e in table]
+    parameters = [problem.parameters(theta[None], e.name)[0] for e in table]
+    first, _ = solve_driven(equations[0], parameters[0], "static")
+    return list(follow(equations, parameters, 0, first.z)) if first.code == CONVERGED else []
+
+
+def _choices(passages: Sequence[Passage], point: int) -> list[Place]:
+    """Return the place of a point on each stable sheet: its orbit, or the fold of the sheet that is nearest to it."""
+    result = []
+    for sheet in sorted({p.sheet for p in passages if p.sheet % 2 == 0}):
+        at = [p for p in passages if p.sheet == sheet and p.point == point]
+        if at:
+            result.append(Place(sheet, at[0].equations, at[0].z, True))
+            continue
+        points = [p.point for p in passages if p.sheet == sheet and p.point is not None]
+        ends_before = bool(points) and max(points) < point
+        fold = [p for p in passages if p.is_fold and p.sheet == (sheet if ends_before else sheet - 1)]
+        if points and fold:
+            result.append(Place(sheet, fold[0].equations, fold[0].z, False))
+    return result
+
+
+def _costs(problem: Description, theta: np.ndarray, experiment: Experiment, choices: Sequence[Place]) -> np.ndarray:
+    """Return how badly each choice fits the data, (choices,): the sum over the kinds of data of ln(share of misfit)."""
+    parameters, sensors = problem.parameter_maps[experiment.name].split(theta)
+    none, frequency = np.zeros(0), np.array(experiment.frequency)
+    observation, squares = problem.observations[experiment.name], []
+    for place in choices:
+        outputs = place.equations.outputs(place.z, parameters)
+        residuals = observation.residuals(Response(outputs, frequency, none, sensors))
+        squares.append([float(r @ r) for r in residuals])
+    total = np.array(squares)
+    share = total / np.maximum(total.sum(axis=0), np.finfo(float).tiny)
+    return np.log(SMALL_SHARE + share).sum(axis=1)
+
+
+def _sheets(choices: Sequence[Sequence[Place]], costs: Sequence[np.ndarray], *, jumps: bool) -> list[int]:
+    """Return the index of the best choice of every point; in a sweep later points are on the same or a later sheet."""
+    if not jumps:
+        return [int(np.argmin(cost)) for cost in costs]
+    total, came = [costs[0]], []
+    for before, now, cost in zip(choices, choices[1:], costs[1:], strict=False):
+        allowed = np.array([[a.sheet <= b.sheet for a in before] for b in now])
+        reached = np.where(allowed, total[-1], np.inf)
+        came.append(np.argmin(reached, axis=1))
+        total.append(cost + reached.min(axis=1))
+    best = [int(np.argmin(total[-1]))]
+    for back in reversed(came):
+        best.append(int(back[best[-1]]))
+    return best[::-1]
+
+
+def _distance(z: np.ndarray, other: np.ndarray) -> float:
+    """Return the largest square of the distance of two orbits (points, states), in units of their ranges."""
+    if z.shape != other.shape:
+        return np.inf
+    size = np.maximum(np.ptp(z, axis=0), np.finfo(float).tiny)
+    return float(np.max(np.abs(z - other) / size) ** 2)
+
+
+def reach_further(problem: Description, points: Sequence[Point], groups: Sequence[GroupSolution]) -> None:
+    """Solve the points of one sheet, in the order of the sweep, whose solves have failed, from their neighbours.
+
+    Points beyond a fold get the orbit there, with its frequency. The solutions are changed in place.
+    """
+    for point in points:
+        if not point.known:
+            status = groups[point.group].status[point.member]
+            np.maximum(status, STALLED, out=status)
+    statuses = np.stack([groups[point.group].status[point.member] for point in points])
+    equations = [problem.equations[point.name] for point in points]
+    for b in np.flatnonzero(np.any(statuses != CONVERGED, axis=0)).tolist():
+        good = (statuses[:, b] == CONVERGED).tolist()
+        if True not in good:
+            continue
+        parameters = [groups[point.group].parameters[point.member, b] for point in points]
+        first = good.index(True)
+        starts = [(k, 1) for k in range(first, len(good) - 1) if good[k] and not good[k + 1]]
+        for start, heading in [*starts, *([(first, -1)] if first else [])]:
+            z = groups[points[start].group].z[points[start].member, b]
+            for k, equations_there, orbit in _further(equations, parameters, start, z, heading, good):
+                group, member = groups[points[k].group], points[k].member
+                group.outputs[member, b] = equations_there.outputs(orbit, parameters[k])
+                group.z[member, b], group.frequency[member, b] = orbit, equations_there.frequency
+                group.status[member, b] = CONVERGED
+
+
+def _further(
+    equations: Sequence[PeriodicEquations],
+    parameters: Sequence[np.ndarray],
+    start: int,
+    z: np.ndarray,
+    heading: int,
+    good: Sequence[bool],
+) -> Iterator[tuple[int, PeriodicEquations, np.ndarray]]:
+    """Yield number, equations and orbit of the points next to a solved one that are not solved."""
+    end = start + heading
+    while 0 <= end < len(good) and not good[end]:
+        end += heading
+    low, high = sorted((start, end - heading))
+    part: Any = slice(low, high + 1)
+    at = start
+    with np.errstate(all="ignore"):
+        for passage in follow(equations[part], parameters[part], start - low, z, heading, further=False):
+            if passage.is_fold:
+                for k in range(at + heading, end, heading):
+                    yield k, passage.equations, passage.z
+                return
+            assert passage.point is not None
+            at = low + passage.point
+            if at != start:
+                yield at, passage.equations, passage.z

@@ -1,0 +1,207 @@
+"""Equations and outputs of models that are given by mass, damping and stiffness matrices."""
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from bayesperiodic import _checks
+from bayesperiodic.models.hysteresis import Hysteretic
+from bayesperiodic.models.names import Names
+
+KINDS_OF_MOTION = {"displacement": "", "velocity": "d", "acceleration": "dd"}
+CONSTANT_PART = "1"
+# Arguments of the functions of elements that are no parameters.
+OF_THE_MOTION = ("d", "v", "s", "name", "names")
+
+
+@dataclass(frozen=True)
+class Element:
+    """A nonlinear part between two degrees of freedom of `Model.from_matrices`, or of one and the ground.
+
+    Attributes
+    ----------
+    name : str
+        A Python identifier; the parameters are called name_parameter, and the state, if any, name.
+    force : callable
+        A function of `bp.elements`, or your own: of d, the relative displacement [m], and v, the relative velocity
+        [m/s], if it has these arguments, and of its parameters by name. It returns an expression or `Hysteretic`.
+    place : int, tuple (i, j) or array (n,)
+        A degree of freedom; two of them, d being x_i − x_j; or weights, d being their sum with all displacements.
+    constants : mapping of str to number, optional
+        Arguments that are no parameters of the model, such as a width; of `iwan` also the `names` of its states.
+
+    Raises
+    ------
+    ValueError
+        If the name is no identifier, the force is no function, or a constant is no argument of it.
+
+    Examples
+    --------
+    >>> stop = bp.elements.Element("stop", bp.elements.gap, 3, {"width": 1e-5})
+    >>> stop.parameters
+    ('k', 'clearance')
+    >>> bp.elements.Element("air", lambda v, drag: drag * v * abs(v), 0).parameters
+    ('drag',)
+    """
+
+    name: str
+    force: Callable[..., Any]
+    place: Any
+    constants: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _checks.identifiers("name", [self.name])
+        if not callable(self.force):
+            raise ValueError(f"force: must be a function, such as elements.gap, got {self.force!r}.")
+        arguments = tuple(inspect.signature(self.force).parameters)
+        for constant in self.constants:
+            _checks.one_of("constants", constant, [n for n in arguments if n not in OF_THE_MOTION or n == "names"])
+        if "names" in arguments and "names" not in self.constants:
+            raise ValueError("constants: must have the names of the states, got none; take iwan_states(name, 8).")
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Arguments of the force that are parameters."""
+        arguments = inspect.signature(self.force).parameters
+        return tuple(name for name in arguments if name not in (*OF_THE_MOTION, *self.constants))
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the internal states."""
+        arguments = inspect.signature(self.force).parameters
+        return tuple(self.constants["names"]) if "names" in arguments else (self.name,) * ("name" in arguments)
+
+    def evaluate(self, d: sp.Expr, v: sp.Expr, s: Names, p: Names) -> Hysteretic:
+        """Return the force and the equations of the internal states.
+
+        Parameters
+        ----------
+        d, v : sympy expression
+            Relative displacement and velocity.
+        s, p : states and parameters of the model
+            With those of the element.
+
+        Returns
+        -------
+        Hysteretic
+        """
+        motion = {"d": d, "v": v, "s": s, "name": self.name}
+        arguments = {n: motion[n] for n in inspect.signature(self.force).parameters if n in motion}
+        arguments |= {n: p[f"{self.name}_{n}"] for n in self.parameters}
+        given = self.force(**arguments, **self.constants)
+        return given if isinstance(given, Hysteretic) else Hysteretic(sp.sympify(given), ())
+
+
+def definition(
+    matrices: Mapping[str, Any],
+    forces: Mapping[str, Any],
+    outputs: Mapping[str, tuple[Any, str]],
+    elements: Iterable[Element],
+) -> dict[str, Any]:
+    """Return the arguments of `Model` for matrices by name; see `Model.from_matrices`."""
+    parts = {kind: _parts(kind, given) for kind, given in matrices.items()}
+    count = len(next(iter(parts["mass"].values())))
+    for kind, named in parts.items():
+        for matrix in named.values():
+            if matrix.shape != (count, count):
+                raise ValueError(f"{kind}: must have the shape of mass, {(count, count)}, got {matrix.shape}.")
+    if parts["mass"].keys() == {CONSTANT_PART} and np.linalg.matrix_rank(parts["mass"][CONSTANT_PART]) < count:
+        raise ValueError("mass: must be regular, got a singular matrix; eliminate the degrees of freedom without mass.")
+    placed = list(elements)
+    for element in placed:
+        _checks.instance("elements", element, Element)
+    _checks.mapping("forces", forces, "{'force': 0}")
+    _checks.mapping("outputs", outputs, "{'x': (0, 'displacement')}")
+    inputs = {name: _weights(f"forces[{name!r}]", place, count) for name, place in forces.items()}
+    measured = {name: _measured(f"outputs[{name!r}]", given, count) for name, given in outputs.items()}
+    weights = [_weights(f"place of element {e.name!r}", e.place, count) for e in placed]
+    degrees = [f"x{number}" for number in range(count)]
+
+    def equations(s: Names, p: Names, u: Names) -> list[sp.Expr]:
+        total: list[sp.Expr] = [sp.S.Zero] * count
+        for kind, derivative in (("mass", "dd"), ("damping", "d"), ("stiffness", "")):
+            for name, matrix in parts[kind].items():
+                factor = sp.S.One if name == CONSTANT_PART else p[name]
+                for i, row in enumerate(matrix):
+                    total[i] += factor * _combined(row, [s[derivative + x] for x in degrees])
+        internal: list[sp.Expr] = []
+        for element, at in zip(placed, weights, strict=True):
+            d, v = (_combined(at, [s[derivative + x] for x in degrees]) for derivative in ("", "d"))
+            part = element.evaluate(d, v, s, p)
+            internal += part.equations
+            total = [sum_ + _number(w) * part.force if w else sum_ for sum_, w in zip(total, at, strict=True)]
+        for name, at in inputs.items():
+            total = [sum_ - _number(w) * u[name] if w else sum_ for sum_, w in zip(total, at, strict=True)]
+        return [*total, *internal]
+
+    factors = [name for named in parts.values() for name in named if name != CONSTANT_PART]
+    return {
+        "states": [*degrees, *(state for e in placed for state in e.states)],
+        "inputs": [*inputs],
+        "parameters": [*dict.fromkeys(factors), *(f"{e.name}_{name}" for e in placed for name in e.parameters)],
+        "equations": equations,
+        "outputs": lambda s, p, u: {
+            name: _combined(at, [s[derivative + x] for x in degrees]) for name, (at, derivative) in measured.items()
+        },
+    }
+
+
+def _parts(kind: str, given: Any) -> dict[str, np.ndarray]:
+    """Return the matrices of a sum by the names of their factors."""
+    if given is None:
+        return {}
+    named = dict(given) if isinstance(given, Mapping) else {CONSTANT_PART: given}
+    if not named:
+        raise ValueError(f"{kind}: must have at least one matrix, got none.")
+    result = {}
+    for name, matrix in named.items():
+        dense = _checks.real_array(kind, matrix.toarray() if hasattr(matrix, "toarray") else matrix)
+        if dense.ndim != 2 or dense.shape[0] != dense.shape[1] or not dense.size:
+            raise ValueError(f"{kind}: must be a square matrix, got the shape {dense.shape}.")
+        if not np.isfinite(dense).all():
+            raise ValueError(f"{kind}: must be finite, got a matrix with other values.")
+        result[name] = dense
+    return result
+
+
+def _weights(argument: str, place: Any, count: int) -> np.ndarray:
+    """Return the weights of all degrees of freedom in a place."""
+    if isinstance(place, np.ndarray) and place.ndim:
+        weights = _checks.real_array(argument, place)
+        if weights.shape != (count,) or not np.isfinite(weights).all() or not weights.any():
+            raise ValueError(
+                f"{argument}: must be {count} finite weights, not all zero, got an array of shape {weights.shape}."
+            )
+        return weights
+    numbers = place if isinstance(place, tuple) else (place,)
+    if len(numbers) not in (1, 2) or len(set(numbers)) < len(numbers):
+        raise ValueError(
+            f"{argument}: must be one degree of freedom, a tuple of two different ones, or an array, got {place!r}."
+        )
+    weights = np.zeros(count)
+    for number, sign in zip(numbers, (1.0, -1.0), strict=False):
+        if _checks.integer(argument, number, minimum=0) >= count:
+            raise ValueError(f"{argument}: must be below {count}, the number of degrees of freedom, got {number}.")
+        weights[number] = sign
+    return weights
+
+
+def _measured(argument: str, given: Any, count: int) -> tuple[np.ndarray, str]:
+    if not isinstance(given, tuple) or len(given) != 2 or not isinstance(given[1], str):
+        raise ValueError(f"{argument}: must be a place and a kind, such as (0, 'acceleration'), got {given!r}.")
+    _checks.one_of(argument, given[1], KINDS_OF_MOTION)
+    return _weights(argument, given[0], count), KINDS_OF_MOTION[given[1]]
+
+
+def _combined(weights: np.ndarray, symbols: list[sp.Symbol]) -> sp.Expr:
+    terms = (_number(w) * symbol for w, symbol in zip(weights, symbols, strict=True) if w)
+    return sum(terms, sp.S.Zero)
+
+
+def _number(value: float) -> sp.Expr:
+    """Return a coefficient, 1 and −1 as such."""
+    return sp.Integer(int(value)) if abs(value) == 1.0 else sp.Float(float(value))
