@@ -238,7 +238,7 @@ class Since:
                 "its dates are finer than nanoseconds; read them with xarray and give seconds to from_arrays"
             )
         result = np.asarray(self.origin + whole.astype(np.int64).astype("timedelta64[ns]"))
-        result[lost] = np.datetime64("NaT")
+        result[lost] = np.datetime64("NaT", "ns")
         return result
 
 
