@@ -8,6 +8,7 @@ import io
 import itertools
 import math
 import mmap
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -65,8 +66,7 @@ def check_heaps(path: Path) -> None:
     A heap is a list of objects after a head of 16 bytes; an object is its number, counts and size, and its bytes.
     """
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        start = -1
-        while (start := content.find(HEAP, start + 1)) >= 0:
+        for start in [match.start() for match in re.finditer(HEAP, content)]:
             size = int.from_bytes(content[start + 8 : start + 16], "little")
             place, end = start + 16, start + size
             while place + 16 <= end:

@@ -5,6 +5,7 @@ import json
 import os
 import pickle
 import signal
+import sys
 import threading
 import warnings
 from collections import OrderedDict
@@ -84,9 +85,18 @@ def checked_executor(executor: Any) -> Any:
     """Return `executor`; raise a ValueError unless it takes tasks."""
     if executor is None or (callable(getattr(executor, "submit", None)) and not isinstance(executor, type)):
         return executor
-    with suppress(ValueError):
-        return _checks.integer("executor", executor, 1)
-    raise ValueError(f"executor: must be {EXECUTORS}, got {executor!r}.")
+    try:
+        number = _checks.integer("executor", executor, 1)
+    except ValueError:
+        raise ValueError(f"executor: must be {EXECUTORS}, got {executor!r}.") from None
+    main = sys.modules["__main__"]
+    script = getattr(main, "__file__", None) or ""
+    if getattr(main, "__spec__", None) is None and script.startswith("<") and not os.path.isfile(script):
+        raise ValueError(
+            f"executor: must be None in a script from {script}, got {number}, as new processes read the script again; "
+            "save it as a file."
+        )
+    return number
 
 
 def _start_worker() -> None:

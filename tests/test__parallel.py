@@ -182,6 +182,20 @@ def test_error_for_a_script_without_main_guard_names_it(tmp_path):
     assert "must have its calls below: if __name__ == '__main__'" in done.stderr.strip().splitlines()[-1]
 
 
+def test_script_from_the_standard_input_is_refused_by_one_message():
+    """New processes would read a file of the name <stdin>. Code given by -c has no file, and is no obstacle."""
+    script = (
+        "import operator\nfrom bayesperiodic._parallel import TaskPool\nif __name__ == '__main__':\n"
+        "    with TaskPool(1, 2) as tasks:\n        print(list(tasks.run(operator.pow, [3])))\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or "." for path in sys.path)}
+    options = {"capture_output": True, "text": True, "env": environment}
+    done = subprocess.run([sys.executable, "-"], input=script, **options)
+    assert "ValueError: executor: must be None in a script from <stdin>, got 1" in done.stderr.splitlines()[-1]
+    assert done.stderr.count("Traceback") == 1
+    assert subprocess.run([sys.executable, "-c", script], **options).stdout == "[(0, 8)]\n"
+
+
 @pytest.mark.parametrize("bad", [0, -2, True, 1.5, "2", ThreadPoolExecutor, [2], get_context("spawn")])
 def test_object_that_is_no_executor_is_rejected(bad):
     with pytest.raises(ValueError, match=r"executor: must be None, a number of processes >= 1, .*got"):

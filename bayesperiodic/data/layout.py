@@ -176,7 +176,9 @@ def _times(layout: Layout, contents: Contents, columns: Mapping[str, _Column]) -
         clock, rate = clocks[channel], rates.get(channel)
         key = (id(clock), column.values.size, rate, offsets[channel])
         if key not in known:
-            known[key] = _clocked(layout, contents, column, rate) + offsets[channel]
+            known[key] = _clocked(layout, contents, column, rate)
+            if offsets[channel]:
+                known[key] = known[key] + offsets[channel]
         times[channel] = known[key]
     if len(known) == 1:
         return next(iter(known.values()))

@@ -117,7 +117,7 @@ def null_directions(system: System) -> list[tuple[dict[sp.Symbol, float], np.nda
             return []
         # Each parameter in the unit of its own effect, so that a large one does not hide the others.
         unit = np.where(size > 0.0, size, 1.0)
-        _, singular, directions = np.linalg.svd(sensitivities / unit)
+        _, singular, directions = np.linalg.svd(sensitivities / unit, full_matrices=False)
         without = directions[np.count_nonzero(singular > ZERO_SINGULAR_VALUE * singular[0]) :] / unit
         values = dict(zip((*system.parameters.values(), *system.known.values()), [*theta, *known], strict=True))
         samples.append((values, np.linalg.qr(without.T)[0].T))

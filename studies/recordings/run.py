@@ -44,6 +44,10 @@ def run(options: argparse.Namespace) -> None:
             common.row(f"{fault}: size found, relative to the biased one", one["found"] / one["biased"], 0.0, 1.0, note)
             for fault, one in found.items()
         ),
+        *(
+            common.row(f"{fault}: bias where it is not found [stated standard errors]", one["hidden"], 0.0, BIAS)
+            for fault, one in found.items()
+        ),
     ]  # fmt: skip
     print("\n" + common.shown("good recordings, synthetic", {"all": alarms} | by_system(lines)))
     print("\n" + common.shown(f"smallest faults, synthetic: found in {SHARE:.0%}; biased by {BIAS} sd", found))
@@ -75,13 +79,18 @@ def by_system(lines: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def draw(found: dict[str, dict[str, float]]) -> Figure:
-    """Return the sizes that are found relative to those with a bias."""
-    figure, axes = plt.subplots(figsize=(7.0, 3.6), layout="constrained")
+    """Return the sizes that are found relative to those with a bias, and the bias of those that are not found."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.6), sharey=True, layout="constrained")
     place = np.arange(len(found))
-    axes.barh(place, [one["found"] / one["biased"] for one in found.values()], color="C0")
-    axes.axvline(1.0, color="0.3", lw=1.0)
-    axes.set(xscale="log", xlabel=f"size found in {SHARE:.0%}, relative to that with a bias of {BIAS} sd")
-    axes.set_yticks(place, [fault.split(" [")[0] for fault in found])
-    axes.invert_yaxis()
-    axes.set_title("synthetic", fontsize="medium")
+    left.barh(place, [one["found"] / one["biased"] for one in found.values()], color="C0")
+    left.axvline(1.0, color="0.3", lw=1.0)
+    left.set(
+        xscale="log", xlabel=f"size found in {SHARE:.0%}, relative to\nthat with a bias of {BIAS} sd of white noise"
+    )
+    right.barh(place, [one["hidden"] for one in found.values()], color="C1")
+    right.axvline(BIAS, color="0.3", lw=1.0)
+    right.set(xlabel="largest mean bias where it is not found\n[stated standard errors]")
+    left.set_yticks(place, [fault.split(" [")[0] for fault in found])
+    left.invert_yaxis()
+    figure.suptitle("synthetic", fontsize="medium")
     return figure

@@ -40,7 +40,12 @@ class Clock:
 
     def times(self, samples: int) -> np.ndarray:
         """Return the times of all samples [s]."""
-        return self.start + self.step * np.arange(samples) if self.stored is None else self.stored()
+        if self.stored is not None:
+            return self.stored()
+        times = np.arange(samples, dtype=float)
+        times *= self.step
+        times += self.start
+        return times
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,12 +20,17 @@ COMMENT = re.compile(r"(?:^|[\r\n])[ \t]*#(?!N/A)")
 
 @dataclass(frozen=True)
 class Text:
-    """A text file, its encoding, what to say about it, and its last line that begins with a number sign (from 1)."""
+    """A text file, its encoding, what to say about it, and what its lines contain.
+
+    `last_comment` is the last line that begins with a number sign (from 1); `blanks` says whether there are blanks
+    after the first `PART_BYTES` characters.
+    """
 
     path: Path
     encoding: str
     remark: str = ""
     last_comment: int = 0
+    blanks: bool = True
 
     def __repr__(self) -> str:
         return repr(str(self.path))
@@ -45,24 +50,24 @@ def opened(path: Path, encoding: str | None) -> Text:
             raise ValueError(
                 f"encoding: must be one of Python's, such as 'utf-8', 'latin-1' or 'cp1252', got {encoding!r}."
             ) from None
-        return Text(path, encoding, f"encoding {encoding!r}, as given", _check(path, encoding))
+        return Text(path, encoding, f"encoding {encoding!r}, as given", *_check(path, encoding))
     with path.open("rb") as content:
         head = content.read(4)
     marked = next((name for mark, name in MARKS.items() if head.startswith(mark)), "")
     if marked:
-        return Text(path, marked, f"encoding {marked!r}, by its byte order mark", _check(path, marked))
+        return Text(path, marked, f"encoding {marked!r}, by its byte order mark", *_check(path, marked))
     try:
-        return Text(path, "utf-8", "", _check(path, "utf-8"))
+        return Text(path, "utf-8", "", *_check(path, "utf-8"))
     except _Undecoded as error:
         if (other := _other_bytes(path)) is None:
             raise ValueError(str(error)) from None
-    last, shown = _check(path, "cp1252"), ", ".join(repr(one) for one in other.decode("cp1252")[:8])
+    shown = ", ".join(repr(one) for one in other.decode("cp1252")[:8])
     return Text(
         path,
         "cp1252",
         f"encoding 'cp1252' of Windows (Latin-1), as bytes are not UTF-8; read as the characters {shown}: if they are "
         "others, give encoding=",
-        last,
+        *_check(path, "cp1252"),
     )
 
 
@@ -87,13 +92,13 @@ class _Undecoded(ValueError):
     """A byte is not in the encoding."""
 
 
-def _check(path: Path, encoding: str) -> int:
-    """Return the last line that begins with a number sign.
+def _check(path: Path, encoding: str) -> tuple[int, bool]:
+    """Return the last line that begins with a number sign, and whether there are blanks after the first part.
 
     Raise a ValueError if the file is not in its encoding, or contains characters 0, at which numbers end.
     """
     name = "UTF-8" if encoding == "utf-8" else encoding
-    comment, before, decoder = (0, 0), "\n", codecs.getincrementaldecoder(encoding)()
+    comment, before, blanks, decoder = (0, 0), "\n", False, codecs.getincrementaldecoder(encoding)()
     with path.open("rb") as content:
         for number, part in enumerate(itertools.chain(iter(lambda: content.read(PART_BYTES), b""), [b""])):
             try:
@@ -114,8 +119,8 @@ def _check(path: Path, encoding: str) -> int:
             if "#" in text:
                 for match in COMMENT.finditer(before + text):
                     comment = number, text.count("\n", 0, match.end() - 1)
-            before = text[-1:] or before
-    return _lines(path, comment[0] * PART_BYTES) + comment[1] + 1 if comment != (0, 0) else 0
+            before, blanks = text[-1:] or before, blanks or (number > 0 and " " in text)
+    return _lines(path, comment[0] * PART_BYTES) + comment[1] + 1 if comment != (0, 0) else 0, blanks
 
 
 def _lines(path: Path, size: int) -> int:

@@ -305,7 +305,7 @@ def _moments(file: Path, sheet: str, place: int, first: int, cells: list[Any], d
         rows = _rows(book[sheet])[first:]
         epoch = np.datetime64(book.epoch, "us") if book.epoch.year == 1904 else np.datetime64("1899-12-30", "us")
     days = [row[place] if place < len(row) else None for row in rows]
-    result = np.full(len(cells), np.timedelta64("NaT"), "timedelta64[us]")
+    result = np.full(len(cells), np.timedelta64("NaT", "us"), "timedelta64[us]")
     for k, (day, cell) in enumerate(zip(days, cells, strict=True)):
         if _is_empty(cell):
             continue

@@ -11,7 +11,15 @@ import numpy as np
 
 from bayesperiodic import _hdf5
 from bayesperiodic.data.formats.contents import LARGEST_ARRAY, OTHERWISE, Clock, Contents, Key, StoredChannel
-from bayesperiodic.data.formats.hdf5_attributes import UNIT_NAMES, Packing, Since, attributes, sampling, unused_scale
+from bayesperiodic.data.formats.hdf5_attributes import (
+    UNIT_NAMES,
+    Packing,
+    Since,
+    attributes,
+    meaning_of_integers,
+    sampling,
+    unused_scale,
+)
 
 # Columns of tables: at most so many, and a table is so many times longer than wide.
 MOST_COLUMNS, SLENDER = 64, 10
@@ -90,6 +98,7 @@ def _channels(
         if sampling({key: value}) is not None:
             remarks += (f"its group has an attribute {key} = {value}, which is not used; give sampling_rate=",)
     scale = packing.unused or unused_scale(stored)
+    scale = scale or ("" if packing.remark else meaning_of_integers(stored, item.dtype))
     refusal = packing.refusal or (since.refusal or _scaled_dates(scale) if since else "")
     for (label, column), unit in zip(columns.items(), units, strict=True):
         shown = "" if since else f"{unit or 'stored values'} ({scale} not applied)" if scale else unit

@@ -47,6 +47,8 @@ SCALE_WORDS = re.compile(
 )
 # Names of what is added, of what says nothing by its value 1, and of no scale.
 ADDED, FULL_SCALE, DATE_NAME = re.compile("offset|zero|bias|intercept"), re.compile("fullscale"), re.compile("date")
+# Ranges or counts of a converter, and not those of netCDF that limit the values.
+RANGE = re.compile(r"(?!valid|actual|display|plot|color|time|freq).*range|.*counts|fsr")
 NUMBER_START = re.compile(r"\s*[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?(\s*[^\W\d].*|\s*[/%*].*|\s*)", re.DOTALL)
 APPLIED = ("scale_factor", "add_offset")
 # What netCDF fills with by default; the fill value of HDF5 is not read, because h5py crashes on some damaged ones.
@@ -236,7 +238,7 @@ class Since:
                 "its dates are finer than nanoseconds; read them with xarray and give seconds to from_arrays"
             )
         result = np.asarray(self.origin + whole.astype(np.int64).astype("timedelta64[ns]"))
-        result[lost] = np.datetime64("NaT")
+        result[lost] = np.datetime64("NaT", "ns")
         return result
 
 
@@ -255,6 +257,18 @@ def unused_scale(stored: Mapping[str, Any]) -> str:
         if "resol" in plain:
             neutral = (1.0, -1.0)  # -1 stands for unknown in Neurodata Without Borders
         if isinstance(value, str) or any(one not in neutral for one in _numbers(value) or ()):
+            return f"{key} = {value}"
+    return ""
+
+
+def meaning_of_integers(stored: Mapping[str, Any], kind: np.dtype[Any]) -> str:
+    """Return the attribute that may say what counts of a converter mean, such as "range = 10", and not their limits."""
+    if kind.kind not in "iu":
+        return ""
+    limits = np.iinfo(kind)
+    neutral = (0, limits.min, -limits.max, limits.max, limits.max + 1, limits.max - limits.min + 1)
+    for key, value in stored.items():
+        if RANGE.fullmatch(_plain(key)) and any(one not in neutral for one in _numbers(value) or [np.nan]):
             return f"{key} = {value}"
     return ""
 

@@ -1,5 +1,6 @@
 """MDF files, versions 2 to 4, of measurements in vehicles."""
 
+import contextlib
 import functools
 import gc
 import html
@@ -37,6 +38,9 @@ ALL_INVALID, INVALID_BIT = 1, 2
 # Conversions of numbers by few coefficients, and those that are refused: by a formula, which asammdf evaluates as code,
 # and in version 3 exponential ones, which programs compute in different ways.
 COEFFICIENTS = {4: (1, 2), 3: (0, 6, 9)}
+# Types of numbers, of floats among them, bits of those that are read as they are, and conversions that change nothing.
+NUMBERS, FLOATS = {4: (0, 1, 2, 3, 4, 5), 3: (0, 1, 2, 3, *range(9, 17))}, {4: (4, 5), 3: (2, 3, 11, 12, 15, 16)}
+DOUBLE_BITS, NO_CONVERSION = 64, {4: (0,), 3: (65535,)}
 REFUSED = {4: {3: "by a formula"}, 3: {10: "by a formula", 7: "that is exponential", 8: "that is logarithmic"}}
 IN_XML = re.compile(r"<TX[^>]*>(.*?)</TX>", re.DOTALL)
 
@@ -91,7 +95,9 @@ def _channels(mdf: Any, version: int, k: int, label: str) -> Iterator[StoredChan
     """Yield the channels of a group, of its masters those that are no times."""
     group = mdf.groups[k]
     inner = group.channel_group
-    clock, samples = _clock(mdf, version, k), int(inner.cycles_nr)
+    times: list[np.ndarray] = []
+    clock, samples = _clock(mdf, version, k, times), int(inner.cycles_nr)
+    plain = clock is not None and not clock.refusal and _is_plain(mdf, version, k)
     if version == 4 and group.data_location == SORTED and not inner.flags & mdf_blocks.VLSD:
         length = sum(block.original_size for block in group.get_data_blocks())
         if length != samples * (inner.samples_byte_nr + inner.invalidation_bytes_nr):
@@ -105,7 +111,7 @@ def _channels(mdf: Any, version: int, k: int, label: str) -> Iterator[StoredChan
         yield StoredChannel(
             name,
             samples,
-            partial(_values, mdf, version, k, i),
+            partial(_values, mdf, version, k, i, times if plain else None),
             label,
             _unit(channel),
             clock,
@@ -155,11 +161,34 @@ def _conversions(conversion: Any) -> Iterator[Any]:
             yield from _conversions(block)
 
 
-def _values(mdf: Any, version: int, k: int, i: int) -> Any:
-    """Return the physical values of a channel, NaN where they are marked as invalid, texts as such."""
+def _is_plain(mdf: Any, version: int, k: int) -> bool:
+    """Return whether a group has times of its own that are stored as they are, which asammdf returns with a channel."""
+    group = mdf.groups[k]
+    remote = version == 4 and group.channel_group.flags & mdf_blocks.REMOTE_MASTER
+    masters = [one for one in group.channels if one.channel_type in MASTERS[version]]
+    if remote or len(masters) != 1 or (version == 4 and masters[0].channel_type == VIRTUAL):
+        return False
+    (master,) = masters
+    converted = master.conversion and master.conversion.conversion_type not in NO_CONVERSION[version]
+    lost = version == 4 and master.flags & (ALL_INVALID | INVALID_BIT)
+    return bool(master.bit_count == DOUBLE_BITS and master.data_type in FLOATS[version] and not converted and not lost)
+
+
+def _values(mdf: Any, version: int, k: int, i: int, times: list[np.ndarray] | None = None) -> Any:
+    """Return the physical values of a channel, NaN where they are marked as invalid, texts as such.
+
+    The times of the group are kept in `times`, as reading them alone takes as long as a channel.
+    """
     channel = mdf.groups[k].channels[i]
     with silenced("asammdf"):
-        values, invalid = mdf.get(group=k, index=i, raw=True, samples_only=True, ignore_invalidation_bits=True)
+        options: dict[str, Any] = {"group": k, "index": i, "raw": True, "ignore_invalidation_bits": True}
+        if times is None or times or channel.data_type not in NUMBERS[version]:
+            values, invalid = mdf.get(**options, samples_only=True)
+        else:
+            with contextlib.redirect_stdout(None):  # to which asammdf writes of channels of damaged files
+                signal = mdf.get(**options)
+            values, invalid = signal.samples, signal.invalidation_bits
+            times.append(signal.timestamps)
         if conversion := channel.conversion:
             # asammdf computes squares of integers in 32 bits, and products of short floats in those.
             if conversion.conversion_type in COEFFICIENTS[version] and values.dtype.kind in "fiu":
@@ -175,11 +204,11 @@ def _values(mdf: Any, version: int, k: int, i: int) -> Any:
     return np.asarray(values)
 
 
-def _clock(mdf: Any, version: int, k: int) -> Clock | None:
+def _clock(mdf: Any, version: int, k: int, known: list[np.ndarray]) -> Clock | None:
     """Return the times of a group by its master; one without is None."""
     group = mdf.groups[k].channel_group
     if version == 4 and group.flags & mdf_blocks.REMOTE_MASTER and mdf.version >= "4.20":
-        return _clock(mdf, version, group.cg_master_index) if group.cg_master_index != k else None
+        return _clock(mdf, version, group.cg_master_index, []) if group.cg_master_index != k else None
     masters = [(i, one) for i, one in enumerate(mdf.groups[k].channels) if one.channel_type in MASTERS[version]]
     if not masters:
         return None
@@ -199,11 +228,13 @@ def _clock(mdf: Any, version: int, k: int) -> Clock | None:
         refusal = f"the unit {unit!r}"
     if refusal:
         return Clock(refusal=f"whose times {master.name!r} have {refusal}; {BY_RATE}")
-    return Clock(stored=functools.cache(partial(_times, mdf, version, k, i)), origin=_origin(mdf))
+    return Clock(stored=functools.cache(partial(_times, mdf, version, k, i, known)), origin=_origin(mdf))
 
 
-def _times(mdf: Any, version: int, k: int, i: int) -> np.ndarray:
-    """Return the times of a group [s] from the start of the file."""
+def _times(mdf: Any, version: int, k: int, i: int, known: list[np.ndarray]) -> np.ndarray:
+    """Return the times of a group [s] from the start of the file, those that are known as they are."""
+    if known:
+        return np.asarray(known[0], dtype=float)
     master = mdf.groups[k].channels[i]
     if (version == 4 and master.channel_type == VIRTUAL) or (version == 3 and master.bit_count == 0):
         with silenced("asammdf"):

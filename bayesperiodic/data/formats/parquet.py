@@ -169,5 +169,5 @@ def _times_of_day(read: Any, kind: Any, arrow: Any, compute: Any) -> np.ndarray:
     values = compute.cast(integers, arrow.int64()).to_numpy()
     missing = np.isnan(values) if values.dtype.kind == "f" else np.zeros(values.shape, bool)
     whole = np.where(missing, 0, values).astype(f"timedelta64[{kind.unit}]")
-    whole[missing] = np.timedelta64("NaT")
+    whole[missing] = np.timedelta64("NaT", kind.unit)
     return rolled(whole)[0]

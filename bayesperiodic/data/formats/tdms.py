@@ -31,9 +31,12 @@ class _Mapped(mmap.mmap):
     """A file in memory, of which no more is read than there is."""
 
     def readinto(self, buffer: Any) -> int:
-        part = self.read(len(buffer))
-        memoryview(buffer)[: len(part)] = part
-        return len(part)
+        start = self.tell()
+        count = min(len(buffer), len(self) - start)
+        with memoryview(self) as content:
+            memoryview(buffer)[:count] = content[start : start + count]
+        self.seek(start + count)
+        return count
 
 
 def contents(file: Path, wanted: list[Key]) -> Contents:

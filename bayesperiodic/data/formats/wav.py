@@ -54,7 +54,11 @@ def contents(file: Path, wanted: list[Key]) -> Contents:
 
 
 def _scaled(values: np.ndarray, middle: float, scale: float) -> np.ndarray:
-    return (values - middle) / scale if scale != 1.0 or middle else values
+    if scale == 1.0:  # floats
+        return values
+    result = np.subtract(values, middle, dtype=float)
+    result /= scale
+    return result
 
 
 def _structure(file: Path) -> tuple[_Form, int]:

@@ -268,6 +268,28 @@ def test_scale_of_no_convention_is_decided_by_the_user(made, stored):
     assert np.allclose(read(path, sampling_rate=100.0, units={"x": 0.5}).outputs["x"], 0.5 * SWING)
 
 
+@pytest.mark.parametrize(
+    "stored", [{"range": 10.0}, {"Input Range": "±10 V"}, {"counts": 4096}, {"adc_range": [-5, 5]}]
+)
+def test_counts_with_a_range_are_not_taken_as_volts(made, stored):
+    """Of floats, and with the range of the type itself or that of netCDF for the values, they are no counts."""
+    counts = np.round(1000 * SWING).astype("i2")
+    for units in ({"units": "V"}, {}):
+        with pytest.raises(ValueError, match=r"units\['x'\]: must say what '.* not applied\)' in the file is"):
+            read(made(x=(counts, stored | units)), sampling_rate=100.0)
+    np.testing.assert_allclose(
+        read(made(x=(counts, stored)), sampling_rate=100.0, units={"x": 1e-3}).outputs["x"], 1e-3 * counts
+    )
+    for kept, other in (
+        (SWING, stored),
+        (counts, {"range": np.array([-32768, 32767])}),
+        (counts, {"range": 65536, "valid_range": np.array([-1000, 1000]), "sample_count": 60}),
+        (counts, {"scale_factor": 1.0, "actual_range": np.array([-990, 998])}),
+    ):
+        run = read(made(x=(kept, other | {"units": "V"})), sampling_rate=100.0)
+        np.testing.assert_array_equal(run.outputs["x"], kept)
+
+
 def test_scale_that_changes_nothing_is_ignored(made):
     path = made(x=(SWING, {"gain": 1.0, "offset": 0, "units": "V", "zero_level": 0.0, "multiplier": 1}))
     assert np.array_equal(read(path, sampling_rate=100.0).outputs["x"], SWING)

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.data.formats import text
+from bayesperiodic.data.formats import encodings, text
 from tests.data.test_damaged_files import damaged
 
 X = {"outputs": {"x": "x"}}
@@ -500,3 +500,31 @@ def test_unit_of_the_time_that_is_none_of_time_is_asked_for(write):
 
 def test_row_of_units_behind_a_mark_of_comments_in_a_field_is_seen(write):
     assert read(write("#,t,x\n#,ms,mm\n0,0,1\n1,1,2\n")) == ([0.0, 0.001], [0.001, 0.002])
+
+
+@pytest.mark.parametrize("place", [0, 119_999])
+@pytest.mark.parametrize("cell", [' "2.5"', "  NaN"])
+def test_blanks_before_a_field_of_any_row_are_left_out(write, place, cell):
+    """The file has more than one of the parts that are searched for blanks; numbers have them in pandas anyway."""
+    rows = [f"{k / 100},{k % 7}.5" for k in range(120_000)]
+    rows[place] = f"{place / 100},{cell}"
+    assert sum(map(len, rows)) > encodings.PART_BYTES
+    run = bp.Recording.from_file(write("t,x\n" + "\n".join(rows)), time="t", missing="drop", **X)
+    wanted = {k: k % 7 + 0.5 for k in range(len(rows))}
+    if "2.5" in cell:
+        wanted[place] = 2.5
+    else:
+        del wanted[place]
+    np.testing.assert_array_equal(run.outputs["x"], [*wanted.values()])
+    np.testing.assert_array_equal(run.time, np.array([*wanted]) / 100)
+
+
+@pytest.mark.parametrize("row", [0, 1, 2])
+def test_empty_field_at_the_end_of_one_row_is_none(write, row):
+    """Of a number there, the row is refused, in the first one too."""
+    rows = ["0,1.5", "1,2.5", "2,3.5"]
+    rows[row] += ","
+    assert read(write("t,x\n" + "\n".join(rows))) == ([0.0, 1.0, 2.0], [1.5, 2.5, 3.5])
+    rows[row] += "7"
+    with pytest.raises(ValueError, match=r"2 fields in each row|has rows of|has 2 fields for 3"):
+        read(write("t,x\n" + "\n".join(rows)))
