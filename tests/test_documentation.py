@@ -1,7 +1,7 @@
 """Every public name is documented in full: what it does, takes, gives back and raises, with an example that runs.
 
-Public are `bayesperiodic.__all__`, the `__all__` of `elements`, `measurements`, `models`, `noise` and `plot`, and the methods and
-properties of their classes without a leading underscore. The rules, in the sections of numpydoc:
+Public are `bayesperiodic.__all__`, the `__all__` of `elements`, `measurements`, `models`, `noise` and `plot`, and the
+methods and properties of their classes without a leading underscore. The rules, in the sections of numpydoc:
 
 - Parameters (of a result: Attributes) names exactly the arguments (the fields), arrays with their shapes.
 - Returns or Yields is there where something is returned. A property says it in its summary, with an array's shape.
