@@ -165,8 +165,31 @@ def recording(count, draws, results):
     return bp.plot.recording(bp.Recording.from_arrays(time, values, name=name))
 
 
+def elements(count, draws, results):
+    friction = {
+        f"{name}, a width": lambda d, v, s, k=k: bp.elements.jenkins(s, "joint", v, 2e5, 10, 0.05 * (k + 1))
+        for k, name in enumerate(NAMES[:count])
+    }
+    return bp.plot.elements(friction, 2e-4)
+
+
+def response(count, draws, results):
+    f = np.linspace(0.1, 0.2, 6)
+    c = 0.5 / (1.0 - (2 * np.pi * f) ** 2 + 0.4j * np.pi * f) + 0.01 * np.cos(7 * np.arange(6))
+    runs = bp.response_table({"f": f, "c": c}, frequency="f", outputs={"displacement": "c"}, inputs={"force": 0.5})
+    priors = {"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)}
+    table = bp.Problem(bp.models.duffing, runs, priors=priors, fixed={"m": 1, "k3": 0})
+    return bp.plot.response(table, bp.map_estimate(table, progress=False))
+
+
+def population(count, draws, results):
+    units = {f"unit {k}, of a name of some length": results["posterior"] for k in range(count + 2)}
+    springs = bp.population(units, ["k"], spread={"k": bp.HalfNormal(0.01)}, seed=1, progress=False)
+    return bp.plot.population(springs)
+
+
 DRAWERS = [
-    branch, comparison, corner, fit, loops, marginals, missing_terms, models, modes, orbits, profile, ranks, recording,
+    elements, population, response, branch, comparison, corner, fit, loops, marginals, missing_terms, models, modes, orbits, profile, ranks, recording,
     section, summary, traces,
 ]  # fmt: skip
 
@@ -177,7 +200,7 @@ def test_every_public_figure_is_looked_at():
 
 
 # Figures of more than so many are the same.
-MOST = {summary: 1, fit: 2, loops: 2, missing_terms: 2}
+MOST = {response: 1, summary: 1, fit: 2, loops: 2, missing_terms: 2}
 
 
 @pytest.mark.parametrize(("drawer", "count"), [(d, n) for d in DRAWERS for n in (1, 2, 9) if n <= MOST.get(d, 9)])

@@ -7,7 +7,7 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.unexplained import NOT_TESTED, testable
 
 # Simulated residuals to which the serial correlation is compared, and the fewest rows more than parameters.
-SIMULATED, SPARE_ROWS = 9999, 3
+SIMULATED_TABLES, SPARE_ROWS = 9999, 3
 
 
 def rows_of(problem: Problem, quantity: str) -> list[int]:
@@ -28,7 +28,7 @@ def serial_correlation(residual: np.ndarray, jacobian: np.ndarray) -> float:
     basis = column_space(jacobian)
     if residual.size - basis.shape[1] < SPARE_ROWS:
         return NOT_TESTED
-    noise = np.random.default_rng(0).standard_normal((SIMULATED + 1, residual.size))
+    noise = np.random.default_rng(0).standard_normal((SIMULATED_TABLES + 1, residual.size))
     noise[0] = residual
     left = noise - (noise @ basis) @ basis.T
     square = np.sum(left**2, axis=1)

@@ -39,6 +39,13 @@ class MembershipTest(Result):
         Level of each p-value: the false-alarm rate over their number.
     false_alarm : float
         Probability that a member is called different, at most.
+
+    Examples
+    --------
+    >>> units, spread = dict.fromkeys(["1", "2", "3"], posterior), {"k": bp.HalfNormal(0.01)}
+    >>> verdict = bp.population(units, ["k"], spread=spread, seed=1, progress=False).test(posterior)
+    >>> isinstance(verdict, bp.MembershipTest), verdict.differing
+    (True, ())
     """
 
     unit: str
