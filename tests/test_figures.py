@@ -189,8 +189,8 @@ def population(count, draws, results):
 
 
 DRAWERS = [
-    elements, population, response, branch, comparison, corner, fit, loops, marginals, missing_terms, models, modes, orbits, profile, ranks, recording,
-    section, summary, traces,
+    branch, comparison, corner, elements, fit, loops, marginals, missing_terms, models, modes, orbits, population,
+    profile, ranks, recording, response, section, summary, traces,
 ]  # fmt: skip
 
 
