@@ -235,7 +235,7 @@ class _Reader:
         """Return what the table says of an output, with the given standard deviations of amplitudes and phases."""
         name, rows, (sd, phase_sd) = one.channel, self.frequency.size, given
         sizes, angles, errors = {}, {}, {}
-        kind, meant = OF_SIGNAL.get(self.size, (Amplitude, self.size))
+        kind = OF_SIGNAL.get(self.size, (Amplitude,))[0]
         _checks.integer(f"derivatives[{name!r}]", order, 0)
         if kind is not Amplitude and (order or self.per or set(columns) != {1}):
             raise ValueError(
@@ -244,7 +244,8 @@ class _Reader:
             )
         for h, key in columns.items():
             values = self.source.amplitude(name, key, rows, self.per)
-            scale = self.drive[self.per] if self.per else np.full(rows, 1.0 / AMPLITUDES_IN[meant])
+            # A meter's values are compared as they are.
+            scale = self.drive[self.per] if self.per else np.full(rows, 1.0 / AMPLITUDES_IN.get(self.size, 1.0))
             scale = scale / (2 * np.pi * h * self.frequency) ** order
             sizes[h] = np.abs(values) * scale
             if sd is not None:
