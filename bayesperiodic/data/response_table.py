@@ -1,6 +1,7 @@
 """Experiments from a table of frequencies, amplitudes and phases, or from frequency response functions."""
 
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -158,7 +159,8 @@ def response_table(
         )
         for name, columns in amplitudes.items()
     }  # fmt: skip
-    of_table = Sweep(_table_name(label, amplitudes, inputs), sweep, resolution)
+    numbers = [at, *drive.values(), *(sizes for each in read.values() for sizes in each.size.values())]
+    of_table = Sweep(_table_name(label, amplitudes, inputs, numbers), sweep, resolution)
     samples = samples or max(
         FEWEST_TABLE_POINTS, POINTS_A_HARMONIC * max(h for each in amplitudes.values() for h in each)
     )
@@ -302,10 +304,16 @@ def _by_harmonic(columns: Columns) -> dict[int, Key]:
     return dict(columns)
 
 
-def _table_name(label: str, outputs: Mapping[str, Mapping[int, Key]], inputs: Mapping[str, float | Key]) -> str:
-    """Return a name of the table that tells it from others: its file, columns and levels."""
+def _table_name(
+    label: str,
+    outputs: Mapping[str, Mapping[int, Key]],
+    inputs: Mapping[str, float | Key],
+    values: Iterable[np.ndarray],
+) -> str:
+    """Return a name of the table that tells it from others: its file, columns and levels, and a sum of its values."""
     parts = [f"{name} {', '.join(map(str, columns.values()))}" for name, columns in outputs.items()]
-    return f"{label}: {'; '.join([*parts, *(f'{name} {level}' for name, level in inputs.items())])}"
+    parts += [f"{name} {level}" for name, level in inputs.items()]
+    return f"{label}: {'; '.join(parts)} [{zlib.crc32(np.concatenate([*values]).tobytes()):08x}]"
 
 
 def _names(frequencies: np.ndarray) -> list[str]:

@@ -190,6 +190,12 @@ def test_values_of_meters_are_of_the_whole_signal(size, kind, of_sine):
     assert amplitudes(runs, "force", "inputs") == pytest.approx(FORCE / of_sine)
 
 
+def test_tables_of_the_same_columns_are_tables_of_their_own():
+    tables = TABLE, TABLE | {"F": 2.0 * FORCE}, TABLE | {"A": 1.01 * TABLE["A"]}
+    sweeps = [{run.sweep for run in bp.response_table(table, **COLUMNS, sweep="up")} for table in (*tables, TABLE)]
+    assert [len(one) for one in sweeps] == [1] * 4 and len(set.union(*sweeps)) == 3
+
+
 def test_phase_against_another_output_is_compared_with_that():
     runs = bp.response_table(
         TABLE, **(COLUMNS | {"outputs": {"x": "A", "v": "A"}, "against": {"x": "v"}, "phase_sd": {"x": 1.0}})
