@@ -582,8 +582,8 @@ class Description(Printed):
         swept = dict.fromkeys(getattr(e.condition, "vary", "") for e in self.experiments)
         return (
             f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
-            f"data: {', '.join((*self.channels, *self.quantities, *(f'jumps in {s}' for s in swept if s)))} with {self.likelihood.values:.0f} "
-            f"independent values, {self.noise.name} noise"
+            f"data: {', '.join((*self.channels, *self.quantities, *(f'jumps in {s}' for s in swept if s)))} "
+            f"with {self.likelihood.values:.0f} independent values, {self.noise.name} noise"
             f"{f', noise of {noisy} integrated out' if noisy else ''}{f', sensors: {sensors}' if sensors else ''})"
         )
 
