@@ -77,3 +77,12 @@ def test_reports_show_the_table(tmp_path):
     fit = bp.map_estimate(problem, start=fit.theta, progress=False)
     page = bp.report(problem, fit, None, tmp_path / "report.html").read_text(encoding="utf-8")
     assert 'id="figure-response"' in page and "Measured responses over frequency" in page
+
+
+def test_parts_of_the_branch_end_at_folds():
+    """Folds have a multiplier of 1, whose rounding error does not decide how the part that ends there is drawn."""
+    problem, fit = solved()
+    (curve,) = curves(problem, fit).values()
+    first, last = np.flatnonzero(curve.folds)
+    for fold, before in ((first, True), (last, False)):
+        assert curve.stable[fold - 1] == curve.stable[fold] == before and curve.stable[fold + 1] == (not before)

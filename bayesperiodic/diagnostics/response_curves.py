@@ -125,13 +125,17 @@ def curves(problem: Problem, fit: MapEstimate) -> dict[Sweep, Curve]:
         z = solve_driven(rows[0], at[0], "static")[0].z if start is None else start
         with np.errstate(all="ignore"):
             passages = list(follow(fine, at, 0, z))
+        folds = np.array([p.is_fold for p in passages])
+        stable = np.array([_stable(p.equations, at[p.point or 0], p.z) for p in passages])
+        for k in np.flatnonzero(folds[1:]) + 1:  # a multiplier is 1: a fold ends the part before it
+            stable[k] = stable[k - 1] != folds[k - 1]
         names, inputs = problem.model.outputs, problem.model.inputs
         result[sweep] = Curve(
             np.array([p.equations.frequency for p in passages]),
             {name: np.array([p.equations.outputs(p.z, at[0])[:, c] for p in passages]) for c, name in enumerate(names)}
             | {name: np.array([p.equations.inputs[:, c] for p in passages]) for c, name in enumerate(inputs)},
-            np.array([_stable(p.equations, at[p.point or 0], p.z) for p in passages]),
-            np.array([p.is_fold for p in passages]),
+            stable,
+            folds,
         )
     return result
 
