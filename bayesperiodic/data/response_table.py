@@ -1,6 +1,7 @@
 """Experiments from a table of frequencies, amplitudes and phases, or from frequency response functions."""
 
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -158,7 +159,8 @@ def response_table(
         )
         for name, columns in amplitudes.items()
     }  # fmt: skip
-    of_table = Sweep(_table_name(label, amplitudes, inputs), sweep, resolution)
+    numbers = [at, *drive.values(), *(sizes for each in read.values() for sizes in each.size.values())]
+    of_table = Sweep(_table_name(label, amplitudes, inputs, numbers), sweep, resolution)
     samples = samples or max(
         FEWEST_TABLE_POINTS, POINTS_A_HARMONIC * max(h for each in amplitudes.values() for h in each)
     )
@@ -235,7 +237,7 @@ class _Reader:
         """Return what the table says of an output, with the given standard deviations of amplitudes and phases."""
         name, rows, (sd, phase_sd) = one.channel, self.frequency.size, given
         sizes, angles, errors = {}, {}, {}
-        kind, meant = OF_SIGNAL.get(self.size, (Amplitude, self.size))
+        kind = OF_SIGNAL.get(self.size, (Amplitude,))[0]
         _checks.integer(f"derivatives[{name!r}]", order, 0)
         if kind is not Amplitude and (order or self.per or set(columns) != {1}):
             raise ValueError(
@@ -244,7 +246,8 @@ class _Reader:
             )
         for h, key in columns.items():
             values = self.source.amplitude(name, key, rows, self.per)
-            scale = self.drive[self.per] if self.per else np.full(rows, 1.0 / AMPLITUDES_IN[meant])
+            # A meter's values are compared as they are.
+            scale = self.drive[self.per] if self.per else np.full(rows, 1.0 / AMPLITUDES_IN.get(self.size, 1.0))
             scale = scale / (2 * np.pi * h * self.frequency) ** order
             sizes[h] = np.abs(values) * scale
             if sd is not None:
@@ -301,10 +304,16 @@ def _by_harmonic(columns: Columns) -> dict[int, Key]:
     return dict(columns)
 
 
-def _table_name(label: str, outputs: Mapping[str, Mapping[int, Key]], inputs: Mapping[str, float | Key]) -> str:
-    """Return a name of the table that tells it from others: its file, columns and levels."""
+def _table_name(
+    label: str,
+    outputs: Mapping[str, Mapping[int, Key]],
+    inputs: Mapping[str, float | Key],
+    values: Iterable[np.ndarray],
+) -> str:
+    """Return a name of the table that tells it from others: its file, columns and levels, and a sum of its values."""
     parts = [f"{name} {', '.join(map(str, columns.values()))}" for name, columns in outputs.items()]
-    return f"{label}: {'; '.join([*parts, *(f'{name} {level}' for name, level in inputs.items())])}"
+    parts += [f"{name} {level}" for name, level in inputs.items()]
+    return f"{label}: {'; '.join(parts)} [{zlib.crc32(np.concatenate([*values]).tobytes()):08x}]"
 
 
 def _names(frequencies: np.ndarray) -> list[str]:

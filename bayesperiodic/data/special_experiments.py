@@ -67,6 +67,8 @@ def jump(
     Fold(direction='up', vary='frequency', step=0.001, sd=0.0001)
     """
     _checks.one_of("direction", direction, ("up", "down"))
+    _checks.mapping("inputs", inputs, "{'force': 0.2}")
+    points = _checks.integer("samples", samples, 4)
     given = {input_name: _amplitude(f"inputs[{input_name!r}]", value) for input_name, value in inputs.items()}
     _checks.one_of("vary", vary, (FREQUENCY, *given))
     if (step is None) == (sd is None):
@@ -80,7 +82,7 @@ def jump(
         raise ValueError(f"step: must be less than the measured {vary}, {place:g}, got {step!r}.")
     error = JITTER_OF_PLACES * width if sd is None else _checks.positive("sd", sd) / unit
     return Experiment(
-        name, frequency, {}, _waves(given, samples), samples=samples, condition=Fold(direction, vary, width, error)
+        name, frequency, {}, _waves(given, points), samples=points, condition=Fold(direction, vary, width, error)
     )
 
 
@@ -142,7 +144,8 @@ def resonance_point(
     >>> point.condition.free, point.independent
     (('frequency', 'force'), {'x': 2})
     """
-    if len(amplitude) != 1:
+    _checks.mapping("inputs", inputs, "{'force': None}")
+    if len(_checks.mapping("amplitude", amplitude, "{'x': 0.01}")) != 1:
         raise ValueError(f"amplitude: must be that of one output, such as {{'x': 0.01}}, got {dict(amplitude)!r}.")
     ((output, size),) = amplitude.items()
     size = _checks.positive(f"amplitude[{output!r}]", size)

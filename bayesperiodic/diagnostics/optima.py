@@ -116,11 +116,10 @@ def distinct(one: Optimum, other: Optimum) -> bool:
 
 
 def held_out_error(state: Optimum) -> float:
-    """Return the mean fraction unexplained in experiments that are left out, one at a time; NaN for few experiments."""
+    """Return the mean fraction unexplained in experiments left out, one at a time; NaN for few or for tables."""
     problem = state.problem
-    if len(problem.experiments) < FEWEST_EXPERIMENTS or any(
-        problem.plain_names[name] != name for name in problem.names
-    ):
+    local = any(problem.plain_names[name] != name for name in problem.names)
+    if local or len(problem.experiments) < FEWEST_EXPERIMENTS or not problem.channels:
         return np.nan
     whole, fractions = problem.anchored(state.iterate.theta, state.orbits), []
     for e in problem.experiments:

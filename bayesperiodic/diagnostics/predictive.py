@@ -564,7 +564,9 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
 
 
 def _inside(e: Experiment, prediction: Bands) -> float:
-    """Return the fraction of the measured values within the band."""
+    """Return the fraction of the measured values within the band; NaN without a time history."""
+    if not e.outputs:
+        return np.nan
     within = [
         (values >= prediction.low[e.name][channel]) & (values <= prediction.high[e.name][channel])
         for channel, values in e.outputs.items()

@@ -16,6 +16,7 @@ from bayesperiodic.estimation.adequacy import Whitened, used
 from bayesperiodic.estimation.covariance import predicted_changes, residual_variances
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.likelihood.quantities import Quantities
 from bayesperiodic.periodic.equations import PeriodicEquations, respond
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 
@@ -59,7 +60,10 @@ class ScoreTests:
         data: list[np.ndarray] = []  # components of the measured outputs less their means, one array (size,) a block
         for e in problem.experiments:
             seen = problem.observations[e.name]
-            data += seen.errors(np.stack([e.outputs[c] - e.outputs[c].mean() for c in seen.channels], axis=-1))
+            signals = np.zeros((len(seen.data), len(seen.compared_channels)))
+            signals[:, : len(seen.channels)] = seen.data - seen.data.mean(axis=0)
+            parts = zip(seen.blocks, seen.errors(signals), strict=True)
+            data += [block.sizes if isinstance(block, Quantities) else part for block, part in parts]
         self.widths = _widths(likelihood.whitened(data, noise), likelihood.whitened(effects, noise))
         joined = [np.concatenate([s, c]) for s, c in zip(here.jacobian, effects, strict=True)]
         white, parameters = Whitened(problem, Compared(list(here.residuals), joined), noise), len(problem.names)

@@ -116,7 +116,9 @@ class FitCheck(Result):
     def __repr__(self) -> str:
         columns = {"robust sd": self.robust_sd, "shift on twice the points": self.doubling_shift}
         lines = ["FitCheck", pd.DataFrame(columns).map("{:.3g}".format).to_string()]
-        return "\n".join([*lines, "Residuals", pd.DataFrame(self.by_channel()).T.to_string(), *self.remarks()])
+        if rows := self.by_channel():
+            lines += ["Residuals", pd.DataFrame(rows).T.to_string()]
+        return "\n".join([*lines, *self.remarks()])
 
     def by_channel(self) -> dict[str, dict[str, str]]:
         """Return the split of the noise and the test of whiteness of each channel, as printed."""
@@ -553,17 +555,15 @@ class MapEstimate(Result):
             name: (f"{value:.6g}", *(f"{spreads[column][name]:.3g}" for column in columns[1:]))
             for name, value in self.theta.items()
         } | {name: (f"{value:.4g}", *"-" * len(spreads)) for name, value in self.noise.items()}
-        estimates, more = pd.DataFrame.from_dict(rows, orient="index", columns=columns), {}
-        if self.checks:
-            more = self.checks.by_channel()
+        estimates = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+        more = self.checks.by_channel() if self.checks else {}
         channels = {
             channel: {"rms": f"{rms:.4g}", "unexplained variance": f"{self.fvu[channel]:.2%}"} | more.get(channel, {})
             for channel, rms in self.rms.items()
         }
-        residuals = pd.DataFrame.from_dict(channels, orient="index")
         lines = [f"MapEstimate ({status})", estimates.to_string()]
         lines += [ROBUST_TAKEN] if self.misspecified else []
-        lines += ["Residuals", residuals.to_string()]
+        lines += ["Residuals", pd.DataFrame.from_dict(channels, orient="index").to_string()] if channels else []
         lines += [f"The noise has the {self.noise_prior}."] if self.noise else []
         if self.noisy_inputs and self.checks:
             caused = ", ".join(f"{sd:.3g} in {channel}" for channel, sd in self.checks.input_noise.items())

@@ -59,6 +59,7 @@ class Block(ABC):
 
     words: ClassVar[str] = "{0.size} values of {0.channel}"  # what is compared, a format of the block
     counted: ClassVar[bool] = False  # whether the variance is unknown, so that eq. (7) counts the values
+    observed: ClassVar[bool] = True  # whether the components are measured values
     timed: ClassVar[bool] = False  # whether the components are values of one channel along the period
     spectral: ClassVar[bool] = False  # whether they are Fourier components of one channel
 

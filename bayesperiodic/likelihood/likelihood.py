@@ -175,7 +175,7 @@ class Likelihood:
     @property
     def values(self) -> float:
         """The independent values of all data."""
-        return sum(block.count if block.counted else block.size for block in self.blocks)
+        return sum(block.count if block.counted else block.size for block in self.blocks if block.observed)
 
     def _summed(self, values: Iterable[Any]) -> dict[str, Any]:
         """Return the sum of values, one a block, behind each variance."""

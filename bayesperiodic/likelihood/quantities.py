@@ -106,6 +106,12 @@ class Quantities(Block):
         return self.quantity(values) + components * (self.known if self.known.size else 1.0)
 
     @property
+    def sizes(self) -> np.ndarray:
+        """The measured values (size,) as components, of phases one radian."""
+        values = np.ones(self.size) if self.kind.signed else self.values
+        return values / self.known if self.known.size else values
+
+    @property
     def counted(self) -> bool:  # type: ignore[override]
         """Whether the standard deviation is unknown."""
         return not self.known.size

@@ -26,6 +26,7 @@ class Reach(LinearBlock):
     resolution: float = 1.0  # [Hz]
 
     words: ClassVar[str] = REACH_OF_BRANCH
+    observed: ClassVar[bool] = False
 
     @classmethod
     def of(cls, experiment: Experiment, model: Model) -> "list[Reach]":

@@ -93,6 +93,8 @@ class Element:
         arguments = {n: motion[n] for n in inspect.signature(self.force).parameters if n in motion}
         arguments |= {n: p[f"{self.name}_{n}"] for n in self.parameters}
         given = self.force(**arguments, **self.constants)
+        if not isinstance(given, Hysteretic | sp.Expr | float | int):
+            raise ValueError(f"force of element {self.name!r}: must return an expression or Hysteretic, got {given!r}.")
         return given if isinstance(given, Hysteretic) else Hysteretic(sp.sympify(given), ())
 
 
@@ -111,6 +113,8 @@ def definition(
                 raise ValueError(f"{kind}: must have the shape of mass, {(count, count)}, got {matrix.shape}.")
     if parts["mass"].keys() == {CONSTANT_PART} and np.linalg.matrix_rank(parts["mass"][CONSTANT_PART]) < count:
         raise ValueError("mass: must be regular, got a singular matrix; eliminate the degrees of freedom without mass.")
+    if isinstance(elements, Element):
+        raise ValueError(f"elements: must be a list of elements, got {elements.name!r} alone; give [element].")
     placed = list(elements)
     for element in placed:
         _checks.instance("elements", element, Element)
@@ -178,9 +182,10 @@ def _weights(argument: str, place: Any, count: int) -> np.ndarray:
             )
         return weights
     numbers = place if isinstance(place, tuple) else (place,)
-    if len(numbers) not in (1, 2) or len(set(numbers)) < len(numbers):
+    if isinstance(place, list) or len(numbers) not in (1, 2) or numbers[1:] == numbers[:1]:
         raise ValueError(
-            f"{argument}: must be one degree of freedom, a tuple of two different ones, or an array, got {place!r}."
+            f"{argument}: must be one degree of freedom, a tuple of two different ones, or an array of {count} "
+            f"weights, got {place!r}."
         )
     weights = np.zeros(count)
     for number, sign in zip(numbers, (1.0, -1.0), strict=False):

@@ -13,7 +13,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.predictive import Prediction
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, caveats_of, chosen, draws_label, styled
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, OF_TABLES, axis_label, caveats_of, chosen, draws_label, styled
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.sampling.draws import Posterior
 
@@ -63,6 +63,8 @@ def fit(
     shown = [(e, channel) for e in drawn for channel in e.outputs]
     inexact = [e for e in drawn if e.name in estimate.input_errors]
     noisy = [(e, name) for e in inexact for name, sd in estimate.input_sd[e.name].items() if sd.any()]
+    if not shown:
+        raise ValueError(f"experiments: must have time histories, got {', '.join(runs)}; {OF_TABLES}.")
     heights = [3, 1] * len(shown) + [1] * len(noisy)
     figure = figure or plt.figure(figsize=(7.0, 4.6 * len(shown) + 1.3 * len(noisy)), layout="constrained")
     grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
@@ -158,13 +160,15 @@ def loops(
     ['force [N]', 'rate of force [N/s]']
     """
     problem = check_results(problem, estimate=estimate)
+    if not problem.channels:
+        raise ValueError(f"problem: must have time histories, got none; {OF_TABLES}.")
     output = problem.channels[0] if output is None else output
     _checks.one_of("output", output, problem.channels)
     input = next(iter(problem.model.inputs), "") if input is None else input
     _checks.one_of("input", input, problem.model.inputs)
     figure = figure or plt.figure(figsize=(9.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
-    for number, e in enumerate(problem.experiments):
+    for number, e in enumerate(e for e in problem.experiments if output in e.outputs):
         measured = e.outputs[output]
         predicted = measured - estimate.residuals[e.name][output]
         amplitudes = _fourier.coefficients(e.inputs[input])

@@ -14,7 +14,7 @@ from bayesperiodic.diagnostics.verdicts import FINE
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot.estimates import draw_period
 from bayesperiodic.plot.pairs import corner
-from bayesperiodic.plot.style import axis_label, styled
+from bayesperiodic.plot.style import OF_TABLES, axis_label, styled
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.sampling.draws import Posterior
 
@@ -45,12 +45,14 @@ def summary(problem: Problem, fit: MapEstimate, posterior: Posterior, *, figure:
     ['displacement [m]', 'residual [m]']
     """
     problem = check_results(problem, fit=fit, posterior=posterior)
+    if not problem.channels:
+        raise ValueError(f"problem: must have time histories, got none; {OF_TABLES}.")
     identified, compared = identifiability(problem, fit, posterior, profile=False), compare(problem, fit, posterior)
     figure = figure or plt.figure(figsize=(10.0, 5.6))
     parts: Any = figure.subfigures(1, 2, width_ratios=[1.15, 1.0])
     left, right = parts
     above, below = right.subfigures(2, 1, height_ratios=[1.7, 1.0])
-    channel = max(fit.fvu, key=lambda name: fit.fvu[name])
+    channel = max(problem.channels, key=lambda name: fit.fvu[name])
     having = [e for e in problem.experiments if channel in e.outputs]
     worst = max(having, key=lambda e: float((fit.residuals[e.name][channel] ** 2).sum()))
     room = {"left": 0.15, "right": 0.97, "bottom": 0.1, "top": 0.93, "hspace": 0.08, "height_ratios": [2.2, 1.0]}

@@ -32,6 +32,8 @@ SHARED_ENTRIES = {
     "Raises\n": "\nRaises\n------\nValueError\n"
     "    For an object of another class, an unknown name or results of another problem.",
 }
+# What is there for problems without time histories.
+OF_TABLES = "bp.plot.response(problem, fit) draws response tables"
 
 
 def styled(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:

@@ -98,6 +98,8 @@ def _residuals(panels: list[Axes], problem: Problem, search: MissingTerms, shown
     fit = next(iter(shown.values()))
     place = search.steps[0].place if search.steps else ""
     channel = place if place in problem.channels else max(fit.fvu, key=lambda name: fit.fvu[name])
+    if channel not in problem.channels:
+        raise ValueError(f"problem: must have time histories, got none of {channel!r}; {style.OF_TABLES}.")
     having = [e for e in problem.experiments if channel in e.outputs]
     e = max(having, key=lambda run: float(np.sum(fit.residuals[run.name][channel] ** 2)))
     (across, x), *others = _variables(problem, fit, search, e).items()

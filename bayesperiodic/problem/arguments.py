@@ -107,7 +107,10 @@ def checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tupl
         raise ValueError("experiments: must have at least one experiment, got ().")
     names = [experiment.name for experiment in result]
     if len(set(names)) < len(names):
-        raise ValueError(f"experiments: names must differ, got {names}. Name them with fold(name=…).")
+        raise ValueError(
+            f"experiments: names must differ, got {names}. Name them with fold(name=…), or those of a table with "
+            "dataclasses.replace(experiment, name=…)."
+        )
     for e in result:
         _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
         if not e.channels and not isinstance(e.condition, Fold):

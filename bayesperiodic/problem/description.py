@@ -579,12 +579,12 @@ class Description(Printed):
     def __repr__(self) -> str:
         sensors = ", ".join(f"{channel} {sensor!r}" for channel, sensor in self.sensors.given.items())
         noisy = ", ".join(dict.fromkeys(name for inputs in self.noisy_inputs.values() for name in inputs))
+        swept = dict.fromkeys(getattr(e.condition, "vary", "") for e in self.experiments)
         return (
             f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
-            f"data: {', '.join((*self.channels, *self.quantities))} with {self.likelihood.values:.0f} independent "
-            f"values, {self.noise.name} noise"
-            f"{f', noise of {noisy} integrated out' if noisy else ''}"
-            f"{f', sensors: {sensors}' if sensors else ''})"
+            f"data: {', '.join((*self.channels, *self.quantities, *(f'jumps in {s}' for s in swept if s)))} "
+            f"with {self.likelihood.values:.0f} independent values, {self.noise.name} noise"
+            f"{f', noise of {noisy} integrated out' if noisy else ''}{f', sensors: {sensors}' if sensors else ''})"
         )
 
 

@@ -156,7 +156,7 @@ def rms(values: np.ndarray) -> float:
 
 def drawn(given: ReportInputs) -> list[Experiment]:
     """Return the experiments whose period is drawn: all, or those with the largest residuals, in their order."""
-    every, residuals = given.problem.experiments, given.fit.residuals
+    every, residuals = [e for e in given.problem.experiments if e.outputs], given.fit.residuals
     whole = {channel: max(size, np.finfo(float).tiny) for channel, size in given.fit.rms.items()}
     deviations = [max(rms(left) / whole[c] for c, left in residuals[e.name].items()) for e in every]
     kept = np.sort(np.argsort(np.negative(deviations), kind="stable")[:MOST_DRAWN])
@@ -382,7 +382,7 @@ def residuals(given: ReportInputs) -> Rows:
     """Return the table of the residuals."""
     fit, rows = given.fit, []
     for channel, value in fit.rms.items():
-        split, white = fit.noise_split.get(channel), fit.whiteness[channel]
+        split, white = fit.noise_split.get(channel), fit.whiteness.get(channel)
         noise, error = (np.nan, np.nan) if split is None else (split.measurement, split.model)
         rows.append(
             {
@@ -393,8 +393,8 @@ def residuals(given: ReportInputs) -> Rows:
                 "Measurement noise": number(noise),
                 "Model error": number(np.nan if np.isnan(noise) else error),
                 "Input noise": number(fit.input_noise.get(channel, np.nan)),
-                "Whiteness p": html.p_value(white.p),
-                "Autocorrelation": number(white.lag1, 2),
+                "Whiteness p": html.p_value(white.p if white else np.nan),
+                "Autocorrelation": number(white.lag1 if white else np.nan, 2),
             }
         )
     return rows

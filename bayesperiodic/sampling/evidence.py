@@ -268,7 +268,8 @@ def _estimate(at_draws: np.ndarray, at_mixture: np.ndarray, failed: float) -> Br
 
 def _data(problem: Problem) -> dict[str, float]:
     """Return the independent values behind each vector of data."""
-    return {f"{b.experiment}: {b.channel}": b.count if b.counted else float(b.size) for b in problem.likelihood.blocks}
+    observed = [block for block in problem.likelihood.blocks if block.observed]
+    return {f"{b.experiment}: {b.channel}": b.count if b.counted else float(b.size) for b in observed}
 
 
 def _constant(problem: Problem) -> float:

@@ -26,6 +26,7 @@ from bayesperiodic.sampling.shrinkage import Shrunken, outside, shrink
 LOG_SPREAD = 0.5
 # Spread of a common parameter, relative to the smallest standard deviation of a unit.
 COMMON_SPREAD = 0.2
+SPREADS, COVARIATES = "{'k': bp.HalfNormal(0.1)}", "{'temperature': {'unit 1': 20.0}}"
 FEWEST_UNITS, FEWEST_DEGREES, MOST_TURNS, WIDER_PRIOR = 3, 2.0, 5, 1.5
 
 
@@ -123,6 +124,8 @@ def population(
     _checks.integer("seed", seed, 0)
     names, single = checked_names(names), not isinstance(units, Mapping)
     given = {"": units} if single else dict(units)
+    for argument, mapping, example in (("spread", spread, SPREADS), ("covariates", covariates, COVARIATES)):
+        _checks.mapping(argument, mapping or {}, example)
     settings = Settings(names, spread or {}, tuple(common), correlation, _checked_degrees(degrees))
     workers = checked_executor(executor)
     drawn, left_out = _draw(given, names, single, seed, workers)

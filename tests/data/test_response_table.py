@@ -176,10 +176,24 @@ def test_harmonics_of_a_table_are_data_of_their_own():
     assert (first.harmonic, third.harmonic) == (1, 3) and third.value == pytest.approx(0.1 * first.value)
 
 
-def test_values_of_meters_are_of_the_whole_signal():
-    runs = bp.response_table(TABLE, **(COLUMNS | {"phases": None, "size": "rms of signal"}))
-    assert [type(run.measurements[0]).__name__ for run in runs] == ["RootMeanSquare"] * 6
-    assert amplitudes(runs, "force", "inputs") == pytest.approx(FORCE * np.sqrt(2.0))
+@pytest.mark.parametrize(
+    "size, kind, of_sine", [("rms", "RootMeanSquare", np.sqrt(0.5)), ("peak to peak", "PeakToPeak", 2.0)]
+)
+def test_values_of_meters_are_of_the_whole_signal(size, kind, of_sine):
+    runs = bp.response_table(
+        TABLE, **(COLUMNS | {"phases": None, "size": f"{size} of signal", "sd": {"x": "1%"}})
+    )  # fmt: skip
+    meters = [run.measurements[0] for run in runs]
+    assert [type(one).__name__ for one in meters] == [kind] * 6
+    assert [one.value for one in meters] == pytest.approx(TABLE["A"])
+    assert [one.sd for one in meters] == pytest.approx(0.01 * TABLE["A"])
+    assert amplitudes(runs, "force", "inputs") == pytest.approx(FORCE / of_sine)
+
+
+def test_tables_of_the_same_columns_are_tables_of_their_own():
+    tables = TABLE, TABLE | {"F": 2.0 * FORCE}, TABLE | {"A": 1.01 * TABLE["A"]}
+    sweeps = [{run.sweep for run in bp.response_table(table, **COLUMNS, sweep="up")} for table in (*tables, TABLE)]
+    assert [len(one) for one in sweeps] == [1] * 4 and len(set.union(*sweeps)) == 3
 
 
 def test_phase_against_another_output_is_compared_with_that():

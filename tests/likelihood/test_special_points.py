@@ -103,6 +103,13 @@ def test_the_amplitude_is_no_data_where_it_determines_the_level():
         (lambda: bp.jump("j", 0.5, {"force": 1.0}, direction="up", vary="x", sd=0.5), "vary: must be"),
         (lambda: bp.jump("j", 0.5, {"force": 0.0}, direction="up", vary="force", sd=0.5), "must not be zero"),
         (lambda: bp.jump("j", 0.5, {"force": "1"}, direction="up", sd=-0.5), "sd: must be"),
+        (lambda: bp.jump("j", 0.5, 1.0, direction="up", sd=0.5), "inputs: must be a mapping"),
+        (
+            lambda: bp.jump("j", 0.5, {"force": 1.0}, direction="up", sd=0.5, samples="64"),
+            "samples: must be an integer",
+        ),
+        (lambda: bp.resonance_point("r", 0.5, 1.0, {"force": None}, frequency_sd=0.1), "amplitude: must be a mapping"),
+        (lambda: bp.resonance_point("r", 0.5, {"x": 1.0}, ["force"], frequency_sd=0.1), "inputs: must be a mapping"),
         (lambda: bp.resonance_point("r", 0.5, {}, {"force": 1.0}, frequency_sd=0.1), "amplitude: must be"),
         (lambda: bp.resonance_point("r", 0.5, {"x": 1.0}, {"force": 1.0}, frequency_sd=0.1), "amplitude_sd: must be"),
         (lambda: bp.resonance_point("r", 0.5, {"x": 1.0}, {}, frequency_sd=0.1), "inputs: must have"),

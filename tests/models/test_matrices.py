@@ -129,7 +129,11 @@ def test_states_and_parameters_carry_the_name_of_the_element():
         ({"forces": {"force": np.ones(3)}}, r"forces\['force'\]: must be 2 finite weights"),
         ({"outputs": {"x": 0}}, r"outputs\['x'\]: must be a place and a kind"),
         ({"outputs": {"x": (0, "speed")}}, r"outputs\['x'\]: must be one of"),
+        ({"forces": {"force": [0, 1]}}, r"forces\['force'\]: must be one degree of freedom, .* got \[0, 1\]"),
+        ({"outputs": {"x": ([0, 1], "displacement")}}, r"outputs\['x'\]: must be one degree of freedom"),
         ({"elements": [bp.elements.cubic]}, "elements: must be a Element"),
+        ({"elements": Element("e", bp.elements.cubic, 0)}, "elements: must be a list of elements, got 'e' alone"),
+        ({"elements": [Element("e", lambda d: None, 0)]}, "force of element 'e': must return an expression"),
         ({"elements": [Element("e", bp.elements.cubic, -1)]}, "place of element 'e': must be an integer >= 0"),
     ],
 )

@@ -240,6 +240,10 @@ def test_bad_arguments_are_refused():
         bp.population(units, "a", seed=1)
     with pytest.raises(ValueError, match=r"units\['x'\]: must be a Problem"):
         bp.population({"x": 3.0}, ["a"], seed=1)
+    with pytest.raises(ValueError, match="spread: must be a mapping"):
+        bp.population({}, ["a"], spread=0.5, seed=1)
+    with pytest.raises(ValueError, match="covariates: must be a mapping"):
+        bp.population({}, ["a"], covariates=["day"], seed=1)
     with pytest.raises(ValueError, match="degrees: must be > 2"):
         bp.population({}, ["a"], degrees=1.0, seed=1)
 
