@@ -19,7 +19,7 @@ for notebook in (HERE.parent / "studies" / "notebooks").glob("*.ipynb"):
     shutil.copy2(notebook, HERE / "tutorials" / notebook.name)
 shutil.copytree(HERE.parent / "studies" / "notebooks" / "sketches", HERE / "tutorials" / "sketches", dirs_exist_ok=True)
 # Public names whose modules are elsewhere in the package.
-sys.modules |= {"bayesperiodic.noise": bp.noise, "bayesperiodic.elements": bp.elements}
+sys.modules |= {f"bayesperiodic.{name}": getattr(bp, name) for name in ("noise", "elements", "measurements")}
 
 project, author = "bayesperiodic", "the bayesperiodic authors"
 release = importlib.metadata.version("bayesperiodic")

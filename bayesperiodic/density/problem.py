@@ -93,7 +93,7 @@ class Problem(Description):
     Examples
     --------
     >>> problem  # doctest: +NORMALIZE_WHITESPACE
-    Problem('duffing', 1 experiments, free: c, k, channels: displacement with 11 independent values, independent noise,
+    Problem('duffing', 1 experiments, free: c, k, data: displacement with 11 independent values, independent noise,
     noise of force integrated out)
     >>> at = {"c": 0.2, "k": 1.0}, {"displacement": 1e-6}
     >>> bool(problem.log_posterior(*at) > problem.log_posterior({"c": 0.2, "k": 1.1}, at[1]))

@@ -173,12 +173,12 @@ def test_searches_that_need_time_histories_refuse_special_points(exact):
 
 @pytest.mark.slow
 def test_intervals_from_jumps_and_backbones_cover_the_truth():
-    """200 data sets of parameters drawn from the prior; 90 % intervals, 99 % band of the binomial distribution.
+    """60 data sets of parameters drawn from the prior; 90 % intervals, 99 % band of the binomial distribution.
 
     False-alarm rate 3 % (three parameters); the data are those of harmonic balance with normal errors, the priors
     those of the estimate. Fixed seed.
     """
-    generator, inside, count = np.random.default_rng(64), np.zeros(3), 200
+    generator, inside, count = np.random.default_rng(64), np.zeros(3), 60
     wide = {"c": bp.LogNormal(0.08, 0.1), "k": bp.LogNormal(1.0, 0.03), "k3": bp.LogNormal(0.5, 0.1)}
     for _ in range(count):
         truth = {name: float(prior.quantile(generator.uniform())) for name, prior in wide.items()}

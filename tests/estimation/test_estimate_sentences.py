@@ -35,10 +35,10 @@ def problem(rates=0, noise="exact"):
         free_noise=("variance[y]",),
         logarithmic=np.array([True, False]),
         input_noise=noise,
-        model=SimpleNamespace(input_derivatives=lambda: {"u": rates} if rates else {}),
+        model=SimpleNamespace(autonomous=False, input_derivatives=lambda: {"u": rates} if rates else {}),
         experiments=[
-            SimpleNamespace(samples=40),
-            SimpleNamespace(samples=64),
+            SimpleNamespace(samples=40, sweep=None, measurements=()),
+            SimpleNamespace(samples=64, sweep=None, measurements=()),
         ],
         joint_prior=SimpleNamespace(supports={"a": (0.0, 5.0), "b": (-np.inf, np.inf)}),
     )

@@ -11,6 +11,11 @@ from tests.sampling.gaussian_units import gaussian_units
 
 SCALE = 0.2
 PRIOR = bp.HalfNormal(SCALE)
+# Units of a population; a hundred take ten minutes.
+COUNTS = [
+    *(pytest.param(count, marks=pytest.mark.slow) for count in (5, 20)),
+    pytest.param(100, marks=pytest.mark.campaign),
+]
 
 
 def grid_draws(density, count, generator):
@@ -47,8 +52,7 @@ def one_population(count, seed, spread=None):
     return *ranks, *p
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [5, 20, 100])
+@pytest.mark.parametrize("count", COUNTS)
 def test_coverage_and_false_alarms_over_200_populations(count):
     """The spread is drawn from its prior, so that 90 % intervals contain the truth in 90 % of the cases.
 
@@ -65,8 +69,7 @@ def test_coverage_and_false_alarms_over_200_populations(count):
     assert np.mean(stranger < 0.05) > (0.3 if count == 5 else 0.8)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [5, 20, 100])
+@pytest.mark.parametrize("count", COUNTS)
 def test_no_spread_leaves_the_mean_unbiased_and_the_spread_bounded(count):
     """Without any spread, 90 % intervals of the mean are at least as wide as they should be."""
     mean, spread, *_ = np.array([one_population(count, seed, 0.0) for seed in range(100)]).T
