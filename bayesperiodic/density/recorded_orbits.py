@@ -53,4 +53,4 @@ def _misfit(problem: Description, solver: ResponseSolver, theta: np.ndarray, nam
     if simulation.statuses(name)[0] != CONVERGED:
         return np.inf
     response, observation = simulation.at(0).response(name), problem.observations[name]
-    return max(unexplained(observation, response).values()) + bool(other_orbit(observation, response))
+    return max(unexplained(observation, response).values(), default=0.0) + bool(other_orbit(observation, response))
