@@ -127,7 +127,7 @@ def curves(problem: Problem, fit: MapEstimate) -> dict[Sweep, Curve]:
             passages = list(follow(fine, at, 0, z))
         folds = np.array([p.is_fold for p in passages])
         stable = np.array([_stable(p.equations, at[p.point or 0], p.z) for p in passages])
-        for k in np.flatnonzero(folds[1:]) + 1:  # a multiplier is 1: a fold ends the part before it
+        for k in (np.flatnonzero(folds[1:]) + 1).tolist():  # a multiplier is 1: a fold ends the part before it
             stable[k] = stable[k - 1] != folds[k - 1]
         names, inputs = problem.model.outputs, problem.model.inputs
         result[sweep] = Curve(
