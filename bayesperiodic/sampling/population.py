@@ -126,6 +126,8 @@ def population(
     given = {"": units} if single else dict(units)
     for argument, mapping, example in (("spread", spread, SPREADS), ("covariates", covariates, COVARIATES)):
         _checks.mapping(argument, mapping or {}, example)
+    if isinstance(common, str):
+        raise ValueError(f"common: must be a list of names, got {common!r}; give [{common!r}].")
     settings = Settings(names, spread or {}, tuple(common), correlation, _checked_degrees(degrees))
     workers = checked_executor(executor)
     drawn, left_out = _draw(given, names, single, seed, workers)
@@ -323,8 +325,8 @@ def _warn(chains: Chains, bad: Sequence[str]) -> None:
     if bad:
         warnings.warn(
             f"Draws of {', '.join(bad)} are no importance sample of the population (Pareto k > {USABLE_WEIGHTS} or "
-            f"fewer than {FEWEST_EFFECTIVE:.0f} effective draws); give "
-            "(problem, posterior) for these units, with single priors, and they are sampled again.",
+            f"fewer than {FEWEST_EFFECTIVE:.0f} effective draws). Units given as (problem, posterior), with single "
+            "priors, are sampled again; where that does not help, the units contradict `common`, or the population.",
             stacklevel=4,
         )
 

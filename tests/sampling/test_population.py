@@ -244,6 +244,8 @@ def test_bad_arguments_are_refused():
         bp.population({}, ["a"], spread=0.5, seed=1)
     with pytest.raises(ValueError, match="covariates: must be a mapping"):
         bp.population({}, ["a"], covariates=["day"], seed=1)
+    with pytest.raises(ValueError, match="common: must be a list of names, got 'b'"):
+        bp.population(units, ["a"], common="b", seed=1)
     with pytest.raises(ValueError, match="degrees: must be > 2"):
         bp.population({}, ["a"], degrees=1.0, seed=1)
 
