@@ -5,6 +5,7 @@ for the test run.
 """
 
 import re
+import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
@@ -151,3 +152,11 @@ def example_objects(request: pytest.FixtureRequest, doctest_namespace: dict[str,
     yield
     for name in names:
         del doctest_namespace[name]
+
+
+@pytest.fixture(autouse=True)
+def close_figures() -> Iterator[None]:
+    """Close the figures of a test or an example."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")

@@ -88,6 +88,11 @@ class Element:
         Returns
         -------
         Hysteretic
+
+        Raises
+        ------
+        ValueError
+            If the force returns no expression.
         """
         motion = {"d": d, "v": v, "s": s, "name": self.name}
         arguments = {n: motion[n] for n in inspect.signature(self.force).parameters if n in motion}
