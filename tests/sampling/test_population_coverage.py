@@ -5,7 +5,6 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.sampling.membership import Expected, membership
-from bayesperiodic.sampling.population import Settings, fitted
 from bayesperiodic.sampling.population_density import Hierarchy, PopulationDensity
 from tests.sampling.gaussian_units import gaussian_units
 
@@ -76,26 +75,3 @@ def test_no_spread_leaves_the_mean_unbiased_and_the_spread_bounded(count):
     print(count, "no spread", int(np.sum((mean > 0.05) & (mean < 0.95))))
     assert np.sum((mean > 0.05) & (mean < 0.95)) >= 80  # below once in 1000 at 90 %
     assert abs(np.mean(mean) - 0.5) < 0.11
-
-
-@pytest.mark.slow
-def test_coverage_of_correlation_and_slope_over_60_populations():
-    """Each count of 90 % intervals leaves its 99.9 % band once in 1000."""
-    inside = {"correlation[a, b]": 0, "slope[a, day]": 0, "spread[b]": 0}
-    for seed in range(60):
-        generator, count = np.random.default_rng([seed, 3]), 20
-        sds = PRIOR.sample(2, generator)
-        correlation, slope = generator.uniform(-1.0, 1.0), SCALE * generator.standard_normal()
-        covariance = np.outer(sds, sds) * [[1.0, correlation], [correlation, 1.0]]
-        day = np.arange(count) - 0.5 * (count - 1)
-        truths = 1.0 + generator.multivariate_normal([0.0, 0.0], covariance, count)
-        truths[:, 0] += slope * day / day.std()
-        noise = np.full(truths.shape, 0.1)
-        units = gaussian_units(truths + noise * generator.standard_normal(noise.shape), noise, seed, draws=500)
-        settings = Settings(("a", "b"), {"a": PRIOR, "b": PRIOR}, (), True, np.inf)
-        result = fitted(units, settings, {"day": dict(zip(units, day, strict=True))}, seed, False)
-        truth = {"correlation[a, b]": correlation, "slope[a, day]": slope / day.std(), "spread[b]": sds[1]}
-        for label, value in truth.items():
-            inside[label] += bool(result.summary().loc[label, "q05"] < value < result.summary().loc[label, "q95"])
-    print(inside)
-    assert all(46 <= count <= 60 for count in inside.values())
