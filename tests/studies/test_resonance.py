@@ -17,7 +17,7 @@ def test_quick_run_covers_the_truth_and_is_faster_than_free_delays(tmp_path):
         found = results[f"duffing: {kind}"]
         assert found["converged"] == 1.0
         assert max(found["sd over that of the prior"].values()) < 0.1
-    assert results["speed"]["ratio"] > 4.0  # 5.1 to 6.5 on two busy cores
+    assert results["speed"]["ratio"] > 2.0  # of processor times; 5.1 to 6.5 on two busy cores
     assert results["speed"]["finite, table"] == 1.0 and results["speed"]["finite, improvised"] > 0.9
 
 
