@@ -2,12 +2,11 @@
 
 from functools import cache
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics.response_curves import curves
+from bayesperiodic.diagnostics.response_curves import Quantity, curves
 from tests.known import LINEAR, linear_experiment
 from tests.response_tables import noisy, problem_of, swept, true_branch
 
@@ -20,14 +19,26 @@ def solved():
     return problem, bp.map_estimate(problem, checks=False, progress=False)
 
 
-@pytest.fixture(autouse=True)
-def closed():
-    yield
-    plt.close("all")
-
-
 def lines(axes, label):
     return [line for line in axes.lines if line.get_label() == label]
+
+
+@pytest.mark.parametrize("word, size", [("peak-to-peak value", np.ptp), ("rms value", np.std)])
+def test_sizes_along_a_branch_are_of_the_signal_between_the_points_too(word, size):
+    coarse, fine = (2 * np.pi * np.arange(n) / n for n in (16, 40_000))
+    wave = [np.cos(t + 0.3) + 0.4 * np.cos(2 * t + 1.0) for t in (coarse, fine)]
+    assert Quantity(word, "x").of({"x": wave[0]}) == pytest.approx(size(wave[1]), rel=1e-7)
+
+
+def test_every_residual_is_drawn_below_its_channel():
+    problem, fit = solved()
+    below = bp.plot.response(problem, fit).axes[0]
+    shown = np.concatenate([line.get_ydata() for line in below.lines if line.get_marker() not in ("None", "")])
+    white = np.concatenate(problem.likelihood.whitened(
+        list(problem.density().linearise(problem.vector(fit.theta)).residuals), np.array(list(fit.noise.values()))
+    ))  # fmt: skip
+    observed = np.concatenate([np.full(b.size, b.observed) for b in problem.likelihood.blocks])
+    assert np.sort(shown) == pytest.approx(np.sort(white[observed]), abs=1e-4)
 
 
 def test_the_measured_table_and_both_folds_are_drawn():

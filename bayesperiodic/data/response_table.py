@@ -150,12 +150,13 @@ def response_table(
     first = [contents.find(label, key) for each in amplitudes.values() for key in each.values()]
     at, factor = source.frequencies(first, frequency), AMPLITUDES_IN[OF_SIGNAL.get(size, (None, size))[1]]
     drive = {name: source.drive(name, value, at.size) / factor for name, value in inputs.items()}
-    reader = _Reader(source, at, drive, size, PHASE_UNITS[phase_unit], lag, per)
-    errors, orders = ((sd or {}, phase_sd or {}), derivatives or {})
+    orders = {name: _checks.integer(f"derivatives[{name!r}]", order, 0) for name, order in (derivatives or {}).items()}
+    reader = _Reader(source, at, drive, size, PHASE_UNITS[phase_unit], lag, per, orders)
+    errors = sd or {}, phase_sd or {}
     read = {
         name: reader.output(
             _Output(name, to=(against or {}).get(name, "")), columns, angles.get(name, {}),
-            [each.get(name) for each in errors], orders.get(name, 0),
+            [each.get(name) for each in errors],
         )
         for name, columns in amplitudes.items()
     }  # fmt: skip
@@ -170,7 +171,7 @@ def response_table(
                 name, float(at[k]), {channel: each.harmonics(k) for channel, each in read.items() if each.whole},
                 {channel: [0.0, level[k]] for channel, level in drive.items()}, samples=samples,
             ),
-            measurements=[one for each in read.values() for one in each.measurements(k)],
+            measurements=[one for each in read.values() if not each.whole for one in each.measurements(k)],
             sweep=of_table,
         )
         for k, name in enumerate(_names(at))
@@ -207,9 +208,9 @@ class _Output:
         return result
 
     def measurements(self, row: int) -> list[Measurement]:
-        """Return the measurements, none if it is compared as complex amplitudes."""
+        """Return the measurements, if it is not compared as complex amplitudes."""
         result: list[Measurement] = []
-        for h, sizes in {}.items() if self.whole else self.size.items():
+        for h, sizes in self.size.items():
             more = {"harmonic": h} if self.kind is Amplitude else {}
             sd = float(self.sd[h][row]) if self.sd else None
             result.append(self.kind(self.channel, float(sizes[row]), sd=sd, **more))
@@ -230,15 +231,14 @@ class _Reader:
     radian: float
     lag: bool
     per: str | None
+    orders: dict[str, int]  # of the time derivatives that are in the table
 
-    def output(
-        self, one: _Output, columns: dict[int, Key], phases: dict[int, Key], given: list[Any], order: int
-    ) -> _Output:
+    def output(self, one: _Output, columns: dict[int, Key], phases: dict[int, Key], given: list[Any]) -> _Output:
         """Return what the table says of an output, with the given standard deviations of amplitudes and phases."""
         name, rows, (sd, phase_sd) = one.channel, self.frequency.size, given
         sizes, angles, errors = {}, {}, {}
-        kind = OF_SIGNAL.get(self.size, (Amplitude,))[0]
-        _checks.integer(f"derivatives[{name!r}]", order, 0)
+        kind, order = OF_SIGNAL.get(self.size, (Amplitude,))[0], self.orders.get(name, 0)
+        turn = 0.5 * np.pi * (order - self.orders.get(one.to, 0))
         if kind is not Amplitude and (order or self.per or set(columns) != {1}):
             raise ValueError(
                 f"size: must be of sines, {', '.join(map(repr, AMPLITUDES_IN))}, with per, derivatives or harmonics, "
@@ -253,7 +253,7 @@ class _Reader:
             if sd is not None:
                 errors[h] = self.source.deviations(name, sd, key, values) * scale
             if (angle := self._angles(name, values, phases.get(h))) is not None:
-                angles[h] = angle - 0.5 * np.pi * order
+                angles[h] = angle - turn
         self._check_phases(name, columns, phases, angles)
         if phase_sd is not None and not angles:
             raise ValueError(f"phase_sd: must be of outputs with phases, got one for {name!r}.")

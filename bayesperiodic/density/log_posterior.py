@@ -309,7 +309,7 @@ class LogPosterior(SamplingCoordinates):
         value, by_residual, by_noise = self.problem.likelihood.value_and_gradients(here.residuals, noise)
         if not np.isfinite(value):
             return -np.inf, *zeros, CONVERGED
-        forward = forward or here.beyond
+        forward |= here.beyond
         if forward or any(o.multipliers for o in self.problem.observations.values()):
             here = here.anchored()
         by_theta = np.add.reduce(list(here.vjp(by_residual, adjoint=not forward).values()))

@@ -14,7 +14,9 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import ResponseSolver, orbit_multipliers
 from bayesperiodic.density.sweeps import tables
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.likelihood.quantities import peak_to_peak
 from bayesperiodic.periodic.compiled import CONVERGED
+from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.solution import as_guess
 from bayesperiodic.periodic.solve import solve_driven
 from bayesperiodic.periodic.table_branch import between, follow
@@ -47,7 +49,7 @@ class Quantity(NamedTuple):
         """Return the quantity (…,) of signals."""
         signal = waves[self.channel]
         if self.word == PeakToPeak.word:
-            return np.ptp(signal, axis=-1)
+            return peak_to_peak(signal)
         if self.word == RootMeanSquare.word:
             return signal.std(axis=-1)
         c = _fourier.coefficients(signal, self.harmonic)[..., self.harmonic]
@@ -125,14 +127,18 @@ def curves(problem: Problem, fit: MapEstimate) -> dict[Sweep, Curve]:
         z = solve_driven(rows[0], at[0], "static")[0].z if start is None else start
         with np.errstate(all="ignore"):
             passages = list(follow(fine, at, 0, z))
-        folds = np.array([p.is_fold for p in passages])
-        stable = np.array([_stable(p.equations, at[p.point or 0], p.z) for p in passages])
+        folds, last, given = np.array([p.is_fold for p in passages]), 0, []
+        for p in passages:
+            last = last if p.point is None else p.point
+            given.append(at[last])
+        stable = np.array([_stable(p.equations, theta_of, p.z) for p, theta_of in zip(passages, given, strict=True)])
+        outputs = np.array([p.equations.outputs(p.z, theta_of) for p, theta_of in zip(passages, given, strict=True)])
         for k in (np.flatnonzero(folds[1:]) + 1).tolist():  # a multiplier is 1: a fold ends the part before it
             stable[k] = stable[k - 1] != folds[k - 1]
         names, inputs = problem.model.outputs, problem.model.inputs
         result[sweep] = Curve(
             np.array([p.equations.frequency for p in passages]),
-            {name: np.array([p.equations.outputs(p.z, at[0])[:, c] for p in passages]) for c, name in enumerate(names)}
+            {name: outputs[..., c] for c, name in enumerate(names)}
             | {name: np.array([p.equations.inputs[:, c] for p in passages]) for c, name in enumerate(inputs)},
             stable,
             folds,
@@ -140,18 +146,20 @@ def curves(problem: Problem, fit: MapEstimate) -> dict[Sweep, Curve]:
     return result
 
 
-def _stable(equations: object, parameters: np.ndarray, z: np.ndarray) -> bool:
-    largest = orbit_multipliers(equations, parameters, z, 1)  # type: ignore[arg-type]
+def _stable(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> bool:
+    largest = orbit_multipliers(equations, parameters, z, 1)
     return bool(np.abs(largest).max(initial=0.0) < 1.0)
 
 
 def residuals(problem: Problem, fit: MapEstimate, solver: ResponseSolver) -> dict[str, list[tuple[str, np.ndarray]]]:
-    """Return the whitened residuals (size,) of every experiment, with what they are of."""
+    """Return the whitened residuals (size,) of every experiment's measured values, with their channels."""
     density = LogPosterior(problem, solver)
     here = Linearisation(problem.vector(fit.theta), solver, density.comparisons)
     noise = np.array([fit.noise[name] for name in problem.noise_names])
     white = problem.likelihood.whitened(list(here.residuals), noise)
     result: dict[str, list[tuple[str, np.ndarray]]] = {}
     for block, values in zip(problem.likelihood.blocks, white, strict=True):
-        result.setdefault(block.experiment, []).append((block.channel, values))
+        if block.observed:
+            channel = problem.observations[block.experiment].compared_channels[block.place]
+            result.setdefault(block.experiment, []).append((channel, values))
     return result

@@ -58,10 +58,14 @@ class Block(ABC):
     log_scale: float = 0.0  # ln|∂ components/∂ data| of values that are divided by known standard deviations
 
     words: ClassVar[str] = "{0.size} values of {0.channel}"  # what is compared, a format of the block
-    counted: ClassVar[bool] = False  # whether the variance is unknown, so that eq. (7) counts the values
     observed: ClassVar[bool] = True  # whether the components are measured values
     timed: ClassVar[bool] = False  # whether the components are values of one channel along the period
     spectral: ClassVar[bool] = False  # whether they are Fourier components of one channel
+
+    @property
+    def counted(self) -> bool:
+        """Whether the variance is unknown, so that eq. (7) counts the values."""
+        return False
 
     @classmethod
     @abstractmethod
@@ -192,9 +196,13 @@ class LinearBlock(Block):
 class Timed(LinearBlock):
     """Values of one output along the period, whose variance is a noise parameter."""
 
-    counted: ClassVar[bool] = True
     timed: ClassVar[bool] = True
     words: ClassVar[str] = "{0.channel}"
+
+    @property
+    def counted(self) -> bool:
+        """True: the variance is a noise parameter."""
+        return True
 
     def parameter_names(self, noise: Any) -> tuple[str, ...]:
         """Return the variance and the parameters of the spectrum's shape."""

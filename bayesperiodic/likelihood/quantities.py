@@ -36,7 +36,7 @@ POINTS_A_WAVE, EXTREME_STEPS = 16, 4
 
 @dataclass(frozen=True, eq=False)
 class Quantities(Block):
-    """Values of one kind and channel, of known standard deviations, by which they are divided, or of unknown ones."""
+    """Values of one kind and channel, of known standard deviations, by which they are divided, or of an unknown one."""
 
     values: np.ndarray = field(default_factory=lambda: np.empty(0))  # (size,) measured
     known: np.ndarray = field(default_factory=lambda: np.empty(0))  # (size,) standard deviations; empty if unknown
@@ -86,33 +86,41 @@ class Quantities(Block):
     def slopes(self, values: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the place of a channel and the derivatives (size, points) of the quantities at signals (points, …)."""
 
+    def difference(self, predicted: np.ndarray) -> np.ndarray:
+        """Return measured less predicted quantities (…, size), in their unit."""
+        return self.values - predicted
+
     def off(self, values: np.ndarray) -> np.ndarray:
-        """Return measured less predicted quantities (…, size) of signals (…, points, channels), in their unit."""
-        return self.values - self.quantity(values)
+        """Return `difference` for signals (…, points, channels)."""
+        return self.difference(self.quantity(values))
+
+    @property
+    def unit(self) -> np.ndarray:
+        """What the differences are divided by: the standard deviations if these are known, else one."""
+        return self.known if self.known.size else np.ones(self.size)
 
     def shown(self, predicted: np.ndarray) -> np.ndarray:
         """Return the components (…, size) of data less prediction."""
-        return self.values - predicted
+        return self.difference(predicted) / self.unit
 
     def steepness(self, predicted: np.ndarray) -> np.ndarray:
         """Return the derivatives (size,) of predicted components, those of `shown` with the other sign."""
-        return np.ones(self.size)
+        return 1.0 / self.unit
 
     def replicate(self, values: np.ndarray, components: np.ndarray) -> np.ndarray:
         """Return possible measurements (draws, size) of signals (draws, points, channels), with errors (draws, size).
 
         The errors are normal, with variance 1 where the standard deviation is known.
         """
-        return self.quantity(values) + components * (self.known if self.known.size else 1.0)
+        return self.quantity(values) + components * self.unit
 
     @property
     def sizes(self) -> np.ndarray:
         """The measured values (size,) as components, of phases one radian."""
-        values = np.ones(self.size) if self.kind.signed else self.values
-        return values / self.known if self.known.size else values
+        return (np.ones(self.size) if self.kind.signed else self.values) / self.unit
 
     @property
-    def counted(self) -> bool:  # type: ignore[override]
+    def counted(self) -> bool:
         """Whether the standard deviation is unknown."""
         return not self.known.size
 
@@ -254,7 +262,7 @@ class Amplitudes(OfHarmonics):
 
 @dataclass(frozen=True, eq=False)
 class RelativePhases(OfHarmonics):
-    """RelativePhases of harmonics against those of other channels, within half a turn of the measured ones."""
+    """Phases of harmonics against those of other channels, within half a turn of the measured ones."""
 
     against: tuple[int, ...] = ()  # place of the other channel, -1 for an input
     of_inputs: np.ndarray = field(default_factory=lambda: np.empty(0))  # (size,), phase of the input
@@ -290,18 +298,9 @@ class RelativePhases(OfHarmonics):
         """Return the phases."""
         return sum((sign * np.angle(c) for c, _, sign in self._ratios(values)), -self.of_inputs)
 
-    def off(self, values: np.ndarray) -> np.ndarray:
+    def difference(self, predicted: np.ndarray) -> np.ndarray:
         """Return the differences within half a turn."""
-        return _fourier.within_half_turn(super().off(values))
-
-    def shown(self, predicted: np.ndarray) -> np.ndarray:
-        """Return the differences within half a turn, in standard deviations if these are known."""
-        off = _fourier.within_half_turn(self.values - predicted)
-        return off / self.known if self.known.size else off
-
-    def steepness(self, predicted: np.ndarray) -> np.ndarray:
-        """Return one over the standard deviations, if these are known."""
-        return 1.0 / self.known if self.known.size else super().steepness(predicted)
+        return _fourier.within_half_turn(self.values - predicted)
 
     def slopes(self, values: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the derivatives by the channel, and by the others."""
@@ -311,20 +310,7 @@ class RelativePhases(OfHarmonics):
 
 
 @dataclass(frozen=True, eq=False)
-class Sizes(Quantities):
-    """Normal sizes of whole signals."""
-
-    def shown(self, predicted: np.ndarray) -> np.ndarray:
-        """Return the differences, in standard deviations if these are known."""
-        return (self.values - predicted) / (self.known if self.known.size else 1.0)
-
-    def steepness(self, predicted: np.ndarray) -> np.ndarray:
-        """Return one over the standard deviations, if these are known."""
-        return 1.0 / self.known if self.known.size else super().steepness(predicted)
-
-
-@dataclass(frozen=True, eq=False)
-class RootMeanSquares(Sizes):
+class RootMeanSquares(Quantities):
     """Root mean squares about the mean."""
 
     kind: ClassVar[type[Measurement]] = RootMeanSquare
@@ -341,39 +327,44 @@ class RootMeanSquares(Sizes):
 
 
 @dataclass(frozen=True, eq=False)
-class PeakToPeaks(Sizes):
+class PeakToPeaks(Quantities):
     """Ranges of the trigonometric polynomial through the points."""
 
     kind: ClassVar[type[Measurement]] = PeakToPeak
 
     def quantity(self, values: np.ndarray) -> np.ndarray:
         """Return the range."""
-        high, low = (self._extreme(values[..., self.place], sign)[1] for sign in (1.0, -1.0))
-        return (high + low)[..., None]
+        return peak_to_peak(values[..., self.place])[..., None]
 
     def slopes(self, values: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the derivative, the weights that interpolate at the extremes."""
         total, at = np.zeros(self.points), np.arange(self.points) / self.points
         orders = np.arange(1, _fourier.highest_harmonic(self.points) + 1)
         for sign in (1.0, -1.0):
-            where = self._extreme(values[..., self.place], sign)[0]
+            where = _extreme(values[..., self.place], sign)[0]
             waves = np.cos(TWO_PI * np.outer(orders, where - at)).sum(axis=0)
             total += sign * (1.0 + 2.0 * waves) / self.points
         yield self.place, total[None]
 
-    def _extreme(self, signal: np.ndarray, sign: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return place (…,) in periods and value of the largest value of sign · signals (…, points)."""
-        c = sign * _fourier.coefficients(signal)
-        orders, fine = np.arange(c.shape[-1]), POINTS_A_WAVE * c.shape[-1]
-        at = np.argmax(_fourier.on_grid(c, fine), axis=-1) / fine
-        for _ in range(EXTREME_STEPS):
-            waves = c * np.exp(1j * TWO_PI * orders * at[..., None])
-            slope = np.real(np.sum(1j * TWO_PI * orders * waves, axis=-1))
-            curve = np.real(np.sum((1j * TWO_PI * orders) ** 2 * waves, axis=-1))
-            with np.errstate(invalid="ignore", divide="ignore"):
-                step = np.where(curve < 0.0, -slope / curve, 0.0)
-            at = at + np.clip(step, -0.5 / fine, 0.5 / fine)
-        return at, np.real(np.sum(c * np.exp(1j * TWO_PI * orders * at[..., None]), axis=-1))
+
+def peak_to_peak(signal: np.ndarray) -> np.ndarray:
+    """Return the range (…,) of the trigonometric polynomials through signals (…, points)."""
+    return _extreme(signal, 1.0)[1] + _extreme(signal, -1.0)[1]
+
+
+def _extreme(signal: np.ndarray, sign: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return place (…,) in periods and value of the largest value of sign · signals (…, points)."""
+    c = sign * _fourier.coefficients(signal)
+    orders, fine = np.arange(c.shape[-1]), POINTS_A_WAVE * c.shape[-1]
+    at = np.argmax(_fourier.on_grid(c, fine), axis=-1) / fine
+    for _ in range(EXTREME_STEPS):
+        waves = c * np.exp(1j * TWO_PI * orders * at[..., None])
+        slope = np.real(np.sum(1j * TWO_PI * orders * waves, axis=-1))
+        curve = np.real(np.sum((1j * TWO_PI * orders) ** 2 * waves, axis=-1))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            step = np.where(curve < 0.0, -slope / curve, 0.0)
+        at = at + np.clip(step, -0.5 / fine, 0.5 / fine)
+    return at, np.real(np.sum(c * np.exp(1j * TWO_PI * orders * at[..., None]), axis=-1))
 
 
 def _bessel_ratio(x: np.ndarray) -> np.ndarray:

@@ -19,8 +19,12 @@ class SectionPoints(LinearBlock):
 
     whitening: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))  # (size, size)
 
-    counted: ClassVar[bool] = True
     words: ClassVar[str] = "{0.size} values with a given covariance"
+
+    @property
+    def counted(self) -> bool:
+        """True: the scale is a noise parameter."""
+        return True
 
     @classmethod
     def of(cls, experiment: Experiment, model: Model) -> "list[SectionPoints]":

@@ -31,10 +31,8 @@ from bayesperiodic.periodic.equations import (
     frequency_derivatives,
 )
 
-MOST_SPECIAL_STEPS, FREE_STEPS = (
-    15,
-    3,
-)  # of Newton's iteration; those during which a step may be longer than the one before
+# Steps of Newton's iteration, and those of them during which one may be longer than the one before.
+MOST_SPECIAL_STEPS, FREE_STEPS = 15, 3
 LONGEST_CHANGE = 0.5  # in units of the orbit; a longer one is shortened
 BEND_DISTANCE = 1e-5  # of the differences along a direction, in units of the orbit
 SMALLEST_SHARE_OF_WAY = 1.0 / 32.0  # of the way from an anchor

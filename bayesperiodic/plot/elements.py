@@ -83,8 +83,7 @@ def elements(
     ['displacement [m]', 'velocity [m/s]']
     """
     shown = elements if isinstance(elements, Mapping) else {"": elements}
-    wanted = [amplitudes] if np.ndim(amplitudes) == 0 else list(amplitudes)  # type: ignore[arg-type]
-    wanted = [_checks.positive("amplitudes", amplitude) for amplitude in wanted]
+    wanted = [_checks.positive("amplitudes", amplitude) for amplitude in np.atleast_1d(amplitudes).tolist()]
     frequency = _checks.positive("frequency", frequency)
     figure = figure or plt.figure(figsize=(8.4, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)

@@ -24,7 +24,6 @@ from bayesperiodic.diagnostics.response_curves import (
     residuals,
 )
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.likelihood.reach import REACH_OF_BRANCH
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, legend_entries, styled
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.sampling.draws import Posterior
@@ -230,10 +229,9 @@ def _jumps(table: Sequence[Experiment], sheets: Any) -> list[int]:
 def _draw_residuals(axes: Axes, channel: str, every: Any, left: Any) -> None:
     for table, colour, marker in zip(every.values(), _colours(len(every)), MARKERS * 9, strict=False):
         for e in table:
-            for label, values in left[e.name]:
-                if label != REACH_OF_BRANCH and label.split(" of ")[-1].split(",")[0] == channel:
-                    at = np.full(values.size, e.frequency)
-                    axes.plot(at, values, ls="", marker=marker, ms=3, color=colour, mfc="none")
+            for values in (part for name, part in left[e.name] if name == channel):
+                at = np.full(values.size, e.frequency)
+                axes.plot(at, values, ls="", marker=marker, ms=3, color=colour, mfc="none")
     axes.axhline(0.0, lw=1.0, color="black")
     for line in (-2.0, 2.0):
         axes.axhline(line, lw=0.8, ls=":", color="black")

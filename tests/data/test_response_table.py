@@ -196,8 +196,10 @@ def test_tables_of_the_same_columns_are_tables_of_their_own():
     assert [len(one) for one in sweeps] == [1] * 4 and len(set.union(*sweeps)) == 3
 
 
-def test_phase_against_another_output_is_compared_with_that():
-    runs = bp.response_table(
-        TABLE, **(COLUMNS | {"outputs": {"x": "A", "v": "A"}, "against": {"x": "v"}, "phase_sd": {"x": 1.0}})
-    )
-    assert runs[0].measurements[1].to == "v"
+@pytest.mark.parametrize("orders, turn", [({}, 0.0), ({"x": 1}, 90.0), ({"v": 2}, -180.0), ({"x": 2, "v": 2}, 0.0)])
+def test_phase_against_another_output_is_compared_with_that(orders, turn):
+    """A derivative in the table is a quarter of a turn ahead of its output."""
+    table = TABLE | {"phi": np.full(6, 30.0 + turn)}
+    given = {"outputs": {"x": "A", "v": "A"}, "against": {"x": "v"}, "phase_sd": {"x": 1.0}, "derivatives": orders}
+    phase = bp.response_table(table, **(COLUMNS | given))[0].measurements[1]
+    assert phase.to == "v" and phase.value == pytest.approx(np.radians(30.0))

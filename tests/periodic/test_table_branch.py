@@ -69,7 +69,7 @@ def test_points_have_the_inputs_of_their_rows_where_these_change():
         else:  # On the line between its neighbours.
             force = 0.2 - 0.4 * (p.equations.frequency - 0.1)
             assert np.ptp(p.equations.inputs[:, 0]) / 2 == pytest.approx(force, rel=1e-9)
-            exact = table([p.equations.frequency], lambda f: force)[0]  # noqa: B023
+            exact = table([p.equations.frequency], lambda f, force=force: force)[0]
             assert p.equations.inputs == pytest.approx(exact.inputs, abs=1e-9)
 
 
