@@ -179,3 +179,14 @@ def test_fit_of_a_gap_spring_is_right_where_a_ramp_of_a_smooth_absolute_value_is
     assert right.sd["k"] < 0.01 and right.sd["kg"] < 1.0
     wrong = fitted(lambda d, k: k * (d + bp.smooth_abs(d, 0.01)) / 2)
     assert abs(wrong.theta["kg"] - 20.0) > 3 * wrong.sd["kg"]
+
+
+def test_the_absolute_value_of_a_rounded_ramp_of_unknown_width_is_refused():
+    """Its derivative by SymPy has an infinity where the ramp is zero, see findings/."""
+    with pytest.raises(ValueError, match=r"equations or outputs: must be elementary functions.*cannot be compiled"):
+        model = bp.Model(
+            "stop", states=["x"], inputs=["u"], parameters=["w"],
+            equations=lambda s, p, u: [s.ddx + s.dx + s.x + abs(bp.elements.ramp(s.x, p.w)) - u.u],
+            outputs=lambda s, p, u: {"x": s.x},
+        )  # fmt: skip
+        bp.solve_periodic(model, {"w": 0.1}, {"u": np.zeros(16)}, frequency=1.0, samples=16)
