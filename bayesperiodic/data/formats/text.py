@@ -16,10 +16,10 @@ from bayesperiodic import _checks
 from bayesperiodic.data.formats import header_units, text_cells
 from bayesperiodic.data.formats.contents import Contents, Key, StoredChannel
 from bayesperiodic.data.formats.encodings import PART_BYTES, Text, opened
+from bayesperiodic.data.formats.header_units import MISSING
 from bayesperiodic.data.formats.text_cells import CellEvidence
 from bayesperiodic.data.formats.text_header import (
     BLANKS,
-    MISSING,
     TIME_NAME,
     USABLE,
     Head,
@@ -43,6 +43,7 @@ SUMMARY = re.compile(
     re.IGNORECASE,
 )
 TIME_UNITS = ("s", "ms", "us", "µs", "min", "h", "sec", "second", "Second")
+LOGICAL = "logical values, 1 for True and 0 for False"
 DECIMAL_SIGNS = {".": "decimal point", ",": "decimal comma"}
 
 
@@ -164,9 +165,10 @@ def _columns(file: Text, top: Head, places: list[int], notation: _Notation) -> t
         table, rows = _table(file, top, places, decimal)
     result: Read = {}
     for place, values in table.items():
-        result[place] = (
-            _converted(values, decimal, bool(sign), notation, top) if values.dtype == object else (values, "", "")
-        )
+        if values.dtype == object:
+            result[place] = _converted(values, decimal, bool(sign), notation, top)
+        else:
+            result[place] = values, LOGICAL if values.dtype == bool else "", ""
     if notation.date_format and not any(values.dtype.kind in "mM" for values, _, _ in result.values()):
         cell = next((cell for values in texts.values() for cell in values if isinstance(cell, str)), "numbers")
         raise ValueError(
@@ -270,7 +272,7 @@ def _read(file: Text, top: Head, places: list[int], decimal: str, surplus: int) 
         # The only column of a file may have empty cells, which are empty lines, but not at the end.
         alone = width == 1
         if alone:
-            source = io.StringIO(source.read().rstrip())
+            source = io.StringIO(source.read().rstrip(" \t\r\n"))
         elif len(places) * UNWANTED_RATIO < width or separator == BLANKS and top.more > 0:
             source = _narrowed(rows_of(source, separator, strict=True), places, width, width + max(top.more, 0) + 1)
             at = {place: k for k, place in enumerate(places)}
