@@ -209,6 +209,19 @@ def landing_gear_campaigns():
     yield f"Laplace's intervals, which need no draws, cover {listed(d['covered']['laplace'].values())} times"
 
 
+@on("docs/studies/population.md")
+def population_cost():
+    d = results("population/scaling")
+    counts, end = list(d["joint"]), d["extrapolated"]
+    ratios = [f"{one['times_fewer_evaluations']:.1f}" for one in d["joint"].values()]
+    yield (
+        f"takes {listed(ratios)} times more evaluations of a spring's density for {listed(counts)} springs. A power "
+        f"law through these gives {end['times_fewer_evaluations']:.0f} times for {end['units']}"
+    )
+    stopped = [n for n, one in d["joint"].items() if not one["converged"]]
+    yield f"The joint chains of {listed(stopped)} springs ended before the stop rule had passed"
+
+
 @on("docs/studies/damper.md")
 def damper():
     d = results("damper")

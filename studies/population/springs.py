@@ -41,11 +41,11 @@ def spring_population(count: int, seed: int) -> tuple[bp.Population, dict[str, A
         "member": result.test(spring(damping[-2], 1.0, generator)),
         "stiffer": result.test(spring(damping[-1], STIFFER, generator)),
     }
-    account = account(result) | {
+    entries = account(result) | {
         "truth": {"spread[c]": DAMPING_SPREAD, "spread[k]": 0.0},
         "tests": {
             name: {"member": t.member, "p": t.table["p"].to_dict(), "verdict": t.verdict} for name, t in tests.items()
         },
         "joint_dimension": 3 * count + len(result.labels),
     }
-    return result, account
+    return result, entries

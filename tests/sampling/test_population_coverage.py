@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.interpolate import RectBivariateSpline
 
 import bayesperiodic as bp
 from bayesperiodic.sampling.membership import Expected, membership
@@ -10,7 +11,7 @@ from tests.sampling.gaussian_units import gaussian_units
 
 SCALE = 0.2
 PRIOR = bp.HalfNormal(SCALE)
-# Units of a population; a hundred take ten minutes.
+# Units of a population; a hundred take minutes.
 COUNTS = [
     *(pytest.param(count, marks=pytest.mark.slow) for count in (5, 20)),
     pytest.param(100, marks=pytest.mark.campaign),
@@ -18,15 +19,22 @@ COUNTS = [
 
 
 def grid_draws(density, count, generator):
-    """Return draws (count, 2) of mean and ln spread from their density on a grid, without the sampler."""
+    """Return draws (count, 2) of mean and ln spread from splines of their log-density, located on a coarse grid."""
     centre, width = density.start[0][0], density.start[1][0]
-    means = centre + width * np.linspace(-6.0, 6.0, 61)
-    logs = np.log(np.geomspace(1e-3, 1.0, 45))
-    points = np.stack([axis.ravel() for axis in np.meshgrid(means, logs, indexing="ij")], axis=-1)
-    log = density.evaluate(points).log_prob
-    weights = np.exp(log - log.max())
+    ends = np.array([[centre - 6.0 * width, centre + 6.0 * width], np.log([1e-3, 1.0])])
+    for sizes in ((13, 11), (13, 13)):
+        axes = [np.linspace(*pair, size) for pair, size in zip(ends, sizes, strict=True)]
+        points = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=-1)
+        log = density.evaluate(points).log_prob
+        steps, inside = np.array([axis[1] - axis[0] for axis in axes]), points[log > log.max() - 11.0]
+        ends = np.stack([inside.min(axis=0) - steps, inside.max(axis=0) + steps], axis=-1)
+    spline = RectBivariateSpline(*axes, log.reshape(13, 13))
+    fine = [np.linspace(axis[0], axis[-1], 97) for axis in axes]
+    values = spline(*fine).ravel()
+    points = np.stack([axis.ravel() for axis in np.meshgrid(*fine, indexing="ij")], axis=-1)
+    weights = np.exp(values - values.max())
     chosen = generator.choice(len(points), count, p=weights / weights.sum())
-    steps = np.array([means[1] - means[0], logs[1] - logs[0]])
+    steps = np.array([axis[1] - axis[0] for axis in fine])
     return points[chosen] + steps * generator.uniform(-0.5, 0.5, (count, 2))
 
 
