@@ -10,13 +10,14 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.initial_orbits import Guesses, experiments_guesses
+from bayesperiodic.density.sheets import Sheet, SheetPoint
 from bayesperiodic.density.special_points import (
     PointDerivatives,
     special_anchor,
     special_equations,
     special_values,
 )
-from bayesperiodic.density.sweeps import SAME_ORBIT, Place, TablePoint, distance, places, reach_further, tables
+from bayesperiodic.density.sweeps import SAME_ORBIT, Place, distance, places, tables
 from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
 from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
@@ -75,7 +76,7 @@ class ResponseSolver:
 
     def __getstate__(self) -> dict[str, Any]:
         # The factors at the anchors are computed again; the anchors are kept to the last bit.
-        kept = {key: value for key, value in self.__dict__.items() if key not in ("_batches", "_specials")}
+        kept = {key: value for key, value in self.__dict__.items() if key not in ("_batches", "_specials", "_sheets")}
         return kept | {"_changes": None}
 
     def anchored(self, theta: np.ndarray) -> "ResponseSolver":
@@ -183,16 +184,18 @@ class ResponseSolver:
         return self.sheets == other.sheets and all(distance(z, there) < SAME_ORBIT for z, there in orbits)
 
     @cached_property
-    def _sheets(self) -> list[list[TablePoint]]:
-        """The points of each sheet of the tables' branches, in the order of the sweep."""
-        result: dict[Any, list[TablePoint]] = {}
-        for sweep, table in tables(self.problem).items():
-            for name in (e.name for e in table):
+    def _sheets(self) -> list[Sheet]:
+        """The sheets of the tables' branches."""
+        result: list[Sheet] = []
+        for table in tables(self.problem).values():
+            of_sheets: dict[int, list[SheetPoint]] = {}
+            for row, name in enumerate(e.name for e in table):
                 orbit = self.anchors[name]
-                if orbit.sheet is not None:
-                    known = orbit.anchor.sensitivities is not None
-                    result.setdefault((sweep, orbit.sheet), []).append(TablePoint(name, *self._places[name], known))
-        return list(result.values())
+                if orbit.sheet is not None and isinstance(orbit.anchor, Anchor):
+                    point = SheetPoint(row, *self._places[name], orbit.anchor)
+                    of_sheets.setdefault(orbit.sheet, []).append(point)
+            result += [Sheet(self.problem, table, points) for points in of_sheets.values()]
+        return result
 
     def _batch(self, names: list[str]) -> Batch | AutonomousBatch | SpecialBatch:
         """Return the solver of experiments of one group."""
@@ -237,8 +240,8 @@ class ResponseSolver:
                 ]
             of_all = solved.outputs, solved.frequency, parameters, sensors, logarithms, solved.z, status
             groups.append(GroupSolution(*of_all, np.ones(status.shape)))
-        for points in self._sheets:
-            reach_further(self.problem, points, groups)
+        for sheet in self._sheets:
+            sheet.reach(groups, threads)
         return Simulation(groups, self._places)
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:

@@ -75,7 +75,8 @@ class SpecialBatch:
         for e, special in enumerate(specials):
             if special.rows is not None and special.targets is not None:
                 rows[e], targets[e] = special.rows, special.targets
-            inputs.append(np.stack([(name != FREQUENCY) * special.scaled_inputs for name in free]))
+            by_frequency = 0.0 * special.scaled_inputs if special.input_slope is None else special.input_slope
+            inputs.append(np.stack([by_frequency if n == FREQUENCY else special.scaled_inputs for n in free]))
         of_points = [a.point for a in anchors]
         slopes = [_slopes(anchor) for anchor in anchors]
         border = Border(*(np.stack(each) for each in zip(*(part.border for part in parts), strict=True)))
@@ -91,7 +92,7 @@ class SpecialBatch:
         stacked += [np.array([int(part.known) for part in parts])]
         self._packed = SpecialAnchors(*stacked)
         self._sets = Sets(
-            np.stack([s.equations.inputs - s.scaled_inputs for s in specials]),
+            np.stack([s.inputs_at_zero for s in specials]),
             np.array([s.equations.frequency for s in specials]),
             np.stack([s.equations.drift for s in specials]),
         )
