@@ -10,7 +10,7 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.initial_orbits import Guesses, experiments_guesses
-from bayesperiodic.density.sheets import Sheet, SheetPoint
+from bayesperiodic.density.sheets import FoldSolves, Sheet, SheetPoint
 from bayesperiodic.density.special_points import (
     PointDerivatives,
     special_anchor,
@@ -221,8 +221,11 @@ class ResponseSolver:
         other experiments may be skipped.
         """
         groups, keep = [], keep or bool(self._sheets)
-        for experiments, maps, batch, multipliers in self._batches:
-            values = maps.values(theta)
+        every = [maps.values(theta) for _, maps, *_ in self._batches]
+        folds, without = self._folds(every, threads)
+        for (experiments, maps, batch, multipliers), values, left_out in zip(
+            self._batches, every, without, strict=True
+        ):
             parameters, sensors = values[..., : maps.count], values[..., maps.count :]
             if isinstance(batch, SpecialBatch):
                 groups.append(_special_solution(batch, parameters, sensors, threads))
@@ -230,7 +233,8 @@ class ResponseSolver:
             if isinstance(batch, AutonomousBatch):
                 solved = batch.solve(parameters, threads, keep=keep or multipliers, whole=whole)
             else:
-                solved = batch.solve(parameters, threads, keep=keep or multipliers, polish=polish or multipliers)
+                given: dict[str, Any] = {"keep": keep or multipliers, "polish": polish or multipliers}
+                solved = batch.solve(parameters, threads, **given, without=left_out)
             status, logarithms = solved.status, [np.empty((len(theta), 0))] * len(experiments)
             if multipliers:
                 status = status.copy()
@@ -240,9 +244,27 @@ class ResponseSolver:
                 ]
             of_all = solved.outputs, solved.frequency, parameters, sensors, logarithms, solved.z, status
             groups.append(GroupSolution(*of_all, np.ones(status.shape)))
-        for sheet in self._sheets:
-            sheet.reach(groups, threads)
+        for sheet, of_sheet in zip(self._sheets, folds, strict=True):
+            sheet.reach(groups, of_sheet)
         return Simulation(groups, self._places)
+
+    def _folds(
+        self, values: Sequence[np.ndarray], threads: int | None
+    ) -> tuple[list[FoldSolves], list[np.ndarray | None]]:
+        """Return the folds at the ends of sheets, and which solves (experiments, solves) of each group lie beyond one.
+
+        `values` are the parameters of each group, (experiments, solves, parameters).
+        """
+        folds, without = [], [None] * len(values)
+        for sheet in self._sheets:
+            first, count = sheet.points[0], self._batches[sheet.points[0].group][1].count
+            folds.append(sheet.beyond_folds(values[first.group][first.member, :, :count], threads))
+            if folds[-1].beyond.any():
+                for point, beyond in zip(sheet.points, folds[-1].beyond, strict=True):
+                    if without[point.group] is None:
+                        without[point.group] = np.zeros(values[point.group].shape[:2], dtype=bool)
+                    without[point.group][point.member] = beyond
+        return folds, without
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
         """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""

@@ -97,13 +97,15 @@ class SpecialBatch:
             np.stack([s.equations.drift for s in specials]),
         )
 
-    def solve(self, parameters: np.ndarray, threads: int | None = None) -> SpecialSolution:
-        """Solve every point for parameters (sets, solves, parameters); the result does not depend on the threads."""
+    def solve(
+        self, parameters: np.ndarray, threads: int | None = None, *, follow: bool = True
+    ) -> SpecialSolution:
+        """Solve every point for parameters (sets, solves, parameters); the result does not depend on the threads.
+
+        With `follow` those that are far from their anchors are followed in steps.
+        """
         first, (sets, solves) = self._first, parameters.shape[:2]
-        points, channels = first.grid.points, first.model.kernels.channels
-        z, outputs = np.zeros((sets, solves, points, first.count)), np.zeros((sets, solves, points, channels))
-        values = np.tile(self._packed.values[:, None], (1, solves, 1))
-        solution = SpecialSolution(z, outputs, values, *np.zeros((2, sets, solves), dtype=int))
+        solution = self.empty(solves)
         reach_many = kernels("special", first.count, first.grid.stencil).reach_many
         given = first.functions, first.grid.packed, self._sets, self._packed, self._frequency
         every = np.ascontiguousarray(parameters)
@@ -112,11 +114,24 @@ class SpecialBatch:
             reach_many(*given, every, *block, solution)
             for index in range(*block):
                 e, b = index // solves, index % solves
-                if solution.status[e, b] == STALLED:
+                if follow and solution.status[e, b] == STALLED:
                     self._follow(e, b, every[e, b], solution)
 
         in_blocks(part, sets * solves, SMALLEST_BLOCK, threads)
         return solution
+
+    def empty(self, solves: int) -> SpecialSolution:
+        """Return arrays for the solutions, with the values of the anchors."""
+        first, sets = self._first, len(self._specials)
+        points, channels = first.grid.points, first.model.kernels.channels
+        z, outputs = np.zeros((sets, solves, points, first.count)), np.zeros((sets, solves, points, channels))
+        values = np.tile(self._packed.values[:, None], (1, solves, 1))
+        return SpecialSolution(z, outputs, values, *np.zeros((2, sets, solves), dtype=int))
+
+    def predicted(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the linear predictions of the unknowns (sets, solves, unknowns) for parameters as in `solve`."""
+        changes = parameters - self._packed.parameters[:, None]
+        return self._packed.values[:, None] + np.einsum("ebp,epk->ebk", changes, self._packed.value_slopes)
 
     def frequency(self, solution: SpecialSolution) -> np.ndarray:
         """Return the frequencies (sets, solves) of solutions [Hz]."""
