@@ -21,6 +21,10 @@ from bayesperiodic.periodic.equations import FREQUENCY
 from bayesperiodic.periodic.special import SpecialEquations, SpecialPoint, SpecialSensitivities
 
 
+# Change of a special point, in units of the point, from one further anchor to the next.
+LATTICE = 0.1
+
+
 @dataclass(frozen=True)
 class SpecialAnchor:
     """A solved special point from which others are predicted; or, without sensitivities, a failed solve."""
@@ -65,6 +69,7 @@ class SpecialBatch:
 
     def __init__(self, specials: Sequence[SpecialEquations], anchors: Sequence[SpecialAnchor]):
         self._specials, self._anchors = list(specials), list(anchors)
+        self._further: dict[tuple[int, ...], SpecialBatch | None] = {}
         first = specials[0]
         self._first, free = first.equations, first.free
         parts = [_anchored(special, anchor) for special, anchor in zip(specials, anchors, strict=True)]
@@ -150,6 +155,13 @@ class SpecialBatch:
         if anchor.sensitivities is None:
             solution.status[e, b] = anchor.code or STALLED
             return
+        further = self._further_anchor(e, parameters)
+        if further is not None:
+            near = further.solve(parameters[None, None], 1, follow=False)
+            if near.status[0, 0] != STALLED:
+                for whole, part in zip(solution, near, strict=True):
+                    whole[e, b] = part[0, 0]
+                return
         solved = special.follow(anchor.point, anchor.parameters, parameters)
         point, here = solved.point, special.at(solved.point.values)
         solution.z[e, b], solution.values[e, b] = point.z, point.values
@@ -157,6 +169,27 @@ class SpecialBatch:
         jagged = solved.code == CONVERGED and here.kernels.is_jagged(np.ascontiguousarray(point.z), here.inputs)
         solution.status[e, b] = NOT_RESOLVED if jagged else solved.code
         solution.iterations[e, b] += solved.steps
+
+
+    def _further_anchor(self, e: int, parameters: np.ndarray) -> "SpecialBatch | None":
+        """Return the solver anchored at the node of a lattice of parameters next to some, None if it has no point.
+
+        Its edges are changes of parameters that change the point by `LATTICE`. So the anchor depends on the parameters
+        alone; it is kept for others near the same node.
+        """
+        special, anchor = self._specials[e], self._anchors[e]
+        slopes = _slopes(anchor)
+        each = [SpecialPoint(*(part[p] for part in slopes)) for p in range(parameters.size)]
+        rates = np.array([special.size(slope, anchor.point) for slope in each])
+        place = np.rint((parameters - anchor.parameters) * rates / LATTICE).astype(int)
+        key = (e, *place.tolist())
+        if key not in self._further:
+            node = anchor.parameters + np.divide(place * LATTICE, rates, out=np.zeros_like(rates), where=rates > 0.0)
+            solved, self._further[key] = special.follow(anchor.point, anchor.parameters, node), None
+            if solved.code == CONVERGED:
+                there = SpecialAnchor.at(special, node, solved.point, np.flatnonzero(rates > 0.0))
+                self._further[key] = SpecialBatch([special], [there])
+        return self._further[key]
 
 
 def _anchored(special: SpecialEquations, anchor: SpecialAnchor) -> _Anchored:
