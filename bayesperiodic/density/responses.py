@@ -97,17 +97,25 @@ class ResponseSolver:
                 solved = None if name in lost else self._solved(simulation, name)
                 anchors[name] = _initial_orbit(self.problem, name, theta, orbit.guess, solved)
             else:
-                here = Place(orbit.sheet, *self._solved(simulation, name), name not in self.beyond(simulation))
+                here = Place(orbit.sheet, *self._solved(simulation, name), not self._is_beyond(name, simulation))
                 anchors[name] = _placed(self.problem, name, theta, orbit.guess, here)
+        return ResponseSolver(self.problem, anchors)
+
+    def on_best_sheets(self, theta: np.ndarray) -> "ResponseSolver":
+        """Return the solver with the points of tables on the sheets that fit the data best at θ (names,)."""
+        best, anchors = places(self.problem, theta), dict(self.anchors)
+        for name in best:
+            anchors[name] = _placed(self.problem, name, theta, self.anchors[name].guess, best[name])
         return ResponseSolver(self.problem, anchors)
 
     def beyond(self, simulation: Simulation) -> list[str]:
         """Return the points of tables that the branch does not reach at the first of the solves, see `sweeps`."""
-        return [
-            e.name
-            for e in self.problem.experiments
-            if self.anchors[e.name].sheet is not None and simulation.response(e.name).frequency[0] != e.frequency
-        ]
+        return [e.name for e in self.problem.experiments if self._is_beyond(e.name, simulation)]
+
+    def _is_beyond(self, experiment: str, simulation: Simulation) -> bool:
+        if self.anchors[experiment].sheet is None:
+            return False
+        return bool(simulation.response(experiment).frequency[0] != self._measured_frequency(experiment))
 
     def _solved(self, simulation: Simulation, experiment: str, i: int = 0) -> tuple[PeriodicEquations, np.ndarray]:
         """Return the equations at the frequency, and the scale of the input, of one of the solves, and its z."""

@@ -297,7 +297,7 @@ def _on_best_sheets(problem: Problem, end: End, progress: bool) -> End:
     """Return the end of a climb; where tables fit better on other sheets of their branches, the best from there."""
     for _ in range(MOST_SHEET_CHANGES if tables(problem) else 0):
         theta = end.iterate.theta
-        solver = ResponseSolver.start(problem, theta)
+        solver = end.iterate.here.solver.on_best_sheets(theta)
         if end.iterate.here.solver.on_same_orbits(solver):
             break
         near = LogPosterior(problem, solver).linearise(theta)
