@@ -263,15 +263,18 @@ class ResponseSolver:
 
         `values` are the parameters of each group, (experiments, solves, parameters).
         """
-        folds, without = [], [None] * len(values)
+        folds: list[FoldSolves] = []
+        without: list[np.ndarray | None] = [None] * len(values)
         for sheet in self._sheets:
-            first, count = sheet.points[0], self._batches[sheet.points[0].group][1].count
+            first = sheet.points[0]
+            count = self._batches[first.group][1].count
             folds.append(sheet.beyond_folds(values[first.group][first.member, :, :count], threads))
             if folds[-1].beyond.any():
                 for point, beyond in zip(sheet.points, folds[-1].beyond, strict=True):
-                    if without[point.group] is None:
-                        without[point.group] = np.zeros(values[point.group].shape[:2], dtype=bool)
-                    without[point.group][point.member] = beyond
+                    left_out = without[point.group]
+                    if left_out is None:
+                        left_out = without[point.group] = np.zeros(values[point.group].shape[:2], dtype=bool)
+                    left_out[point.member] = beyond
         return folds, without
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:

@@ -12,7 +12,7 @@ from bayesperiodic.estimation.gauss_newton import Iterate, Objective, informatio
 
 # Derivative along one width of the prior, in standard deviations of the data, below which it vanishes; change of the
 # residuals within that width from which on it is no approximation; parts of the width that are tried.
-VANISHING, NOTABLE, PARTS = 0.1, 1.0, (1.0, 0.5, 0.25)
+VANISHING_RATE, NOTABLE_CHANGE, WIDTH_PARTS = 0.1, 1.0, (1.0, 0.5, 0.25)
 
 
 def second_order(objective: Objective, iterate: Iterate) -> list[str]:
@@ -21,9 +21,9 @@ def second_order(objective: Objective, iterate: Iterate) -> list[str]:
     widths = problem.joint_prior.widths
     rates = np.sqrt(np.diag(information(problem, iterate)[0])) * widths
     result = []
-    for i in np.flatnonzero(rates < VANISHING).tolist():
+    for i in np.flatnonzero(rates < VANISHING_RATE).tolist():
         changes = [_change(objective, iterate, sign * widths * (np.arange(widths.size) == i)) for sign in (1.0, -1.0)]
-        if max(changes) > NOTABLE:
+        if max(changes) > NOTABLE_CHANGE:
             result.append(problem.names[i])
     return result
 
@@ -32,7 +32,7 @@ def _change(objective: Objective, iterate: Iterate, width: np.ndarray) -> float:
     """Return by how much a width changes the residuals, in standard deviations; 0 where no part of it can be solved."""
     likelihood = objective.density.problem.likelihood
     before = np.concatenate(likelihood.whitened(iterate.here.residuals, iterate.noise))
-    for part in PARTS:
+    for part in WIDTH_PARTS:
         there = objective.at(iterate.theta + part * width, iterate.here, iterate.noise)
         if there is not None:
             after = np.concatenate(likelihood.whitened(there.here.residuals, iterate.noise))

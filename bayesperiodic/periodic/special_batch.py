@@ -20,7 +20,6 @@ from bayesperiodic.periodic.compiled import (
 from bayesperiodic.periodic.equations import FREQUENCY
 from bayesperiodic.periodic.special import SpecialEquations, SpecialPoint, SpecialSensitivities
 
-
 # Change of a special point, in units of the point, from one further anchor to the next.
 LATTICE = 0.1
 
@@ -102,9 +101,7 @@ class SpecialBatch:
             np.stack([s.equations.drift for s in specials]),
         )
 
-    def solve(
-        self, parameters: np.ndarray, threads: int | None = None, *, follow: bool = True
-    ) -> SpecialSolution:
+    def solve(self, parameters: np.ndarray, threads: int | None = None, *, follow: bool = True) -> SpecialSolution:
         """Solve every point for parameters (sets, solves, parameters); the result does not depend on the threads.
 
         With `follow` those that are far from their anchors are followed in steps.
@@ -169,7 +166,6 @@ class SpecialBatch:
         jagged = solved.code == CONVERGED and here.kernels.is_jagged(np.ascontiguousarray(point.z), here.inputs)
         solution.status[e, b] = NOT_RESOLVED if jagged else solved.code
         solution.iterations[e, b] += solved.steps
-
 
     def _further_anchor(self, e: int, parameters: np.ndarray) -> "SpecialBatch | None":
         """Return the solver anchored at the node of a lattice of parameters next to some, None if it has no point.

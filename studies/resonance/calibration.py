@@ -13,6 +13,8 @@ import numpy as np
 from scipy import stats
 
 import bayesperiodic as bp
+from studies import common
+from studies.resonance import systems
 from studies.resonance.systems import NOISE, SAMPLES, averaged
 
 AMPLITUDE, PHASE, BACKBONE, BACKBONE_FORCE, JUMPS, ALL = (
@@ -42,7 +44,7 @@ def branch(truth: dict[str, float]) -> tuple[list[list[bp.PeriodicSolution]], np
 
 def drawn_truth(rng: np.random.Generator) -> dict[str, float]:
     """Return parameters drawn from the prior."""
-    return {name: float(prior.quantile(rng.uniform())) for name, prior in PRIORS.items()}
+    return {name: float(prior.quantile(np.array(rng.uniform()))) for name, prior in PRIORS.items()}
 
 
 def drawn_sweep(rng: np.random.Generator) -> tuple[dict[str, float], np.ndarray]:
@@ -83,9 +85,7 @@ def points(kinds: tuple[str, ...], truth: dict[str, float], rng: np.random.Gener
         ]
     given: dict[str, Any] = {"frequency_sd": PLACE_SD, "samples": SAMPLES}
     if BACKBONE in kinds:
-        runs += [
-            bp.resonance_point(f"{a} m", 0.17, {"displacement": a}, {"force": None}, **given) for a in AMPLITUDES
-        ]
+        runs += [bp.resonance_point(f"{a} m", 0.17, {"displacement": a}, {"force": None}, **given) for a in AMPLITUDES]
     if BACKBONE_FORCE in kinds:
         runs += [
             bp.resonance_point(f"{u} N", 0.17, {"displacement": 1.0}, {"force": u}, amplitude_sd=SHARE_SD, **given)
@@ -154,9 +154,14 @@ def weighted_draws(
     return draws, weights, effective
 
 
+def source() -> str:
+    """Return a key that identifies the version of the replicates."""
+    return common.source_key(__file__, systems.__file__)
+
+
 def averaged_z(problem: bp.Problem, truth: dict[str, float]) -> dict[str, float]:
     """Return the distances of the truth from the estimates with the averaged equation, in their standard deviations."""
-    each = [run.measurements[0] for run in problem.experiments]
+    each: list[Any] = [run.measurements[0] for run in problem.experiments]
     given = {
         "f": FREQUENCIES, "A": np.array([one.value for one in each]), "sd": np.array([float(one.sd) for one in each])
     }  # fmt: skip
@@ -186,5 +191,5 @@ def replicate(task: tuple[str, int, int]) -> dict[str, Any]:
         "rank": {p: float(weights @ (draws[:, i] < np.log(truth[p]))) for i, p in enumerate(names)},
         "z": {p: (fit.theta[p] - truth[p]) / fit.sd[p] for p in names},
         "contraction": {p: float(sd[i] / PRIORS[p].spread) for i, p in enumerate(names)},
-        "averaged": closed, "seconds": time.process_time() - began,
+        "averaged": closed, "source": source(), "seconds": time.process_time() - began,
     }  # fmt: skip

@@ -1,6 +1,6 @@
 """Tables, jumps and resonance points of nonlinear resonances: what they determine, and whether the intervals cover.
 
-``--replicates N`` makes N sets of data of each kind (default 40), of Duffing oscillators drawn from the prior. A z is
+``--replicates N`` makes N sets of data of each kind (default 25), of Duffing oscillators drawn from the prior. A z is
 the deviation of an estimate from the truth in units of its standard deviation.
 """
 
@@ -17,7 +17,7 @@ import bayesperiodic as bp
 from studies import common
 from studies.resonance import calibration, systems
 
-REPLICATES, QUICK, FALSE_ALARM, COVERED = 40, 2, 0.01, 0.90
+REPLICATES, QUICK, FALSE_ALARM, COVERED = 25, 2, 0.01, 0.90
 NINETY = float(stats.norm.ppf(0.95))
 SAMPLED, LAPLACE, LEFT = "posterior", "Laplace approximation", "sd over that of the prior"
 
@@ -30,7 +30,7 @@ def run(options: argparse.Namespace) -> None:
         lines = common.resumed(
             options.out / "parts" / "posteriors.jsonl", tasks, calibration.replicate,
             lambda line: (line["kind"], line["number"], line["seed"]),
-            common.source_key(calibration.__file__, systems.__file__),
+            calibration.source(),
         )  # fmt: skip
     with watch.part("speed", "densities of a table, and of the same data as harmonics with free delays"):
         speed = systems.speed(options.seed)
