@@ -781,7 +781,7 @@ def rounded_slider():
 @on("docs/reference/files.md")
 def formats():
     """Yield the number of damaged files, and each row of the table, whose tests must exist."""
-    sources = [path.read_text("utf-8") for path in sorted((ROOT / "tests/data/formats").glob("test_*.py"))]
+    sources = [path.read_text("utf-8") for path in sorted((ROOT / "tests/data").rglob("test_*.py"))]
     known = {name for source in sources for name in re.findall(r"^def (test_\w+)", source, re.MULTILINE)}
     yield "with one error: 200 and more of each"
     rows = [line for line in (ROOT / "docs/reference/files.md").read_text("utf-8").splitlines() if line[:2] == "| "]

@@ -149,4 +149,5 @@ def distance(z: np.ndarray, other: np.ndarray) -> float:
     if z.shape != other.shape:
         return np.inf
     size = np.maximum(np.ptp(z, axis=0), np.finfo(float).tiny)
-    return float(np.max(np.abs(z - other) / size) ** 2)
+    with np.errstate(over="ignore"):  # orbits of extreme parameters are infinitely far apart
+        return float(np.max(np.square((z - other) / size)))

@@ -14,9 +14,11 @@ import bayesperiodic as bp
 NUMBER = re.compile(r"[ \t]*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?[ \t]*")
 # What pandas and the documentation take for a missing value.
 MISSING = {"", "nan", "NaN", "NA", "N/A", "null", "-nan"}
+# Columns of nothing else are logical, as a gate or a trigger is stored.
+LOGICAL = {"True": 1.0, "false": 0.0}
 JUNK = [
     "x", "1;5", "1_000", "0x1F", "\u0661", "1d3", "True", "false", "inf", "-Infinity", "--1", "1e", "1 2",
-    "\u22121", "1e400", "'1'", "#N/A!", "1.2.3", "\ufeff1", "1\u00a0", "\u20281",
+    "\u22121", "1e400", "'1'", "#N/A!", "1.2.3", "1\ufeff", "1\u00a0", "\u20281",
 ]  # fmt: skip
 floats = st.floats(-1e99, 1e99, allow_nan=False).filter(lambda x: x == 0.0 or abs(x) > 1e-90)
 
@@ -88,7 +90,11 @@ def expected(header, rows, used):
         return None
     if any(header.count(name) > 1 for name in used):
         return None
-    columns = {name: [value(row[header.index(name)]) for row in rows] for name in used}
+    columns = {name: [row[header.index(name)] for row in rows] for name in used}
+    columns = {
+        name: [LOGICAL[cell] for cell in column] if LOGICAL.keys() >= {*column} else [*map(value, column)]
+        for name, column in columns.items()
+    }
     if any(x is None for values in columns.values() for x in values):
         return None
     return {name: np.array(values) for name, values in columns.items()}
@@ -140,6 +146,58 @@ def test_damaged_files_are_read_as_they_are_or_refused(path, file, missing, data
             keep = ~np.isnan(wanted[name])
             np.testing.assert_allclose(recording.times[channel], np.flatnonzero(keep) / 2.0)
             np.testing.assert_array_max_ulp(recording.outputs[channel], wanted[name][keep], 1)
+
+
+@pytest.mark.parametrize("word", ["N/A", "NaN", "n/a"])
+@pytest.mark.parametrize("width", [1, 2])
+def test_first_row_of_missing_values_is_a_sample(path, word, width):
+    """N/A is newton per ampere too, so that the row was taken for units and the sample lost."""
+    rows = ["ab"[:width], word * width, "1" * width, "2" * width, "3" * width]
+    path.write_text("\n".join(",".join(row if row != word * width else [word] * width) for row in rows) + "\n")
+    with pytest.raises(ValueError, match="must be finite"):
+        bp.Recording.from_csv(path, sampling_rate=2.0, outputs={"a": "a"})
+    recording = bp.Recording.from_csv(path, sampling_rate=2.0, outputs={"a": "a"}, missing="drop")
+    np.testing.assert_array_equal(recording.times["a"], [0.5, 1.0, 1.5])
+
+
+@pytest.mark.parametrize("word", ["na", "k.A.", "pp", "EU", "pk"])
+def test_words_for_no_unit_are_no_units(path, word):
+    """Each of them is a unit of pint, "pp" of 0.35 mm."""
+    path.write_text(f"t,x\ns,{word}\n0,1\n1,2\n")
+    with pytest.raises(ValueError, match=r"units\['x'\]: must say what"):
+        bp.Recording.from_file(path, time="t", outputs={"x": "x"})
+    recording = bp.Recording.from_file(path, time="t", outputs={"x": "x"}, units={"x": 1.0})
+    np.testing.assert_array_equal(recording.outputs["x"], [1.0, 2.0])
+
+
+def test_byte_order_mark_before_the_first_number_is_no_part_of_it(path):
+    """As where files are joined; elsewhere it shows damage."""
+    path.write_text("a,b\n\ufeff1.5,1\n2,3\n", encoding="utf-8")
+    recording = bp.Recording.from_csv(path, sampling_rate=2.0, outputs={"a": "a"})
+    np.testing.assert_array_equal(recording.outputs["a"], [1.5, 2.0])
+    path.write_text("a,b\n1.5,1\n\ufeff2,3\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="must contain numbers"):
+        bp.Recording.from_csv(path, sampling_rate=2.0, outputs={"a": "a"})
+
+
+@pytest.mark.parametrize(
+    ("cells", "wanted"),
+    [
+        (["True", "False", "True"], [1, 0, 1]),
+        (["TRUE", "false", "FALSE"], [1, 0, 0]),
+        (["True", "1.5", "False"], None),
+        (["True", "", "False"], None),
+    ],
+)
+def test_logical_columns_are_ones_and_zeros(path, cells, wanted):
+    path.write_text("\n".join(["gate,x", *(f"{cell},{k}" for k, cell in enumerate(cells)), ""]))
+    if wanted is None:
+        with pytest.raises(ValueError, match="must"):
+            bp.Recording.from_csv(path, sampling_rate=2.0, outputs={"gate": "gate"})
+        return
+    recording = bp.Recording.from_csv(path, sampling_rate=2.0, outputs={"gate": "gate"})
+    np.testing.assert_array_equal(recording.outputs["gate"], wanted)
+    assert "logical values, 1 for True and 0 for False" in str(bp.inspect(path))
 
 
 @given(

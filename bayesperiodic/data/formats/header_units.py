@@ -5,6 +5,11 @@ import re
 
 from bayesperiodic.data.units import AMBIGUOUS, LOGARITHMIC, is_known
 
+# Texts of missing values.
+MISSING = [
+    "", "nan", "NaN", "NAN", "-nan", "-NaN", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None", "1.#IND",
+    "-1.#IND", "1.#QNAN", "-1.#QNAN",
+]  # fmt: skip
 LONGEST_UNIT_TEXT, LONGEST_UNIT_NAME = 30, 300
 # Letters that are units, and seldom names.
 LETTERS = set("msNVAKWJTHLlhΩ°%")
@@ -128,7 +133,12 @@ def _is_meant(style: str, place: int, texts: dict[int, str], names: list[str]) -
 
 
 def unit_row(cells: list[str]) -> list[str] | None:
-    """Return the units in the row below the names, or None if it is none; one evident unit makes it a row of units."""
+    """Return the units in the row below the names, or None if it is none; one evident unit makes it a row of units.
+
+    N/A is newton per ampere too, but a row of nothing else holds missing values.
+    """
+    if all(cell in MISSING for cell in cells):
+        return None
     texts = [unbracketed(cell) for cell in cells]
     return texts if mostly_known(texts) or any(map(is_evident, texts)) else None
 

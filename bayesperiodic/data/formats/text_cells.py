@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesperiodic.data.formats.text_header import DATE, EXPONENT, GROUPS, MISSING, NUMBER_CELL, TIME_OF_DAY
+from bayesperiodic.data.formats.header_units import MISSING
+from bayesperiodic.data.formats.text_header import DATE, EXPONENT, GROUPS, NUMBER_CELL, TIME_OF_DAY
 
 GROUPED, PLAIN_COMMA = re.compile(rf"[+-]?{GROUPS}"), re.compile(rf"[+-]?[0-9]*,[0-9]+{EXPONENT}")
 PLAIN_POINT = re.compile(rf"[+-]?(?:[0-9]+\.[0-9]*|\.[0-9]+){EXPONENT}")

@@ -10,13 +10,16 @@ from typing import TextIO
 
 from bayesperiodic import _checks
 from bayesperiodic.data.formats.encodings import Text
-from bayesperiodic.data.formats.header_units import is_evident, is_possible, known, mostly_known, unbracketed, unit_row
+from bayesperiodic.data.formats.header_units import (
+    MISSING,
+    is_evident,
+    is_possible,
+    known,
+    mostly_known,
+    unbracketed,
+    unit_row,
+)
 
-# Texts of missing values.
-MISSING = [
-    "", "nan", "NaN", "NAN", "-nan", "-NaN", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None", "1.#IND",
-    "-1.#IND", "1.#QNAN", "-1.#QNAN",
-]  # fmt: skip
 # Lines among which the header is searched for, separators of fields in the order in which they are tried, and one that
 # stands for any number of blanks and tabs.
 PREAMBLE, SEPARATORS, BLANKS = 1000, (",", ";", "\t", "|"), " "
