@@ -103,7 +103,7 @@ def draw(found: dict[str, dict[str, Any]], band: tuple[float, float]) -> Figure:
     left.axvspan(*band, color="0.9", zorder=-1)
     left.axvline(COVERED, lw=0.8, ls=":", color="black")
     left.set_xlabel("share of 90 % intervals that contain the truth")
-    right.set_xlabel("standard deviation over that of the prior, of logarithms")
+    right.set_xlabel("sd of logarithms over that of the prior")
     right.set_xscale("log")
     left.set_yticks(range(len(found)), [*found])
     left.set_ylim(-0.6, len(found) - 0.4)
