@@ -142,7 +142,8 @@ def integer(argument: str, value: Any, minimum: int | None = None) -> int:
 def real_array(argument: str, values: Any) -> np.ndarray:
     """Return `values` as an array of floats; raise a ValueError unless they are real numbers.
 
-    Masked values, and the missing ones of pandas, are NaN. Dates and durations are no numbers.
+    It is a copy, unless `values` is an array of floats that is read-only. Masked values, and the missing ones of
+    pandas, are NaN. Dates and durations are no numbers.
     """
     try:
         array = np.asarray(values)
@@ -152,7 +153,7 @@ def real_array(argument: str, values: Any) -> np.ndarray:
             import pandas as pd
 
             array = np.where(pd.isna(array), np.nan, array)
-        floats = array.astype(float)
+        floats = array.astype(float, copy=array.flags.writeable or array.base is not None)
     except (TypeError, ValueError):
         kind = getattr(values, "dtype", None)
         got = f"{shortened(values)}{f' of type {kind}' if kind is not None else ''}"
@@ -162,19 +163,24 @@ def real_array(argument: str, values: Any) -> np.ndarray:
 
 def finite_vector(argument: str, values: Any, length: int | None = None, meaning: str = "") -> np.ndarray:
     """Return `values` as a finite 1-d float array; `meaning` explains the length, such as "samples·periods"."""
+    array = _vector(argument, values, length, meaning)
+    _size(argument, array)
+    return array
+
+
+def _vector(argument: str, values: Any, length: int | None, meaning: str) -> np.ndarray:
     array = real_array(argument, values)
     if array.ndim != 1:
         raise ValueError(f"{argument}: must be one-dimensional, got shape {array.shape}.")
     if length is not None and array.size != length:
         explained = f" ({meaning})" if meaning else ""
         raise ValueError(f"{argument}: must have {length} values{explained}, got {array.size}.")
-    _size(argument, array)
     return array
 
 
 def measured_vector(argument: str, values: Any, length: int | None = None, meaning: str = "") -> np.ndarray:
     """Return `values` as by `finite_vector`; raise a ValueError if its values are too small or too large."""
-    return measured(argument, finite_vector(argument, values, length, meaning))
+    return measured(argument, _vector(argument, values, length, meaning))
 
 
 def measured(argument: str, array: np.ndarray) -> np.ndarray:

@@ -34,6 +34,15 @@ def test_number_of_values_is_that_of_the_table(problem):
     assert "data: amplitude of displacement with 8 independent values" in repr(problem)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("factor", [1e-300, 1e-12, -1.0, 1e150])
+def test_solves_at_extreme_parameters_are_silent(problem, factor):
+    for place in range(len(problem.names)):
+        theta = problem.median()
+        theta[place] *= factor
+        assert {solution.status for solution in problem.solve(theta).values()}
+
+
 def test_report_has_the_table_and_no_periods(problem, fit, tmp_path):
     text = bp.report(problem, fit, None, tmp_path / "table.html").read_text(encoding="utf-8")
     assert "figure-response" in text and "figure-fit-1" not in text and "figure-loops" not in text

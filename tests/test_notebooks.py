@@ -23,8 +23,8 @@ def cells(path, kind):
     return ["".join(c["source"]) for c in json.loads(path.read_text("utf-8"))["cells"] if c["cell_type"] == kind]
 
 
-def test_there_are_eight_notebooks():
-    assert [path.stem[0] for path in NOTEBOOKS] == list("12345678")
+def test_there_are_nine_notebooks():
+    assert [path.stem[0] for path in NOTEBOOKS] == list("123456789")
 
 
 @every

@@ -621,6 +621,18 @@ def clocks():
     yield f"at their nominal rates, the first {first}."
 
 
+@on("docs/studies/resonance.md")
+def resonance():
+    d = results("resonance")
+    assert d["replicates"] == 25 and all(row["met"] for row in d["checks"])
+    kinds = [one for one in d.values() if isinstance(one, dict) and "posterior" in one]
+    assert len(kinds) == 6 and all(one["converged"] == 1.0 for one in kinds)
+    left = {kind: d[kind]["sd over that of the prior"]["c"] for kind in ("amplitudes and phases", "amplitudes")}
+    with_phases, alone = (100 * share for share in left.values())
+    yield f"of the damping to {with_phases:.0f} % of the prior's, amplitudes alone to {alone:.0f} %"
+    yield f"are off by {d['averaged equation']['k3']['bias [sd]']:.1f} standard deviations on average"
+
+
 # Rows of the table of coverage that are outside of the band, for reasons that the page gives.
 EXPLAINED = {"ten levels", "missing cubic term", "3 cycles", "AR(0.9), measured", "frequency estimated"}
 
@@ -782,7 +794,7 @@ def rounded_slider():
 @on("docs/reference/files.md")
 def formats():
     """Yield the number of damaged files, and each row of the table, whose tests must exist."""
-    sources = [path.read_text("utf-8") for path in sorted((ROOT / "tests/data/formats").glob("test_*.py"))]
+    sources = [path.read_text("utf-8") for path in sorted((ROOT / "tests/data").rglob("test_*.py"))]
     known = {name for source in sources for name in re.findall(r"^def (test_\w+)", source, re.MULTILINE)}
     yield "with one error: 200 and more of each"
     rows = [line for line in (ROOT / "docs/reference/files.md").read_text("utf-8").splitlines() if line[:2] == "| "]

@@ -19,8 +19,9 @@ WRAP_TOLERANCE, LARGEST_UNWRAPPED_STEP, SMOOTH_UNWRAPPED = 0.35, 0.5, 0.5
 # Samples of one value in a row that may be a stuck sensor, how many times longer than usual ones they are, and so many
 # runs at an end of the range that they are clipped.
 FEWEST_STUCK, LONG_RUN, RUNS_AT_END = 10, 10.0, 3
-# Clipped samples: fewest, fewest in a row, and how many times more than at the next level.
-FEWEST_CLIPPED, CLIPPED_RUN, PILED_UP = 6, 3, 6.0
+# Clipped samples: fewest, fewest in a row, and how many times more than at the next level. Without such a row: fewest,
+# and the largest gap below them relative to that between the next values, which noise fills.
+FEWEST_CLIPPED, CLIPPED_RUN, PILED_UP, FEWEST_SCATTERED, LARGEST_GAP = 6, 3, 6.0, 10, 20.0
 # Distance of outliers from the mean period in standard deviations of the others, and how often they may return.
 FAR, RETURNING = 8.0, 0.5
 # Distance of large outliers relative to the largest one.
@@ -235,16 +236,24 @@ def _piles_up(values: np.ndarray, top: np.ndarray, place: np.ndarray) -> bool:
     """Return whether the samples at the highest value are more than a smooth signal has there."""
     if top.size < FEWEST_CLIPPED:
         return False
-    _, length = runs(np.diff(top) == 1)
-    together = np.flatnonzero(np.diff(top) == 1)
-    if together.size < 0.5 * top.size or length.max(initial=0) < CLIPPED_RUN - 1:
+    if not in_rows(top) and top.size < FEWEST_SCATTERED:
         return False
     levels, counts = np.unique(values[place], return_counts=True)
     # A relay has few values; a quantised one has neighbouring levels with which the highest is compared.
     if levels.size < FEWEST_VALUES or top.size > MOST_DROPPED * place.size:
         return False
+    gaps = np.diff(levels[-top.size - 1 :])
+    if not in_rows(top) and gaps[-1] > LARGEST_GAP * np.median(gaps[:-1]):  # an exact maximum of a signal without noise
+        return False
     below = counts[-6:-1]
     return bool(top.size > PILED_UP * max(float(below.max()), 1.0))
+
+
+def in_rows(samples: np.ndarray) -> bool:
+    """Return whether clipped samples follow each other, as where a signal exceeds the limit by more than its noise."""
+    next_to = np.diff(samples) == 1
+    _, length = runs(next_to)
+    return bool(np.count_nonzero(next_to) >= 0.5 * samples.size and length.max(initial=0) >= CLIPPED_RUN - 1)
 
 
 def held_of(values: np.ndarray) -> tuple[int, np.ndarray]:

@@ -110,7 +110,8 @@ class _Column:
 
 def numbers(argument: str, values: Any, *, text: bool = False, time: bool = False) -> np.ndarray:
     """Return values of a file as numbers; of times also as dates, and integers as they are."""
-    array = np.squeeze(np.asarray(values))
+    array = np.asarray(values)
+    array = array if array.ndim == 1 else np.squeeze(array)
     time = time and not text
     if time and (times := dates(argument, array)) is not None:
         array = times
@@ -131,6 +132,8 @@ def numbers(argument: str, values: Any, *, text: bool = False, time: bool = Fals
         raise ValueError(
             f"{argument}: must be one column of real numbers, got shape {np.shape(values)} and type {array.dtype}."
         )
+    if array.dtype == float and array.base is None:  # as it was just read, a recording need not copy it
+        array.flags.writeable = False
     return array if text or time else array.astype(float, copy=False)
 
 

@@ -1,12 +1,13 @@
 """Check of a recording: faults of its sensors and its clock, and its steady part, before it is folded."""
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import toeplitz
+from scipy.special import ndtr
 
 from bayesperiodic import _fourier
 from bayesperiodic._io import Result, Storable
@@ -123,6 +124,7 @@ class Effect:
     relative: float  # size of the contamination relative to the signal
     predicted: np.ndarray  # at all samples
     noise: float  # standard deviation of the others about the prediction
+    order: int  # highest harmonic of the prediction
 
     @property
     def severity(self) -> str:
@@ -132,7 +134,7 @@ class Effect:
         return SERIOUS if self.bias > SERIOUS_BIAS else HARMLESS
 
 
-UNKNOWN = Effect(np.nan, np.nan, np.zeros(0), np.nan)
+UNKNOWN = Effect(np.nan, np.nan, np.zeros(0), np.nan, 0)
 
 
 def effect_of(time: np.ndarray, values: np.ndarray, bad: np.ndarray, frequency: float, harmonics: int) -> Effect:
@@ -155,13 +157,27 @@ def effect_of(time: np.ndarray, values: np.ndarray, bad: np.ndarray, frequency: 
     noise = float(np.sqrt(fit.variances[0]))
     if not np.isfinite(predicted).all() or noise > 0.9 * float(values[~bad].std()):
         return UNKNOWN
-    wrong = np.where(bad, values - predicted, 0.0)
+    noise = max(noise, 1e-9 * float(np.abs(values[~bad]).max()))
+    return _effect(np.where(bad, values - predicted, 0.0), time, frequency, order, predicted, noise)
+
+
+def _effect(
+    wrong: np.ndarray, time: np.ndarray, frequency: float, order: int, predicted: np.ndarray, noise: float
+) -> Effect:
+    """Return the effect of errors of the samples on the amplitudes up to an order."""
     sums = np.abs(_fourier.sums(wrong[None], frequency * time, order)[0]) / time.size
-    weights = np.r_[1.0, np.full(order, 2.0)]
-    size = float(np.sqrt(weights @ sums**2))
-    scatter = max(noise, 1e-9 * float(np.abs(values[~bad]).max())) / np.sqrt(time.size)
+    size = float(np.sqrt(np.r_[1.0, np.full(order, 2.0)] @ sums**2))
     spread = max(float(predicted.std()), np.finfo(float).tiny)
-    return Effect(size / scatter, size / spread, predicted, noise)
+    return Effect(size / (noise / np.sqrt(time.size)), size / spread, predicted, noise, order)
+
+
+def clipped_effect(effect: Effect, time: np.ndarray, frequency: float, limits: Sequence[tuple[float, float]]) -> Effect:
+    """Return the effect of limits (sign, level) on a signal with normal noise, by the mean of what exceeds them."""
+    lost = np.zeros(time.size)
+    for sign, level in limits:
+        above = sign * (effect.predicted - level) / effect.noise
+        lost -= sign * effect.noise * (above * ndtr(above) + np.exp(-0.5 * above**2) / np.sqrt(2.0 * np.pi))
+    return _effect(lost, time, frequency, effect.order, effect.predicted, effect.noise)
 
 
 def times_of(time: np.ndarray, samples: np.ndarray) -> np.ndarray:
@@ -291,10 +307,13 @@ def _bad_findings(
         predicted[used] = every.predicted
         every = replace(every, predicted=predicted)
 
-    def finding(kind: str, samples: np.ndarray, what: str) -> Finding:
+    def finding(kind: str, samples: np.ndarray, what: str, limits: Sequence[tuple[float, float]] = ()) -> Finding:
         only = np.isin(np.arange(total), samples)
         effect = every
-        if every.predicted.size:
+        if limits and every.predicted.size:
+            at = replace(every, predicted=every.predicted[used])
+            effect = clipped_effect(at, time[used], frequency or 1.0, limits)
+        elif every.predicted.size:
             kept = np.where(bad & ~only, every.predicted, values)
             effect = effect_of(time[used], kept[used], only[used], frequency or 1.0, harmonics)
         return _finding(channel, kind, time, samples, what, effect, frequency, bool(only[used].any()))
@@ -311,13 +330,14 @@ def _bad_findings(
     clipped = [
         (end, sign)
         for end, sign in ((fault.low, -1.0), (fault.high, 1.0))
-        if end.size and _beyond(every, values, end, sign)
+        if end.size and (fault.noisy and not faults.in_rows(end) or _beyond(every, values, end, sign))
     ]
     if clipped:
         samples = np.sort(np.concatenate([end for end, _ in clipped]))
         level = " and ".join(f"{values[end[0]]:.6g}" for end, _ in clipped)
         if fault.noisy:
-            yield finding("clipped", samples, f"is clipped at {level}")
+            limits = [(sign, float(values[end[0]])) for end, sign in clipped]
+            yield finding("clipped", samples, f"is clipped at {level}", limits)
         else:
             yield _saturated(channel, time, samples, fault, level)
     if fault.outliers.size:

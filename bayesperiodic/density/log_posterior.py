@@ -287,7 +287,8 @@ class LogPosterior(SamplingCoordinates):
         """
         theta, noise = self.to_natural(point)
         value, by_theta, by_noise, status = self.value_and_gradient_at(theta, noise)
-        by_theta[self.logarithmic] *= theta[self.logarithmic]
+        if np.isfinite(value):  # else θ may be infinite
+            by_theta[self.logarithmic] *= theta[self.logarithmic]
         return value, np.concatenate([by_theta, by_noise[self.noise_columns]]), status
 
     def value_and_gradient_at(

@@ -10,13 +10,14 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.initial_orbits import Guesses, experiments_guesses
+from bayesperiodic.density.sheets import FoldSolves, Sheet, SheetPoint
 from bayesperiodic.density.special_points import (
     PointDerivatives,
     special_anchor,
     special_equations,
     special_values,
 )
-from bayesperiodic.density.sweeps import SAME_ORBIT, Place, TablePoint, distance, places, reach_further, tables
+from bayesperiodic.density.sweeps import SAME_ORBIT, Place, distance, places, tables
 from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
 from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
@@ -75,7 +76,7 @@ class ResponseSolver:
 
     def __getstate__(self) -> dict[str, Any]:
         # The factors at the anchors are computed again; the anchors are kept to the last bit.
-        kept = {key: value for key, value in self.__dict__.items() if key not in ("_batches", "_specials")}
+        kept = {key: value for key, value in self.__dict__.items() if key not in ("_batches", "_specials", "_sheets")}
         return kept | {"_changes": None}
 
     def anchored(self, theta: np.ndarray) -> "ResponseSolver":
@@ -96,17 +97,25 @@ class ResponseSolver:
                 solved = None if name in lost else self._solved(simulation, name)
                 anchors[name] = _initial_orbit(self.problem, name, theta, orbit.guess, solved)
             else:
-                here = Place(orbit.sheet, *self._solved(simulation, name), name not in self.beyond(simulation))
+                here = Place(orbit.sheet, *self._solved(simulation, name), not self._is_beyond(name, simulation))
                 anchors[name] = _placed(self.problem, name, theta, orbit.guess, here)
+        return ResponseSolver(self.problem, anchors)
+
+    def on_best_sheets(self, theta: np.ndarray) -> "ResponseSolver":
+        """Return the solver with the points of tables on the sheets that fit the data best at θ (names,)."""
+        best, anchors = places(self.problem, theta), dict(self.anchors)
+        for name in best:
+            anchors[name] = _placed(self.problem, name, theta, self.anchors[name].guess, best[name])
         return ResponseSolver(self.problem, anchors)
 
     def beyond(self, simulation: Simulation) -> list[str]:
         """Return the points of tables that the branch does not reach at the first of the solves, see `sweeps`."""
-        return [
-            e.name
-            for e in self.problem.experiments
-            if self.anchors[e.name].sheet is not None and simulation.response(e.name).frequency[0] != e.frequency
-        ]
+        return [e.name for e in self.problem.experiments if self._is_beyond(e.name, simulation)]
+
+    def _is_beyond(self, experiment: str, simulation: Simulation) -> bool:
+        if self.anchors[experiment].sheet is None:
+            return False
+        return bool(simulation.response(experiment).frequency[0] != self._measured_frequency(experiment))
 
     def _solved(self, simulation: Simulation, experiment: str, i: int = 0) -> tuple[PeriodicEquations, np.ndarray]:
         """Return the equations at the frequency, and the scale of the input, of one of the solves, and its z."""
@@ -183,16 +192,18 @@ class ResponseSolver:
         return self.sheets == other.sheets and all(distance(z, there) < SAME_ORBIT for z, there in orbits)
 
     @cached_property
-    def _sheets(self) -> list[list[TablePoint]]:
-        """The points of each sheet of the tables' branches, in the order of the sweep."""
-        result: dict[Any, list[TablePoint]] = {}
-        for sweep, table in tables(self.problem).items():
-            for name in (e.name for e in table):
+    def _sheets(self) -> list[Sheet]:
+        """The sheets of the tables' branches."""
+        result: list[Sheet] = []
+        for table in tables(self.problem).values():
+            of_sheets: dict[int, list[SheetPoint]] = {}
+            for row, name in enumerate(e.name for e in table):
                 orbit = self.anchors[name]
-                if orbit.sheet is not None:
-                    known = orbit.anchor.sensitivities is not None
-                    result.setdefault((sweep, orbit.sheet), []).append(TablePoint(name, *self._places[name], known))
-        return list(result.values())
+                if orbit.sheet is not None and isinstance(orbit.anchor, Anchor):
+                    point = SheetPoint(row, *self._places[name], orbit.anchor)
+                    of_sheets.setdefault(orbit.sheet, []).append(point)
+            result += [Sheet(self.problem, table, points) for points in of_sheets.values()]
+        return result
 
     def _batch(self, names: list[str]) -> Batch | AutonomousBatch | SpecialBatch:
         """Return the solver of experiments of one group."""
@@ -218,8 +229,11 @@ class ResponseSolver:
         other experiments may be skipped.
         """
         groups, keep = [], keep or bool(self._sheets)
-        for experiments, maps, batch, multipliers in self._batches:
-            values = maps.values(theta)
+        every = [maps.values(theta) for _, maps, *_ in self._batches]
+        folds, without = self._folds(every, threads)
+        for (experiments, maps, batch, multipliers), values, left_out in zip(
+            self._batches, every, without, strict=True
+        ):
             parameters, sensors = values[..., : maps.count], values[..., maps.count :]
             if isinstance(batch, SpecialBatch):
                 groups.append(_special_solution(batch, parameters, sensors, threads))
@@ -227,7 +241,8 @@ class ResponseSolver:
             if isinstance(batch, AutonomousBatch):
                 solved = batch.solve(parameters, threads, keep=keep or multipliers, whole=whole)
             else:
-                solved = batch.solve(parameters, threads, keep=keep or multipliers, polish=polish or multipliers)
+                given: dict[str, Any] = {"keep": keep or multipliers, "polish": polish or multipliers}
+                solved = batch.solve(parameters, threads, **given, without=left_out)
             status, logarithms = solved.status, [np.empty((len(theta), 0))] * len(experiments)
             if multipliers:
                 status = status.copy()
@@ -237,9 +252,30 @@ class ResponseSolver:
                 ]
             of_all = solved.outputs, solved.frequency, parameters, sensors, logarithms, solved.z, status
             groups.append(GroupSolution(*of_all, np.ones(status.shape)))
-        for points in self._sheets:
-            reach_further(self.problem, points, groups)
+        for sheet, of_sheet in zip(self._sheets, folds, strict=True):
+            sheet.reach(groups, of_sheet)
         return Simulation(groups, self._places)
+
+    def _folds(
+        self, values: Sequence[np.ndarray], threads: int | None
+    ) -> tuple[list[FoldSolves], list[np.ndarray | None]]:
+        """Return the folds at the ends of sheets, and which solves (experiments, solves) of each group lie beyond one.
+
+        `values` are the parameters of each group, (experiments, solves, parameters).
+        """
+        folds: list[FoldSolves] = []
+        without: list[np.ndarray | None] = [None] * len(values)
+        for sheet in self._sheets:
+            first = sheet.points[0]
+            count = self._batches[first.group][1].count
+            folds.append(sheet.beyond_folds(values[first.group][first.member, :, :count], threads))
+            if folds[-1].beyond.any():
+                for point, beyond in zip(sheet.points, folds[-1].beyond, strict=True):
+                    left_out = without[point.group]
+                    if left_out is None:
+                        left_out = without[point.group] = np.zeros(values[point.group].shape[:2], dtype=bool)
+                    left_out[point.member] = beyond
+        return folds, without
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
         """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""

@@ -5,18 +5,18 @@ The branch of a table is followed once from its first point through all frequenc
 from one sheet to a later one. Among these choices the one is taken that the measured values fit best.
 
 In solves at other θ a sheet may end at a fold before a measured frequency. The orbit of such a point is that at the
-fold, which is found from the solution of the nearest point that the sheet reaches; see `likelihood.reach`.
+fold, see `sheets` and `likelihood.reach`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.sweep import Sweep
-from bayesperiodic.likelihood.observation import GroupSolution, Response
-from bayesperiodic.periodic.compiled import CONVERGED, STALLED
+from bayesperiodic.likelihood.observation import Response
+from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.solve import solve_driven
 from bayesperiodic.periodic.table_branch import Passage, follow
@@ -35,15 +35,6 @@ class Place(NamedTuple):
     equations: PeriodicEquations  # at its frequency, that of the fold if the branch does not reach the point
     z: np.ndarray  # (points, states)
     reached: bool
-
-
-class TablePoint(NamedTuple):
-    """A point of a table among the solves of all experiments."""
-
-    name: str
-    group: int
-    member: int
-    known: bool  # whether its anchor is an orbit at its frequency
 
 
 def tables(problem: Description) -> dict[Sweep, list[Experiment]]:
@@ -158,58 +149,5 @@ def distance(z: np.ndarray, other: np.ndarray) -> float:
     if z.shape != other.shape:
         return np.inf
     size = np.maximum(np.ptp(z, axis=0), np.finfo(float).tiny)
-    return float(np.max(np.abs(z - other) / size) ** 2)
-
-
-def reach_further(problem: Description, points: Sequence[TablePoint], groups: Sequence[GroupSolution]) -> None:
-    """Solve the points of one sheet, in the order of the sweep, whose solves have failed, from their neighbours.
-
-    Points beyond a fold get the orbit there, with its frequency. The solutions are changed in place.
-    """
-    for point in points:
-        if not point.known:
-            status = groups[point.group].status[point.member]
-            np.maximum(status, STALLED, out=status)
-    statuses = np.stack([groups[point.group].status[point.member] for point in points])
-    equations = [problem.equations[point.name] for point in points]
-    for b in np.flatnonzero(np.any(statuses != CONVERGED, axis=0)).tolist():
-        good = (statuses[:, b] == CONVERGED).tolist()
-        if True not in good:
-            continue
-        parameters = [groups[point.group].parameters[point.member, b] for point in points]
-        first = good.index(True)
-        starts = [(k, 1) for k in range(first, len(good) - 1) if good[k] and not good[k + 1]]
-        for start, heading in [*starts, *([(first, -1)] if first else [])]:
-            z = groups[points[start].group].z[points[start].member, b]
-            for k, equations_there, orbit in _further(equations, parameters, start, z, heading, good):
-                group, member = groups[points[k].group], points[k].member
-                group.outputs[member, b] = equations_there.outputs(orbit, parameters[k])
-                group.z[member, b], group.frequency[member, b] = orbit, equations_there.frequency
-                group.status[member, b] = CONVERGED
-
-
-def _further(
-    equations: Sequence[PeriodicEquations],
-    parameters: Sequence[np.ndarray],
-    start: int,
-    z: np.ndarray,
-    heading: int,
-    good: Sequence[bool],
-) -> Iterator[tuple[int, PeriodicEquations, np.ndarray]]:
-    """Yield number, equations and orbit of the points next to a solved one that are not solved."""
-    end = start + heading
-    while 0 <= end < len(good) and not good[end]:
-        end += heading
-    low, high = sorted((start, end - heading))
-    part: Any = slice(low, high + 1)
-    at = start
-    with np.errstate(all="ignore"):
-        for passage in follow(equations[part], parameters[part], start - low, z, heading, further=False):
-            if passage.is_fold:
-                for k in range(at + heading, end, heading):
-                    yield k, passage.equations, passage.z
-                return
-            assert passage.point is not None
-            at = low + passage.point
-            if at != start:
-                yield at, passage.equations, passage.z
+    with np.errstate(over="ignore"):  # orbits of extreme parameters are infinitely far apart
+        return float(np.max(np.square((z - other) / size)))

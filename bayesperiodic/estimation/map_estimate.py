@@ -41,6 +41,7 @@ from bayesperiodic.estimation.gauss_newton import (
 from bayesperiodic.estimation.laplace import joint_laplace
 from bayesperiodic.estimation.modes import default_starts, notable, weighed, with_images
 from bayesperiodic.estimation.result import MapEstimate, NoiseEstimate, Search, TrueInputs
+from bayesperiodic.estimation.second_order import second_order_warnings
 from bayesperiodic.estimation.table_orbits import table_warnings
 from bayesperiodic.estimation.units import compared_with_data, not_isolated, singular_start, unit_error
 from bayesperiodic.likelihood.noise import Relative
@@ -136,7 +137,8 @@ def map_estimate(
     UserWarning
         If an estimate lies at the end of its prior's support, if another optimum has more than 1 % of the posterior
         mass by its Laplace approximation, if data contain no noise, if the orbit of an experiment is not the measured
-        one, if the branch of a response table does not reach a point or is unstable there, and as `check` does.
+        one, if the branch of a response table does not reach a point or is unstable there, if the data depend on a
+        parameter only to second order at the estimate, and as `check` does.
 
     References
     ----------
@@ -181,7 +183,8 @@ def map_estimate(
         {"objective": end.iterate.objective} | _by_name(problem, end.iterate.theta) if end else lost for end in ends
     ]
     result = _describe(problem, objective, modes, tuple(outcomes), checks)
-    for text in estimation_warnings(problem, result):
+    beyond = second_order_warnings(objective, modes[0].iterate)
+    for text in (*estimation_warnings(problem, result), *beyond):
         warnings.warn(text, UserWarning, stacklevel=3)
     return result
 
@@ -297,7 +300,7 @@ def _on_best_sheets(problem: Problem, end: End, progress: bool) -> End:
     """Return the end of a climb; where tables fit better on other sheets of their branches, the best from there."""
     for _ in range(MOST_SHEET_CHANGES if tables(problem) else 0):
         theta = end.iterate.theta
-        solver = ResponseSolver.start(problem, theta)
+        solver = end.iterate.here.solver.on_best_sheets(theta)
         if end.iterate.here.solver.on_same_orbits(solver):
             break
         near = LogPosterior(problem, solver).linearise(theta)

@@ -12,6 +12,7 @@ from bayesperiodic.periodic.compiled import (
     CONVERGED,
     NO_FACTORS,
     NOT_RESOLVED,
+    STALLED,
     Anchors,
     BatchSolution,
     Border,
@@ -115,7 +116,13 @@ class Batch:
         return kernels("batch", self._first.count, self._first.grid.stencil).solve_many, self._first.functions
 
     def solve(
-        self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False, polish: bool = False
+        self,
+        parameters: np.ndarray,
+        threads: int | None = None,
+        *,
+        keep: bool = False,
+        polish: bool = False,
+        without: np.ndarray | None = None,
     ) -> BatchSolution:
         """Solve every input set for every parameter vector; the result does not depend on the number of threads.
 
@@ -128,10 +135,14 @@ class Batch:
             Return z too.
         polish : bool
             Take further chord steps, so that z and what is derived from it are as accurate as possible.
+        without : bool array (sets, solves), optional
+            Solves to be left out, whose status is "stalled".
         """
         first, grid = self._first, self._first.grid
         every, solution = _unsolved(first, self._size, parameters, keep)
         solution.frequency[:] = self._sets.frequency[:, None]
+        if without is not None:
+            solution.status[without] = STALLED
         solve_many, functions = self._compiled
         before = functions, grid.packed, grid.periods, self._sets, self._anchors, every
         after = polish, first.model.kernels.output_rates, solution
@@ -221,7 +232,7 @@ def _unsolved(
     shape, points = every.shape[:2], equations.grid.points
     z = np.empty((*shape, points if keep else 0, equations.count))
     outputs = np.empty((*shape, points, equations.model.kernels.channels))
-    return every, BatchSolution(z, outputs, np.empty(shape), *np.empty((2, *shape), dtype=int))
+    return every, BatchSolution(z, outputs, np.empty(shape), *np.zeros((2, *shape), dtype=int))
 
 
 def phase_bordered(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> BorderedFactors:

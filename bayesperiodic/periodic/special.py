@@ -16,7 +16,7 @@ References
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -90,6 +90,7 @@ class SpecialEquations:
     rows: np.ndarray | None = None  # (unknowns, points, channels) of the conditions Σ rows·ŷ = targets; None for a fold
     targets: np.ndarray | None = None  # (unknowns,)
     forward: np.ndarray | None = None  # (points, channels), of the turned amplitude, positive at the lag
+    input_slope: np.ndarray | None = None  # (points, 3·inputs), change of the inputs with a free frequency [per Hz]
 
     @property
     def is_fold(self) -> bool:
@@ -111,6 +112,12 @@ class SpecialEquations:
                 change[:, names.index(name) :: width] = inputs[:, names.index(name) :: width]
         return change
 
+    @property
+    def inputs_at_zero(self) -> np.ndarray:
+        """The inputs (points, 3·inputs) where all unknowns are zero, at the frequency of `equations`."""
+        still = self.equations.inputs - self.scaled_inputs
+        return still if self.input_slope is None else still - self.equations.frequency * self.input_slope
+
     def parametrised(self, parameters: np.ndarray) -> ParametrisedEquations:
         """Return the equations with the first unknown free, for a continuation."""
         if self.free[0] == FREQUENCY:
@@ -124,6 +131,8 @@ class SpecialEquations:
         for name, value in zip(self.free, values, strict=True):
             if name != FREQUENCY:
                 here = replace(here, inputs=here.inputs + (value - 1.0) * self.scaled_inputs)
+            elif self.input_slope is not None:
+                here = replace(here, inputs=here.inputs + (value - here.frequency) * self.input_slope)
         return here.at_frequency(float(values[self.free.index(FREQUENCY)])) if FREQUENCY in self.free else here
 
     def row(self, vector: np.ndarray) -> np.ndarray:
@@ -155,12 +164,16 @@ class SpecialEquations:
         self, name: str, here: PeriodicEquations, z: np.ndarray, columns: np.ndarray, d: Derivatives
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return ∂g (points, states) and ∂f (points, channels) by one of the unknowns."""
-        if name == FREQUENCY:
-            return frequency_derivatives(here, z, columns, d)
-        width = len(here.model.inputs)
-        ratio = here.frequency / self.equations.frequency
-        change = (self.scaled_inputs * np.repeat([1.0, ratio, ratio**2], width))[None]
-        return along(d.g_u, change)[0], along(d.f_u, change)[0]
+        change = self.scaled_inputs if name != FREQUENCY else self.input_slope
+        by_inputs: tuple[Any, Any] = (0.0, 0.0)
+        if change is not None:
+            ratio = here.frequency / self.equations.frequency
+            moved = (change * np.repeat([1.0, ratio, ratio**2], len(here.model.inputs)))[None]
+            by_inputs = along(d.g_u, moved)[0], along(d.f_u, moved)[0]
+        if name != FREQUENCY:
+            return by_inputs
+        g, f = frequency_derivatives(here, z, columns, d)
+        return g + by_inputs[0], f + by_inputs[1]
 
     def missed(self, outputs: np.ndarray) -> np.ndarray:
         """Return by how much outputs (points, channels) miss the conditions, (unknowns,)."""

@@ -20,6 +20,9 @@ from bayesperiodic.periodic.compiled import (
 from bayesperiodic.periodic.equations import FREQUENCY
 from bayesperiodic.periodic.special import SpecialEquations, SpecialPoint, SpecialSensitivities
 
+# Change of a special point, in units of the point, from one further anchor to the next.
+LATTICE = 0.1
+
 
 @dataclass(frozen=True)
 class SpecialAnchor:
@@ -65,6 +68,7 @@ class SpecialBatch:
 
     def __init__(self, specials: Sequence[SpecialEquations], anchors: Sequence[SpecialAnchor]):
         self._specials, self._anchors = list(specials), list(anchors)
+        self._further: dict[tuple[int, ...], SpecialBatch | None] = {}
         first = specials[0]
         self._first, free = first.equations, first.free
         parts = [_anchored(special, anchor) for special, anchor in zip(specials, anchors, strict=True)]
@@ -75,7 +79,8 @@ class SpecialBatch:
         for e, special in enumerate(specials):
             if special.rows is not None and special.targets is not None:
                 rows[e], targets[e] = special.rows, special.targets
-            inputs.append(np.stack([(name != FREQUENCY) * special.scaled_inputs for name in free]))
+            by_frequency = 0.0 * special.scaled_inputs if special.input_slope is None else special.input_slope
+            inputs.append(np.stack([by_frequency if n == FREQUENCY else special.scaled_inputs for n in free]))
         of_points = [a.point for a in anchors]
         slopes = [_slopes(anchor) for anchor in anchors]
         border = Border(*(np.stack(each) for each in zip(*(part.border for part in parts), strict=True)))
@@ -91,18 +96,18 @@ class SpecialBatch:
         stacked += [np.array([int(part.known) for part in parts])]
         self._packed = SpecialAnchors(*stacked)
         self._sets = Sets(
-            np.stack([s.equations.inputs - s.scaled_inputs for s in specials]),
+            np.stack([s.inputs_at_zero for s in specials]),
             np.array([s.equations.frequency for s in specials]),
             np.stack([s.equations.drift for s in specials]),
         )
 
-    def solve(self, parameters: np.ndarray, threads: int | None = None) -> SpecialSolution:
-        """Solve every point for parameters (sets, solves, parameters); the result does not depend on the threads."""
+    def solve(self, parameters: np.ndarray, threads: int | None = None, *, follow: bool = True) -> SpecialSolution:
+        """Solve every point for parameters (sets, solves, parameters); the result does not depend on the threads.
+
+        With `follow` those that are far from their anchors are followed in steps.
+        """
         first, (sets, solves) = self._first, parameters.shape[:2]
-        points, channels = first.grid.points, first.model.kernels.channels
-        z, outputs = np.zeros((sets, solves, points, first.count)), np.zeros((sets, solves, points, channels))
-        values = np.tile(self._packed.values[:, None], (1, solves, 1))
-        solution = SpecialSolution(z, outputs, values, *np.zeros((2, sets, solves), dtype=int))
+        solution = self.empty(solves)
         reach_many = kernels("special", first.count, first.grid.stencil).reach_many
         given = first.functions, first.grid.packed, self._sets, self._packed, self._frequency
         every = np.ascontiguousarray(parameters)
@@ -111,11 +116,24 @@ class SpecialBatch:
             reach_many(*given, every, *block, solution)
             for index in range(*block):
                 e, b = index // solves, index % solves
-                if solution.status[e, b] == STALLED:
+                if follow and solution.status[e, b] == STALLED:
                     self._follow(e, b, every[e, b], solution)
 
         in_blocks(part, sets * solves, SMALLEST_BLOCK, threads)
         return solution
+
+    def empty(self, solves: int) -> SpecialSolution:
+        """Return arrays for the solutions, with the values of the anchors."""
+        first, sets = self._first, len(self._specials)
+        points, channels = first.grid.points, first.model.kernels.channels
+        z, outputs = np.zeros((sets, solves, points, first.count)), np.zeros((sets, solves, points, channels))
+        values = np.tile(self._packed.values[:, None], (1, solves, 1))
+        return SpecialSolution(z, outputs, values, *np.zeros((2, sets, solves), dtype=int))
+
+    def predicted(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the linear predictions of the unknowns (sets, solves, unknowns) for parameters as in `solve`."""
+        changes = parameters - self._packed.parameters[:, None]
+        return self._packed.values[:, None] + np.einsum("ebp,epk->ebk", changes, self._packed.value_slopes)
 
     def frequency(self, solution: SpecialSolution) -> np.ndarray:
         """Return the frequencies (sets, solves) of solutions [Hz]."""
@@ -134,6 +152,13 @@ class SpecialBatch:
         if anchor.sensitivities is None:
             solution.status[e, b] = anchor.code or STALLED
             return
+        further = self._further_anchor(e, parameters)
+        if further is not None:
+            near = further.solve(parameters[None, None], 1, follow=False)
+            if near.status[0, 0] != STALLED:
+                for whole, part in zip(solution, near, strict=True):
+                    whole[e, b] = part[0, 0]
+                return
         solved = special.follow(anchor.point, anchor.parameters, parameters)
         point, here = solved.point, special.at(solved.point.values)
         solution.z[e, b], solution.values[e, b] = point.z, point.values
@@ -141,6 +166,26 @@ class SpecialBatch:
         jagged = solved.code == CONVERGED and here.kernels.is_jagged(np.ascontiguousarray(point.z), here.inputs)
         solution.status[e, b] = NOT_RESOLVED if jagged else solved.code
         solution.iterations[e, b] += solved.steps
+
+    def _further_anchor(self, e: int, parameters: np.ndarray) -> "SpecialBatch | None":
+        """Return the solver anchored at the node of a lattice of parameters next to some, None if it has no point.
+
+        Its edges are changes of parameters that change the point by `LATTICE`. So the anchor depends on the parameters
+        alone; it is kept for others near the same node.
+        """
+        special, anchor = self._specials[e], self._anchors[e]
+        slopes = _slopes(anchor)
+        each = [SpecialPoint(*(part[p] for part in slopes)) for p in range(parameters.size)]
+        rates = np.array([special.size(slope, anchor.point) for slope in each])
+        place = np.rint((parameters - anchor.parameters) * rates / LATTICE).astype(int)
+        key = (e, *place.tolist())
+        if key not in self._further:
+            node = anchor.parameters + np.divide(place * LATTICE, rates, out=np.zeros_like(rates), where=rates > 0.0)
+            solved, self._further[key] = special.follow(anchor.point, anchor.parameters, node), None
+            if solved.code == CONVERGED:
+                there = SpecialAnchor.at(special, node, solved.point, np.flatnonzero(rates > 0.0))
+                self._further[key] = SpecialBatch([special], [there])
+        return self._further[key]
 
 
 def _anchored(special: SpecialEquations, anchor: SpecialAnchor) -> _Anchored:

@@ -19,9 +19,11 @@ TINY_SCALE, SMALL_AMPLITUDE = 1e-9, 1e-3  # of an unknown input; of the amplitud
 CLIMB, LEAST_CLIMB = 0.5, 0.01  # of the logarithm of the amplitude
 
 
-def fold_equations(equations: PeriodicEquations, vary: str, direction: str) -> SpecialEquations:
+def fold_equations(
+    equations: PeriodicEquations, vary: str, direction: str, *, input_slope: np.ndarray | None = None
+) -> SpecialEquations:
     """Return the equations of a fold at which a sweep "up" or "down" of the frequency or an input's scale jumps."""
-    return SpecialEquations(equations, (vary,), sign=-1.0 if direction == "up" else 1.0)
+    return SpecialEquations(equations, (vary,), sign=-1.0 if direction == "up" else 1.0, input_slope=input_slope)
 
 
 def phase_equations(

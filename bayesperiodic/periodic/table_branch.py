@@ -68,7 +68,7 @@ def follow(
         if not inside and not further:
             return
         here = table[at]
-        there = table[at + heading] if inside else _beyond(table, at, heading)
+        there = neighbour(table, at, heading)
         arrived: np.ndarray | None = z
         back = False
         if there.frequency != here.frequency:
@@ -100,6 +100,21 @@ def between(here: PeriodicEquations, there: PeriodicEquations, share: float) -> 
     return replace(here, inputs=inputs).at_frequency(frequency)
 
 
+def input_slope(here: PeriodicEquations, there: PeriodicEquations) -> np.ndarray | None:
+    """Return the change of the inputs between two points of the table, (points, 3·inputs), at the frequency of `here`.
+
+    It is per Hz; None if the inputs are the same.
+    """
+    change, width = there.at_frequency(here.frequency).inputs - here.inputs, len(here.model.inputs)
+    # Of equal inputs the rates, which are converted, differ by rounding errors.
+    return change / (there.frequency - here.frequency) if change[:, :width].any() else None
+
+
+def neighbour(table: Sequence[PeriodicEquations], at: int, heading: int) -> PeriodicEquations:
+    """Return the equations of the next point of the table, or at a frequency beyond its end."""
+    return table[at + heading] if 0 <= at + heading < len(table) else _beyond(table, at, heading)
+
+
 def _equations_at(
     here: PeriodicEquations, there: PeriodicEquations, parameters: np.ndarray, point: BranchPoint
 ) -> PeriodicEquations:
@@ -109,10 +124,9 @@ def _equations_at(
 
 def _interpolated(here: PeriodicEquations, there: PeriodicEquations, parameters: np.ndarray) -> ParametrisedEquations:
     """Return the equations between two points of the table, whose unknown is the frequency."""
-    slope = there.at_frequency(here.frequency).inputs - here.inputs
-    if not slope.any():
+    slope = input_slope(here, there)
+    if slope is None:
         return ParametrisedEquations(here, parameters, (FREQUENCY,))
-    slope /= there.frequency - here.frequency
     base = replace(here, inputs=here.inputs - here.frequency * slope)
     return ParametrisedEquations(base, parameters, (FREQUENCY,), input_change=slope)
 

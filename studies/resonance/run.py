@@ -1,7 +1,7 @@
-"""Tables of nonlinear resonances: what amplitudes tell without phases, and the averaged equation beside.
+"""Tables, jumps and resonance points of nonlinear resonances: what they determine, and whether the intervals cover.
 
-``--replicates N`` makes N tables of each kind and system (default 200). A z is the deviation of an estimate from the
-truth in units of its standard deviation.
+``--replicates N`` makes N sets of data of each kind (default 25), of Duffing oscillators drawn from the prior. A z is
+the deviation of an estimate from the truth in units of its standard deviation.
 """
 
 import argparse
@@ -15,85 +15,100 @@ from scipy import stats
 
 import bayesperiodic as bp
 from studies import common
-from studies.resonance import systems
+from studies.resonance import calibration, systems
 
-REPLICATES, QUICK, FALSE_ALARM, COVERED = 200, 2, 0.01, 0.90
+REPLICATES, QUICK, FALSE_ALARM, COVERED = 25, 2, 0.01, 0.90
 NINETY = float(stats.norm.ppf(0.95))
+SAMPLED, LAPLACE, LEFT = "posterior", "Laplace approximation", "sd over that of the prior"
 
 
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
     watch, count = common.Stopwatch(), QUICK if options.quick else options.replicates or REPLICATES
-    names = ["duffing"] if options.quick else [*systems.SYSTEMS]
-    cases = [(name, kind) for name in names for kind in systems.KINDS] + [("duffing", systems.AVERAGED)]
-    tasks = [(name, kind, number, options.seed) for name, kind in cases for number in range(count)]
-    with watch.part("estimates", f"estimates from {len(tasks)} sets of tables"):
+    tasks = [(kind, number, options.seed) for number in range(count) for kind in calibration.KINDS]
+    with watch.part("posteriors", f"posteriors of {len(tasks)} sets of data"):
         lines = common.resumed(
-            options.out / "parts" / "estimates.jsonl", tasks, systems.replicate,
-            lambda line: (line["system"], line["kind"], line["number"], line["seed"]),
-            common.source_key(systems.__file__),
+            options.out / "parts" / "posteriors.jsonl", tasks, calibration.replicate,
+            lambda line: (line["kind"], line["number"], line["seed"]),
+            calibration.source(),
         )  # fmt: skip
     with watch.part("speed", "densities of a table, and of the same data as harmonics with free delays"):
         speed = systems.speed(options.seed)
-    found = {f"{name}: {kind}": summary(lines, name, kind) for name, kind in cases}
+    found = {kind: summary([line for line in lines if line["kind"] == kind]) for kind in calibration.KINDS}
+    averaged = {p: [line["averaged"][p] for line in lines if line["averaged"]] for p in calibration.PRIORS}
     low, high = stats.binom.interval(1.0 - FALSE_ALARM, count, COVERED)
     band = float(low) / count, float(high) / count
     checks = [
-        common.row(f"{case}: 90 % intervals of {p} that contain it", share, *band)
-        for case, of_case in found.items()
-        if systems.AVERAGED not in case
-        for p, share in of_case["coverage"].items()
+        common.row(f"{kind}: 90 % intervals of {p} that contain it", share, *band)
+        for kind, of_kind in found.items()
+        for p, share in of_kind[SAMPLED].items()
     ]
     faster = "64 densities: time as harmonics with free delays over that as a table"
     checks.append(common.row(faster, speed["ratio"], 5.0, None))
+    closed = {p: z_summary(np.array(z)) for p, z in averaged.items()}
     print("\n" + common.table_of_rows(checks) + "\n\n" + common.shown("by kind of data", _flat(found)))
+    print("\n" + common.shown("averaged equation, amplitudes", closed))
     with watch.part("figures", "drawing"):
-        figures = {"kinds": draw(found)} | {name.replace(" ", "_"): _response(name, options.seed) for name in names}
+        names = ["duffing"] if options.quick else [*systems.SYSTEMS]
+        figures = {"kinds": draw(found, band)}
+        figures |= {name.replace(" ", "_"): _response(name, options.seed) for name in names}
         paths = common.save_figures(options.out, figures)
-    results = {"replicates": count, "seed": options.seed, "band": list(band), "checks": checks, "speed": speed} | found
-    common.finish(options.out, results, watch, paths, synthetic=True)
+    results = {"replicates": count, "seed": options.seed, "band": list(band), "checks": checks, "speed": speed}
+    common.finish(options.out, results | {"averaged equation": closed} | found, watch, paths, synthetic=True)
 
 
-def summary(lines: list[dict[str, Any]], name: str, kind: str) -> dict[str, Any]:
-    """Return coverage, bias, spread and contraction of each parameter over the replicates of a case."""
-    of_case = [line for line in lines if (line["system"], line["kind"]) == (name, kind)]
-    names = [*systems.SYSTEMS[name].truth]
-    z = {p: np.array([line["z"][p] for line in of_case]) for p in names}
+def summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return coverage of posteriors and Laplace approximations, z, and what is left of the priors' sd, of one kind."""
+    ranks = {p: np.array([line["rank"][p] for line in lines]) for p in calibration.PRIORS}
+    z = {p: z_summary(np.array([line["z"][p] for line in lines])) for p in calibration.PRIORS}
     return {
-        "converged": float(np.mean([line["status"] == "converged" for line in of_case])),
-        "coverage": {p: float(np.mean(np.abs(values) < NINETY)) for p, values in z.items()},
-        "bias": {p: float(values.mean()) for p, values in z.items()},
-        "rms of z": {p: float(np.sqrt(np.mean(values**2))) for p, values in z.items()},
-        "sd over that of the prior": {p: float(np.median([line["contraction"][p] for line in of_case])) for p in names},
-        "seconds": float(np.median([line["seconds"] for line in of_case])),
+        "converged": float(np.mean([line["status"] == "converged" for line in lines])),
+        "near a fold": float(np.mean([line["warned"] for line in lines])),
+        "least effective number": float(min(line["effective"] for line in lines)),
+        SAMPLED: {p: float(np.mean(np.abs(rank - 0.5) < 0.5 * COVERED)) for p, rank in ranks.items()},
+        LAPLACE: {p: of_p["coverage"] for p, of_p in z.items()},
+        "rms of z": {p: of_p["rms of z"] for p, of_p in z.items()},
+        "bias": {p: of_p["bias [sd]"] for p, of_p in z.items()},
+        LEFT: {p: float(np.median([line["contraction"][p] for line in lines])) for p in calibration.PRIORS},
+        "seconds": float(np.median([line["seconds"] for line in lines])),
+    }
+
+
+def z_summary(z: np.ndarray) -> dict[str, float]:
+    """Return coverage of 90 % intervals, bias and spread."""
+    return {
+        "coverage": float(np.mean(np.abs(z) < NINETY)),
+        "bias [sd]": float(z.mean()),
+        "rms of z": float(np.sqrt(np.mean(z**2))),
     }
 
 
 def _flat(found: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return coverage and bias of every parameter by case."""
-    return {
-        f"{case}, {p}": {"coverage": share, "bias [sd]": of_case["bias"][p], "rms of z": of_case["rms of z"][p]}
-        for case, of_case in found.items()
-        for p, share in of_case["coverage"].items()
-    }
+    """Return coverage and spread of every parameter by kind."""
+    columns = (SAMPLED, LAPLACE, "rms of z", LEFT)
+    return {f"{kind}, {p}": {c: of_kind[c][p] for c in columns} for kind, of_kind in found.items()
+            for p in calibration.PRIORS}  # fmt: skip
 
 
-def draw(found: dict[str, dict[str, Any]]) -> Figure:
-    """Draw coverage and remaining standard deviations of all cases."""
-    figure = plt.figure(figsize=(9.0, 0.5 * len(found) + 2.4), layout="constrained")
+def draw(found: dict[str, dict[str, Any]], band: tuple[float, float]) -> Figure:
+    """Draw coverage and remaining standard deviations of all kinds."""
+    figure = plt.figure(figsize=(9.0, 0.55 * len(found) + 2.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
-    for place, of_case in enumerate(found.values()):
-        for axes, quantity in ((left, "coverage"), (right, "sd over that of the prior")):
-            for p, value in of_case[quantity].items():
-                axes.plot(value, place, ".", color="black")
-                axes.annotate(p, (value, place), xytext=(0, 4), textcoords="offset points", ha="center", fontsize=7)
+    for shift, (p, marker) in zip((-0.2, 0.0, 0.2), zip(calibration.PRIORS, "os^", strict=True), strict=True):
+        places = np.arange(len(found)) + shift
+        for quantity, axes, face in ((SAMPLED, left, "black"), (LAPLACE, left, "none"), (LEFT, right, "black")):
+            values = [of_kind[quantity][p] for of_kind in found.values()]
+            label = {SAMPLED: f"{p}, {SAMPLED}", LAPLACE: f"{p}, {LAPLACE}", LEFT: None}[quantity]
+            axes.plot(values, places, marker, ls="", color="black", mfc=face, ms=5, label=label)
+    left.axvspan(*band, color="0.9", zorder=-1)
     left.axvline(COVERED, lw=0.8, ls=":", color="black")
     left.set_xlabel("share of 90 % intervals that contain the truth")
-    right.set_xlabel("standard deviation over that of the prior")
+    right.set_xlabel("sd of logarithms over that of the prior")
     right.set_xscale("log")
     left.set_yticks(range(len(found)), [*found])
     left.set_ylim(-0.6, len(found) - 0.4)
     left.invert_yaxis()
+    common.shared_legend(figure, 3)
     return figure
 
 

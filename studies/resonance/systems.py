@@ -1,7 +1,6 @@
 """Systems, tables of their responses, and their estimates: with the periodic solver and with the averaged equation."""
 
 import time
-import warnings
 from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
@@ -13,8 +12,6 @@ import bayesperiodic as bp
 
 SAMPLES, NOISE, POINTS = 64, 0.01, 40
 AMPLITUDE, PHASE, BOTH = "amplitude", "amplitude and phase", "amplitude, both sweeps"
-AVERAGED = "amplitude, averaged equation"
-KINDS = (AMPLITUDE, PHASE, BOTH)
 
 TWO_MODES = bp.Model(
     "two_modes",
@@ -93,30 +90,6 @@ def problem(name: str, kind: str, seed: int) -> bp.Problem:
         runs += [replace(e, name=f"{direction}, {e.name}") for e in these]
     priors = {p: bp.LogNormal(value, 0.3) for p, value in system.truth.items()}
     return bp.Problem(system.model, runs, priors=priors, fixed=system.fixed)
-
-
-def replicate(task: tuple[str, str, int, int]) -> dict[str, Any]:
-    """Return deviations from the truth in standard deviations, and these relative to those of the priors.
-
-    The task is a system, a kind of data, the number of the replicate, and the seed.
-    """
-    name, kind, number, seed = task
-    truth = SYSTEMS[name].truth
-    began = time.process_time()
-    if kind == AVERAGED:
-        at, sd = averaged(table(name, "up", [seed + number, 0]), SYSTEMS[name].force, truth)
-        status = "converged"
-    else:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            fit = bp.map_estimate(problem(name, kind, seed + number), checks=False, progress=False, starts=1)
-        at, sd, status = fit.theta, fit.sd, fit.status
-    return {
-        "system": name, "kind": kind, "number": number, "seed": seed, "status": status,
-        "z": {p: (at[p] - truth[p]) / sd[p] for p in truth},
-        "contraction": {p: sd[p] / (0.3 * truth[p]) for p in truth},
-        "seconds": time.process_time() - began,
-    }  # fmt: skip
 
 
 def averaged(

@@ -373,7 +373,8 @@ def test_wide_and_narrow_files_are_read_alike(tmp_path, monkeypatch, table, chan
     (tmp_path / "run.csv").write_bytes(f"t,x,n\n{table}".encode())
     found = []
     for wide in (10**9, 0):  # as a narrow file and as a wide one
-        monkeypatch.setattr(text, "UNWANTED_RATIO", wide)
+        monkeypatch.setattr(text, "NARROW_COLUMNS", wide)
+        monkeypatch.setattr(text, "UNWANTED_RATIO", 0)
         try:
             run = bp.Recording.from_csv(tmp_path / "run.csv", time="t", outputs={"x": channel}, missing="drop")
             found.append((np.array(run.time).tolist(), run.outputs["x"].tolist()))

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+import bayesperiodic as bp
 from bayesperiodic.data import faults
+from bayesperiodic.data.recording_check import Effect, clipped_effect
 
 TIME = np.arange(4000) / 100.0
 PHASE = 2 * np.pi * TIME
@@ -188,3 +190,38 @@ def test_many_impacts_of_every_period_are_no_outliers():
     rng = np.random.default_rng(3)
     values = -20.0 * far * rng.uniform(0.8, 1.2, phase.size) + 0.05 * rng.standard_normal(phase.size)
     assert not faults.outliers_of(values, phase, values, 0.0).size
+
+
+def test_few_clipped_samples_a_cycle_are_found_by_their_equal_values():
+    """Noise fills the values below the limit; 1 % of the samples are at it, and seldom two of them in a row."""
+    generator = np.random.default_rng(0)
+    time = np.arange(3000) / 50
+    clean = np.cos(2 * np.pi * time) + 0.2 * np.cos(6 * np.pi * time + 0.4)
+    values = clean + 0.02 * generator.standard_normal(3000)
+    limit = np.quantile(values, 0.99)
+    clipped = np.minimum(values, limit)
+    low, high = faults.clipped_of(clipped, [])
+    assert low.size == 0 and high.tolist() == np.flatnonzero(clipped == limit).tolist()
+    assert not faults.in_rows(high)
+    recording = bp.Recording.from_arrays(time, {"x": clipped})
+    (finding,) = recording.check(frequency=1.0).findings
+    assert (finding.kind, finding.count) == ("clipped", 30) and finding.severity != "harmless"
+    for sound in (clean, values):  # the highest values of the signal without noise are equal
+        assert [end.size for end in faults.clipped_of(sound, [])] == [0, 0]
+
+
+@pytest.mark.parametrize("size", [0.01, 0.04])
+def test_bias_by_clipping_is_that_of_the_mean_of_many_recordings(size):
+    """Least squares of a sine whose upper part is limited, against the stated root sum of squares: within 15 %."""
+    generator = np.random.default_rng(1)
+    time = np.arange(3000) / 50
+    clean = np.cos(2 * np.pi * time + 0.3)
+    limit = float(np.quantile(clean + 0.02 * generator.standard_normal(3000), 1.0 - size))
+    waves = np.exp(-2j * np.pi * np.outer(np.arange(8), time))
+    values = clean + 0.02 * generator.standard_normal((200, 3000))
+    change = np.mean([waves @ (np.minimum(one, limit) - one) / 3000 for one in values], axis=0)
+    wanted = np.sqrt(np.r_[1.0, np.full(7, 2.0)] @ np.abs(change) ** 2) / (0.02 / np.sqrt(3000))
+    effect = Effect(np.nan, np.nan, clean, 0.02, 7)
+    assert clipped_effect(effect, time, 1.0, [(1.0, limit)]).bias == pytest.approx(wanted, rel=0.15)
+    turned = Effect(np.nan, np.nan, -clean, 0.02, 7)
+    assert clipped_effect(turned, time, 1.0, [(-1.0, -limit)]).bias == pytest.approx(wanted, rel=0.15)

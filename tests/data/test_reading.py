@@ -160,6 +160,16 @@ def test_first_row_of_missing_values_is_a_sample(path, word, width):
     np.testing.assert_array_equal(recording.times["a"], [0.5, 1.0, 1.5])
 
 
+@pytest.mark.parametrize("word", ["na", "k.A.", "pp", "EU", "pk"])
+def test_words_for_no_unit_are_no_units(path, word):
+    """Each of them is a unit of pint, "pp" of 0.35 mm."""
+    path.write_text(f"t,x\ns,{word}\n0,1\n1,2\n")
+    with pytest.raises(ValueError, match=r"units\['x'\]: must say what"):
+        bp.Recording.from_file(path, time="t", outputs={"x": "x"})
+    recording = bp.Recording.from_file(path, time="t", outputs={"x": "x"}, units={"x": 1.0})
+    np.testing.assert_array_equal(recording.outputs["x"], [1.0, 2.0])
+
+
 def test_byte_order_mark_before_the_first_number_is_no_part_of_it(path):
     """As where files are joined; elsewhere it shows damage."""
     path.write_text("a,b\n\ufeff1.5,1\n2,3\n", encoding="utf-8")

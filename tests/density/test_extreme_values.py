@@ -36,7 +36,9 @@ def test_densities_and_solves_are_silent(name, factor):
         density = problem.density(coordinates=coordinates)
         point = np.full(density.dimension, np.log(abs(factor)))
         assert not np.isnan(density.evaluate(np.tile(point, (2, 1))).log_prob).any()
-        assert not np.isnan(density.value_and_gradient(point)[0])
+        for far in (point, 1e5 * point):  # the logarithms of infinite values too, as a trajectory may reach
+            value, gradient, _ = density.value_and_gradient(far)
+            assert not np.isnan(value) and np.isfinite(gradient).all()
     assert {solution.status for solution in problem.solve(there).values()}
     assert problem.outputs(np.stack([there, theta]))[1].shape == (2,)
     anchored = problem.anchored(there)

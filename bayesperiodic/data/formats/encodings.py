@@ -13,6 +13,8 @@ MARKS = {
     codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32", codecs.BOM_UTF8: "utf-8",
     codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16",
 }  # fmt: skip
+# Encodings whose first 128 bytes are ASCII, by Python's names.
+ASCII_ENCODINGS = ("utf-8", "ascii", "cp1252", "iso8859-1", "iso8859-15")
 # Letters of UTF-8 with more than one byte.
 UTF8_LETTERS = re.compile(rb"[\xc2-\xdf][\x80-\xbf]|[\xe0-\xef][\x80-\xbf]{2}|[\xf0-\xf4][\x80-\xbf]{3}")
 COMMENT = re.compile(r"(?:^|[\r\n])[ \t]*#(?!N/A)")
@@ -99,10 +101,13 @@ def _check(path: Path, encoding: str) -> tuple[int, bool]:
     """
     name = "UTF-8" if encoding == "utf-8" else encoding
     comment, before, blanks, decoder = (0, 0), "\n", False, codecs.getincrementaldecoder(encoding)()
+    plain = codecs.lookup(encoding).name in ASCII_ENCODINGS
     with path.open("rb") as content:
         for number, part in enumerate(itertools.chain(iter(lambda: content.read(PART_BYTES), b""), [b""])):
-            try:
-                text = decoder.decode(part, final=not part)
+            plain = plain and part.isascii()
+            try:  # most parts are ASCII, and without what is searched for in their characters
+                seek = not plain or b"#" in part or b"\0" in part or not part
+                text = decoder.decode(part, final=not part) if seek else part[-1:].decode("ascii")
             except UnicodeDecodeError as error:
                 line = _lines(path, number * PART_BYTES) + error.object[: error.start].count(b"\n") + 1
                 cut_off = not part  # within a letter
@@ -119,7 +124,8 @@ def _check(path: Path, encoding: str) -> tuple[int, bool]:
             if "#" in text:
                 for match in COMMENT.finditer(before + text):
                     comment = number, text.count("\n", 0, match.end() - 1)
-            before, blanks = text[-1:] or before, blanks or (number > 0 and " " in text)
+            blanks = blanks or (number > 0 and (" " in text or plain and b" " in part))
+            before = text[-1:] or before
     return _lines(path, comment[0] * PART_BYTES) + comment[1] + 1 if comment != (0, 0) else 0, blanks
 
 

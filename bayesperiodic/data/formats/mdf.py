@@ -4,13 +4,13 @@ import contextlib
 import functools
 import gc
 import html
-import io
 import re
 import sys
+import weakref
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -48,16 +48,18 @@ IN_XML = re.compile(r"<TX[^>]*>(.*?)</TX>", re.DOTALL)
 def contents(file: Path, wanted: list[Key]) -> Contents:
     """Return the channels of an MDF file but its masters, which are their times; each is read when it is asked for."""
     asammdf = package("asammdf", "asammdf", "MDF files")
-    content = file.read_bytes()
-    mdf_blocks.check(content)
-    mdf = _opened(asammdf, content)
+    with contextlib.ExitStack() as stack:
+        content = stack.enter_context(file.open("rb"))
+        mdf_blocks.check(mdf_blocks.Bytes(content))
+        mdf = _opened(asammdf, content)
+        weakref.finalize(mdf, stack.pop_all().close)
     version = 4 if mdf.version >= "4" else 3
     labels = [*unique_names(_group_name(group, k, len(mdf.groups)) for k, group in enumerate(mdf.groups, 1))]
     channels = [channel for k, label in enumerate(labels) for channel in _channels(mdf, version, k, label)]
     return Contents("MDF file", tuple(channels), (f"version {mdf.version}",))
 
 
-def _opened(asammdf: Any, content: bytes) -> Any:
+def _opened(asammdf: Any, content: BinaryIO) -> Any:
     """Return the file as asammdf reads it.
 
     It gets no name, as it deletes a file whose name ends in .bz2 or .gzip. Bus messages remain as they are: databases
@@ -68,7 +70,7 @@ def _opened(asammdf: Any, content: bytes) -> Any:
         try:
             with silenced("asammdf"):
                 return asammdf.MDF(
-                    io.BytesIO(content), process_bus_logging=False, use_display_names=False, add_array_components=False
+                    content, process_bus_logging=False, use_display_names=False, add_array_components=False
                 )
         except Exception as error:
             reason = f"{type(error).__name__}: {error}"

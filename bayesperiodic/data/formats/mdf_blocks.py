@@ -4,9 +4,10 @@ asammdf follows the links of a damaged file without end if they form a circle, a
 cut off. Layouts after ASAM MDF 4.2 and Vector's description of MDF 3.3.
 """
 
+import io
 import struct
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, BinaryIO
 
 from bayesperiodic.data.formats.contents import LARGEST_ARRAY
 
@@ -29,9 +30,29 @@ CONVERSIONS = 10
 CUT_OFF, CIRCLE = "it is cut off or damaged", "it is damaged: its blocks form a circle"
 
 
-def check(content: Any) -> None:
+class Bytes:
+    """The bytes of an opened file, each read where it is needed."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._size = file, file.seek(0, io.SEEK_END)
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, key: slice) -> bytes:
+        start, stop = min(key.start or 0, self._size), min(key.stop, self._size)
+        self._file.seek(start)
+        return self._file.read(max(stop - start, 0))
+
+
+def _unpack(form: str, content: Bytes, start: int) -> tuple[Any, ...]:
+    """Return values at a place of a file; raise a struct.error if they are beyond its end."""
+    return struct.unpack(form, content[start : start + struct.calcsize(form)])
+
+
+def check(content: Bytes) -> None:
     """Raise a ValueError unless all blocks lie in the file, none leads back to itself, and all samples are there."""
-    if content[:8].strip(b" \0") == b"UnFinMF" or struct.unpack_from("<HH", content, UNFINISHED_FLAGS) != (0, 0):
+    if content[:8].strip(b" \0") == b"UnFinMF" or _unpack("<HH", content, UNFINISHED_FLAGS) != (0, 0):
         raise ValueError(
             "it is not finalized: the program that wrote it was stopped, and its numbers of samples are unknown; "
             "asammdf.MDF(path).save(other) writes a finalized one"
@@ -42,7 +63,7 @@ def check(content: Any) -> None:
         raise ValueError(CUT_OFF) from None
 
 
-def _check_4(content: Any) -> None:
+def _check_4(content: Bytes) -> None:
     for address, kind, links in _walk(content):
         if kind == b"##DG":
             _check_data_group(content, address, links)
@@ -54,17 +75,17 @@ def _check_4(content: Any) -> None:
         raise ValueError(CUT_OFF)
 
 
-def _block(content: Any, address: int) -> tuple[bytes, int, tuple[int, ...]]:
+def _block(content: Bytes, address: int) -> tuple[bytes, int, tuple[int, ...]]:
     """Return identifier, place of the data, and links of a block of version 4."""
     if not 0 < address <= len(content) - 24:
         raise ValueError(CUT_OFF)
-    kind, _, length, count = struct.unpack_from("<4sIQQ", content, address)
+    kind, _, length, count = _unpack("<4sIQQ", content, address)
     if not kind.startswith(b"##") or length < 24 + 8 * count or address + length > len(content):
         raise ValueError(CUT_OFF)
-    return kind, address + 24 + 8 * count, struct.unpack_from(f"<{count}Q", content, address + 24)
+    return kind, address + 24 + 8 * count, _unpack(f"<{count}Q", content, address + 24)
 
 
-def _walk(content: Any) -> Iterator[tuple[int, bytes, tuple[int, ...]]]:
+def _walk(content: Bytes) -> Iterator[tuple[int, bytes, tuple[int, ...]]]:
     """Yield the blocks of version 4 that form a tree."""
     seen, waiting = {0}, [FIRST_BLOCK]
     while waiting:
@@ -79,10 +100,10 @@ def _walk(content: Any) -> Iterator[tuple[int, bytes, tuple[int, ...]]]:
         waiting += [links[place] for place in TREE.get(kind, ()) if links[place]]
 
 
-def _check_data_group(content: Any, address: int, links: tuple[int, ...]) -> None:
+def _check_data_group(content: Bytes, address: int, links: tuple[int, ...]) -> None:
     """Raise a ValueError if a data group has fewer samples than its channel groups say, or more."""
     _, place, _ = _block(content, address)
-    identifier, needed, least, exact, group, seen = content[place], 0, 2**62, True, links[1], set()
+    identifier, needed, least, exact, group, seen = _unpack("B", content, place)[0], 0, 2**62, True, links[1], set()
     while group:
         if group in seen:
             raise ValueError(CIRCLE)
@@ -90,7 +111,7 @@ def _check_data_group(content: Any, address: int, links: tuple[int, ...]) -> Non
         kind, place, group_links = _block(content, group)
         if kind != b"##CG" or len(group_links) < 6:
             raise ValueError(CUT_OFF)
-        _, cycles, flags, _, _, size, invalid = struct.unpack_from("<QQHHIII", content, place)
+        _, cycles, flags, _, _, size, invalid = _unpack("<QQHHIII", content, place)
         exact &= not flags & VLSD
         width = identifier + size + (0 if flags & REMOTE_MASTER else invalid)
         needed += 0 if flags & VLSD else cycles * width
@@ -103,7 +124,7 @@ def _check_data_group(content: Any, address: int, links: tuple[int, ...]) -> Non
         raise ValueError(f"{CUT_OFF}: a data group has {length} bytes and not {needed}")
 
 
-def _length(content: Any, address: int) -> int:
+def _length(content: Bytes, address: int) -> int:
     """Return the number of bytes in a data block or a list of them, unpacked, without those of invalidation bits."""
     total, seen, waiting = 0, set(), [address]
     while waiting:
@@ -112,9 +133,9 @@ def _length(content: Any, address: int) -> int:
             raise ValueError(CIRCLE)
         seen.add(at)
         kind, place, links = _block(content, at)
-        size = struct.unpack_from("<Q", content, at + 8)[0] - 24
+        size = _unpack("<Q", content, at + 8)[0] - 24
         if kind == b"##DZ":
-            original, _, _, _, size, packed = struct.unpack_from("<2sBBIQQ", content, place)
+            original, _, _, _, size, packed = _unpack("<2sBBIQQ", content, place)
             if place + 24 + packed > len(content) or size > min(LARGEST_ARRAY, DEFLATE_RATIO * (packed + 100)):
                 raise ValueError(CUT_OFF)
             kind = b"##" + original
@@ -127,7 +148,7 @@ def _length(content: Any, address: int) -> int:
     return total
 
 
-def _check_conversion(content: Any, address: int, depth: int) -> None:
+def _check_conversion(content: Bytes, address: int, depth: int) -> None:
     """Raise a ValueError if the conversions of a channel refer to one another in a circle."""
     if not address:
         return
@@ -140,7 +161,7 @@ def _check_conversion(content: Any, address: int, depth: int) -> None:
         _check_conversion(content, link, depth + 1)
 
 
-def _check_3(content: Any) -> None:
+def _check_3(content: Bytes) -> None:
     """Raise a ValueError unless the blocks of version 2 or 3 form a tree, and all samples are there."""
     if content[24:26] != b"\0\0":
         raise ValueError("its numbers begin with the highest byte (Motorola), which asammdf does not read")
@@ -150,25 +171,25 @@ def _check_3(content: Any) -> None:
         if address in seen:
             raise ValueError(CIRCLE)
         seen.add(address)
-        kind, length = struct.unpack_from("<2sH", content, address)
+        kind, length = _unpack("<2sH", content, address)
         if kind != expected or length < max(TREE_3[kind]) + 4 or address + length > len(content):
             raise ValueError(CUT_OFF)
-        links = [struct.unpack_from("<I", content, address + place)[0] for place in TREE_3[kind]]
+        links = [_unpack("<I", content, address + place)[0] for place in TREE_3[kind]]
         below = {b"HD": [b"DG"], b"DG": [b"DG", b"CG"], b"CG": [b"CG", b"CN"], b"CN": [b"CN"]}[kind]
         waiting += [(link, name) for link, name in zip(links, below, strict=True) if link]
         if kind == b"DG":
             _check_data_group_3(content, address, links[1])
 
 
-def _check_data_group_3(content: Any, address: int, group: int) -> None:
-    data, _, identifiers = struct.unpack_from("<IHH", content, address + 16)
+def _check_data_group_3(content: Bytes, address: int, group: int) -> None:
+    data, _, identifiers = _unpack("<IHH", content, address + 16)
     needed, seen = 0, set()
     while group:
         if group in seen:
             raise ValueError(CIRCLE)
         seen.add(group)
-        size, cycles = struct.unpack_from("<HI", content, group + 20)
+        size, cycles = _unpack("<HI", content, group + 20)
         needed += cycles * (size + identifiers)
-        group = struct.unpack_from("<I", content, group + 4)[0]
+        group = _unpack("<I", content, group + 4)[0]
     if data + needed > len(content):
         raise ValueError(f"{CUT_OFF}: a data group has {max(len(content) - data, 0)} bytes and not {needed}")

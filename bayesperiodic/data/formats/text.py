@@ -31,10 +31,10 @@ from bayesperiodic.data.formats.text_header import (
     skip,
 )  # fmt: skip
 
-# Columns per wanted column above which the others are not made numbers, and the separator of the wanted ones.
-UNWANTED_RATIO, UNIT_SEPARATOR = 2, "\x1f"
-# Rows that pandas reads at once.
-PART_ROWS = 100_000
+# Columns of a file, and per wanted one, above which the others are not made numbers; the separator of the wanted ones.
+NARROW_COLUMNS, UNWANTED_RATIO, UNIT_SEPARATOR = 200, 2, "\x1f"
+# Cells that pandas reads at once, and least rows.
+PART_CELLS, PART_ROWS = 200_000, 2000
 # Bytes at the end of a file among which rows of summaries are searched for, and their first words.
 TAIL_BYTES = 2**14
 SUMMARY = re.compile(
@@ -273,7 +273,7 @@ def _read(file: Text, top: Head, places: list[int], decimal: str, surplus: int) 
         alone = width == 1
         if alone:
             source = io.StringIO(source.read().rstrip(" \t\r\n"))
-        elif len(places) * UNWANTED_RATIO < width or separator == BLANKS and top.more > 0:
+        elif NARROW_COLUMNS < width > len(places) * UNWANTED_RATIO or separator == BLANKS and top.more > 0:
             source = _narrowed(rows_of(source, separator, strict=True), places, width, width + max(top.more, 0) + 1)
             at = {place: k for k, place in enumerate(places)}
             width, surplus, separator = len(places) + 1, 0, UNIT_SEPARATOR
@@ -291,19 +291,20 @@ def _read(file: Text, top: Head, places: list[int], decimal: str, surplus: int) 
             "na_values": missing,
         }
         start = source.tell() if source is not text else None
-        table = _in_parts(source, options)
+        table = _in_parts(source, options, {*at.values(), *range(width - 1, width + surplus)})
         if table is None:
             if start is None:
                 text.seek(0)
                 skip(text, lines, top.separator)
             else:
                 source.seek(start)
-            table = _frame(pd.read_csv(source, **options))
-    if not table[0].size:
+            frame = pd.read_csv(source, **options)
+            table = {k: frame[k].to_numpy() for k in frame}
+    if not table[width - 1].size:
         raise ValueError(f"path: must be a CSV file with rows of data, got {file!r}, which has none.")
     if any(pd.notna(table[k]).any() for k in range(width, width + surplus)) or pd.isna(table[width - 1]).any():
         _check_fields(file, top)
-    return {place: table[k] for place, k in at.items()}, table[0].size
+    return {place: table[k] for place, k in at.items()}, table[width - 1].size
 
 
 def _has_blanks(file: Text, top: Head) -> bool:
@@ -315,20 +316,17 @@ def _has_blanks(file: Text, top: Head) -> bool:
         return " " in text.read(PART_BYTES)
 
 
-def _frame(table: Any) -> dict[int, np.ndarray]:
-    return {k: table[k].to_numpy() for k in table}
-
-
-def _in_parts(source: Any, options: dict[str, Any]) -> dict[int, np.ndarray] | None:
-    """Return columns that pandas reads part by part, or None if parts of a column are of different kinds.
+def _in_parts(source: Any, options: dict[str, Any], kept: set[int]) -> dict[int, np.ndarray] | None:
+    """Return the kept columns, which pandas reads part by part, or None if parts of one are of different kinds.
 
     It takes two thirds of the time of the whole at once.
     """
     import pandas as pd
 
     try:
-        with pd.read_csv(source, chunksize=PART_ROWS, **options) as parts:
-            tables = [_frame(part) for part in parts]
+        rows = max(PART_CELLS // len(options["names"]), PART_ROWS)
+        with pd.read_csv(source, chunksize=rows, **options) as parts:
+            tables = [{k: part[k].to_numpy() for k in kept} for part in parts]
     except pd.errors.EmptyDataError:
         return {k: np.empty(0) for k in options["names"]}
     if not tables:

@@ -148,7 +148,8 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
     of the solves.
 
     `parameters` is (sets, solves, parameters); for `polish` see `newton_chord`; `rates` tells whether the outputs
-    depend on q̇ or q̈. The solution is filled except for the frequency, z only if it has entries.
+    depend on q̇ or q̈. The solution is filled except for the frequency, z only if it has entries; solves whose status is
+    not "converged" before are left out.
     """
     outputs = grid_function_at(functions.outputs)
     points, count = anchors.z.shape[1], STATES if STATES > 0 else anchors.z.shape[2]
@@ -168,6 +169,8 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
     border = Border(table, table, table, table, np.empty(0, dtype=np.int64))
     for index in range(start, stop):
         e, b = index // solves, index % solves
+        if solution.status[e, b] != CONVERGED:
+            continue
         at, theta = anchors.z[e], parameters[e, b]
         setting = Setting(sets.inputs[e], theta, sets.frequency[e], sets.drift[e])
         sensitivities, anchor_parameters = anchors.sensitivities[e], anchors.parameters[e]

@@ -10,7 +10,8 @@ from bayesperiodic._compile.functions import grid_function_at
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
     from bayesperiodic.periodic._kernels.newton import *
 
-MAX_POINT_STEPS = 16
+# Steps, and those of them during which one may be longer than the one before.
+MAX_POINT_STEPS, FREE_POINT_STEPS = 16, 3
 SAFETY = 0.01  # of the prediction that the next step will be below the tolerance
 BEND_STEP, LEAST_BEND = 1e-4, 0.2
 
@@ -148,7 +149,7 @@ def broyden(
         for i in range(points):
             for s in range(count):
                 step[i * count + s] = (share * vector[i, s] - change[i, s]) / unit[s]
-        if iteration > 0 and not dot(step, step) < squares[iteration - 1]:
+        if iteration > FREE_POINT_STEPS and not dot(step, step) < squares[iteration - 1]:
             return False, iteration + 1
         for k in range(iteration):
             part = dot(taken[k], step) / squares[k]
