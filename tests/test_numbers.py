@@ -621,6 +621,21 @@ def clocks():
     yield f"at their nominal rates, the first {first}."
 
 
+@on("docs/studies/recordings.md")
+def faults_of_recordings():
+    d = results("recordings")
+    alarms = d["false_alarms"]
+    met = {row["what"]: row["met"] for row in d["checks"]}
+    assert met["good recordings with serious findings, or refused"] and alarms["refused"] == 0.0
+    yield f"{d['recordings']} good recordings"
+    yield f"{d['each']} of each size"
+    serious, warned, kept = (100 * alarms[key] for key in ("serious", "warned", "kept_mean"))
+    yield f"are in {serious:.1f} % of the good recordings, warnings in {warned:.1f} %, and none is refused"
+    yield f"On average, {kept:.0f} % of the cycles"
+    for fault, one in d["faults"].items():
+        yield f"| {fault} | {one['found']:.2g} | {one['biased']:.2g} | {one['hidden']:.2f} |"
+
+
 @on("docs/studies/resonance.md")
 def resonance():
     d = results("resonance")
