@@ -153,7 +153,7 @@ def real_array(argument: str, values: Any) -> np.ndarray:
             import pandas as pd
 
             array = np.where(pd.isna(array), np.nan, array)
-        floats = array.astype(float, copy=array.flags.writeable or array.base is not None)
+        floats = array.astype(float, copy=_can_change(array))
     except (TypeError, ValueError):
         kind = getattr(values, "dtype", None)
         got = f"{shortened(values)}{f' of type {kind}' if kind is not None else ''}"
@@ -224,10 +224,15 @@ def read_only(value: Any) -> Any:
     """Return arrays and mappings, also those in mappings, as copies that refuse changes; other values as they are."""
     if isinstance(value, Mapping):
         return ReadOnly({key: read_only(item) for key, item in value.items()})
-    if isinstance(value, np.ndarray) and (value.flags.writeable or value.base is not None):
+    if isinstance(value, np.ndarray) and _can_change(value):
         value = value.copy()
         value.flags.writeable = False
     return value
+
+
+def _can_change(array: np.ndarray) -> bool:
+    """Return whether an array, or one whose memory it uses, can be written to."""
+    return bool(array.flags.writeable or array.base is not None)
 
 
 def _code_points(name: str) -> str:

@@ -236,14 +236,15 @@ def _piles_up(values: np.ndarray, top: np.ndarray, place: np.ndarray) -> bool:
     """Return whether the samples at the highest value are more than a smooth signal has there."""
     if top.size < FEWEST_CLIPPED:
         return False
-    if not in_rows(top) and top.size < FEWEST_SCATTERED:
+    scattered = not in_rows(top)
+    if scattered and top.size < FEWEST_SCATTERED:
         return False
     levels, counts = np.unique(values[place], return_counts=True)
     # A relay has few values; a quantised one has neighbouring levels with which the highest is compared.
     if levels.size < FEWEST_VALUES or top.size > MOST_DROPPED * place.size:
         return False
     gaps = np.diff(levels[-top.size - 1 :])
-    if not in_rows(top) and gaps[-1] > LARGEST_GAP * np.median(gaps[:-1]):  # an exact maximum of a signal without noise
+    if scattered and gaps[-1] > LARGEST_GAP * np.median(gaps[:-1]):  # an exact maximum of a signal without noise
         return False
     below = counts[-6:-1]
     return bool(top.size > PILED_UP * max(float(below.max()), 1.0))

@@ -1,6 +1,6 @@
 """Contents of objects in memory: tables of pandas, datasets of xarray, time series after SEP 005."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -38,9 +38,9 @@ def dataframe(table: Any) -> Contents:
         if str(column.dtype).startswith("pint["):  # of pint-pandas
             unit, values = str(column.dtype)[5:-1], column.pint.magnitude.to_numpy
         unit = unit if isinstance(unit, str) else ""
-        channels.append(StoredChannel(str(name), len(table), values, group, unit, clock))
+        channels.append(StoredChannel(str(name), len(table), _copied(values), group, unit, clock))
     if table.index.name is not None and str(table.index.name) not in [channel.name for channel in channels]:
-        channels.append(StoredChannel(str(table.index.name), len(table), table.index.to_numpy, clock=clock))
+        channels.append(StoredChannel(str(table.index.name), len(table), _copied(table.index.to_numpy), clock=clock))
     return Contents("DataFrame", tuple(_distinct("table", channels)), word="column", numbered=False)
 
 
@@ -66,7 +66,7 @@ def dataset(data: Any) -> Contents:
             refusal = f"packed values, with {packed[0]!r} in attrs; decode them first by xarray.decode_cf(dataset)"
         clock = clocks.get(variable.dims[0]) if dimensions else None
         read, size, unit = variable.to_numpy, int(variable.size), _unit(variable)
-        channels.append(StoredChannel(str(name), size, read, unit=unit, clock=clock, refusal=refusal))
+        channels.append(StoredChannel(str(name), size, _copied(read), unit=unit, clock=clock, refusal=refusal))
     return Contents("Dataset", tuple(channels), word="variable")
 
 
@@ -120,7 +120,12 @@ def _sep005(place: int, one: Mapping[str, Any]) -> StoredChannel:
                 )
         clock = Clock(stored=lambda: times, origin=origin)
     group = str(one.get("group") or "")
-    return StoredChannel(str(one["name"]), data.size, lambda: data, group, str(one["unit_str"] or ""), clock)
+    return StoredChannel(str(one["name"]), data.size, _copied(lambda: data), group, str(one["unit_str"] or ""), clock)
+
+
+def _copied(read: Callable[[], Any]) -> Callable[[], np.ndarray]:
+    """Return a reader of arrays that the user does not have, as a recording keeps them."""
+    return lambda: np.array(read())
 
 
 def _is_ragged(values: Any) -> bool:

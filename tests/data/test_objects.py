@@ -217,3 +217,21 @@ def test_missing_date_at_the_start_is_left_out():
     index = pd.DatetimeIndex([pd.NaT, *pd.date_range("2024", periods=399, freq="10ms")])
     run = bp.Recording.from_dataframe(pd.DataFrame({"x": X}, index=index), outputs={"x": "x"}, missing="drop")
     assert run.time == pytest.approx(TIME[:-1]) and np.array_equal(run.outputs["x"], X[1:])
+
+
+@pytest.mark.parametrize("kind", ["arrays", "frame", "xarray", "sep005"])
+def test_arrays_of_the_user_are_neither_shared_nor_made_read_only(kind):
+    time, x = TIME.copy(), X.copy()
+    if kind == "arrays":
+        run = bp.Recording.from_arrays(time, {"x": x})
+    elif kind == "frame":
+        run = bp.Recording.from_dataframe(pd.DataFrame({"t": time, "x": x}), time="t", outputs={"x": "x"})
+    elif kind == "xarray":
+        data = xr.Dataset({"x": ("time", x)}, {"time": ("time", time, {"units": "s"})})
+        run = bp.Recording.from_xarray(data, outputs={"x": "x"})
+    else:
+        run = bp.Recording.from_sep005([{"name": "x", "data": x, "time": time, "unit_str": "m"}], outputs={"x": "x"})
+    assert x.flags.writeable and time.flags.writeable
+    x[:], time[:] = 7.0, 7.0
+    np.testing.assert_array_equal(run.outputs["x"], X)
+    np.testing.assert_allclose(run.time, TIME)

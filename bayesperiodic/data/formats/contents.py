@@ -52,8 +52,8 @@ class Clock:
 class StoredChannel:
     """A channel of a file.
 
-    `values` returns its physical values, with the scale of the file applied: numbers, dates or texts. `refusal` says
-    why they cannot be used, and what to do; `remarks` say what a user would not guess.
+    `values` returns its physical values, with the scale of the file applied: numbers, dates or texts, in an array that
+    nobody else has. `refusal` says why they cannot be used, and what to do; `remarks` say what a user would not guess.
     """
 
     name: str
