@@ -160,6 +160,17 @@ def test_first_row_of_missing_values_is_a_sample(path, word, width):
     np.testing.assert_array_equal(recording.times["a"], [0.5, 1.0, 1.5])
 
 
+@pytest.mark.parametrize("blank", ["\u00a0", "\u2028", "\u3000"])
+@pytest.mark.parametrize("place", [1, 2])
+def test_blanks_of_other_alphabets_are_no_part_of_a_number(path, blank, place):
+    """At the end of a file of one column they were dropped, elsewhere refused."""
+    cells = ["0.5", "1.5", "2.5"]
+    cells[place] += blank
+    path.write_text("\n".join(["a", *cells]), encoding="utf-8")
+    with pytest.raises(ValueError, match="must contain numbers"):
+        bp.Recording.from_csv(path, sampling_rate=2.0, outputs={"a": "a"})
+
+
 @pytest.mark.parametrize("word", ["na", "k.A.", "pp", "EU", "pk"])
 def test_words_for_no_unit_are_no_units(path, word):
     """Each of them is a unit of pint, "pp" of 0.35 mm."""

@@ -1,5 +1,6 @@
 """MDF files, written here after ASAM MDF 4.1 and Vector's description of MDF 3.3, or by asammdf for variants."""
 
+import io
 import logging
 import struct
 import warnings
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.data.formats import mdf_blocks
 from tests.data.test_damaged_files import damaged
 
 TIME = np.arange(200) / 1000
@@ -440,3 +442,10 @@ def test_damaged_file_is_read_or_refused_by_one_error(tmp_path, content, capfd):
                 assert "run.mf4" in str(error)
     assert capfd.readouterr() == ("", "") and logging.getLogger("asammdf").level == level
     assert [one.name for one in tmp_path.iterdir()] == ["run.mf4"]
+
+
+def test_places_beyond_the_end_of_a_file_are_empty():
+    """Links of damaged files are any numbers of 64 bits."""
+    content = mdf_blocks.Bytes(io.BytesIO(b"abc"))
+    assert len(content) == 3
+    assert [content[1:9], content[3:4], content[2**64 - 8 : 2**64]] == [b"bc", b"", b""]
