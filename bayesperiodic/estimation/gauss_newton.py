@@ -27,6 +27,8 @@ UNINFORMED = 0.9
 OVERFLOWS = 1e150
 # Change of the factors that ends the correction, and the largest part of its values that parameters may take up.
 SETTLED_FACTOR, MOST_TAKEN = 1e-6, 0.99
+# Status of a climb that was ended by what it reports to.
+ENDED = "ended"
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,8 @@ class Iterate:
     objective: float
 
 
-# Called for every new iterate with it and the step [standard deviations].
-Report = Callable[[Iterate, float], None] | None
+# Called for every new iterate with it and the step [standard deviations]; True ends the climb.
+Report = Callable[[Iterate, float], bool] | None
 
 
 class End(NamedTuple):
@@ -194,6 +196,8 @@ def climb(
     for _ in range(MAX_ROUNDS):
         now, status, objectives = _ascend(objective, now, resting, report, most)
         history += objectives
+        if status == ENDED:
+            break
         ends = at_ends(objective, now)
         inwards = ends * objective.hessian_and_gradient(now)[1] < 0.0
         wanted = always | (ends != 0.0 if status == "stalled" else resting & ~inwards)
@@ -251,8 +255,8 @@ def _ascend(
             return now, "converged" if size < NEGLIGIBLE_STEP else "stalled", history
         gain, now = trial.objective - now.objective, objective.anchored(trial)
         history.append(now.objective)
-        if report is not None:
-            report(now, damping * size)
+        if report is not None and report(now, damping * size):
+            return now, ENDED, history
         if size < CONVERGED_STEP and gain < SMALL_GAIN:
             return now, "converged", history
     return now, "iterations", history

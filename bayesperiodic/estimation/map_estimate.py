@@ -39,7 +39,14 @@ from bayesperiodic.estimation.gauss_newton import (
     resumed,
 )
 from bayesperiodic.estimation.laplace import joint_laplace
-from bayesperiodic.estimation.modes import default_starts, notable, weighed, with_images
+from bayesperiodic.estimation.modes import (
+    SEPARATE_SDS,
+    default_starts,
+    notable,
+    optimum_of,
+    weighed,
+    with_images,
+)
 from bayesperiodic.estimation.result import MapEstimate, NoiseEstimate, Search, TrueInputs
 from bayesperiodic.estimation.second_order import second_order_warnings
 from bayesperiodic.estimation.table_orbits import table_warnings
@@ -168,7 +175,7 @@ def map_estimate(
     end = _on_measured_orbits(problem, theta, end, progress)
     ends: list[End | None] = [end]
     for draw in problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0))):
-        ends.append(_from_draw(objective, end.iterate, draw, progress))
+        ends.append(_from_draw(objective, [one for one in ends if one], draw, progress))
     best = max((end for end in ends if end), key=preference)
     noisy, moved = _with_noisy_inputs(problem, best, progress)
     if noisy is not problem:
@@ -278,22 +285,34 @@ def _linearised(problem: Problem, theta: np.ndarray, initial: InitialEstimate | 
     return LogPosterior(problem, ResponseSolver.start(problem, initial.theta, initial.states)).linearise(initial.theta)
 
 
-def _from_draw(objective: Objective, first: Iterate, theta: np.ndarray, progress: bool) -> End | None:
-    """Return the end of the iteration from a draw of the prior; None if there is no orbit or no finite density."""
+def _from_draw(objective: Objective, ends: Sequence[End], theta: np.ndarray, progress: bool) -> End | None:
+    """Return the end of the iteration from a draw of the prior; None if there is no orbit or no finite density.
+
+    It is solved from the orbits of the first end, and is one of the ends where it comes close to that.
+    """
+    first = ends[0].iterate
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         other = objective.at(theta, first.here, objective.density.problem.likelihood.guess())
-        return None if other is None else _climb(objective, objective.anchored(other), progress)
+        return None if other is None else _climb(objective, objective.anchored(other), progress, ends=ends)
 
 
-def _climb(objective: Objective, first: Iterate, progress: bool, most: int = MAX_STEPS) -> End:
+def _climb(
+    objective: Objective, first: Iterate, progress: bool, most: int = MAX_STEPS, ends: Sequence[End] = ()
+) -> End:
+    """Climb with a progress bar; where an iterate comes close to one of the ends, that is returned."""
+    reached: list[End] = []
     with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress, delay=SHOWN_AFTER) as bar:
 
-        def report(iterate: Iterate, size: float) -> None:
+        def report(iterate: Iterate, size: float) -> bool:
             bar.set_postfix_str(f"objective {iterate.objective:.6g}, step {size:.2g} sd", refresh=False)
             bar.update()
+            known = optimum_of(objective, iterate, ends) if size < SEPARATE_SDS else None
+            reached.extend([known] if known else [])
+            return known is not None
 
-        return climb(objective, first, report=report, most=most)
+        end = climb(objective, first, report=report, most=most)
+    return reached[0] if reached else end
 
 
 def _on_best_sheets(problem: Problem, end: End, progress: bool) -> End:

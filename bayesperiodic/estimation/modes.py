@@ -21,6 +21,8 @@ MOST_STARTS, MOST_UNKNOWNS, DENSE = 8, 16_000, 50
 # Ends of the iteration are separate optima if their distance exceeds one standard deviation of the Laplace
 # approximation at one of them. Optima whose objective is lower than the best one's by more than 30 are left out.
 SEPARATE_SDS, LOWEST_OBJECTIVE, MOST_MODES = 1.0, 30.0, 16
+# An iterate within this distance of a known optimum leads to it, if its objective is lower by no more than the square.
+NEAR_SDS = 0.3
 # A converged end is preferred to one that has not converged if their objectives differ by less.
 EQUAL_OBJECTIVES = 1e-3
 # Smallest density of an image, relative to the optimum's, and largest number of signs changed in all combinations.
@@ -95,6 +97,16 @@ def with_images(objective: Objective, ends: Sequence[End], climbed: Callable[[It
                 waiting.append(end)
     optima.sort(key=lambda end: -end.iterate.objective)
     return [end for end in optima if end.iterate.objective >= optima[0].iterate.objective - LOWEST_OBJECTIVE]
+
+
+def optimum_of(objective: Objective, iterate: Iterate, ends: Sequence[End]) -> End | None:
+    """Return the converged end next to an iterate of the same objective, which the climb leads to; None if none is."""
+    for end in ends:
+        if end.status == "converged" and len(iterate.here.other_orbits) == len(end.iterate.here.other_orbits):
+            missing = end.iterate.objective - iterate.objective
+            if 0.0 <= missing <= _distance(objective, iterate.theta, end.iterate) ** 2 <= NEAR_SDS**2:
+                return end
+    return None
 
 
 def _is_separate(objective: Objective, theta: np.ndarray, optima: Sequence[End]) -> bool:
