@@ -49,6 +49,7 @@ from bayesperiodic.estimation.modes import (
 )
 from bayesperiodic.estimation.result import MapEstimate, NoiseEstimate, Search, TrueInputs
 from bayesperiodic.estimation.second_order import second_order_warnings
+from bayesperiodic.estimation.shape import shape_warnings
 from bayesperiodic.estimation.table_orbits import table_warnings
 from bayesperiodic.estimation.units import compared_with_data, not_isolated, singular_start, unit_error
 from bayesperiodic.likelihood.noise import Relative
@@ -144,8 +145,8 @@ def map_estimate(
     UserWarning
         If an estimate lies at the end of its prior's support, if another optimum has more than 1 % of the posterior
         mass by its Laplace approximation, if data contain no noise, if the orbit of an experiment is not the measured
-        one, if the branch of a response table does not reach a point or is unstable there, if the data depend on a
-        parameter only to second order at the estimate, and as `check` does.
+        one, if the branch of a response table does not reach a point or is unstable there, if the posterior of a table is
+        not normal near the estimate, if the data depend on a parameter only to second order there, and as `check` does.
 
     References
     ----------
@@ -191,7 +192,8 @@ def map_estimate(
     ]
     result = _describe(problem, objective, modes, tuple(outcomes), checks)
     beyond = second_order_warnings(objective, modes[0].iterate)
-    for text in (*estimation_warnings(problem, result), *beyond):
+    shape = shape_warnings(objective, modes[0].iterate, result.joint)
+    for text in (*estimation_warnings(problem, result), *beyond, *shape):
         warnings.warn(text, UserWarning, stacklevel=3)
     return result
 
