@@ -1,14 +1,17 @@
 """Estimates from response tables: the same from distant starts, and warnings about orbits that cannot be right."""
 
+import re
 import warnings
 
 import numpy as np
 import pytest
+from scipy.special import i0e
 
 import bayesperiodic as bp
-from tests.response_tables import TRUTH, noisy, problem_of, swept
+from tests.response_tables import PRIORS, TRUTH, harmonic_balance, noisy, problem_of, swept
 
 F = np.linspace(0.1, 0.26, 24)
+TRUTH_OF_PRIORS = {name: TRUTH[name] for name in PRIORS}
 
 
 def estimate(problem, **more):
@@ -49,10 +52,59 @@ def test_points_that_no_orbit_of_the_branch_reaches_are_reported():
 
 
 def test_amplitudes_alone_tell_the_branch():
-    table = {"f": F, "A": np.abs(noisy(swept(F, "up"), 0.01, 2))}
-    columns = {"frequency": "f", "outputs": {"displacement": "A"}, "inputs": {"force": 0.2}}
-    runs = bp.response_table(table, **columns, sweep="up", sd={"displacement": 0.01})
-    priors = {"c": bp.LogNormal(0.1, 0.3), "k": bp.LogNormal(1.0, 0.1), "k3": bp.LogNormal(0.3, 0.3)}
-    fit, texts = estimate(bp.Problem(bp.models.duffing, runs, priors=priors, fixed={"m": 1.0}))
+    fit, texts = estimate(amplitudes_alone(F, "up", 2))
     assert fit.converged and not texts
     assert all(abs(fit.theta[name] - TRUTH[name]) < 4.0 * fit.sd[name] for name in fit.theta)
+
+
+def amplitudes_alone(frequencies, direction, seed):
+    """Return the problem of a table of amplitudes with stated errors."""
+    table = {"f": frequencies, "A": np.abs(noisy(swept(frequencies, direction), 0.01, seed))}
+    columns = {"frequency": "f", "outputs": {"displacement": "A"}, "inputs": {"force": 0.2}}
+    runs = bp.response_table(table, **columns, sweep=direction, sd={"displacement": 0.01})
+    return bp.Problem(bp.models.duffing, runs, priors=PRIORS, fixed={"m": 1.0})
+
+
+def harmonic_balance_falls(problem, fit, name, steps):
+    """Return by how much the log-posterior falls where one parameter moves by standard deviations of Laplace.
+
+    The amplitudes are those of harmonic balance with SciPy; rows beyond the fold have the amplitude there, and its distance.
+    """
+    mode, covariance = np.log([*fit.joint_mode.values()]), fit.joint_covariance.to_numpy()
+    at = [*fit.joint_mode].index(name)
+    move = covariance[at] / np.sqrt(covariance[at, at])
+    values = np.exp(mode + np.outer([0.0, *steps], move))
+    f, c = harmonic_balance(*values.T)
+    measured = np.array([(e.frequency, e.measurements[0].value) for e in problem.experiments])
+    result = []
+    for frequency, amplitude, theta in zip(f.T, np.abs(c).T, values, strict=True):
+        upper, lower = np.flatnonzero(np.diff(np.sign(np.diff(frequency)))) + 1
+        jumped = measured[:, 0] > frequency[upper] if not result else jumped
+        first = np.interp(np.minimum(measured[:, 0], frequency[upper]), frequency[: upper + 1], amplitude[: upper + 1])
+        last = np.interp(np.maximum(measured[:, 0], frequency[lower]), frequency[lower:], amplitude[lower:])
+        model, y = np.where(jumped, last, first), measured[:, 1]
+        rice = np.log(y / 1e-4) - (y - model) ** 2 / 2e-4 + np.log(i0e(y * model / 1e-4))
+        prior = -0.5 * np.sum(((np.log(theta) - np.log([0.1, 1.0, 0.3])) / [0.3, 0.1, 0.3]) ** 2)
+        beyond = np.where(jumped, 0.0, np.maximum(measured[:, 0] / frequency[upper] - 1.0, 0.0))
+        result.append(rice.sum() + prior - 0.5 * np.sum((beyond / problem.experiments[0].sweep.resolution) ** 2))
+    return result[0] - np.array(result[1:])
+
+
+def test_a_posterior_that_ends_at_a_jump_is_not_called_normal():
+    """With amplitudes alone, the density falls off a cliff on one side of the estimate: so it does by another method.
+
+    With phases it is normal, and nothing is said.
+    """
+    rows = np.linspace(0.1, 0.26, 40)
+    problem = amplitudes_alone(rows, "up", 2)
+    with pytest.warns(UserWarning, match="posterior is not normal") as caught:
+        fit = bp.map_estimate(problem, start=TRUTH_OF_PRIORS, progress=False)
+    (text,) = [str(one.message) for one in caught if "not normal" in str(one.message)]
+    name, step, fall = re.search(r"where '(\w+)' moves by ([-+]\d) .* falls by ([\d.e+]+) instead of 2,", text).groups()
+    (other,) = harmonic_balance_falls(problem, fit, name, [float(step)])
+    assert other > 8.0 and float(fall) == pytest.approx(other, rel=0.05)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        bp.map_estimate(
+            problem_of(rows, noisy(swept(rows, "up"), 0.01, 2), "up"), start=TRUTH_OF_PRIORS, progress=False
+        )
