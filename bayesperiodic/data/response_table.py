@@ -93,7 +93,7 @@ def response_table(
         branch is compared with the orbit at the fold, and the distance to it, over this standard deviation, is one
         more residual.
     samples : int, optional
-        Grid points per period, by default 48, or 32 for each harmonic up to the highest in the table. With the default
+        Grid points per period, by default 64, or 32 for each harmonic up to the highest in the table. With the default
         scheme of tables, "central4", this is enough for smooth responses; `check` tells what twice as many change.
 
     Returns
@@ -179,7 +179,7 @@ def response_table(
 
 
 # Default numbers of grid points: least, and for each harmonic up to the highest one in a table.
-FEWEST_TABLE_POINTS, POINTS_A_HARMONIC = 48, 32
+FEWEST_TABLE_POINTS, POINTS_A_HARMONIC = 64, 32
 EXAMPLE = "{'displacement': 'the column of its amplitudes'}"
 
 

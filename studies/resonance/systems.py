@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 import bayesperiodic as bp
 
-SAMPLES, NOISE, POINTS = 48, 0.01, 40
+SAMPLES, NOISE, POINTS = 64, 0.01, 40
 AMPLITUDE, PHASE, BOTH = "amplitude", "amplitude and phase", "amplitude, both sweeps"
 
 TWO_MODES = bp.Model(

@@ -106,7 +106,7 @@ def test_the_posterior_is_that_of_harmonic_balance_with_the_fold_as_its_end():
     """
     rows, sd = np.array([0.12, 0.15, 0.17, 0.185, 0.195, 0.1985, 0.20015]), 0.03
     data = noisy(swept(rows, "up"), sd, 3)
-    samples = 48
+    samples = 64
     known = {"m": 1.0, "variance[displacement]": samples / 2 * sd**2}
     problem = problem_of(rows, data, "up", fixed=known).anchored(dict(zip(("c", "k", "k3"), THETA, strict=True)))
     spread = np.array([[1e-4, 0.0, 0.0], [0.0, 4e-4, -8e-4], [0.0, -8e-4, 2.2e-3]])
