@@ -144,14 +144,14 @@ def soft_sweep(frequencies, force):
 @pytest.mark.slow
 @pytest.mark.parametrize("direction", ["up", "down"])
 def test_amplitudes_of_a_softening_spring_lead_to_the_truth_from_wide_priors(direction):
-    """Precise amplitudes alone, with gaps: without the stage of larger errors a sweep down ended 1,300 lower."""
+    """Precise amplitudes alone, with gaps: without the stage of larger errors the sweep down ended 15,000 lower."""
     rows = np.delete(np.linspace(0.11, 0.19, 36), [5, 6, 7, 20])
     rows, force, sd = rows if direction == "up" else rows[::-1], 0.06, 0.005
-    table = {"f": rows, "A": np.abs(noisy(soft_sweep(rows, force), sd, 1))}
+    table = {"f": rows, "A": np.abs(noisy(soft_sweep(rows, force), sd, 0))}
     columns = {"frequency": "f", "outputs": {"x": "A"}, "inputs": {"force": force}}
     runs = bp.response_table(table, **columns, sweep=direction, sd={"x": sd})
     springs = {"k": bp.LogNormal(1.0, 0.2), "k3": bp.Normal(0.0, 0.5), "k5": bp.Normal(0.0, 0.5)}
     problem = bp.Problem(SOFT, runs, priors={"c": bp.LogNormal(0.05, 0.5)} | springs)
-    fit, _ = estimate(problem, starts=2)
+    fit, _ = estimate(problem, starts=1)
     assert fit.converged
     assert all(abs(fit.theta[name] - SOFT_TRUTH[name]) < 4.5 * fit.sd[name] for name in SOFT_TRUTH)
