@@ -12,6 +12,7 @@ from scipy.stats import t as student
 
 import bayesperiodic as bp
 from bayesperiodic.priors.stored import as_text, from_text
+from bayesperiodic.problem.parameters import support, unit
 from bayesperiodic.sampling.membership import Expected, UnitEstimate
 from bayesperiodic.sampling.population import Redraws, Settings, fitted
 from bayesperiodic.sampling.population_density import Hierarchy, Parameters, PopulationDensity
@@ -179,6 +180,10 @@ def test_result_can_be_saved_and_is_printed(tmp_path):
     result.save(tmp_path / "population.h5")
     loaded = bp.load(tmp_path / "population.h5")
     assert repr(loaded) == repr(result) and "Population of 8 units, normal (converged)" in repr(result)
+    group = loaded.tree["posterior"].to_dataset()
+    assert [(unit(group, label), support(group, label)) for label in loaded.labels] == [
+        ("m", (-np.inf, np.inf)), ("m", (0.0, np.inf)),
+    ]  # fmt: skip
     assert loaded.as_prior() == result.as_prior()
     np.testing.assert_array_equal(loaded.predict()["a"], result.predict()["a"])
 
