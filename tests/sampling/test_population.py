@@ -1,5 +1,6 @@
 """Populations against closed forms, quadrature, and the joint posterior."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 
@@ -344,6 +345,24 @@ def test_stored_draws_and_problems_with_draws_give_the_same_population(tmp_path)
     )
     assert repr(first) == repr(second)
     assert first.unit_calls == sum(posterior.log_posterior_calls for _, posterior in pairs.values())
+
+
+@cache
+def three_gears(executor=None):
+    """Return the population of three gears, sampled by these workers."""
+    return bp.population(gears(3), ["k"], spread={"k": bp.HalfNormal(0.2)}, seed=1, executor=executor, progress=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["processes", "dask", "threads"])
+def test_populations_are_identical_for_any_executor(which, request):
+    """Three gears, sampled by workers, which also return their draws in any order."""
+    with ThreadPoolExecutor(2) as threads:
+        result = three_gears(threads if which == "threads" else request.getfixturevalue(which))
+    serial = three_gears()
+    for label in serial.labels:
+        np.testing.assert_array_equal(result.draws(label), serial.draws(label))
+    assert result.units.equals(serial.units) and result.unit_calls == serial.unit_calls > 0
 
 
 @pytest.mark.slow
