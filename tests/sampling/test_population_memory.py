@@ -52,9 +52,8 @@ def traced(function):
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize(
-    "count", [pytest.param(40, marks=pytest.mark.slow), pytest.param(1000, marks=pytest.mark.campaign)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [40])
 def test_stored_units_take_the_memory_of_one_and_2000_draws_of_each(stored, count):
     """The files are read several times; mean and spread are those of the linear model with as many units.
 
