@@ -4,6 +4,7 @@ from itertools import combinations
 from unittest import mock
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from matplotlib.text import Text
 
@@ -27,6 +28,15 @@ def posterior_of(draws, supports=None, modes=None, units=None, walkers=10):
     tree = xr.DataTree.from_dict({"posterior": xr.Dataset(group, coords), "sample_stats": xr.Dataset(stats)})
     ones = dict.fromkeys(draws, 1.0)
     return bp.Posterior(tree, True, "made for a test", ones, ones, ones, 0.5, {}, 1, 1)
+
+
+def population_of(draws):
+    """Return a population of one parameter, with the given draws of the population's parameters [m]."""
+    at = {"a": {"logarithmic": False, "unit": "m", "low": -np.inf, "high": np.inf}}
+    empty = pd.DataFrame()
+    times = dict.fromkeys(draws, 1.0)
+    tree = posterior_of(draws).tree
+    return bp.Population(tree, ("a",), at, {}, np.inf, {}, empty, empty, True, "made for a test", times, 1, 1, 1)
 
 
 def texts(figure):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from matplotlib.contour import ContourSet
+from scipy.integrate import cumulative_trapezoid
 from scipy.stats import multivariate_normal, norm
 
 import bayesperiodic as bp
@@ -16,7 +17,10 @@ from bayesperiodic.plot import grid, regions
 from bayesperiodic.plot.style import ENSEMBLES
 from bayesperiodic.problem.parameters import support
 from bayesperiodic.sampling.convergence import arviz
-from tests.drawn import faults, posterior_of
+from bayesperiodic.sampling.population_density import Hierarchy
+from bayesperiodic.sampling.population_result import parameter_attributes
+from bayesperiodic.sampling.population_units import Coordinate
+from tests.drawn import faults, population_of, posterior_of
 
 COUNT = 20_000
 REAL, POSITIVE = (-np.inf, np.inf), (0.0, np.inf)
@@ -249,6 +253,52 @@ def test_figures_and_draws_work_with_corner_and_arviz(solved):
     theirs = corner.corner(posterior.data, var_names=names, bins=10)
     assert [theirs.axes[k].get_xlabel() for k in (2, 3)] == names
     assert arviz().plot_pair(posterior.data, var_names=names) is not None
+
+
+@pytest.mark.parametrize("style", ["regions", "corner"])
+def test_populations_are_drawn_with_their_units_and_supports(style):
+    generator = np.random.default_rng(2)
+    draws = {"mean[a]": 1.0 + 0.1 * generator.standard_normal(4000), "spread[a]": generator.gamma(6.0, 0.05, 4000)}
+    result = population_of(draws)
+    figure = bp.plot.corner(result, style=style, truths={"spread[a]": 2.0})
+    assert [figure.axes[k].get_xlabel() for k in (2, 3)] == ["mean[a]\n[m]", "spread[a]\n[m]"]
+    low, high = figure.axes[2].get_ylim()
+    assert low < np.quantile(draws["spread[a]"], 0.01) < 2.0 < high
+    legend = " ".join(text.get_text() for text in figure.legends[0].get_texts())
+    assert "MCMC" in legend and "truth" in legend
+    if style == "regions":
+        x, density = figure.axes[3].lines[0].get_data()
+        quartiles = np.quantile(draws["spread[a]"], [0.25, 0.5, 0.75])
+        shares = np.interp(quartiles, x, cumulative_trapezoid(density, x, initial=0.0))
+        assert shares == pytest.approx([0.25, 0.5, 0.75], abs=0.03)
+    title = bp.plot.corner(replace(result, converged=False), style=style).legends[0].get_title().get_text()
+    assert title == "NOT CONVERGED"
+
+
+def test_the_attributes_of_a_population_are_those_of_its_parameters():
+    """Logarithmic parameters have dimensionless spreads, slopes are per unit of the covariate."""
+    spreads = {"k": bp.HalfNormal(0.1), "b": bp.Uniform(0.0, 2.0)}
+    hierarchy = Hierarchy(("k", "b"), ("day",), spreads, {"k": 1.0, "b": 1.0}, True, np.inf)
+    coordinates = [Coordinate(True, "N/m", POSITIVE), Coordinate(False, "m", REAL)]
+    attributes = {label: [*parameter_attributes(hierarchy, coordinates, label).values()] for label in hierarchy.labels}
+    assert attributes == {
+        "mean[k]": ["N/m", [0.0, np.inf]],
+        "mean[b]": ["m", [-np.inf, np.inf]],
+        "slope[k, day]": ["1 per day", [-np.inf, np.inf]],
+        "slope[b, day]": ["m per day", [-np.inf, np.inf]],
+        "spread[k]": ["1", [0.0, np.inf]],
+        "spread[b]": ["m", [0.0, 2.0]],
+        "correlation[k, b]": ["1", [-1.0, 1.0]],
+    }
+
+
+def test_what_populations_do_not_have_is_refused(solved):
+    problem, fit, _ = solved
+    for argument in ({"laplace": fit}, {"problem": problem}):
+        with pytest.raises(ValueError, match=f"{next(iter(argument))}: must be None for a Population"):
+            bp.plot.corner(population_of({"mean[a]": np.arange(8.0)}), **argument)
+    with pytest.raises(ValueError, match=r"name.*: .*mean\[a\]"):
+        bp.plot.corner(population_of({"mean[a]": np.arange(8.0)}), names=["a"])
 
 
 def two_quantities(seed, size=4000):

@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import norm
@@ -37,6 +38,7 @@ from bayesperiodic.plot.style import (
 from bayesperiodic.problem.fingerprint import check_fingerprint, check_results
 from bayesperiodic.problem.parameters import support
 from bayesperiodic.sampling.draws import MODE, Posterior
+from bayesperiodic.sampling.population_result import Population
 
 REGION_LEVELS = (0.5, 0.9)
 LEVELS_TEXT = "50 and 90 %"
@@ -56,7 +58,7 @@ ZERO_STYLE: dict[str, Any] = {"color": "0.75", "lw": 0.8, "zorder": 0.5}
 
 @styled
 def corner(
-    posterior: Posterior,
+    posterior: Posterior | Population,
     *,
     laplace: MapEstimate | None = None,
     problem: Problem | None = None,
@@ -89,13 +91,16 @@ def corner(
 
     Parameters
     ----------
-    posterior : Posterior
+    posterior : Posterior or Population
+        Of a population, the draws of its parameters, see `Population.labels`.
     laplace : MapEstimate, optional
-        For style="regions" only.
+        For style="regions" only; not for a population.
     problem : Problem, optional
-        Of the draws, whose priors are then drawn on the diagonal as thin lines; for style="regions" only.
+        Of the draws, whose priors are then drawn on the diagonal as thin lines; for style="regions" only; not for a
+        population.
     names : sequence of str, optional
-        Full names such as "k", "theta16[run 7]" and "variance[force]", in the order of the rows; by default all.
+        Full names such as "k", "theta16[run 7]" and "variance[force]", or "spread[k]" of a population, in the order of
+        the rows; by default all.
     truths : mapping of str to float, optional
         Values to mark by lines, such as the parameters of simulated data.
     labels : sequence of str, optional
@@ -132,9 +137,15 @@ def corner(
     (4, ['c', '[N s/m]'])
     >>> first = bp.plot.corner(posterior, style="corner", names=["c", "k"], bins=30, show_titles=True)
     >>> both = bp.plot.corner(posterior, style="corner", names=["c", "k"], figure=first)
+    >>> units, spread = dict.fromkeys(["1", "2", "3"], posterior), {"k": bp.HalfNormal(0.01)}
+    >>> springs = bp.population(units, ["k"], spread=spread, seed=1, progress=False)
+    >>> len(bp.plot.corner(springs).axes)
+    4
     """
-    _checks.instance("posterior", posterior, Posterior)
     _check_style(style, {"laplace": laplace, "problem": problem}, options)
+    if isinstance(posterior, Population):
+        posterior = _of_population(posterior, {"laplace": laplace, "problem": problem})
+    _checks.instance("posterior", posterior, Posterior)
     if problem is not None:
         check_results(problem, posterior=posterior)
     if names is None and len(posterior.names) > MOST_NAMES_DRAWN:
@@ -173,6 +184,18 @@ def corner(
     write_labels(drawn.grid, labels)
     arrange(drawn.grid, write_legend(drawn.grid, handles, caveats_of(posterior)))
     return figure
+
+
+def _of_population(result: Population, of_problems: Mapping[str, Any]) -> Posterior:
+    """Return the draws of a population's parameters as a figure takes them."""
+    for name, value in of_problems.items():
+        if value is not None:
+            raise ValueError(f"{name}: must be None for a Population, which has none, got {type(value).__name__}.")
+    groups = {"posterior": result.tree["posterior"].to_dataset(), "sample_stats": xr.Dataset()}
+    return Posterior(
+        xr.DataTree.from_dict(groups), result.converged, result.reason, result.tau, ess={}, rhat={},
+        acceptance=np.nan, failures={}, log_posterior_calls=result.calls, seed=result.seed,
+    )  # fmt: skip
 
 
 def _check_style(style: str, of_regions: Mapping[str, Any], options: Mapping[str, Any]) -> None:

@@ -14,7 +14,7 @@ from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.priors.single import LOG_ROOT_TWO_PI
 from bayesperiodic.sampling.population_units import UnitDraws
 
-# Values of a block of units that are in memory at once.
+# Values of a block of units and points that are in memory at once.
 BLOCK_VALUES = 300_000
 
 
@@ -132,14 +132,20 @@ class PopulationDensity:
     standardised, in the order of the units' members.
     """
 
-    def __init__(self, structure: Hierarchy, units: Sequence[UnitDraws], covariates: np.ndarray):
+    def __init__(
+        self,
+        structure: Hierarchy,
+        units: Sequence[UnitDraws],
+        covariates: np.ndarray,
+        groups: list[Members] | None = None,
+    ):
         self.structure, self.units = structure, units
         self.covariates = covariates
-        self.groups = [self._group(count) for count in sorted({len(unit.members) for unit in units})]
+        self.groups = groups or [self._group(count) for count in sorted({len(unit.members) for unit in units})]
 
     def with_structure(self, structure: Hierarchy) -> "PopulationDensity":
-        """Return the density of another kind of population of the same units."""
-        return PopulationDensity(structure, self.units, self.covariates)
+        """Return the density of another kind of population of the same units, whose arrays are shared."""
+        return PopulationDensity(structure, self.units, self.covariates, self.groups)
 
     def _group(self, count: int) -> Members:
         places = [k for k, unit in enumerate(self.units) if len(unit.members) == count]
@@ -187,14 +193,18 @@ class PopulationDensity:
         return Evaluation(total, np.empty((len(points), 0)), np.full(len(points), CONVERGED))
 
     def _log_likelihood(self, group: Members, parameters: Parameters) -> np.ndarray:
-        """Return the sum of the log-likelihoods of some units (points,)."""
+        """Return the sum of the log-likelihoods of some units (points,), in blocks of points and units."""
         units, draws = group.features.shape[:2]
-        total, step = np.zeros(len(parameters.means)), max(1, BLOCK_VALUES // (draws * len(parameters.means)))
-        for start in range(0, units, step):
-            terms, constant = self.log_terms(group, parameters, slice(start, start + step))
-            top = terms.max(axis=1)
-            np.exp(np.subtract(terms, top[:, None], out=terms), out=terms)
-            total += np.sum(np.log(terms.mean(axis=1)) + top + constant, axis=0)
+        total, most = np.zeros(len(parameters.means)), max(1, BLOCK_VALUES // draws)
+        for first in range(0, len(total), most):
+            block = slice(first, first + most)
+            chosen = Parameters(*(values[block] for values in parameters))
+            step = max(1, BLOCK_VALUES // (draws * len(chosen.means)))
+            for start in range(0, units, step):
+                terms, constant = self.log_terms(group, chosen, slice(start, start + step))
+                top = terms.max(axis=1)
+                np.exp(np.subtract(terms, top[:, None], out=terms), out=terms)
+                total[block] += np.sum(np.log(terms.mean(axis=1)) + top + constant, axis=0)
         return total
 
     def log_terms(self, group: Members, parameters: Parameters, part: slice) -> tuple[np.ndarray, np.ndarray]:

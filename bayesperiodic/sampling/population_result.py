@@ -1,6 +1,7 @@
 """Result of a population: its parameters, its units, and what it predicts."""
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -252,9 +253,19 @@ class Population(Result):
             For draws without their prior or that have not converged, or whose prior is as narrow as the data.
         RuntimeError
             If a problem cannot be sampled.
+
+        Warns
+        -----
+        UserWarning
+            If the draws of the population have not converged.
         """
         if not 0.0 < _checks.finite_number("false_alarm", false_alarm) < 1.0:
             raise ValueError(f"false_alarm: must be between 0 and 1, got {false_alarm!r}.")
+        if not self.converged:
+            warnings.warn(
+                f"The population has not converged ({self.reason}), so that the false-alarm rate is not known.",
+                stacklevel=2,
+            )
         if isinstance(new, Problem):
             unit = sampled(self.names, task_of("new", new, False, self.seed))
             if isinstance(unit, str):
@@ -326,20 +337,23 @@ class Population(Result):
         )
         size = f"{scale * values.mean():.2g} ± {scale * values.std(ddof=1):.1g}{suffix}"
         below = f"{scale * np.quantile(values, 0.95):.2g}{suffix}"
-        log = row["log_bayes_factor"]
-        known = " beyond the covariates" if self.covariates else ""
+        log, known = row["log_bayes_factor"], " beyond the covariates" if self.covariates else ""
+        undecided, below = f"Whether {name} differs between units is undecided", f"below {below} with 95 % probability"
+        if not self.converged:
+            return f"{undecided}: the chains have not converged ({self.reason})."
         if abs(log - row["bridge"]) > 3.0 * row["bridge_error"] + LARGEST_DIFFERENCE:
-            return (
-                f"Whether {name} differs between units is undecided: two estimates of the evidence disagree "
-                f"({log:.1f} and {row['bridge']:.1f}); spread {size}."
-            )
-        # Twice the error, so that few draws in the tails decide nothing.
-        if log - 2.0 * row["error"] > STRONG:
-            factor = _factor(log - 2.0 * row["error"])
-            return f"{name} differs between units{known}: spread {size}, not explained by noise ({factor} at least)."
-        if log + 2.0 * row["error"] < -POSITIVE:
-            return f"No spread of {name} is seen{known}: below {below} with 95 % probability ({_factor(log)})."
-        return f"Whether {name} differs between units is undecided: spread below {below} ({_factor(log)})."
+            pair = f"{log:.1f} and {row['bridge']:.1f}"
+            return f"{undecided}: two estimates of the evidence disagree ({pair}); spread {size}."
+        # Twice the errors, so that few draws in the tails decide nothing.
+        estimates = [(log, row["error"])] + [(row["bridge"], row["bridge_error"])] * bool(np.isfinite(row["bridge"]))
+        least, most = min(x - 2.0 * e for x, e in estimates), max(x + 2.0 * e for x, e in estimates)
+        if least > STRONG:
+            cause = ", but perhaps by the error of the model" if (self.units["robust"] > 0).any() else ""
+            factor = _factor(least)
+            return f"{name} differs between units{known}: spread {size}, not explained by noise{cause} ({factor})."
+        if most < -POSITIVE:
+            return f"No spread of {name} is seen{known}: {below} ({_factor(most)})."
+        return f"{undecided}{known}: spread {below} (log Bayes factor for a spread between {least:.1f} and {most:.1f})."
 
     @property
     def remarks(self) -> list[str]:
@@ -347,8 +361,8 @@ class Population(Result):
         lines = [f"{unit} lies outside the population of the others, p = {p:.2g}." for unit, p in self.outside.items()]
         if wrong := sorted({*self.units[POPULATION_UNIT][self.units["robust"] > 0]}):
             lines.append(
-                f"The model is misspecified in {len(wrong)} units; their draws are robust, and the spread includes the "
-                "part of the error of the model that differs between units."
+                f"The model is misspecified in {len(wrong)} of {self.units[POPULATION_UNIT].nunique()} units, whose "
+                "draws are robust; the spread includes the part of the error of the model that differs between units."
             )
         poor = ~(self.units["pareto_k"] <= USABLE_WEIGHTS) | (self.units["effective"] < FEWEST_EFFECTIVE)
         if bad := sorted({*self.units[POPULATION_UNIT][poor]}):
@@ -373,10 +387,10 @@ class Population(Result):
 
 
 def _factor(log: float) -> str:
-    """Return a Bayes factor in words."""
+    """Return the smallest Bayes factor within its error in words."""
     kind = "a spread" if log > 0.0 else "no spread"
-    size = "above 1e6" if abs(log) > np.log(1e6) else f"{np.exp(abs(log)):.2g}"
-    return f"Bayes factor {size} for {kind}"
+    size = "1e6" if abs(log) > np.log(1e6) else f"{np.exp(abs(log)):.2g}"
+    return f"Bayes factor for {kind} at least {size}"
 
 
 def coordinate_prior(at: Coordinate, mean: float, sd: float) -> Any:
@@ -407,7 +421,12 @@ def gather_population(
     coords = {POPULATION_UNIT: members, PARAMETER: list(structure.names)}
     tree = xr.DataTree.from_dict(
         {
-            "posterior": xr.Dataset({label: ((CHAIN, DRAW), x) for label, x in every.items()}),
+            "posterior": xr.Dataset(
+                {
+                    label: ((CHAIN, DRAW), x, parameter_attributes(structure, first.coordinates, label))
+                    for label, x in every.items()
+                }
+            ),
             UNIT_GROUP: xr.Dataset({"shrunken": (dims, natural)}, coords=coords),
         }
     )
@@ -430,6 +449,21 @@ def gather_population(
         unit_calls=sum(unit.calls for unit in density.units),
         seed=seed,
     )
+
+
+def parameter_attributes(structure: Any, coordinates: Sequence[Coordinate], label: str) -> dict[str, Any]:
+    """Return unit and support of a parameter of the population, as the attributes of `Posterior.tree`."""
+    kind, _, inner = label.removesuffix("]").partition("[")
+    name, _, covariate = inner.partition(", ")
+    at = dict(zip(structure.names, coordinates, strict=True))[name]
+    of_spread = "1" if at.logarithmic else at.unit
+    units, support = {
+        "mean": (at.unit, (0.0 if at.logarithmic else -np.inf, np.inf)),
+        "slope": (f"{of_spread or '1'} per {covariate}", (-np.inf, np.inf)),
+        "spread": (of_spread, getattr(structure.spread[name], "support", (0.0, np.inf))),
+        "correlation": ("1", (-1.0, 1.0)),
+    }[kind]
+    return {"units": units, f"support of {label}": list(support)}
 
 
 def _variables(

@@ -85,4 +85,5 @@ def damper_population(
             member = None
         predicted[left_out] = {"interval_90": intervals, "median": medians, "inside": inside, "member": member}
     counts = {name: sum(row["inside"][name] for row in predicted.values()) for name in DAMPER_NAMES}
-    return result, account(result) | {"tests": len(posteriors), "predicted": predicted, "inside_90": counts}
+    tried = {"predicted": predicted, "inside_90": counts} if predicted else {}
+    return result, account(result) | {"tests": len(posteriors)} | tried

@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> None:
     figures: dict[str, Figure] = {}
     with watch.part("springs", "sampling simulated springs one by one, and their population"):
         springs, account = spring_population(QUICK_SPRINGS if options.quick else SPRINGS, options.seed)
-        figures["springs"] = common.titled(bp.plot.population(springs), "Simulated springs (synthetic data)")
+        figures["springs"] = _titled(bp.plot.population(springs), "Simulated springs (synthetic data)")
     print(springs)
     results: dict[str, Any] = {"seed": options.seed, "springs": account}
     paths = [] if options.quick else find_tests(options.data)
@@ -42,12 +42,19 @@ def run(options: argparse.Namespace) -> None:
         with watch.part("dampers", "sampling their population, and that of all but one"):
             left_out = list(posteriors)[: options.replicates]
             dampers, results["dampers"] = damper_population(posteriors, left_out, options.seed)
-            figures["forest"] = common.titled(bp.plot.population(dampers), "Friction damper, twelve tests")
-            figures["amplitude"] = common.titled(
-                bp.plot.population(dampers, covariate="amplitude"), "Friction damper, by amplitude [m]"
-            )
+            title = f"Friction damper, {len(posteriors)} tests"
+            figures["forest"] = _titled(bp.plot.population(dampers), title)
+            for covariate, unit in {"amplitude": "m", "tension": "N"}.items():
+                figure = bp.plot.population(dampers, covariate=covariate)
+                figures[covariate] = _titled(figure, f"{title}, by {covariate} [{unit}]")
         print(dampers)
     else:
         print(f"  the tests of the friction damper are not used; they are at {ADDRESS}")
     saved = common.save_figures(options.out, figures)
     common.finish(options.out, results, watch, saved, synthetic=not paths)
+
+
+def _titled(figure: Figure, title: str) -> Figure:
+    """Return a figure with a title before its caveats, if any."""
+    figure.suptitle(", ".join(filter(None, [title, figure.get_suptitle()])), fontsize="medium")
+    return figure

@@ -1,5 +1,6 @@
 """Populations against closed forms, quadrature, and the joint posterior."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 
@@ -12,6 +13,7 @@ from scipy.stats import t as student
 
 import bayesperiodic as bp
 from bayesperiodic.priors.stored import as_text, from_text
+from bayesperiodic.problem.parameters import support, unit
 from bayesperiodic.sampling.membership import Expected, UnitEstimate
 from bayesperiodic.sampling.population import Redraws, Settings, fitted
 from bayesperiodic.sampling.population_density import Hierarchy, Parameters, PopulationDensity
@@ -179,6 +181,10 @@ def test_result_can_be_saved_and_is_printed(tmp_path):
     result.save(tmp_path / "population.h5")
     loaded = bp.load(tmp_path / "population.h5")
     assert repr(loaded) == repr(result) and "Population of 8 units, normal (converged)" in repr(result)
+    group = loaded.tree["posterior"].to_dataset()
+    assert [(unit(group, label), support(group, label)) for label in loaded.labels] == [
+        ("m", (-np.inf, np.inf)), ("m", (0.0, np.inf)),
+    ]  # fmt: skip
     assert loaded.as_prior() == result.as_prior()
     np.testing.assert_array_equal(loaded.predict()["a"], result.predict()["a"])
 
@@ -339,6 +345,24 @@ def test_stored_draws_and_problems_with_draws_give_the_same_population(tmp_path)
     )
     assert repr(first) == repr(second)
     assert first.unit_calls == sum(posterior.log_posterior_calls for _, posterior in pairs.values())
+
+
+@cache
+def three_gears(executor=None):
+    """Return the population of three gears, sampled by these workers."""
+    return bp.population(gears(3), ["k"], spread={"k": bp.HalfNormal(0.2)}, seed=1, executor=executor, progress=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["processes", "dask", "threads"])
+def test_populations_are_identical_for_any_executor(which, request):
+    """Three gears, sampled by workers, which also return their draws in any order."""
+    with ThreadPoolExecutor(2) as threads:
+        result = three_gears(threads if which == "threads" else request.getfixturevalue(which))
+    serial = three_gears()
+    for label in serial.labels:
+        np.testing.assert_array_equal(result.draws(label), serial.draws(label))
+    assert result.units.equals(serial.units) and result.unit_calls == serial.unit_calls > 0
 
 
 @pytest.mark.slow
