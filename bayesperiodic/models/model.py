@@ -492,6 +492,14 @@ class CondensedModel(Model):
             transitions=(),
         ).kernels()
 
+    @cached_property
+    def with_all_outputs(self) -> "CondensedModel":
+        """The model whose outputs are the displacements of all degrees of freedom."""
+        other, places = copy(self), np.eye(len(self.states))
+        other.structure = replace(self.structure, measured={x: (places[i], 0) for i, x in enumerate(self.states)})
+        other.outputs = self.states
+        return other
+
     def input_derivatives(self) -> dict[str, int]:
         """Return 0 for every input."""
         return dict.fromkeys(self.inputs, 0)
@@ -513,7 +521,7 @@ class CondensedModel(Model):
         return "\\begin{aligned}\n" + " \\\\\n".join([motion, *(["d &= W x"] if count else []), *forces]) + "\n\\end{aligned}"
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "element_kernels"}
+        return {key: value for key, value in self.__dict__.items() if key not in ("element_kernels", "with_all_outputs")}
 
 
 def _called(argument: str, given: Any, spaces: tuple[Names, ...]) -> Any:

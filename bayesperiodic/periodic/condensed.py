@@ -12,19 +12,23 @@ References
    response of nonlinear dynamic systems, Journal of Applied Mechanics 56 (1989) 149-154.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from bayesperiodic.models.model import CondensedModel
+from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, SINGULAR, STALLED
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved
 from bayesperiodic.periodic.receptance import Receptance
+from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
 # Points of the grid of the elements, and relative change of the outputs below which they are not doubled.
-FEWEST_POINTS, MOST_POINTS, RESOLVED = 64, 4096, 1e-8
+FEWEST_POINTS, MOST_POINTS, RESOLVED = 32, 4096, 1e-6
+# The largest change of outputs that count as resolved by the most points; the smallest relative harmonic of an input.
+COARSE, LEAST_HARMONIC = 1e-2, 1e-12
 # Share of a step that is left by harmonics whose coupling by the elements is neglected in Newton's matrix.
 WEAK = 0.05
 STEPS, HALVED, LAST_STEP, ROUNDING = 40, 10, 1e-10, 1e-13
@@ -58,12 +62,9 @@ class Preconditioner:
     The higher ones, which the elements couple only weakly, are treated as uncoupled.
     """
 
-    def __init__(self, forces: Forces, rates: np.ndarray, d_f: np.ndarray):
+    def __init__(self, forces: Forces, rates: np.ndarray, d_f: np.ndarray, low: int = 0):
         points, self.elements = forces.values.shape
-        steepest = np.abs(forces.stiffness).max(axis=0) + rates[:, None] * np.abs(forces.damping).max(axis=0)
-        coupling = np.sqrt(np.sum(np.abs(d_f * steepest[:, None, :]) ** 2, axis=(1, 2)))
-        strong = np.flatnonzero(~(coupling < WEAK))
-        self.low = low = min(len(rates), int(strong.max(initial=0)) + 1)
+        self.low = low = low or self.strongly_coupled(forces, rates, d_f)
         numbers = np.arange(low)
         stiffness, damping = (np.fft.fft(part, axis=0).T / points for part in forces[1:])
         difference, total = (numbers[:, None] - numbers) % points, (numbers[:, None] + numbers) % points
@@ -83,6 +84,13 @@ class Preconditioner:
         matrix[zero, zero] = np.eye(self.elements)
         self.inverse = np.linalg.inv(matrix)
 
+    @staticmethod
+    def strongly_coupled(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> int:
+        """Return the number of low harmonics beyond which all are coupled weakly."""
+        steepest = np.abs(forces.stiffness).max(axis=0) + rates[:, None] * np.abs(forces.damping).max(axis=0)
+        coupling = np.sqrt(np.sum(np.abs(d_f * steepest[:, None, :]) ** 2, axis=(1, 2)))
+        return min(len(rates), int(np.flatnonzero(~(coupling < WEAK)).max(initial=0)) + 1)
+
     def __call__(self, right: np.ndarray) -> np.ndarray:
         """Return the approximate solution (…, harmonics, elements) for a right-hand side of that shape."""
         result, low = right.copy(), right[..., : self.low, :]
@@ -98,6 +106,35 @@ class CondensedEquations(PeriodicEquations):
     """d + H_df f(d, ḋ, θ) - H_du u = 0 for one set of inputs; z are the displacements d (points, elements) on any grid."""
 
     model: CondensedModel
+
+    @classmethod
+    def build(
+        cls,
+        model: Model,
+        inputs: Mapping[str, np.ndarray] | None,
+        *,
+        scheme: str | Scheme | None = None,
+        **settings: Any,
+    ) -> "CondensedEquations":
+        """Check the arguments, see `PeriodicEquations.build`; harmonics take the place of a scheme."""
+        if find_scheme(scheme or fourier) is not fourier:
+            raise ValueError(
+                f"scheme: must be 'fourier' or None for {model.name!r}, which is condensed, got {scheme!r}; the points "
+                "of its elements are doubled as often as needed."
+            )
+        return super().build(model, inputs, scheme=fourier, **settings)  # type: ignore[return-value]
+
+    @property
+    def of_all_states(self) -> "CondensedEquations":
+        """The equations whose outputs are the displacements of all degrees of freedom."""
+        return replace(self, model=self.model.with_all_outputs)
+
+    def scaled_residual(self, z: np.ndarray, parameters: np.ndarray) -> float:
+        """Return the norm of the residual in units of its largest term."""
+        d, matrices = harmonics(z), self.matrices(parameters, len(z))[0]
+        free = _times(matrices.d_u, self.input_harmonics(len(z)))
+        residual, size = _residual(d, self.forces(d, parameters)[0], matrices, free)
+        return float(np.linalg.norm(residual)) / size
 
     @property
     def count(self) -> int:
@@ -117,24 +154,36 @@ class CondensedEquations(PeriodicEquations):
 
         `directions` are indices of parameters, their number standing for the frequency.
         """
-        rates, elements = self.rates(points), self.count
-        harmonics = np.arange(points // 2) / self.grid.periods
-        response = self._receptance(parameters, self.frequency, harmonics, directions)
-        orders = np.array([order for _, order in self.model.structure.measured.values()], dtype=int)
-        outputs = (1j * rates[:, None]) ** orders
-        result = []
-        for values in (response.values, response.derivatives):
-            rows = values[..., elements:, :] * outputs[..., None]
-            result.append(rows)
-        direct, changes = result
+        numbers = np.arange(points // 2) / self.grid.periods
+        response = self._receptance(parameters, self.frequency, numbers, directions)
+        here, changes = (self._parts(values) for values in (response.values, response.derivatives))
+        orders = self._orders / self.frequency
         for number, direction in enumerate(directions):
             if direction == len(self.model.parameters):
-                changes[number] += direct * (orders / self.frequency)[:, None]
-        parts = [
-            ResponseMatrices(v[..., :elements, :elements], v[..., :elements, elements:], rows[..., :elements], rows[..., elements:])
-            for v, rows in zip((response.values, response.derivatives), (direct, changes), strict=True)
-        ]
-        return parts[0], parts[1]
+                changes.y_f[number] += here.y_f * orders[:, None]
+                changes.y_u[number] += here.y_u * orders[:, None]
+        return here, changes
+
+    def many_matrices(self, parameters: np.ndarray, points: int) -> ResponseMatrices:
+        """Return the frequency response for parameter vectors (vectors, parameters)."""
+        numbers = np.arange(points // 2) / self.grid.periods
+        return self._parts(self._receptance.many(parameters, self.frequency, numbers))
+
+    @property
+    def _orders(self) -> np.ndarray:
+        return np.array([order for _, order in self.model.structure.measured.values()])
+
+    @property
+    def factors(self) -> list[int]:
+        """Indices of the parameters that are factors of matrices."""
+        return list(self._receptance.factors)
+
+    def _parts(self, response: np.ndarray) -> ResponseMatrices:
+        """Return the parts of a response of displacements (…, harmonics, rows, columns), outputs differentiated."""
+        elements, rates = self.count, self.rates(2 * response.shape[-3])
+        rows = response[..., elements:, :] * ((1j * rates[:, None]) ** self._orders)[..., None]
+        d = response[..., :elements, :]
+        return ResponseMatrices(d[..., :elements], d[..., elements:], rows[..., :elements], rows[..., elements:])
 
     def input_harmonics(self, points: int, inputs: np.ndarray | None = None) -> np.ndarray:
         """Return the harmonics (…, harmonics, inputs) of inputs (…, grid points, inputs), by default these."""
@@ -146,6 +195,10 @@ class CondensedEquations(PeriodicEquations):
         if kept == values.shape[-2] // 2 + 1 and values.shape[-2] % 2 == 0:
             result[..., kept - 1, :] *= 0.5  # the highest harmonic of an even grid stands for two
         return result
+
+    def reduced(self, states: np.ndarray) -> np.ndarray:
+        """Return the displacements of the elements (points, elements) for those of all degrees of freedom."""
+        return states @ self.model.structure.weights.T
 
     def on_points(self, harmonics: np.ndarray) -> np.ndarray:
         """Return values (…, points, columns) on the experiment's grid from harmonics (…, harmonics, columns)."""
@@ -209,7 +262,9 @@ class CondensedEquations(PeriodicEquations):
 
     def find(self, parameters: np.ndarray, guess: np.ndarray | None) -> tuple[Solved, str]:
         """Solve from a guess (points, elements), or from rest, and double the points until the outputs are resolved."""
-        points = self._fewest() if guess is None else max(self._fewest(), 1 << (len(guess) - 1).bit_length())
+        points = self._fewest()
+        if guess is not None:  # of which the last doubling is repeated
+            points = max(points, 1 << (len(guess) // 2 - 1).bit_length())
         start = np.zeros((points // 2, self.count), dtype=complex) if guess is None else resized(harmonics(guess), points)
         d, code, history = self._newton(parameters, start, 1.0, None)
         found_by = "newton"
@@ -296,7 +351,26 @@ class CondensedEquations(PeriodicEquations):
         """Return the outputs (points, channels) on the experiment's grid."""
         return self._outputs(harmonics(z), parameters)
 
-    def directional(
+    def sensitivities_along(
+        self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
+    ) -> Sensitivities | None:
+        """Return derivatives along directions (directions, parameters) of the parameters; None if singular."""
+        return self._sensitivities(z, parameters, np.pad(directions, ((0, 0), (0, 1))))
+
+    def parameter_sensitivities(self, z: np.ndarray, parameters: np.ndarray) -> Sensitivities | None:
+        """Return derivatives to every parameter and last to the frequency; None if singular."""
+        return self._sensitivities(z, parameters, np.eye(parameters.size + 1))
+
+    def input_sensitivities(
+        self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray, frequency: np.ndarray
+    ) -> Sensitivities | None:
+        """Return derivatives along changes of inputs and frequency; None if singular."""
+        of_frequency = np.zeros((len(directions), parameters.size + 1))
+        of_frequency[:, -1] = frequency
+        result = self._sensitivities(z, parameters, of_frequency, directions[..., : len(self.model.inputs)])
+        return result and result._replace(frequency=frequency)
+
+    def _sensitivities(
         self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray, inputs: np.ndarray | None = None
     ) -> Sensitivities | None:
         """Return derivatives along directions (directions, parameters + 1), the frequency last; None if singular.
@@ -323,8 +397,6 @@ class CondensedEquations(PeriodicEquations):
         outputs = explicit - _times(matrices.y_f, _linearised(forces, rates, moved))
         return Sensitivities(on_grid(moved, points), self.on_points(outputs), np.zeros(len(directions)))
 
-
-LEAST_HARMONIC, COARSE = 1e-12, 1e-2
 
 
 _RECEPTANCES: WeakKeyDictionary[CondensedModel, Receptance] = WeakKeyDictionary()
@@ -410,3 +482,9 @@ def _linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.
         if np.linalg.norm(step) <= SWEEP_ERROR * size:
             return x
     return None
+
+
+def equations_for(model: Model, inputs: Mapping[str, np.ndarray] | None, **settings: Any) -> PeriodicEquations:
+    """Return the equations of a model, condensed or discretised; arguments as those of `PeriodicEquations.build`."""
+    kind = CondensedEquations if isinstance(model, CondensedModel) else PeriodicEquations
+    return kind.build(model, inputs, **settings)

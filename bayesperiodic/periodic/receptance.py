@@ -2,11 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import scipy.linalg
 
+from bayesperiodic._compile.cache import load
 from bayesperiodic.models.structure import CONSTANT_PART, POWERS, Structure
 
 # Largest error of a part in the eigenvectors' basis that counts as diagonal, relative to the diagonal.
@@ -116,9 +119,32 @@ class Receptance:
                 changes = [-np.einsum("ki,kiab->kab", s, parts) for s in slopes]
         return Response(values, np.array(changes).reshape(len(slopes), *values.shape))
 
+    def many(self, parameters: np.ndarray, frequency: float, harmonics: np.ndarray) -> np.ndarray:
+        """Return the response (vectors, harmonics, rows, columns) for parameter vectors (vectors, parameters)."""
+        if self._modes is None:
+            return np.stack([self(theta, frequency, harmonics).values for theta in parameters])
+        diagonals, rows, columns = self._modes
+        factors = np.where(self._factors < 0, 1.0, parameters[:, self._factors])
+        parts = [(factors * (self._powers == power)) @ diagonals for power in (2, 1, 0)]
+        products = (rows[:, None] * columns).reshape(-1, diagonals.shape[1])
+        result = np.empty((len(parameters), len(harmonics), len(products)), dtype=complex)
+        compiled().modal_responses(np.ascontiguousarray(products), *parts, 2 * np.pi * frequency * harmonics, result)
+        return result.reshape(*result.shape[:2], len(rows), len(columns))
+
+    @property
+    def factors(self) -> tuple[int, ...]:
+        """Indices of the parameters that are factors of matrices."""
+        return tuple(sorted({int(i) for i in self._factors if i >= 0}))
+
     def _slope(self, direction: int, parameters: np.ndarray, rates: np.ndarray, factors: np.ndarray, frequency: float) -> np.ndarray:
         """Return the derivative of `coefficients` by a parameter or by the frequency."""
         if direction == self._size:
             return factors * self._powers / frequency
         moved = np.where(self._factors == direction, 1.0, 0.0)
         return (1j * rates[:, None]) ** self._powers * moved
+
+
+@cache
+def compiled() -> ModuleType:
+    """Return the compiled functions of condensed equations."""
+    return load(Path(__file__).with_name("_kernels").joinpath("condensed.py").read_text(encoding="utf-8"))

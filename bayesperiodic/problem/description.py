@@ -29,6 +29,7 @@ from bayesperiodic.likelihood.noise import PER_EXPERIMENT, Noise, as_noise
 from bayesperiodic.likelihood.observation import Observation
 from bayesperiodic.models.model import Model
 from bayesperiodic.models.sensed import DELAY, sensor_name
+from bayesperiodic.periodic.condensed import equations_for
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.priors.joint import JointPrior
@@ -529,7 +530,7 @@ class Description(Printed):
         result = {}
         for e in self.experiments:
             inputs, frequency = self.drive(e, self.input_errors.get(e.name))
-            result[e.name] = PeriodicEquations.build(
+            result[e.name] = equations_for(
                 self.model,
                 inputs,
                 frequency=frequency,
