@@ -149,6 +149,7 @@ def correct_many(
 
 @njit(
     "void(float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1], float64[::1], complex128[:,:,::1])",
+    fastmath={"reassoc", "nsz", "contract"},  # for sums in vector registers
     **CONDENSED_OPTIONS,
 )
 def modal_responses(products, mass, damping, stiffness, rates, result):
@@ -166,13 +167,8 @@ def modal_responses(products, mass, damping, stiffness, rates, result):
                 size = 1.0 / (a * a + c * c)
                 real[r], imaginary[r] = a * size, -c * size
             for p in range(pairs):
-                x, y, x1, y1 = 0.0, 0.0, 0.0, 0.0
-                for r in range(0, modes - 1, 2):
+                x, y = 0.0, 0.0
+                for r in range(modes):
                     x += products[p, r] * real[r]
                     y += products[p, r] * imaginary[r]
-                    x1 += products[p, r + 1] * real[r + 1]
-                    y1 += products[p, r + 1] * imaginary[r + 1]
-                if modes % 2:
-                    x += products[p, modes - 1] * real[modes - 1]
-                    y += products[p, modes - 1] * imaginary[modes - 1]
-                result[b, k, p] = complex(x + x1, y + y1)
+                result[b, k, p] = complex(x, y)
