@@ -11,7 +11,7 @@ import sympy as sp
 from bayesperiodic import _checks
 from bayesperiodic.models.hysteresis import Hysteretic
 from bayesperiodic.models.names import DERIVATIVES, Names
-from bayesperiodic.models.structure import CONSTANT_PART, POWERS, Structure
+from bayesperiodic.models.structure import CONSTANT_PART, POWERS, Matrices, Structure
 
 KINDS_OF_MOTION = {"displacement": 0, "velocity": 1, "acceleration": 2}  # order of the derivative
 # Arguments of the functions of elements that are no parameters.
@@ -128,7 +128,7 @@ def structure(
     inputs = {name: _weights(f"forces[{name!r}]", place, count) for name, place in forces.items()}
     measured = {name: _measured(f"outputs[{name!r}]", given, count) for name, given in outputs.items()}
     weights = [_weights(f"place of element {e.name!r}", e.place, count) for e in placed]
-    return Structure(parts, inputs, measured, placed, np.array(weights).reshape(-1, count))
+    return Structure(Matrices(parts), inputs, measured, placed, np.array(weights).reshape(-1, count))
 
 
 def definition(given: Structure) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import scipy.linalg
 
 from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, SINGULAR, STALLED
@@ -82,7 +83,13 @@ class Preconditioner:
         zero = slice(size, size + self.elements)
         matrix[zero], matrix[:, zero] = 0.0, 0.0
         matrix[zero, zero] = np.eye(self.elements)
-        self.inverse = np.linalg.inv(matrix)
+        self.matrix = matrix
+        self._factors = scipy.linalg.lu_factor(matrix, check_finite=False)
+
+    @property
+    def inverse(self) -> np.ndarray:
+        """Inverse for the low harmonics, real parts of harmonics and elements before the imaginary ones."""
+        return np.linalg.inv(self.matrix)
 
     @staticmethod
     def strongly_coupled(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> int:
@@ -95,7 +102,8 @@ class Preconditioner:
         """Return the approximate solution (…, harmonics, elements) for a right-hand side of that shape."""
         result, low = right.copy(), right[..., : self.low, :]
         flat = np.concatenate([part.reshape(*right.shape[:-2], -1) for part in (low.real, low.imag)], axis=-1)
-        solved = (self.inverse @ flat[..., None])[..., 0]
+        columns = flat.reshape(-1, flat.shape[-1]).T
+        solved = scipy.linalg.lu_solve(self._factors, columns, check_finite=False).T.reshape(flat.shape)
         real, imaginary = np.split(solved, 2, axis=-1)
         result[..., : self.low, :] = (real + 1j * imaginary).reshape(low.shape)
         return result

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg
 
-from bayesperiodic.models.structure import CONSTANT_PART
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
-from bayesperiodic.periodic.condensed import CondensedEquations, Forces, harmonics, on_grid, resized
+from bayesperiodic.periodic.condensed import CondensedEquations, Forces, harmonics, on_grid, receptance, resized
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
 from bayesperiodic.periodic.floquet import Floquet
 from bayesperiodic.periodic.index_one import orbit_floquet
@@ -20,7 +18,7 @@ from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, by_name, d
 MODES = 16
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CondensedSolution(PeriodicSolution):
     """A periodic solution of a condensed model, see `Model.from_matrices`; a `PeriodicSolution` but for the following.
 
@@ -98,8 +96,11 @@ def described(
     changes = np.abs(every.outputs(coarse, theta) - states).max(axis=0).tolist()
     several, fewer = np.empty((0, 0, 0)), np.empty((0, 0, 0))
     if code == CONVERGED:
-        several, fewer = (linearised_modes(equations, theta, z, count) for count in (MODES, MODES // 2))
-        fewer = fewer if several.shape[1] < len(model.states) else np.empty((0, 0, 0))
+        modes = receptance(model).lowest_modes(theta, MODES)
+        modes = modes / np.sqrt(np.einsum("nr,nm,mr->r", modes, receptance(model).sums(theta)[0], modes))
+        several = linearised_modes(equations, theta, z, modes)
+        if modes.shape[1] < len(model.states):
+            fewer = linearised_modes(equations, theta, z, modes[:, : MODES // 2])
     return CondensedSolution(
         model=model.name,
         autonomous=False,
@@ -129,30 +130,21 @@ def described(
     )
 
 
-def linearised_modes(equations: CondensedEquations, theta: np.ndarray, z: np.ndarray, count: int) -> np.ndarray:
-    """Return ∂g/∂(q, q̇, q̈) (points, modes, 3·modes) in the coordinates q of the lowest modes, mass-normalised.
+def linearised_modes(
+    equations: CondensedEquations, theta: np.ndarray, z: np.ndarray, modes: np.ndarray
+) -> np.ndarray:
+    """Return ∂g/∂(q, q̇, q̈) (points, modes, 3·modes) in the coordinates q of the lowest modes (n, modes).
 
     The other modes follow the forces of the elements statically, which makes these springs in series.
     """
-    structure, names = equations.model.structure, equations.model.parameters
-    mass, damping, stiffness = (
-        sum(
-            (a * (1.0 if name == CONSTANT_PART else theta[names.index(name)]) for name, a in parts.items()),
-            np.zeros((structure.degrees, structure.degrees)),
-        )
-        for parts in (structure.parts[kind] for kind in ("mass", "damping", "stiffness"))
-    )
-    symmetric = 0.5 * (mass + mass.T), 0.5 * (stiffness + stiffness.T)
-    _, vectors = scipy.linalg.eigh(symmetric[1], symmetric[0])
-    low, high = vectors[:, :count], vectors[:, count:]
-    at = structure.weights @ low
-    places = structure.weights @ high
-    compliance = places @ np.linalg.solve(high.T @ stiffness @ high, places.T) if high.size else np.zeros((len(at),) * 2)
+    places, sums = equations.model.structure.weights, receptance(equations.model).sums(theta)
+    mass, damping, stiffness = (modes.T @ matrix @ modes for matrix in sums)
+    at = places @ modes
+    compliance = places @ np.linalg.solve(sums[2], places.T) - at @ np.linalg.solve(stiffness, at.T)
     forces: Forces = equations.forces(harmonics(z), theta)[0]
-    springs = np.einsum("ne,ef->nef", forces.stiffness, np.eye(len(at)))
-    dampers = np.einsum("ne,ef->nef", forces.damping, np.eye(len(at)))
+    springs, dampers = (part[..., None] * np.eye(len(at)) for part in forces[1:])
     series = np.linalg.inv(np.eye(len(at)) + springs @ compliance)
     springs, dampers = series @ springs, series @ dampers @ series.transpose(0, 2, 1)
-    parts = [low.T @ stiffness @ low + at.T @ springs @ at, low.T @ damping @ low + at.T @ dampers @ at]
-    inertia = np.broadcast_to(low.T @ mass @ low, parts[0].shape)
+    parts = [stiffness + at.T @ springs @ at, damping + at.T @ dampers @ at]
+    inertia = np.broadcast_to(mass, parts[0].shape)
     return np.ascontiguousarray(np.concatenate([*parts, inertia], axis=2))

@@ -10,14 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from bayesperiodic._compile.cache import load
-from bayesperiodic.models.structure import CONSTANT_PART, POWERS, Structure
-
-# Largest error of a part in the eigenvectors' basis that counts as diagonal, relative to the diagonal.
-DIAGONAL = 1e-10
-# Part of a matrix that differs from a multiple of another one by no more is that multiple.
-MULTIPLE = 1e-14
-# Smallest ratio of the singular values of a stiffness matrix that counts as regular.
-REGULAR = 1e-13
+from bayesperiodic.models.structure import CONSTANT_PART, POWERS, REGULAR, Structure
 
 
 @dataclass(frozen=True)
@@ -44,50 +37,38 @@ class Receptance:
     """
 
     def __init__(self, structure: Structure, parameters: Sequence[str], rows: np.ndarray, columns: np.ndarray):
-        self._rows, self._columns = rows, columns
+        self._structure, self._rows, self._columns = structure, rows, columns
         parts = [(POWERS[kind], name, a) for kind, named in structure.parts.items() for name, a in named.items()]
         self._powers = np.array([power for power, _, _ in parts])
         self._factors = np.array([-1 if n == CONSTANT_PART else parameters.index(n) for _, n, _ in parts])
         self._matrices = np.stack([a for *_, a in parts])
-        self._size = len(parameters)
+        self._size, self._regular = len(parameters), False
 
     @cached_property
     def _modes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Diagonals of the parts (parts, n), rows and columns in the modes' basis; None without such a basis."""
-        if not all(np.array_equal(a, a.T) for a in self._matrices):
-            return None
-        mass, stiffness = (self._matrices[self._powers == power].sum(axis=0) for power in (2, 0))
-        try:  # of the inverse problem, in which the lowest modes are the most accurate
-            inverse, vectors = scipy.linalg.eigh(mass, stiffness)
-        except np.linalg.LinAlgError:
-            return None
-        if not inverse.min() > 0.0:
-            return None
-        diagonals = np.stack([self._diagonal(a, (mass, inverse), (stiffness, np.ones_like(inverse)), vectors)
-                              for a in self._matrices])
-        if not np.isfinite(diagonals).all():
-            return None
-        return diagonals, self._rows @ vectors, self._columns @ vectors
-
-    @staticmethod
-    def _diagonal(
-        part: np.ndarray, mass: tuple[np.ndarray, np.ndarray], stiffness: tuple[np.ndarray, np.ndarray], vectors: np.ndarray
-    ) -> np.ndarray:
-        """Return a part in the modes' basis; NaN if it is not diagonal there."""
-        for matrix, values in (mass, stiffness):
-            ratio = np.vdot(matrix, part) / np.vdot(matrix, matrix)
-            if np.abs(part - ratio * matrix).max() <= MULTIPLE * np.abs(part).max():
-                return ratio * values
-        inside = vectors.T @ part @ vectors
-        diagonal = np.diag(inside)
-        sizes = np.sqrt(np.abs(diagonal))
-        off = np.abs(inside - np.diag(diagonal))
-        return diagonal if np.all(off <= DIAGONAL * np.outer(sizes, sizes)) else np.full(len(part), np.nan)
+        """Diagonals of the parts (parts, n), rows and columns in the modes' coordinates; None without modes."""
+        modes = self._structure.matrices.modes
+        return modes and (modes.diagonals, self._rows @ modes.vectors, self._columns @ modes.vectors)
 
     @property
     def modal(self) -> bool:
         """Whether one basis of real modes diagonalises all parts."""
         return self._modes is not None
+
+    def lowest_modes(self, parameters: np.ndarray, count: int) -> np.ndarray:
+        """Return the lowest undamped modes (n, modes)."""
+        modes = self._structure.matrices.modes
+        if modes is not None:
+            return modes.vectors[:, :count]
+        mass, _, stiffness = self.sums(parameters)
+        size = len(mass)
+        given = 0.5 * (stiffness + stiffness.T), 0.5 * (mass + mass.T)
+        return np.asarray(scipy.linalg.eigh(*given, subset_by_index=(0, min(count, size) - 1))[1])
+
+    def sums(self, parameters: np.ndarray) -> list[np.ndarray]:
+        """Return mass, damping and stiffness matrix."""
+        factors = np.where(self._factors < 0, 1.0, parameters[self._factors])
+        return [np.tensordot(factors * (self._powers == power), self._matrices, (0, 0)) for power in (2, 1, 0)]
 
     def coefficients(self, parameters: np.ndarray, rates: np.ndarray) -> np.ndarray:
         """Return the factor of each part, (harmonics, parts), at the angular frequencies `rates` [1/s]."""
@@ -103,6 +84,7 @@ class Receptance:
         """
         rates = 2 * np.pi * frequency * harmonics
         factors = self.coefficients(parameters, rates)
+        self._check_regular(parameters)
         slopes = [self._slope(d, parameters, rates, factors, frequency) for d in directions]
         if self._modes is not None:
             diagonals, rows, columns = self._modes
@@ -118,6 +100,18 @@ class Receptance:
                 parts = np.einsum("kna,inj,kjb->kiab", left, self._matrices, right, optimize=True)
                 changes = [-np.einsum("ki,kiab->kab", s, parts) for s in slopes]
         return Response(values, np.array(changes).reshape(len(slopes), *values.shape))
+
+    def _check_regular(self, parameters: np.ndarray) -> None:
+        """Raise a ValueError for a structure that can move without being deformed."""
+        if self._modes is None and not self._regular:
+            stiffness = self.sums(parameters)[2]
+            sizes = np.linalg.svd(stiffness, compute_uv=False)
+            if not sizes[-1] > REGULAR * sizes[0]:
+                raise ValueError(
+                    "stiffness: must be regular in a condensed model, got a singular matrix; support the structure, "
+                    "such as by soft springs, or take condensed=False."
+                )
+            self._regular = True
 
     def many(self, parameters: np.ndarray, frequency: float, harmonics: np.ndarray) -> np.ndarray:
         """Return the response (vectors, harmonics, rows, columns) for parameter vectors (vectors, parameters)."""
