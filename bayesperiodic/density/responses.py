@@ -25,10 +25,10 @@ from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
 from bayesperiodic.periodic.condensed import CondensedEquations
 from bayesperiodic.periodic.condensed_batch import CondensedBatch
-from bayesperiodic.periodic.condensed_solution import described
+from bayesperiodic.periodic.condensed_solution import described, in_units, linearised_modes, normalised_modes
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
-from bayesperiodic.periodic.solution import PeriodicSolution, as_guess, describe, logarithmic_jacobian
+from bayesperiodic.periodic.solution import PeriodicSolution, as_guess, logarithmic_jacobian
 from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.periodic.special import SpecialEquations, SpecialPoint
 from bayesperiodic.periodic.special_batch import SpecialAnchor, SpecialBatch
@@ -521,13 +521,18 @@ def _leading_multipliers_directly(
     equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int
 ) -> np.ndarray | None:
     """Return the largest multipliers of a driven model where `floquet.leading_multipliers` finds them."""
+    period = equations.grid.periods / equations.frequency
+    if isinstance(equations, CondensedEquations):
+        linear = linearised_modes(equations, parameters, z, normalised_modes(equations, parameters))
+        return leading_multipliers(
+            first_order_matrix(linear, (2,) * linear.shape[1]) * in_units(linear.shape[1], period), period, count
+        )
     orders = tuple(equations.model.orders.values())
     columns = equations.residual_jacobian(z, parameters)[:, equations.count :]
     try:
         matrix = first_order_matrix(columns.reshape(len(z), equations.count, -1), orders)
     except np.linalg.LinAlgError:
         return None
-    period = equations.grid.periods / equations.frequency
     spread = np.ptp(z, axis=0)
     sizes = np.where(spread > 0.0, spread, 1.0)
     sizes = np.concatenate([sizes, 2 * np.pi / period * sizes[[order == 2 for order in orders]]])
@@ -535,7 +540,7 @@ def _leading_multipliers_directly(
 
 
 def _described(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> PeriodicSolution:
-    return describe(equations, parameters, Solved(z, CONVERGED, NO_HISTORY), sensitivities=False)
+    return described(equations, parameters, Solved(z, CONVERGED, NO_HISTORY), sensitivities=False)
 
 
 def _without_trivial(solution: PeriodicSolution, values: np.ndarray) -> np.ndarray:

@@ -430,7 +430,8 @@ class CondensedModel(Model):
             raise ValueError(f"elements: must have forces of d, v and parameters, got {', '.join(unknown)}.")
         return given
 
-    def _refused(self) -> ValueError:
+    def refusal(self) -> ValueError:
+        """Return the error for what needs symbolic equations."""
         return ValueError(
             f"model: must have symbolic equations for this, got {self.name!r}, which is condensed to the displacements "
             "of its elements; make it with Model.from_matrices(…, condensed=False), of few degrees of freedom, such as "
@@ -440,17 +441,17 @@ class CondensedModel(Model):
     @property
     def equations(self) -> tuple[sp.Expr, ...]:  # type: ignore[override]
         """Refused."""
-        raise self._refused()
+        raise self.refusal()
 
     @property
     def output_expressions(self) -> tuple[sp.Expr, ...]:  # type: ignore[override]
         """Refused."""
-        raise self._refused()
+        raise self.refusal()
 
     @property
     def symbolic(self) -> SymbolicModel:
         """Refused."""
-        raise self._refused()
+        raise self.refusal()
 
     @cached_property
     def autonomous(self) -> bool:

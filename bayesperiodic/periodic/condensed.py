@@ -14,6 +14,7 @@ References
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -131,6 +132,11 @@ class CondensedEquations(PeriodicEquations):
                 "of its elements are doubled as often as needed."
             )
         return super().build(model, inputs, scheme=fourier, **settings)  # type: ignore[return-value]
+
+    @property
+    def kernels(self) -> ModuleType:
+        """Refused: what needs them is for discretised equations."""
+        raise self.model.refusal()
 
     @property
     def of_all_states(self) -> "CondensedEquations":

@@ -44,8 +44,7 @@ class CondensedSolution(PeriodicSolution):
 
     def _floquet(self, linearisation: np.ndarray) -> Floquet | str:
         modes = linearisation.shape[1]
-        sizes = np.repeat([1.0, 2 * np.pi / self.period], modes)
-        return orbit_floquet(linearisation, (2,) * modes, sizes, self.period)
+        return orbit_floquet(linearisation, (2,) * modes, in_units(modes, self.period)[0], self.period)
 
     @cached_property
     def multiplier_error(self) -> float:
@@ -96,8 +95,7 @@ def described(
     changes = np.abs(every.outputs(coarse, theta) - states).max(axis=0).tolist()
     several, fewer = np.empty((0, 0, 0)), np.empty((0, 0, 0))
     if code == CONVERGED:
-        modes = receptance(model).lowest_modes(theta, MODES)
-        modes = modes / np.sqrt(np.einsum("nr,nm,mr->r", modes, receptance(model).sums(theta)[0], modes))
+        modes = normalised_modes(equations, theta)
         several = linearised_modes(equations, theta, z, modes)
         if modes.shape[1] < len(model.states):
             fewer = linearised_modes(equations, theta, z, modes[:, : MODES // 2])
@@ -128,6 +126,19 @@ def described(
         fewer_modes=fewer,
         changes=dict(zip(model.states, changes if code == CONVERGED else [np.nan] * len(changes), strict=True)),
     )
+
+
+def normalised_modes(equations: CondensedEquations, theta: np.ndarray) -> np.ndarray:
+    """Return the lowest undamped modes (n, modes) of unit modal mass."""
+    linear = receptance(equations.model)
+    modes = linear.lowest_modes(theta, MODES)
+    return modes / np.sqrt(np.sum(modes * (linear.sums(theta)[0] @ modes), axis=0))
+
+
+def in_units(modes: int, period: float) -> np.ndarray:
+    """Return the factors (2·modes, 2·modes) of a first-order matrix for rates in units of 2π/period."""
+    sizes = np.repeat([1.0, 2 * np.pi / period], modes)
+    return sizes / sizes[:, None]
 
 
 def linearised_modes(
