@@ -25,7 +25,7 @@ from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
 from bayesperiodic.periodic.condensed import CondensedEquations
 from bayesperiodic.periodic.condensed_batch import CondensedBatch
-from bayesperiodic.periodic.condensed_solution import described, in_units, linearised_modes, normalised_modes
+from bayesperiodic.periodic.condensed_solution import described, modal_multipliers
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
 from bayesperiodic.periodic.solution import PeriodicSolution, as_guess, logarithmic_jacobian
@@ -510,6 +510,8 @@ def orbit_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: n
     """Return the `count` largest multipliers of a solution z, or fewer, without an autonomous orbit's trivial 1."""
     if not count:
         return np.empty(0)
+    if isinstance(equations, CondensedEquations):
+        return modal_multipliers(equations, parameters, z)[0][:count]
     easy = None if equations.model.autonomous else _leading_multipliers_directly(equations, parameters, z, count)
     if easy is not None:
         return easy
@@ -521,18 +523,13 @@ def _leading_multipliers_directly(
     equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int
 ) -> np.ndarray | None:
     """Return the largest multipliers of a driven model where `floquet.leading_multipliers` finds them."""
-    period = equations.grid.periods / equations.frequency
-    if isinstance(equations, CondensedEquations):
-        linear = linearised_modes(equations, parameters, z, normalised_modes(equations, parameters))
-        return leading_multipliers(
-            first_order_matrix(linear, (2,) * linear.shape[1]) * in_units(linear.shape[1], period), period, count
-        )
     orders = tuple(equations.model.orders.values())
     columns = equations.residual_jacobian(z, parameters)[:, equations.count :]
     try:
         matrix = first_order_matrix(columns.reshape(len(z), equations.count, -1), orders)
     except np.linalg.LinAlgError:
         return None
+    period = equations.grid.periods / equations.frequency
     spread = np.ptp(z, axis=0)
     sizes = np.where(spread > 0.0, spread, 1.0)
     sizes = np.concatenate([sizes, 2 * np.pi / period * sizes[[order == 2 for order in orders]]])

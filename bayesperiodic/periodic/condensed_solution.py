@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
 from bayesperiodic.periodic.condensed import CondensedEquations, Forces, harmonics, on_grid, receptance, resized
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
-from bayesperiodic.periodic.floquet import Floquet
-from bayesperiodic.periodic.index_one import orbit_floquet
 from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, by_name, describe
 
-# Lowest modes in which the linearised equations are integrated; half of them give the error.
+# Lowest modes in which the linearised equations are solved; half of them give the error.
 MODES = 16
 
 
@@ -24,45 +24,48 @@ class CondensedSolution(PeriodicSolution):
 
     Attributes
     ----------
-    linearisation : array (points, modes, 3·modes)
-        The linearised equations on the orbit in the lowest modes, at most 16, at the points of the elements' grid. The
-        elements bend the other modes too, statically.
-    fewer_modes : array (points, modes, 3·modes)
-        The same in half of these modes, for `multiplier_error`; empty if there are as many modes as degrees of freedom.
+    linearisation, twice_the_points : array
+        Empty.
+    of_modes : complex array (2·modes,)
+        The multipliers, those of the 16 lowest modes at most; the elements bend the other modes statically. Those below
+        about 1e-12 are rounding errors. None unless converged.
+    multiplier_error : float
+        Estimated error of the largest modulus: its change with half of the steps in time, and of the modes.
     changes : dict of str to float
         See `error_estimate`.
     """
 
-    fewer_modes: np.ndarray
+    of_modes: np.ndarray
+    multiplier_error: float
     changes: dict[str, float]
 
-    @cached_property
-    def _linearised(self) -> Floquet | str:
-        if not self.converged:
-            return f"the solve ended with the status {self.status!r}"
-        return self._floquet(self.linearisation)
+    @property
+    def floquet(self) -> None:
+        """None: there are no eigenfunctions."""
+        return None
 
-    def _floquet(self, linearisation: np.ndarray) -> Floquet | str:
-        modes = linearisation.shape[1]
-        return orbit_floquet(linearisation, (2,) * modes, in_units(modes, self.period)[0], self.period)
+    @property
+    def multipliers(self) -> np.ndarray:
+        """Floquet multipliers over the response period, complex (2·modes,), largest modulus first."""
+        return self.of_modes
 
-    @cached_property
-    def multiplier_error(self) -> float:
-        """Estimated error of the largest multiplier's modulus: its change if half of the modes are left out."""
-        if not self.converged or not self.fewer_modes.size:
-            return 0.0
-        fewer = self._floquet(self.fewer_modes)
-        if isinstance(fewer, str) or self.floquet is None:
-            return np.inf
-        return float(abs(np.exp(fewer.exponents[0].real) - np.exp(self.floquet.exponents[0].real)))
+    @property
+    def exponents(self) -> np.ndarray:
+        """Floquet exponents log(multiplier)/period [1/s], complex (2·modes,)."""
+        return self._others / self.period
+
+    @property
+    def _others(self) -> np.ndarray:
+        with np.errstate(divide="ignore"):
+            return np.log(self.of_modes)
 
     @cached_property
     def stability_unknown(self) -> str:
         """Why the stability is unknown; empty if it is known."""
-        if isinstance(self._linearised, str):
-            return self._linearised
-        largest = float(np.exp(self._linearised.exponents[0].real))
-        if abs(largest - 1.0) <= self.multiplier_error:
+        if not self.converged:
+            return f"the solve ended with the status {self.status!r}"
+        largest = float(np.abs(self.of_modes[0]))
+        if not abs(largest - 1.0) > self.multiplier_error:
             return f"the largest multiplier has the modulus {largest:.3g}, with an error of {self.multiplier_error:.1g}"
         return ""
 
@@ -93,12 +96,7 @@ def described(
     states, outputs = every.outputs(z, theta), equations.outputs(z, theta)
     coarse = on_grid(resized(harmonics(z), len(z) // 2), len(z) // 2)
     changes = np.abs(every.outputs(coarse, theta) - states).max(axis=0).tolist()
-    several, fewer = np.empty((0, 0, 0)), np.empty((0, 0, 0))
-    if code == CONVERGED:
-        modes = normalised_modes(equations, theta)
-        several = linearised_modes(equations, theta, z, modes)
-        if modes.shape[1] < len(model.states):
-            fewer = linearised_modes(equations, theta, z, modes[:, : MODES // 2])
+    multipliers, error = modal_multipliers(equations, theta, z) if code == CONVERGED else (np.empty(0, complex), np.nan)
     return CondensedSolution(
         model=model.name,
         autonomous=False,
@@ -118,44 +116,84 @@ def described(
         sensitivities=of_outputs,
         state_sensitivities=of_states,
         frequency_sensitivities=dict.fromkeys(model.parameters, 0.0) if of_outputs else {},
-        linearisation=several,
+        linearisation=np.empty((0, 0, 0)),
         twice_the_points=np.empty((0, 0)),
         iterations=len(solved.history),
         residual=equations.scaled_residual(z, theta),
         history=solved.history,
-        fewer_modes=fewer,
+        of_modes=multipliers,
+        multiplier_error=error,
         changes=dict(zip(model.states, changes if code == CONVERGED else [np.nan] * len(changes), strict=True)),
     )
 
 
-def normalised_modes(equations: CondensedEquations, theta: np.ndarray) -> np.ndarray:
-    """Return the lowest undamped modes (n, modes) of unit modal mass."""
-    linear = receptance(equations.model)
-    modes = linear.lowest_modes(theta, MODES)
-    return modes / np.sqrt(np.sum(modes * (linear.sums(theta)[0] @ modes), axis=0))
+class _ModalEquations(NamedTuple):
+    """Linearised equations in the coordinates of the lowest modes, of unit modal mass."""
+
+    stiffness: np.ndarray  # (modes, modes)
+    damping: np.ndarray
+    at: np.ndarray  # (elements, modes), displacements of the elements
+    compliance: np.ndarray  # (elements, elements), static one of the other modes
+
+    def monodromy(self, forces: Forces, period: float) -> np.ndarray:
+        """Return the map of (q, q̇) over the period, of as many steps as the forces have points.
+
+        Each step is the exact motion of the linear structure between two instants at which the elements act ([1]_), in
+        the middle of the step. The error is of second order.
+
+        References
+        ----------
+        .. [1] G. Strang, On the construction and comparison of difference schemes, SIAM Journal on Numerical Analysis 5
+           (1968) 506-517.
+        """
+        modes, (steps, elements) = len(self.stiffness), forces.values.shape
+        length, unit = period / steps, np.eye(elements)
+        springs, dampers = (part[..., None] * unit for part in forces[1:])
+        series = np.linalg.inv(unit + springs @ self.compliance)
+        springs, dampers = series @ springs, series @ dampers @ series.transpose(0, 2, 1)
+        # ∫ exp(−s D G) ds over a step, D the dampers, G = at·atᵀ, is a block of the exponential of a larger matrix.
+        larger = np.zeros((steps, 2 * elements, 2 * elements))
+        larger[:, :elements, :elements] = -length * dampers @ (self.at @ self.at.T)
+        larger[:, :elements, elements:] = length * unit
+        acting = scipy.linalg.expm(larger)[:, :elements, elements:] if elements else springs
+        kicks = np.tile(np.eye(2 * modes), (steps, 1, 1))
+        kicks[:, modes:, :modes] -= self.at.T @ acting @ springs @ self.at
+        kicks[:, modes:, modes:] -= self.at.T @ acting @ dampers @ self.at
+        zero = np.zeros((modes, modes))
+        free = np.block([[zero, np.eye(modes)], [-self.stiffness, -self.damping]])
+        half = scipy.linalg.expm(0.5 * length * free)
+        products = half @ kicks @ half
+        while len(products) > 1:  # the number of points is a power of two
+            products = products[1::2] @ products[::2]
+        return np.asarray(products[0])
 
 
-def in_units(modes: int, period: float) -> np.ndarray:
-    """Return the factors (2·modes, 2·modes) of a first-order matrix for rates in units of 2π/period."""
-    sizes = np.repeat([1.0, 2 * np.pi / period], modes)
-    return sizes / sizes[:, None]
+def _modal_equations(equations: CondensedEquations, theta: np.ndarray, count: int) -> _ModalEquations:
+    linear, places = receptance(equations.model), equations.model.structure.weights
+    modes, (mass, damping, stiffness) = linear.lowest_modes(theta, count), linear.sums(theta)
+    modes = modes / np.sqrt(np.sum(modes * (mass @ modes), axis=0))
+    inverse = np.linalg.inv(modes.T @ mass @ modes)
+    at, within = places @ modes, modes.T @ stiffness @ modes
+    compliance = places @ np.linalg.solve(stiffness, places.T) - at @ np.linalg.solve(within, at.T)
+    return _ModalEquations(inverse @ within, inverse @ modes.T @ damping @ modes, at, compliance)
 
 
-def linearised_modes(
-    equations: CondensedEquations, theta: np.ndarray, z: np.ndarray, modes: np.ndarray
-) -> np.ndarray:
-    """Return ∂g/∂(q, q̇, q̈) (points, modes, 3·modes) in the coordinates q of the lowest modes (n, modes).
-
-    The other modes follow the forces of the elements statically, which makes these springs in series.
-    """
-    places, sums = equations.model.structure.weights, receptance(equations.model).sums(theta)
-    mass, damping, stiffness = (modes.T @ matrix @ modes for matrix in sums)
-    at = places @ modes
-    compliance = places @ np.linalg.solve(sums[2], places.T) - at @ np.linalg.solve(stiffness, at.T)
-    forces: Forces = equations.forces(harmonics(z), theta)[0]
-    springs, dampers = (part[..., None] * np.eye(len(at)) for part in forces[1:])
-    series = np.linalg.inv(np.eye(len(at)) + springs @ compliance)
-    springs, dampers = series @ springs, series @ dampers @ series.transpose(0, 2, 1)
-    parts = [stiffness + at.T @ springs @ at, damping + at.T @ dampers @ at]
-    inertia = np.broadcast_to(mass, parts[0].shape)
-    return np.ascontiguousarray(np.concatenate([*parts, inertia], axis=2))
+def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the Floquet multipliers in the lowest modes, largest first, and the error of the largest modulus."""
+    period, d = equations.grid.periods / equations.frequency, harmonics(z)
+    grids = [equations.forces(resized(d, points), theta)[0] for points in (len(z), 2 * len(z), 4 * len(z))]
+    several = _modal_equations(equations, theta, MODES)
+    one, two, four = (several.monodromy(forces, period) for forces in grids)
+    # Richardson's extrapolation of even powers of the step.
+    coarse, fine = (two + (two - one) / 3.0, four + (four - two) / 3.0)
+    values = np.linalg.eigvals(fine + (fine - coarse) / 15.0).astype(complex)
+    values = values[np.argsort(-np.abs(values), kind="stable")]
+    largest = float(np.abs(values[0]))
+    error = abs(largest - float(np.abs(np.linalg.eigvals(fine)).max()))
+    if len(several.stiffness) < len(equations.model.states):
+        fewer = _modal_equations(equations, theta, MODES // 2)
+        error += abs(
+            float(np.abs(np.linalg.eigvals(fewer.monodromy(grids[2], period))).max())
+            - float(np.abs(np.linalg.eigvals(four)).max())
+        )
+    return values, error
