@@ -488,7 +488,7 @@ class CondensedModel(Model):
             parameters=tuple(self.parameter_symbols.values()),
             tau=self.time_symbols["tau"],
             frequency=self.time_symbols["frequency"],
-            equations=self.element_forces,
+            equations=self.element_forces or (sp.S.Zero,),
             outputs=(sp.S.Zero,),
             transitions=(),
         ).kernels()

@@ -229,6 +229,8 @@ class CondensedEquations(PeriodicEquations):
     def _evaluated(self, name: str, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         points, kernels = 2 * len(d), self.model.element_kernels
         states = np.zeros((points, 3 * self.count))
+        if not self.count:
+            return np.zeros((points, 0))
         states[:, : self.count] = on_grid(d, points)
         states[:, self.count : 2 * self.count] = on_grid(1j * self.rates(points)[:, None] * d, points)
         return kernels.evaluate(name, states, np.empty((points, 0)), parameters, np.zeros(points), self.frequency)

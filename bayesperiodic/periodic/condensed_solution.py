@@ -15,7 +15,7 @@ from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solve
 from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, by_name, describe
 
 # Lowest modes in which the linearised equations are solved; half of them give the error.
-MODES = 16
+MODES, MOST_STEPS = 16, 1024
 
 
 @dataclass(frozen=True, repr=False)
@@ -138,8 +138,8 @@ class _ModalEquations(NamedTuple):
     def monodromy(self, forces: Forces, period: float) -> np.ndarray:
         """Return the map of (q, q̇) over the period, of as many steps as the forces have points.
 
-        Each step is the exact motion of the linear structure between two instants at which the elements act ([1]_), in
-        the middle of the step. The error is of second order.
+        Each step is the exact motion of the linear structure between two points, at which the elements act for half of
+        the step ([1]_). The error is of second order.
 
         References
         ----------
@@ -151,18 +151,17 @@ class _ModalEquations(NamedTuple):
         springs, dampers = (part[..., None] * unit for part in forces[1:])
         series = np.linalg.inv(unit + springs @ self.compliance)
         springs, dampers = series @ springs, series @ dampers @ series.transpose(0, 2, 1)
-        # ∫ exp(−s D G) ds over a step, D the dampers, G = at·atᵀ, is a block of the exponential of a larger matrix.
+        # ∫ exp(−s D G) ds over half a step, D the dampers, G = at·atᵀ, is a block of the exponential of a larger matrix.
         larger = np.zeros((steps, 2 * elements, 2 * elements))
-        larger[:, :elements, :elements] = -length * dampers @ (self.at @ self.at.T)
-        larger[:, :elements, elements:] = length * unit
+        larger[:, :elements, :elements] = -0.5 * length * dampers @ (self.at @ self.at.T)
+        larger[:, :elements, elements:] = 0.5 * length * unit
         acting = scipy.linalg.expm(larger)[:, :elements, elements:] if elements else springs
         kicks = np.tile(np.eye(2 * modes), (steps, 1, 1))
         kicks[:, modes:, :modes] -= self.at.T @ acting @ springs @ self.at
         kicks[:, modes:, modes:] -= self.at.T @ acting @ dampers @ self.at
         zero = np.zeros((modes, modes))
         free = np.block([[zero, np.eye(modes)], [-self.stiffness, -self.damping]])
-        half = scipy.linalg.expm(0.5 * length * free)
-        products = half @ kicks @ half
+        products = np.roll(kicks, -1, axis=0) @ scipy.linalg.expm(length * free) @ kicks
         while len(products) > 1:  # the number of points is a power of two
             products = products[1::2] @ products[::2]
         return np.asarray(products[0])
@@ -181,8 +180,10 @@ def _modal_equations(equations: CondensedEquations, theta: np.ndarray, count: in
 def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the Floquet multipliers in the lowest modes, largest first, and the error of the largest modulus."""
     period, d = equations.grid.periods / equations.frequency, harmonics(z)
-    grids = [equations.forces(resized(d, points), theta)[0] for points in (len(z), 2 * len(z), 4 * len(z))]
     several = _modal_equations(equations, theta, MODES)
+    fastest = float(np.sqrt(np.abs(np.linalg.eigvals(several.stiffness)).max()))
+    steps = max(len(z), min(MOST_STEPS, 1 << int(np.ceil(np.log2(max(1.0, period * fastest))))))
+    grids = [equations.forces(resized(d, every * steps), theta)[0] for every in (1, 2, 4)]
     one, two, four = (several.monodromy(forces, period) for forces in grids)
     # Richardson's extrapolation of even powers of the step.
     coarse, fine = (two + (two - one) / 3.0, four + (four - two) / 3.0)

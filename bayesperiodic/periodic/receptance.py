@@ -67,12 +67,17 @@ class Receptance:
 
     def sums(self, parameters: np.ndarray) -> list[np.ndarray]:
         """Return mass, damping and stiffness matrix."""
-        factors = np.where(self._factors < 0, 1.0, parameters[self._factors])
+        factors = self._values(parameters)
         return [np.tensordot(factors * (self._powers == power), self._matrices, (0, 0)) for power in (2, 1, 0)]
+
+    def _values(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the factors (…, parts) of the parts at parameters (…, parameters)."""
+        constant = np.ones((*parameters.shape[:-1], 1))
+        return np.asarray(np.concatenate([parameters, constant], axis=-1)[..., self._factors])
 
     def coefficients(self, parameters: np.ndarray, rates: np.ndarray) -> np.ndarray:
         """Return the factor of each part, (harmonics, parts), at the angular frequencies `rates` [1/s]."""
-        factors = np.where(self._factors < 0, 1.0, parameters[self._factors])
+        factors = self._values(parameters)
         return (1j * rates[:, None]) ** self._powers * factors
 
     def __call__(
@@ -118,7 +123,7 @@ class Receptance:
         if self._modes is None:
             return np.stack([self(theta, frequency, harmonics).values for theta in parameters])
         diagonals, rows, columns = self._modes
-        factors = np.where(self._factors < 0, 1.0, parameters[:, self._factors])
+        factors = self._values(parameters)
         parts = [(factors * (self._powers == power)) @ diagonals for power in (2, 1, 0)]
         products = (rows[:, None] * columns).reshape(-1, diagonals.shape[1])
         result = np.empty((len(parameters), len(harmonics), len(products)), dtype=complex)
