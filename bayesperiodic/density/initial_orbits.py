@@ -63,12 +63,16 @@ class InitialEstimate(NamedTuple):
 
 @unwarned
 def simultaneous_fit(problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> InitialEstimate | None:
-    """Return θ and orbits near the MAP point; None for an autonomous or condensed model, or an experiment without a guess.
+    """Return θ and orbits near the MAP point; None for autonomous and condensed models, or without guesses.
 
     The fit starts at θ (names,) and at guesses, by default the experiments' own, ignores multipliers, and moves
     positive parameters in their logarithms.
     """
-    if problem.model.autonomous or isinstance(problem.model, CondensedModel) or not (guesses or all(e.guess for e in problem.experiments)):
+    if (
+        problem.model.autonomous
+        or isinstance(problem.model, CondensedModel)
+        or not (guesses or all(e.guess for e in problem.experiments))
+    ):
         return None
     fit = _SimultaneousFit(problem, guesses or experiments_guesses(problem, theta))
     return fit.iterate(fit.parameters_along_guesses(theta))

@@ -167,7 +167,9 @@ class ResponseSolver:
     @cached_property
     def _batches(
         self,
-    ) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch | SpecialBatch | CondensedBatch, bool]]:
+    ) -> list[
+        tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch | SpecialBatch | CondensedBatch, bool]
+    ]:
         """The groups, their parameters, their solver, and whether multipliers were measured."""
         return [
             (

@@ -404,7 +404,9 @@ class CondensedModel(Model):
                 "states or an argument s; take condensed=False, or a memoryless element."
             )
         if not structure.inputs:
-            raise ValueError("forces: must have at least one force in a condensed model, got none; take condensed=False.")
+            raise ValueError(
+                "forces: must have at least one force in a condensed model, got none; take condensed=False."
+            )
         given = definition(structure)
         self._set_names(name, given["states"], given["inputs"], given["parameters"])
         self.outputs = _checks.identifiers("outputs", structure.measured, (*RESERVED, *self.inputs))
@@ -413,7 +415,9 @@ class CondensedModel(Model):
         moving = with_derivatives("e", tuple(f"d{number}" for number in range(len(structure.elements))))
         self.element_symbols = tuple(moving.values())
         s, p, forces = Names("states", {}), Names("parameters", self.parameter_symbols), []
-        for element, d, v in zip(structure.elements, self.element_symbols, self.element_symbols[len(structure.elements) :], strict=False):
+        for element, d, v in zip(
+            structure.elements, self.element_symbols, self.element_symbols[len(structure.elements) :], strict=False
+        ):
             forces.append(self._element_force(element.evaluate(d, v, s, p).force))
         self.element_forces = tuple(forces)
         of_matrices = {factor for named in structure.parts.values() for factor in named}
@@ -506,7 +510,7 @@ class CondensedModel(Model):
         return dict.fromkeys(self.inputs, 0)
 
     def latex(self) -> str:
-        """Return the equation of motion of the matrices, and the forces of the elements, as an ``aligned`` environment."""
+        """Return the equation of motion, and the forces of the elements, as a LaTeX ``aligned`` environment."""
         written = {symbol: sp.latex(sp.Symbol(name)) for name, symbol in self.parameter_symbols.items()}
         count = len(self.element_forces)
         for number in range(count):
@@ -517,12 +521,20 @@ class CondensedModel(Model):
             for number, factor in enumerate(self.structure.parts[kind]):
                 scale = "" if factor == CONSTANT_PART else written[self.parameter_symbols[factor]] + r"\,"
                 sums.append(f"{scale}{letter}_{{{number}}} {motion}")
-        forces = [f"f_{{{number + 1}}} &= {sp.latex(f, symbol_names=written)}" for number, f in enumerate(self.element_forces)]
+        forces = [
+            f"f_{{{number + 1}}} &= {sp.latex(f, symbol_names=written)}" for number, f in enumerate(self.element_forces)
+        ]
         motion = " + ".join([*sums, *(["W^T f"] if count else [])]) + r" &= B u"
-        return "\\begin{aligned}\n" + " \\\\\n".join([motion, *(["d &= W x"] if count else []), *forces]) + "\n\\end{aligned}"
+        return (
+            "\\begin{aligned}\n"
+            + " \\\\\n".join([motion, *(["d &= W x"] if count else []), *forces])
+            + "\n\\end{aligned}"
+        )
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key not in ("element_kernels", "with_all_outputs")}
+        return {
+            key: value for key, value in self.__dict__.items() if key not in ("element_kernels", "with_all_outputs")
+        }
 
 
 def _called(argument: str, given: Any, spaces: tuple[Names, ...]) -> Any:

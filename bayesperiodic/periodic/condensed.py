@@ -85,6 +85,8 @@ class Preconditioner:
         matrix[zero], matrix[:, zero] = 0.0, 0.0
         matrix[zero, zero] = np.eye(self.elements)
         self.matrix = matrix
+        if not self.elements:
+            return
         self._factors = scipy.linalg.lu_factor(matrix, check_finite=False)
 
     @property
@@ -102,6 +104,8 @@ class Preconditioner:
     def __call__(self, right: np.ndarray) -> np.ndarray:
         """Return the approximate solution (…, harmonics, elements) for a right-hand side of that shape."""
         result, low = right.copy(), right[..., : self.low, :]
+        if not self.elements:
+            return result
         flat = np.concatenate([part.reshape(*right.shape[:-2], -1) for part in (low.real, low.imag)], axis=-1)
         columns = flat.reshape(-1, flat.shape[-1]).T
         solved = scipy.linalg.lu_solve(self._factors, columns, check_finite=False).T.reshape(flat.shape)
@@ -112,7 +116,7 @@ class Preconditioner:
 
 @dataclass(frozen=True)
 class CondensedEquations(PeriodicEquations):
-    """d + H_df f(d, ḋ, θ) - H_du u = 0 for one set of inputs; z are the displacements d (points, elements) on any grid."""
+    """d + H_df f(d, ḋ, θ) - H_du u = 0 for one set of inputs; z are the displacements d (points, elements)."""
 
     model: CondensedModel
 
@@ -163,7 +167,9 @@ class CondensedEquations(PeriodicEquations):
         """Return the angular frequencies of the harmonics below half the points [1/s]."""
         return 2 * np.pi * self.frequency / self.grid.periods * np.arange(points // 2)
 
-    def matrices(self, parameters: np.ndarray, points: int, directions: Any = ()) -> tuple[ResponseMatrices, ResponseMatrices]:
+    def matrices(
+        self, parameters: np.ndarray, points: int, directions: Any = ()
+    ) -> tuple[ResponseMatrices, ResponseMatrices]:
         """Return the frequency response at the harmonics below half the points, and its derivatives.
 
         `directions` are indices of parameters, their number standing for the frequency.
@@ -188,9 +194,9 @@ class CondensedEquations(PeriodicEquations):
         return np.array([order for _, order in self.model.structure.measured.values()])
 
     @property
-    def factors(self) -> list[int]:
+    def matrix_parameters(self) -> list[int]:
         """Indices of the parameters that are factors of matrices."""
-        return list(self._receptance.factors)
+        return list(self._receptance.matrix_parameters)
 
     def _parts(self, response: np.ndarray) -> ResponseMatrices:
         """Return the parts of a response of displacements (…, harmonics, rows, columns), outputs differentiated."""
@@ -219,7 +225,10 @@ class CondensedEquations(PeriodicEquations):
         return sampled(harmonics, self.grid.points)
 
     def forces(self, d: np.ndarray, parameters: np.ndarray) -> tuple[Forces, np.ndarray]:
-        """Return the forces at harmonics d (harmonics, elements), and their derivatives (points, elements, parameters)."""
+        """Return the forces at harmonics d (harmonics, elements), and those by θ (points, elements, parameters)."""
+        if not self.count:
+            none = np.zeros((2 * len(d), 0))
+            return Forces(none, none, none), np.zeros((2 * len(d), 0, parameters.size))
         values, given = self._evaluated("residual_jacobian", d, parameters), self.count
         f, slopes = values[:, :given], values[:, given:].reshape(len(values), given, 3, given)
         own = np.arange(given)
@@ -229,8 +238,6 @@ class CondensedEquations(PeriodicEquations):
     def _evaluated(self, name: str, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         points, kernels = 2 * len(d), self.model.element_kernels
         states = np.zeros((points, 3 * self.count))
-        if not self.count:
-            return np.zeros((points, 0))
         states[:, : self.count] = on_grid(d, points)
         states[:, self.count : 2 * self.count] = on_grid(1j * self.rates(points)[:, None] * d, points)
         return kernels.evaluate(name, states, np.empty((points, 0)), parameters, np.zeros(points), self.frequency)
@@ -246,7 +253,8 @@ class CondensedEquations(PeriodicEquations):
         points = 2 * len(d)
         matrices = given or self.matrices(parameters, points)[0]
         free = load * _times(matrices.d_u, self.input_harmonics(points))
-        history, rates = [], self.rates(points)
+        rates = self.rates(points)
+        history: list[tuple[float, float, float]] = []
         forces, _ = self.forces(d, parameters)
         residual, size = _residual(d, forces, matrices, free)
         for _ in range(STEPS):
@@ -281,7 +289,9 @@ class CondensedEquations(PeriodicEquations):
         points = self._fewest()
         if guess is not None:  # of which the last doubling is repeated
             points = max(points, 1 << (len(guess) // 2 - 1).bit_length())
-        start = np.zeros((points // 2, self.count), dtype=complex) if guess is None else resized(harmonics(guess), points)
+        start = (
+            np.zeros((points // 2, self.count), dtype=complex) if guess is None else resized(harmonics(guess), points)
+        )
         d, code, history = self._newton(parameters, start, 1.0, None)
         found_by = "newton"
         if code != CONVERGED and guess is None:
@@ -295,7 +305,9 @@ class CondensedEquations(PeriodicEquations):
             if code != CONVERGED:
                 break
             d, after = finer, self._outputs(finer, parameters)
-            change = np.max(np.abs(after - before) / np.maximum(np.abs(after).max(axis=0), np.finfo(float).tiny), initial=0.0)
+            change = np.max(
+                np.abs(after - before) / np.maximum(np.abs(after).max(axis=0), np.finfo(float).tiny), initial=0.0
+            )
             before = after
             if change <= RESOLVED:
                 break
@@ -355,7 +367,8 @@ class CondensedEquations(PeriodicEquations):
                 continue
             if at >= 1.0:
                 return d + (1.0 - load) / (at - load) * (there - d)
-            d, load, before, step = there, at, tangent * np.sign(turn), min(1.5 * step, LARGEST_LOAD_STEP * (1.0 + np.linalg.norm(there) / unit))
+            d, load, before = there, at, tangent * np.sign(turn)
+            step = min(1.5 * step, LARGEST_LOAD_STEP * (1.0 + float(np.linalg.norm(there)) / unit))
         return None
 
     def _outputs(self, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -400,7 +413,11 @@ class CondensedEquations(PeriodicEquations):
         f, load = harmonics(forces.values), self.input_harmonics(points)
         velocity = on_grid(1j * rates[:, None] * d, points)
         slopes = np.concatenate([by_theta, (forces.damping * velocity / self.frequency)[..., None]], axis=-1)
-        direct = np.moveaxis(harmonics(slopes[..., used].reshape(points, -1)).reshape(len(d), self.count, used.size), -1, 0)
+        direct = np.moveaxis(
+            harmonics(slopes[..., used].reshape(points, self.count * used.size)).reshape(len(d), self.count, used.size),
+            -1,
+            0,
+        )
         of_d = _times(changes.d_u, load) - _times(changes.d_f, f) - _times(matrices.d_f, direct)
         of_y = _times(changes.y_u, load) - _times(changes.y_f, f) - _times(matrices.y_f, direct)
         right, explicit = (np.tensordot(directions[:, used], part, (1, 0)) for part in (of_d, of_y))
@@ -412,7 +429,6 @@ class CondensedEquations(PeriodicEquations):
             return None
         outputs = explicit - _times(matrices.y_f, _linearised(forces, rates, moved))
         return Sensitivities(on_grid(moved, points), self.on_points(outputs), np.zeros(len(directions)))
-
 
 
 _RECEPTANCES: WeakKeyDictionary[CondensedModel, Receptance] = WeakKeyDictionary()

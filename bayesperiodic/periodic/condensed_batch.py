@@ -31,8 +31,12 @@ class CondensedBatch:
         self._d = np.stack([resized(harmonics(a.z), points) for a in anchors])
         shape = (len(first.model.parameters), *self._d.shape[1:])
         self._slopes = np.stack(
-            [np.zeros(shape, dtype=complex) if a.sensitivities is None else resized(harmonics(a.sensitivities), points)
-             for a in anchors]
+            [
+                np.zeros(shape, dtype=complex)
+                if a.sensitivities is None
+                else resized(harmonics(a.sensitivities), points)
+                for a in anchors
+            ]
         )
         self._matrices = [e.matrices(a.parameters, points)[0] for e, a in zip(sets, anchors, strict=True)]
         self._load = np.stack([e.input_harmonics(points) for e in sets])
@@ -50,12 +54,12 @@ class CondensedBatch:
         for e, anchor, d, matrices in zip(self._sets, self._anchors, self._d, self._matrices, strict=True):
             given.append((e.forces(d, anchor.parameters)[0], e.rates(self._points), matrices.d_f))
         low, inverses = 1, []
-        for e, part in enumerate(given):
-            if self._known[e]:
+        for known, part in zip(self._known, given, strict=True):
+            if known:
                 low = max(low, Preconditioner.strongly_coupled(*part))
         size = 2 * low * self._d.shape[-1]
-        for e, part in enumerate(given):
-            if self._known[e]:
+        for known, part in zip(self._known, given, strict=True):
+            if known:
                 inverses.append(np.ascontiguousarray(Preconditioner(*part, low).inverse.T))
             else:
                 inverses.append(np.zeros((size, size)))
@@ -65,8 +69,11 @@ class CondensedBatch:
         """Return the frequency responses of each set, (1 or solves, harmonics, rows, columns)."""
         result = []
         for e, (equations, anchor, known) in enumerate(zip(self._sets, self._anchors, self._matrices, strict=True)):
-            factors = list(equations.factors)
-            if np.array_equal(parameters[e][:, factors], np.broadcast_to(anchor.parameters[factors], (len(parameters[e]), len(factors)))):
+            factors = list(equations.matrix_parameters)
+            if np.array_equal(
+                parameters[e][:, factors],
+                np.broadcast_to(anchor.parameters[factors], (len(parameters[e]), len(factors))),
+            ):
                 result.append(ResponseMatrices(*(part[None] for part in known)))
             else:
                 result.append(equations.many_matrices(parameters[e], self._points))
@@ -122,9 +129,7 @@ class CondensedBatch:
             d[e, b], status[e, b], more = self._follow(e, every[e, b])
             f[e, b] = harmonics(self._sets[e].forces(d[e, b], every[e, b])[0].values)
             steps[e, b] += more
-        outputs = np.stack(
-            [self._outputs(e, responses[e], f[e]) for e in range(count)]
-        )
+        outputs = np.stack([self._outputs(e, responses[e], f[e]) for e in range(count)])
         z = on_grid(d, self._points) if keep else np.empty((count, solves, 0, first.count))
         frequency = np.repeat([[e.frequency] for e in self._sets], solves, axis=1)
         return BatchSolution(z, outputs, frequency, status, steps)

@@ -151,7 +151,7 @@ class _ModalEquations(NamedTuple):
         springs, dampers = (part[..., None] * unit for part in forces[1:])
         series = np.linalg.inv(unit + springs @ self.compliance)
         springs, dampers = series @ springs, series @ dampers @ series.transpose(0, 2, 1)
-        # ∫ exp(−s D G) ds over half a step, D the dampers, G = at·atᵀ, is a block of the exponential of a larger matrix.
+        # ∫ exp(−s D G) ds over half a step, D the dampers, G = at·atᵀ, is a block of a larger matrix's exponential.
         larger = np.zeros((steps, 2 * elements, 2 * elements))
         larger[:, :elements, :elements] = -0.5 * length * dampers @ (self.at @ self.at.T)
         larger[:, :elements, elements:] = 0.5 * length * unit

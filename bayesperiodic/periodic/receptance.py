@@ -48,7 +48,9 @@ class Receptance:
     def _modes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Diagonals of the parts (parts, n), rows and columns in the modes' coordinates; None without modes."""
         modes = self._structure.matrices.modes
-        return modes and (modes.diagonals, self._rows @ modes.vectors, self._columns @ modes.vectors)
+        if modes is None:
+            return None
+        return modes.diagonals, self._rows @ modes.vectors, self._columns @ modes.vectors
 
     @property
     def modal(self) -> bool:
@@ -95,13 +97,17 @@ class Receptance:
             diagonals, rows, columns = self._modes
             inverse = 1.0 / (factors @ diagonals)
             values = np.einsum("ar,kr,br->kab", rows, inverse, columns, optimize=True)
-            changes = [-np.einsum("ar,kr,br->kab", rows, inverse**2 * (s @ diagonals), columns, optimize=True) for s in slopes]
+            changes = [
+                -np.einsum("ar,kr,br->kab", rows, inverse**2 * (s @ diagonals), columns, optimize=True) for s in slopes
+            ]
         else:
             stiffness = np.tensordot(factors, self._matrices, (1, 0))
             right = np.linalg.solve(stiffness, np.broadcast_to(self._columns.T, (len(rates), *self._columns.T.shape)))
             values, changes = self._rows @ right, []
             if slopes:
-                left = np.linalg.solve(stiffness.transpose(0, 2, 1), np.broadcast_to(self._rows.T, (len(rates), *self._rows.T.shape)))
+                left = np.linalg.solve(
+                    stiffness.transpose(0, 2, 1), np.broadcast_to(self._rows.T, (len(rates), *self._rows.T.shape))
+                )
                 parts = np.einsum("kna,inj,kjb->kiab", left, self._matrices, right, optimize=True)
                 changes = [-np.einsum("ki,kiab->kab", s, parts) for s in slopes]
         return Response(values, np.array(changes).reshape(len(slopes), *values.shape))
@@ -131,11 +137,13 @@ class Receptance:
         return result.reshape(*result.shape[:2], len(rows), len(columns))
 
     @property
-    def factors(self) -> tuple[int, ...]:
+    def matrix_parameters(self) -> tuple[int, ...]:
         """Indices of the parameters that are factors of matrices."""
         return tuple(sorted({int(i) for i in self._factors if i >= 0}))
 
-    def _slope(self, direction: int, parameters: np.ndarray, rates: np.ndarray, factors: np.ndarray, frequency: float) -> np.ndarray:
+    def _slope(
+        self, direction: int, parameters: np.ndarray, rates: np.ndarray, factors: np.ndarray, frequency: float
+    ) -> np.ndarray:
         """Return the derivative of `coefficients` by a parameter or by the frequency."""
         if direction == self._size:
             return factors * self._powers / frequency

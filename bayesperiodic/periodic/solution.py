@@ -425,9 +425,7 @@ def as_guess(equations: PeriodicEquations, guess: Mapping[str, np.ndarray] | Per
     return equations.reduced(np.ascontiguousarray(np.tile(z, times).T))
 
 
-def by_name(
-    values: np.ndarray, rows: tuple[str, ...], directions: tuple[str, ...]
-) -> dict[str, dict[str, np.ndarray]]:
+def by_name(values: np.ndarray, rows: tuple[str, ...], directions: tuple[str, ...]) -> dict[str, dict[str, np.ndarray]]:
     """Return the columns of values (directions, points, rows) by row and direction."""
     return {row: {name: values[d, :, r].copy() for d, name in enumerate(directions)} for r, row in enumerate(rows)}
 

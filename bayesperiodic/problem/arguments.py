@@ -93,11 +93,11 @@ def fixed_values(name: str, given: Any, runs: list[str], local: bool) -> dict[st
 
 def _check_condensed(e: Experiment, model: Model) -> None:
     """Refuse what is not known of condensed models."""
-    unknown = {
+    unknown: dict[str, Any] = {
         "multipliers": e.multipliers, "condition": e.condition, "sweep": e.sweep, "guess": e.guess == DATA and DATA,
     }  # fmt: skip
     for name, value in unknown.items():
-        if value is not None and value is not False and np.size(value):
+        if value is not None and value is not False:
             raise ValueError(
                 f"{name} of experiment {e.name!r}: must be absent for {model.name!r}, which is condensed, got "
                 f"{_checks.shortened(value)}; make the model with Model.from_matrices(…, condensed=False), of few "

@@ -93,7 +93,11 @@ def correct_many(
     solves, count, elements = d.shape[1], d.shape[2], d.shape[3]
     points, size = 2 * count, low * elements
     states, out = np.zeros((points, 3 * elements)), np.empty((points, elements))
-    work, residual, step = np.empty(points, dtype=np.complex128), np.empty((count, elements), dtype=np.complex128), np.empty(2 * size)
+    work, residual, step = (
+        np.empty(points, dtype=np.complex128),
+        np.empty((count, elements), dtype=np.complex128),
+        np.empty(2 * size),
+    )
     for index in range(start, stop):
         e, b = index // solves, index % solves
         if lost[e, b] != 0:
