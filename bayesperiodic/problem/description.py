@@ -530,15 +530,8 @@ class Description(Printed):
         result = {}
         for e in self.experiments:
             inputs, frequency = self.drive(e, self.input_errors.get(e.name))
-            result[e.name] = equations_for(
-                self.model,
-                inputs,
-                frequency=frequency,
-                samples=e.samples,
-                scheme=self.scheme,
-                periods=e.periods,
-                winding=e.winding,
-            )
+            how = {"samples": e.samples, "scheme": self.scheme, "periods": e.periods, "winding": e.winding}
+            result[e.name] = equations_for(self.model, inputs, frequency=frequency, **how)
         return result
 
     def __getstate__(self) -> dict[str, Any]:
