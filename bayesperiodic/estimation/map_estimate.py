@@ -52,6 +52,7 @@ from bayesperiodic.estimation.second_order import second_order_warnings
 from bayesperiodic.estimation.shape import shape_warnings
 from bayesperiodic.estimation.table_orbits import table_warnings
 from bayesperiodic.estimation.units import compared_with_data, not_isolated, singular_start, unit_error
+from bayesperiodic.estimation.wide_tables import widened
 from bayesperiodic.likelihood.noise import Relative
 from bayesperiodic.models.model import CondensedModel
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
@@ -107,7 +108,9 @@ def map_estimate(
     recording. If they differ, the fit is repeated from orbits that the measured outputs show; if an orbit remains
     another one, the status is "other orbit".
 
-    Points of response tables are fitted on the sheets of the model's branch that fit them best at the estimate.
+    Points of response tables are fitted on the sheets of the model's branch that fit them best at the estimate. Unless
+    `start` is given, tables are first fitted with larger errors, a tenth of their largest value, and 2 % of their
+    frequencies: with precise ones, iterations from distant starts end at other optima.
 
     The iteration starts at several points where its solves are cheap, and at the images of an optimum under changes of
     signs and exchanges of two parameters, if their density is at least a thousandth of the optimum's. Ends further
@@ -146,8 +149,9 @@ def map_estimate(
     UserWarning
         If an estimate lies at the end of its prior's support, if another optimum has more than 1 % of the posterior
         mass by its Laplace approximation, if data contain no noise, if the orbit of an experiment is not the measured
-        one, if the branch of a response table does not reach a point or is unstable there, if the posterior of a table is
-        not normal near the estimate, if the data depend on a parameter only to second order there, and as `check` does.
+        one, if the branch of a response table does not reach a point or is unstable there, if the posterior of a
+        table is not normal near the estimate, if the data depend on a parameter only to second order there, and as
+        `check` does.
 
     References
     ----------
@@ -169,15 +173,21 @@ def map_estimate(
         starts = default_starts(problem) if start is None else 1
     _checks.integer("starts", starts, 1)
     _checks.instance("checks", checks, bool)
-    first = _first_iterate(problem, theta)
+    draws = problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0)))
+    near = _in_wide_tables(problem, theta, draws, progress) if start is None else []
+    first = _first_iterate(problem, near[0]) if near else None
+    first = first or _first_iterate(problem, theta)
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
     objective = _objective(problem, first.here)
     end = _on_best_sheets(problem, _climb(objective, first, progress), progress)
     end = _on_measured_orbits(problem, theta, end, progress)
     ends: list[End | None] = [end]
-    for draw in problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0))):
-        ends.append(_from_draw(objective, [one for one in ends if one], draw, progress))
+    for draw in near[1:] or draws:
+        if near and draw is near[0]:
+            ends.append(end)
+        else:
+            ends.append(_from_draw(objective, [one for one in ends if one], draw, progress))
     best = max((end for end in ends if end), key=preference)
     noisy, moved = _with_noisy_inputs(problem, best, progress)
     if noisy is not problem:
@@ -286,6 +296,24 @@ def _linearised(problem: Problem, theta: np.ndarray, initial: InitialEstimate | 
     if initial is None or not initial.states:
         return problem.density().linearise(theta)
     return LogPosterior(problem, ResponseSolver.start(problem, initial.theta, initial.states)).linearise(initial.theta)
+
+
+def _in_wide_tables(problem: Problem, theta: np.ndarray, draws: np.ndarray, progress: bool) -> list[np.ndarray]:
+    """Return where climbs in tables with larger errors end, the best first, of each start; nothing without tables."""
+    wide = widened(problem)
+    first = wide and _first_iterate(wide, theta)
+    if not (wide and first):
+        return []
+    objective = _objective(wide, first.here)
+    ends: list[End] = [_on_best_sheets(wide, _climb(objective, first, progress), progress)]
+    lost = []
+    for draw in draws:
+        end = _from_draw(objective, ends, draw, progress)
+        if end:
+            ends.append(end)
+        else:
+            lost.append(draw)
+    return [*(end.iterate.theta for end in sorted(ends, key=preference, reverse=True)), *lost]
 
 
 def _from_draw(objective: Objective, ends: Sequence[End], theta: np.ndarray, progress: bool) -> End | None:
