@@ -25,6 +25,7 @@ from bayesperiodic.data.experiment import DATA
 from bayesperiodic.likelihood.likelihood import Likelihood
 from bayesperiodic.likelihood.noise_estimate import estimate_noise
 from bayesperiodic.likelihood.observation import Observation, Response
+from bayesperiodic.models.model import CondensedModel
 from bayesperiodic.periodic.equations import CyclicFactors, PeriodicEquations, along
 from bayesperiodic.problem.description import Description
 
@@ -62,12 +63,16 @@ class InitialEstimate(NamedTuple):
 
 @unwarned
 def simultaneous_fit(problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> InitialEstimate | None:
-    """Return θ and orbits near the MAP point; None if the model is autonomous or an experiment has no guess.
+    """Return θ and orbits near the MAP point; None for autonomous and condensed models, or without guesses.
 
     The fit starts at θ (names,) and at guesses, by default the experiments' own, ignores multipliers, and moves
     positive parameters in their logarithms.
     """
-    if problem.model.autonomous or not (guesses or all(e.guess for e in problem.experiments)):
+    if (
+        problem.model.autonomous
+        or isinstance(problem.model, CondensedModel)
+        or not (guesses or all(e.guess for e in problem.experiments))
+    ):
         return None
     fit = _SimultaneousFit(problem, guesses or experiments_guesses(problem, theta))
     return fit.iterate(fit.parameters_along_guesses(theta))

@@ -11,6 +11,7 @@ import numpy as np
 from bayesperiodic.density.initial_orbits import measured_orbits
 from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED, other_orbit, unexplained
 from bayesperiodic.density.responses import ResponseSolver
+from bayesperiodic.models.model import CondensedModel
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.problem.description import Description
@@ -39,7 +40,8 @@ def _others(
     problem: Description, solver: ResponseSolver, theta: np.ndarray, first: dict[str, PeriodicSolution]
 ) -> Iterator[ResponseSolver]:
     yield solver.anchored(theta)
-    if not problem.model.autonomous and all(np.isfinite([*s.states.values()]).all() for s in first.values()):
+    unable = problem.model.autonomous or isinstance(problem.model, CondensedModel)
+    if not unable and all(np.isfinite([*s.states.values()]).all() for s in first.values()):
         near = {name: solution.states for name, solution in first.items()}
         yield ResponseSolver.start(problem, theta, measured_orbits(problem, theta, near, 1).states)
 

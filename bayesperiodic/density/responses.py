@@ -19,12 +19,16 @@ from bayesperiodic.density.special_points import (
 )
 from bayesperiodic.density.sweeps import SAME_ORBIT, Place, distance, places, tables
 from bayesperiodic.likelihood.observation import GroupSolution, Response, Simulation
+from bayesperiodic.models.model import CondensedModel
 from bayesperiodic.periodic.arclength import PATH_LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
-from bayesperiodic.periodic.equations import PeriodicEquations, Solved, directional_sensitivities
+from bayesperiodic.periodic.condensed import CondensedEquations
+from bayesperiodic.periodic.condensed_batch import CondensedBatch
+from bayesperiodic.periodic.condensed_solution import described, modal_multipliers
+from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
-from bayesperiodic.periodic.solution import PeriodicSolution, as_guess, describe, logarithmic_jacobian
+from bayesperiodic.periodic.solution import PeriodicSolution, as_guess, logarithmic_jacobian
 from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.periodic.special import SpecialEquations, SpecialPoint
 from bayesperiodic.periodic.special_batch import SpecialAnchor, SpecialBatch
@@ -163,7 +167,9 @@ class ResponseSolver:
     @cached_property
     def _batches(
         self,
-    ) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch | SpecialBatch, bool]]:
+    ) -> list[
+        tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch | SpecialBatch | CondensedBatch, bool]
+    ]:
         """The groups, their parameters, their solver, and whether multipliers were measured."""
         return [
             (
@@ -205,13 +211,15 @@ class ResponseSolver:
             result += [Sheet(self.problem, table, points) for points in of_sheets.values()]
         return result
 
-    def _batch(self, names: list[str]) -> Batch | AutonomousBatch | SpecialBatch:
+    def _batch(self, names: list[str]) -> Batch | AutonomousBatch | SpecialBatch | CondensedBatch:
         """Return the solver of experiments of one group."""
         anchors: list[Any] = [self.anchors[name].anchor for name in names]
         if names[0] in self._specials:
             return SpecialBatch([self._specials[name] for name in names], anchors)
-        kind = AutonomousBatch if self.problem.model.autonomous else Batch
-        return kind([self.problem.equations[name] for name in names], anchors)
+        sets: list[Any] = [self.problem.equations[name] for name in names]
+        if isinstance(self.problem.model, CondensedModel):
+            return CondensedBatch(sets, anchors)
+        return (AutonomousBatch if self.problem.model.autonomous else Batch)(sets, anchors)
 
     def solve(
         self,
@@ -280,7 +288,8 @@ class ResponseSolver:
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
         """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""
         anchor = self.anchors[experiment].anchor
-        if isinstance(anchor, SpecialAnchor) or anchor.sensitivities is None:
+        condensed = isinstance(self.problem.model, CondensedModel)
+        if condensed or isinstance(anchor, SpecialAnchor) or anchor.sensitivities is None:
             return PATH_LOST
         parameters = self.problem.parameters(theta[None], experiment)[0]
         return path_outcome(self.problem.equations[experiment], anchor, parameters)
@@ -321,7 +330,7 @@ class ResponseSolver:
         for e in self.problem.experiments:
             (here, z), code = self._solved(simulation, e.name), int(simulation.statuses(e.name)[0])
             here, parameters = without_sensors(self.problem, here, self._at_scale(e, simulation), theta)
-            solutions[e.name] = describe(here, parameters, Solved(z, code, NO_HISTORY))
+            solutions[e.name] = described(here, parameters, Solved(z, code, NO_HISTORY))
         return solutions
 
     def _at_scale(self, experiment: Experiment, simulation: Simulation) -> Experiment:
@@ -411,7 +420,7 @@ class ResponseSolver:
         """
         result: dict[str, np.ndarray] = {}
         for g, (experiments, maps, batch, _) in enumerate(self._batches):
-            assert isinstance(batch, Batch)
+            assert isinstance(batch, Batch | CondensedBatch)
             solved = simulation.groups[g]
             parameters = solved.parameters[:, 0]
             values = np.concatenate([parameters, solved.sensors[:, 0]], axis=1)
@@ -448,10 +457,14 @@ def _initial_orbit(
             return InitialOrbit(guess, Anchor(parameters, z, equations.frequency), None)
         solved = here, z
     here, z = solved
+    if isinstance(here, CondensedEquations):  # on as many points as it takes there
+        z, code, *_ = here.find(parameters, z)[0]
+        if code != CONVERGED:
+            return InitialOrbit(guess, Anchor(parameters, z, equations.frequency), None)
     parameter_map = problem.parameter_maps[experiment]
     moving = np.flatnonzero(parameter_map.slopes(theta)[: parameter_map.count].any(axis=1))
     directions = np.eye(parameters.size)[moving]
-    derivative = directional_sensitivities(here, z, parameters, directions)
+    derivative = here.sensitivities_along(z, parameters, directions)
     by_all = derivative and PointDerivatives(
         np.tensordot(directions, derivative.outputs, (0, 0)),
         directions.T @ derivative.frequency,
@@ -499,6 +512,8 @@ def orbit_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: n
     """Return the `count` largest multipliers of a solution z, or fewer, without an autonomous orbit's trivial 1."""
     if not count:
         return np.empty(0)
+    if isinstance(equations, CondensedEquations):
+        return modal_multipliers(equations, parameters, z)[0][:count]
     easy = None if equations.model.autonomous else _leading_multipliers_directly(equations, parameters, z, count)
     if easy is not None:
         return easy
@@ -524,7 +539,7 @@ def _leading_multipliers_directly(
 
 
 def _described(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> PeriodicSolution:
-    return describe(equations, parameters, Solved(z, CONVERGED, NO_HISTORY), sensitivities=False)
+    return described(equations, parameters, Solved(z, CONVERGED, NO_HISTORY), sensitivities=False)
 
 
 def _without_trivial(solution: PeriodicSolution, values: np.ndarray) -> np.ndarray:

@@ -28,7 +28,8 @@ from bayesperiodic.likelihood.likelihood import Likelihood
 from bayesperiodic.likelihood.noise import LENGTHSCALE, VARIANCE
 from bayesperiodic.likelihood.observation import Response
 from bayesperiodic.periodic.compiled import CONVERGED
-from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, input_sensitivities
+from bayesperiodic.periodic.condensed import equations_for
+from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.problem.model_inputs import sensor_values
@@ -459,7 +460,7 @@ def _solved(
     None if the solve fails; the frequency of an autonomous model is that of the near solution at first.
     """
     points, (inputs, frequency) = finer * experiment.samples * experiment.periods, drive
-    equations = PeriodicEquations.build(
+    equations = equations_for(
         problem.model,
         {n: _fourier.on_grid(_fourier.coefficients(u), points) for n, u in inputs.items()},
         frequency=near.frequency if problem.model.autonomous else frequency,
@@ -504,7 +505,7 @@ def input_loadings(
             changes[..., column] = problem.sensors.corrected_changes(e, name, changes[..., column])
         equations = problem.equations[e.name].at_frequency(solution.frequency)
         parameters, z = problem.parameters(theta[None], e.name)[0], periodic_part(equations, solution.states)
-        moved = input_sensitivities(equations, z, parameters, changes, rates)
+        moved = equations.input_sensitivities(z, parameters, changes, rates)
         if moved is not None:
             caused = predicted_changes(problem, e, equations, theta, z, moved)
             loadings[e.name] = (caused - _common(problem, e, noise)).T

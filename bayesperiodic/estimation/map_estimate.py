@@ -54,6 +54,7 @@ from bayesperiodic.estimation.table_orbits import table_warnings
 from bayesperiodic.estimation.units import compared_with_data, not_isolated, singular_start, unit_error
 from bayesperiodic.estimation.wide_tables import widened
 from bayesperiodic.likelihood.noise import Relative
+from bayesperiodic.models.model import CondensedModel
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.problem.model_inputs import model_inputs
@@ -392,7 +393,8 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
 
     Orbits and parameters are looked for from the start and from the estimate.
     """
-    if problem.model.autonomous or not all(e.outputs for e in problem.experiments):
+    unable = problem.model.autonomous or isinstance(problem.model, CondensedModel)
+    if unable or not all(e.outputs for e in problem.experiments):
         return
     solutions = {name: solution.states for name, solution in end.here.solver.solutions(end.theta).items()}
     for theta in (start, end.theta):

@@ -10,10 +10,10 @@ import sympy as sp
 
 from bayesperiodic import _checks
 from bayesperiodic.models.hysteresis import Hysteretic
-from bayesperiodic.models.names import Names
+from bayesperiodic.models.names import DERIVATIVES, Names
+from bayesperiodic.models.structure import CONSTANT_PART, POWERS, Matrices, Structure
 
-KINDS_OF_MOTION = {"displacement": "", "velocity": "d", "acceleration": "dd"}
-CONSTANT_PART = "1"
+KINDS_OF_MOTION = {"displacement": 0, "velocity": 1, "acceleration": 2}  # order of the derivative
 # Arguments of the functions of elements that are no parameters.
 OF_THE_MOTION = ("d", "v", "s", "name", "names")
 
@@ -103,13 +103,13 @@ class Element:
         return given if isinstance(given, Hysteretic) else Hysteretic(sp.sympify(given), ())
 
 
-def definition(
+def structure(
     matrices: Mapping[str, Any],
     forces: Mapping[str, Any],
     outputs: Mapping[str, tuple[Any, str]],
     elements: Iterable[Element],
-) -> dict[str, Any]:
-    """Return the arguments of `Model` for matrices by name; see `Model.from_matrices`."""
+) -> Structure:
+    """Return the checked structure of matrices by name; see `Model.from_matrices`."""
     parts = {kind: _parts(kind, given) for kind, given in matrices.items()}
     count = len(next(iter(parts["mass"].values())))
     for kind, named in parts.items():
@@ -120,7 +120,7 @@ def definition(
         raise ValueError("mass: must be regular, got a singular matrix; eliminate the degrees of freedom without mass.")
     if isinstance(elements, Element):
         raise ValueError(f"elements: must be a list of elements, got {elements.name!r} alone; give [element].")
-    placed = list(elements)
+    placed = tuple(elements)
     for element in placed:
         _checks.instance("elements", element, Element)
     _checks.mapping("forces", forces, "{'force': 0}")
@@ -128,33 +128,39 @@ def definition(
     inputs = {name: _weights(f"forces[{name!r}]", place, count) for name, place in forces.items()}
     measured = {name: _measured(f"outputs[{name!r}]", given, count) for name, given in outputs.items()}
     weights = [_weights(f"place of element {e.name!r}", e.place, count) for e in placed]
-    degrees = [f"x{number}" for number in range(count)]
+    return Structure(Matrices(parts), inputs, measured, placed, np.array(weights).reshape(-1, count))
+
+
+def definition(given: Structure) -> dict[str, Any]:
+    """Return the arguments of `Model` for a structure; the equations are functions, which only `Model` calls."""
+    degrees = [f"x{number}" for number in range(given.degrees)]
 
     def equations(s: Names, p: Names, u: Names) -> list[sp.Expr]:
-        total: list[sp.Expr] = [sp.S.Zero] * count
-        for kind, derivative in (("mass", "dd"), ("damping", "d"), ("stiffness", "")):
-            for name, matrix in parts[kind].items():
+        total: list[sp.Expr] = [sp.S.Zero] * given.degrees
+        for kind, power in POWERS.items():
+            for name, matrix in given.parts[kind].items():
                 factor = sp.S.One if name == CONSTANT_PART else p[name]
                 for i, row in enumerate(matrix):
-                    total[i] += factor * _combined(row, [s[derivative + x] for x in degrees])
+                    total[i] += factor * _combined(row, [s[DERIVATIVES[power] + x] for x in degrees])
         internal: list[sp.Expr] = []
-        for element, at in zip(placed, weights, strict=True):
-            d, v = (_combined(at, [s[derivative + x] for x in degrees]) for derivative in ("", "d"))
+        for element, at in zip(given.elements, given.weights, strict=True):
+            d, v = (_combined(at, [s[derivative + x] for x in degrees]) for derivative in DERIVATIVES[:2])
             part = element.evaluate(d, v, s, p)
             internal += part.equations
             total = [sum_ + _number(w) * part.force if w else sum_ for sum_, w in zip(total, at, strict=True)]
-        for name, at in inputs.items():
+        for name, at in given.inputs.items():
             total = [sum_ - _number(w) * u[name] if w else sum_ for sum_, w in zip(total, at, strict=True)]
         return [*total, *internal]
 
-    factors = [name for named in parts.values() for name in named if name != CONSTANT_PART]
+    factors = [name for named in given.parts.values() for name in named if name != CONSTANT_PART]
     return {
-        "states": [*degrees, *(state for e in placed for state in e.states)],
-        "inputs": [*inputs],
-        "parameters": [*dict.fromkeys(factors), *(f"{e.name}_{name}" for e in placed for name in e.parameters)],
+        "states": [*degrees, *(state for e in given.elements for state in e.states)],
+        "inputs": [*given.inputs],
+        "parameters": [*dict.fromkeys(factors), *(f"{e.name}_{name}" for e in given.elements for name in e.parameters)],
         "equations": equations,
         "outputs": lambda s, p, u: {
-            name: _combined(at, [s[derivative + x] for x in degrees]) for name, (at, derivative) in measured.items()
+            name: _combined(at, [s[DERIVATIVES[order] + x] for x in degrees])
+            for name, (at, order) in given.measured.items()
         },
     }
 
@@ -200,7 +206,7 @@ def _weights(argument: str, place: Any, count: int) -> np.ndarray:
     return weights
 
 
-def _measured(argument: str, given: Any, count: int) -> tuple[np.ndarray, str]:
+def _measured(argument: str, given: Any, count: int) -> tuple[np.ndarray, int]:
     if not isinstance(given, tuple) or len(given) != 2 or not isinstance(given[1], str):
         raise ValueError(f"{argument}: must be a place and a kind, such as (0, 'acceleration'), got {given!r}.")
     _checks.one_of(argument, given[1], KINDS_OF_MOTION)

@@ -4,7 +4,9 @@ import inspect
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
+from dataclasses import replace
 from functools import cache, cached_property
+from hashlib import sha256
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -18,11 +20,14 @@ from bayesperiodic._compile.code_generation import Kernels, SymbolicModel, VjpKe
 from bayesperiodic._compile.grid_function import GridFunction
 from bayesperiodic._expressions import parse
 from bayesperiodic._printing import Printed
-from bayesperiodic.models.matrices import definition
+from bayesperiodic.models.matrices import definition, structure
 from bayesperiodic.models.names import DERIVATIVES, Names, with_derivatives
+from bayesperiodic.models.structure import CONSTANT_PART, Structure
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
 LARGEST_FLOAT = np.finfo(float).max
+# Degrees of freedom above which models of matrices are condensed.
+MOST_SYMBOLIC = 10
 VJP_FUNCTIONS = ("outputs_vjp", "equations_vjp")
 # Texts of the TypeErrors of NumPy, math and `if` when they are given symbols.
 NUMERIC_ONLY = ("ufunc", "truth value", "expression to float", "to integer", "'Symbol'")
@@ -99,19 +104,7 @@ class Model(Printed):
     ):
         if description:
             self.__doc__ = description
-        (self.name,) = _checks.identifiers("name", [name])
-        self.states = _checks.identifiers("states", states, RESERVED)
-        self.inputs = _checks.identifiers("inputs", inputs, (*RESERVED, *self.states))
-        self.parameters = _checks.identifiers("parameters", parameters, RESERVED)
-        for argument, space, names in (("states", "s", self.states), ("inputs", "u", self.inputs)):
-            _check_derivative_names(argument, space, names)
-        if not self.states:
-            raise ValueError("states: must have at least one name, got none.")
-
-        self.state_symbols = with_derivatives("s", self.states)
-        self.input_symbols = with_derivatives("u", self.inputs)
-        self.parameter_symbols = {n: sp.Symbol(f"p_{n}", real=True) for n in self.parameters}
-        self.time_symbols = {n: sp.Symbol(f"t_{n}", real=True) for n in ("tau", "frequency")}
+        self._set_names(name, states, inputs, parameters)
         spaces = (
             Names("states", self.state_symbols | self.time_symbols),
             Names("parameters", self.parameter_symbols),
@@ -132,15 +125,7 @@ class Model(Printed):
         if not self.outputs:
             raise ValueError("outputs: must have at least one output, got none.")
 
-        used = _symbols((*self.equations, *self.output_expressions))
-        if unused := [n for n, symbol in self.parameter_symbols.items() if symbol not in used]:
-            warnings.warn(
-                f"parameters: no equation and no output of {self.name!r} contains {', '.join(map(repr, unused))}, so "
-                "that no data can determine the value; leave the name out, or check the equations.",
-                UserWarning,
-                stacklevel=2,
-            )
-
+        self._warn_of_unused((*self.equations, *self.output_expressions), self.parameters)
         self.angles = tuple(angles)
         for angle in self.angles:
             _checks.one_of("angles", angle, (*self.states, *self.outputs))
@@ -151,6 +136,31 @@ class Model(Printed):
         for channel, unit in self.units.items():
             _checks.text(f"units[{channel!r}]", unit)
         self.orders = {state: self._order(state) for state in self.states}
+
+    def _set_names(self, name: str, states: Iterable[str], inputs: Iterable[str], parameters: Iterable[str]) -> None:
+        """Check the names, and make their symbols."""
+        (self.name,) = _checks.identifiers("name", [name])
+        self.states = _checks.identifiers("states", states, RESERVED)
+        self.inputs = _checks.identifiers("inputs", inputs, (*RESERVED, *self.states))
+        self.parameters = _checks.identifiers("parameters", parameters, RESERVED)
+        for argument, space, names in (("states", "s", self.states), ("inputs", "u", self.inputs)):
+            _check_derivative_names(argument, space, names)
+        if not self.states:
+            raise ValueError("states: must have at least one name, got none.")
+        self.state_symbols = with_derivatives("s", self.states)
+        self.input_symbols = with_derivatives("u", self.inputs)
+        self.parameter_symbols = {n: sp.Symbol(f"p_{n}", real=True) for n in self.parameters}
+        self.time_symbols = {n: sp.Symbol(f"t_{n}", real=True) for n in ("tau", "frequency")}
+
+    def _warn_of_unused(self, expressions: Iterable[sp.Expr], names: Iterable[str]) -> None:
+        used = _symbols(expressions)
+        if unused := [n for n in names if self.parameter_symbols[n] not in used]:
+            warnings.warn(
+                f"parameters: no equation and no output of {self.name!r} contains {', '.join(map(repr, unused))}, so "
+                "that no data can determine the value; leave the name out, or check the equations.",
+                UserWarning,
+                stacklevel=3,
+            )
 
     @classmethod
     def from_matrices(
@@ -163,12 +173,14 @@ class Model(Printed):
         forces: Mapping[str, Any],
         outputs: Mapping[str, tuple[Any, str]],
         elements: Iterable[Any] = (),
+        condensed: bool | None = None,
     ) -> "Model":
-        """Return the model M ẍ + C ẋ + K x + elements = forces of a few degrees of freedom.
+        """Return the model M ẍ + C ẋ + K x + elements = forces.
 
-        The states are x0, x1, …, in the order of the matrices, and those of the elements. The equations are symbolic:
-        the time of compilation and the cost of a solution grow with the cube of the number of states, so that some
-        ten degrees of freedom are practical; reduce larger models to the modes in the frequency range first.
+        The states are x0, x1, …, in the order of the matrices, and those of the elements. A condensed model is solved
+        in the displacements of its elements alone, to which the linear rest is condensed by its frequency response, see
+        `CondensedModel`; it may have hundreds of degrees of freedom. Else the equations are symbolic, so that time of
+        compilation and cost of a solution grow with the cube of the number of states.
 
         Parameters
         ----------
@@ -184,6 +196,9 @@ class Model(Printed):
             tuple (i, j) the difference of i and j.
         elements : sequence of elements.Element
             Nonlinear parts. Each parameter of an element is a parameter of the model, called element_parameter.
+        condensed : bool, optional
+            By default True for more than ten degrees of freedom, if all elements are memoryless: their forces are
+            functions of displacement and velocity, without internal states.
 
         Returns
         -------
@@ -193,7 +208,8 @@ class Model(Printed):
         ------
         ValueError
             For matrices that are not square, of different sizes or not finite, a singular mass matrix, a place that
-            does not exist, and as for `Model`.
+            does not exist, a condensed model without force or with an element that has internal states, and as for
+            `Model`.
 
         Examples
         --------
@@ -204,7 +220,10 @@ class Model(Printed):
         (('x0', 'x1', 'joint'), ('alpha', 'joint_stiffness', 'joint_limit'))
         """
         matrices = {"mass": mass, "damping": damping, "stiffness": stiffness}
-        return cls(name, **definition(matrices, forces, outputs, elements))
+        given = structure(matrices, forces, outputs, elements)
+        if condensed is None:
+            condensed = given.memoryless and bool(given.inputs) and given.degrees > MOST_SYMBOLIC
+        return CondensedModel(name, given) if condensed else cls(name, **definition(given))
 
     def _expression(self, argument: str, given: Any) -> sp.Expr:
         if isinstance(given, int | float):
@@ -359,6 +378,163 @@ class Model(Printed):
             f"Model({self.name!r}, states={list(self.states)}, inputs={list(self.inputs)}, "
             f"parameters={list(self.parameters)}, outputs={list(self.outputs)})"
         )
+
+
+class CondensedModel(Model):
+    """Model of matrices whose periodic solutions are found in the displacements of its elements alone.
+
+    `Model.from_matrices` makes it. It has no symbolic equations: what needs them raises a ValueError.
+
+    Parameters
+    ----------
+    name : str
+    structure : Structure
+        Checked matrices, places and elements.
+
+    Raises
+    ------
+    ValueError
+        Without a force, and for an element with internal states.
+    """
+
+    def __init__(self, name: str, structure: Structure):
+        if not structure.memoryless:
+            raise ValueError(
+                "elements: must be functions of displacement and velocity in a condensed model, got one with internal "
+                "states or an argument s; take condensed=False, or a memoryless element."
+            )
+        if not structure.inputs:
+            raise ValueError(
+                "forces: must have at least one force in a condensed model, got none; take condensed=False."
+            )
+        given = definition(structure)
+        self._set_names(name, given["states"], given["inputs"], given["parameters"])
+        self.outputs = _checks.identifiers("outputs", structure.measured, (*RESERVED, *self.inputs))
+        if not self.outputs:
+            raise ValueError("outputs: must have at least one output, got none.")
+        moving = with_derivatives("e", tuple(f"d{number}" for number in range(len(structure.elements))))
+        self.element_symbols = tuple(moving.values())
+        s, p, forces = Names("states", {}), Names("parameters", self.parameter_symbols), []
+        for element, d, v in zip(
+            structure.elements, self.element_symbols, self.element_symbols[len(structure.elements) :], strict=False
+        ):
+            forces.append(self._element_force(element.evaluate(d, v, s, p).force))
+        self.element_forces = tuple(forces)
+        of_matrices = {factor for named in structure.parts.values() for factor in named}
+        self._warn_of_unused(forces, [n for n in self.parameters if n not in of_matrices])
+        # Functions cannot be pickled; what they returned is kept.
+        self.structure = replace(structure, elements=())
+        self.angles, self.units, self.orders = (), {}, dict.fromkeys(self.states, 2)
+
+    def _element_force(self, given: sp.Expr) -> sp.Expr:
+        known = {*self.element_symbols, *self.parameter_symbols.values()}
+        if given.has(sp.I, sp.zoo, sp.nan, sp.oo, -sp.oo):
+            raise ValueError(f"elements: must have real and finite forces, got {_checks.shortened(given)}.")
+        if unknown := sorted(map(str, given.free_symbols - known)):
+            raise ValueError(f"elements: must have forces of d, v and parameters, got {', '.join(unknown)}.")
+        return given
+
+    def refusal(self) -> ValueError:
+        """Return the error for what needs symbolic equations."""
+        return ValueError(
+            f"model: must have symbolic equations for this, got {self.name!r}, which is condensed to the displacements "
+            "of its elements; make it with Model.from_matrices(…, condensed=False), of few degrees of freedom, such as "
+            "the modes in the frequency range."
+        )
+
+    @property
+    def equations(self) -> tuple[sp.Expr, ...]:  # type: ignore[override]
+        """Refused."""
+        raise self.refusal()
+
+    @property
+    def output_expressions(self) -> tuple[sp.Expr, ...]:  # type: ignore[override]
+        """Refused."""
+        raise self.refusal()
+
+    @property
+    def symbolic(self) -> SymbolicModel:
+        """Refused."""
+        raise self.refusal()
+
+    @cached_property
+    def autonomous(self) -> bool:
+        """False, since a force acts."""
+        return False
+
+    @cached_property
+    def explicit_time(self) -> bool:
+        """False, since elements are functions of displacement and velocity."""
+        return False
+
+    @cached_property
+    def smooth_signs(self) -> tuple[sp.Expr, ...]:
+        """None: the points of the grid are doubled until the forces are resolved."""
+        return ()
+
+    @property
+    def definition(self) -> str:
+        """All that solutions depend on, as text; equal for equal models."""
+        names = self.states, self.inputs, self.parameters, self.outputs, "condensed"
+        arrays = [m for named in self.structure.parts.values() for m in named.values()]
+        arrays += [*self.structure.inputs.values(), *(at for at, _ in self.structure.measured.values())]
+        content = sha256(b"".join(a.tobytes() for a in [*arrays, self.structure.weights])).hexdigest()
+        factors = {kind: [*named] for kind, named in self.structure.parts.items()}
+        orders = [order for _, order in self.structure.measured.values()]
+        return "\n".join([repr(names), repr(factors), repr(orders), content, *map(sp.srepr, self.element_forces)])
+
+    @cached_property
+    def element_kernels(self) -> Kernels:
+        """The compiled forces of the elements, as equations of the elements' displacements; cached on disk."""
+        return SymbolicModel(
+            states=self.element_symbols,
+            inputs=(),
+            parameters=tuple(self.parameter_symbols.values()),
+            tau=self.time_symbols["tau"],
+            frequency=self.time_symbols["frequency"],
+            equations=self.element_forces or (sp.S.Zero,),
+            outputs=(sp.S.Zero,),
+            transitions=(),
+        ).kernels()
+
+    @cached_property
+    def with_all_outputs(self) -> "CondensedModel":
+        """The model whose outputs are the displacements of all degrees of freedom."""
+        other, places = copy(self), np.eye(len(self.states))
+        other.structure = replace(self.structure, measured={x: (places[i], 0) for i, x in enumerate(self.states)})
+        other.outputs = self.states
+        return other
+
+    def input_derivatives(self) -> dict[str, int]:
+        """Return 0 for every input."""
+        return dict.fromkeys(self.inputs, 0)
+
+    def latex(self) -> str:
+        """Return the equation of motion, and the forces of the elements, as a LaTeX ``aligned`` environment."""
+        written = {symbol: sp.latex(sp.Symbol(name)) for name, symbol in self.parameter_symbols.items()}
+        count = len(self.element_forces)
+        for number in range(count):
+            for order, mark in enumerate(("d", r"\dot{d}")):
+                written[self.element_symbols[order * count + number]] = f"{mark}_{{{number + 1}}}"
+        sums = []
+        for kind, letter, motion in (("mass", "M", r"\ddot{x}"), ("damping", "C", r"\dot{x}"), ("stiffness", "K", "x")):
+            for number, factor in enumerate(self.structure.parts[kind]):
+                scale = "" if factor == CONSTANT_PART else written[self.parameter_symbols[factor]] + r"\,"
+                sums.append(f"{scale}{letter}_{{{number}}} {motion}")
+        forces = [
+            f"f_{{{number + 1}}} &= {sp.latex(f, symbol_names=written)}" for number, f in enumerate(self.element_forces)
+        ]
+        motion = " + ".join([*sums, *(["W^T f"] if count else [])]) + r" &= B u"
+        return (
+            "\\begin{aligned}\n"
+            + " \\\\\n".join([motion, *(["d &= W x"] if count else []), *forces])
+            + "\n\\end{aligned}"
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {
+            key: value for key, value in self.__dict__.items() if key not in ("element_kernels", "with_all_outputs")
+        }
 
 
 def _called(argument: str, given: Any, spaces: tuple[Names, ...]) -> Any:

@@ -28,7 +28,6 @@ from bayesperiodic.periodic.equations import (
     Sensitivities,
     empty_factors,
     frequency_derivatives,
-    parameter_sensitivities,
     workspace,
 )
 
@@ -50,7 +49,7 @@ class Anchor:
     @classmethod
     def at(cls, equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> "Anchor":
         """Return the anchor at a solution z; without sensitivities if ∂g/∂z is singular."""
-        derivative = parameter_sensitivities(equations, z, parameters)
+        derivative = equations.parameter_sensitivities(z, parameters)
         return cls.of(equations, parameters, z, derivative, np.arange(parameters.size))
 
     @classmethod

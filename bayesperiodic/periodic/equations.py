@@ -356,6 +356,46 @@ class PeriodicEquations:
         """Return one of the model's grid functions at the periodic part z."""
         return self.model.kernels.evaluate(name, self.states(z), self.inputs, parameters, self.grid.tau, self.frequency)
 
+    def reduced(self, states: np.ndarray) -> np.ndarray:
+        """Return z (points, states) for the periodic parts of all states: the same."""
+        return states
+
+    def sensitivities_along(
+        self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
+    ) -> "Sensitivities | None":
+        """Return derivatives along directions (directions, parameters) of the parameters; None if singular."""
+        d, columns = self.derivatives(z, parameters), self.residual_jacobian(z, parameters)
+        with np.errstate(over="ignore", invalid="ignore"):  # of derivatives that overflow, which callers check
+            g, f = np.tensordot(directions, d.g_theta, (1, 2)), np.tensordot(directions, d.f_theta, (1, 2))
+        return respond(self, z, columns, d, g, f)
+
+    def parameter_sensitivities(self, z: np.ndarray, parameters: np.ndarray) -> "Sensitivities | None":
+        """Return derivatives to every parameter and, for a driven model, last to the frequency; None if singular.
+
+        For an autonomous model the change of the orbit is orthogonal to the flow, states in units of their range.
+        """
+        d, columns = self.derivatives(z, parameters), self.residual_jacobian(z, parameters)
+        g, f = np.moveaxis(d.g_theta, 2, 0), np.moveaxis(d.f_theta, 2, 0)
+        if not self.model.autonomous:
+            g_frequency, f_frequency = frequency_derivatives(self, z, columns, d)
+            g, f = np.concatenate([g, g_frequency[None]]), np.concatenate([f, f_frequency[None]])
+        return respond(self, z, columns, d, g, f)
+
+    def input_sensitivities(
+        self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray, frequency: np.ndarray
+    ) -> "Sensitivities | None":
+        """Return derivatives along perturbations of a driven model's inputs and frequency; None if singular.
+
+        They are (directions, points, 3·inputs) of (u, u̇, ü) as functions of τ, and (directions,) of the frequency [Hz].
+        """
+        d, columns = self.derivatives(z, parameters), self.residual_jacobian(z, parameters)
+        g, f = along(d.g_u, directions), along(d.f_u, directions)
+        if frequency.any():
+            g_frequency, f_frequency = frequency_derivatives(self, z, columns, d)
+            g, f = g + frequency[:, None, None] * g_frequency, f + frequency[:, None, None] * f_frequency
+        result = respond(self, z, columns, d, g, f)
+        return result and result._replace(frequency=frequency)
+
 
 def phase_row(grid: CyclicGrid, z: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Return the row (points, states) of the phase condition against z, given q, q̇, q̈ side by side."""
@@ -419,47 +459,6 @@ class Sensitivities(NamedTuple):
     states: np.ndarray  # (directions, points, states)
     outputs: np.ndarray  # (directions, points, channels)
     frequency: np.ndarray  # (directions,), of the solution's frequency [Hz per unit]; zero for a driven model
-
-
-def directional_sensitivities(
-    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
-) -> Sensitivities | None:
-    """Return derivatives along directions (directions, parameters) of the parameters; None if singular."""
-    d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
-    with np.errstate(over="ignore", invalid="ignore"):  # of derivatives that overflow, which callers check
-        g, f = np.tensordot(directions, d.g_theta, (1, 2)), np.tensordot(directions, d.f_theta, (1, 2))
-    return respond(equations, z, columns, d, g, f)
-
-
-def parameter_sensitivities(
-    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray
-) -> Sensitivities | None:
-    """Return derivatives to every parameter and, for a driven model, last to the frequency; None if singular.
-
-    For an autonomous model the change of the orbit is orthogonal to the flow, states in units of their range.
-    """
-    d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
-    g, f = np.moveaxis(d.g_theta, 2, 0), np.moveaxis(d.f_theta, 2, 0)
-    if not equations.model.autonomous:
-        g_frequency, f_frequency = frequency_derivatives(equations, z, columns, d)
-        g, f = np.concatenate([g, g_frequency[None]]), np.concatenate([f, f_frequency[None]])
-    return respond(equations, z, columns, d, g, f)
-
-
-def input_sensitivities(
-    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray, frequency: np.ndarray
-) -> Sensitivities | None:
-    """Return derivatives along perturbations of a driven model's inputs and frequency; None if singular.
-
-    They are (directions, points, 3·inputs) of (u, u̇, ü) as functions of τ, and (directions,) of the frequency [Hz].
-    """
-    d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
-    g, f = along(d.g_u, directions), along(d.f_u, directions)
-    if frequency.any():
-        g_frequency, f_frequency = frequency_derivatives(equations, z, columns, d)
-        g, f = g + frequency[:, None, None] * g_frequency, f + frequency[:, None, None] * f_frequency
-    result = respond(equations, z, columns, d, g, f)
-    return result and result._replace(frequency=frequency)
 
 
 def along(derivatives: np.ndarray, directions: np.ndarray) -> np.ndarray:

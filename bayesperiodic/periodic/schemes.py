@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Storable
-from bayesperiodic.models.model import Model
+from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.compiled import Grid
 
 UNROLLED_OFFSETS = 5
@@ -125,8 +125,10 @@ def default_scheme(model: Model, *, tables: bool = False) -> str:
     into even and odd points that only the other terms relate: on an even grid the equations have solutions in which the
     two differ, and those of an autonomous model are nearly singular. central4 relates them. For such models it is also
     more accurate, kinks included, and a batch of solves takes 1.3 times (one state) to twice (two states) as long.
-    For `tables` of responses, whose grids are coarse, it is central4 too.
+    For `tables` of responses, whose grids are coarse, it is central4 too. A condensed model has harmonics ("fourier").
     """
+    if isinstance(model, CondensedModel):
+        return fourier.name
     return central4.name if tables or 1 in model.orders.values() else central2.name
 
 

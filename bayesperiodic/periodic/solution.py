@@ -19,7 +19,6 @@ from bayesperiodic.periodic.equations import (
     CyclicFactors,
     PeriodicEquations,
     Solved,
-    parameter_sensitivities,
     phase_row,
 )
 from bayesperiodic.periodic.floquet import Floquet, derivative_factors, first_order_matrix
@@ -344,13 +343,13 @@ def describe(
     by_state: dict[str, dict[str, np.ndarray]] = {}
     by_parameter: dict[str, float] = {}
     if code == CONVERGED and sensitivities:
-        derivative = parameter_sensitivities(equations, solved.z, theta)
+        derivative = equations.parameter_sensitivities(solved.z, theta)
         if derivative is None:
             code = SINGULAR
         else:
             names = (*model.parameters, FREQUENCY)[: len(derivative.frequency)]
-            by_output = _by_name(derivative.outputs, model.outputs, names)
-            by_state = _by_name(derivative.states, model.states, names)
+            by_output = by_name(derivative.outputs, model.outputs, names)
+            by_state = by_name(derivative.states, model.states, names)
             by_parameter = dict(zip(model.parameters, derivative.frequency.tolist(), strict=False))
     states, outputs = equations.states(solved.z), equations.outputs(solved.z, theta)
     columns, spectral = equations.residual_jacobian(solved.z, theta), code == CONVERGED and np.isinf(grid.scheme.order)
@@ -407,7 +406,7 @@ def periodic_part(equations: PeriodicEquations, states: Mapping[str, np.ndarray]
     _checks.same_names("guess", states, model.states)
     given = [_checks.finite_vector(f"guess[{n!r}]", states[n], grid.points, "samples·periods") for n in model.states]
     z = np.stack(given, axis=-1)
-    return z - equations.drift * grid.tau[:, None]
+    return equations.reduced(z - equations.drift * grid.tau[:, None])
 
 
 def as_guess(equations: PeriodicEquations, guess: Mapping[str, np.ndarray] | PeriodicSolution) -> np.ndarray:
@@ -423,12 +422,11 @@ def as_guess(equations: PeriodicEquations, guess: Mapping[str, np.ndarray] | Per
     times = equations.grid.periods // guess.periods
     if guess.samples != equations.grid.samples:
         z = _fourier.on_grid(_fourier.coefficients(z), equations.grid.samples * guess.periods)
-    return np.ascontiguousarray(np.tile(z, times).T)
+    return equations.reduced(np.ascontiguousarray(np.tile(z, times).T))
 
 
-def _by_name(
-    values: np.ndarray, rows: tuple[str, ...], directions: tuple[str, ...]
-) -> dict[str, dict[str, np.ndarray]]:
+def by_name(values: np.ndarray, rows: tuple[str, ...], directions: tuple[str, ...]) -> dict[str, dict[str, np.ndarray]]:
+    """Return the columns of values (directions, points, rows) by row and direction."""
     return {row: {name: values[d, :, r].copy() for d, name in enumerate(directions)} for r, row in enumerate(rows)}
 
 
@@ -469,7 +467,7 @@ def multiplier_sensitivities(model: Model, solution: PeriodicSolution) -> dict[s
     True
     """
     equations, theta, z = equations_of(model, solution)
-    derivative = parameter_sensitivities(equations, z, theta)
+    derivative = equations.parameter_sensitivities(z, theta)
     if solution.floquet is None or derivative is None:
         raise ValueError("solution: must be regular, got singular linearised equations. Change a parameter slightly.")
     if solution.floquet.reduced:

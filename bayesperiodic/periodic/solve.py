@@ -10,6 +10,8 @@ from bayesperiodic import _checks, _fourier
 from bayesperiodic.models.model import Model, integration_kernels, parameter_vector
 from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, OTHER_ORBIT, SINGULAR, STATUSES
+from bayesperiodic.periodic.condensed import COARSE, MOST_POINTS, CondensedEquations, equations_for
+from bayesperiodic.periodic.condensed_solution import described
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.isolation import MANY_CYCLES, has_neighbours
 from bayesperiodic.periodic.schemes import Scheme
@@ -235,7 +237,7 @@ def solve_periodic(
     6.3807
     """
     _checks.instance("model", model, Model)
-    equations = PeriodicEquations.build(
+    equations = equations_for(
         model, inputs, frequency=frequency, samples=samples, scheme=scheme, periods=periods, winding=winding
     )
     theta = parameter_vector(model, parameters)
@@ -243,7 +245,7 @@ def solve_periodic(
         equations, solved, found_by = solve_free(equations, theta, guess)
     else:
         solved, found_by = solve_driven(equations, theta, guess)
-    solution = describe(equations, theta, solved, found_by)
+    solution = described(equations, theta, solved, found_by)
     in_family = model.autonomous and (not solution.converged or (solution.resolved and solution.stable is None))
     if in_family and is_one_of_many(equations, theta, guess if not solution.converged else solution):
         solution = describe(equations, theta, solved._replace(code=SINGULAR), found_by)
@@ -269,6 +271,13 @@ def _solution_warnings(
 ) -> Iterator[str]:
     """Yield the warnings about a solution: what the grid does not resolve."""
     name, samples = solution.model, solution.samples
+    if isinstance(equations, CondensedEquations):
+        if solution.status == STATUSES[NOT_RESOLVED]:
+            yield (
+                f"The solution of {name!r} is not resolved: its outputs still change by more than {COARSE:.0%} where "
+                f"the forces of the elements are evaluated at {MOST_POINTS} points; make kinks smoother (width)."
+            )
+        return
     if solution.status == STATUSES[NOT_FINITE] and (term := singular_term(equations, z, theta)):
         yield (
             f"The equations of {name!r} are not finite at states that the solve starts from or reaches: {term}. Give "
@@ -310,6 +319,9 @@ def solve_driven(
 
     The status is "other orbit" if the solution repeats more often within the response period than the guess.
     """
+    if isinstance(equations, CondensedEquations):
+        _checks.one_of("guess", guess if isinstance(guess, str) else "static", ("static",))
+        return equations.find(theta, None if isinstance(guess, str) else as_guess(equations, guess))
     if not isinstance(guess, str):
         start = as_guess(equations, guess)
         solved, found_by = solve_from(equations, theta, start)

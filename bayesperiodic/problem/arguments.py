@@ -9,7 +9,7 @@ from bayesperiodic import _checks
 from bayesperiodic.data.experiment import DATA, Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.data.special_points import Fold, PhaseLag
-from bayesperiodic.models.model import Model
+from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.models.sensed import SHIFT
 
 
@@ -91,6 +91,20 @@ def fixed_values(name: str, given: Any, runs: list[str], local: bool) -> dict[st
     return {run: _checks.finite_number(f"fixed[{name!r}][{run!r}]", given[run]) for run in runs if run in given}
 
 
+def _check_condensed(e: Experiment, model: Model) -> None:
+    """Refuse what is not known of condensed models."""
+    unknown: dict[str, Any] = {
+        "multipliers": e.multipliers, "condition": e.condition, "sweep": e.sweep, "guess": e.guess == DATA and DATA,
+    }  # fmt: skip
+    for name, value in unknown.items():
+        if value is not None and value is not False:
+            raise ValueError(
+                f"{name} of experiment {e.name!r}: must be absent for {model.name!r}, which is condensed, got "
+                f"{_checks.shortened(value)}; make the model with Model.from_matrices(…, condensed=False), of few "
+                "degrees of freedom."
+            )
+
+
 def checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tuple[Experiment, ...]:
     """Return the experiments; raise a ValueError unless they are experiments with signals that the model has."""
     if isinstance(experiments, Experiment):
@@ -126,6 +140,8 @@ def checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tupl
             raise ValueError(
                 f"guess of experiment {e.name!r}: must be states for {model.name!r}, which is autonomous, got {DATA!r}."
             )
+        if isinstance(model, CondensedModel):
+            _check_condensed(e, model)
         if e.guess and not isinstance(e.guess, str):
             _checks.same_names(f"guess of experiment {e.name!r}", e.guess, model.states)
         if model.autonomous and not e.frequency_se > 0.0:

@@ -29,6 +29,7 @@ from bayesperiodic.likelihood.noise import PER_EXPERIMENT, Noise, as_noise
 from bayesperiodic.likelihood.observation import Observation
 from bayesperiodic.models.model import Model
 from bayesperiodic.models.sensed import DELAY, sensor_name
+from bayesperiodic.periodic.condensed import equations_for
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.priors.joint import JointPrior
@@ -529,15 +530,8 @@ class Description(Printed):
         result = {}
         for e in self.experiments:
             inputs, frequency = self.drive(e, self.input_errors.get(e.name))
-            result[e.name] = PeriodicEquations.build(
-                self.model,
-                inputs,
-                frequency=frequency,
-                samples=e.samples,
-                scheme=self.scheme,
-                periods=e.periods,
-                winding=e.winding,
-            )
+            how = {"samples": e.samples, "scheme": self.scheme, "periods": e.periods, "winding": e.winding}
+            result[e.name] = equations_for(self.model, inputs, frequency=frequency, **how)
         return result
 
     def __getstate__(self) -> dict[str, Any]:

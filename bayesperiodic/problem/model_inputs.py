@@ -7,6 +7,7 @@ import numpy as np
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.input_noise import true_inputs
 from bayesperiodic.models.sensed import DELAY
+from bayesperiodic.periodic.condensed import equations_for
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.problem.description import Description
 
@@ -35,7 +36,7 @@ def without_sensors(
     parameters, model = problem.parameters(theta[None], experiment.name)[0], problem.sensors.plain_model
     if problem.model is model:
         return equations, parameters
-    plain = PeriodicEquations.build(
+    plain = equations_for(
         model,
         model_inputs(problem, experiment, theta),
         frequency=equations.frequency,

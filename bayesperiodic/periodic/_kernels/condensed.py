@@ -1,0 +1,178 @@
+"""Compiled corrections of many condensed solutions with the matrix of Newton's iteration at their anchors."""
+
+import numpy as np
+from numba import njit
+
+from bayesperiodic._compile.functions import grid_function_at
+
+CONDENSED_OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
+MOST_CORRECTIONS, FASTEST, NEAR, TOLERANCE, POLISHED = 12, 0.3, 0.5, 1e-10, 1e-13
+NUMBERS, AMPLITUDES = "float64[::1]", "complex128[:,::1]"
+
+
+@njit("void(complex128[::1], complex128[::1], int64[::1], boolean)", **CONDENSED_OPTIONS)
+def transform(x, turns, place, back):
+    """Replace x by its discrete Fourier transform, or by the inverse one times the number of points, a power of two.
+
+    `turns` are exp(−2πi k/points) for half the points, `place` the bit-reversed numbers.
+    """
+    points = x.size
+    for i in range(points):
+        j = place[i]
+        if j > i:
+            x[i], x[j] = x[j], x[i]
+    width = 1
+    while width < points:
+        every = points // (2 * width)
+        for k in range(width):
+            turn = turns[k * every]
+            if back:
+                turn = turn.conjugate()
+            for i in range(k, points, 2 * width):
+                other = turn * x[i + width]
+                x[i + width] = x[i] - other
+                x[i] = x[i] + other
+        width *= 2
+
+
+@njit(
+    f"void(int64, {AMPLITUDES}, {NUMBERS}, float64, float64, complex128[::1], int64[::1], float64[:,::1],"
+    f"float64[:,::1], complex128[::1], {AMPLITUDES})",
+    **CONDENSED_OPTIONS,
+)
+def forces(address, d, parameters, rate, periods, turns, place, states, out, work, f):
+    """Fill the harmonics f of the elements' forces at harmonics d (harmonics, elements).
+
+    The displacement and the velocity over `rate`, 2π times the frequency [Hz], are real and imaginary part of one
+    series; so are the forces of two elements.
+    """
+    count, elements, points = d.shape[0], d.shape[1], turns.size * 2
+    for e in range(elements):
+        work[0], work[count] = d[0, e].real, 0.0
+        for k in range(1, count):
+            order = k / periods
+            work[k] = d[k, e] * (1.0 - order)
+            work[points - k] = d[k, e].conjugate() * (1.0 + order)
+        transform(work, turns, place, True)
+        for i in range(points):
+            states[i, e] = work[i].real
+            states[i, elements + e] = rate * work[i].imag
+    if elements == 0:
+        return
+    grid_function_at(address)(states, np.empty((points, 0)), parameters, np.zeros(points), rate, out)
+    for e in range(0, elements, 2):
+        both = e + 1 < elements
+        for i in range(points):
+            work[i] = complex(out[i, e], out[i, e + 1] if both else 0.0) / points
+        transform(work, turns, place, False)
+        for k in range(count):
+            here, there = work[k], work[(points - k) % points].conjugate()
+            f[k, e] = 0.5 * (here + there)
+            if both:
+                f[k, e + 1] = -0.5j * (here - there)
+
+
+@njit(
+    "void(int64, complex128[:,:,:,:,::1], complex128[:,:,:,::1], float64[:,:,::1], int64, float64[:,:,::1],"
+    "float64[::1], float64, complex128[::1], int64[::1], boolean, int64, int64, float64[:,::1],"
+    "complex128[:,:,:,::1], complex128[:,:,:,::1], int64[:,::1], int64[:,::1])",
+    **CONDENSED_OPTIONS,
+)
+def correct_many(
+    address, d_f, free, inverse, low, parameters, rate, periods, turns, place, polish, start, stop, moved, d, f, lost,
+    steps,
+):  # fmt: skip
+    """Correct predicted harmonics d (sets, solves, harmonics, elements) in place, and fill those of the forces, f.
+
+    `d_f` (sets, 1 or solves, harmonics, elements, elements) is the frequency response between the elements, `free` (…,
+    harmonics, elements) the displacements without their forces, `inverse` (sets, size, size) the transposed inverse of
+    the derivative of the residual by the `low` lowest harmonics at the anchors, `moved` (sets, solves) the predicted
+    change. `lost` becomes 1 where the steps do not become small at the rate `FASTEST`, or the first is not below `NEAR`
+    of the predicted change: the solution may be another one.
+    """
+    solves, count, elements = d.shape[1], d.shape[2], d.shape[3]
+    points, size = 2 * count, low * elements
+    states, out = np.zeros((points, 3 * elements)), np.empty((points, elements))
+    work, residual, step = (
+        np.empty(points, dtype=np.complex128),
+        np.empty((count, elements), dtype=np.complex128),
+        np.empty(2 * size),
+    )
+    for index in range(start, stop):
+        e, b = index // solves, index % solves
+        if lost[e, b] != 0:
+            continue
+        response, unforced = d_f[e, b if d_f.shape[1] > 1 else 0], free[e, b if free.shape[1] > 1 else 0]
+        x, theta, y, before, done = d[e, b], parameters[e, b], f[e, b], np.inf, False
+        for iteration in range(MOST_CORRECTIONS):
+            forces(address, x, theta, rate[e], periods, turns, place, states, out, work, y)
+            steps[e, b] = iteration + 1
+            if done:
+                break
+            length, square = 0.0, 0.0
+            for k in range(count):
+                for i in range(elements):
+                    total = x[k, i] - unforced[k, i]
+                    for j in range(elements):
+                        total += response[k, i, j] * y[k, j]
+                    residual[k, i] = total
+            step[:] = 0.0
+            for k in range(low):
+                for i in range(elements):
+                    at = k * elements + i
+                    real, imaginary = residual[k, i].real, residual[k, i].imag
+                    column = inverse[e, at]
+                    for row in range(2 * size):
+                        step[row] += column[row] * real
+                    column = inverse[e, size + at]
+                    for row in range(2 * size):
+                        step[row] += column[row] * imaginary
+            for k in range(count):
+                for i in range(elements):
+                    at = k * elements + i
+                    change = complex(step[at], step[size + at]) if k < low else residual[k, i]
+                    x[k, i] -= change
+                    length += change.real**2 + change.imag**2
+                    square += x[k, i].real ** 2 + x[k, i].imag ** 2
+            length, square = np.sqrt(length), np.sqrt(square)
+            if not (length < np.inf and square < np.inf):
+                break
+            if length <= POLISHED * square or (not polish and length <= TOLERANCE * square):
+                done = True
+            elif iteration == 0 and length > NEAR * moved[e, b] and length > NEAR * 1e-3 * square:
+                break
+            elif iteration > 0 and not length < FASTEST * before:
+                done = length <= TOLERANCE * square
+                if not done:
+                    break
+            elif iteration > 0 and not polish and length * length <= TOLERANCE * square * before:
+                done = True
+            before = length
+        lost[e, b] = 0 if done else 1
+
+
+@njit(
+    "void(float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1], float64[::1], complex128[:,:,::1])",
+    fastmath={"reassoc", "nsz", "contract"},  # for sums in vector registers
+    **CONDENSED_OPTIONS,
+)
+def modal_responses(products, mass, damping, stiffness, rates, result):
+    """Fill the frequency responses (solves, harmonics, pairs) of modes at angular frequencies.
+
+    `products` (pairs, modes) are those of the modes at two places; mass, damping and stiffness are (solves, modes).
+    """
+    solves, modes, pairs = mass.shape[0], mass.shape[1], products.shape[0]
+    real, imaginary = np.empty(modes), np.empty(modes)
+    for b in range(solves):
+        for k in range(rates.size):
+            for r in range(modes):
+                a = stiffness[b, r] - rates[k] ** 2 * mass[b, r]
+                c = rates[k] * damping[b, r]
+                size = 1.0 / (a * a + c * c)
+                real[r], imaginary[r] = a * size, -c * size
+            for p in range(pairs):
+                x, y = 0.0, 0.0
+                for r in range(modes):
+                    x += products[p, r] * real[r]
+                    y += products[p, r] * imaginary[r]
+                result[b, k, p] = complex(x, y)

@@ -1,0 +1,522 @@
+"""Periodic equations of structures with few nonlinear elements, in the displacements of the elements alone.
+
+The displacements d of the elements over the period are unknown, at points of a grid whose number is a power of two. In
+harmonics d = H_du u - H_df f(d, ḋ): the frequency response H of the linear structure between the places of inputs u,
+elements and outputs is that of all degrees of freedom, the forces f of the elements are evaluated at the points ([1]_).
+Outputs, also accelerations, come from the forces by the same frequency response. The number of points is doubled until
+the outputs do not change any more.
+
+References
+----------
+.. [1] T. M. Cameron, J. H. Griffin, An alternating frequency/time domain method for calculating the steady-state
+   response of nonlinear dynamic systems, Journal of Applied Mechanics 56 (1989) 149-154.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import ModuleType
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import scipy.linalg
+
+from bayesperiodic.models.model import CondensedModel, Model
+from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, SINGULAR, STALLED
+from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved
+from bayesperiodic.periodic.receptance import Receptance
+from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
+
+# Points of the grid of the elements, and relative change of the outputs below which they are not doubled.
+FEWEST_POINTS, MOST_POINTS, RESOLVED = 32, 4096, 1e-6
+# The largest change of outputs that count as resolved by the most points; the smallest relative harmonic of an input.
+COARSE, LEAST_HARMONIC = 1e-2, 1e-12
+# Share of a step that is left by harmonics whose coupling by the elements is neglected in Newton's matrix.
+WEAK = 0.05
+STEPS, HALVED, LAST_STEP, ROUNDING = 40, 10, 1e-10, 1e-13
+SWEEPS, SWEEP_ERROR = 200, 1e-13
+# Steps of the load along the branch, in units of the load and of the linear response; corrections, their largest ratio,
+# the last one, and the smallest cosine between two tangents.
+FIRST_LOAD_STEP, SMALLEST_LOAD_STEP, LARGEST_LOAD_STEP = 0.05, 1e-6, 0.1
+CORRECTIONS, CONTRACTION, LOAD_ERROR, STRAIGHT = 10, 0.6, 1e-7, 0.9
+
+
+class Forces(NamedTuple):
+    """Forces of the elements on a grid, (points, elements), and their derivatives by displacement and velocity."""
+
+    values: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+
+
+class ResponseMatrices(NamedTuple):
+    """Frequency response at harmonics, each (…, harmonics, rows, columns)."""
+
+    d_f: np.ndarray
+    d_u: np.ndarray
+    y_f: np.ndarray
+    y_u: np.ndarray
+
+
+class Preconditioner:
+    """Inverse of the derivative of the residual by the harmonics of d, exact for the low ones.
+
+    The higher ones, which the elements couple only weakly, are treated as uncoupled.
+    """
+
+    def __init__(self, forces: Forces, rates: np.ndarray, d_f: np.ndarray, low: int = 0):
+        points, self.elements = forces.values.shape
+        self.low = low = low or self.strongly_coupled(forces, rates, d_f)
+        numbers = np.arange(low)
+        stiffness, damping = (np.fft.fft(part, axis=0).T / points for part in forces[1:])
+        difference, total = (numbers[:, None] - numbers) % points, (numbers[:, None] + numbers) % points
+        turning = 1j * rates[:low]
+        same = stiffness[:, difference] + damping[:, difference] * turning
+        mirrored = stiffness[:, total] - damping[:, total] * turning
+        mirrored[:, :, 0] = 0.0
+        sums = [np.einsum("kab,bkl->kalb", d_f[:low], part) for part in (same + mirrored, 1j * (same - mirrored))]
+        unit = np.einsum("kl,ab->kalb", np.eye(low), np.eye(self.elements))
+        by_real, by_imaginary = (s + u for s, u in zip(sums, (unit, 1j * unit), strict=True))
+        blocks = [[by_real.real, by_imaginary.real], [by_real.imag, by_imaginary.imag]]
+        size = low * self.elements
+        matrix = np.block([[block.reshape(size, size) for block in row] for row in blocks])
+        # The imaginary parts of the means are zero.
+        zero = slice(size, size + self.elements)
+        matrix[zero], matrix[:, zero] = 0.0, 0.0
+        matrix[zero, zero] = np.eye(self.elements)
+        self.matrix = matrix
+        if not self.elements:
+            return
+        self._factors = scipy.linalg.lu_factor(matrix, check_finite=False)
+
+    @property
+    def inverse(self) -> np.ndarray:
+        """Inverse for the low harmonics, real parts of harmonics and elements before the imaginary ones."""
+        return np.linalg.inv(self.matrix)
+
+    @staticmethod
+    def strongly_coupled(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> int:
+        """Return the number of low harmonics beyond which all are coupled weakly."""
+        steepest = np.abs(forces.stiffness).max(axis=0) + rates[:, None] * np.abs(forces.damping).max(axis=0)
+        coupling = np.sqrt(np.sum(np.abs(d_f * steepest[:, None, :]) ** 2, axis=(1, 2)))
+        return min(len(rates), int(np.flatnonzero(~(coupling < WEAK)).max(initial=0)) + 1)
+
+    def __call__(self, right: np.ndarray) -> np.ndarray:
+        """Return the approximate solution (…, harmonics, elements) for a right-hand side of that shape."""
+        result, low = right.copy(), right[..., : self.low, :]
+        if not self.elements:
+            return result
+        flat = np.concatenate([part.reshape(*right.shape[:-2], -1) for part in (low.real, low.imag)], axis=-1)
+        columns = flat.reshape(-1, flat.shape[-1]).T
+        solved = scipy.linalg.lu_solve(self._factors, columns, check_finite=False).T.reshape(flat.shape)
+        real, imaginary = np.split(solved, 2, axis=-1)
+        result[..., : self.low, :] = (real + 1j * imaginary).reshape(low.shape)
+        return result
+
+
+@dataclass(frozen=True)
+class CondensedEquations(PeriodicEquations):
+    """d + H_df f(d, ḋ, θ) - H_du u = 0 for one set of inputs; z are the displacements d (points, elements)."""
+
+    model: CondensedModel
+
+    @classmethod
+    def build(
+        cls,
+        model: Model,
+        inputs: Mapping[str, np.ndarray] | None,
+        *,
+        scheme: str | Scheme | None = None,
+        **settings: Any,
+    ) -> "CondensedEquations":
+        """Check the arguments, see `PeriodicEquations.build`; harmonics take the place of a scheme."""
+        if find_scheme(scheme or fourier) is not fourier:
+            raise ValueError(
+                f"scheme: must be 'fourier' or None for {model.name!r}, which is condensed, got {scheme!r}; the points "
+                "of its elements are doubled as often as needed."
+            )
+        return super().build(model, inputs, scheme=fourier, **settings)  # type: ignore[return-value]
+
+    @property
+    def kernels(self) -> ModuleType:
+        """Refused: what needs them is for discretised equations."""
+        raise self.model.refusal()
+
+    @property
+    def of_all_states(self) -> "CondensedEquations":
+        """The equations whose outputs are the displacements of all degrees of freedom."""
+        return replace(self, model=self.model.with_all_outputs)
+
+    def scaled_residual(self, z: np.ndarray, parameters: np.ndarray) -> float:
+        """Return the norm of the residual in units of its largest term."""
+        d, matrices = harmonics(z), self.matrices(parameters, len(z))[0]
+        free = _times(matrices.d_u, self.input_harmonics(len(z)))
+        residual, size = _residual(d, self.forces(d, parameters)[0], matrices, free)
+        return float(np.linalg.norm(residual)) / size
+
+    @property
+    def count(self) -> int:
+        """Number of elements."""
+        return len(self.model.element_forces)
+
+    @property
+    def _receptance(self) -> Receptance:
+        return receptance(self.model)
+
+    def rates(self, points: int) -> np.ndarray:
+        """Return the angular frequencies of the harmonics below half the points [1/s]."""
+        return 2 * np.pi * self.frequency / self.grid.periods * np.arange(points // 2)
+
+    def matrices(
+        self, parameters: np.ndarray, points: int, directions: Any = ()
+    ) -> tuple[ResponseMatrices, ResponseMatrices]:
+        """Return the frequency response at the harmonics below half the points, and its derivatives.
+
+        `directions` are indices of parameters, their number standing for the frequency.
+        """
+        numbers = np.arange(points // 2) / self.grid.periods
+        response = self._receptance(parameters, self.frequency, numbers, directions)
+        here, changes = (self._parts(values) for values in (response.values, response.derivatives))
+        orders = self._orders / self.frequency
+        for number, direction in enumerate(directions):
+            if direction == len(self.model.parameters):
+                changes.y_f[number] += here.y_f * orders[:, None]
+                changes.y_u[number] += here.y_u * orders[:, None]
+        return here, changes
+
+    def many_matrices(self, parameters: np.ndarray, points: int) -> ResponseMatrices:
+        """Return the frequency response for parameter vectors (vectors, parameters)."""
+        numbers = np.arange(points // 2) / self.grid.periods
+        return self._parts(self._receptance.many(parameters, self.frequency, numbers))
+
+    @property
+    def _orders(self) -> np.ndarray:
+        return np.array([order for _, order in self.model.structure.measured.values()])
+
+    @property
+    def matrix_parameters(self) -> list[int]:
+        """Indices of the parameters that are factors of matrices."""
+        return list(self._receptance.matrix_parameters)
+
+    def _parts(self, response: np.ndarray) -> ResponseMatrices:
+        """Return the parts of a response of displacements (…, harmonics, rows, columns), outputs differentiated."""
+        elements, rates = self.count, self.rates(2 * response.shape[-3])
+        rows = response[..., elements:, :] * ((1j * rates[:, None]) ** self._orders)[..., None]
+        d = response[..., :elements, :]
+        return ResponseMatrices(d[..., :elements], d[..., elements:], rows[..., :elements], rows[..., elements:])
+
+    def input_harmonics(self, points: int, inputs: np.ndarray | None = None) -> np.ndarray:
+        """Return the harmonics (…, harmonics, inputs) of inputs (…, grid points, inputs), by default these."""
+        values = self.inputs[:, : len(self.model.inputs)] if inputs is None else inputs
+        amplitudes = np.fft.rfft(values, axis=-2) / values.shape[-2]
+        result = np.zeros((*values.shape[:-2], points // 2, values.shape[-1]), dtype=complex)
+        kept = min(points // 2, amplitudes.shape[-2])
+        result[..., :kept, :] = amplitudes[..., :kept, :]
+        if kept == values.shape[-2] // 2 + 1 and values.shape[-2] % 2 == 0:
+            result[..., kept - 1, :] *= 0.5  # the highest harmonic of an even grid stands for two
+        return result
+
+    def reduced(self, states: np.ndarray) -> np.ndarray:
+        """Return the displacements of the elements (points, elements) for those of all degrees of freedom."""
+        return states @ self.model.structure.weights.T
+
+    def on_points(self, harmonics: np.ndarray) -> np.ndarray:
+        """Return values (…, points, columns) on the experiment's grid from harmonics (…, harmonics, columns)."""
+        return sampled(harmonics, self.grid.points)
+
+    def forces(self, d: np.ndarray, parameters: np.ndarray) -> tuple[Forces, np.ndarray]:
+        """Return the forces at harmonics d (harmonics, elements), and those by θ (points, elements, parameters)."""
+        if not self.count:
+            none = np.zeros((2 * len(d), 0))
+            return Forces(none, none, none), np.zeros((2 * len(d), 0, parameters.size))
+        values, given = self._evaluated("residual_jacobian", d, parameters), self.count
+        f, slopes = values[:, :given], values[:, given:].reshape(len(values), given, 3, given)
+        own = np.arange(given)
+        by_theta = self._evaluated("derivatives", d, parameters)[:, : given * parameters.size]
+        return Forces(f, slopes[:, own, 0, own], slopes[:, own, 1, own]), by_theta.reshape(len(f), given, -1)
+
+    def _evaluated(self, name: str, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        points, kernels = 2 * len(d), self.model.element_kernels
+        states = np.zeros((points, 3 * self.count))
+        states[:, : self.count] = on_grid(d, points)
+        states[:, self.count : 2 * self.count] = on_grid(1j * self.rates(points)[:, None] * d, points)
+        return kernels.evaluate(name, states, np.empty((points, 0)), parameters, np.zeros(points), self.frequency)
+
+    def solve(self, parameters: np.ndarray, guess: np.ndarray, *_: Any) -> Solved:
+        """Run Newton's iteration from a guess (points, elements) on its grid."""
+        d, code, history = self._newton(parameters, harmonics(guess), 1.0, None)
+        return Solved(on_grid(d, len(guess)), code, history)
+
+    def _newton(
+        self, parameters: np.ndarray, d: np.ndarray, load: float, given: ResponseMatrices | None
+    ) -> tuple[np.ndarray, int, np.ndarray]:
+        points = 2 * len(d)
+        matrices = given or self.matrices(parameters, points)[0]
+        free = load * _times(matrices.d_u, self.input_harmonics(points))
+        rates = self.rates(points)
+        history: list[tuple[float, float, float]] = []
+        forces, _ = self.forces(d, parameters)
+        residual, size = _residual(d, forces, matrices, free)
+        for _ in range(STEPS):
+            if not np.isfinite(residual).all():
+                return d, NOT_FINITE, np.array(history).reshape(-1, 3)
+            before = float(np.linalg.norm(residual))
+            try:
+                step = Preconditioner(forces, rates, matrices.d_f)(residual)
+            except np.linalg.LinAlgError:
+                return d, SINGULAR, np.array(history).reshape(-1, 3)
+            share = 1.0
+            for _ in range(HALVED):
+                there = d - share * step
+                new_forces, _ = self.forces(there, parameters)
+                residual, size = _residual(there, new_forces, matrices, free)
+                after = float(np.linalg.norm(residual))
+                if after < before or after <= ROUNDING * size:
+                    break
+                share *= 0.5
+            else:
+                if before <= LAST_STEP * size:  # at rounding level
+                    return d, CONVERGED, np.array(history).reshape(-1, 3)
+                return d, STALLED, np.array(history).reshape(-1, 3)
+            d, forces = there, new_forces
+            history.append((before / size, float(np.linalg.norm(step)) / size, share))
+            if share == 1.0 and (after <= ROUNDING * size or np.linalg.norm(step) <= LAST_STEP * size):
+                return d, CONVERGED, np.array(history)
+        return d, STALLED, np.array(history)
+
+    def find(self, parameters: np.ndarray, guess: np.ndarray | None) -> tuple[Solved, str]:
+        """Solve from a guess (points, elements), or from rest, and double the points until the outputs are resolved."""
+        points = self._fewest()
+        if guess is not None:  # of which the last doubling is repeated
+            points = max(points, 1 << (len(guess) // 2 - 1).bit_length())
+        start = (
+            np.zeros((points // 2, self.count), dtype=complex) if guess is None else resized(harmonics(guess), points)
+        )
+        d, code, history = self._newton(parameters, start, 1.0, None)
+        found_by = "newton"
+        if code != CONVERGED and guess is None:
+            raised = self._raise_load(parameters, start)
+            if raised is not None:
+                d, code, history = self._newton(parameters, raised, 1.0, None)
+                found_by = "input amplitude"
+        before = self._outputs(d, parameters)
+        while code == CONVERGED:
+            finer, code, history = self._newton(parameters, resized(d, 4 * len(d)), 1.0, None)
+            if code != CONVERGED:
+                break
+            d, after = finer, self._outputs(finer, parameters)
+            change = np.max(
+                np.abs(after - before) / np.maximum(np.abs(after).max(axis=0), np.finfo(float).tiny), initial=0.0
+            )
+            before = after
+            if change <= RESOLVED:
+                break
+            if 2 * len(d) >= MOST_POINTS:
+                code = CONVERGED if change <= COARSE else NOT_RESOLVED
+                break
+        return Solved(on_grid(d, 2 * len(d)), code, history), found_by
+
+    def _fewest(self) -> int:
+        """Return the number of points with which to start: enough for the harmonics of the inputs."""
+        sizes = np.abs(self.input_harmonics(2 * self.grid.points)).max(axis=1, initial=0.0)
+        highest = int(np.flatnonzero(sizes > LEAST_HARMONIC * sizes.max(initial=0.0)).max(initial=0))
+        return max(FEWEST_POINTS, 1 << (4 * highest).bit_length())
+
+    def _raise_load(self, parameters: np.ndarray, start: np.ndarray) -> np.ndarray | None:
+        """Follow the branch of solutions d while the load grows from zero, through folds; None if that fails."""
+        points = 2 * len(start)
+        matrices, rates = self.matrices(parameters, points)[0], self.rates(points)
+        full = _times(matrices.d_u, self.input_harmonics(points))
+        d, code, _ = self._newton(parameters, start, 0.0, matrices)
+        load, unit, step = 0.0, float(np.linalg.norm(full)), FIRST_LOAD_STEP
+        if code != CONVERGED or not unit > 0.0:
+            return None
+
+        def corrected(d: np.ndarray, load: float, along: np.ndarray) -> tuple[np.ndarray, float, np.ndarray, bool]:
+            """Return the solution in the plane across a direction, and the tangent there."""
+            size = np.inf
+            for _ in range(CORRECTIONS):
+                forces, _ = self.forces(d, parameters)
+                inverse = Preconditioner(forces, rates, matrices.d_f)
+                residual, _ = _residual(d, forces, matrices, load * full)
+                by_residual, by_load = _stacked(inverse(residual), unit), _stacked(inverse(full), unit)
+                change = along[:-1] @ by_residual / (along[:-1] @ by_load + along[-1])
+                move, last = _unstacked(change * by_load - by_residual, unit, d.shape), size
+                d, load, size = d + move, load + change, float(np.hypot(np.linalg.norm(move) / unit, change))
+                if not size < CONTRACTION * last:
+                    break
+                if size < LOAD_ERROR:
+                    return d, load, np.append(by_load, 1.0), True
+            return d, load, along, False
+
+        _, _, before, good = corrected(d, load, np.append(np.zeros(2 * d.size), 1.0))
+        before /= np.linalg.norm(before)
+        while good or step >= SMALLEST_LOAD_STEP:
+            try:
+                there, at, tangent, good = corrected(
+                    d + _unstacked(step * before[:-1], unit, d.shape), load + step * before[-1], before
+                )
+            except np.linalg.LinAlgError:
+                return None
+            tangent = tangent / np.linalg.norm(tangent)
+            turn = float(tangent @ before)
+            if not good or abs(turn) < STRAIGHT:
+                step *= 0.5
+                if step < SMALLEST_LOAD_STEP:
+                    return None
+                continue
+            if at >= 1.0:
+                return d + (1.0 - load) / (at - load) * (there - d)
+            d, load, before = there, at, tangent * np.sign(turn)
+            step = min(1.5 * step, LARGEST_LOAD_STEP * (1.0 + float(np.linalg.norm(there)) / unit))
+        return None
+
+    def _outputs(self, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        matrices, forces = self.matrices(parameters, 2 * len(d))[0], self.forces(d, parameters)[0]
+        load = self.input_harmonics(2 * len(d))
+        return self.on_points(_times(matrices.y_u, load) - _times(matrices.y_f, harmonics(forces.values)))
+
+    def outputs(self, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """Return the outputs (points, channels) on the experiment's grid."""
+        return self._outputs(harmonics(z), parameters)
+
+    def sensitivities_along(
+        self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
+    ) -> Sensitivities | None:
+        """Return derivatives along directions (directions, parameters) of the parameters; None if singular."""
+        return self._sensitivities(z, parameters, np.pad(directions, ((0, 0), (0, 1))))
+
+    def parameter_sensitivities(self, z: np.ndarray, parameters: np.ndarray) -> Sensitivities | None:
+        """Return derivatives to every parameter and last to the frequency; None if singular."""
+        return self._sensitivities(z, parameters, np.eye(parameters.size + 1))
+
+    def input_sensitivities(
+        self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray, frequency: np.ndarray
+    ) -> Sensitivities | None:
+        """Return derivatives along changes of inputs and frequency; None if singular."""
+        of_frequency = np.zeros((len(directions), parameters.size + 1))
+        of_frequency[:, -1] = frequency
+        result = self._sensitivities(z, parameters, of_frequency, directions[..., : len(self.model.inputs)])
+        return result and result._replace(frequency=frequency)
+
+    def _sensitivities(
+        self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray, inputs: np.ndarray | None = None
+    ) -> Sensitivities | None:
+        """Return derivatives along directions (directions, parameters + 1), the frequency last; None if singular.
+
+        `inputs` (directions, grid points, inputs) are changes of the inputs.
+        """
+        d, points, rates = harmonics(z), len(z), self.rates(len(z))
+        used = np.flatnonzero(directions.any(axis=0))
+        matrices, changes = self.matrices(parameters, points, used.tolist())
+        forces, by_theta = self.forces(d, parameters)
+        f, load = harmonics(forces.values), self.input_harmonics(points)
+        velocity = on_grid(1j * rates[:, None] * d, points)
+        slopes = np.concatenate([by_theta, (forces.damping * velocity / self.frequency)[..., None]], axis=-1)
+        direct = np.moveaxis(
+            harmonics(slopes[..., used].reshape(points, self.count * used.size)).reshape(len(d), self.count, used.size),
+            -1,
+            0,
+        )
+        of_d = _times(changes.d_u, load) - _times(changes.d_f, f) - _times(matrices.d_f, direct)
+        of_y = _times(changes.y_u, load) - _times(changes.y_f, f) - _times(matrices.y_f, direct)
+        right, explicit = (np.tensordot(directions[:, used], part, (1, 0)) for part in (of_d, of_y))
+        if inputs is not None:
+            more = self.input_harmonics(points, inputs)
+            right, explicit = right + _times(matrices.d_u, more), explicit + _times(matrices.y_u, more)
+        moved = _linear_solve(forces, rates, matrices.d_f, right)
+        if moved is None:
+            return None
+        outputs = explicit - _times(matrices.y_f, _linearised(forces, rates, moved))
+        return Sensitivities(on_grid(moved, points), self.on_points(outputs), np.zeros(len(directions)))
+
+
+_RECEPTANCES: WeakKeyDictionary[CondensedModel, Receptance] = WeakKeyDictionary()
+
+
+def receptance(model: CondensedModel) -> Receptance:
+    """Return the frequency response of elements and outputs to elements and inputs, computed once a model."""
+    if model not in _RECEPTANCES:
+        given = model.structure
+        rows = np.array([*given.weights, *(at for at, _ in given.measured.values())])
+        columns = np.array([*given.weights, *given.inputs.values()])
+        _RECEPTANCES[model] = Receptance(given, model.parameters, rows, columns)
+    return _RECEPTANCES[model]
+
+
+def harmonics(values: np.ndarray) -> np.ndarray:
+    """Return the complex harmonics (…, points/2, columns) of values (…, points, columns), without the highest."""
+    points = values.shape[-2]
+    return np.fft.rfft(values, axis=-2)[..., : points // 2, :] / points
+
+
+def on_grid(amplitudes: np.ndarray, points: int) -> np.ndarray:
+    """Return values (…, points, columns) of harmonics (…, harmonics, columns), no more than half the points."""
+    return np.fft.irfft(amplitudes, points, axis=-2) * points
+
+
+def resized(amplitudes: np.ndarray, points: int) -> np.ndarray:
+    """Return harmonics of a grid as those of another one."""
+    result = np.zeros((*amplitudes.shape[:-2], points // 2, amplitudes.shape[-1]), dtype=complex)
+    kept = min(amplitudes.shape[-2], points // 2)
+    result[..., :kept, :] = amplitudes[..., :kept, :]
+    return result
+
+
+def sampled(amplitudes: np.ndarray, points: int) -> np.ndarray:
+    """Return the values of a series of harmonics at any number of points, however few."""
+    count = amplitudes.shape[-2]
+    if points >= 2 * count:
+        return on_grid(amplitudes, points)
+    every = -(-2 * count // points)
+    return on_grid(amplitudes, every * points)[..., ::every, :]
+
+
+def _stacked(amplitudes: np.ndarray, unit: float) -> np.ndarray:
+    return np.concatenate([amplitudes.real.ravel(), amplitudes.imag.ravel()]) / unit
+
+
+def _unstacked(vector: np.ndarray, unit: float, shape: tuple[int, ...]) -> np.ndarray:
+    real, imaginary = np.split(vector * unit, 2)
+    return (real + 1j * imaginary).reshape(shape)
+
+
+def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    return (matrices @ vectors[..., None])[..., 0]
+
+
+def _residual(d: np.ndarray, forces: Forces, matrices: ResponseMatrices, free: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the residual and the size of its terms."""
+    parts = d, _times(matrices.d_f, harmonics(forces.values)), -free
+    return parts[0] + parts[1] + parts[2], max(*(float(np.linalg.norm(part)) for part in parts), np.finfo(float).tiny)
+
+
+def _linearised(forces: Forces, rates: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Return the change of the forces for a change of d, harmonics (…, harmonics, elements) both."""
+    points = len(forces.values)
+    change = forces.stiffness * on_grid(moved, points) + forces.damping * on_grid(1j * rates[:, None] * moved, points)
+    return harmonics(change)
+
+
+def _linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.ndarray) -> np.ndarray | None:
+    """Return x of the linearised equations (…, harmonics, elements); None if they are singular."""
+    try:
+        inverse = Preconditioner(forces, rates, d_f)
+    except np.linalg.LinAlgError:
+        return None
+    x = inverse(right)
+    for _ in range(SWEEPS):
+        step = inverse(right - x - _times(d_f, _linearised(forces, rates, x)))
+        x = x + step
+        size = float(np.linalg.norm(x))
+        if not np.isfinite(size):
+            return None
+        if np.linalg.norm(step) <= SWEEP_ERROR * size:
+            return x
+    return None
+
+
+def equations_for(model: Model, inputs: Mapping[str, np.ndarray] | None, **settings: Any) -> PeriodicEquations:
+    """Return the equations of a model, condensed or discretised; arguments as those of `PeriodicEquations.build`."""
+    kind = CondensedEquations if isinstance(model, CondensedModel) else PeriodicEquations
+    return kind.build(model, inputs, **settings)

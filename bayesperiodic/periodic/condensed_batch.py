@@ -1,0 +1,179 @@
+"""Condensed solutions at many parameter vectors, predicted from the anchors of their input sets."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bayesperiodic.periodic.batch import Anchor, in_blocks
+from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STALLED, BatchSolution
+from bayesperiodic.periodic.condensed import (
+    CondensedEquations,
+    Preconditioner,
+    ResponseMatrices,
+    harmonics,
+    on_grid,
+    resized,
+)
+from bayesperiodic.periodic.receptance import compiled
+
+FEWEST_SOLVES = 4
+# Parts of the way from an anchor in which a solution is followed, and largest change in units of the predicted one.
+LARGEST_PART, SMALLEST_PART, STRAIGHT_PATH = 0.25, 1.0 / 256.0, 0.5
+
+
+class CondensedBatch:
+    """Input sets of one condensed model on one grid with an anchor each, solved for many parameter vectors."""
+
+    def __init__(self, sets: Sequence[CondensedEquations], anchors: Sequence[Anchor]):
+        first = sets[0]
+        self._sets, self._anchors = list(sets), list(anchors)
+        self._points = points = max(len(a.z) for a in anchors)
+        self._d = np.stack([resized(harmonics(a.z), points) for a in anchors])
+        shape = (len(first.model.parameters), *self._d.shape[1:])
+        self._slopes = np.stack(
+            [
+                np.zeros(shape, dtype=complex)
+                if a.sensitivities is None
+                else resized(harmonics(a.sensitivities), points)
+                for a in anchors
+            ]
+        )
+        self._matrices = [e.matrices(a.parameters, points)[0] for e, a in zip(sets, anchors, strict=True)]
+        self._load = np.stack([e.input_harmonics(points) for e in sets])
+        self._rates = np.array([2 * np.pi * e.frequency for e in sets])
+        self._known = np.array([a.sensitivities is not None for a in anchors])
+        self._inverse, self._low = self._preconditioners()
+        turns = np.exp(-2j * np.pi * np.arange(points // 2) / points)
+        bits = points.bit_length() - 1
+        place = np.array([int(f"{i:0{bits}b}"[::-1], 2) for i in range(points)])
+        self._transform = turns, place
+
+    def _preconditioners(self) -> tuple[np.ndarray, int]:
+        """Return the transposed inverses of the sets, all of the largest number of low harmonics, and that number."""
+        given = []
+        for e, anchor, d, matrices in zip(self._sets, self._anchors, self._d, self._matrices, strict=True):
+            given.append((e.forces(d, anchor.parameters)[0], e.rates(self._points), matrices.d_f))
+        low, inverses = 1, []
+        for known, part in zip(self._known, given, strict=True):
+            if known:
+                low = max(low, Preconditioner.strongly_coupled(*part))
+        size = 2 * low * self._d.shape[-1]
+        for known, part in zip(self._known, given, strict=True):
+            if known:
+                inverses.append(np.ascontiguousarray(Preconditioner(*part, low).inverse.T))
+            else:
+                inverses.append(np.zeros((size, size)))
+        return np.stack(inverses), low
+
+    def _responses(self, parameters: np.ndarray) -> list[ResponseMatrices]:
+        """Return the frequency responses of each set, (1 or solves, harmonics, rows, columns)."""
+        result = []
+        for e, (equations, anchor, known) in enumerate(zip(self._sets, self._anchors, self._matrices, strict=True)):
+            factors = list(equations.matrix_parameters)
+            if np.array_equal(
+                parameters[e][:, factors],
+                np.broadcast_to(anchor.parameters[factors], (len(parameters[e]), len(factors))),
+            ):
+                result.append(ResponseMatrices(*(part[None] for part in known)))
+            else:
+                result.append(equations.many_matrices(parameters[e], self._points))
+        return result
+
+    def solve(
+        self,
+        parameters: np.ndarray,
+        threads: int | None = None,
+        *,
+        keep: bool = False,
+        polish: bool = False,
+        without: np.ndarray | None = None,
+    ) -> BatchSolution:
+        """Solve every input set for every parameter vector; arguments and result as those of `batch.Batch.solve`.
+
+        Solutions are corrected from the linear prediction of the anchor, or else followed from it in steps. z has the
+        grid of the anchor with the most points.
+        """
+        first, count = self._sets[0], len(self._sets)
+        every = np.empty((count, *parameters.shape[-2:]))
+        every[:] = parameters
+        solves = every.shape[1]
+        change = every - np.stack([a.parameters for a in self._anchors])[:, None]
+        ahead = np.einsum("ebp,epkm->ebkm", change, self._slopes)
+        d = self._d[:, None] + ahead
+        moved, f = np.sqrt(np.sum(np.abs(ahead) ** 2, axis=(2, 3))), np.empty_like(d)
+        lost, steps = np.zeros((2, count, solves), dtype=np.int64)
+        lost[~self._known] = 1
+        if without is not None:
+            lost[without] = 1
+        responses = self._responses(every)
+        vectors = max(len(r.d_f) for r in responses)
+        d_f = np.empty((count, vectors, *responses[0].d_f.shape[1:]), dtype=complex)
+        free = np.empty(d_f.shape[:-1], dtype=complex)
+        for e, response in enumerate(responses):
+            d_f[e], free[e] = response.d_f, _unforced(response.d_u, self._load[e])
+        turns, place = self._transform
+        address = first.model.element_kernels.residual.address if first.count else 0
+
+        def part(block: tuple[int, int]) -> None:
+            compiled().correct_many(
+                address, d_f, free, self._inverse, self._low, every, self._rates, float(first.grid.periods), turns,
+                place, polish, *block, moved, d, f, lost, steps,
+            )  # fmt: skip
+
+        in_blocks(part, lost.size, FEWEST_SOLVES, threads)
+        status = np.full(lost.shape, CONVERGED)
+        for e, b in np.argwhere(lost):
+            if without is not None and without[e, b]:
+                status[e, b] = STALLED
+                continue
+            d[e, b], status[e, b], more = self._follow(e, every[e, b])
+            f[e, b] = harmonics(self._sets[e].forces(d[e, b], every[e, b])[0].values)
+            steps[e, b] += more
+        outputs = np.stack([self._outputs(e, responses[e], f[e]) for e in range(count)])
+        z = on_grid(d, self._points) if keep else np.empty((count, solves, 0, first.count))
+        frequency = np.repeat([[e.frequency] for e in self._sets], solves, axis=1)
+        return BatchSolution(z, outputs, frequency, status, steps)
+
+    def _outputs(self, e: int, response: ResponseMatrices, f: np.ndarray) -> np.ndarray:
+        given = _unforced(response.y_u, self._load[e]) - (response.y_f @ f[..., None])[..., 0]
+        return self._sets[e].on_points(given)
+
+    def _follow(self, e: int, parameters: np.ndarray) -> tuple[np.ndarray, int, int]:
+        """Follow a solution from the anchor in steps; return it, the status, and Newton's steps."""
+        equations, anchor = self._sets[e], self._anchors[e]
+        if not self._known[e]:  # a guess, from which to solve
+            solved = equations.solve(parameters, on_grid(self._d[e], self._points))
+            return harmonics(solved.z), solved.code, len(solved.history)
+        change = parameters - anchor.parameters
+        here, done, step, used = self._d[e], 0.0, LARGEST_PART, 0
+        ahead = np.tensordot(change, self._slopes[e], (0, 0))
+        while done < 1.0:
+            there = anchor.parameters + (done + step) * change
+            predicted = here + step * ahead
+            solved = equations.solve(there, on_grid(predicted, self._points))
+            used, d = used + len(solved.history), harmonics(solved.z)
+            size = float(np.linalg.norm(step * ahead))
+            straight = np.linalg.norm(d - predicted) <= STRAIGHT_PATH * size and np.all(solved.history[:, 2] == 1.0)
+            if solved.code != CONVERGED or not straight:
+                step *= 0.5
+                if step < SMALLEST_PART:
+                    return d, OTHER_ORBIT if solved.code == CONVERGED else solved.code, used
+                continue
+            ahead, here, done = (d - here) / step, d, done + step
+            step = min(2.0 * step, LARGEST_PART, 1.0 - done)
+        return here, CONVERGED, used
+
+    def vjp(self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, moving: tuple[int, ...]) -> np.ndarray:
+        """Return Σ weights · ∂ŷ/∂θ (sets, moving) at one solution of every input set; see `batch.Batch.vjp`."""
+        result = np.full((len(self._sets), len(moving)), np.nan)
+        directions = np.eye(parameters.shape[1])[list(moving)]
+        for e, equations in enumerate(self._sets):
+            derivative = equations.sensitivities_along(z[e], parameters[e], directions)
+            if derivative is not None:
+                result[e] = np.einsum("dnc,nc->d", derivative.outputs, weights[e])
+        return result
+
+
+def _unforced(response: np.ndarray, load: np.ndarray) -> np.ndarray:
+    """Return the harmonics (…, harmonics, rows) that inputs (harmonics, inputs) cause."""
+    return (response @ load[..., None])[..., 0]

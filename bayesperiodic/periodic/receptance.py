@@ -1,0 +1,157 @@
+"""Frequency response of a linear structure between few places, with its derivatives by all parameters."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import scipy.linalg
+
+from bayesperiodic._compile.cache import load
+from bayesperiodic.models.structure import CONSTANT_PART, POWERS, REGULAR, Structure
+
+
+@dataclass(frozen=True)
+class Response:
+    """Frequency response at harmonics, (harmonics, rows, columns), and its derivatives, (directions, …)."""
+
+    values: np.ndarray
+    derivatives: np.ndarray
+
+
+class Receptance:
+    """Response R·(−(kω)² M + ikω C + K)⁻¹·S of displacements along rows R to forces along columns S.
+
+    M, C and K are sums of parts times factors, which are parameters or 1. Where one basis of real modes diagonalises
+    all parts, as with Rayleigh or modal damping, it is computed once; else one matrix is factorised per harmonic.
+
+    Parameters
+    ----------
+    structure : Structure
+    parameters : sequence of str
+        Names of the model's parameters.
+    rows, columns : array (…, n)
+        Weights of the degrees of freedom.
+    """
+
+    def __init__(self, structure: Structure, parameters: Sequence[str], rows: np.ndarray, columns: np.ndarray):
+        self._structure, self._rows, self._columns = structure, rows, columns
+        parts = [(POWERS[kind], name, a) for kind, named in structure.parts.items() for name, a in named.items()]
+        self._powers = np.array([power for power, _, _ in parts])
+        self._factors = np.array([-1 if n == CONSTANT_PART else parameters.index(n) for _, n, _ in parts])
+        self._matrices = np.stack([a for *_, a in parts])
+        self._size, self._regular = len(parameters), False
+
+    @cached_property
+    def _modes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Diagonals of the parts (parts, n), rows and columns in the modes' coordinates; None without modes."""
+        modes = self._structure.matrices.modes
+        if modes is None:
+            return None
+        return modes.diagonals, self._rows @ modes.vectors, self._columns @ modes.vectors
+
+    @property
+    def modal(self) -> bool:
+        """Whether one basis of real modes diagonalises all parts."""
+        return self._modes is not None
+
+    def lowest_modes(self, parameters: np.ndarray, count: int) -> np.ndarray:
+        """Return the lowest undamped modes (n, modes)."""
+        modes = self._structure.matrices.modes
+        if modes is not None:
+            return modes.vectors[:, :count]
+        mass, _, stiffness = self.sums(parameters)
+        size = len(mass)
+        given = 0.5 * (stiffness + stiffness.T), 0.5 * (mass + mass.T)
+        return np.asarray(scipy.linalg.eigh(*given, subset_by_index=(0, min(count, size) - 1))[1])
+
+    def sums(self, parameters: np.ndarray) -> list[np.ndarray]:
+        """Return mass, damping and stiffness matrix."""
+        factors = self._values(parameters)
+        return [np.tensordot(factors * (self._powers == power), self._matrices, (0, 0)) for power in (2, 1, 0)]
+
+    def _values(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the factors (…, parts) of the parts at parameters (…, parameters)."""
+        constant = np.ones((*parameters.shape[:-1], 1))
+        return np.asarray(np.concatenate([parameters, constant], axis=-1)[..., self._factors])
+
+    def coefficients(self, parameters: np.ndarray, rates: np.ndarray) -> np.ndarray:
+        """Return the factor of each part, (harmonics, parts), at the angular frequencies `rates` [1/s]."""
+        factors = self._values(parameters)
+        return (1j * rates[:, None]) ** self._powers * factors
+
+    def __call__(
+        self, parameters: np.ndarray, frequency: float, harmonics: np.ndarray, directions: Sequence[int] = ()
+    ) -> Response:
+        """Return the response at multiples of a frequency [Hz], and its derivatives.
+
+        `directions` are indices of parameters, the number of parameters standing for the frequency.
+        """
+        rates = 2 * np.pi * frequency * harmonics
+        factors = self.coefficients(parameters, rates)
+        self._check_regular(parameters)
+        slopes = [self._slope(d, parameters, rates, factors, frequency) for d in directions]
+        if self._modes is not None:
+            diagonals, rows, columns = self._modes
+            inverse = 1.0 / (factors @ diagonals)
+            values = np.einsum("ar,kr,br->kab", rows, inverse, columns, optimize=True)
+            changes = [
+                -np.einsum("ar,kr,br->kab", rows, inverse**2 * (s @ diagonals), columns, optimize=True) for s in slopes
+            ]
+        else:
+            stiffness = np.tensordot(factors, self._matrices, (1, 0))
+            right = np.linalg.solve(stiffness, np.broadcast_to(self._columns.T, (len(rates), *self._columns.T.shape)))
+            values, changes = self._rows @ right, []
+            if slopes:
+                left = np.linalg.solve(
+                    stiffness.transpose(0, 2, 1), np.broadcast_to(self._rows.T, (len(rates), *self._rows.T.shape))
+                )
+                parts = np.einsum("kna,inj,kjb->kiab", left, self._matrices, right, optimize=True)
+                changes = [-np.einsum("ki,kiab->kab", s, parts) for s in slopes]
+        return Response(values, np.array(changes).reshape(len(slopes), *values.shape))
+
+    def _check_regular(self, parameters: np.ndarray) -> None:
+        """Raise a ValueError for a structure that can move without being deformed."""
+        if self._modes is None and not self._regular:
+            stiffness = self.sums(parameters)[2]
+            sizes = np.linalg.svd(stiffness, compute_uv=False)
+            if not sizes[-1] > REGULAR * sizes[0]:
+                raise ValueError(
+                    "stiffness: must be regular in a condensed model, got a singular matrix; support the structure, "
+                    "such as by soft springs, or take condensed=False."
+                )
+            self._regular = True
+
+    def many(self, parameters: np.ndarray, frequency: float, harmonics: np.ndarray) -> np.ndarray:
+        """Return the response (vectors, harmonics, rows, columns) for parameter vectors (vectors, parameters)."""
+        if self._modes is None:
+            return np.stack([self(theta, frequency, harmonics).values for theta in parameters])
+        diagonals, rows, columns = self._modes
+        factors = self._values(parameters)
+        parts = [(factors * (self._powers == power)) @ diagonals for power in (2, 1, 0)]
+        products = (rows[:, None] * columns).reshape(-1, diagonals.shape[1])
+        result = np.empty((len(parameters), len(harmonics), len(products)), dtype=complex)
+        compiled().modal_responses(np.ascontiguousarray(products), *parts, 2 * np.pi * frequency * harmonics, result)
+        return result.reshape(*result.shape[:2], len(rows), len(columns))
+
+    @property
+    def matrix_parameters(self) -> tuple[int, ...]:
+        """Indices of the parameters that are factors of matrices."""
+        return tuple(sorted({int(i) for i in self._factors if i >= 0}))
+
+    def _slope(
+        self, direction: int, parameters: np.ndarray, rates: np.ndarray, factors: np.ndarray, frequency: float
+    ) -> np.ndarray:
+        """Return the derivative of `coefficients` by a parameter or by the frequency."""
+        if direction == self._size:
+            return factors * self._powers / frequency
+        moved = np.where(self._factors == direction, 1.0, 0.0)
+        return (1j * rates[:, None]) ** self._powers * moved
+
+
+@cache
+def compiled() -> ModuleType:
+    """Return the compiled functions of condensed equations."""
+    return load(Path(__file__).with_name("_kernels").joinpath("condensed.py").read_text(encoding="utf-8"))

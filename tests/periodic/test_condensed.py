@@ -1,0 +1,257 @@
+"""Condensed models against symbolic ones, harmonic balance of all degrees of freedom, and SciPy's integration."""
+
+import pickle
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy.optimize
+from scipy.integrate import solve_ivp
+
+import bayesperiodic as bp
+from bayesperiodic.periodic.condensed import CondensedEquations, receptance
+
+Element = bp.elements.Element
+VALUES = {"alpha": 0.05, "beta": 0.01, "spring_k3": 0.05, "air_drag": 0.1}
+FREQUENCY, SAMPLES = 0.055, 64
+FORCE = 0.05 + 0.2 * np.cos(2 * np.pi * np.arange(SAMPLES) / SAMPLES)
+GENERAL = {"alpha": 0.02, "cut": 0.3, "soft": 0.8, "spring_k3": 0.05, "air_drag": 0.1}
+
+
+def matrices(count):
+    """Return mass and stiffness of a cantilever by finite differences."""
+    chain = 2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
+    chain[-1, -1] = 1
+    return 4 / count * np.eye(count), (count / 4) ** 2 * chain @ chain + chain
+
+
+@cache
+def beam(count, condensed=True, general=False):
+    """Return a beam with a cubic spring and cubic air drag; `general` has damping that modes do not diagonalise."""
+    mass, stiffness = matrices(count)
+    place, tip = np.diag(np.arange(count) == 0) * 1.0, np.diag(np.arange(count) == count - 1) * 1.0
+    parts = (
+        {"damping": {"alpha": mass, "cut": place}, "stiffness": {"1": stiffness, "soft": tip}}
+        if general
+        else {"damping": {"alpha": mass, "beta": stiffness}, "stiffness": stiffness}
+    )
+    return bp.Model.from_matrices(
+        "beam", mass=mass, **parts, forces={"force": count - 1}, condensed=condensed,
+        outputs={"x": (count - 1, "displacement"), "v": (0, "velocity"), "a": (count // 2, "acceleration")},
+        elements=[
+            Element("spring", bp.elements.cubic, count - 1),
+            Element("air", lambda v, drag: drag * v**3, (count // 2, 0)),
+        ],
+    )  # fmt: skip
+
+
+def solved(count, condensed=True, values=None, general=False, frequency=FREQUENCY, **changes):
+    """Return the solution of a beam."""
+    how = {"frequency": frequency, "samples": SAMPLES, "scheme": "fourier"} | changes
+    return bp.solve_periodic(
+        beam(count, condensed, general), values or (GENERAL if general else VALUES), {"force": FORCE}, **how
+    )
+
+
+def worst(ours, other):
+    """Return the largest difference of arrays by name, relative to the largest value of each."""
+    return max(np.abs(ours[name] - other[name]).max() / np.abs(other[name]).max() for name in other)
+
+
+@pytest.mark.parametrize("general", [False, True])
+@pytest.mark.parametrize("count", [2, 4, pytest.param(8, marks=pytest.mark.slow)])
+def test_condensed_solution_and_sensitivities_are_those_of_the_symbolic_model(count, general):
+    ours, symbolic = (solved(count, condensed, general=general) for condensed in (True, False))
+    assert ours.status == symbolic.status == "converged"
+    assert ours.residual < 1e-12
+    assert receptance(beam(count, True, general)).modal != general
+    for kind in ("outputs", "states"):
+        assert worst(getattr(ours, kind), getattr(symbolic, kind)) < 1e-8
+    for kind in ("sensitivities", "state_sensitivities"):
+        for name, by_parameter in getattr(symbolic, kind).items():
+            assert worst(getattr(ours, kind)[name], by_parameter) < 1e-8
+
+
+def harmonic_balance(count, harmonics):
+    """Return outputs of the beam by SciPy's root of all harmonics, with one inverse a harmonic of all coordinates."""
+    mass, stiffness = matrices(count)
+    damping, rate, points = VALUES["alpha"] * mass + VALUES["beta"] * stiffness, 2 * np.pi * FREQUENCY, 256
+    rates = rate * np.arange(harmonics + 1)
+    places = np.zeros((2, count))
+    places[0, -1], places[1, count // 2], places[1, 0] = 1, 1, -1
+    response = np.linalg.inv(-(rates[:, None, None] ** 2) * mass + 1j * rates[:, None, None] * damping + stiffness)
+    waves = np.exp(2j * np.pi * np.outer(np.arange(harmonics + 1), np.arange(points) / points))
+    load = np.zeros((harmonics + 1, count), complex)
+    load[:2, -1] = 0.05, 0.1
+
+    def in_time(amplitudes):
+        return amplitudes[:, :1].real + 2 * (amplitudes[:, 1:] @ waves[1:]).real
+
+    def motion(vector):
+        real, imaginary = np.split(vector.reshape(2, -1), [harmonics + 1], axis=1)
+        d = real + 1j * np.pad(imaginary, ((0, 0), (1, 0)))
+        cubes = in_time(d)[0] ** 3, in_time(1j * rates * d)[1] ** 3
+        forces = np.array([VALUES["spring_k3"] * cubes[0], VALUES["air_drag"] * cubes[1]]) @ waves.conj().T / points
+        return d, np.einsum("kij,kj->ki", response, load - forces.T @ places)
+
+    def residual(vector):
+        d, x = motion(vector)
+        error = d - places @ x.T
+        return np.concatenate([error.real, error.imag[:, 1:]], axis=1).ravel()
+
+    root = scipy.optimize.root(residual, np.zeros(2 * (2 * harmonics + 1)), tol=1e-14)
+    x = motion(root.x)[1]
+    amplitudes = np.array([x[:, -1], 1j * rates * x[:, 0], -(rates**2) * x[:, count // 2]])
+    return dict(zip("xva", in_time(amplitudes)[:, :: points // SAMPLES], strict=True))
+
+
+@pytest.mark.parametrize("count", [32, pytest.param(128, marks=pytest.mark.slow)])
+def test_many_degrees_of_freedom_move_as_in_an_independent_harmonic_balance(count):
+    assert worst(solved(count).outputs, harmonic_balance(count, 27)) < 1e-6
+
+
+@pytest.mark.parametrize("general", [False, True])
+def test_sensitivities_of_many_degrees_of_freedom_are_finite_differences(general):
+    values = GENERAL if general else VALUES
+    here = solved(32, general=general)
+    for name in (*values, "frequency"):
+        ends, value = [], values.get(name, FREQUENCY)
+        for sign in (1, -1):
+            changed = {"frequency": FREQUENCY} | values
+            changed[name] = value * (1 + 1e-4 * sign)
+            frequency = changed.pop("frequency")
+            ends.append(solved(32, values=changed, general=general, frequency=frequency, guess=here).outputs)
+        for output, by_parameter in here.sensitivities.items():
+            difference = (ends[0][output] - ends[1][output]) / (2e-4 * value)
+            np.testing.assert_allclose(by_parameter[name], difference, atol=1e-5 * np.abs(difference).max())
+
+
+def test_multipliers_are_those_of_scipys_integration_of_the_linearised_equations():
+    """All 16 of 8 degrees of freedom; their estimated error, that of the largest, holds."""
+    count, solution = 8, solved(8)
+    mass, stiffness = matrices(count)
+    damping, rate = VALUES["alpha"] * mass + VALUES["beta"] * stiffness, 2 * np.pi * FREQUENCY
+    states = np.array([solution.states[f"x{i}"] for i in range(count)])
+    amplitudes = np.fft.rfft(states) / SAMPLES
+    orders = np.arange(amplitudes.shape[1])
+    weight = np.where(orders == 0, 1.0, 2.0)
+    between = np.zeros(count)
+    between[count // 2], between[0] = 1, -1
+
+    def rates(t, flat):
+        y = flat.reshape(2 * count, -1)
+        turning = weight * np.exp(1j * orders * rate * t)
+        tip, relative = (amplitudes[-1] @ turning).real, (between @ amplitudes @ (1j * rate * orders * turning)).real
+        k = stiffness + np.diag(np.eye(count)[-1]) * 3 * VALUES["spring_k3"] * tip**2
+        c = damping + np.outer(between, between) * 3 * VALUES["air_drag"] * relative**2
+        return np.concatenate([y[count:], -np.linalg.solve(mass, k @ y[:count] + c @ y[count:])]).ravel()
+
+    end = solve_ivp(rates, (0, 1 / FREQUENCY), np.eye(2 * count).ravel(), rtol=1e-9, atol=1e-11).y[:, -1]
+    exact = np.linalg.eigvals(end.reshape(2 * count, -1))
+    exact = exact[np.argsort(-np.abs(exact))]
+    for value in exact[:8]:
+        assert np.abs(solution.multipliers - value).min() < 1e-6
+    assert abs(abs(solution.multipliers[0]) - abs(exact[0])) < 1e-7
+    assert solution.multiplier_error < 1e-7
+
+
+def test_multipliers_in_few_modes_are_those_in_all_to_their_error(monkeypatch):
+    """Of 24 degrees of freedom in 16 and in 24 modes; only the former have an error of the modes left out."""
+    few = solved(24)
+    monkeypatch.setattr("bayesperiodic.periodic.condensed_solution.MODES", 24)
+    every = solved(24)
+    assert few.multipliers.shape == (32,) and every.multipliers.shape == (48,)
+    difference = abs(abs(few.multipliers[0]) - abs(every.multipliers[0]))
+    assert every.multiplier_error < difference <= few.multiplier_error < 1e-3
+    assert few.stable
+
+
+def test_order_of_convergence_at_a_kink():
+    """The displacement of a beam at a sharp stop is at least of order 1.5 in the number of points."""
+    mass, stiffness = matrices(12)
+    model = bp.Model.from_matrices(
+        "stopped", mass=mass, stiffness=stiffness, damping={"alpha": mass}, forces={"force": 11},
+        outputs={"x": (11, "displacement")},
+        elements=[Element("stop", lambda d, k, clearance: k * (abs(d - clearance) + d - clearance) / 2, 11)],
+    )  # fmt: skip
+    equations = CondensedEquations.build(model, {"force": FORCE}, frequency=0.04, samples=SAMPLES)
+    theta = np.array([0.2, 0.5, 0.1])
+    reference = equations.solve(theta, np.zeros((4096, 1)))
+    exact, errors = equations.outputs(reference.z, theta), []
+    for points in (64, 128, 256, 512):
+        solution = equations.solve(theta, reference.z[:: 4096 // points])
+        assert solution.code == 0
+        errors.append(np.abs(equations.outputs(solution.z, theta) - exact).max())
+    assert exact.max() > 0.15  # it touches the stop
+    slope = np.polyfit(np.log([64, 128, 256, 512]), np.log(errors), 1)[0]
+    assert -slope > 1.5
+
+
+def test_points_are_doubled_until_the_outputs_are_resolved():
+    """What half of the points leave of the error is what the solution states, and is below a millionth."""
+    solution = solved(12)
+    assert 0.0 < max(solution.error_estimate().values()) < 1e-6
+
+
+def test_model_of_hundreds_of_degrees_of_freedom_is_condensed_and_can_be_pickled():
+    model = beam(300, None)
+    again = pickle.loads(pickle.dumps(model))
+    assert type(model).__name__ == "CondensedModel" and again.definition == model.definition
+    assert type(beam(10, None)).__name__ == "Model"
+    assert "W^T f" in model.latex()
+
+
+def test_structure_without_elements_has_its_frequency_response():
+    mass, stiffness = matrices(12)
+    model = bp.Model.from_matrices(
+        "linear", mass=mass, stiffness=stiffness, damping={"alpha": mass}, forces={"force": 0},
+        outputs={"x": (11, "displacement")},
+    )  # fmt: skip
+    solution = bp.solve_periodic(model, {"alpha": 0.1}, {"force": FORCE}, frequency=0.1, samples=SAMPLES)
+    rate = 0.2 * np.pi
+    x = [np.linalg.solve(stiffness - r**2 * mass + 0.1j * r * mass, np.eye(12)[0])[-1] for r in (0.0, rate)]
+    expected = 0.05 * x[0].real + 0.2 * (x[1] * np.exp(2j * np.pi * solution.tau)).real
+    np.testing.assert_allclose(solution.outputs["x"], expected, atol=1e-12)
+
+
+def free_bar(**changes):
+    chain = matrices(12)[1]
+    arguments = {
+        "mass": np.eye(12), "stiffness": chain, "forces": {"force": 0}, "outputs": {"x": (0, "displacement")},
+        "condensed": True,
+    }  # fmt: skip
+    return bp.Model.from_matrices("bar", **(arguments | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"elements": [Element("joint", bp.elements.jenkins, 0, {"width": 0.1})]}, "elements: must be functions of"),
+        ({"elements": [Element("late", lambda s, k: k * s.tau, 0)]}, "elements: must be functions of"),
+        ({"forces": {}}, "forces: must have at least one force in a condensed model"),
+    ],
+)
+def test_what_cannot_be_condensed_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        free_bar(**changes)
+
+
+def test_structure_that_moves_without_deformation_is_refused():
+    rigid = 2 * np.eye(12) - np.eye(12, k=1) - np.eye(12, k=-1)
+    rigid[0, 0] = rigid[-1, -1] = 1
+    with pytest.raises(ValueError, match="stiffness: must be regular in a condensed model"):
+        bp.solve_periodic(free_bar(stiffness=rigid), {}, {"force": FORCE}, frequency=0.1, samples=SAMPLES)
+
+
+def test_what_needs_symbolic_equations_is_refused_with_the_alternative():
+    model, solution = beam(12), solved(12)
+    for call in (
+        lambda: bp.continue_periodic(model, solution, vary="frequency", until=0.1),
+        lambda: bp.structure(model),
+        lambda: bp.multiplier_sensitivities(model, solution),
+        lambda: bp.simulate(model, VALUES, {"force": FORCE}, frequency=FREQUENCY, duration=1.0, sampling_rate=10.0),
+    ):
+        with pytest.raises(ValueError, match=r"must have symbolic equations for this.*condensed=False"):
+            call()
+    with pytest.raises(ValueError, match="scheme: must be 'fourier' or None"):
+        solved(12, scheme="central4")
