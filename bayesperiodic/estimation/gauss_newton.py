@@ -28,7 +28,7 @@ OVERFLOWS = 1e150
 # Change of the factors that ends the correction, and the largest part of its values that parameters may take up.
 SETTLED_FACTOR, MOST_TAKEN = 1e-6, 0.99
 # Status of a climb that was ended by what it reports to.
-ENDED = "ended"
+CLIMB_ENDED = "ended"
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def climb(
     for _ in range(MAX_ROUNDS):
         now, status, objectives = _ascend(objective, now, resting, report, most)
         history += objectives
-        if status == ENDED:
+        if status == CLIMB_ENDED:
             break
         ends = at_ends(objective, now)
         inwards = ends * objective.hessian_and_gradient(now)[1] < 0.0
@@ -256,7 +256,7 @@ def _ascend(
         gain, now = trial.objective - now.objective, objective.anchored(trial)
         history.append(now.objective)
         if report is not None and report(now, damping * size):
-            return now, ENDED, history
+            return now, CLIMB_ENDED, history
         if size < CONVERGED_STEP and gain < SMALL_GAIN:
             return now, "converged", history
     return now, "iterations", history
