@@ -113,7 +113,10 @@ def test_draws_have_the_spread_of_the_laplace_approximation():
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [({"guess": "data"}, "guess of experiment"), ({"multipliers": [0.5], "multiplier_sd": [0.1]}, "multipliers of experiment")],
+    [
+        ({"guess": "data"}, "guess of experiment"),
+        ({"multipliers": [0.5], "multiplier_sd": [0.1]}, "multipliers of experiment"),
+    ],
 )
 def test_data_that_condensed_models_do_not_predict_are_refused(changes, message):
     with pytest.raises(ValueError, match=f"{message}.*condensed"):
