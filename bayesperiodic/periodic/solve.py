@@ -279,8 +279,9 @@ def _solution_warnings(
     if isinstance(equations, CondensedEquations):
         if solution.status == STATUSES[NOT_RESOLVED]:
             yield (
-                f"The solution of {name!r} is not resolved: its outputs still change by more than {LARGEST_OUTPUT_CHANGE:.0%} where "
-                f"the forces of the elements are evaluated at {MOST_ELEMENT_POINTS} points; make kinks smoother (width)."
+                f"The solution of {name!r} is not resolved: its outputs still change by more than "
+                f"{LARGEST_OUTPUT_CHANGE:.0%} where the forces of the elements are evaluated at {MOST_ELEMENT_POINTS} "
+                "points; make kinks smoother (width)."
             )
         return
     if solution.status == STATUSES[NOT_FINITE] and (term := singular_term(equations, z, theta)):

@@ -93,8 +93,8 @@ def correct_many(
     `d_f` (sets, 1 or solves, harmonics, elements, elements) is the frequency response between the elements, `free` (…,
     harmonics, elements) the displacements without their forces, `inverse` (sets, size, size) the transposed inverse of
     the derivative of the residual by the `low` lowest harmonics at the anchors, `moved` (sets, solves) the predicted
-    change. `lost` becomes 1 where the steps do not become small at the rate `CORRECTION_RATE`, or the first is not below `FIRST_CORRECTION`
-    of the predicted change: the solution may be another one.
+    change. `lost` becomes 1 where the steps do not become small at the rate `CORRECTION_RATE`, or the first is
+    not below `FIRST_CORRECTION` of the predicted change: the solution may be another one.
     """
     solves, count, elements = d.shape[1], d.shape[2], d.shape[3]
     points, size = 2 * count, low * elements
