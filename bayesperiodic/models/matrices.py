@@ -11,7 +11,7 @@ import sympy as sp
 from bayesperiodic import _checks
 from bayesperiodic.models.hysteresis import Hysteretic
 from bayesperiodic.models.names import DERIVATIVES, Names
-from bayesperiodic.models.structure import CONSTANT_PART, POWERS, Matrices, Structure
+from bayesperiodic.models.structure import CONSTANT_PART, POWERS, Matrices, MatrixStructure
 
 KINDS_OF_MOTION = {"displacement": 0, "velocity": 1, "acceleration": 2}  # order of the derivative
 # Arguments of the functions of elements that are no parameters.
@@ -108,7 +108,7 @@ def structure(
     forces: Mapping[str, Any],
     outputs: Mapping[str, tuple[Any, str]],
     elements: Iterable[Element],
-) -> Structure:
+) -> MatrixStructure:
     """Return the checked structure of matrices by name; see `Model.from_matrices`."""
     parts = {kind: _parts(kind, given) for kind, given in matrices.items()}
     count = len(next(iter(parts["mass"].values())))
@@ -128,10 +128,10 @@ def structure(
     inputs = {name: _weights(f"forces[{name!r}]", place, count) for name, place in forces.items()}
     measured = {name: _measured(f"outputs[{name!r}]", given, count) for name, given in outputs.items()}
     weights = [_weights(f"place of element {e.name!r}", e.place, count) for e in placed]
-    return Structure(Matrices(parts), inputs, measured, placed, np.array(weights).reshape(-1, count))
+    return MatrixStructure(Matrices(parts), inputs, measured, placed, np.array(weights).reshape(-1, count))
 
 
-def definition(given: Structure) -> dict[str, Any]:
+def definition(given: MatrixStructure) -> dict[str, Any]:
     """Return the arguments of `Model` for a structure; the equations are functions, which only `Model` calls."""
     degrees = [f"x{number}" for number in range(given.degrees)]
 

@@ -22,7 +22,7 @@ from bayesperiodic._expressions import parse
 from bayesperiodic._printing import Printed
 from bayesperiodic.models.matrices import definition, structure
 from bayesperiodic.models.names import DERIVATIVES, Names, with_derivatives
-from bayesperiodic.models.structure import CONSTANT_PART, Structure
+from bayesperiodic.models.structure import CONSTANT_PART, MatrixStructure
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
 LARGEST_FLOAT = np.finfo(float).max
@@ -388,7 +388,7 @@ class CondensedModel(Model):
     Parameters
     ----------
     name : str
-    structure : Structure
+    structure : MatrixStructure
         Checked matrices, places and elements.
 
     Raises
@@ -397,7 +397,7 @@ class CondensedModel(Model):
         Without a force, and for an element with internal states.
     """
 
-    def __init__(self, name: str, structure: Structure):
+    def __init__(self, name: str, structure: MatrixStructure):
         if not structure.memoryless:
             raise ValueError(
                 "elements: must be functions of displacement and velocity in a condensed model, got one with internal "

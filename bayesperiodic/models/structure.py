@@ -11,11 +11,11 @@ import scipy.linalg
 CONSTANT_PART = "1"
 POWERS = {"mass": 2, "damping": 1, "stiffness": 0}  # of iω
 # Largest entry beside the diagonal of a part in the modes' coordinates, relative to the diagonal.
-DIAGONAL = 1e-10
+OFF_DIAGONAL = 1e-10
 # Largest difference from a multiple of another matrix, relative to the largest entry.
-MULTIPLE = 1e-14
+OFF_MULTIPLE = 1e-14
 # Smallest ratio of the eigenvalues of a regular stiffness matrix.
-REGULAR = 1e-13
+LEAST_REGULAR = 1e-13
 
 
 class Modes:
@@ -61,17 +61,17 @@ def _diagonal(
     """Return a part in the modes' coordinates (modes,); None if it is not diagonal there."""
     for matrix, values in known:
         ratio = np.vdot(matrix, part) / np.vdot(matrix, matrix)
-        if np.abs(part - ratio * matrix).max() <= MULTIPLE * np.abs(part).max():
+        if np.abs(part - ratio * matrix).max() <= OFF_MULTIPLE * np.abs(part).max():
             return np.asarray(ratio * values)
     inside = vectors.T @ part @ vectors
     diagonal = np.diag(inside)
     sizes = np.sqrt(np.abs(diagonal))
     beside = np.abs(inside - np.diag(diagonal))
-    return diagonal if np.all(beside <= DIAGONAL * np.outer(sizes, sizes)) else None
+    return diagonal if np.all(beside <= OFF_DIAGONAL * np.outer(sizes, sizes)) else None
 
 
 @dataclass(frozen=True)
-class Structure:
+class MatrixStructure:
     """What `Model.from_matrices` was given, checked: the matrices, the places, and the elements."""
 
     matrices: Matrices

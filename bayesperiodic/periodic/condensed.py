@@ -28,17 +28,17 @@ from bayesperiodic.periodic.receptance import Receptance
 from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
 # Points of the grid of the elements, and relative change of the outputs below which they are not doubled.
-FEWEST_POINTS, MOST_POINTS, RESOLVED = 32, 4096, 1e-6
+FEWEST_ELEMENT_POINTS, MOST_ELEMENT_POINTS, RESOLVED_CHANGE = 32, 4096, 1e-6
 # The largest change of outputs that count as resolved by the most points; the smallest relative harmonic of an input.
-COARSE, LEAST_HARMONIC = 1e-2, 1e-12
+LARGEST_OUTPUT_CHANGE, LEAST_HARMONIC = 1e-2, 1e-12
 # Share of a step that is left by harmonics whose coupling by the elements is neglected in Newton's matrix.
-WEAK = 0.05
-STEPS, HALVED, LAST_STEP, ROUNDING = 40, 10, 1e-10, 1e-13
-SWEEPS, SWEEP_ERROR = 200, 1e-13
+WEAK_COUPLING = 0.05
+MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40, 10, 1e-10, 1e-13
+MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR = 200, 1e-13
 # Steps of the load along the branch, in units of the load and of the linear response; corrections, their largest ratio,
 # the last one, and the smallest cosine between two tangents.
 FIRST_LOAD_STEP, SMALLEST_LOAD_STEP, LARGEST_LOAD_STEP = 0.05, 1e-6, 0.1
-CORRECTIONS, CONTRACTION, LOAD_ERROR, STRAIGHT = 10, 0.6, 1e-7, 0.9
+MOST_LOAD_CORRECTIONS, LOAD_CONTRACTION, LOAD_ERROR, STRAIGHT_TANGENTS = 10, 0.6, 1e-7, 0.9
 
 
 class Forces(NamedTuple):
@@ -99,7 +99,7 @@ class Preconditioner:
         """Return the number of low harmonics beyond which all are coupled weakly."""
         steepest = np.abs(forces.stiffness).max(axis=0) + rates[:, None] * np.abs(forces.damping).max(axis=0)
         coupling = np.sqrt(np.sum(np.abs(d_f * steepest[:, None, :]) ** 2, axis=(1, 2)))
-        return min(len(rates), int(np.flatnonzero(~(coupling < WEAK)).max(initial=0)) + 1)
+        return min(len(rates), int(np.flatnonzero(~(coupling < WEAK_COUPLING)).max(initial=0)) + 1)
 
     def __call__(self, right: np.ndarray) -> np.ndarray:
         """Return the approximate solution (…, harmonics, elements) for a right-hand side of that shape."""
@@ -231,9 +231,11 @@ class CondensedEquations(PeriodicEquations):
             return Forces(none, none, none), np.zeros((2 * len(d), 0, parameters.size))
         values, given = self._evaluated("residual_jacobian", d, parameters), self.count
         f, slopes = values[:, :given], values[:, given:].reshape(len(values), given, 3, given)
-        own = np.arange(given)
+        diagonal = np.arange(given)
         by_theta = self._evaluated("derivatives", d, parameters)[:, : given * parameters.size]
-        return Forces(f, slopes[:, own, 0, own], slopes[:, own, 1, own]), by_theta.reshape(len(f), given, -1)
+        return Forces(f, slopes[:, diagonal, 0, diagonal], slopes[:, diagonal, 1, diagonal]), by_theta.reshape(
+            len(f), given, -1
+        )
 
     def _evaluated(self, name: str, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         points, kernels = 2 * len(d), self.model.element_kernels
@@ -257,7 +259,7 @@ class CondensedEquations(PeriodicEquations):
         history: list[tuple[float, float, float]] = []
         forces, _ = self.forces(d, parameters)
         residual, size = _residual(d, forces, matrices, free)
-        for _ in range(STEPS):
+        for _ in range(MOST_CONDENSED_STEPS):
             if not np.isfinite(residual).all():
                 return d, NOT_FINITE, np.array(history).reshape(-1, 3)
             before = float(np.linalg.norm(residual))
@@ -266,21 +268,21 @@ class CondensedEquations(PeriodicEquations):
             except np.linalg.LinAlgError:
                 return d, SINGULAR, np.array(history).reshape(-1, 3)
             share = 1.0
-            for _ in range(HALVED):
+            for _ in range(MOST_STEP_HALVINGS):
                 there = d - share * step
                 new_forces, _ = self.forces(there, parameters)
                 residual, size = _residual(there, new_forces, matrices, free)
                 after = float(np.linalg.norm(residual))
-                if after < before or after <= ROUNDING * size:
+                if after < before or after <= NEWTON_ROUNDING * size:
                     break
                 share *= 0.5
             else:
-                if before <= LAST_STEP * size:  # at rounding level
+                if before <= LAST_NEWTON_STEP * size:  # at rounding level
                     return d, CONVERGED, np.array(history).reshape(-1, 3)
                 return d, STALLED, np.array(history).reshape(-1, 3)
             d, forces = there, new_forces
             history.append((before / size, float(np.linalg.norm(step)) / size, share))
-            if share == 1.0 and (after <= ROUNDING * size or np.linalg.norm(step) <= LAST_STEP * size):
+            if share == 1.0 and (after <= NEWTON_ROUNDING * size or np.linalg.norm(step) <= LAST_NEWTON_STEP * size):
                 return d, CONVERGED, np.array(history)
         return d, STALLED, np.array(history)
 
@@ -309,10 +311,10 @@ class CondensedEquations(PeriodicEquations):
                 np.abs(after - before) / np.maximum(np.abs(after).max(axis=0), np.finfo(float).tiny), initial=0.0
             )
             before = after
-            if change <= RESOLVED:
+            if change <= RESOLVED_CHANGE:
                 break
-            if 2 * len(d) >= MOST_POINTS:
-                code = CONVERGED if change <= COARSE else NOT_RESOLVED
+            if 2 * len(d) >= MOST_ELEMENT_POINTS:
+                code = CONVERGED if change <= LARGEST_OUTPUT_CHANGE else NOT_RESOLVED
                 break
         return Solved(on_grid(d, 2 * len(d)), code, history), found_by
 
@@ -320,7 +322,7 @@ class CondensedEquations(PeriodicEquations):
         """Return the number of points with which to start: enough for the harmonics of the inputs."""
         sizes = np.abs(self.input_harmonics(2 * self.grid.points)).max(axis=1, initial=0.0)
         highest = int(np.flatnonzero(sizes > LEAST_HARMONIC * sizes.max(initial=0.0)).max(initial=0))
-        return max(FEWEST_POINTS, 1 << (4 * highest).bit_length())
+        return max(FEWEST_ELEMENT_POINTS, 1 << (4 * highest).bit_length())
 
     def _raise_load(self, parameters: np.ndarray, start: np.ndarray) -> np.ndarray | None:
         """Follow the branch of solutions d while the load grows from zero, through folds; None if that fails."""
@@ -335,7 +337,7 @@ class CondensedEquations(PeriodicEquations):
         def corrected(d: np.ndarray, load: float, along: np.ndarray) -> tuple[np.ndarray, float, np.ndarray, bool]:
             """Return the solution in the plane across a direction, and the tangent there."""
             size = np.inf
-            for _ in range(CORRECTIONS):
+            for _ in range(MOST_LOAD_CORRECTIONS):
                 forces, _ = self.forces(d, parameters)
                 inverse = Preconditioner(forces, rates, matrices.d_f)
                 residual, _ = _residual(d, forces, matrices, load * full)
@@ -343,7 +345,7 @@ class CondensedEquations(PeriodicEquations):
                 change = along[:-1] @ by_residual / (along[:-1] @ by_load + along[-1])
                 move, last = _unstacked(change * by_load - by_residual, unit, d.shape), size
                 d, load, size = d + move, load + change, float(np.hypot(np.linalg.norm(move) / unit, change))
-                if not size < CONTRACTION * last:
+                if not size < LOAD_CONTRACTION * last:
                     break
                 if size < LOAD_ERROR:
                     return d, load, np.append(by_load, 1.0), True
@@ -360,7 +362,7 @@ class CondensedEquations(PeriodicEquations):
                 return None
             tangent = tangent / np.linalg.norm(tangent)
             turn = float(tangent @ before)
-            if not good or abs(turn) < STRAIGHT:
+            if not good or abs(turn) < STRAIGHT_TANGENTS:
                 step *= 0.5
                 if step < SMALLEST_LOAD_STEP:
                     return None
@@ -505,13 +507,13 @@ def _linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.
     except np.linalg.LinAlgError:
         return None
     x = inverse(right)
-    for _ in range(SWEEPS):
+    for _ in range(MOST_LINEAR_SWEEPS):
         step = inverse(right - x - _times(d_f, _linearised(forces, rates, x)))
         x = x + step
         size = float(np.linalg.norm(x))
         if not np.isfinite(size):
             return None
-        if np.linalg.norm(step) <= SWEEP_ERROR * size:
+        if np.linalg.norm(step) <= LINEAR_SWEEP_ERROR * size:
             return x
     return None
 

@@ -16,9 +16,9 @@ from bayesperiodic.periodic.condensed import (
 )
 from bayesperiodic.periodic.receptance import compiled
 
-FEWEST_SOLVES = 4
+FEWEST_CONDENSED_SOLVES = 4
 # Parts of the way from an anchor in which a solution is followed, and largest change in units of the predicted one.
-LARGEST_PART, SMALLEST_PART, STRAIGHT_PATH = 0.25, 1.0 / 256.0, 0.5
+LARGEST_PATH_PART, SMALLEST_PATH_PART, STRAIGHT_PATH = 0.25, 1.0 / 256.0, 0.5
 
 
 class CondensedBatch:
@@ -120,7 +120,7 @@ class CondensedBatch:
                 place, polish, *block, moved, d, f, lost, steps,
             )  # fmt: skip
 
-        in_blocks(part, lost.size, FEWEST_SOLVES, threads)
+        in_blocks(part, lost.size, FEWEST_CONDENSED_SOLVES, threads)
         status = np.full(lost.shape, CONVERGED)
         for e, b in np.argwhere(lost):
             if without is not None and without[e, b]:
@@ -145,7 +145,7 @@ class CondensedBatch:
             solved = equations.solve(parameters, on_grid(self._d[e], self._points))
             return harmonics(solved.z), solved.code, len(solved.history)
         change = parameters - anchor.parameters
-        here, done, step, used = self._d[e], 0.0, LARGEST_PART, 0
+        here, done, step, used = self._d[e], 0.0, LARGEST_PATH_PART, 0
         ahead = np.tensordot(change, self._slopes[e], (0, 0))
         while done < 1.0:
             there = anchor.parameters + (done + step) * change
@@ -156,11 +156,11 @@ class CondensedBatch:
             straight = np.linalg.norm(d - predicted) <= STRAIGHT_PATH * size and np.all(solved.history[:, 2] == 1.0)
             if solved.code != CONVERGED or not straight:
                 step *= 0.5
-                if step < SMALLEST_PART:
+                if step < SMALLEST_PATH_PART:
                     return d, OTHER_ORBIT if solved.code == CONVERGED else solved.code, used
                 continue
             ahead, here, done = (d - here) / step, d, done + step
-            step = min(2.0 * step, LARGEST_PART, 1.0 - done)
+            step = min(2.0 * step, LARGEST_PATH_PART, 1.0 - done)
         return here, CONVERGED, used
 
     def vjp(self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, moving: tuple[int, ...]) -> np.ndarray:

@@ -15,7 +15,7 @@ from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solve
 from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, by_name, describe
 
 # Lowest modes in which the linearised equations are solved; half of them give the error.
-MODES, MOST_STEPS = 16, 1024
+MOST_MODES, MOST_MODAL_STEPS = 16, 1024
 
 
 @dataclass(frozen=True, repr=False)
@@ -180,9 +180,9 @@ def _modal_equations(equations: CondensedEquations, theta: np.ndarray, count: in
 def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the Floquet multipliers in the lowest modes, largest first, and the error of the largest modulus."""
     period, d = equations.grid.periods / equations.frequency, harmonics(z)
-    several = _modal_equations(equations, theta, MODES)
+    several = _modal_equations(equations, theta, MOST_MODES)
     fastest = float(np.sqrt(np.abs(np.linalg.eigvals(several.stiffness)).max()))
-    steps = max(len(z), min(MOST_STEPS, 1 << int(np.ceil(np.log2(max(1.0, period * fastest))))))
+    steps = max(len(z), min(MOST_MODAL_STEPS, 1 << int(np.ceil(np.log2(max(1.0, period * fastest))))))
     grids = [equations.forces(resized(d, every * steps), theta)[0] for every in (1, 2, 4)]
     one, two, four = (several.monodromy(forces, period) for forces in grids)
     # Richardson's extrapolation of even powers of the step.
@@ -192,7 +192,7 @@ def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.nd
     largest = float(np.abs(values[0]))
     error = abs(largest - float(np.abs(np.linalg.eigvals(fine)).max()))
     if len(several.stiffness) < len(equations.model.states):
-        fewer = _modal_equations(equations, theta, MODES // 2)
+        fewer = _modal_equations(equations, theta, MOST_MODES // 2)
         error += abs(
             float(np.abs(np.linalg.eigvals(fewer.monodromy(grids[2], period))).max())
             - float(np.abs(np.linalg.eigvals(four)).max())

@@ -10,11 +10,11 @@ import numpy as np
 import scipy.linalg
 
 from bayesperiodic._compile.cache import load
-from bayesperiodic.models.structure import CONSTANT_PART, POWERS, REGULAR, Structure
+from bayesperiodic.models.structure import CONSTANT_PART, LEAST_REGULAR, POWERS, MatrixStructure
 
 
 @dataclass(frozen=True)
-class Response:
+class LinearResponse:
     """Frequency response at harmonics, (harmonics, rows, columns), and its derivatives, (directions, …)."""
 
     values: np.ndarray
@@ -22,21 +22,21 @@ class Response:
 
 
 class Receptance:
-    """Response R·(−(kω)² M + ikω C + K)⁻¹·S of displacements along rows R to forces along columns S.
+    """LinearResponse R·(−(kω)² M + ikω C + K)⁻¹·S of displacements along rows R to forces along columns S.
 
     M, C and K are sums of parts times factors, which are parameters or 1. Where one basis of real modes diagonalises
     all parts, as with Rayleigh or modal damping, it is computed once; else one matrix is factorised per harmonic.
 
     Parameters
     ----------
-    structure : Structure
+    structure : MatrixStructure
     parameters : sequence of str
         Names of the model's parameters.
     rows, columns : array (…, n)
         Weights of the degrees of freedom.
     """
 
-    def __init__(self, structure: Structure, parameters: Sequence[str], rows: np.ndarray, columns: np.ndarray):
+    def __init__(self, structure: MatrixStructure, parameters: Sequence[str], rows: np.ndarray, columns: np.ndarray):
         self._structure, self._rows, self._columns = structure, rows, columns
         parts = [(POWERS[kind], name, a) for kind, named in structure.parts.items() for name, a in named.items()]
         self._powers = np.array([power for power, _, _ in parts])
@@ -84,7 +84,7 @@ class Receptance:
 
     def __call__(
         self, parameters: np.ndarray, frequency: float, harmonics: np.ndarray, directions: Sequence[int] = ()
-    ) -> Response:
+    ) -> LinearResponse:
         """Return the response at multiples of a frequency [Hz], and its derivatives.
 
         `directions` are indices of parameters, the number of parameters standing for the frequency.
@@ -110,14 +110,14 @@ class Receptance:
                 )
                 parts = np.einsum("kna,inj,kjb->kiab", left, self._matrices, right, optimize=True)
                 changes = [-np.einsum("ki,kiab->kab", s, parts) for s in slopes]
-        return Response(values, np.array(changes).reshape(len(slopes), *values.shape))
+        return LinearResponse(values, np.array(changes).reshape(len(slopes), *values.shape))
 
     def _check_regular(self, parameters: np.ndarray) -> None:
         """Raise a ValueError for a structure that can move without being deformed."""
         if self._modes is None and not self._regular:
             stiffness = self.sums(parameters)[2]
             sizes = np.linalg.svd(stiffness, compute_uv=False)
-            if not sizes[-1] > REGULAR * sizes[0]:
+            if not sizes[-1] > LEAST_REGULAR * sizes[0]:
                 raise ValueError(
                     "stiffness: must be regular in a condensed model, got a singular matrix; support the structure, "
                     "such as by soft springs, or take condensed=False."

@@ -10,7 +10,12 @@ from bayesperiodic import _checks, _fourier
 from bayesperiodic.models.model import Model, integration_kernels, parameter_vector
 from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, OTHER_ORBIT, SINGULAR, STATUSES
-from bayesperiodic.periodic.condensed import COARSE, MOST_POINTS, CondensedEquations, equations_for
+from bayesperiodic.periodic.condensed import (
+    LARGEST_OUTPUT_CHANGE,
+    MOST_ELEMENT_POINTS,
+    CondensedEquations,
+    equations_for,
+)
 from bayesperiodic.periodic.condensed_solution import described
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.isolation import MANY_CYCLES, has_neighbours
@@ -274,8 +279,9 @@ def _solution_warnings(
     if isinstance(equations, CondensedEquations):
         if solution.status == STATUSES[NOT_RESOLVED]:
             yield (
-                f"The solution of {name!r} is not resolved: its outputs still change by more than {COARSE:.0%} where "
-                f"the forces of the elements are evaluated at {MOST_POINTS} points; make kinks smoother (width)."
+                f"The solution of {name!r} is not resolved: its outputs still change by more than "
+                f"{LARGEST_OUTPUT_CHANGE:.0%} where the forces of the elements are evaluated at {MOST_ELEMENT_POINTS} "
+                "points; make kinks smoother (width)."
             )
         return
     if solution.status == STATUSES[NOT_FINITE] and (term := singular_term(equations, z, theta)):

@@ -9,6 +9,7 @@ import scipy.optimize
 from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
+from bayesperiodic.periodic import condensed, condensed_solution
 from bayesperiodic.periodic.condensed import CondensedEquations, receptance
 
 Element = bp.elements.Element
@@ -158,12 +159,54 @@ def test_multipliers_are_those_of_scipys_integration_of_the_linearised_equations
 def test_multipliers_in_few_modes_are_those_in_all_to_their_error(monkeypatch):
     """Of 24 degrees of freedom in 16 and in 24 modes; only the former have an error of the modes left out."""
     few = solved(24)
-    monkeypatch.setattr("bayesperiodic.periodic.condensed_solution.MODES", 24)
+    monkeypatch.setattr("bayesperiodic.periodic.condensed_solution.MOST_MODES", 24)
     every = solved(24)
     assert few.multipliers.shape == (32,) and every.multipliers.shape == (48,)
     difference = abs(abs(few.multipliers[0]) - abs(every.multipliers[0]))
     assert every.multiplier_error < difference <= few.multiplier_error < 1e-3
     assert few.stable
+
+
+def test_modes_left_out_bend_statically(monkeypatch):
+    """A linear spring as an element: in 3 of 8 modes, the multiplier of the lowest mode is nearer with flexibility."""
+    mass, stiffness = matrices(8)
+    model = bp.Model.from_matrices(
+        "sprung", mass=mass, stiffness=stiffness, damping={"alpha": mass}, forces={"force": 7}, condensed=True,
+        outputs={"x": (7, "displacement")}, elements=[Element("spring", lambda d, k: k * d, 7)],
+    )  # fmt: skip
+    tip = np.diag(np.arange(8) == 7) * 2.0
+    rate = np.sqrt(np.linalg.eigvals(np.linalg.solve(mass, stiffness + tip)).real.min() - 0.025**2)
+    exact, errors = np.exp((-0.025 + 1j * rate) / 0.1), []
+    monkeypatch.setattr(condensed_solution, "MOST_MODES", 3)
+    modal = condensed_solution._modal_equations
+    for scale in (1, 0):
+        monkeypatch.setattr(
+            condensed_solution,
+            "_modal_equations",
+            lambda *given, scale=scale: (m := modal(*given))._replace(compliance=scale * m.compliance),
+        )
+        solution = bp.solve_periodic(
+            model, {"alpha": 0.05, "spring_k": 2.0}, {"force": FORCE}, frequency=0.1, samples=SAMPLES
+        )
+        errors.append(np.abs(solution.multipliers - exact).min())
+    assert errors[0] < 0.2 * errors[1]
+
+
+def test_newtons_matrix_is_that_of_the_linearised_equations():
+    """With all harmonics strongly coupled, it inverts a finite difference of the residual."""
+    equations = CondensedEquations.build(beam(8), {"force": FORCE}, frequency=FREQUENCY, samples=SAMPLES)
+    theta, random = np.array([*VALUES.values()]), np.random.default_rng(0)
+    d, step = random.standard_normal((2, 16, 2)) + 1j * random.standard_normal((2, 16, 2))
+    d[0], step[0] = d[0].real, step[0].real
+    response = equations.matrices(theta, 32)[0].d_f
+
+    def residual(at):
+        forces = condensed.harmonics(equations.forces(at, theta)[0].values)
+        return at + (response @ forces[..., None])[..., 0]
+
+    change = (residual(d + 1e-6 * step) - residual(d - 1e-6 * step)) / 2e-6
+    inverse = condensed.Preconditioner(equations.forces(d, theta)[0], equations.rates(32), response, 16)
+    np.testing.assert_allclose(inverse(change), step, atol=1e-6)
 
 
 def test_order_of_convergence_at_a_kink():
@@ -204,10 +247,10 @@ def test_model_of_hundreds_of_degrees_of_freedom_is_condensed_and_can_be_pickled
 def test_structure_without_elements_has_its_frequency_response():
     mass, stiffness = matrices(12)
     model = bp.Model.from_matrices(
-        "linear", mass=mass, stiffness=stiffness, damping={"alpha": mass}, forces={"force": 0},
+        "linear", mass=mass, stiffness=stiffness, damping={"alpha": 2 * mass}, forces={"force": 0},
         outputs={"x": (11, "displacement")},
     )  # fmt: skip
-    solution = bp.solve_periodic(model, {"alpha": 0.1}, {"force": FORCE}, frequency=0.1, samples=SAMPLES)
+    solution = bp.solve_periodic(model, {"alpha": 0.05}, {"force": FORCE}, frequency=0.1, samples=SAMPLES)
     rate = 0.2 * np.pi
     x = [np.linalg.solve(stiffness - r**2 * mass + 0.1j * r * mass, np.eye(12)[0])[-1] for r in (0.0, rate)]
     expected = 0.05 * x[0].real + 0.2 * (x[1] * np.exp(2j * np.pi * solution.tau)).real

@@ -6,8 +6,14 @@ from numba import njit
 from bayesperiodic._compile.functions import grid_function_at
 
 CONDENSED_OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
-MOST_CORRECTIONS, FASTEST, NEAR, TOLERANCE, POLISHED = 12, 0.3, 0.5, 1e-10, 1e-13
-NUMBERS, AMPLITUDES = "float64[::1]", "complex128[:,::1]"
+MOST_CORRECTIONS, CORRECTION_RATE, FIRST_CORRECTION, LAST_CORRECTION, LAST_POLISHED_CORRECTION = (
+    12,
+    0.3,
+    0.5,
+    1e-10,
+    1e-13,
+)
+REALS, COMPLEX_ROWS = "float64[::1]", "complex128[:,::1]"
 
 
 @njit("void(complex128[::1], complex128[::1], int64[::1], boolean)", **CONDENSED_OPTIONS)
@@ -36,8 +42,8 @@ def transform(x, turns, place, back):
 
 
 @njit(
-    f"void(int64, {AMPLITUDES}, {NUMBERS}, float64, float64, complex128[::1], int64[::1], float64[:,::1],"
-    f"float64[:,::1], complex128[::1], {AMPLITUDES})",
+    f"void(int64, {COMPLEX_ROWS}, {REALS}, float64, float64, complex128[::1], int64[::1], float64[:,::1],"
+    f"float64[:,::1], complex128[::1], {COMPLEX_ROWS})",
     **CONDENSED_OPTIONS,
 )
 def forces(address, d, parameters, rate, periods, turns, place, states, out, work, f):
@@ -87,8 +93,8 @@ def correct_many(
     `d_f` (sets, 1 or solves, harmonics, elements, elements) is the frequency response between the elements, `free` (…,
     harmonics, elements) the displacements without their forces, `inverse` (sets, size, size) the transposed inverse of
     the derivative of the residual by the `low` lowest harmonics at the anchors, `moved` (sets, solves) the predicted
-    change. `lost` becomes 1 where the steps do not become small at the rate `FASTEST`, or the first is not below `NEAR`
-    of the predicted change: the solution may be another one.
+    change. `lost` becomes 1 where the steps do not become small at the rate `CORRECTION_RATE`, or the first is
+    not below `FIRST_CORRECTION` of the predicted change: the solution may be another one.
     """
     solves, count, elements = d.shape[1], d.shape[2], d.shape[3]
     points, size = 2 * count, low * elements
@@ -137,15 +143,17 @@ def correct_many(
             length, square = np.sqrt(length), np.sqrt(square)
             if not (length < np.inf and square < np.inf):
                 break
-            if length <= POLISHED * square or (not polish and length <= TOLERANCE * square):
+            if length <= LAST_POLISHED_CORRECTION * square or (not polish and length <= LAST_CORRECTION * square):
                 done = True
-            elif iteration == 0 and length > NEAR * moved[e, b] and length > NEAR * 1e-3 * square:
+            elif (
+                iteration == 0 and length > FIRST_CORRECTION * moved[e, b] and length > FIRST_CORRECTION * 1e-3 * square
+            ):
                 break
-            elif iteration > 0 and not length < FASTEST * before:
-                done = length <= TOLERANCE * square
+            elif iteration > 0 and not length < CORRECTION_RATE * before:
+                done = length <= LAST_CORRECTION * square
                 if not done:
                     break
-            elif iteration > 0 and not polish and length * length <= TOLERANCE * square * before:
+            elif iteration > 0 and not polish and length * length <= LAST_CORRECTION * square * before:
                 done = True
             before = length
         lost[e, b] = 0 if done else 1
