@@ -46,7 +46,9 @@ def run(options: argparse.Namespace) -> None:
             figures["forest"] = _titled(bp.plot.population(dampers), title)
             for covariate, unit in {"amplitude": "m", "tension": "N"}.items():
                 figure = bp.plot.population(dampers, covariate=covariate)
-                figures[covariate] = _titled(figure, f"{title}, by {covariate} [{unit}]")
+                for axes in figure.axes:
+                    axes.set_xlabel(f"{covariate} [{unit}]")
+                figures[covariate] = _titled(figure, title)
         print(dampers)
     else:
         print(f"  the tests of the friction damper are not used; they are at {ADDRESS}")
