@@ -22,6 +22,7 @@ from scipy.stats import norm
 from bayesperiodic.problem.parameters import CHAIN, DRAW
 
 FEWEST_WEIGHTS, EQUAL_WEIGHTS, LARGEST_LOG_RATIO = 0.25, 1e-6, 700.0
+WINDOW = 5.0  # of the sum of autocorrelations, in autocorrelation times
 QUANTILE_LEVELS = np.array([0.05, 0.5, 0.95])
 
 
@@ -75,10 +76,16 @@ def _of_arviz(statistic: str, values: np.ndarray, method: str) -> float:
 
 
 def autocorrelation_time(chains: np.ndarray) -> np.ndarray:
-    """Return the integrated autocorrelation time of each coordinate in steps, the mean over the ensembles."""
+    """Return the integrated autocorrelation time of each coordinate in steps, the mean over the ensembles.
+
+    emcee subtracts the mean of each walker, which makes its estimate too small, however many walkers there are: by 18 %
+    at 50 autocorrelation times. The factor 1 + (2·window + 1)/steps corrects that to first order (U. Wolff, Monte Carlo
+    errors with less errors, Computer Physics Communications 156 (2004) 143-153).
+    """
     with np.errstate(invalid="ignore"):  # a walker that has not moved yet
-        times = [emcee.autocorr.integrated_time(e, tol=0, quiet=True, has_walkers=True) for e in chains]
-    return np.mean(times, axis=0)
+        times = [emcee.autocorr.integrated_time(e, c=WINDOW, tol=0, quiet=True, has_walkers=True) for e in chains]
+    mean = np.mean(times, axis=0)
+    return mean * (1.0 + (2.0 * WINDOW * mean + 1.0) / chains.shape[1])
 
 
 def quantile_spread(chains: np.ndarray) -> np.ndarray:

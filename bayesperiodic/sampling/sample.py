@@ -59,10 +59,10 @@ from bayesperiodic.sampling.starts import FROM_LAPLACE, STARTS, laplace_mixture,
 EMCEE, NUTS = "emcee", "nuts"
 FEWEST_STEPS, FEWEST_KEPT = 50, 10
 # Steps between fits of the mixture, and at least between checks of the stop rule.
-ROUND = 50
+ROUND, CHECKED = 25, 50
 # Burn-in ends when the autocorrelation time [steps] expected of the mixture is FAST_MIXTURE, or after
 # MOST_BURN_IN_ROUNDS.
-FAST_MIXTURE, MOST_BURN_IN_ROUNDS = 3.0, 20
+FAST_MIXTURE, MOST_BURN_IN_ROUNDS = 3.0, 40
 # It starts again, before MOST_BURN_IN_ROUNDS, if SLOW_MIXTURE is expected at the draws that are kept: their tails were
 # not known yet.
 SLOW_MIXTURE = 6.0
@@ -97,7 +97,7 @@ def sample(
     there. The eigenvectors of the Laplace approximation in these coordinates are the axes. Four steps in five propose
     from a mixture of Student t distributions, independently of the walkers; the others are differential-evolution [2]_
     and stretch moves within each ensemble, for what the mixture misses. The narrow axes of the mixture follow quadratic
-    forms of the wider ones, where ridges are curved. It is fitted to the draws of all ensembles every 50 steps of the
+    forms of the wider ones, where ridges are curved. It is fitted to the draws of all ensembles every 25 steps of the
     burn-in, which is removed; that ends when a tau of at most 3 is expected, or after 1000 steps, and the mixture is
     fixed. Before 1000 steps the burn-in starts again if later draws let a tau above 6 be expected. On the posterior of
     the damper, in six dimensions, tau is 2, with moves within the ensembles alone 23; on that of the landing gear's 15
@@ -400,8 +400,8 @@ class _EnsembleRun:
         rounds, fast = state["steps"] // ROUND, False
         if present and rounds > 1 and new <= FAST_MIXTURE:
             fast = self._expected_time(StudentMixture.from_lists(state["mixture"]), half) <= FAST_MIXTURE
-        state |= {"tries": [0, 0], "next": state["steps"] + ROUND}
         done = fast or rounds >= MOST_BURN_IN_ROUNDS
+        state |= {"tries": [0, 0], "next": state["steps"] + (CHECKED if done else ROUND)}
         state |= {"burnt": state["steps"] if done else 0, "missing": [] if done else [ADAPTED], "tau": [], "passes": 0}
 
     def _outdated(self) -> bool:
@@ -423,7 +423,7 @@ class _EnsembleRun:
         modes = mode_of(self.density, self.fit, kept)
         tau, missing = stop_rule(kept, modes, np.array(state["tau"]), self.density.labels)
         passes = 0 if missing else state["passes"] + 1
-        ahead = max(ROUND, (steps - state["burnt"]) // 4 // ROUND * ROUND)
+        ahead = max(CHECKED, (steps - state["burnt"]) // 4 // CHECKED * CHECKED)
         state |= {"next": steps + ahead, "tau": tau.tolist(), "passes": passes, "missing": missing}
         if passes >= PASSES:
             shape = f"{self.ensembles} × {self.walkers} walkers"

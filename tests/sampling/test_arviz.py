@@ -7,7 +7,7 @@ import emcee
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import signal, stats
 
 import bayesperiodic as bp
 from bayesperiodic.sampling import convergence
@@ -192,6 +192,23 @@ def test_effective_size_and_error_of_autoregressive_walkers_are_those_of_the_clo
     assert convergence.effective_size(chains) == pytest.approx(64_000 / 9, rel=0.1)
     assert convergence.mean_error(chains) / scale == pytest.approx(np.sqrt(9 / 64_000), rel=0.05)
     assert convergence.effective_size(values.reshape(4, -1)) > 5 * 64_000 / 9
+
+
+@pytest.mark.parametrize(("r", "length"), [(0.8, 50), (0.8, 100), (0.2, 100)])
+def test_autocorrelation_time_of_short_chains_is_that_of_the_closed_form(r, length):
+    """Known: tau = (1 + r)/(1 − r), of 4 ensembles of 250 walkers, 50 or 100 tau long, within 5 %.
+
+    emcee's estimate is 8 to 18 % smaller, as it takes the mean of each walker's own values; by chance 5 % are exceeded
+    in less than one of 1000 cases.
+    """
+    tau = (1 + r) / (1 - r)
+    steps, generator = int(length * tau), np.random.default_rng(1)
+    noise = generator.standard_normal((steps, 4, 250))
+    noise[1:] *= np.sqrt(1 - r**2)
+    chains = np.moveaxis(signal.lfilter([1.0], [1.0, -r], noise, axis=0), 0, 1)[..., None]
+    bare = emcee.autocorr.integrated_time(chains[0], tol=0, quiet=True, has_walkers=True)[0]
+    assert convergence.autocorrelation_time(chains)[0] == pytest.approx(tau, rel=0.05)
+    assert bare < 0.95 * tau
 
 
 def test_values_that_do_not_vary_have_no_effective_size():
