@@ -105,7 +105,7 @@ def harmonic_balance_falls(problem, fit, name, steps):
 def test_the_profile_near_a_fold_is_that_of_another_method():
     """Ends of the 90 % interval of the damping from amplitudes alone: the largest density there, by a search of SciPy.
 
-    It has fallen by half of the quantile of χ², 1.353, within 0.05. Laplace's fall is wrong by more than a factor of two.
+    It has fallen by half of the quantile of χ², 1.353, within 0.05. Laplace's is off by more than a factor of two.
     """
     problem = amplitudes_alone(np.linspace(0.1, 0.26, 40), "up", 2)
     with warnings.catch_warnings():
