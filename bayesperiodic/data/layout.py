@@ -125,7 +125,7 @@ def numbers(argument: str, values: Any, *, text: bool = False, time: bool = Fals
             except (TypeError, ValueError):
                 pass
         rows = np.flatnonzero(pd.isna(pd.to_numeric(cells, errors="coerce")) & pd.notna(cells))
-        got = f"{cells[rows[0]]!r} in data row {rows[0] + 1}" if rows.size else "numbers too long to be read"
+        got = f"{cells[rows[0]]!r} in data row {rows[0] + 1}" if rows.size else f"{cells[0]!r}"
         hint = "; dates must be those of ISO 8601, give date_format= for others in a text" if time else ""
         raise ValueError(f"{argument}: must contain numbers, with a decimal point, got {got}{hint}.")
     if array.ndim != 1 or (array.dtype.kind not in ("fiubmM" if time else "fiub") and not text):

@@ -11,7 +11,7 @@ from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.formats.contents import Key
 from bayesperiodic.data.measurements import Amplitude, Measurement, PeakToPeak, Phase, RootMeanSquare
-from bayesperiodic.data.sweep import RESOLUTION, Sweep
+from bayesperiodic.data.sweep import DOWN, RESOLUTION, UP, Sweep
 from bayesperiodic.data.table_columns import TableColumns, check_phases, contents_of
 from bayesperiodic.data.units import Units
 
@@ -107,6 +107,11 @@ def response_table(
         As for `Recording.from_file`, and for negative amplitudes, levels in dB, phases that are missing, beyond 720°
         or folded into ±90°, and frequencies ≤ 0.
 
+    Warns
+    -----
+    UserWarning
+        If phases in degrees are probably radians.
+
     Examples
     --------
     >>> f = np.array([0.10, 0.14, 0.18])
@@ -134,6 +139,11 @@ def response_table(
     _checks.mapping("inputs", inputs, "{'force': 0.5}")
     _checks.one_of("size", size, SIZE_KINDS)
     _checks.one_of("phase_unit", phase_unit, PHASE_UNITS)
+    if sweep not in (None, UP, DOWN):
+        raise ValueError(
+            f"sweep: must be 'up', 'down' or None, got {sweep!r}; make a table of each sweep, or give None: each row "
+            "is then on the stable branch that fits it best."
+        )
     if per is not None:
         _checks.one_of("per", per, inputs)
     for key in units or {}:
@@ -281,7 +291,8 @@ class _Reader:
         if phase is None:
             return None
         angles = self.source.sized(f"phases[{name!r}]", self.source.angles(phase, self.radian), values.size)
-        check_phases(f"phases[{name!r}]", self.source.label, angles[np.argsort(self.frequency, kind="stable")])
+        order = np.argsort(self.frequency, kind="stable")
+        check_phases(f"phases[{name!r}]", self.source.label, angles[order], values[order])
         return sign * angles
 
     def _check_phases(self, name: str, columns: dict[int, Key], phases: dict[int, Key], angles: dict[int, Any]) -> None:

@@ -1,6 +1,7 @@
 """Columns of a table of measured responses, in SI."""
 
 import re
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from bayesperiodic.data.units import Units, from_file, kind_of
 LARGEST_PHASE = 720.0
 # Phases of an arc tangent of a quotient, in degrees, and what they then jump by.
 FOLDED_PHASE, FOLDED_JUMP = 90.5, 120.0
+# Degrees within which phases may be radians, least range of these, and how much higher a peak is than both ends.
+IN_RADIANS, LEAST_TURN, PEAK_HEIGHT = 3.15, 1.0, 3.0
 # Names and units of levels.
 LEVEL = re.compile(r"(?<![A-Za-z])dB(?![A-Za-z])")
 
@@ -172,9 +175,20 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float | np.number) and not isinstance(value, bool)
 
 
-def check_phases(argument: str, label: str, angles: np.ndarray) -> None:
-    """Raise a ValueError for phases, in the order of frequencies, that are the arc tangent of a quotient."""
+def check_phases(argument: str, label: str, angles: np.ndarray, sizes: np.ndarray) -> None:
+    """Raise a ValueError for phases, in the order of frequencies, that are the arc tangent of a quotient.
+
+    Warn of phases in degrees that are radians: of those through a resonance, a peak of the amplitudes `sizes`.
+    """
     degrees = np.degrees(angles)
+    within, peak = np.abs(degrees).max(initial=0.0) <= IN_RADIANS, sizes.max() > PEAK_HEIGHT * max(sizes[0], sizes[-1])
+    if within and peak and np.ptp(degrees) > LEAST_TURN:
+        warnings.warn(
+            f"{argument}: turns by {np.ptp(degrees):.2g} degrees only at a resonance in {label}; if these are radians, "
+            "give phase_unit='rad'.",
+            UserWarning,
+            stacklevel=2,
+        )
     jumps = np.abs(np.diff(degrees))
     if np.abs(degrees).max() <= FOLDED_PHASE and jumps.max(initial=0.0) > FOLDED_JUMP:
         raise ValueError(

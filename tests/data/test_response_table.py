@@ -1,5 +1,7 @@
 """Tables of responses, against the closed form of a linear oscillator."""
 
+import warnings
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -88,6 +90,8 @@ def test_an_estimate_from_a_table_has_the_truth_in_its_interval():
         (TABLE, {"inputs": {"force": -1.0}}, r"inputs\['force'\]: must be > 0"),
         (TABLE, {"inputs": {"force": "G"}}, "column of the table: must be one of 'f', 'A', 'phi', 'F', 'H', got 'G'"),
         (TABLE, {"units": {"y": 1.0}}, "units: must be one of"),
+        (TABLE, {"sweep": "both"}, "sweep: must be 'up', 'down' or None, got 'both'; make a table of each sweep"),
+        (TABLE | {"A": TABLE["A"].astype(str)}, {}, "column 'A' of the table: must contain numbers, .* got '0.*'"),
         (
             TABLE | {"A": np.where(F > 0.2, np.nan, TABLE["A"])},
             {},
@@ -98,6 +102,20 @@ def test_an_estimate_from_a_table_has_the_truth_in_its_interval():
 def test_tables_that_cannot_be_what_they_say_are_refused(table, arguments, message):
     with pytest.raises(ValueError, match=message):
         bp.response_table(table, **(COLUMNS | arguments))
+
+
+def test_phases_in_radians_without_their_unit_are_warned_of():
+    """Through a resonance phases turn by more than degrees; a table below it may have small ones."""
+    table = TABLE | {"phi": np.radians(TABLE["phi"])}
+    with pytest.warns(
+        UserWarning, match=r"phases\['x'\]: turns by 2.* degrees only at a resonance .* phase_unit='rad'"
+    ):
+        bp.response_table(table, **COLUMNS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        bp.response_table(table, **COLUMNS, phase_unit="rad")
+        below = slice(np.argmax(TABLE["A"]))
+        bp.response_table({name: values[below] for name, values in table.items()}, **COLUMNS)
 
 
 @pytest.mark.parametrize(
