@@ -8,6 +8,7 @@ import emcee
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 from scipy.stats import t as student
 
@@ -87,6 +88,21 @@ def test_student_population_is_the_integral_over_the_unit():
     expected = [value(mean, np.exp(log)) for mean, log in points]
     here = density.evaluate(points).log_prob
     np.testing.assert_allclose(here - here[0], np.array(expected) - expected[0], atol=0.15)
+
+
+@pytest.mark.parametrize("draws", [2000, 333])
+def test_compiled_means_over_the_draws_are_those_of_numpy(draws):
+    """Also 3000 standard deviations from the population, where the exponentials of all terms are zero."""
+    estimates = np.append(ESTIMATES, [[300.0]], axis=0)
+    units = [*gaussian_units(estimates, np.append(SDS, [[0.1]], axis=0), 1, draws=draws).values()]
+    density = PopulationDensity(one_name().structure, units, np.zeros((len(units), 0)))
+    points = np.array([[0.9, np.log(0.2)], [1.2, np.log(1e-3)], [1.0, np.log(30.0)]])
+    (group,), parameters = density.groups, density.structure.parameters(points)
+    terms, constant = density.log_terms(group, parameters, slice(None))
+    expected = logsumexp(terms, axis=1) - np.log(draws) + constant
+    here = density.evaluate(points).log_prob - density.structure.log_prior(points)
+    assert np.exp(terms[-1, :, 0] + constant[-1, 0]).max() == 0.0
+    np.testing.assert_allclose(here, expected.sum(axis=0), rtol=1e-13)
 
 
 @cache
