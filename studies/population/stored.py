@@ -80,8 +80,8 @@ def stored(most: int, seed: int) -> dict[str, Any]:
             total = time.process_time() - start
         rows[str(count)] = _seconds(profile) | {
             "total": total, "calls": found.calls, "memory": _memory() - before, "converged": found.converged,
-            "summary": found.summary().to_dict("index"), "log_bayes_factor": float(found.evidence["log_bayes_factor"]["c"]),
-            "largest_pareto_k": float(found.units["pareto_k"].max()), "outside": len(found.outside),
+            "summary": found.summary().to_dict("index"), "largest_pareto_k": float(found.units["pareto_k"].max()),
+            "log_bayes_factor": float(found.evidence["log_bayes_factor"]["c"]), "outside": len(found.outside),
         }  # fmt: skip
         count *= 10
     with tempfile.TemporaryDirectory() as folder:
