@@ -349,17 +349,17 @@ def test_equals_the_joint_posterior_of_five_gears():
 
 
 @pytest.mark.slow
-def test_stored_draws_and_problems_with_draws_give_the_same_population(tmp_path):
+def test_stored_draws_read_here_or_by_workers_and_problems_with_draws_give_the_same_population(tmp_path):
     pairs = gear_posteriors()
     paths = {}
     for name, (_, posterior) in pairs.items():
         paths[name] = tmp_path / f"{name}.h5"
         posterior.save(paths[name])
-    first, second = (
-        bp.population(units, ["k"], spread={"k": bp.HalfNormal(0.2)}, seed=1, progress=False)
-        for units in (pairs, paths)
+    first, second, third = (
+        bp.population(units, ["k"], spread={"k": bp.HalfNormal(0.2)}, seed=1, executor=executor, progress=False)
+        for units, executor in ((pairs, None), (paths, None), (paths, 2))
     )
-    assert repr(first) == repr(second)
+    assert repr(first) == repr(second) == repr(third)
     assert first.unit_calls == sum(posterior.log_posterior_calls for _, posterior in pairs.values())
 
 
