@@ -332,7 +332,8 @@ if __name__ == "__main__":
         there = bp.sample(problem, fit, executor=pool, **settings)
         profile = bp.profile(problem, fit, executor=pool)
         units = dict.fromkeys(["1", "2", "3"], problem)
-        groups = [bp.population(units, ["k"], spread={"k": 0.1}, seed=1, executor=e, progress=False) for e in (pool, None)]
+        kind = {"names": ["k"], "spread": {"k": 0.1}, "seed": 1, "progress": False}
+        groups = [bp.population(units, executor=executor, **kind) for executor in (pool, None)]
     here = bp.sample(problem, fit, **settings)
     same = all(np.array_equal(here.draws(name), there.draws(name)) for name in here.names)
     same = same and np.array_equal(*(group.draws("mean[k]") for group in groups))
