@@ -216,7 +216,8 @@ def cost_of_stored_units():
     stages, last = ("reading", "chains", "shrinkage", "evidence"), list(d["units"].values())[-1]
     assert list(d["units"]) == ["10", "100", "1000"] and all(one["converged"] for one in d["units"].values())
     for count, one in d["units"].items():
-        yield f"| {count} | {' | '.join(f'{one[stage]:.0f}' if one[stage] > 9.5 else f'{one[stage]:.2g}' for stage in stages)} |"
+        cells = [f"{one[stage]:.0f}" if one[stage] > 9.5 else f"{one[stage]:.2g}" for stage in stages]
+        yield f"| {count} | {' | '.join(cells)} |"
         shares = [one[stage] / int(count) / (last[stage] / 1000) for stage in stages]
         assert count != "100" or max(abs(np.log(shares))) < np.log(2.0), "stages are not proportional to the units"
     yield f"{unit:.1f} s each for springs with three parameters, {unit * 1e4 / 3600:.0f} hours on 100 cores"

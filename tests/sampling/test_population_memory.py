@@ -95,7 +95,10 @@ def test_stored_units_take_the_memory_of_one_and_2000_draws_of_each(stored, coun
     "count", [pytest.param(100, marks=pytest.mark.slow), pytest.param(1000, marks=pytest.mark.campaign)]
 )
 def test_stored_units_have_the_mean_slope_and_spread_of_the_linear_model(count, tmp_path):
-    """Their memory is that of 2000 draws of each. And the truth is within 3.5 standard deviations, which fails once in 700 by chance; files are removed."""
+    """Their memory is that of 2000 draws of each. Files are removed.
+
+    The truth is within 3.5 standard deviations, which fails once in 700 by chance.
+    """
     units = stored_units(tmp_path, count, 2)
     few = traced(lambda: stored_population(StoredUnits(*(first_of(part, 10) for part in units)), 1))[1]
     result, peak = traced(lambda: stored_population(units, 1))
