@@ -5,7 +5,12 @@ from numba import njit
 
 # ln 2 in two parts, the first of few digits; a number whose last bit is that of one; the lowest logarithm.
 LOG2_E = 1.4426950408889634
-LOG_TWO, REST_OF_LOG_TWO, ROUNDING, LOWEST = 0.6931471803691238, 1.9082149292705877e-10, 6755399441055744.0, -700.0
+LOG_TWO, REST_OF_LOG_TWO, ROUNDING_SHIFT, LOWEST = (
+    0.6931471803691238,
+    1.9082149292705877e-10,
+    6755399441055744.0,
+    -700.0,
+)
 LANES = 8
 MIXTURE_OPTIONS = {
     "cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy", "fastmath": {"contract"},
@@ -38,8 +43,8 @@ def log_means(features, coefficients, result):
             for n in range(draws):
                 y = x[n] - top
                 y = y if y > LOWEST else LOWEST
-                power[n] = y * LOG2_E + ROUNDING
-                turns = power[n] - ROUNDING
+                power[n] = y * LOG2_E + ROUNDING_SHIFT
+                turns = power[n] - ROUNDING_SHIFT
                 x[n] = (y - turns * LOG_TWO) - turns * REST_OF_LOG_TWO
             for n in range(draws):
                 r = x[n]
