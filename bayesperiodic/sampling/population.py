@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from bayesperiodic.sampling.population_chains import Chains, sample_chains
 from bayesperiodic.sampling.population_density import Hierarchy, PopulationDensity
 from bayesperiodic.sampling.population_evidence import evidence_for_spread
 from bayesperiodic.sampling.population_result import Population, coordinate_prior, gather_population
-from bayesperiodic.sampling.population_units import UnitDraws, checked_names, sampled, task_of, unit_draws
+from bayesperiodic.sampling.population_units import UnitDraws, carried_out, checked_names, task_of, unit_draws
 from bayesperiodic.sampling.shrinkage import Shrunken, outside, shrink
 
 # Prior scale of the spread of a parameter that is sampled in its logarithm.
@@ -83,7 +84,7 @@ def population(
         for a normal one.
     seed : int
     executor : None, int, Dask Client, or executor with the interface of concurrent.futures
-        Workers that sample the units given as problems, one task a unit, see `sample`.
+        Workers that sample the units given as problems and read those given as paths, one task a unit, see `sample`.
     progress : bool
 
     Returns
@@ -194,8 +195,8 @@ def _draw(
     given: Mapping[str, Any], names: tuple[str, ...], single: bool, seed: int, executor: Any
 ) -> tuple[dict[str, UnitDraws], dict[str, str]]:
     """Return the draws of all units, one of them in memory at a time, and why some have none."""
-    problems = {name: unit for name, unit in given.items() if isinstance(unit, Problem)}
-    result = _sampled(problems, names, single, seed, executor)
+    tasks = {name: unit for name, unit in given.items() if isinstance(unit, Problem | str | Path)}
+    result = _carried_out(tasks, names, single, seed, executor)
     for name, unit in given.items():
         if name not in result:
             result[name] = unit_draws(name, unit, names, single)
@@ -205,17 +206,17 @@ def _draw(
     return {name: result[name] for name in given if name not in left_out}, left_out
 
 
-def _sampled(
-    problems: Mapping[str, Problem], names: tuple[str, ...], single: bool, seed: int, executor: Any
+def _carried_out(
+    units: Mapping[str, Any], names: tuple[str, ...], single: bool, seed: int, executor: Any
 ) -> dict[str, Any]:
-    """Return the draws of problems, or why there are none, by name; each has a seed of its own."""
-    if not problems:
+    """Return the draws of problems and of files, or why there are none, by name; each has a seed of its own."""
+    if not units:
         return {}
-    labels = list(problems)
-    tasks = (task_of(name, problem, single, seed + 1 + k) for k, (name, problem) in enumerate(problems.items()))
+    labels = list(units)
+    tasks = (task_of(name, unit, single, seed + 1 + k) for k, (name, unit) in enumerate(units.items()))
     workers = ThreadPoolExecutor(1) if executor is None else nullcontext(executor)
     with workers as executor, TaskPool(executor, names) as pool:
-        return {labels[number]: draws for number, draws in pool.run(sampled, tasks)}
+        return {labels[number]: draws for number, draws in pool.run(carried_out, tasks)}
 
 
 class Redraws:
@@ -235,7 +236,7 @@ class Redraws:
             if problem is not None and not any(self._parameters(unit) & {*key} for key in joint):
                 changed[name] = problem.replace(priors=dict(problem.priors) | self._priors(unit, expected))
         seed = self._seed + 1_000_000 * turn
-        drawn = _sampled(changed, self._names, self._single, seed, self._executor)
+        drawn = _carried_out(changed, self._names, self._single, seed, self._executor)
         return {name: draws for name, draws in drawn.items() if isinstance(draws, UnitDraws)}
 
     def _full(self, unit: UnitDraws, member: str, name: str) -> str:

@@ -2,13 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import combinations
+from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import betaln, gammaln
+from scipy.special import betaln, gammaln, logsumexp
 
+from bayesperiodic._compile.cache import load
 from bayesperiodic.density.log_posterior import Evaluation
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.priors.single import LOG_ROOT_TWO_PI
@@ -16,6 +19,11 @@ from bayesperiodic.sampling.population_units import UnitDraws
 
 # Values of a block of units and points that are in memory at once.
 BLOCK_VALUES = 300_000
+
+
+@cache
+def _kernels() -> ModuleType:
+    return load(Path(__file__).with_name("_kernels").joinpath("mixture.py").read_text(encoding="utf-8"))
 
 
 class Parameters(NamedTuple):
@@ -116,7 +124,7 @@ class Members(NamedTuple):
     """Units with the same number of members, and their places among all units."""
 
     places: list[int]
-    features: np.ndarray  # (units, draws, features): log-weight, coordinates and their products, standardised
+    features: np.ndarray  # (units, features, draws): log-weight, coordinates and their products, standardised
     kernels: np.ndarray  # (units, d, d), standardised
     centre: np.ndarray  # (units, d)
     scale: np.ndarray  # (units, d)
@@ -156,7 +164,7 @@ class PopulationDensity:
         z = (np.stack([unit.centres for unit in chosen]) - centre[:, None]) / scale[:, None]
         first, second = self._products(z.shape[-1])
         weights = np.stack([unit.log_weights for unit in chosen])[..., None]
-        features = np.concatenate([weights, z, z[..., first] * z[..., second]], axis=-1)
+        features = np.concatenate([weights, z, z[..., first] * z[..., second]], axis=-1).swapaxes(1, 2).copy()
         kernels = np.stack([unit.kernel for unit in chosen]) / (scale[:, :, None] * scale[:, None])
         covariates = np.stack([self.covariates[starts[k] : starts[k] + count] for k in places])
         return Members(places, features, kernels, centre, scale, covariates)
@@ -194,38 +202,54 @@ class PopulationDensity:
 
     def _log_likelihood(self, group: Members, parameters: Parameters) -> np.ndarray:
         """Return the sum of the log-likelihoods of some units (points,), in blocks of points and units."""
-        units, draws = group.features.shape[:2]
+        units, _, draws = group.features.shape
+        # The terms of all draws are in memory for Student's distribution only.
+        values = draws if np.isfinite(self.structure.degrees) else 1
         total, most = np.zeros(len(parameters.means)), max(1, BLOCK_VALUES // draws)
         for first in range(0, len(total), most):
             block = slice(first, first + most)
-            chosen = Parameters(*(values[block] for values in parameters))
-            step = max(1, BLOCK_VALUES // (draws * len(chosen.means)))
+            chosen = Parameters(*(array[block] for array in parameters))
+            step = max(1, BLOCK_VALUES // (values * len(chosen.means)))
             for start in range(0, units, step):
-                terms, constant = self.log_terms(group, chosen, slice(start, start + step))
-                top = terms.max(axis=1)
-                np.exp(np.subtract(terms, top[:, None], out=terms), out=terms)
-                total[block] += np.sum(np.log(terms.mean(axis=1)) + top + constant, axis=0)
+                total[block] += self._log_means(group, chosen, slice(start, start + step)).sum(axis=0)
         return total
+
+    def _log_means(self, group: Members, parameters: Parameters, part: slice) -> np.ndarray:
+        """Return the log-likelihoods of some units (units, points), their draws integrated out."""
+        if np.isfinite(self.structure.degrees):
+            terms, constant = self.log_terms(group, parameters, part)
+            return logsumexp(terms, axis=1) - np.log(terms.shape[1]) + constant
+        coefficients, constant = self._coefficients(group, parameters, part)
+        result = np.empty(constant.shape)
+        _kernels().log_means(group.features[part], coefficients, result)
+        return result + constant
+
+    def _coefficients(self, group: Members, parameters: Parameters, part: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Return what log-weight, coordinates and products are multiplied by in the log-density of a normal population.
+
+        Coefficients (units, points, features), and its constant (units, points).
+        """
+        mean, covariance = self.moments(group, parameters, part)
+        precision, (_, log_det) = np.linalg.inv(covariance), np.linalg.slogdet(covariance)
+        linear, dimension = np.einsum("iwab,iwb->iwa", precision, mean), mean.shape[-1]
+        first, second = self._products(dimension)
+        products = precision[..., first, second] * np.where(first == second, -0.5, -1.0)
+        constant = -0.5 * log_det - np.log(group.scale[part]).sum(axis=-1)[:, None] - dimension * LOG_ROOT_TWO_PI
+        constant -= 0.5 * np.einsum("iwa,iwa->iw", mean, linear)
+        return np.concatenate([np.ones((*linear.shape[:2], 1)), linear, products], axis=-1), constant
 
     def log_terms(self, group: Members, parameters: Parameters, part: slice) -> tuple[np.ndarray, np.ndarray]:
         """Return log-likelihoods at all draws (units, draws, points) of some units, up to constants (units, points)."""
-        mean, covariance = self.moments(group, parameters, part)
-        precision, (_, log_det) = np.linalg.inv(covariance), np.linalg.slogdet(covariance)
-        linear = np.einsum("iwab,iwb->iwa", precision, mean)
-        square, dimension = np.einsum("iwa,iwa->iw", mean, linear), mean.shape[-1]
-        first, second = self._products(dimension)
-        products = precision[..., first, second] * np.where(first == second, -0.5, -1.0)
-        features = group.features[part]
-        constant = -0.5 * log_det - np.log(group.scale[part]).sum(axis=-1)[:, None]
-        degrees = self.structure.degrees
+        coefficients, constant = self._coefficients(group, parameters, part)
+        features, degrees = group.features[part].swapaxes(1, 2), self.structure.degrees
         if np.isinf(degrees):
-            coefficients = np.concatenate([np.ones((*linear.shape[:2], 1)), linear, products], axis=-1)
-            return features @ np.ascontiguousarray(
-                coefficients.swapaxes(1, 2)
-            ), constant - 0.5 * square - dimension * LOG_ROOT_TWO_PI
-        coefficients = np.concatenate([linear, products], axis=-1)
-        distance = square[:, None] - 2.0 * (features[..., 1:] @ coefficients.swapaxes(1, 2))
+            return features @ coefficients.swapaxes(1, 2), constant
+        mean, _ = self.moments(group, parameters, part)
+        square = np.einsum("iwa,iwa->iw", mean, coefficients[..., 1 : 1 + mean.shape[-1]])
+        distance = square[:, None] - 2.0 * (features[..., 1:] @ coefficients[..., 1:].swapaxes(1, 2))
+        dimension = mean.shape[-1]
         half = 0.5 * (degrees + dimension)
+        constant = constant + 0.5 * square + dimension * LOG_ROOT_TWO_PI
         total = gammaln(half) - gammaln(0.5 * degrees) - 0.5 * dimension * np.log(degrees * np.pi)
         return features[..., :1] - half * np.log1p(np.maximum(distance, 0.0) / degrees), constant + total
 

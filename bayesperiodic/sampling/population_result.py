@@ -18,7 +18,7 @@ from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.convergence import QUANTILE_LEVELS
 from bayesperiodic.sampling.membership import FEWEST_EFFECTIVE, USABLE_WEIGHTS, Expected, MembershipTest, membership
 from bayesperiodic.sampling.population_density import Parameters
-from bayesperiodic.sampling.population_units import Coordinate, sampled, task_of, unit_draws
+from bayesperiodic.sampling.population_units import Coordinate, carried_out, task_of, unit_draws
 
 POPULATION_UNIT, PARAMETER, UNIT_GROUP = "unit", "parameter", "units"
 # Draws of the population in results.
@@ -267,7 +267,7 @@ class Population(Result):
                 stacklevel=2,
             )
         if isinstance(new, Problem):
-            unit = sampled(self.names, task_of("new", new, False, self.seed))
+            unit = carried_out(self.names, task_of("new", new, False, self.seed))
             if isinstance(unit, str):
                 raise RuntimeError(f"new: cannot be sampled, {unit}.")
         else:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesperiodic import _checks
-from bayesperiodic._io import load
+from bayesperiodic._io import load_groups
 from bayesperiodic._linalg import covariance_cholesky
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.map_estimate import map_estimate
@@ -19,12 +19,15 @@ from bayesperiodic.problem.fingerprint import check_fingerprint, fingerprint
 from bayesperiodic.problem.parameters import column, support, unit
 from bayesperiodic.sampling.convergence import QUANTILE_LEVELS
 from bayesperiodic.sampling.draws import Posterior
+from bayesperiodic.sampling.robust import ROBUST
 from bayesperiodic.sampling.sample import sample
 
 # Draws of each unit that are kept.
 KEPT_DRAWS = 2000
 # Curvature of a prior, relative to that of the kernel, up to which it is taken into account.
 MOST_CURVATURE = 0.5
+# Of a saved posterior.
+READ_GROUPS = "posterior", ROBUST
 UNIT = "a Problem, a Posterior, (problem, posterior), or the path of a saved Posterior"
 
 
@@ -101,7 +104,7 @@ def unit_draws(name: str, given: Any, names: Sequence[str], alone: bool = False)
     """Return the draws of a unit that was sampled; `alone`, its runs are the members under their own names."""
     problem, posterior = given if isinstance(given, tuple) and len(given) == 2 else (None, given)
     if isinstance(posterior, str | Path):
-        posterior = load(posterior)
+        posterior = load_groups(posterior, READ_GROUPS)
     if not isinstance(posterior, Posterior) or not (problem is None or isinstance(problem, Problem)):
         raise ValueError(f"units[{name!r}]: must be {UNIT}, got {type(given).__name__}.")
     if not posterior.converged:
@@ -173,33 +176,36 @@ class _LogPrior:
         return total + np.sum([prior.log_prob(values[:, at]) for prior, at in self._terms], axis=0)
 
 
-class SampleTask(NamedTuple):
-    """A unit to sample, for a worker."""
+class UnitTask(NamedTuple):
+    """A unit to sample, or to read from its file, for a worker."""
 
     name: str
-    pickled: bytes  # the problem, by cloudpickle
+    pickled: bytes  # the problem or the path, by cloudpickle
     alone: bool
     seed: int
 
 
-def sampled(names: Sequence[str], task: SampleTask) -> UnitDraws | str:
-    """Return the draws of a unit's problem, or why there are none."""
-    problem = pickle.loads(task.pickled)
-    try:
-        fit = map_estimate(problem, progress=False)
-        posterior = sample(problem, fit, seed=task.seed, progress=False)
-    except RuntimeError as error:
-        return str(error)
-    if not posterior.converged:
-        return f"the draws have not converged ({posterior.reason})"
-    return unit_draws(task.name, (problem, posterior), names, task.alone)
+def carried_out(names: Sequence[str], task: UnitTask) -> UnitDraws | str:
+    """Return the draws of a unit's problem, or why there are none, or those in its file."""
+    given = pickle.loads(task.pickled)
+    if isinstance(given, Problem):
+        try:
+            fit = map_estimate(given, progress=False)
+            posterior = sample(given, fit, seed=task.seed, progress=False)
+        except RuntimeError as error:
+            return str(error)
+        if not posterior.converged:
+            return f"the draws have not converged ({posterior.reason})"
+        given = given, posterior
+    return unit_draws(task.name, given, names, task.alone)
 
 
-def task_of(name: str, problem: Problem, alone: bool, seed: int) -> SampleTask:
-    """Return the task of sampling a unit."""
+def task_of(name: str, given: Problem | str | Path, alone: bool, seed: int) -> UnitTask:
+    """Return the task of sampling or reading a unit."""
     import cloudpickle
 
-    return SampleTask(name, cloudpickle.dumps(problem), alone, seed)
+    given = given if isinstance(given, Problem) else Path(given).absolute()
+    return UnitTask(name, cloudpickle.dumps(given), alone, seed)
 
 
 def checked_names(names: Any) -> tuple[str, ...]:

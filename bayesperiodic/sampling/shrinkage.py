@@ -47,14 +47,14 @@ def _one(
     """Return draws (draws, d), k̂, effective size and log-likelihoods (draws,) of one unit."""
     part = slice(row, row + 1)
     terms, constant = density.log_terms(group, parameters, part)
-    log, count = terms[0], group.features.shape[1]
+    log, count = terms[0], group.features.shape[2]
     total = logsumexp(log, axis=0)
     log_weights = logsumexp(log - total, axis=1)
     weights = np.exp(log_weights - logsumexp(log_weights))
     chosen = np.argmax(log + generator.gumbel(size=log.shape), axis=0)
     mean, covariance = (values[0] for values in density.moments(group, parameters, part))
     dimension, kernel = mean.shape[-1], group.kernels[row]
-    centres = group.features[row, chosen, 1 : 1 + dimension]
+    centres = group.features[row, 1 : 1 + dimension, chosen]
     spread, degrees = covariance - kernel, density.structure.degrees
     if np.isfinite(degrees):
         offset = centres - mean

@@ -4,7 +4,8 @@ Simulated springs with a known spread of the damping and none of the stiffness, 
 Measured: twelve steady-sine tests of a banded rotary friction damper with backlash (github.com/ARTS-Laboratory/
 Dataset-Friction-Damper-with-Backlash, commit 0e09aa9d), friction force Kw and sharpness rho of Dahl's model by
 amplitude, frequency and band tension; with ``--replicates N`` the first N tests are predicted from all others. Without
-the files only the springs. ``--scaling`` only counts the evaluations that springs one by one take, and in one problem.
+the files only the springs. ``--scaling`` only counts the evaluations that springs one by one take, and in one problem;
+with ``--replicates N`` it measures each stage of populations of 10, 100, …, N stored units instead.
 """
 
 import argparse
@@ -17,11 +18,18 @@ from studies import common
 from studies.population.damper import ADDRESS, damper_population, find_tests, sampled_test
 from studies.population.scaling import scaling, table
 from studies.population.springs import QUICK_SPRINGS, SPRINGS, spring_population
+from studies.population.stored import stored, stored_table
 
 
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
     watch = common.Stopwatch()
+    if options.scaling and options.replicates:
+        with watch.part("stored", f"populations of up to {options.replicates} stored units"):
+            costs = stored(options.replicates, options.seed)
+        print(stored_table(costs))
+        common.finish(options.out / "stored", costs, watch, synthetic=True)
+        return
     if options.scaling:
         with watch.part("scaling", "simulated springs one by one, and in one joint problem"):
             found = scaling(options.seed, quick=options.quick)

@@ -331,8 +331,12 @@ if __name__ == "__main__":
     with MPIPoolExecutor() as pool:
         there = bp.sample(problem, fit, executor=pool, **settings)
         profile = bp.profile(problem, fit, executor=pool)
+        units = dict.fromkeys(["1", "2", "3"], problem)
+        kind = {"names": ["k"], "spread": {"k": 0.1}, "seed": 1, "progress": False}
+        groups = [bp.population(units, executor=executor, **kind) for executor in (pool, None)]
     here = bp.sample(problem, fit, **settings)
     same = all(np.array_equal(here.draws(name), there.draws(name)) for name in here.names)
+    same = same and np.array_equal(*(group.draws("mean[k]") for group in groups))
     print("workers", pool.num_workers, "same", same, profile.shape)
 """
 
@@ -346,7 +350,7 @@ needs_mpi = pytest.mark.skipif(
 
 
 @needs_mpi
-def test_chains_are_identical_with_mpi(tmp_path):
+def test_chains_and_populations_are_identical_with_mpi(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or str(Path.cwd()) for path in sys.path)}

@@ -8,6 +8,7 @@ import emcee
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 from scipy.stats import t as student
 
@@ -87,6 +88,21 @@ def test_student_population_is_the_integral_over_the_unit():
     expected = [value(mean, np.exp(log)) for mean, log in points]
     here = density.evaluate(points).log_prob
     np.testing.assert_allclose(here - here[0], np.array(expected) - expected[0], atol=0.15)
+
+
+@pytest.mark.parametrize("draws", [2000, 333])
+def test_compiled_means_over_the_draws_are_those_of_numpy(draws):
+    """Also 3000 standard deviations from the population, where the exponentials of all terms are zero."""
+    estimates = np.append(ESTIMATES, [[300.0]], axis=0)
+    units = [*gaussian_units(estimates, np.append(SDS, [[0.1]], axis=0), 1, draws=draws).values()]
+    density = PopulationDensity(one_name().structure, units, np.zeros((len(units), 0)))
+    points = np.array([[0.9, np.log(0.2)], [1.2, np.log(1e-3)], [1.0, np.log(30.0)]])
+    (group,), parameters = density.groups, density.structure.parameters(points)
+    terms, constant = density.log_terms(group, parameters, slice(None))
+    expected = logsumexp(terms, axis=1) - np.log(draws) + constant
+    here = density.evaluate(points).log_prob - density.structure.log_prior(points)
+    assert np.exp(terms[-1, :, 0] + constant[-1, 0]).max() == 0.0
+    np.testing.assert_allclose(here, expected.sum(axis=0), rtol=1e-13)
 
 
 @cache
@@ -333,17 +349,17 @@ def test_equals_the_joint_posterior_of_five_gears():
 
 
 @pytest.mark.slow
-def test_stored_draws_and_problems_with_draws_give_the_same_population(tmp_path):
+def test_stored_draws_read_here_or_by_workers_and_problems_with_draws_give_the_same_population(tmp_path):
     pairs = gear_posteriors()
     paths = {}
     for name, (_, posterior) in pairs.items():
         paths[name] = tmp_path / f"{name}.h5"
         posterior.save(paths[name])
-    first, second = (
-        bp.population(units, ["k"], spread={"k": bp.HalfNormal(0.2)}, seed=1, progress=False)
-        for units in (pairs, paths)
+    first, second, third = (
+        bp.population(units, ["k"], spread={"k": bp.HalfNormal(0.2)}, seed=1, executor=executor, progress=False)
+        for units, executor in ((pairs, None), (paths, None), (paths, 2))
     )
-    assert repr(first) == repr(second)
+    assert repr(first) == repr(second) == repr(third)
     assert first.unit_calls == sum(posterior.log_posterior_calls for _, posterior in pairs.values())
 
 

@@ -1,0 +1,1 @@
+"""Sources of the compiled functions of the samplers."""
