@@ -29,8 +29,13 @@ from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
 # Points of the grid of the elements, and relative change of the outputs below which they are not doubled.
 FEWEST_ELEMENT_POINTS, MOST_ELEMENT_POINTS, RESOLVED_CHANGE = 32, 4096, 1e-6
-# The largest change of outputs that count as resolved by the most points; the smallest relative harmonic of an input.
+# Bound of the error of the outputs, see `unresolved`, above which points are doubled too.
+RESOLVED_SHARE = 1e-4
+# The largest change or bound of outputs that count as resolved by the most points; the smallest relative harmonic of an
+# input.
 LARGEST_OUTPUT_CHANGE, LEAST_HARMONIC = 1e-2, 1e-12
+# Points up to which a solve that fails is repeated, and their ratio.
+MOST_STARTING_POINTS, STARTING_RATIO = 512, 4
 # Share of a step that is left by harmonics whose coupling by the elements is neglected in Newton's matrix.
 WEAK_COUPLING = 0.05
 MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40, 10, 1e-10, 1e-13
@@ -56,6 +61,11 @@ class ResponseMatrices(NamedTuple):
     d_u: np.ndarray
     y_f: np.ndarray
     y_u: np.ndarray
+
+    @property
+    def largest(self) -> np.ndarray:
+        """Largest modulus of y_f over the harmonics, (…, rows, columns)."""
+        return np.asarray(np.abs(self.y_f).max(axis=-3))
 
 
 class Preconditioner:
@@ -291,32 +301,42 @@ class CondensedEquations(PeriodicEquations):
         points = self._fewest()
         if guess is not None:  # of which the last doubling is repeated
             points = max(points, 1 << (len(guess) // 2 - 1).bit_length())
-        start = (
-            np.zeros((points // 2, self.count), dtype=complex) if guess is None else resized(harmonics(guess), points)
-        )
+        given = None if guess is None else harmonics(guess)
+        d, code, history, found_by = self._from(parameters, given, points)
+        while code != CONVERGED and points < MOST_STARTING_POINTS:  # few points may not resolve a contact
+            points = min(STARTING_RATIO * points, MOST_STARTING_POINTS)
+            d, code, history, found_by = self._from(parameters, given, points)
+        if code == CONVERGED:
+            d, code, history = self.doubled(parameters, d)
+        return Solved(on_grid(d, 2 * len(d)), code, history), found_by
+
+    def _from(
+        self, parameters: np.ndarray, guess: np.ndarray | None, points: int
+    ) -> tuple[np.ndarray, int, np.ndarray, str]:
+        """Return a solution on a number of points from a guess (harmonics, elements) or from rest; code, history, how."""
+        start = np.zeros((points // 2, self.count), dtype=complex) if guess is None else resized(guess, points)
         d, code, history = self._newton(parameters, start, 1.0, None)
-        found_by = "newton"
         if code != CONVERGED and guess is None:
             raised = self._raise_load(parameters, start)
             if raised is not None:
-                d, code, history = self._newton(parameters, raised, 1.0, None)
-                found_by = "input amplitude"
-        before = self._outputs(d, parameters)
-        while code == CONVERGED:
+                return *self._newton(parameters, raised, 1.0, None), "input amplitude"
+        return d, code, history, "newton"
+
+    def doubled(self, parameters: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
+        """Double the points of a solution until its outputs are resolved; return it, the code and Newton's history."""
+        history, change = np.empty((0, 3)), np.nan
+        before, share = self._outputs(d, parameters)
+        while not (change <= RESOLVED_CHANGE and share <= RESOLVED_SHARE):
+            if 2 * len(d) >= MOST_ELEMENT_POINTS:
+                worst = np.fmax(change, share)
+                return d, CONVERGED if worst <= LARGEST_OUTPUT_CHANGE else NOT_RESOLVED, history
             finer, code, history = self._newton(parameters, resized(d, 4 * len(d)), 1.0, None)
             if code != CONVERGED:
-                break
-            d, after = finer, self._outputs(finer, parameters)
-            change = np.max(
-                np.abs(after - before) / np.maximum(np.abs(after).max(axis=0), np.finfo(float).tiny), initial=0.0
-            )
-            before = after
-            if change <= RESOLVED_CHANGE:
-                break
-            if 2 * len(d) >= MOST_ELEMENT_POINTS:
-                code = CONVERGED if change <= LARGEST_OUTPUT_CHANGE else NOT_RESOLVED
-                break
-        return Solved(on_grid(d, 2 * len(d)), code, history), found_by
+                return d, code, history
+            d, (after, share) = finer, self._outputs(finer, parameters)
+            sizes = np.maximum(np.abs(after).max(axis=0), np.finfo(float).tiny)
+            before, change = after, float(np.max(np.abs(after - before) / sizes, initial=0.0))
+        return d, CONVERGED, history
 
     def _fewest(self) -> int:
         """Return the number of points with which to start: enough for the harmonics of the inputs."""
@@ -373,14 +393,15 @@ class CondensedEquations(PeriodicEquations):
             step = min(1.5 * step, LARGEST_LOAD_STEP * (1.0 + float(np.linalg.norm(there)) / unit))
         return None
 
-    def _outputs(self, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        matrices, forces = self.matrices(parameters, 2 * len(d))[0], self.forces(d, parameters)[0]
-        load = self.input_harmonics(2 * len(d))
-        return self.on_points(_times(matrices.y_u, load) - _times(matrices.y_f, harmonics(forces.values)))
+    def _outputs(self, d: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the outputs on the experiment's grid, and the bound of their error by the number of points."""
+        matrices, f = self.matrices(parameters, 2 * len(d))[0], harmonics(self.forces(d, parameters)[0].values)
+        y = _times(matrices.y_u, self.input_harmonics(2 * len(d))) - _times(matrices.y_f, f)
+        return self.on_points(y), float(unresolved(matrices.largest, f, y))
 
     def outputs(self, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return the outputs (points, channels) on the experiment's grid."""
-        return self._outputs(harmonics(z), parameters)
+        return self._outputs(harmonics(z), parameters)[0]
 
     def sensitivities_along(
         self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
@@ -472,6 +493,19 @@ def sampled(amplitudes: np.ndarray, points: int) -> np.ndarray:
         return on_grid(amplitudes, points)
     every = -(-2 * count // points)
     return on_grid(amplitudes, every * points)[..., ::every, :]
+
+
+def unresolved(largest: np.ndarray, f: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return a bound of the relative error of the outputs by the number of points, (…).
+
+    Sampled forces f (…, harmonics, elements) have the harmonics beyond half the points added to the low ones. They are
+    smaller than the largest of the upper half of the harmonics, which is taken to act at that where the frequency
+    response to it is `largest` (outputs, elements). Outputs y are (…, harmonics, outputs).
+    """
+    upper = f[..., f.shape[-2] // 2 :, :]
+    above = np.sqrt(np.max(upper.real**2 + upper.imag**2, axis=-2))
+    size = np.sqrt(np.einsum("...kc,...kc->...c", y.real, y.real) + np.einsum("...kc,...kc->...c", y.imag, y.imag))
+    return np.asarray(np.max(above @ largest.T / np.maximum(size, np.finfo(float).tiny), axis=-1))
 
 
 def _stacked(amplitudes: np.ndarray, unit: float) -> np.ndarray:

@@ -10,7 +10,10 @@ from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
 from bayesperiodic.periodic import condensed, condensed_solution
+from bayesperiodic.periodic.batch import Anchor
+from bayesperiodic.periodic.compiled import STATUSES
 from bayesperiodic.periodic.condensed import CondensedEquations, receptance
+from bayesperiodic.periodic.condensed_batch import CondensedBatch
 
 Element = bp.elements.Element
 VALUES = {"alpha": 0.05, "beta": 0.01, "spring_k3": 0.05, "air_drag": 0.1}
@@ -298,3 +301,76 @@ def test_what_needs_symbolic_equations_is_refused_with_the_alternative():
             call()
     with pytest.raises(ValueError, match="scheme: must be 'fourier' or None"):
         solved(12, scheme="central4")
+
+
+STOPPED = {"alpha": 0.5, "stop_k": 10.0, "stop_clearance": 0.6}
+
+
+@cache
+def stopped():
+    """Return a beam of 6 degrees of freedom with a stiff and sharp stop."""
+    mass, stiffness = matrices(6)
+    return bp.Model.from_matrices(
+        "stopped", mass=mass, stiffness=stiffness, damping={"alpha": mass}, forces={"force": 5}, condensed=True,
+        outputs={"x": (5, "displacement"), "v": (2, "velocity")},
+        elements=[Element("stop", lambda d, k, clearance: k * (abs(d - clearance) + d - clearance) / 2, 5)],
+    )  # fmt: skip
+
+
+def integrated(values, frequency):
+    """Return the outputs of the stopped beam after 30 periods of SciPy's integration from rest."""
+    mass, stiffness = matrices(6)
+    inverse = np.linalg.inv(mass)
+
+    def rates(t, y):
+        push = 0.05 + 0.2 * np.cos(2 * np.pi * frequency * t)
+        push -= values["stop_k"] * max(y[5] - values["stop_clearance"], 0.0)
+        return np.concatenate([y[6:], inverse @ (push * np.eye(6)[5] - stiffness @ y[:6]) - values["alpha"] * y[6:]])
+
+    times = (30 + np.arange(SAMPLES) / SAMPLES) / frequency
+    y = solve_ivp(rates, (0, times[-1]), np.zeros(12), t_eval=times, rtol=1e-9, atol=1e-11, max_step=0.05).y
+    return {"x": y[5], "v": y[8]}
+
+
+def unstopped(frequency):
+    """Return equations, and an anchor out of contact, of few points, and the parameters in contact."""
+    equations = CondensedEquations.build(stopped(), {"force": FORCE}, frequency=frequency, samples=SAMPLES)
+    theta = np.array([*STOPPED.values()])
+    free = theta * [1, 1, 2]
+    z = equations.find(free, None)[0].z
+    assert len(z) <= 64 and z.max() < free[2]
+    return (
+        equations,
+        Anchor.of(equations, free, z, equations.sensitivities_along(z, free, np.eye(3)), np.arange(3)),
+        theta,
+    )
+
+
+def test_points_of_a_batch_are_doubled_where_those_of_the_anchor_do_not_resolve_the_response():
+    """A stiff stop far from an anchor out of contact, against SciPy's integration."""
+    frequency = 0.04
+    equations, anchor, theta = unstopped(frequency)
+    solved = CondensedBatch([equations], [anchor]).solve(np.stack([theta, anchor.parameters]), keep=True)
+    assert solved.status.tolist() == [[0, 0]] and solved.z.shape[2] > len(anchor.z)
+    exact = integrated(STOPPED, frequency)
+    assert exact["x"].max() > 1.02 * STOPPED["stop_clearance"]
+    assert worst(dict(zip("xv", solved.outputs[0, 0].T, strict=True)), exact) < 1e-4
+    coarse = equations.solve(theta, solved.z[0, 0][:: solved.z.shape[2] // len(anchor.z)])
+    assert worst(dict(zip("xv", equations.outputs(coarse.z, theta).T, strict=True)), exact) > 1e-3
+    np.testing.assert_allclose(equations.outputs(solved.z[0, 0], theta), solved.outputs[0, 0], atol=1e-9)
+
+
+def test_response_that_no_points_resolve_does_not_enter_a_likelihood(monkeypatch):
+    """With 64 points at most, the status in contact is "not resolved", and the log-likelihood −∞."""
+    frequency = 0.04
+    monkeypatch.setattr(condensed, "MOST_ELEMENT_POINTS", 64)
+    monkeypatch.setattr(condensed, "LARGEST_OUTPUT_CHANGE", 1e-3)
+    equations, anchor, theta = unstopped(frequency)
+    solved = CondensedBatch([equations], [anchor]).solve(np.stack([theta, anchor.parameters]))
+    assert [STATUSES[code] for code in solved.status[0]] == ["not resolved", "converged"]
+    run = bp.Experiment("run", frequency, {"x": solved.outputs[0, 1, :, 0]}, {"force": FORCE}, samples=SAMPLES)
+    free = dict(zip(STOPPED, anchor.parameters, strict=True))
+    problem = bp.Problem(stopped(), [run], priors={n: bp.LogNormal(v, 1.0) for n, v in free.items()})
+    order = [[*STOPPED].index(n) for n in problem.names]
+    values = problem.log_likelihood(np.stack([anchor.parameters, theta])[:, order], {"x": 1e-3})
+    assert np.isfinite(values[0]) and values[1] == -np.inf
