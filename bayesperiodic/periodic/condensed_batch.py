@@ -19,8 +19,8 @@ from bayesperiodic.periodic.condensed import (
 from bayesperiodic.periodic.receptance import compiled
 
 FEWEST_CONDENSED_SOLVES = 4
-# Parts of the way from an anchor in which a solution is followed, and largest correction in units of the predicted change
-# or, where a contact begins, of this part of the solution.
+# Parts of the way from an anchor in which a solution is followed, and largest correction in units of the predicted
+# change or, where a contact begins, of this part of the solution.
 LARGEST_PATH_PART, SMALLEST_PATH_PART, STRAIGHT_PATH, LEAST_PATH_CHANGE = 0.25, 1.0 / 256.0, 0.5, 0.01
 
 
@@ -56,7 +56,7 @@ class CondensedBatch:
         """Return the transposed inverses of the sets, all of the largest number of low harmonics, and that number."""
         given = []
         for e, anchor, d, matrices in zip(self._sets, self._anchors, self._d, self._matrices, strict=True):
-            given.append((e.forces(d, anchor.parameters)[0], e.rates(self._points), matrices.d_f))
+            given.append((e.forces(d, anchor.parameters), e.rates(self._points), matrices.d_f))
         low, inverses = 1, []
         for known, part in zip(self._known, given, strict=True):
             if known:
@@ -132,7 +132,7 @@ class CondensedBatch:
                 status[e, b] = STALLED
                 continue
             d[e, b], status[e, b], more = self._follow(e, every[e, b])
-            f[e, b] = harmonics(self._sets[e].forces(d[e, b], every[e, b])[0].values)
+            f[e, b] = harmonics(self._sets[e].forces(d[e, b], every[e, b]).values)
             steps[e, b] += more
         every_y = [
             _unforced(r.y_u, load) - (r.y_f @ y[..., None])[..., 0]

@@ -14,6 +14,7 @@ from bayesperiodic.periodic.batch import Anchor
 from bayesperiodic.periodic.compiled import STATUSES
 from bayesperiodic.periodic.condensed import CondensedEquations, receptance
 from bayesperiodic.periodic.condensed_batch import CondensedBatch
+from bayesperiodic.periodic.receptance import Receptance
 
 Element = bp.elements.Element
 VALUES = {"alpha": 0.05, "beta": 0.01, "spring_k3": 0.05, "air_drag": 0.1}
@@ -162,7 +163,8 @@ def test_multipliers_are_those_of_scipys_integration_of_the_linearised_equations
 def test_multipliers_in_few_modes_are_those_in_all_to_their_error(monkeypatch):
     """Of 24 degrees of freedom in 16 and in 24 modes; only the former have an error of the modes left out."""
     few = solved(24)
-    monkeypatch.setattr("bayesperiodic.periodic.condensed_solution.MOST_MODES", 24)
+    monkeypatch.setattr(condensed_solution, "MOST_MODES", 24)
+    monkeypatch.setattr(condensed_solution, "CLEAR_OF_CIRCLE", 0.0)
     every = solved(24)
     assert few.multipliers.shape == (32,) and every.multipliers.shape == (48,)
     difference = abs(abs(few.multipliers[0]) - abs(every.multipliers[0]))
@@ -181,11 +183,11 @@ def test_modes_left_out_bend_statically(monkeypatch):
     rate = np.sqrt(np.linalg.eigvals(np.linalg.solve(mass, stiffness + tip)).real.min() - 0.025**2)
     exact, errors = np.exp((-0.025 + 1j * rate) / 0.1), []
     monkeypatch.setattr(condensed_solution, "MOST_MODES", 3)
-    modal = condensed_solution._modal_equations
+    modal = Receptance.lowest
     for scale in (1, 0):
         monkeypatch.setattr(
-            condensed_solution,
-            "_modal_equations",
+            Receptance,
+            "lowest",
             lambda *given, scale=scale: (m := modal(*given))._replace(compliance=scale * m.compliance),
         )
         solution = bp.solve_periodic(
@@ -204,11 +206,11 @@ def test_newtons_matrix_is_that_of_the_linearised_equations():
     response = equations.matrices(theta, 32)[0].d_f
 
     def residual(at):
-        forces = condensed.harmonics(equations.forces(at, theta)[0].values)
+        forces = condensed.harmonics(equations.forces(at, theta).values)
         return at + (response @ forces[..., None])[..., 0]
 
     change = (residual(d + 1e-6 * step) - residual(d - 1e-6 * step)) / 2e-6
-    inverse = condensed.Preconditioner(equations.forces(d, theta)[0], equations.rates(32), response, 16)
+    inverse = condensed.Preconditioner(equations.forces(d, theta), equations.rates(32), response, 16)
     np.testing.assert_allclose(inverse(change), step, atol=1e-6)
 
 
@@ -292,8 +294,9 @@ def test_structure_that_moves_without_deformation_is_refused():
 def test_what_needs_symbolic_equations_is_refused_with_the_alternative():
     model, solution = beam(12), solved(12)
     for call in (
-        lambda: bp.continue_periodic(model, solution, vary="frequency", until=0.1),
+        lambda: bp.double_period(model, solution, "frequency"),
         lambda: bp.structure(model),
+        lambda: bp.double_period(model, solution, "frequency"),
         lambda: bp.multiplier_sensitivities(model, solution),
         lambda: bp.simulate(model, VALUES, {"force": FORCE}, frequency=FREQUENCY, duration=1.0, sampling_rate=10.0),
     ):
