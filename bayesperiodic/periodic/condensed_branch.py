@@ -85,30 +85,32 @@ class CondensedParametrised(ParametrisedEquations):
             return equations.at_frequency(value), self.parameters  # type: ignore[return-value]
         return equations, np.where(np.arange(self.parameters.size) == self._index, value, self.parameters)
 
-    def _linearised(
-        self, d: np.ndarray, values: np.ndarray
-    ) -> tuple[tuple[Forces, np.ndarray, ResponseMatrices], np.ndarray, np.ndarray, float]:
-        """Return what the derivative by d takes, that by the unknown, the residual and its size."""
+    def _residual(self, d: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the residual at harmonics d and the size of its terms."""
         equations, theta = self.at(values)
-        moves = self.free[0] != INPUTS
+        matrices, load = equations.matrices(theta, 2 * len(d))[0], equations.input_harmonics(2 * len(d))
+        return residual_of(d, equations.forces(d, theta), matrices, times(matrices.d_u, load))
+
+    def _bordered(self, d: np.ndarray, values: np.ndarray, row: np.ndarray, corner: float) -> _Bordered:
+        """Return the factors of the linearised equations and a condition row·z + corner·value."""
+        equations, theta = self.at(values)
+        moves, points = self.free[0] != INPUTS, 2 * len(d)
         forces, matrices, of_d, _ = equations.slopes(d, theta, [self._index] if moves else [])
-        points = 2 * len(d)
         if moves:
             slope = -of_d[0]
         else:
             change = self.input_change[:, : len(equations.model.inputs)]
             slope = -times(matrices.d_u, equations.input_harmonics(points, change))
-        residual, size = residual_of(d, forces, matrices, times(matrices.d_u, equations.input_harmonics(points)))
-        return (forces, equations.rates(points), matrices), slope, residual, size
+        return _Bordered((forces, equations.rates(points), matrices), slope, row, corner)
 
     def along(self, z: np.ndarray, values: np.ndarray, conditions: Change) -> Change | None:
         """Return the change along the branch for which the condition is 1; None if it is not unique."""
-        given, slope, residual, _ = self._linearised(harmonics(z), values)
+        d = harmonics(z)
         try:
-            inverse = _Bordered(given, slope, conditions[0][0], conditions[1][0, 0])
+            inverse = self._bordered(d, values, conditions[0][0], conditions[1][0, 0])
         except np.linalg.LinAlgError:
             return None
-        x, y = inverse(np.zeros_like(residual), 1.0)
+        x, y = inverse(np.zeros_like(d), 1.0)
         return (on_grid(x, len(z)), np.array([y])) if np.isfinite(x).all() else None
 
     def solve(
@@ -120,28 +122,28 @@ class CondensedParametrised(ParametrisedEquations):
         history: list[tuple[float, float, float]] = []
         before, inverse, code = np.inf, None, STALLED
         for _ in range(MOST_BRANCH_CORRECTIONS):
-            given, slope, residual, size = self._linearised(d, np.array([value]))
+            here = np.array([value])
+            residual, size = self._residual(d, here)
             if not np.isfinite(residual).all():
                 code = NOT_FINITE
                 break
-            if inverse is None:
-                try:
-                    inverse = _Bordered(given, slope, row, corner)
-                except np.linalg.LinAlgError:
-                    code = SINGULAR
-                    break
+            try:
+                inverse = inverse or self._bordered(d, here, row, corner)
+            except np.linalg.LinAlgError:
+                code = SINGULAR
+                break
             left = float(np.sum(row * on_grid(d, len(z)))) + corner * value - target
             step, move = inverse(residual, left)
             d, value = d - step, value - move
             length = float(np.hypot(np.linalg.norm(step) / size, move / scales[0]))
             history.append((float(np.linalg.norm(residual)) / size, length, 1.0))
             ratio = length / before
-            if length <= LAST_BRANCH_CORRECTION or (ratio < 1.0 and length * ratio <= LAST_BRANCH_CORRECTION):
+            if length <= LAST_BRANCH_CORRECTION or (before < np.inf and length * ratio <= LAST_BRANCH_CORRECTION):
                 code = CONVERGED
                 break
-            if len(history) > 1 and ratio > BRANCH_CONTRACTION:
+            if ratio > BRANCH_CONTRACTION:
                 break
-            inverse, before = inverse if ratio < REUSED and len(history) > 1 else None, length
+            inverse, before = inverse if ratio < REUSED else None, length
         z = on_grid(d, len(z))
         if code == CONVERGED and len(z) >= MOST_ELEMENT_POINTS and not self._bound(z, value) <= LARGEST_OUTPUT_CHANGE:
             code = NOT_RESOLVED

@@ -377,3 +377,86 @@ def test_response_that_no_points_resolve_does_not_enter_a_likelihood(monkeypatch
     order = [[*STOPPED].index(n) for n in problem.names]
     values = problem.log_likelihood(np.stack([anchor.parameters, theta])[:, order], {"x": 1e-3})
     assert np.isfinite(values[0]) and values[1] == -np.inf
+
+
+@cache
+def response(count, condensed=True, vary="frequency", until=0.1):
+    """Return the branch of a beam over its first resonance, or in a parameter or the force."""
+    start = solved(count, condensed, frequency=0.045)
+    step = abs(until - {"frequency": 0.045, "force": 1.0}.get(vary, VALUES.get(vary))) / (50 if condensed else 12)
+    return bp.continue_periodic(beam(count, condensed), start, vary, until=until, step=step, progress=False)
+
+
+@pytest.mark.parametrize("count", [4, pytest.param(8, marks=pytest.mark.slow)])
+def test_branch_has_the_folds_and_multipliers_of_the_symbolic_model(count):
+    """Over the bent peak, stable, unstable and stable; multipliers of the orbits at one frequency."""
+    ours, symbolic = (response(count, condensed) for condensed in (True, False))
+    assert ours.complete and symbolic.complete and len(ours.folds) == len(symbolic.folds) == 2
+    np.testing.assert_allclose([s.frequency for s in ours.folds], [s.frequency for s in symbolic.folds], rtol=1e-7)
+    middle = np.mean([s.frequency for s in ours.folds])
+    orbits = (bp.solutions_at(beam(count, c), b, middle) for c, b in ((True, ours), (False, symbolic)))
+    for one, other in zip(*orbits, strict=True):
+        assert worst(one.outputs, other.outputs) < 1e-7
+        assert one.stable == other.stable
+        for value in other.multipliers[:4]:
+            assert np.abs(one.multipliers - value).min() < 1e-6
+    stable = [s.stable for s in ours if s.stable is not None]
+    assert np.count_nonzero(np.diff(stable)) == 2
+    assert set(bp.solutions_at(beam(count), ours, middle)[1].outputs) == {"x", "v", "a"}
+
+
+@pytest.mark.parametrize(("vary", "until"), [("force", 0.2), ("spring_k3", 0.5), ("alpha", 0.01)])
+def test_branches_in_other_quantities_end_at_the_solution_there(vary, until):
+    branch = response(12, vary=vary, until=until)
+    assert branch.complete and branch.values[-1] == until
+    if vary == "force":
+        last = bp.solve_periodic(
+            beam(12), VALUES, {"force": until * FORCE}, frequency=0.045, samples=SAMPLES, guess=branch[-1].states
+        )
+    else:
+        last = solved(12, values=VALUES | {vary: until}, frequency=0.045, guess=branch[-1].states)
+    assert last.converged and worst(branch[-1].outputs, last.outputs) < 1e-8
+    assert branch.data.sizes["point"] == len(branch)
+
+
+def test_points_are_doubled_along_a_branch_into_contact():
+    """The clearance falls until a sharp stop is touched: the end is that of SciPy's integration."""
+    values, frequency = STOPPED | {"stop_clearance": 1.2}, 0.04
+    start = bp.solve_periodic(stopped(), values, {"force": FORCE}, frequency=frequency, samples=SAMPLES)
+    branch = bp.continue_periodic(stopped(), start, "stop_clearance", until=0.6, progress=False)
+    assert branch.complete and branch[-1].stable
+    assert worst(branch[-1].outputs, integrated(STOPPED, frequency)) < 1e-4
+
+
+def test_multipliers_of_an_unstable_orbit_are_those_of_scipys_integration_of_the_nonlinear_equations():
+    """A small perturbation of the unstable orbit of 8 degrees of freedom grows by the largest multiplier a period."""
+    count, branch = 8, response(8)
+    orbit = bp.solutions_at(beam(8), branch, np.mean([s.frequency for s in branch.folds]))[1]
+    mass, stiffness = matrices(count)
+    damping, inverse = VALUES["alpha"] * mass + VALUES["beta"] * stiffness, np.linalg.inv(mass)
+    between = np.zeros(count)
+    between[count // 2], between[0] = 1, -1
+
+    def rates(t, y):
+        x, v = np.split(y, 2)
+        f = stiffness @ x + damping @ v + VALUES["air_drag"] * (between @ v) ** 3 * between
+        f[-1] += VALUES["spring_k3"] * x[-1] ** 3 - 0.05 - 0.2 * np.cos(2 * np.pi * orbit.frequency * t)
+        return np.concatenate([v, -inverse @ f])
+
+    amplitudes = np.fft.rfft(np.array([orbit.states[f"x{i}"] for i in range(count)])) / SAMPLES
+    turning = np.where(np.arange(amplitudes.shape[1]) == 0, 1.0, 2.0) * amplitudes
+    here = np.concatenate(
+        [
+            turning.sum(axis=1).real,
+            (2j * np.pi * orbit.frequency * np.arange(turning.shape[1]) * turning).sum(axis=1).real,
+        ]
+    )
+
+    def end(y):
+        return solve_ivp(rates, (0, orbit.period), y, rtol=1e-10, atol=1e-12).y[:, -1]
+
+    columns = [(end(here + 1e-5 * e) - end(here - 1e-5 * e)) / 2e-5 for e in np.eye(2 * count)]
+    exact = np.linalg.eigvals(np.transpose(columns))
+    largest = exact[np.argmax(np.abs(exact))]
+    assert orbit.stable is False
+    assert abs(orbit.multipliers[0] - largest) < 1e-4 * abs(largest)
