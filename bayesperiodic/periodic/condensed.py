@@ -12,7 +12,7 @@ References
    response of nonlinear dynamic systems, Journal of Applied Mechanics 56 (1989) 149-154.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -189,12 +189,20 @@ class CondensedEquations(PeriodicEquations):
         return 2 * np.pi * self.frequency / self.grid.periods * np.arange(points // 2)
 
     def matrices(
-        self, parameters: np.ndarray, points: int, directions: Any = ()
+        self, parameters: np.ndarray, points: int, directions: Sequence[int] = ()
     ) -> tuple[ResponseMatrices, ResponseMatrices]:
         """Return the frequency response at the harmonics below half the points, and its derivatives.
 
         `directions` are indices of parameters, their number standing for the frequency.
         """
+        return self._receptance.recent(
+            ("matrices", parameters.tobytes(), self.frequency, self.grid.periods, points, *directions),
+            lambda: self._matrices(parameters, points, directions),
+        )
+
+    def _matrices(
+        self, parameters: np.ndarray, points: int, directions: Sequence[int]
+    ) -> tuple[ResponseMatrices, ResponseMatrices]:
         numbers = np.arange(points // 2) / self.grid.periods
         response = self._receptance(parameters, self.frequency, numbers, directions)
         here, changes = (self._parts(values) for values in (response.values, response.derivatives))
@@ -229,6 +237,10 @@ class CondensedEquations(PeriodicEquations):
     def input_harmonics(self, points: int, inputs: np.ndarray | None = None) -> np.ndarray:
         """Return the harmonics (…, harmonics, inputs) of inputs (…, grid points, inputs), by default these."""
         values = self.inputs[:, : len(self.model.inputs)] if inputs is None else inputs
+        key = ("inputs", points, values.shape, values.tobytes())
+        return self._receptance.recent(key, lambda: self._input_harmonics(points, values))
+
+    def _input_harmonics(self, points: int, values: np.ndarray) -> np.ndarray:
         amplitudes = np.fft.rfft(values, axis=-2) / values.shape[-2]
         result = np.zeros((*values.shape[:-2], points // 2, values.shape[-1]), dtype=complex)
         kept = min(points // 2, amplitudes.shape[-2])
@@ -250,6 +262,10 @@ class CondensedEquations(PeriodicEquations):
         if not self.count:
             none = np.zeros((2 * len(d), 0))
             return Forces(none, none, none)
+        key = ("forces", parameters.tobytes(), self.frequency, self.grid.periods, d.tobytes())
+        return self._receptance.recent(key, lambda: self._forces(d, parameters))
+
+    def _forces(self, d: np.ndarray, parameters: np.ndarray) -> Forces:
         values, given = self._evaluated("residual_jacobian", d, parameters), self.count
         f, slopes = values[:, :given], values[:, given:].reshape(len(values), given, 3, given)
         diagonal = np.arange(given)

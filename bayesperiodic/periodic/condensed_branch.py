@@ -52,6 +52,10 @@ class _Bordered:
     def _high(self, amplitudes: np.ndarray) -> float:
         return float(np.vdot(self._row[self._low :], amplitudes[self._low :]).real)
 
+    def along_row(self, amplitudes: np.ndarray) -> float:
+        """Return row·z for harmonics of z."""
+        return float(np.vdot(self._row, amplitudes).real)
+
     def __call__(self, right: np.ndarray, below: float) -> tuple[np.ndarray, float]:
         """Return the change of the harmonics and of the unknown for a right-hand side."""
         flat = np.append(_flat(right[: self._low]), below - self._high(right))
@@ -85,18 +89,23 @@ class CondensedParametrised(ParametrisedEquations):
             return equations.at_frequency(value), self.parameters  # type: ignore[return-value]
         return equations, np.where(np.arange(self.parameters.size) == self._index, value, self.parameters)
 
-    def _residual(self, d: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the residual at harmonics d and the size of its terms."""
+    @property
+    def _directions(self) -> list[int]:
+        """The parameter, see `CondensedEquations.slopes`."""
+        return [] if self.free[0] == INPUTS else [self._index]
+
+    def _residual(self, d: np.ndarray, values: np.ndarray, directions: list[int]) -> tuple[np.ndarray, float]:
+        """Return the residual at harmonics d and the size of its terms; the directions are those to be used next."""
         equations, theta = self.at(values)
-        matrices, load = equations.matrices(theta, 2 * len(d))[0], equations.input_harmonics(2 * len(d))
+        matrices, load = equations.matrices(theta, 2 * len(d), directions)[0], equations.input_harmonics(2 * len(d))
         return residual_of(d, equations.forces(d, theta), matrices, times(matrices.d_u, load))
 
     def _bordered(self, d: np.ndarray, values: np.ndarray, row: np.ndarray, corner: float) -> _Bordered:
         """Return the factors of the linearised equations and a condition row·z + corner·value."""
         equations, theta = self.at(values)
-        moves, points = self.free[0] != INPUTS, 2 * len(d)
-        forces, matrices, of_d, _ = equations.slopes(d, theta, [self._index] if moves else [])
-        if moves:
+        points = 2 * len(d)
+        forces, matrices, of_d, _ = equations.slopes(d, theta, self._directions)
+        if self._directions:
             slope = -of_d[0]
         else:
             change = self.input_change[:, : len(equations.model.inputs)]
@@ -123,7 +132,7 @@ class CondensedParametrised(ParametrisedEquations):
         before, inverse, code = np.inf, None, STALLED
         for _ in range(MOST_BRANCH_CORRECTIONS):
             here = np.array([value])
-            residual, size = self._residual(d, here)
+            residual, size = self._residual(d, here, [] if inverse else self._directions)
             if not np.isfinite(residual).all():
                 code = NOT_FINITE
                 break
@@ -132,7 +141,7 @@ class CondensedParametrised(ParametrisedEquations):
             except np.linalg.LinAlgError:
                 code = SINGULAR
                 break
-            left = float(np.sum(row * on_grid(d, len(z)))) + corner * value - target
+            left = inverse.along_row(d) + corner * value - target
             step, move = inverse(residual, left)
             d, value = d - step, value - move
             length = float(np.hypot(np.linalg.norm(step) / size, move / scales[0]))

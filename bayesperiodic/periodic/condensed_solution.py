@@ -18,7 +18,7 @@ from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, by_name, d
 MOST_MODES, MODE_ERROR_STEPS = 16, 128
 # Steps in time, and relative change of the largest modulus by twice as many, below which these are enough; with many
 # steps, also that in units of the distance from the unit circle.
-FEWEST_MODAL_STEPS, MANY_MODAL_STEPS, MOST_MODAL_STEPS, MODAL_ERROR, CLEAR_OF_CIRCLE = 32, 1024, 4096, 1e-8, 1e-3
+FEWEST_MODAL_STEPS, MANY_MODAL_STEPS, MOST_MODAL_STEPS, MODAL_ERROR, CLEAR_OF_CIRCLE = 64, 1024, 4096, 1e-8, 1e-3
 LEAST_TURN = 1e-7  # of an undamped mode in a step, below which the formula of a critically damped one is taken
 
 
@@ -195,8 +195,11 @@ class _Linearised:
         turn = np.where(np.abs(turn) * length < LEAST_TURN, LEAST_TURN / length, turn)
         forth, back = np.exp((-decay + 1j * turn) * length), np.exp((-decay - 1j * turn) * length)
         even, odd = (0.5 * (forth + back)).real, ((forth - back) / (2j * turn)).real
-        blocks = [[even + decay * odd, odd], [-squares * odd, even - decay * odd]]
-        return np.block([[np.diag(block) for block in row] for row in blocks])
+        result, q = np.zeros((2 * self._size, 2 * self._size)), np.arange(self._size)
+        v = q + self._size
+        result[q, q], result[q, v] = even + decay * odd, odd
+        result[v, q], result[v, v] = -squares * odd, even - decay * odd
+        return result
 
     def monodromy(self, steps: int) -> np.ndarray:
         """Return the map of (q, q̇) over the period in steps, of second order.
@@ -215,9 +218,11 @@ class _Linearised:
         springs, dampers = (_means(part, steps) for part in self._known)
         result = np.eye(2 * self._size)
         # The middle rule of velocities; two halves of a step make the kick of a whole one.
-        acting = 0.5 * length * np.linalg.inv(unit + 0.25 * length * dampers @ (self.modes.at @ self.modes.at.T))
-        halves = np.concatenate([acting @ springs, acting @ dampers], axis=2)
-        kicks = 2.0 * halves - halves @ (self._places @ self._forcing) @ halves
+        halves = 0.5 * length * np.concatenate([springs, dampers], axis=2)
+        kicks = 2.0 * halves
+        if dampers.any():
+            halves = np.linalg.solve(unit + 0.25 * length * dampers @ (self.modes.at @ self.modes.at.T), halves)
+            kicks = 2.0 * halves - halves @ (self._places @ self._forcing) @ halves
         kicks[0] = halves[0]
         free = self._free(length)
         compiled().monodromy(free, self._diagonal, self._places, self._forcing, kicks, result)

@@ -1,17 +1,20 @@
 """Frequency response of a linear structure between few places, with its derivatives by all parameters."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
 
 from bayesperiodic._compile.cache import load
 from bayesperiodic.models.structure import CONSTANT_PART, LEAST_REGULAR, POWERS, MatrixStructure
+
+# Arrays at the same point that are not computed again, and rows beyond which they are not kept.
+REMEMBERED_ARRAYS, MOST_REMEMBERED_ROWS = 8, 16
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,18 @@ class Receptance:
         self._factors = np.array([-1 if n == CONSTANT_PART else parameters.index(n) for _, n, _ in parts])
         self._matrices = np.stack([a for *_, a in parts])
         self._size, self._regular = len(parameters), False
+        self._recent: dict[tuple[Any, ...], Any] = {}
+
+    def recent(self, key: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
+        """Return arrays that are computed, or were so recently with the same key."""
+        known = self._recent.get(key)
+        if known is None:
+            known = compute()
+            if len(self._rows) <= MOST_REMEMBERED_ROWS:
+                if len(self._recent) >= REMEMBERED_ARRAYS:
+                    self._recent = dict([*self._recent.items()][-REMEMBERED_ARRAYS // 2 :])
+                self._recent[key] = known
+        return known
 
     @cached_property
     def _modes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:

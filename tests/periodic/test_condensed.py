@@ -401,7 +401,8 @@ def test_branch_has_the_folds_and_multipliers_of_the_symbolic_model(count):
         for value in other.multipliers[:4]:
             assert np.abs(one.multipliers - value).min() < 1e-6
     stable = [s.stable for s in ours if s.stable is not None]
-    assert np.count_nonzero(np.diff(stable)) == 2
+    # Between the folds; of 8 degrees of freedom also where two multipliers leave and enter the circle as a pair.
+    assert np.count_nonzero(np.diff(stable)) == (2 if count == 4 else 4)
     assert set(bp.solutions_at(beam(count), ours, middle)[1].outputs) == {"x", "v", "a"}
 
 
