@@ -67,6 +67,22 @@ class ParametrisedEquations:
         equations.bordered_kernels.fill_slopes(*given, columns, table, folded)
         return np.ascontiguousarray(folded.reshape(-1, *z.shape)[:, equations.grid.packed.place])
 
+    def along(self, z: np.ndarray, values: np.ndarray, conditions: Change) -> Change | None:
+        """Return the change along the branch for which the first condition is 1; None if it is not unique."""
+        equations, parameters = self.at(values)
+        columns = equations.residual_jacobian(z, parameters)
+        factors = equations.bordered(columns, self.slopes(values, z, columns), *conditions)
+        solved = factors.solve_bordered(np.zeros((1, *z.shape)), np.eye(1, len(values)))
+        return solved and (solved[0][0], solved[1][0])
+
+    def resolved(self, z: np.ndarray, values: np.ndarray) -> bool:
+        """Return True: the grid is given."""
+        return True
+
+    def on_twice_the_points(self, z: np.ndarray) -> np.ndarray:
+        """Return z on twice the points, where it may have more of them."""
+        raise NotImplementedError
+
     def solve(
         self, z: np.ndarray, values: np.ndarray, conditions: Change, targets: np.ndarray, scales: np.ndarray
     ) -> Solved:
@@ -116,9 +132,8 @@ class Tracer:
 
     def __init__(self, equations: ParametrisedEquations, size: np.ndarray, values: np.ndarray, until: float):
         self.parametrised = equations
-        points = equations.equations.grid.points
         self._size = np.where(size > SMALLEST_SIZE, np.minimum(size, 1.0 / SMALLEST_SIZE), 1.0)
-        self._weights = 1.0 / (self._size**2 * points * len(size))
+        self._weights = 1.0 / (self._size**2 * len(size))  # a point's are these over their number
         self._value_scales = np.maximum(np.abs(values), 1e-12)
         self._value_scales[0] = abs(until - values[0])
 
@@ -130,12 +145,8 @@ class Tracer:
 
     def tangent(self, z: np.ndarray, values: np.ndarray, before: Change) -> Change | None:
         """Return the unit tangent at a point that continues an earlier one; None if it is not unique."""
-        equations, parameters = self.parametrised.at(values)
-        columns = equations.residual_jacobian(z, parameters)
-        slopes = self.parametrised.slopes(values, z, columns)
-        factors = equations.bordered(columns, slopes, *self._conditions(z, before))
-        solved = factors.solve_bordered(np.zeros((1, *z.shape)), np.eye(1, len(values)))
-        return solved and self.unit((solved[0][0], solved[1][0]))
+        change = self.parametrised.along(z, values, self._conditions(z, before))
+        return change and self.unit(change)
 
     def correct(self, start: BranchPoint, step: float) -> tuple[BranchPoint, int] | None:
         """Return the point of the branch a step along the tangent from another, and the iterations it took."""
@@ -151,6 +162,16 @@ class Tracer:
         corner[0, 0] = 1.0 / self._value_scales[0]
         solved = self._solve(start, z, values, (rows, corner), share * (end.distance - start.distance))
         return solved and replace(solved[0], values=np.concatenate([[value], solved[0].values[1:]]))
+
+    def resolved(self, point: BranchPoint) -> bool:
+        """Return whether the points of the grid resolve a point of the branch."""
+        return self.parametrised.resolved(point.z, point.values)
+
+    def refined(self, point: BranchPoint) -> BranchPoint | None:
+        """Return a point of the branch on twice the points of the grid; None if its correction fails."""
+        z, tangent = (self.parametrised.on_twice_the_points(part) for part in (point.z, point.tangent[0]))
+        corrected = self.correct(replace(point, z=z, tangent=(tangent, point.tangent[1])), 0.0)
+        return corrected and corrected[0]
 
     def length(self, change: Change) -> float:
         """Return the length of a change of z and the values."""
@@ -174,13 +195,13 @@ class Tracer:
         """Return rows and corner of: distance along a tangent; for an autonomous model, the phase against z."""
         unknowns = len(tangent[1])
         rows, corner = np.zeros((unknowns, *z.shape)), np.zeros((unknowns, unknowns))
-        rows[0], corner[0] = tangent[0] * self._weights, tangent[1] / self._value_scales**2
+        rows[0], corner[0] = tangent[0] * (self._weights / len(z)), tangent[1] / self._value_scales**2
         if unknowns > 1:
             rows[1] = self.parametrised.equations.phase_row(z)
         return rows, corner
 
     def _product(self, a: Change, b: Change) -> float:
-        return float(np.sum(a[0] * b[0] * self._weights) + np.sum(a[1] * b[1] / self._value_scales**2))
+        return float(np.sum(a[0] * b[0] * self._weights) / len(a[0]) + np.sum(a[1] * b[1] / self._value_scales**2))
 
     def unit(self, change: Change) -> Change:
         """Return a change divided by its length."""
@@ -221,7 +242,11 @@ def trace(
     for _ in range(MAX_POINTS):
         corrected = tracer.correct(here, length)
         after, iterations, limit = None, 0, None
-        if corrected is not None and tracer.follows(here, corrected[0], length):
+        blurred = corrected is not None and not tracer.resolved(corrected[0])
+        if blurred and (finer := tracer.refined(here)) is not None:
+            here = finer
+            continue
+        if not blurred and corrected is not None and tracer.follows(here, corrected[0], length):
             after, iterations = corrected
             limit = _passed(after.values[0], origin, until)
             if limit == origin and here.distance == 0.0:

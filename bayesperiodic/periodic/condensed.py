@@ -12,7 +12,7 @@ References
    response of nonlinear dynamic systems, Journal of Applied Mechanics 56 (1989) 149-154.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -29,8 +29,13 @@ from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
 # Points of the grid of the elements, and relative change of the outputs below which they are not doubled.
 FEWEST_ELEMENT_POINTS, MOST_ELEMENT_POINTS, RESOLVED_CHANGE = 32, 4096, 1e-6
-# The largest change of outputs that count as resolved by the most points; the smallest relative harmonic of an input.
+# Bound of the error of the outputs, see `unresolved`, above which points are doubled too.
+RESOLVED_SHARE = 1e-4
+# The largest change or bound of outputs that count as resolved by the most points; the smallest relative harmonic of an
+# input.
 LARGEST_OUTPUT_CHANGE, LEAST_HARMONIC = 1e-2, 1e-12
+# Points up to which a solve that fails is repeated, and their ratio.
+MOST_STARTING_POINTS, STARTING_RATIO = 512, 4
 # Share of a step that is left by harmonics whose coupling by the elements is neglected in Newton's matrix.
 WEAK_COUPLING = 0.05
 MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40, 10, 1e-10, 1e-13
@@ -56,6 +61,11 @@ class ResponseMatrices(NamedTuple):
     d_u: np.ndarray
     y_f: np.ndarray
     y_u: np.ndarray
+
+    @property
+    def largest(self) -> np.ndarray:
+        """Largest modulus of y_f over the harmonics, (…, rows, columns)."""
+        return np.asarray(np.abs(self.y_f).max(axis=-3))
 
 
 class Preconditioner:
@@ -147,12 +157,23 @@ class CondensedEquations(PeriodicEquations):
         """The equations whose outputs are the displacements of all degrees of freedom."""
         return replace(self, model=self.model.with_all_outputs)
 
-    def scaled_residual(self, z: np.ndarray, parameters: np.ndarray) -> float:
-        """Return the norm of the residual in units of its largest term."""
-        d, matrices = harmonics(z), self.matrices(parameters, len(z))[0]
-        free = _times(matrices.d_u, self.input_harmonics(len(z)))
-        residual, size = _residual(d, self.forces(d, parameters)[0], matrices, free)
-        return float(np.linalg.norm(residual)) / size
+    def outputs_and_residual(self, z: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the outputs (points, channels), and the norm of the residual in units of its largest term."""
+        d, matrices, load = harmonics(z), self.matrices(parameters, len(z))[0], self.input_harmonics(len(z))
+        forces = self.forces(d, parameters)
+        residual, size = residual_of(d, forces, matrices, times(matrices.d_u, load))
+        y = times(matrices.y_u, load) - times(matrices.y_f, harmonics(forces.values))
+        return self.on_points(y), float(np.linalg.norm(residual)) / size
+
+    def displacements(self, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """Return all displacements (2, points, n), and what they are if half of the points give the forces."""
+        points, load, by_points = len(z), self.input_harmonics(len(z)), []
+        for count in (points, points // 2):
+            d = resized(harmonics(z), count)
+            f = resized(harmonics(self.forces(d, parameters).values), points)
+            by_points.append(np.concatenate([-f, load], axis=1))
+        numbers = np.arange(points // 2) / self.grid.periods
+        return self.on_points(self._receptance.displacements(parameters, self.frequency, numbers, np.array(by_points)))
 
     @property
     def count(self) -> int:
@@ -168,12 +189,20 @@ class CondensedEquations(PeriodicEquations):
         return 2 * np.pi * self.frequency / self.grid.periods * np.arange(points // 2)
 
     def matrices(
-        self, parameters: np.ndarray, points: int, directions: Any = ()
+        self, parameters: np.ndarray, points: int, directions: Sequence[int] = ()
     ) -> tuple[ResponseMatrices, ResponseMatrices]:
         """Return the frequency response at the harmonics below half the points, and its derivatives.
 
         `directions` are indices of parameters, their number standing for the frequency.
         """
+        return self._receptance.recent(
+            ("matrices", parameters.tobytes(), self.frequency, self.grid.periods, points, *directions),
+            lambda: self._matrices(parameters, points, directions),
+        )
+
+    def _matrices(
+        self, parameters: np.ndarray, points: int, directions: Sequence[int]
+    ) -> tuple[ResponseMatrices, ResponseMatrices]:
         numbers = np.arange(points // 2) / self.grid.periods
         response = self._receptance(parameters, self.frequency, numbers, directions)
         here, changes = (self._parts(values) for values in (response.values, response.derivatives))
@@ -208,6 +237,10 @@ class CondensedEquations(PeriodicEquations):
     def input_harmonics(self, points: int, inputs: np.ndarray | None = None) -> np.ndarray:
         """Return the harmonics (…, harmonics, inputs) of inputs (…, grid points, inputs), by default these."""
         values = self.inputs[:, : len(self.model.inputs)] if inputs is None else inputs
+        key = ("inputs", points, values.shape, values.tobytes())
+        return self._receptance.recent(key, lambda: self._input_harmonics(points, values))
+
+    def _input_harmonics(self, points: int, values: np.ndarray) -> np.ndarray:
         amplitudes = np.fft.rfft(values, axis=-2) / values.shape[-2]
         result = np.zeros((*values.shape[:-2], points // 2, values.shape[-1]), dtype=complex)
         kept = min(points // 2, amplitudes.shape[-2])
@@ -224,24 +257,31 @@ class CondensedEquations(PeriodicEquations):
         """Return values (…, points, columns) on the experiment's grid from harmonics (…, harmonics, columns)."""
         return sampled(harmonics, self.grid.points)
 
-    def forces(self, d: np.ndarray, parameters: np.ndarray) -> tuple[Forces, np.ndarray]:
-        """Return the forces at harmonics d (harmonics, elements), and those by θ (points, elements, parameters)."""
+    def forces(self, d: np.ndarray, parameters: np.ndarray) -> Forces:
+        """Return the forces at harmonics d (harmonics, elements)."""
         if not self.count:
             none = np.zeros((2 * len(d), 0))
-            return Forces(none, none, none), np.zeros((2 * len(d), 0, parameters.size))
+            return Forces(none, none, none)
+        key = ("forces", parameters.tobytes(), self.frequency, self.grid.periods, d.tobytes())
+        return self._receptance.recent(key, lambda: self._forces(d, parameters))
+
+    def _forces(self, d: np.ndarray, parameters: np.ndarray) -> Forces:
         values, given = self._evaluated("residual_jacobian", d, parameters), self.count
         f, slopes = values[:, :given], values[:, given:].reshape(len(values), given, 3, given)
         diagonal = np.arange(given)
-        by_theta = self._evaluated("derivatives", d, parameters)[:, : given * parameters.size]
-        return Forces(f, slopes[:, diagonal, 0, diagonal], slopes[:, diagonal, 1, diagonal]), by_theta.reshape(
-            len(f), given, -1
-        )
+        return Forces(f, slopes[:, diagonal, 0, diagonal], slopes[:, diagonal, 1, diagonal])
+
+    def forces_by_parameters(self, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the forces by the parameters, (points, elements, parameters)."""
+        if not self.count:
+            return np.zeros((2 * len(d), 0, parameters.size))
+        values = self._evaluated("derivatives", d, parameters)[:, : self.count * parameters.size]
+        return values.reshape(len(values), self.count, -1)
 
     def _evaluated(self, name: str, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         points, kernels = 2 * len(d), self.model.element_kernels
         states = np.zeros((points, 3 * self.count))
-        states[:, : self.count] = on_grid(d, points)
-        states[:, self.count : 2 * self.count] = on_grid(1j * self.rates(points)[:, None] * d, points)
+        states[:, : 2 * self.count] = on_grid(np.concatenate([d, 1j * self.rates(points)[:, None] * d], axis=1), points)
         return kernels.evaluate(name, states, np.empty((points, 0)), parameters, np.zeros(points), self.frequency)
 
     def solve(self, parameters: np.ndarray, guess: np.ndarray, *_: Any) -> Solved:
@@ -254,11 +294,11 @@ class CondensedEquations(PeriodicEquations):
     ) -> tuple[np.ndarray, int, np.ndarray]:
         points = 2 * len(d)
         matrices = given or self.matrices(parameters, points)[0]
-        free = load * _times(matrices.d_u, self.input_harmonics(points))
+        free = load * times(matrices.d_u, self.input_harmonics(points))
         rates = self.rates(points)
         history: list[tuple[float, float, float]] = []
-        forces, _ = self.forces(d, parameters)
-        residual, size = _residual(d, forces, matrices, free)
+        forces = self.forces(d, parameters)
+        residual, size = residual_of(d, forces, matrices, free)
         for _ in range(MOST_CONDENSED_STEPS):
             if not np.isfinite(residual).all():
                 return d, NOT_FINITE, np.array(history).reshape(-1, 3)
@@ -270,8 +310,8 @@ class CondensedEquations(PeriodicEquations):
             share = 1.0
             for _ in range(MOST_STEP_HALVINGS):
                 there = d - share * step
-                new_forces, _ = self.forces(there, parameters)
-                residual, size = _residual(there, new_forces, matrices, free)
+                new_forces = self.forces(there, parameters)
+                residual, size = residual_of(there, new_forces, matrices, free)
                 after = float(np.linalg.norm(residual))
                 if after < before or after <= NEWTON_ROUNDING * size:
                     break
@@ -291,32 +331,42 @@ class CondensedEquations(PeriodicEquations):
         points = self._fewest()
         if guess is not None:  # of which the last doubling is repeated
             points = max(points, 1 << (len(guess) // 2 - 1).bit_length())
-        start = (
-            np.zeros((points // 2, self.count), dtype=complex) if guess is None else resized(harmonics(guess), points)
-        )
+        given = None if guess is None else harmonics(guess)
+        d, code, history, found_by = self._from(parameters, given, points)
+        while code != CONVERGED and points < MOST_STARTING_POINTS:  # few points may not resolve a contact
+            points = min(STARTING_RATIO * points, MOST_STARTING_POINTS)
+            d, code, history, found_by = self._from(parameters, given, points)
+        if code == CONVERGED:
+            d, code, history = self.doubled(parameters, d)
+        return Solved(on_grid(d, 2 * len(d)), code, history), found_by
+
+    def _from(
+        self, parameters: np.ndarray, guess: np.ndarray | None, points: int
+    ) -> tuple[np.ndarray, int, np.ndarray, str]:
+        """Return a solution on a number of points from a guess (harmonics, elements) or rest, code, history, how."""
+        start = np.zeros((points // 2, self.count), dtype=complex) if guess is None else resized(guess, points)
         d, code, history = self._newton(parameters, start, 1.0, None)
-        found_by = "newton"
         if code != CONVERGED and guess is None:
             raised = self._raise_load(parameters, start)
             if raised is not None:
-                d, code, history = self._newton(parameters, raised, 1.0, None)
-                found_by = "input amplitude"
-        before = self._outputs(d, parameters)
-        while code == CONVERGED:
+                return *self._newton(parameters, raised, 1.0, None), "input amplitude"
+        return d, code, history, "newton"
+
+    def doubled(self, parameters: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
+        """Double the points of a solution until its outputs are resolved; return it, the code and Newton's history."""
+        history, change = np.empty((0, 3)), np.nan
+        before, share = self._outputs(d, parameters)
+        while not (change <= RESOLVED_CHANGE and share <= RESOLVED_SHARE):
+            if 2 * len(d) >= MOST_ELEMENT_POINTS:
+                worst = np.fmax(change, share)
+                return d, CONVERGED if worst <= LARGEST_OUTPUT_CHANGE else NOT_RESOLVED, history
             finer, code, history = self._newton(parameters, resized(d, 4 * len(d)), 1.0, None)
             if code != CONVERGED:
-                break
-            d, after = finer, self._outputs(finer, parameters)
-            change = np.max(
-                np.abs(after - before) / np.maximum(np.abs(after).max(axis=0), np.finfo(float).tiny), initial=0.0
-            )
-            before = after
-            if change <= RESOLVED_CHANGE:
-                break
-            if 2 * len(d) >= MOST_ELEMENT_POINTS:
-                code = CONVERGED if change <= LARGEST_OUTPUT_CHANGE else NOT_RESOLVED
-                break
-        return Solved(on_grid(d, 2 * len(d)), code, history), found_by
+                return d, code, history
+            d, (after, share) = finer, self._outputs(finer, parameters)
+            sizes = np.maximum(np.abs(after).max(axis=0), np.finfo(float).tiny)
+            before, change = after, float(np.max(np.abs(after - before) / sizes, initial=0.0))
+        return d, CONVERGED, history
 
     def _fewest(self) -> int:
         """Return the number of points with which to start: enough for the harmonics of the inputs."""
@@ -328,7 +378,7 @@ class CondensedEquations(PeriodicEquations):
         """Follow the branch of solutions d while the load grows from zero, through folds; None if that fails."""
         points = 2 * len(start)
         matrices, rates = self.matrices(parameters, points)[0], self.rates(points)
-        full = _times(matrices.d_u, self.input_harmonics(points))
+        full = times(matrices.d_u, self.input_harmonics(points))
         d, code, _ = self._newton(parameters, start, 0.0, matrices)
         load, unit, step = 0.0, float(np.linalg.norm(full)), FIRST_LOAD_STEP
         if code != CONVERGED or not unit > 0.0:
@@ -338,9 +388,9 @@ class CondensedEquations(PeriodicEquations):
             """Return the solution in the plane across a direction, and the tangent there."""
             size = np.inf
             for _ in range(MOST_LOAD_CORRECTIONS):
-                forces, _ = self.forces(d, parameters)
+                forces = self.forces(d, parameters)
                 inverse = Preconditioner(forces, rates, matrices.d_f)
-                residual, _ = _residual(d, forces, matrices, load * full)
+                residual, _ = residual_of(d, forces, matrices, load * full)
                 by_residual, by_load = _stacked(inverse(residual), unit), _stacked(inverse(full), unit)
                 change = along[:-1] @ by_residual / (along[:-1] @ by_load + along[-1])
                 move, last = _unstacked(change * by_load - by_residual, unit, d.shape), size
@@ -373,14 +423,19 @@ class CondensedEquations(PeriodicEquations):
             step = min(1.5 * step, LARGEST_LOAD_STEP * (1.0 + float(np.linalg.norm(there)) / unit))
         return None
 
-    def _outputs(self, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        matrices, forces = self.matrices(parameters, 2 * len(d))[0], self.forces(d, parameters)[0]
-        load = self.input_harmonics(2 * len(d))
-        return self.on_points(_times(matrices.y_u, load) - _times(matrices.y_f, harmonics(forces.values)))
+    def _outputs(self, d: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the outputs on the experiment's grid, and the bound of their error by the number of points."""
+        matrices, f = self.matrices(parameters, 2 * len(d))[0], harmonics(self.forces(d, parameters).values)
+        y = times(matrices.y_u, self.input_harmonics(2 * len(d))) - times(matrices.y_f, f)
+        return self.on_points(y), float(unresolved(matrices.largest, f, y))
+
+    def error_bound(self, z: np.ndarray, parameters: np.ndarray) -> float:
+        """Return the bound of the relative error of the outputs by the number of points, see `unresolved`."""
+        return self._outputs(harmonics(z), parameters)[1]
 
     def outputs(self, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return the outputs (points, channels) on the experiment's grid."""
-        return self._outputs(harmonics(z), parameters)
+        return self._outputs(harmonics(z), parameters)[0]
 
     def sensitivities_along(
         self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
@@ -401,6 +456,34 @@ class CondensedEquations(PeriodicEquations):
         result = self._sensitivities(z, parameters, of_frequency, directions[..., : len(self.model.inputs)])
         return result and result._replace(frequency=frequency)
 
+    def slopes(
+        self, d: np.ndarray, parameters: np.ndarray, directions: list[int]
+    ) -> tuple[Forces, ResponseMatrices, np.ndarray, np.ndarray]:
+        """Return forces, frequency response, and what changes of parameters add to d and outputs with d held.
+
+        `directions` are indices of parameters, their number standing for the frequency; the latter are (directions,
+        harmonics, elements) and (directions, harmonics, outputs).
+        """
+        points, rates = 2 * len(d), self.rates(2 * len(d))
+        matrices, changes = self.matrices(parameters, points, directions)
+        forces = self.forces(d, parameters)
+        f, load = harmonics(forces.values), self.input_harmonics(points)
+        slopes, size = np.zeros((points, self.count, len(directions))), parameters.size
+        of_elements = [index for index, n in enumerate(directions) if n < size]
+        if of_elements:
+            slopes[..., of_elements] = self.forces_by_parameters(d, parameters)[
+                ..., [directions[n] for n in of_elements]
+            ]
+        for index in (i for i, n in enumerate(directions) if n == size):
+            slopes[..., index] = forces.damping * on_grid(1j * rates[:, None] * d, points) / self.frequency
+        of_forces = harmonics(slopes.reshape(points, self.count * len(directions))).reshape(
+            len(d), self.count, len(directions)
+        )
+        direct = np.moveaxis(of_forces, -1, 0)
+        of_d = times(changes.d_u, load) - times(changes.d_f, f) - times(matrices.d_f, direct)
+        of_y = times(changes.y_u, load) - times(changes.y_f, f) - times(matrices.y_f, direct)
+        return forces, matrices, of_d, of_y
+
     def _sensitivities(
         self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray, inputs: np.ndarray | None = None
     ) -> Sensitivities | None:
@@ -410,26 +493,15 @@ class CondensedEquations(PeriodicEquations):
         """
         d, points, rates = harmonics(z), len(z), self.rates(len(z))
         used = np.flatnonzero(directions.any(axis=0))
-        matrices, changes = self.matrices(parameters, points, used.tolist())
-        forces, by_theta = self.forces(d, parameters)
-        f, load = harmonics(forces.values), self.input_harmonics(points)
-        velocity = on_grid(1j * rates[:, None] * d, points)
-        slopes = np.concatenate([by_theta, (forces.damping * velocity / self.frequency)[..., None]], axis=-1)
-        direct = np.moveaxis(
-            harmonics(slopes[..., used].reshape(points, self.count * used.size)).reshape(len(d), self.count, used.size),
-            -1,
-            0,
-        )
-        of_d = _times(changes.d_u, load) - _times(changes.d_f, f) - _times(matrices.d_f, direct)
-        of_y = _times(changes.y_u, load) - _times(changes.y_f, f) - _times(matrices.y_f, direct)
+        forces, matrices, of_d, of_y = self.slopes(d, parameters, used.tolist())
         right, explicit = (np.tensordot(directions[:, used], part, (1, 0)) for part in (of_d, of_y))
         if inputs is not None:
             more = self.input_harmonics(points, inputs)
-            right, explicit = right + _times(matrices.d_u, more), explicit + _times(matrices.y_u, more)
+            right, explicit = right + times(matrices.d_u, more), explicit + times(matrices.y_u, more)
         moved = _linear_solve(forces, rates, matrices.d_f, right)
         if moved is None:
             return None
-        outputs = explicit - _times(matrices.y_f, _linearised(forces, rates, moved))
+        outputs = explicit - times(matrices.y_f, _linearised(forces, rates, moved))
         return Sensitivities(on_grid(moved, points), self.on_points(outputs), np.zeros(len(directions)))
 
 
@@ -474,6 +546,19 @@ def sampled(amplitudes: np.ndarray, points: int) -> np.ndarray:
     return on_grid(amplitudes, every * points)[..., ::every, :]
 
 
+def unresolved(largest: np.ndarray, f: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return a bound of the relative error of the outputs by the number of points, (…).
+
+    Sampled forces f (…, harmonics, elements) have the harmonics beyond half the points added to the low ones. They are
+    smaller than the largest of the upper half of the harmonics, which is taken to act at that where the frequency
+    response to it is `largest` (outputs, elements). Outputs y are (…, harmonics, outputs).
+    """
+    upper = f[..., f.shape[-2] // 2 :, :]
+    above = np.sqrt(np.max(upper.real**2 + upper.imag**2, axis=-2))
+    size = np.sqrt(np.einsum("...kc,...kc->...c", y.real, y.real) + np.einsum("...kc,...kc->...c", y.imag, y.imag))
+    return np.asarray(np.max(above @ largest.T / np.maximum(size, np.finfo(float).tiny), axis=-1))
+
+
 def _stacked(amplitudes: np.ndarray, unit: float) -> np.ndarray:
     return np.concatenate([amplitudes.real.ravel(), amplitudes.imag.ravel()]) / unit
 
@@ -483,13 +568,16 @@ def _unstacked(vector: np.ndarray, unit: float, shape: tuple[int, ...]) -> np.nd
     return (real + 1j * imaginary).reshape(shape)
 
 
-def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return matrices (…, rows, columns) times vectors (…, columns)."""
     return (matrices @ vectors[..., None])[..., 0]
 
 
-def _residual(d: np.ndarray, forces: Forces, matrices: ResponseMatrices, free: np.ndarray) -> tuple[np.ndarray, float]:
+def residual_of(
+    d: np.ndarray, forces: Forces, matrices: ResponseMatrices, free: np.ndarray
+) -> tuple[np.ndarray, float]:
     """Return the residual and the size of its terms."""
-    parts = d, _times(matrices.d_f, harmonics(forces.values)), -free
+    parts = d, times(matrices.d_f, harmonics(forces.values)), -free
     return parts[0] + parts[1] + parts[2], max(*(float(np.linalg.norm(part)) for part in parts), np.finfo(float).tiny)
 
 
@@ -508,7 +596,7 @@ def _linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.
         return None
     x = inverse(right)
     for _ in range(MOST_LINEAR_SWEEPS):
-        step = inverse(right - x - _times(d_f, _linearised(forces, rates, x)))
+        step = inverse(right - x - times(d_f, _linearised(forces, rates, x)))
         x = x + step
         size = float(np.linalg.norm(x))
         if not np.isfinite(size):

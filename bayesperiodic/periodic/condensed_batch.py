@@ -7,18 +7,21 @@ import numpy as np
 from bayesperiodic.periodic.batch import Anchor, in_blocks
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STALLED, BatchSolution
 from bayesperiodic.periodic.condensed import (
+    RESOLVED_SHARE,
     CondensedEquations,
     Preconditioner,
     ResponseMatrices,
     harmonics,
     on_grid,
     resized,
+    unresolved,
 )
 from bayesperiodic.periodic.receptance import compiled
 
 FEWEST_CONDENSED_SOLVES = 4
-# Parts of the way from an anchor in which a solution is followed, and largest change in units of the predicted one.
-LARGEST_PATH_PART, SMALLEST_PATH_PART, STRAIGHT_PATH = 0.25, 1.0 / 256.0, 0.5
+# Parts of the way from an anchor in which a solution is followed, and largest correction in units of the predicted
+# change or, where a contact begins, of this part of the solution.
+LARGEST_PATH_PART, SMALLEST_PATH_PART, STRAIGHT_PATH, LEAST_PATH_CHANGE = 0.25, 1.0 / 256.0, 0.5, 0.01
 
 
 class CondensedBatch:
@@ -39,6 +42,7 @@ class CondensedBatch:
             ]
         )
         self._matrices = [e.matrices(a.parameters, points)[0] for e, a in zip(sets, anchors, strict=True)]
+        self._largest = [matrices.largest for matrices in self._matrices]
         self._load = np.stack([e.input_harmonics(points) for e in sets])
         self._rates = np.array([2 * np.pi * e.frequency for e in sets])
         self._known = np.array([a.sensitivities is not None for a in anchors])
@@ -52,7 +56,7 @@ class CondensedBatch:
         """Return the transposed inverses of the sets, all of the largest number of low harmonics, and that number."""
         given = []
         for e, anchor, d, matrices in zip(self._sets, self._anchors, self._d, self._matrices, strict=True):
-            given.append((e.forces(d, anchor.parameters)[0], e.rates(self._points), matrices.d_f))
+            given.append((e.forces(d, anchor.parameters), e.rates(self._points), matrices.d_f))
         low, inverses = 1, []
         for known, part in zip(self._known, given, strict=True):
             if known:
@@ -90,8 +94,9 @@ class CondensedBatch:
     ) -> BatchSolution:
         """Solve every input set for every parameter vector; arguments and result as those of `batch.Batch.solve`.
 
-        Solutions are corrected from the linear prediction of the anchor, or else followed from it in steps. z has the
-        grid of the anchor with the most points.
+        Solutions are corrected from the linear prediction of the anchor, or else followed from it in steps, on the grid
+        of the anchor with the most points. Where that grid does not resolve the outputs, the points are doubled; if the
+        most points do not resolve them, the status is "not resolved". z has the grid of the most points.
         """
         first, count = self._sets[0], len(self._sets)
         every = np.empty((count, *parameters.shape[-2:]))
@@ -111,13 +116,13 @@ class CondensedBatch:
         free = np.empty(d_f.shape[:-1], dtype=complex)
         for e, response in enumerate(responses):
             d_f[e], free[e] = response.d_f, _unforced(response.d_u, self._load[e])
-        turns, place = self._transform
+        turns, reversed_bits = self._transform
         address = first.model.element_kernels.residual.address if first.count else 0
 
         def part(block: tuple[int, int]) -> None:
             compiled().correct_many(
                 address, d_f, free, self._inverse, self._low, every, self._rates, float(first.grid.periods), turns,
-                place, polish, *block, moved, d, f, lost, steps,
+                reversed_bits, polish, *block, moved, d, f, lost, steps,
             )  # fmt: skip
 
         in_blocks(part, lost.size, FEWEST_CONDENSED_SOLVES, threads)
@@ -127,16 +132,28 @@ class CondensedBatch:
                 status[e, b] = STALLED
                 continue
             d[e, b], status[e, b], more = self._follow(e, every[e, b])
-            f[e, b] = harmonics(self._sets[e].forces(d[e, b], every[e, b])[0].values)
+            f[e, b] = harmonics(self._sets[e].forces(d[e, b], every[e, b]).values)
             steps[e, b] += more
-        outputs = np.stack([self._outputs(e, responses[e], f[e]) for e in range(count)])
-        z = on_grid(d, self._points) if keep else np.empty((count, solves, 0, first.count))
+        every_y = [
+            _unforced(r.y_u, load) - (r.y_f @ y[..., None])[..., 0]
+            for r, load, y in zip(responses, self._load, f, strict=True)
+        ]
+        outputs = np.stack([e.on_points(y) for e, y in zip(self._sets, every_y, strict=True)])
+        shares = np.stack([unresolved(*of_set) for of_set in zip(self._largest, f, every_y, strict=True)])
+        finer = {}
+        for e, b in np.argwhere((status == CONVERGED) & ~(shares <= RESOLVED_SHARE)):
+            equations, theta = self._sets[e], every[e, b]
+            finer[e, b], status[e, b], history = equations.doubled(theta, d[e, b])
+            outputs[e, b] = equations.outputs(on_grid(finer[e, b], 2 * len(finer[e, b])), theta)
+            steps[e, b] += len(history)
+        z = np.empty((count, solves, 0, first.count))
+        if keep:
+            points = max([self._points, *(2 * len(amplitudes) for amplitudes in finer.values())])
+            z = on_grid(d, points)
+            for place, amplitudes in finer.items():
+                z[place] = on_grid(amplitudes, points)
         frequency = np.repeat([[e.frequency] for e in self._sets], solves, axis=1)
         return BatchSolution(z, outputs, frequency, status, steps)
-
-    def _outputs(self, e: int, response: ResponseMatrices, f: np.ndarray) -> np.ndarray:
-        given = _unforced(response.y_u, self._load[e]) - (response.y_f @ f[..., None])[..., 0]
-        return self._sets[e].on_points(given)
 
     def _follow(self, e: int, parameters: np.ndarray) -> tuple[np.ndarray, int, int]:
         """Follow a solution from the anchor in steps; return it, the status, and Newton's steps."""
@@ -152,7 +169,7 @@ class CondensedBatch:
             predicted = here + step * ahead
             solved = equations.solve(there, on_grid(predicted, self._points))
             used, d = used + len(solved.history), harmonics(solved.z)
-            size = float(np.linalg.norm(step * ahead))
+            size = max(float(np.linalg.norm(step * ahead)), LEAST_PATH_CHANGE * float(np.linalg.norm(d)))
             straight = np.linalg.norm(d - predicted) <= STRAIGHT_PATH * size and np.all(solved.history[:, 2] == 1.0)
             if solved.code != CONVERGED or not straight:
                 step *= 0.5

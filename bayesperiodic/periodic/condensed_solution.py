@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
-from bayesperiodic.periodic.condensed import CondensedEquations, Forces, harmonics, on_grid, receptance, resized
+from bayesperiodic.periodic.condensed import CondensedEquations, harmonics, receptance, resized
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
+from bayesperiodic.periodic.receptance import compiled
 from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, by_name, describe
 
-# Lowest modes in which the linearised equations are solved; half of them give the error.
-MOST_MODES, MOST_MODAL_STEPS = 16, 1024
+# Lowest modes in which the linearised equations are solved; half of them give the error, with these steps in time.
+MOST_MODES, MODE_ERROR_STEPS = 16, 128
+# Steps in time, and relative change of the largest modulus by twice as many, below which these are enough; with many
+# steps, also that in units of the distance from the unit circle.
+FEWEST_MODAL_STEPS, MANY_MODAL_STEPS, MOST_MODAL_STEPS, MODAL_ERROR, CLEAR_OF_CIRCLE = 64, 1024, 4096, 1e-8, 1e-3
+LEAST_TURN = 1e-7  # of an undamped mode in a step, below which the formula of a critically damped one is taken
 
 
 @dataclass(frozen=True, repr=False)
@@ -30,7 +34,7 @@ class CondensedSolution(PeriodicSolution):
         The multipliers, those of the 16 lowest modes at most; the elements bend the other modes statically. Those below
         about 1e-12 are rounding errors. None unless converged.
     multiplier_error : float
-        Estimated error of the largest modulus: its change with half of the steps in time, and of the modes.
+        Estimated error of the largest modulus: its change with half of the steps in time, and with half of the modes.
     changes : dict of str to float
         See `error_estimate`.
     """
@@ -56,8 +60,7 @@ class CondensedSolution(PeriodicSolution):
 
     @property
     def _others(self) -> np.ndarray:
-        with np.errstate(divide="ignore"):
-            return np.log(self.of_modes)
+        return np.log(np.where(self.of_modes == 0.0, np.finfo(float).tiny, self.of_modes))
 
     @cached_property
     def stability_unknown(self) -> str:
@@ -84,18 +87,18 @@ def described(
     if not isinstance(equations, CondensedEquations):
         return describe(equations, theta, solved, found_by, sensitivities)
     model, grid, code, z = equations.model, equations.grid, solved.code, solved.z
-    every, names = equations.of_all_states, (*model.parameters, FREQUENCY)
+    names = (*model.parameters, FREQUENCY)
     of_outputs, of_states = {}, {}
     if code == CONVERGED and sensitivities:
-        parts = [e.parameter_sensitivities(z, theta) for e in (equations, every)]
+        parts = [e.parameter_sensitivities(z, theta) for e in (equations, equations.of_all_states)]
         if parts[0] is None or parts[1] is None:
             code = SINGULAR
         else:
             of_outputs = by_name(parts[0].outputs, model.outputs, names)
             of_states = by_name(parts[1].outputs, model.states, names)
-    states, outputs = every.outputs(z, theta), equations.outputs(z, theta)
-    coarse = on_grid(resized(harmonics(z), len(z) // 2), len(z) // 2)
-    changes = np.abs(every.outputs(coarse, theta) - states).max(axis=0).tolist()
+    outputs, residual = equations.outputs_and_residual(z, theta)
+    states, coarse = equations.displacements(z, theta)
+    changes = np.abs(coarse - states).max(axis=0).tolist()
     multipliers, error = modal_multipliers(equations, theta, z) if code == CONVERGED else (np.empty(0, complex), np.nan)
     return CondensedSolution(
         model=model.name,
@@ -119,7 +122,7 @@ def described(
         linearisation=np.empty((0, 0, 0)),
         twice_the_points=np.empty((0, 0)),
         iterations=len(solved.history),
-        residual=equations.scaled_residual(z, theta),
+        residual=residual,
         history=solved.history,
         of_modes=multipliers,
         multiplier_error=error,
@@ -127,74 +130,109 @@ def described(
     )
 
 
-class _ModalEquations(NamedTuple):
-    """Linearised equations in the coordinates of the lowest modes, of unit modal mass."""
+def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the Floquet multipliers in the lowest modes, largest first, and the error of the largest modulus.
 
-    stiffness: np.ndarray  # (modes, modes)
-    damping: np.ndarray
-    at: np.ndarray  # (elements, modes), displacements of the elements
-    compliance: np.ndarray  # (elements, elements), static one of the other modes
+    The maps over the period with steps h, h/2, h/4, … are extrapolated in even powers of h ([1]_) until the largest
+    modulus does not change any more.
 
-    def monodromy(self, forces: Forces, period: float) -> np.ndarray:
-        """Return the map of (q, q̇) over the period, of as many steps as the forces have points.
+    References
+    ----------
+    .. [1] W. B. Gragg, On extrapolation algorithms for ordinary initial value problems, SIAM Journal on Numerical
+       Analysis 2 (1965) 384-403.
+    """
+    motion = _Linearised(equations, theta, harmonics(z), MOST_MODES)
+    steps, row, largest = FEWEST_MODAL_STEPS, [motion.monodromy(FEWEST_MODAL_STEPS)], []
+    while True:
+        values = np.linalg.eigvals(row[-1]).astype(complex)
+        largest.append(float(np.abs(values).max()))
+        error = abs(largest[-1] - largest[-2]) if len(largest) > 1 else np.inf
+        clear = CLEAR_OF_CIRCLE * abs(largest[-1] - 1.0) if steps >= MANY_MODAL_STEPS else 0.0
+        if steps >= MOST_MODAL_STEPS or (len(row) > 2 and error <= max(clear, MODAL_ERROR * largest[-1])):
+            break
+        steps, before, row = 2 * steps, row, [motion.monodromy(2 * steps)]
+        for order, coarse in enumerate(before, start=1):
+            row.append(row[-1] + (row[-1] - coarse) / (4.0**order - 1.0))
+    values = values[np.argsort(-np.abs(values), kind="stable")]
+    if len(motion.modes.stiffness) < len(equations.model.states):
+        fewer = _Linearised(equations, theta, harmonics(z), MOST_MODES // 2)
+        of_fewer, of_all = (np.abs(np.linalg.eigvals(m.monodromy(MODE_ERROR_STEPS))).max() for m in (fewer, motion))
+        error += abs(float(of_fewer - of_all))
+    return values, error
+
+
+class _Linearised:
+    """Linearised equations of a solution of harmonics d in the coordinates of the lowest modes."""
+
+    def __init__(self, equations: CondensedEquations, theta: np.ndarray, d: np.ndarray, count: int):
+        self._equations, self._theta, self._d = equations, theta, d
+        self.modes = modes = receptance(equations.model).lowest(theta, count, equations.model.structure.weights)
+        self._period, size = equations.grid.periods / equations.frequency, len(modes.stiffness)
+        (elements, _), zero = modes.at.shape, np.zeros_like(modes.at)
+        self._places = np.block([[modes.at, zero], [zero, modes.at]])
+        self._forcing = np.ascontiguousarray(np.concatenate([zero, modes.at], axis=1).T)
+        self._diagonal = not any((a - np.diag(np.diag(a))).any() for a in (modes.stiffness, modes.damping))
+        self._size, self._elements = size, elements
+        self._known = self._couplings(max(2 * len(d), MODE_ERROR_STEPS))
+
+    def _couplings(self, points: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return springs and dampers of the elements in series with the other modes, (points, elements, elements)."""
+        unit, forces = np.eye(self._elements), self._equations.forces(resized(self._d, points), self._theta)
+        springs, dampers = (part[..., None] * unit for part in forces[1:])
+        if self.modes.compliance.any():
+            series = np.linalg.inv(unit + springs @ self.modes.compliance)
+            springs, dampers = series @ springs, series @ dampers @ series.transpose(0, 2, 1)
+        return springs, dampers
+
+    def _free(self, length: float) -> np.ndarray:
+        """Return the motion without elements over a time."""
+        stiffness, damping = self.modes.stiffness, self.modes.damping
+        if not self._diagonal:
+            zero, one = np.zeros_like(stiffness), np.eye(self._size)
+            return np.asarray(scipy.linalg.expm(length * np.block([[zero, one], [-stiffness, -damping]])))
+        decay, squares = 0.5 * np.diag(damping), np.diag(stiffness)
+        turn = np.sqrt((squares - decay**2).astype(complex))
+        turn = np.where(np.abs(turn) * length < LEAST_TURN, LEAST_TURN / length, turn)
+        forth, back = np.exp((-decay + 1j * turn) * length), np.exp((-decay - 1j * turn) * length)
+        even, odd = (0.5 * (forth + back)).real, ((forth - back) / (2j * turn)).real
+        result, q = np.zeros((2 * self._size, 2 * self._size)), np.arange(self._size)
+        v = q + self._size
+        result[q, q], result[q, v] = even + decay * odd, odd
+        result[v, q], result[v, v] = -squares * odd, even - decay * odd
+        return result
+
+    def monodromy(self, steps: int) -> np.ndarray:
+        """Return the map of (q, q̇) over the period in steps, of second order.
 
         Each step is the exact motion of the linear structure between two points, at which the elements act for half of
-        the step ([1]_). The error is of second order.
+        the step ([1]_), with their mean over it.
 
         References
         ----------
         .. [1] G. Strang, On the construction and comparison of difference schemes, SIAM Journal on Numerical Analysis 5
            (1968) 506-517.
         """
-        modes, (steps, elements) = len(self.stiffness), forces.values.shape
-        length, unit = period / steps, np.eye(elements)
-        springs, dampers = (part[..., None] * unit for part in forces[1:])
-        series = np.linalg.inv(unit + springs @ self.compliance)
-        springs, dampers = series @ springs, series @ dampers @ series.transpose(0, 2, 1)
-        # ∫ exp(−s D G) ds over half a step, D the dampers, G = at·atᵀ, is a block of a larger matrix's exponential.
-        larger = np.zeros((steps, 2 * elements, 2 * elements))
-        larger[:, :elements, :elements] = -0.5 * length * dampers @ (self.at @ self.at.T)
-        larger[:, :elements, elements:] = 0.5 * length * unit
-        acting = scipy.linalg.expm(larger)[:, :elements, elements:] if elements else springs
-        kicks = np.tile(np.eye(2 * modes), (steps, 1, 1))
-        kicks[:, modes:, :modes] -= self.at.T @ acting @ springs @ self.at
-        kicks[:, modes:, modes:] -= self.at.T @ acting @ dampers @ self.at
-        zero = np.zeros((modes, modes))
-        free = np.block([[zero, np.eye(modes)], [-self.stiffness, -self.damping]])
-        products = np.roll(kicks, -1, axis=0) @ scipy.linalg.expm(length * free) @ kicks
-        while len(products) > 1:  # the number of points is a power of two
-            products = products[1::2] @ products[::2]
-        return np.asarray(products[0])
+        if steps > len(self._known[0]):
+            self._known = self._couplings(steps)
+        length, unit = self._period / steps, np.eye(self._elements)
+        springs, dampers = (_means(part, steps) for part in self._known)
+        result = np.eye(2 * self._size)
+        # The middle rule of velocities; two halves of a step make the kick of a whole one.
+        halves = 0.5 * length * np.concatenate([springs, dampers], axis=2)
+        kicks = 2.0 * halves
+        if dampers.any():
+            halves = np.linalg.solve(unit + 0.25 * length * dampers @ (self.modes.at @ self.modes.at.T), halves)
+            kicks = 2.0 * halves - halves @ (self._places @ self._forcing) @ halves
+        kicks[0] = halves[0]
+        free = self._free(length)
+        compiled().monodromy(free, self._diagonal, self._places, self._forcing, kicks, result)
+        return result
 
 
-def _modal_equations(equations: CondensedEquations, theta: np.ndarray, count: int) -> _ModalEquations:
-    linear, places = receptance(equations.model), equations.model.structure.weights
-    modes, (mass, damping, stiffness) = linear.lowest_modes(theta, count), linear.sums(theta)
-    modes = modes / np.sqrt(np.sum(modes * (mass @ modes), axis=0))
-    inverse = np.linalg.inv(modes.T @ mass @ modes)
-    at, within = places @ modes, modes.T @ stiffness @ modes
-    compliance = places @ np.linalg.solve(stiffness, places.T) - at @ np.linalg.solve(within, at.T)
-    return _ModalEquations(inverse @ within, inverse @ modes.T @ damping @ modes, at, compliance)
-
-
-def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the Floquet multipliers in the lowest modes, largest first, and the error of the largest modulus."""
-    period, d = equations.grid.periods / equations.frequency, harmonics(z)
-    several = _modal_equations(equations, theta, MOST_MODES)
-    fastest = float(np.sqrt(np.abs(np.linalg.eigvals(several.stiffness)).max()))
-    steps = max(len(z), min(MOST_MODAL_STEPS, 1 << int(np.ceil(np.log2(max(1.0, period * fastest))))))
-    grids = [equations.forces(resized(d, every * steps), theta)[0] for every in (1, 2, 4)]
-    one, two, four = (several.monodromy(forces, period) for forces in grids)
-    # Richardson's extrapolation of even powers of the step.
-    coarse, fine = (two + (two - one) / 3.0, four + (four - two) / 3.0)
-    values = np.linalg.eigvals(fine + (fine - coarse) / 15.0).astype(complex)
-    values = values[np.argsort(-np.abs(values), kind="stable")]
-    largest = float(np.abs(values[0]))
-    error = abs(largest - float(np.abs(np.linalg.eigvals(fine)).max()))
-    if len(several.stiffness) < len(equations.model.states):
-        fewer = _modal_equations(equations, theta, MOST_MODES // 2)
-        error += abs(
-            float(np.abs(np.linalg.eigvals(fewer.monodromy(grids[2], period))).max())
-            - float(np.abs(np.linalg.eigvals(four)).max())
-        )
-    return values, error
+def _means(values: np.ndarray, count: int) -> np.ndarray:
+    """Return the means (count, …) of periodic values (points, …) around fewer points, a power of two both."""
+    every = len(values) // count
+    if every == 1:
+        return values
+    sums = [np.roll(values, every // 2 - shift, axis=0).reshape(count, every, -1).mean(axis=1) for shift in (0, 1)]
+    return 0.5 * (sums[0] + sums[1]).reshape(count, *values.shape[1:])

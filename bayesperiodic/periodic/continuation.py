@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from scipy.optimize import brentq
@@ -16,9 +16,12 @@ from tqdm import tqdm
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic.models.model import Model
+from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.arclength import INPUTS, BranchPoint, ParametrisedEquations, Tracer, trace
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR
+from bayesperiodic.periodic.condensed import CondensedEquations
+from bayesperiodic.periodic.condensed_branch import CondensedParametrised
+from bayesperiodic.periodic.condensed_solution import described
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved, null_vector
 from bayesperiodic.periodic.solution import (
     PeriodicSolution,
@@ -245,6 +248,8 @@ def iterate_periodic(
     0.303
     """
     equations, parameters, z = equations_of(model, solution)
+    if isinstance(equations, CondensedEquations):  # on as many points as it takes
+        z = equations.find(parameters, z)[0].z
     parametrised, values = _parametrised(equations, parameters, vary)
     until = _checks.finite_number("until", until)
     if vary == FREQUENCY:
@@ -289,6 +294,8 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
     >>> doubled.periods, doubled.winding, doubled.stable
     (2, {'phi': 2}, True)
     """
+    if isinstance(model, CondensedModel):
+        raise model.refusal()
     equations, parameters, z = equations_of(model, solution)
     if np.min(abs(solution.multipliers + 1.0), initial=np.inf) > 0.1:
         raise ValueError(
@@ -319,6 +326,7 @@ def _parametrised(
 ) -> tuple[ParametrisedEquations, np.ndarray]:
     """Return the equations with the varied quantity (and an autonomous model's frequency) free, and its values."""
     model = equations.model
+    kind: Any = CondensedParametrised if isinstance(equations, CondensedEquations) else ParametrisedEquations
     allowed = [*model.parameters, *model.inputs, *([] if model.autonomous else [FREQUENCY])]
     _checks.one_of("vary", vary, allowed)
     free, frequency = ((FREQUENCY,), [equations.frequency]) if model.autonomous else ((), [])
@@ -327,15 +335,15 @@ def _parametrised(
         change = np.zeros_like(equations.inputs)
         change[:, column::width] = equations.inputs[:, column::width]
         base = replace(equations, inputs=equations.inputs - change)
-        return ParametrisedEquations(base, parameters, (INPUTS, *free), change), np.array([1.0, *frequency])
+        return kind(base, parameters, (INPUTS, *free), change), np.array([1.0, *frequency])
     value = equations.frequency if vary == FREQUENCY else parameters[model.parameters.index(vary)]
-    return ParametrisedEquations(equations, parameters, (vary, *free)), np.array([value, *frequency])
+    return kind(equations, parameters, (vary, *free)), np.array([value, *frequency])
 
 
 def _solution(parametrised: ParametrisedEquations, point: BranchPoint, sensitivities: bool = False) -> PeriodicSolution:
     equations, parameters = parametrised.at(point.values)
     solved = Solved(point.z, CONVERGED, np.empty((0, 3)))
-    return describe(equations, parameters, solved, FOUND_BY, sensitivities)
+    return described(equations, parameters, solved, FOUND_BY, sensitivities)
 
 
 def _special_points(
@@ -385,11 +393,11 @@ class _Lost(Exception):
 
 def _doubling_test(solution: PeriodicSolution) -> float:
     """Return a test function that changes its sign where a multiplier passes −1; NaN if the orbit is not resolved."""
-    floquet = solution.floquet if solution.resolved else None
-    exponents = floquet.exponents if floquet is not None else np.array([np.nan])
-    growth = np.abs(exponents.real)
-    parts = np.exp(-growth) + np.exp(exponents - growth)
-    return float(np.prod(parts).real)
+    exponents = solution.exponents * solution.period if solution.resolved else np.empty(0)
+    if not exponents.size:
+        return np.nan
+    growth = np.maximum(exponents.real, 0.0)
+    return float(np.prod(np.exp(-growth) + np.exp(exponents - growth)).real)
 
 
 def solutions_at(model: Model, branch: Branch, value: float) -> tuple[PeriodicSolution, ...]:

@@ -1,16 +1,20 @@
 """Frequency response of a linear structure between few places, with its derivatives by all parameters."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
 
 from bayesperiodic._compile.cache import load
 from bayesperiodic.models.structure import CONSTANT_PART, LEAST_REGULAR, POWERS, MatrixStructure
+
+# Arrays at the same point that are not computed again, and rows beyond which they are not kept.
+REMEMBERED_ARRAYS, MOST_REMEMBERED_ROWS = 8, 16
 
 
 @dataclass(frozen=True)
@@ -19,6 +23,15 @@ class LinearResponse:
 
     values: np.ndarray
     derivatives: np.ndarray
+
+
+class LowestModes(NamedTuple):
+    """Linear equations in the coordinates of the lowest modes, of unit modal mass."""
+
+    stiffness: np.ndarray  # (modes, modes)
+    damping: np.ndarray
+    at: np.ndarray  # (elements, modes), displacements of the elements
+    compliance: np.ndarray  # (elements, elements), static one of the other modes
 
 
 class Receptance:
@@ -43,6 +56,18 @@ class Receptance:
         self._factors = np.array([-1 if n == CONSTANT_PART else parameters.index(n) for _, n, _ in parts])
         self._matrices = np.stack([a for *_, a in parts])
         self._size, self._regular = len(parameters), False
+        self._recent: dict[tuple[Any, ...], Any] = {}
+
+    def recent(self, key: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
+        """Return arrays that are computed, or were so recently with the same key."""
+        known = self._recent.get(key)
+        if known is None:
+            known = compute()
+            if len(self._rows) <= MOST_REMEMBERED_ROWS:
+                if len(self._recent) >= REMEMBERED_ARRAYS:
+                    self._recent = dict([*self._recent.items()][-REMEMBERED_ARRAYS // 2 :])
+                self._recent[key] = known
+        return known
 
     @cached_property
     def _modes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
@@ -52,6 +77,46 @@ class Receptance:
             return None
         return modes.diagonals, self._rows @ modes.vectors, self._columns @ modes.vectors
 
+    @cached_property
+    def _products(self) -> np.ndarray:
+        """Products of the modes at a row and a column, complex (modes, rows·columns)."""
+        assert self._modes is not None
+        _, rows, columns = self._modes
+        return np.ascontiguousarray((rows[:, None] * columns).reshape(-1, rows.shape[1]).T.astype(complex))
+
+    def displacements(
+        self, parameters: np.ndarray, frequency: float, harmonics: np.ndarray, forces: np.ndarray
+    ) -> np.ndarray:
+        """Return the displacements (…, harmonics, n) for forces (…, harmonics, columns)."""
+        factors = self.coefficients(parameters, 2 * np.pi * frequency * harmonics)
+        if self._modes is not None:
+            diagonals, _, columns = self._modes
+            modes = self._structure.matrices.modes
+            assert modes is not None
+            return np.asarray((forces @ columns) / (factors @ diagonals) @ modes.vectors.T)
+        stiffness, right = np.tensordot(factors, self._matrices, (1, 0)), np.moveaxis(forces @ self._columns, -2, 0)
+        sides = right.reshape(len(stiffness), -1, right.shape[-1]).transpose(0, 2, 1)
+        solved = np.linalg.solve(stiffness, sides).transpose(0, 2, 1).reshape(right.shape)
+        return np.moveaxis(solved, 0, -2)
+
+    def lowest(self, parameters: np.ndarray, count: int, places: np.ndarray) -> "LowestModes":
+        """Return the equations in the lowest undamped modes of unit mass; places are rows of weights."""
+        modes = self._structure.matrices.modes
+        if modes is not None:
+            factors = self._values(parameters)
+            mass, damping, stiffness = ((factors * (self._powers == power)) @ modes.diagonals for power in (2, 1, 0))
+            at, squares = places @ modes.vectors / np.sqrt(mass), stiffness / mass
+            compliance = at[:, count:] / squares[count:] @ at[:, count:].T
+            return LowestModes(
+                np.diag(squares[:count]), np.diag((damping / mass)[:count]), at[:, :count].copy(), compliance
+            )
+        vectors, (mass, damping, stiffness) = self.lowest_modes(parameters, count), self.sums(parameters)
+        vectors = vectors / np.sqrt(np.sum(vectors * (mass @ vectors), axis=0))
+        inverse = np.linalg.inv(vectors.T @ mass @ vectors)
+        at, within = places @ vectors, vectors.T @ stiffness @ vectors
+        compliance = places @ np.linalg.solve(stiffness, places.T) - at @ np.linalg.solve(within, at.T)
+        return LowestModes(inverse @ within, inverse @ vectors.T @ damping @ vectors, at, compliance)
+
     @property
     def modal(self) -> bool:
         """Whether one basis of real modes diagonalises all parts."""
@@ -59,13 +124,9 @@ class Receptance:
 
     def lowest_modes(self, parameters: np.ndarray, count: int) -> np.ndarray:
         """Return the lowest undamped modes (n, modes)."""
-        modes = self._structure.matrices.modes
-        if modes is not None:
-            return modes.vectors[:, :count]
         mass, _, stiffness = self.sums(parameters)
-        size = len(mass)
         given = 0.5 * (stiffness + stiffness.T), 0.5 * (mass + mass.T)
-        return np.asarray(scipy.linalg.eigh(*given, subset_by_index=(0, min(count, size) - 1))[1])
+        return np.asarray(scipy.linalg.eigh(*given, subset_by_index=(0, min(count, len(mass)) - 1))[1])
 
     def sums(self, parameters: np.ndarray) -> list[np.ndarray]:
         """Return mass, damping and stiffness matrix."""
@@ -95,11 +156,9 @@ class Receptance:
         slopes = [self._slope(d, parameters, rates, factors, frequency) for d in directions]
         if self._modes is not None:
             diagonals, rows, columns = self._modes
-            inverse = 1.0 / (factors @ diagonals)
-            values = np.einsum("ar,kr,br->kab", rows, inverse, columns, optimize=True)
-            changes = [
-                -np.einsum("ar,kr,br->kab", rows, inverse**2 * (s @ diagonals), columns, optimize=True) for s in slopes
-            ]
+            inverse, shape = 1.0 / (factors @ diagonals), (len(rates), len(rows), len(columns))
+            values = (inverse @ self._products).reshape(shape)
+            changes = [-(inverse**2 * (s @ diagonals) @ self._products).reshape(shape) for s in slopes]
         else:
             stiffness = np.tensordot(factors, self._matrices, (1, 0))
             right = np.linalg.solve(stiffness, np.broadcast_to(self._columns.T, (len(rates), *self._columns.T.shape)))
@@ -131,9 +190,9 @@ class Receptance:
         diagonals, rows, columns = self._modes
         factors = self._values(parameters)
         parts = [(factors * (self._powers == power)) @ diagonals for power in (2, 1, 0)]
-        products = (rows[:, None] * columns).reshape(-1, diagonals.shape[1])
+        products = np.ascontiguousarray(self._products.real.T)
         result = np.empty((len(parameters), len(harmonics), len(products)), dtype=complex)
-        compiled().modal_responses(np.ascontiguousarray(products), *parts, 2 * np.pi * frequency * harmonics, result)
+        compiled().modal_responses(products, *parts, 2 * np.pi * frequency * harmonics, result)
         return result.reshape(*result.shape[:2], len(rows), len(columns))
 
     @property

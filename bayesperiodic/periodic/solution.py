@@ -11,8 +11,9 @@ import numpy as np
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
-from bayesperiodic.models.model import Model
+from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
+from bayesperiodic.periodic.condensed import equations_for
 from bayesperiodic.periodic.equations import (
     FREQUENCY,
     BorderedFactors,
@@ -395,7 +396,7 @@ def equations_of(model: Model, solution: PeriodicSolution) -> tuple[PeriodicEqua
         raise ValueError(
             f"solution: must have converged, got status {solution.status!r}. Solve again from another guess."
         )
-    equations = PeriodicEquations.build(model, solution.inputs, **settings_of(solution))
+    equations = equations_for(model, solution.inputs, **settings_of(solution))
     parameters = np.array([solution.parameters[name] for name in model.parameters])
     return equations, parameters, periodic_part(equations, solution.states)
 
@@ -466,6 +467,8 @@ def multiplier_sensitivities(model: Model, solution: PeriodicSolution) -> dict[s
     >>> bool(np.isclose(sum(by_parameter["c"] / solution.multipliers), -10.0))
     True
     """
+    if isinstance(model, CondensedModel):
+        raise model.refusal()
     equations, theta, z = equations_of(model, solution)
     derivative = equations.parameter_sensitivities(z, theta)
     if solution.floquet is None or derivative is None:

@@ -10,7 +10,11 @@ from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
 from bayesperiodic.periodic import condensed, condensed_solution
+from bayesperiodic.periodic.batch import Anchor
+from bayesperiodic.periodic.compiled import STATUSES
 from bayesperiodic.periodic.condensed import CondensedEquations, receptance
+from bayesperiodic.periodic.condensed_batch import CondensedBatch
+from bayesperiodic.periodic.receptance import Receptance
 
 Element = bp.elements.Element
 VALUES = {"alpha": 0.05, "beta": 0.01, "spring_k3": 0.05, "air_drag": 0.1}
@@ -159,7 +163,8 @@ def test_multipliers_are_those_of_scipys_integration_of_the_linearised_equations
 def test_multipliers_in_few_modes_are_those_in_all_to_their_error(monkeypatch):
     """Of 24 degrees of freedom in 16 and in 24 modes; only the former have an error of the modes left out."""
     few = solved(24)
-    monkeypatch.setattr("bayesperiodic.periodic.condensed_solution.MOST_MODES", 24)
+    monkeypatch.setattr(condensed_solution, "MOST_MODES", 24)
+    monkeypatch.setattr(condensed_solution, "CLEAR_OF_CIRCLE", 0.0)
     every = solved(24)
     assert few.multipliers.shape == (32,) and every.multipliers.shape == (48,)
     difference = abs(abs(few.multipliers[0]) - abs(every.multipliers[0]))
@@ -178,11 +183,11 @@ def test_modes_left_out_bend_statically(monkeypatch):
     rate = np.sqrt(np.linalg.eigvals(np.linalg.solve(mass, stiffness + tip)).real.min() - 0.025**2)
     exact, errors = np.exp((-0.025 + 1j * rate) / 0.1), []
     monkeypatch.setattr(condensed_solution, "MOST_MODES", 3)
-    modal = condensed_solution._modal_equations
+    modal = Receptance.lowest
     for scale in (1, 0):
         monkeypatch.setattr(
-            condensed_solution,
-            "_modal_equations",
+            Receptance,
+            "lowest",
             lambda *given, scale=scale: (m := modal(*given))._replace(compliance=scale * m.compliance),
         )
         solution = bp.solve_periodic(
@@ -201,11 +206,11 @@ def test_newtons_matrix_is_that_of_the_linearised_equations():
     response = equations.matrices(theta, 32)[0].d_f
 
     def residual(at):
-        forces = condensed.harmonics(equations.forces(at, theta)[0].values)
+        forces = condensed.harmonics(equations.forces(at, theta).values)
         return at + (response @ forces[..., None])[..., 0]
 
     change = (residual(d + 1e-6 * step) - residual(d - 1e-6 * step)) / 2e-6
-    inverse = condensed.Preconditioner(equations.forces(d, theta)[0], equations.rates(32), response, 16)
+    inverse = condensed.Preconditioner(equations.forces(d, theta), equations.rates(32), response, 16)
     np.testing.assert_allclose(inverse(change), step, atol=1e-6)
 
 
@@ -289,8 +294,9 @@ def test_structure_that_moves_without_deformation_is_refused():
 def test_what_needs_symbolic_equations_is_refused_with_the_alternative():
     model, solution = beam(12), solved(12)
     for call in (
-        lambda: bp.continue_periodic(model, solution, vary="frequency", until=0.1),
+        lambda: bp.double_period(model, solution, "frequency"),
         lambda: bp.structure(model),
+        lambda: bp.double_period(model, solution, "frequency"),
         lambda: bp.multiplier_sensitivities(model, solution),
         lambda: bp.simulate(model, VALUES, {"force": FORCE}, frequency=FREQUENCY, duration=1.0, sampling_rate=10.0),
     ):
@@ -298,3 +304,160 @@ def test_what_needs_symbolic_equations_is_refused_with_the_alternative():
             call()
     with pytest.raises(ValueError, match="scheme: must be 'fourier' or None"):
         solved(12, scheme="central4")
+
+
+STOPPED = {"alpha": 0.5, "stop_k": 10.0, "stop_clearance": 0.6}
+
+
+@cache
+def stopped():
+    """Return a beam of 6 degrees of freedom with a stiff and sharp stop."""
+    mass, stiffness = matrices(6)
+    return bp.Model.from_matrices(
+        "stopped", mass=mass, stiffness=stiffness, damping={"alpha": mass}, forces={"force": 5}, condensed=True,
+        outputs={"x": (5, "displacement"), "v": (2, "velocity")},
+        elements=[Element("stop", lambda d, k, clearance: k * (abs(d - clearance) + d - clearance) / 2, 5)],
+    )  # fmt: skip
+
+
+def integrated(values, frequency):
+    """Return the outputs of the stopped beam after 30 periods of SciPy's integration from rest."""
+    mass, stiffness = matrices(6)
+    inverse = np.linalg.inv(mass)
+
+    def rates(t, y):
+        push = 0.05 + 0.2 * np.cos(2 * np.pi * frequency * t)
+        push -= values["stop_k"] * max(y[5] - values["stop_clearance"], 0.0)
+        return np.concatenate([y[6:], inverse @ (push * np.eye(6)[5] - stiffness @ y[:6]) - values["alpha"] * y[6:]])
+
+    times = (30 + np.arange(SAMPLES) / SAMPLES) / frequency
+    y = solve_ivp(rates, (0, times[-1]), np.zeros(12), t_eval=times, rtol=1e-9, atol=1e-11, max_step=0.05).y
+    return {"x": y[5], "v": y[8]}
+
+
+def unstopped(frequency):
+    """Return equations, and an anchor out of contact, of few points, and the parameters in contact."""
+    equations = CondensedEquations.build(stopped(), {"force": FORCE}, frequency=frequency, samples=SAMPLES)
+    theta = np.array([*STOPPED.values()])
+    free = theta * [1, 1, 2]
+    z = equations.find(free, None)[0].z
+    assert len(z) <= 64 and z.max() < free[2]
+    return (
+        equations,
+        Anchor.of(equations, free, z, equations.sensitivities_along(z, free, np.eye(3)), np.arange(3)),
+        theta,
+    )
+
+
+def test_points_of_a_batch_are_doubled_where_those_of_the_anchor_do_not_resolve_the_response():
+    """A stiff stop far from an anchor out of contact, against SciPy's integration."""
+    frequency = 0.04
+    equations, anchor, theta = unstopped(frequency)
+    solved = CondensedBatch([equations], [anchor]).solve(np.stack([theta, anchor.parameters]), keep=True)
+    assert solved.status.tolist() == [[0, 0]] and solved.z.shape[2] > len(anchor.z)
+    exact = integrated(STOPPED, frequency)
+    assert exact["x"].max() > 1.02 * STOPPED["stop_clearance"]
+    assert worst(dict(zip("xv", solved.outputs[0, 0].T, strict=True)), exact) < 1e-4
+    coarse = equations.solve(theta, solved.z[0, 0][:: solved.z.shape[2] // len(anchor.z)])
+    assert worst(dict(zip("xv", equations.outputs(coarse.z, theta).T, strict=True)), exact) > 1e-3
+    np.testing.assert_allclose(equations.outputs(solved.z[0, 0], theta), solved.outputs[0, 0], atol=1e-9)
+
+
+def test_response_that_no_points_resolve_does_not_enter_a_likelihood(monkeypatch):
+    """With 64 points at most, the status in contact is "not resolved", and the log-likelihood −∞."""
+    frequency = 0.04
+    monkeypatch.setattr(condensed, "MOST_ELEMENT_POINTS", 64)
+    monkeypatch.setattr(condensed, "LARGEST_OUTPUT_CHANGE", 1e-3)
+    equations, anchor, theta = unstopped(frequency)
+    solved = CondensedBatch([equations], [anchor]).solve(np.stack([theta, anchor.parameters]))
+    assert [STATUSES[code] for code in solved.status[0]] == ["not resolved", "converged"]
+    run = bp.Experiment("run", frequency, {"x": solved.outputs[0, 1, :, 0]}, {"force": FORCE}, samples=SAMPLES)
+    free = dict(zip(STOPPED, anchor.parameters, strict=True))
+    problem = bp.Problem(stopped(), [run], priors={n: bp.LogNormal(v, 1.0) for n, v in free.items()})
+    order = [[*STOPPED].index(n) for n in problem.names]
+    values = problem.log_likelihood(np.stack([anchor.parameters, theta])[:, order], {"x": 1e-3})
+    assert np.isfinite(values[0]) and values[1] == -np.inf
+
+
+@cache
+def response(count, condensed=True, vary="frequency", until=0.1):
+    """Return the branch of a beam over its first resonance, or in a parameter or the force."""
+    start = solved(count, condensed, frequency=0.045)
+    step = abs(until - {"frequency": 0.045, "force": 1.0}.get(vary, VALUES.get(vary))) / (50 if condensed else 12)
+    return bp.continue_periodic(beam(count, condensed), start, vary, until=until, step=step, progress=False)
+
+
+@pytest.mark.parametrize("count", [4, pytest.param(8, marks=pytest.mark.slow)])
+def test_branch_has_the_folds_and_multipliers_of_the_symbolic_model(count):
+    """Over the bent peak, stable, unstable and stable; multipliers of the orbits at one frequency."""
+    ours, symbolic = (response(count, condensed) for condensed in (True, False))
+    assert ours.complete and symbolic.complete and len(ours.folds) == len(symbolic.folds) == 2
+    np.testing.assert_allclose([s.frequency for s in ours.folds], [s.frequency for s in symbolic.folds], rtol=1e-7)
+    middle = np.mean([s.frequency for s in ours.folds])
+    orbits = (bp.solutions_at(beam(count, c), b, middle) for c, b in ((True, ours), (False, symbolic)))
+    for one, other in zip(*orbits, strict=True):
+        assert worst(one.outputs, other.outputs) < 1e-7
+        assert one.stable == other.stable
+        for value in other.multipliers[:4]:
+            assert np.abs(one.multipliers - value).min() < 1e-6
+    stable = [s.stable for s in ours if s.stable is not None]
+    # Between the folds; of 8 degrees of freedom also where two multipliers leave and enter the circle as a pair.
+    assert np.count_nonzero(np.diff(stable)) == (2 if count == 4 else 4)
+    assert set(bp.solutions_at(beam(count), ours, middle)[1].outputs) == {"x", "v", "a"}
+
+
+@pytest.mark.parametrize(("vary", "until"), [("force", 0.2), ("spring_k3", 0.5), ("alpha", 0.01)])
+def test_branches_in_other_quantities_end_at_the_solution_there(vary, until):
+    branch = response(12, vary=vary, until=until)
+    assert branch.complete and branch.values[-1] == until
+    if vary == "force":
+        last = bp.solve_periodic(
+            beam(12), VALUES, {"force": until * FORCE}, frequency=0.045, samples=SAMPLES, guess=branch[-1].states
+        )
+    else:
+        last = solved(12, values=VALUES | {vary: until}, frequency=0.045, guess=branch[-1].states)
+    assert last.converged and worst(branch[-1].outputs, last.outputs) < 1e-8
+    assert branch.data.sizes["point"] == len(branch)
+
+
+def test_points_are_doubled_along_a_branch_into_contact():
+    """The clearance falls until a sharp stop is touched: the end is that of SciPy's integration."""
+    values, frequency = STOPPED | {"stop_clearance": 1.2}, 0.04
+    start = bp.solve_periodic(stopped(), values, {"force": FORCE}, frequency=frequency, samples=SAMPLES)
+    branch = bp.continue_periodic(stopped(), start, "stop_clearance", until=0.6, progress=False)
+    assert branch.complete and branch[-1].stable
+    assert worst(branch[-1].outputs, integrated(STOPPED, frequency)) < 1e-4
+
+
+def test_multipliers_of_an_unstable_orbit_are_those_of_scipys_integration_of_the_nonlinear_equations():
+    """A small perturbation of the unstable orbit of 8 degrees of freedom grows by the largest multiplier a period."""
+    count, branch = 8, response(8)
+    orbit = bp.solutions_at(beam(8), branch, np.mean([s.frequency for s in branch.folds]))[1]
+    mass, stiffness = matrices(count)
+    damping, inverse = VALUES["alpha"] * mass + VALUES["beta"] * stiffness, np.linalg.inv(mass)
+    between = np.zeros(count)
+    between[count // 2], between[0] = 1, -1
+
+    def rates(t, y):
+        x, v = np.split(y, 2)
+        f = stiffness @ x + damping @ v + VALUES["air_drag"] * (between @ v) ** 3 * between
+        f[-1] += VALUES["spring_k3"] * x[-1] ** 3 - 0.05 - 0.2 * np.cos(2 * np.pi * orbit.frequency * t)
+        return np.concatenate([v, -inverse @ f])
+
+    amplitudes = np.fft.rfft(np.array([orbit.states[f"x{i}"] for i in range(count)])) / SAMPLES
+    turning = np.where(np.arange(amplitudes.shape[1]) == 0, 1.0, 2.0) * amplitudes
+    here = np.concatenate(
+        [
+            turning.sum(axis=1).real,
+            (2j * np.pi * orbit.frequency * np.arange(turning.shape[1]) * turning).sum(axis=1).real,
+        ]
+    )
+
+    def end(y):
+        return solve_ivp(rates, (0, orbit.period), y, rtol=1e-10, atol=1e-12).y[:, -1]
+
+    columns = [(end(here + 1e-5 * e) - end(here - 1e-5 * e)) / 2e-5 for e in np.eye(2 * count)]
+    exact = np.linalg.eigvals(np.transpose(columns))
+    largest = exact[np.argmax(np.abs(exact))]
+    assert orbit.stable is False
+    assert abs(orbit.multipliers[0] - largest) < 1e-4 * abs(largest)

@@ -184,3 +184,57 @@ def modal_responses(products, mass, damping, stiffness, rates, result):
                     x += products[p, r] * real[r]
                     y += products[p, r] * imaginary[r]
                 result[b, k, p] = complex(x, y)
+
+
+@njit(
+    "void(float64[:,::1], boolean, float64[:,::1], float64[:,::1], float64[:,:,::1], float64[:,::1])",
+    fastmath={"reassoc", "nsz", "contract"},
+    **CONDENSED_OPTIONS,
+)
+def monodromy(free, diagonal, places, forcing, kicks, state):
+    """Replace state, columns of (q, q̇), by those a period later.
+
+    In each step the elements change the state by −forcing·kick·places·state, the first one for half of a step also at
+    the end; then it moves by `free`, of four diagonal blocks if `diagonal`.
+    """
+    steps, elements = kicks.shape[0], forcing.shape[1]
+    size, columns = state.shape[0] // 2, state.shape[1]
+    seen, force, moved = np.empty((2 * elements, columns)), np.empty(columns), np.empty_like(state)
+    for i in range(steps + 1):
+        kick = kicks[i % steps]
+        seen[:] = 0.0
+        for a in range(2 * elements):
+            first = (a // elements) * size  # displacements are of q alone, velocities of q̇
+            for j in range(first, first + size):
+                weight = places[a, j]
+                for c in range(columns):
+                    seen[a, c] += weight * state[j, c]
+        for e in range(elements):
+            force[:] = 0.0
+            for a in range(2 * elements):
+                weight = kick[e, a]
+                if weight != 0.0:
+                    for c in range(columns):
+                        force[c] += weight * seen[a, c]
+            for j in range(size, 2 * size):
+                weight = forcing[j, e]
+                for c in range(columns):
+                    state[j, c] -= weight * force[c]
+        if i == steps:
+            return
+        if diagonal:
+            for j in range(size):
+                a, b, k, d = free[j, j], free[j, size + j], free[size + j, j], free[size + j, size + j]
+                for c in range(columns):
+                    q, v = state[j, c], state[size + j, c]
+                    state[j, c] = a * q + b * v
+                    state[size + j, c] = k * q + d * v
+        else:
+            for j in range(2 * size):
+                for c in range(columns):
+                    moved[j, c] = 0.0
+                for n in range(2 * size):
+                    weight = free[j, n]
+                    for c in range(columns):
+                        moved[j, c] += weight * state[n, c]
+            state[:] = moved
