@@ -425,13 +425,17 @@ class CondensedEquations(PeriodicEquations):
 
     def _outputs(self, d: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the outputs on the experiment's grid, and the bound of their error by the number of points."""
+        y, bound = self._output_harmonics(d, parameters)
+        return self.on_points(y), bound
+
+    def _output_harmonics(self, d: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, float]:
         matrices, f = self.matrices(parameters, 2 * len(d))[0], harmonics(self.forces(d, parameters).values)
         y = times(matrices.y_u, self.input_harmonics(2 * len(d))) - times(matrices.y_f, f)
-        return self.on_points(y), float(unresolved(matrices.largest, f, y))
+        return y, float(unresolved(matrices.largest, f, y))
 
     def error_bound(self, z: np.ndarray, parameters: np.ndarray) -> float:
         """Return the bound of the relative error of the outputs by the number of points, see `unresolved`."""
-        return self._outputs(harmonics(z), parameters)[1]
+        return self._output_harmonics(harmonics(z), parameters)[1]
 
     def outputs(self, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return the outputs (points, channels) on the experiment's grid."""
