@@ -24,6 +24,7 @@ import scipy.linalg
 from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, SINGULAR, STALLED
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved
+from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, sampled
 from bayesperiodic.periodic.receptance import Receptance
 from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
@@ -425,13 +426,17 @@ class CondensedEquations(PeriodicEquations):
 
     def _outputs(self, d: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the outputs on the experiment's grid, and the bound of their error by the number of points."""
+        y, bound = self._output_harmonics(d, parameters)
+        return self.on_points(y), bound
+
+    def _output_harmonics(self, d: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, float]:
         matrices, f = self.matrices(parameters, 2 * len(d))[0], harmonics(self.forces(d, parameters).values)
         y = times(matrices.y_u, self.input_harmonics(2 * len(d))) - times(matrices.y_f, f)
-        return self.on_points(y), float(unresolved(matrices.largest, f, y))
+        return y, float(unresolved(matrices.largest, f, y))
 
     def error_bound(self, z: np.ndarray, parameters: np.ndarray) -> float:
         """Return the bound of the relative error of the outputs by the number of points, see `unresolved`."""
-        return self._outputs(harmonics(z), parameters)[1]
+        return self._output_harmonics(harmonics(z), parameters)[1]
 
     def outputs(self, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return the outputs (points, channels) on the experiment's grid."""
@@ -516,34 +521,6 @@ def receptance(model: CondensedModel) -> Receptance:
         columns = np.array([*given.weights, *given.inputs.values()])
         _RECEPTANCES[model] = Receptance(given, model.parameters, rows, columns)
     return _RECEPTANCES[model]
-
-
-def harmonics(values: np.ndarray) -> np.ndarray:
-    """Return the complex harmonics (…, points/2, columns) of values (…, points, columns), without the highest."""
-    points = values.shape[-2]
-    return np.fft.rfft(values, axis=-2)[..., : points // 2, :] / points
-
-
-def on_grid(amplitudes: np.ndarray, points: int) -> np.ndarray:
-    """Return values (…, points, columns) of harmonics (…, harmonics, columns), no more than half the points."""
-    return np.fft.irfft(amplitudes, points, axis=-2) * points
-
-
-def resized(amplitudes: np.ndarray, points: int) -> np.ndarray:
-    """Return harmonics of a grid as those of another one."""
-    result = np.zeros((*amplitudes.shape[:-2], points // 2, amplitudes.shape[-1]), dtype=complex)
-    kept = min(amplitudes.shape[-2], points // 2)
-    result[..., :kept, :] = amplitudes[..., :kept, :]
-    return result
-
-
-def sampled(amplitudes: np.ndarray, points: int) -> np.ndarray:
-    """Return the values of a series of harmonics at any number of points, however few."""
-    count = amplitudes.shape[-2]
-    if points >= 2 * count:
-        return on_grid(amplitudes, points)
-    every = -(-2 * count // points)
-    return on_grid(amplitudes, every * points)[..., ::every, :]
 
 
 def unresolved(largest: np.ndarray, f: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -11,11 +11,9 @@ from bayesperiodic.periodic.condensed import (
     CondensedEquations,
     Preconditioner,
     ResponseMatrices,
-    harmonics,
-    on_grid,
-    resized,
     unresolved,
 )
+from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized
 from bayesperiodic.periodic.receptance import compiled
 
 FEWEST_CONDENSED_SOLVES = 4

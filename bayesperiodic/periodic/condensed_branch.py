@@ -16,13 +16,11 @@ from bayesperiodic.periodic.condensed import (
     Forces,
     Preconditioner,
     ResponseMatrices,
-    harmonics,
-    on_grid,
     residual_of,
-    resized,
     times,
 )
 from bayesperiodic.periodic.equations import FREQUENCY, Solved
+from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized
 
 # Corrections of a point, their largest ratio, relative size of the last one, and that below which a matrix is reused.
 MOST_BRANCH_CORRECTIONS, BRANCH_CONTRACTION, LAST_BRANCH_CORRECTION, REUSED = 15, 0.7, 1e-10, 0.1

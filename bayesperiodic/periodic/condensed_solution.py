@@ -9,8 +9,9 @@ import numpy as np
 import scipy.linalg
 
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
-from bayesperiodic.periodic.condensed import CondensedEquations, harmonics, receptance, resized
+from bayesperiodic.periodic.condensed import CondensedEquations, receptance
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
+from bayesperiodic.periodic.harmonics import harmonics, resized
 from bayesperiodic.periodic.receptance import compiled
 from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, by_name, describe
 
@@ -19,7 +20,7 @@ MOST_MODES, MODE_ERROR_STEPS = 16, 128
 # Steps in time, and relative change of the largest modulus by twice as many, below which these are enough; with many
 # steps, also that in units of the distance from the unit circle.
 FEWEST_MODAL_STEPS, MANY_MODAL_STEPS, MOST_MODAL_STEPS, MODAL_ERROR, CLEAR_OF_CIRCLE = 64, 1024, 4096, 1e-8, 1e-3
-LEAST_TURN = 1e-7  # of an undamped mode in a step, below which the formula of a critically damped one is taken
+LEAST_STEP_TURN = 1e-7  # of an undamped mode in a step, below which the formula of a critically damped one is taken
 
 
 @dataclass(frozen=True, repr=False)
@@ -192,7 +193,7 @@ class _Linearised:
             return np.asarray(scipy.linalg.expm(length * np.block([[zero, one], [-stiffness, -damping]])))
         decay, squares = 0.5 * np.diag(damping), np.diag(stiffness)
         turn = np.sqrt((squares - decay**2).astype(complex))
-        turn = np.where(np.abs(turn) * length < LEAST_TURN, LEAST_TURN / length, turn)
+        turn = np.where(np.abs(turn) * length < LEAST_STEP_TURN, LEAST_STEP_TURN / length, turn)
         forth, back = np.exp((-decay + 1j * turn) * length), np.exp((-decay - 1j * turn) * length)
         even, odd = (0.5 * (forth + back)).real, ((forth - back) / (2j * turn)).real
         result, q = np.zeros((2 * self._size, 2 * self._size)), np.arange(self._size)

@@ -1,7 +1,7 @@
-"""Cost of a log-likelihood of a finite-element beam with a cubic spring: condensed against symbolic equations.
+"""Cost of a finite-element beam with a cubic spring, condensed against symbolic: log-likelihood and response curve.
 
-Run ``python -m studies.solver.condensed``; processor time. The symbolic model of 32 degrees of freedom compiles for
-about a minute; ``python -m studies.solver.condensed 8 100 300`` leaves it out.
+Run ``python -m studies.solver.condensed``; processor time, of a response curve the least of three. The symbolic model
+of 32 degrees of freedom compiles for about a minute; ``python -m studies.solver.condensed 8 100 300`` leaves it out.
 """
 
 import sys
@@ -13,7 +13,7 @@ import numpy as np
 import bayesperiodic as bp
 
 VALUES = {"alpha": 0.05, "beta": 0.005, "spring_k3": 1.0}
-SAMPLES, FREQUENCY, POINTS, MOST_SYMBOLIC = 128, 0.5, 64, 32
+SAMPLES, FREQUENCY, POINTS, MOST_SYMBOLIC, BRANCHES = 128, 0.5, 64, 32, 3
 
 
 def matrices(degrees: int) -> tuple[np.ndarray, np.ndarray]:
@@ -66,8 +66,20 @@ def cost(given: bp.Problem, count: int, repeats: int) -> tuple[float, float, flo
     return first, 1e3 * (time.process_time() - start) / repeats / count, float(np.isfinite(values).mean())
 
 
+def branch_cost(model: bp.Model) -> tuple[float, int]:
+    """Return milliseconds a point of the response curve over the bent first resonance, and the number of points."""
+    force = 0.05 * np.cos(2 * np.pi * np.arange(SAMPLES) / SAMPLES)
+    start = bp.solve_periodic(model, VALUES, {"force": force}, frequency=0.3, samples=SAMPLES)
+    best, points = np.inf, 0
+    for _ in range(BRANCHES):
+        begin = time.process_time()
+        branch = bp.continue_periodic(model, start, "frequency", until=1.2, progress=False)
+        best, points = min(best, time.process_time() - begin), len(branch)
+    return 1e3 * best / points, points
+
+
 def main(degrees: list[int]) -> None:
-    """Print the table."""
+    """Print the tables."""
     force = 0.1 * np.cos(2 * np.pi * np.arange(SAMPLES) / SAMPLES)
     print("degrees  build [s]  first [s]  warm [ms]  symbolic warm [ms]  ratio")
     for count in degrees:
@@ -83,6 +95,10 @@ def main(degrees: list[int]) -> None:
             _, slow, converged = cost(problem(beam(count, False), run), 16, 2)
             row += f"  {slow:18.4f}  {slow / warm:5.0f}" + ("" if converged == 1.0 else f"  ({converged:.0%} finite)")
         print(row + ("" if finite == 1.0 else f"  ({finite:.0%} finite)"), flush=True)
+    print("response curve with multipliers\ndegrees  points  a point [ms]")
+    for count, condensed in [(2, False), *((count, True) for count in degrees)]:
+        milliseconds, points = branch_cost(beam(count, condensed))
+        print(f"{count:7d}  {points:6d}  {milliseconds:12.2f}" + ("" if condensed else "  (symbolic)"), flush=True)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from bayesperiodic.periodic.batch import Anchor
 from bayesperiodic.periodic.compiled import STATUSES
 from bayesperiodic.periodic.condensed import CondensedEquations, receptance
 from bayesperiodic.periodic.condensed_batch import CondensedBatch
+from bayesperiodic.periodic.harmonics import harmonics
 from bayesperiodic.periodic.receptance import Receptance
 
 Element = bp.elements.Element
@@ -206,7 +207,7 @@ def test_newtons_matrix_is_that_of_the_linearised_equations():
     response = equations.matrices(theta, 32)[0].d_f
 
     def residual(at):
-        forces = condensed.harmonics(equations.forces(at, theta).values)
+        forces = harmonics(equations.forces(at, theta).values)
         return at + (response @ forces[..., None])[..., 0]
 
     change = (residual(d + 1e-6 * step) - residual(d - 1e-6 * step)) / 2e-6

@@ -1,0 +1,31 @@
+"""Complex harmonics of periodic values on grids of any number of points."""
+
+import numpy as np
+
+
+def harmonics(values: np.ndarray) -> np.ndarray:
+    """Return the complex harmonics (…, points/2, columns) of values (…, points, columns), without the highest."""
+    points = values.shape[-2]
+    return np.fft.rfft(values, axis=-2)[..., : points // 2, :] / points
+
+
+def on_grid(amplitudes: np.ndarray, points: int) -> np.ndarray:
+    """Return values (…, points, columns) of harmonics (…, harmonics, columns), no more than half the points."""
+    return np.fft.irfft(amplitudes, points, axis=-2) * points
+
+
+def resized(amplitudes: np.ndarray, points: int) -> np.ndarray:
+    """Return harmonics of a grid as those of another one."""
+    result = np.zeros((*amplitudes.shape[:-2], points // 2, amplitudes.shape[-1]), dtype=complex)
+    kept = min(amplitudes.shape[-2], points // 2)
+    result[..., :kept, :] = amplitudes[..., :kept, :]
+    return result
+
+
+def sampled(amplitudes: np.ndarray, points: int) -> np.ndarray:
+    """Return the values of a series of harmonics at any number of points, however few."""
+    count = amplitudes.shape[-2]
+    if points >= 2 * count:
+        return on_grid(amplitudes, points)
+    every = -(-2 * count // points)
+    return on_grid(amplitudes, every * points)[..., ::every, :]
