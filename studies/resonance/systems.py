@@ -95,7 +95,7 @@ def problem(name: str, kind: str, seed: int) -> bp.Problem:
 def averaged(
     given: dict[str, np.ndarray], level: float, start: dict[str, float]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return estimates and standard deviations by the averaged equation of the Duffing oscillator, m = 1.
+    """Return estimates and standard deviations, infinite if undetermined, by the averaged equation with m = 1.
 
     ((k + ¾ k3 A² − ω²)² + c²ω²) A² = F² ([1]_, section 4.1), of whose amplitudes A at a frequency the nearest to the
     measured one is taken.
@@ -118,7 +118,10 @@ def averaged(
 
     found: Any = least_squares(residuals, np.log([start[name] for name in names]), x_scale=1e-2)
     values = np.exp(found.x)
-    sds = values * np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    try:
+        sds = values * np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    except np.linalg.LinAlgError:  # all amplitudes lie where they do not depend on the damping
+        sds = np.full(values.size, np.inf)
     return dict(zip(names, values.tolist(), strict=True)), dict(zip(names, sds.tolist(), strict=True))
 
 

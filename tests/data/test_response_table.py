@@ -107,9 +107,7 @@ def test_tables_that_cannot_be_what_they_say_are_refused(table, arguments, messa
 def test_phases_in_radians_without_their_unit_are_warned_of():
     """Through a resonance phases turn by more than degrees; a table below it may have small ones."""
     table = TABLE | {"phi": np.radians(TABLE["phi"])}
-    with pytest.warns(
-        UserWarning, match=r"phases\['x'\]: turns by 2.* degrees only .* phase_unit='rad'"
-    ):
+    with pytest.warns(UserWarning, match=r"phases\['x'\]: turns by 2.* degrees only .* phase_unit='rad'"):
         bp.response_table(table, **COLUMNS)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
