@@ -660,13 +660,21 @@ def faults_of_recordings():
 @on("docs/studies/resonance.md")
 def resonance():
     d = results("resonance")
-    assert d["replicates"] == 25 and all(row["met"] for row in d["checks"])
-    kinds = [one for one in d.values() if isinstance(one, dict) and "posterior" in one]
-    assert len(kinds) == 6 and all(one["converged"] == 1.0 for one in kinds)
+    assert d["replicates"] == 200 and all(row["met"] for row in d["checks"])
+    kinds = {name: one for name, one in d.items() if isinstance(one, dict) and "posterior" in one}
+    assert len(kinds) == 6 and all(one["converged"] == 1.0 for name, one in kinds.items() if name != "amplitudes")
+    low, high = (100 * end for end in d["band"])
+    shares = [100 * share for one in kinds.values() for share in one["posterior"].values()]
+    yield f"All {len(shares)} shares are within the 99 % band of {low:.0f} to {high:.0f} %, from {min(shares):.1f} to"
+    yield f"to {max(shares):.1f} %; they are those of the posterior"
+    alone, closed = kinds["amplitudes"], d["averaged equation"]["k3"]
+    yield f"from amplitudes alone, {100 * alone['Laplace approximation']['c']:.1f} % contain it"
+    yield f"{round((1 - alone['converged']) * d['replicates'])} of the 200 estimates from amplitudes alone"
     left = {kind: d[kind]["sd over that of the prior"]["c"] for kind in ("amplitudes and phases", "amplitudes")}
-    with_phases, alone = (100 * share for share in left.values())
-    yield f"of the damping to {with_phases:.0f} % of the prior's, amplitudes alone to {alone:.0f} %"
-    yield f"are off by {d['averaged equation']['k3']['bias [sd]']:.1f} standard deviations on average"
+    with_phases, without = (100 * share for share in left.values())
+    yield f"of the damping to {with_phases:.0f} % of the prior's, amplitudes alone to {without:.0f} %"
+    yield f"off by {closed['median of z']:.1f} standard deviations, and its 90 % intervals"
+    yield f"cover {100 * closed['coverage']:.0f} %. Single"
 
 
 # Rows of the table of coverage that are outside of the band, for reasons that the page gives.

@@ -68,17 +68,17 @@ def summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
         SAMPLED: {p: float(np.mean(np.abs(rank - 0.5) < 0.5 * COVERED)) for p, rank in ranks.items()},
         LAPLACE: {p: of_p["coverage"] for p, of_p in z.items()},
         "rms of z": {p: of_p["rms of z"] for p, of_p in z.items()},
-        "bias": {p: of_p["bias [sd]"] for p, of_p in z.items()},
+        "median of z": {p: of_p["median of z"] for p, of_p in z.items()},
         LEFT: {p: float(np.median([line["contraction"][p] for line in lines])) for p in calibration.PRIORS},
         "seconds": float(np.median([line["seconds"] for line in lines])),
     }
 
 
 def z_summary(z: np.ndarray) -> dict[str, float]:
-    """Return coverage of 90 % intervals, bias and spread."""
+    """Return coverage of 90 % intervals, median and spread; single values of z may be huge."""
     return {
         "coverage": float(np.mean(np.abs(z) < NINETY)),
-        "bias [sd]": float(z.mean()),
+        "median of z": float(np.median(z)),
         "rms of z": float(np.sqrt(np.mean(z**2))),
     }
 
