@@ -665,8 +665,8 @@ def resonance():
     assert len(kinds) == 6 and all(one["converged"] == 1.0 for name, one in kinds.items() if name != "amplitudes")
     low, high = (100 * end for end in d["band"])
     shares = [100 * share for one in kinds.values() for share in one["posterior"].values()]
-    yield f"All {len(shares)} shares are within the 99 % band of {low:.0f} to {high:.0f} %, from {min(shares):.1f} to"
-    yield f"to {max(shares):.1f} %; they are those of the posterior"
+    yield f"All {len(shares)} shares are within the 99 % band of {low:.0f} to {high:.0f} %"
+    yield f"from {min(shares):.1f} to {max(shares):.1f} %; they are those of the posterior"
     alone, closed = kinds["amplitudes"], d["averaged equation"]["k3"]
     yield f"from amplitudes alone, {100 * alone['Laplace approximation']['c']:.1f} % contain it"
     yield f"{round((1 - alone['converged']) * d['replicates'])} of the 200 estimates from amplitudes alone"
