@@ -20,7 +20,7 @@ LARGEST_PHASE = 720.0
 # Phases of an arc tangent of a quotient, in degrees, and what they then jump by.
 FOLDED_PHASE, FOLDED_JUMP = 90.5, 120.0
 # Degrees within which phases may be radians, least range of these, and how much higher a peak is than both ends.
-IN_RADIANS, LEAST_TURN, PEAK_HEIGHT = 3.15, 1.0, 3.0
+IN_RADIANS, LEAST_PHASE_RANGE, PEAK_HEIGHT = 3.15, 1.0, 3.0
 # Names and units of levels.
 LEVEL = re.compile(r"(?<![A-Za-z])dB(?![A-Za-z])")
 
@@ -182,7 +182,7 @@ def check_phases(argument: str, label: str, angles: np.ndarray, sizes: np.ndarra
     """
     degrees = np.degrees(angles)
     within, peak = np.abs(degrees).max(initial=0.0) <= IN_RADIANS, sizes.max() > PEAK_HEIGHT * max(sizes[0], sizes[-1])
-    if within and peak and np.ptp(degrees) > LEAST_TURN:
+    if within and peak and np.ptp(degrees) > LEAST_PHASE_RANGE:
         warnings.warn(
             f"{argument}: turns by {np.ptp(degrees):.2g} degrees only at a resonance in {label}; if these are radians, "
             "give phase_unit='rad'.",
