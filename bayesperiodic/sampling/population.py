@@ -1,5 +1,6 @@
 """Populations: how parameters differ between units that were identified one by one."""
 
+import gc
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -197,6 +198,7 @@ def _draw(
     """Return the draws of all units, one of them in memory at a time, and why some have none."""
     tasks = {name: unit for name, unit in given.items() if isinstance(unit, Problem | str | Path)}
     result = _carried_out(tasks, names, single, seed, executor)
+    gc.collect()  # the trees of draws that were read contain reference cycles
     for name, unit in given.items():
         if name not in result:
             result[name] = unit_draws(name, unit, names, single)
