@@ -213,8 +213,8 @@ class Contender(NamedTuple):
 
 
 CONTENDERS = {
-    OURS[0]: Contender(_own, (20_000, 250)),
-    OURS[1]: Contender(partial(_own, variances="collapsed"), (20_000, 250)),
+    OURS[0]: Contender(_own, (20_000, 150)),
+    OURS[1]: Contender(partial(_own, variances="collapsed"), (20_000, 150)),
     OURS[2]: Contender(partial(_own, sampler="nuts"), (20_000, 250), "nutpie"),
     "emcee": Contender(partial(_ensembles, coordinates="natural"), (4500, 200)),
     "emcee, DE": Contender(partial(_ensembles, moves=EVOLUTION), (2000, 200)),

@@ -51,7 +51,7 @@ def sample_ridge(seed: int, quick: bool) -> Runs:
     positive, both = ridge_problem(CUT), ridge_problem(bp.Normal(1.0, 1.0))
     few = {"max_steps": 250, "ensembles": 2} if quick else {"max_steps": LONG}
     runs: dict[str, tuple[bp.Problem, dict[str, Any]]] = {
-        "natural": (positive, {"coordinates": "natural", "max_steps": 500 if quick else SHORT}),
+        "natural": (positive, {"coordinates": "natural", "max_steps": 150 if quick else SHORT}),
         "uncut": (both, few),
         "uncut_prior": (both, {"start": "prior"} | few),
     }

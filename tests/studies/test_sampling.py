@@ -39,7 +39,7 @@ def test_quick_run_meets_all_checks_of_the_ridge(done):
     assert len(cut) >= 7 and all(check["met"] is not False for check in cut)
     own = found(results, "ridge, bp.sample: sd(a) against quadrature")[0]
     assert own["met"] and own["value"] > 0.0
-    assert "max_steps = 500 reached with" in results["ridge"]["natural"]["reason"]
+    assert "max_steps = 150 reached with" in results["ridge"]["natural"]["reason"]
     assert "Targets" in printed and "quadrature" in printed
 
 
@@ -68,7 +68,7 @@ def test_every_contender_has_a_run_or_a_reason(done):
     damper = cases["damper"]["samplers"]
     # Steps of 4 ensembles of 32 walkers, and their start points.
     assert damper["emcee"]["evaluations"] == 128 * 201
-    assert damper["bp.sample"]["converged"] is False and "max_steps = 250" in damper["bp.sample"]["reason"]
+    assert damper["bp.sample"]["converged"] is False and "max_steps = 150" in damper["bp.sample"]["reason"]
     assert damper["emcee"]["moments"]["Kx"]["mean"] > 0.0 and damper["emcee"]["moments"]["rho"]["sd_error"] > 0.0
     assert found(done[1], "over emcee's default move")[0]["value"] > 1.0
 
