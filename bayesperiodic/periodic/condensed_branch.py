@@ -84,7 +84,7 @@ class CondensedParametrised(ParametrisedEquations):
         if self.free[0] == INPUTS:
             return replace(equations, inputs=equations.inputs + value * self.input_change), self.parameters
         if self.free[0] == FREQUENCY:
-            return equations.at_frequency(value), self.parameters  # type: ignore[return-value]
+            return equations.at_frequency(value), self.parameters
         return equations, np.where(np.arange(self.parameters.size) == self._index, value, self.parameters)
 
     @property

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -214,7 +214,7 @@ class PeriodicEquations:
         turns = np.rint(self.drift * self.grid.periods / (2 * np.pi)).astype(int).tolist()
         return {s: turn for s, turn in zip(self.model.states, turns, strict=True) if s in self.model.angles}
 
-    def at_frequency(self, frequency: float) -> "PeriodicEquations":
+    def at_frequency(self, frequency: float) -> Self:
         """Return the same equations at another frequency, the inputs unchanged as functions of tau."""
         ratio, width = frequency / self.frequency, len(self.model.inputs)
         inputs = self.inputs * np.repeat([1.0, ratio, ratio**2], width)
