@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
     from bayesperiodic.periodic._kernels.newton import *
 
 MAX_CHORDS = 6
-PREDICTION_RATE = 30.0
+PREDICTION_RATE, NEXT_RATE = 30.0, 5.0
 LEAST_STIFFNESS, MOST_STIFFNESS = 0.3, 3.0
 POLISHED = 1e-12
 LARGEST_PART = 1.0 / 16.0
@@ -27,21 +27,33 @@ def in_units(reached, amplitude):
     return result
 
 
+@inlined(NUMBER(MATRIX, MATRIX, VECTOR), fastmath={"reassoc"}, **INNER)
+def weighted_dot(one, other, weights):
+    """Return the sum of products with a weight for each state, in any order."""
+    total = 0.0
+    for i in range(one.shape[0]):
+        for s in range(STATES if STATES > 0 else one.shape[1]):
+            total += weights[s] * one[i, s] * other[i, s]
+    return total
+
+
 @kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
-        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, FACTORS, MATRIX, MATRIX
+        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, CUBE, FACTORS, MATRIX, MATRIX
     ),
     **INNER,
 )
 def newton_chord(
-    functions, grid, setting, amplitude, stiffness, predicted, polish, z, states, change, factors, left, right
+    functions, grid, setting, amplitude, stiffness, predicted, polish, z, states, change, taken, factors, left, right
 ):
     """Improve z in place with the factors of a nearby solution; return whether it converged, the steps, their length.
 
-    `states` are left as they were before the last step. A step above `CHORD_RATE` times the one before ends it. The
-    ratio of two steps predicts how much smaller the next one will be. The ratio of the first step to the prediction
-    gives the order of magnitude, since the prediction is a chord step except for terms of second order:
-    `PREDICTION_RATE` times it exceeded all but two of a hundred observed rates.
+    Each step is corrected by those before it, by Broyden's method (C. T. Kelley, Iterative Methods for Linear and
+    Nonlinear Equations, SIAM 1995, chapter 7). A step above `CHORD_RATE` times the one before ends the iteration.
+    `NEXT_RATE` times the ratio of two steps predicts how much smaller the next one will be, so that errors were no
+    larger than without the correction. The ratio of the first step to the prediction gives the order of magnitude,
+    since the prediction is a chord step except for terms of second order: `PREDICTION_RATE` times it exceeded all but
+    two of a hundred observed rates.
 
     Where ∂g/∂z is nearly singular, steps with the factors of another point are wrong in the direction that it makes
     smallest, and of the wrong sign where the stiffness in that direction has changed its sign. So this direction takes
@@ -51,7 +63,7 @@ def newton_chord(
     in this direction, in units of that of the factors; `left` (points, states) the weights of the equations that are
     largest for a residual in this direction; `right` the direction, scaled to a stiffness of 1 for the ∂g/∂z of the
     factors. If `polish`, the steps go on until one is below `POLISHED` or at rounding level, for derivatives of the
-    outputs. `states` and `change` are work arrays.
+    outputs. `states`, `change` and `taken` (steps, points, states) are work arrays.
     """
     residual = grid_function_at(functions.residual)
     inputs, parameters, frequency, drift = setting
@@ -62,6 +74,9 @@ def newton_chord(
         return False, 0, 0.0
     correction, tolerance = 1.0 / stiffness - 1.0, STEP_TOLERANCE * min(1.0, stiffness)
     previous, moved, rate, converged = predicted, 0.0, PREDICTION_RATE, False
+    squares, scale = np.empty(MAX_CHORDS), np.empty(count)
+    for s in range(count):
+        scale[s] = 1.0 / amplitude[s] ** 2 if amplitude[s] > 0.0 else 0.0
     for iteration in range(MAX_CHORDS):
         differentiate(z, drift, grid, frequency, states)
         residual(states, inputs, parameters, grid.tau, frequency, change)
@@ -69,6 +84,18 @@ def newton_chord(
         back_substitute(grid, factors, change)
         for k in range(step.size):
             step[k] += along * direction[k]
+        for k in range(iteration):
+            part = weighted_dot(taken[k], change, scale) / squares[k]
+            if k < iteration - 1:
+                later = as_vector(taken[k + 1])
+                for j in range(step.size):
+                    step[j] += part * later[j]
+            else:
+                for j in range(step.size):
+                    step[j] /= 1.0 - part
+        squares[iteration] = weighted_dot(change, change, scale)
+        copy(change, taken[iteration])
+        for k in range(step.size):
             position[k] -= step[k]
         if not dot(step, step) < np.inf:
             return False, iteration + 1, moved
@@ -82,7 +109,7 @@ def newton_chord(
         converged = converged or full <= tolerance or rate * full**2 <= tolerance * previous
         if converged and (full <= POLISHED or not polish):
             return True, iteration + 1, moved
-        previous, rate = full, 1.0
+        previous, rate = full, NEXT_RATE
     return converged, MAX_CHORDS, moved
 
 
@@ -164,6 +191,7 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
         np.empty_like(interface_pivots[0]),
     )  # fmt: skip
     work = Workspace(states, columns, np.empty((0, 0)), fresh)
+    taken = np.empty((MAX_CHORDS, points, count))
     nothing, table = np.empty(0), np.empty((0, 0))
     unknowns = Unknowns(nothing, nothing, nothing, table, np.empty((0, 0, 0)), -1)
     border = Border(table, table, table, table, np.empty(0, dtype=np.int64))
@@ -191,7 +219,7 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
             )
             close, used, moved = newton_chord(
                 functions, grid, setting, amplitude, stiffness, in_units(reached, amplitude), polish, z, states,
-                change, factors, anchors.left[e], anchors.right[e],
+                change, taken, factors, anchors.left[e], anchors.right[e],
             )  # fmt: skip
         if not close:
             moved = np.inf
