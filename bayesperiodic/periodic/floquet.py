@@ -188,21 +188,10 @@ def _harmless_products(steps: np.ndarray) -> tuple[np.ndarray, int]:
     while len(products) > 1:
         padded = products if len(products) % 2 == 0 else np.concatenate([products, np.eye(steps.shape[1])[None]])
         longer = padded[1::2] @ padded[0::2]
-        if not np.max(_spread(longer)) < HARMLESS_ERROR:
+        if not _kernels().largest_condition(longer, IN_RANGE) < HARMLESS_ERROR:
             break
         products, length = longer, 2 * length
     return products, length
-
-
-def _spread(matrices: np.ndarray) -> np.ndarray:
-    """Return condition numbers, in Frobenius norms; infinite where the matrices are far from 1 in size."""
-    with np.errstate(all="ignore"):
-        try:
-            back = np.linalg.norm(np.linalg.inv(matrices), axis=(1, 2))
-        except np.linalg.LinAlgError:
-            return np.full(len(matrices), np.inf)
-        there = np.linalg.norm(matrices, axis=(1, 2))
-        return np.where((back < IN_RANGE) & (there < IN_RANGE), there * back, np.inf)
 
 
 def _invariant_bases(groups: np.ndarray, splits: list[int] | None = None) -> tuple[list[int], np.ndarray]:

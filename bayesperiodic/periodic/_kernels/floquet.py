@@ -64,6 +64,28 @@ def transfer_matrices(matrix, weights, first, step, gauss, sums, result):
                     result[point, p, q] = product[p, q]
 
 
+@njit(f"float64({ARRAY_3D}, float64)", **FLOQUET_OPTIONS)
+def largest_condition(matrices, in_range):
+    """Return the largest condition number, in Frobenius norms; infinite if a norm, or an inverse's, is not in range."""
+    count, size, _ = matrices.shape
+    work, inverse, result = np.empty((size, size)), np.empty((size, size)), 0.0
+    for k in range(count):
+        there, back = 0.0, 0.0
+        for p in range(size):
+            for q in range(size):
+                work[p, q], inverse[p, q] = matrices[k, p, q], 1.0 if p == q else 0.0
+                there += matrices[k, p, q] ** 2
+        if not solve(work, inverse):
+            return np.inf
+        for p in range(size):
+            for q in range(size):
+                back += inverse[p, q] ** 2
+        if not (np.sqrt(there) < in_range and np.sqrt(back) < in_range):
+            return np.inf
+        result = max(result, np.sqrt(there * back))
+    return result
+
+
 @njit(f"void({ARRAY_2D}, {ARRAY_2D})", **FLOQUET_OPTIONS)
 def orthogonalise(matrix, basis):
     """Fill the orthogonal factor of QR by Householder's reflections; the matrix is overwritten."""
