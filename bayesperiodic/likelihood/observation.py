@@ -192,6 +192,15 @@ class Observation:
             return None
         return *layouts, self.sensing.layout
 
+    @cached_property
+    def quantities_alike(self) -> tuple[Hashable, ...] | None:
+        """What experiments have in common of which only quantities are compared; None where there is more."""
+        simple = self.caused is None and not (self._free_phase or self.sensing.active)
+        if not (simple and self.blocks and all(isinstance(block, Quantities) for block in self.blocks)):
+            return None
+        alike = (block.alike_in for block in self.blocks if isinstance(block, Quantities))
+        return *alike, self.compared_channels
+
     def changes(self, response: Response, directions: Response) -> list[np.ndarray]:
         """Return the derivatives of the predicted components along directions, one array (directions, size) a block."""
         predicted, moved = self._signals(response), directions.outputs[..., self.picked]
@@ -450,8 +459,14 @@ class _Part(NamedTuple):
 
     group: int  # index of the group of experiments that are solved together
     members: Any  # place in the group of an experiment that is compared alone; slice or list of int of others
-    first: Observation
+    together: list[Observation]
     data: list[np.ndarray]  # Fourier components (experiments, 1, size) a channel; empty if more than these is compared
+    quantities: list[Quantities]  # of all experiments, one a block; empty if more than these is compared
+
+    @property
+    def first(self) -> Observation:
+        """The first of the experiments, which has what all have in common."""
+        return self.together[0]
 
 
 class Comparisons:
@@ -467,14 +482,21 @@ class Comparisons:
         for g, group in enumerate(groups):
             layouts: dict[Any, list[int]] = {}
             for m, observation in enumerate(group):
-                layouts.setdefault(observation.layout or observation.experiment.name, []).append(m)
+                alike = observation.layout or observation.quantities_alike
+                layouts.setdefault(alike or observation.experiment.name, []).append(m)
             for members in layouts.values():
-                together, first, data = [group[m] for m in members], group[members[0]], []
+                together, first = [group[m] for m in members], group[members[0]]
                 at: Any = slice(None) if len(members) == len(group) else members
+                data, quantities = [], []
                 if first.layout:
                     parts = zip(*(o.data_components() for o in together), strict=True)
                     data = [np.stack(components)[:, None] for components in parts]
-                self._parts.append(_Part(g, at if data else members[0], first, data))
+                elif first.quantities_alike:
+                    blocks = zip(*(o.blocks for o in together), strict=True)
+                    quantities = [type(alike[0]).stacked(alike) for alike in blocks]
+                else:
+                    at = members[0]
+                self._parts.append(_Part(g, at, together, data, quantities))
                 blocks = range(stacks, stacks + len(first.blocks))
                 places |= {o.experiment.name: [(b, m) for b in blocks] for m, o in enumerate(together)}
                 stacks = blocks.stop
@@ -495,18 +517,21 @@ class Comparisons:
     def _stacks(self, simulation: Simulation) -> list[np.ndarray]:
         """Return the residual components of all parts, an array (experiments, solves, size) a block."""
         result = []
-        for group, members, first, data in self._parts:
-            solved = simulation.groups[group]
-            if data:
+        for part in self._parts:
+            solved, members, first = simulation.groups[part.group], part.members, part.first
+            if part.quantities:
+                values = solved.outputs[members][..., first.picked]
+                result += [block.shown(block.quantity(values)) for block in part.quantities]
+            elif part.data:
                 signals = ComparedSignals(solved.outputs[members][..., first.picked], np.empty(0), np.empty(0))
                 sensors, frequency = solved.sensors[members], solved.frequency[members]
-                for part, block in zip(data, first.blocks, strict=True):
+                for measured, block in zip(part.data, first.blocks, strict=True):
                     shown = block.errors(signals)
                     if first.sensing.active:
                         shown = block.through_sensor(first.sensing, shown, sensors, frequency)
-                    result.append(part - shown)
+                    result.append(measured - shown)
             else:
-                result += [part[None] for part in first.residuals(solved.response(members))]
+                result += [components[None] for components in first.residuals(solved.response(members))]
         return result
 
     def vjp(
@@ -520,11 +545,18 @@ class Comparisons:
         by_outputs = [np.empty((len(group.outputs), *group.outputs.shape[2:])) for group in simulation.groups]
         by_sensors, by_multipliers = [np.empty(group.sensors[:, 0].shape) for group in simulation.groups], {}
         stacks, left = iter(weights.stacks), iter(residuals.stacks)
-        for group, members, first, data in self._parts:
-            pulls = [next(stacks) if data else next(stacks)[0] for _ in first.blocks]
-            rests = [next(left) for _ in first.blocks]
-            shown = [part[:, 0] - rest for part, rest in zip(data, rests, strict=True)] if data else []
-            pulled = first.vjp(simulation.groups[group].response(members, 0), pulls, shown)
-            by_outputs[group][members], by_sensors[group][members] = pulled.outputs, pulled.sensors
-            by_multipliers[first.experiment.name] = pulled.log_multipliers
+        for part in self._parts:
+            group = simulation.groups[part.group]
+            pulls, rests = ([next(stack) for _ in part.first.blocks] for stack in (stacks, left))
+            if part.data:
+                shown = [data[:, 0] - rest for data, rest in zip(part.data, rests, strict=True)]
+                pulled = part.first.vjp(group.response(part.members, 0), pulls, shown)
+                by_outputs[part.group][part.members] = pulled.outputs
+                by_sensors[part.group][part.members] = pulled.sensors
+                continue
+            places = np.arange(len(group.outputs))[part.members]
+            for k, (m, observation) in enumerate(zip(np.atleast_1d(places).tolist(), part.together, strict=True)):
+                pulled = observation.vjp(group.response(m, 0), [pull[k] for pull in pulls], [])
+                by_outputs[part.group][m], by_sensors[part.group][m] = pulled.outputs, pulled.sensors
+                by_multipliers[observation.experiment.name] = pulled.log_multipliers
         return by_outputs, by_sensors, by_multipliers

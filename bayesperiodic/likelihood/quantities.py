@@ -2,8 +2,8 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -43,6 +43,7 @@ class Quantities(Block):
 
     kind: ClassVar[type[Measurement]]
     words: ClassVar[str] = "{0.channel}"
+    of_each: ClassVar[tuple[str, ...]] = "values", "known"  # fields in which blocks that are alike differ
 
     @classmethod
     def of(cls, experiment: Experiment, model: Model) -> "list[Any]":
@@ -115,6 +116,17 @@ class Quantities(Block):
         return self.quantity(values) + components * self.unit
 
     @property
+    def alike_in(self) -> tuple[Hashable, ...]:
+        """What blocks have in common that are compared all at once."""
+        return type(self), self.place, self.size, self.points, self.counted
+
+    @classmethod
+    def stacked(cls, blocks: "Sequence[Quantities]") -> "Quantities":
+        """Return blocks that are alike as one, for signals (blocks, solves, points, channels)."""
+        each = {name: np.stack([getattr(b, name) for b in blocks])[:, None] for name in cls.of_each}
+        return replace(blocks[0], **{name: values for name, values in each.items() if values.size})
+
+    @property
     def sizes(self) -> np.ndarray:
         """The measured values (size,) as components, of phases one radian."""
         return (np.ones(self.size) if self.kind.signed else self.values) / self.unit
@@ -182,6 +194,11 @@ class OfHarmonics(Quantities):
             )
         return {"lines": lines}
 
+    @property
+    def alike_in(self) -> tuple[Hashable, ...]:
+        """The harmonics too."""
+        return *super().alike_in, tuple(self.lines.tolist())
+
     @cached_property
     def _waves(self) -> np.ndarray:
         """What the complex amplitudes are sums with, (size, points)."""
@@ -235,7 +252,7 @@ class Amplitudes(OfHarmonics):
     def _likeliest(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Measured and likeliest amplitudes in standard deviations, root of the curvature, log-density there."""
         a = self.values / self.known
-        best = np.array([likeliest_amplitude(one) for one in a])
+        best = np.vectorize(likeliest_amplitude, otypes=[float])(a)
         ratio = np.where(a * best > 0.0, _bessel_ratio(a * best) / np.maximum(a * best, np.finfo(float).tiny), 0.5)
         curvature = 1.0 - a**2 * (1.0 - ratio - (ratio * a * best) ** 2)
         return a, best, np.sqrt(np.maximum(curvature, 0.0)), _rice(a, best)
@@ -268,6 +285,7 @@ class RelativePhases(OfHarmonics):
     of_inputs: np.ndarray = field(default_factory=lambda: np.empty(0))  # (size,), phase of the input
 
     kind: ClassVar[type[Measurement]] = Phase
+    of_each: ClassVar[tuple[str, ...]] = "values", "known", "of_inputs"
 
     @classmethod
     def arguments(cls, experiment: Experiment, model: Model, given: list[Any]) -> dict[str, Any]:
@@ -287,6 +305,11 @@ class RelativePhases(OfHarmonics):
                 phase = float(np.angle(c))
             of_inputs.append(phase)
         return {**result, "against": tuple(against), "of_inputs": np.array(of_inputs)}
+
+    @property
+    def alike_in(self) -> tuple[Hashable, ...]:
+        """What the phases are against too."""
+        return *super().alike_in, self.against
 
     def _ratios(self, values: np.ndarray) -> Iterator[tuple[np.ndarray, int, np.ndarray]]:
         """Yield the amplitudes (…, size) of the channel, then of others, their place and which entries they are of."""
