@@ -5,8 +5,8 @@ compared with the data of an experiment, and what the noise model must know of t
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable
-from dataclasses import dataclass, field
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -58,6 +58,7 @@ class Block(ABC):
     log_scale: float = 0.0  # ln|∂ components/∂ data| of values that are divided by known standard deviations
 
     words: ClassVar[str] = "{0.size} values of {0.channel}"  # what is compared, a format of the block
+    of_each: ClassVar[tuple[str, ...]] = ()  # fields in which blocks differ that are alike
     observed: ClassVar[bool] = True  # whether the components are measured values
     timed: ClassVar[bool] = False  # whether the components are values of one channel along the period
     spectral: ClassVar[bool] = False  # whether they are Fourier components of one channel
@@ -113,6 +114,18 @@ class Block(ABC):
     def layout(self) -> Hashable:
         """What blocks have in common whose experiments are compared all at once; None if they are not."""
         return None
+
+    @property
+    def alike_in(self) -> tuple[Hashable, ...] | None:
+        """What blocks without a `layout` have in common that are compared all at once; None if they are not."""
+        return None
+
+    @classmethod
+    def stacked(cls, blocks: "Sequence[Block]") -> "Block":
+        """Return blocks that are alike as one, for signals (blocks, solves, points, channels)."""
+        each = {name: np.stack([getattr(b, name) for b in blocks]) for name in cls.of_each}
+        fields: dict[str, Any] = {name: x.reshape(len(blocks), 1, -1) for name, x in each.items() if x.size}
+        return replace(blocks[0], **fields)
 
     def through_sensor(self, sensing: Any, components: np.ndarray, values: Any, frequency: Any) -> np.ndarray:
         """Return components (…, size) as a sensor with parameters (…, names) shows them, of blocks with a `layout`."""

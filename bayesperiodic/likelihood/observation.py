@@ -11,6 +11,7 @@ from bayesperiodic._parallel import available_cores, in_threads
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.block import (
     NO_SCALE,
+    Block,
     ComparedSignals,
     compared_channels,
     measured_channels,
@@ -24,6 +25,7 @@ from bayesperiodic.models.model import Model
 
 # Outputs (numbers) from which on their comparison with the data is shared among the cores.
 SMALLEST_SHARED = 10_000
+NONE = np.empty(0)
 
 
 class Response(NamedTuple):
@@ -193,12 +195,11 @@ class Observation:
         return *layouts, self.sensing.layout
 
     @cached_property
-    def quantities_alike(self) -> tuple[Hashable, ...] | None:
-        """What experiments have in common of which only quantities are compared; None where there is more."""
-        simple = self.caused is None and not (self._free_phase or self.sensing.active)
-        if not (simple and self.blocks and all(isinstance(block, Quantities) for block in self.blocks)):
+    def alike_in(self) -> tuple[Hashable, ...] | None:
+        """What experiments without a `layout` have in common that are compared all at once; None if they are not."""
+        alike = [block.alike_in for block in self.blocks]
+        if self.caused is not None or self._free_phase or self.sensing.active or not alike or None in alike:
             return None
-        alike = (block.alike_in for block in self.blocks if isinstance(block, Quantities))
         return *alike, self.compared_channels
 
     def changes(self, response: Response, directions: Response) -> list[np.ndarray]:
@@ -461,7 +462,7 @@ class _Part(NamedTuple):
     members: Any  # place in the group of an experiment that is compared alone; slice or list of int of others
     together: list[Observation]
     data: list[np.ndarray]  # Fourier components (experiments, 1, size) a channel; empty if more than these is compared
-    quantities: list[Quantities]  # of all experiments, one a block; empty if more than these is compared
+    alike: list[Block]  # those of all experiments as one; empty if they have data, or are not alike
 
     @property
     def first(self) -> Observation:
@@ -482,21 +483,20 @@ class Comparisons:
         for g, group in enumerate(groups):
             layouts: dict[Any, list[int]] = {}
             for m, observation in enumerate(group):
-                alike = observation.layout or observation.quantities_alike
-                layouts.setdefault(alike or observation.experiment.name, []).append(m)
+                key = observation.layout or observation.alike_in or observation.experiment.name
+                layouts.setdefault(key, []).append(m)
             for members in layouts.values():
                 together, first = [group[m] for m in members], group[members[0]]
                 at: Any = slice(None) if len(members) == len(group) else members
-                data, quantities = [], []
+                data, alike = [], []
                 if first.layout:
                     parts = zip(*(o.data_components() for o in together), strict=True)
                     data = [np.stack(components)[:, None] for components in parts]
-                elif first.quantities_alike:
-                    blocks = zip(*(o.blocks for o in together), strict=True)
-                    quantities = [type(alike[0]).stacked(alike) for alike in blocks]
+                elif first.alike_in:
+                    alike = [type(one[0]).stacked(one) for one in zip(*(o.blocks for o in together), strict=True)]
                 else:
                     at = members[0]
-                self._parts.append(_Part(g, at, together, data, quantities))
+                self._parts.append(_Part(g, at, together, data, alike))
                 blocks = range(stacks, stacks + len(first.blocks))
                 places |= {o.experiment.name: [(b, m) for b in blocks] for m, o in enumerate(together)}
                 stacks = blocks.stop
@@ -519,11 +519,13 @@ class Comparisons:
         result = []
         for part in self._parts:
             solved, members, first = simulation.groups[part.group], part.members, part.first
-            if part.quantities:
-                values = solved.outputs[members][..., first.picked]
-                result += [block.shown(block.quantity(values)) for block in part.quantities]
+            if part.alike:
+                predicted = ComparedSignals(solved.outputs[members][..., first.picked], NONE, solved.frequency[members])
+                measured = np.array([[o.experiment.frequency] for o in part.together])
+                difference = ComparedSignals(NONE, NONE, measured - predicted.frequency)
+                result += [block.compare(predicted, difference) for block in part.alike]
             elif part.data:
-                signals = ComparedSignals(solved.outputs[members][..., first.picked], np.empty(0), np.empty(0))
+                signals = ComparedSignals(solved.outputs[members][..., first.picked], NONE, NONE)
                 sensors, frequency = solved.sensors[members], solved.frequency[members]
                 for measured, block in zip(part.data, first.blocks, strict=True):
                     shown = block.errors(signals)

@@ -2,8 +2,8 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Hashable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Hashable, Iterator
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -43,7 +43,7 @@ class Quantities(Block):
 
     kind: ClassVar[type[Measurement]]
     words: ClassVar[str] = "{0.channel}"
-    of_each: ClassVar[tuple[str, ...]] = "values", "known"  # fields in which blocks that are alike differ
+    of_each: ClassVar[tuple[str, ...]] = "values", "known"
 
     @classmethod
     def of(cls, experiment: Experiment, model: Model) -> "list[Any]":
@@ -117,14 +117,8 @@ class Quantities(Block):
 
     @property
     def alike_in(self) -> tuple[Hashable, ...]:
-        """What blocks have in common that are compared all at once."""
+        """Channel, number of values and points, and whether the standard deviations are known."""
         return type(self), self.place, self.size, self.points, self.counted
-
-    @classmethod
-    def stacked(cls, blocks: "Sequence[Quantities]") -> "Quantities":
-        """Return blocks that are alike as one, for signals (blocks, solves, points, channels)."""
-        each = {name: np.stack([getattr(b, name) for b in blocks])[:, None] for name in cls.of_each}
-        return replace(blocks[0], **{name: values for name, values in each.items() if values.size})
 
     @property
     def sizes(self) -> np.ndarray:

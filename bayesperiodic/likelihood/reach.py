@@ -6,6 +6,7 @@ before the measured frequency f, the point is compared with the orbit at the fol
 zero. So the density is continuous, and falls off beyond the fold over the width w.
 """
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -27,6 +28,7 @@ class Reach(LinearBlock):
 
     words: ClassVar[str] = REACH_OF_BRANCH
     observed: ClassVar[bool] = False
+    of_each: ClassVar[tuple[str, ...]] = ("resolution",)
 
     @classmethod
     def of(cls, experiment: Experiment, model: Model) -> "list[Reach]":
@@ -36,6 +38,11 @@ class Reach(LinearBlock):
         f = experiment.frequency
         given = common(experiment, REACH_OF_BRANCH, count=0.0, size=1)
         return [cls(measured_frequency=f, resolution=experiment.sweep.resolution * f, **given)]
+
+    @property
+    def alike_in(self) -> tuple[Hashable, ...]:
+        """Nothing more."""
+        return (type(self),)
 
     def compare(self, predicted: ComparedSignals, difference: ComparedSignals) -> np.ndarray:
         """Return the distance; the frequency of the prediction is that of its orbit."""

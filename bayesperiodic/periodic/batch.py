@@ -155,7 +155,9 @@ class Batch:
         compiled, functions = self._compiled
         before = functions, grid.packed, grid.periods, self._sets, self._anchors, every
         after = polish, first.model.kernels.output_rates, solution
-        in_blocks(lambda block: compiled.solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads)
+        in_blocks(
+            lambda block: compiled.solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads
+        )
         return solution
 
     def vjp(self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, moving: tuple[int, ...]) -> np.ndarray:

@@ -40,7 +40,20 @@ def weighted_dot(one, other, weights):
 
 @kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
-        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, MATRIX, CUBE, FACTORS, MATRIX,
+        ADDRESSES,
+        GRID,
+        SETTING,
+        VECTOR,
+        NUMBER,
+        NUMBER,
+        FLAG,
+        MATRIX,
+        MATRIX,
+        MATRIX,
+        MATRIX,
+        CUBE,
+        FACTORS,
+        MATRIX,
         MATRIX,
     ),
     **INNER,
