@@ -108,6 +108,28 @@ def test_derivatives_are_those_by_finite_differences():
             assert -j[i] == pytest.approx((high - low) / (2 * step), rel=1e-5, abs=1e-6)
 
 
+def test_experiments_that_are_compared_at_once_have_the_density_of_each_alone():
+    """Frequencies, values, standard deviations and the input's phase are each experiment's."""
+    runs = []
+    for k, frequency in enumerate((0.4, 0.7, 1.1, 1.6)):
+        force = 0.7 * np.cos(AT + 0.4 * k)
+        given = [
+            Amplitude("y", 0.4 + 0.1 * k, sd=0.1 + 0.02 * k), Phase("y", 0.3 - 0.2 * k, to="u", sd=0.1 + 0.03 * k),
+            Phase("cubic", 0.1 * k, to="uneven", sd=0.2), PeakToPeak("uneven", 1.5 + 0.2 * k, sd=0.1 + 0.1 * k),
+            RootMeanSquare("cubic", 0.4 + 0.1 * k, sd=0.05 + 0.01 * k),
+        ]  # fmt: skip
+        runs.append(bp.Experiment(f"{k}", frequency, {}, {"u": force}, samples=N, measurements=given))
+    together = problem(*runs)
+    each = [problem(one) for one in runs]
+    expected = sum(one.log_likelihood(THETA, {}) for one in each)
+    assert together.log_likelihood(THETA, {}) == pytest.approx(expected, rel=1e-12)
+    assert np.ptp([one.log_likelihood(THETA, {}) for one in each]) > 1.0
+    _, slopes = together.value_and_gradient(THETA, {})
+    for name, slope in zip(together.names, slopes, strict=False):
+        high, low = (together.log_posterior(THETA | {name: THETA[name] + s}, {}) for s in (1e-6, -1e-6))
+        assert slope == pytest.approx((high - low) / 2e-6, rel=1e-5)
+
+
 @pytest.mark.parametrize(
     "noise",
     [

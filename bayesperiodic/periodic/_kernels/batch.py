@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
     from bayesperiodic.periodic._kernels.newton import *
 
 MAX_CHORDS = 6
-PREDICTION_RATE, NEXT_RATE = 30.0, 5.0
+PREDICTION_RATE = 30.0
 LEAST_STIFFNESS, MOST_STIFFNESS = 0.3, 3.0
 POLISHED = 1e-12
 LARGEST_PART = 1.0 / 16.0
@@ -64,12 +64,15 @@ def newton_chord(
 ):  # fmt: skip
     """Improve z in place with the factors of a nearby solution; return whether it converged, the steps, their length.
 
-    Each step is corrected by those before it, by Broyden's method (C. T. Kelley, Iterative Methods for Linear and
-    Nonlinear Equations, SIAM 1995, chapter 7). A step above `CHORD_RATE` times the one before ends the iteration.
-    `NEXT_RATE` times the ratio of two steps predicts how much smaller the next one will be, so that errors were no
-    larger than without the correction. The ratio of the first step to the prediction gives the order of magnitude,
-    since the prediction is a chord step except for terms of second order: `PREDICTION_RATE` times it exceeded all but
-    two of a hundred observed rates.
+    The change of second order, if there is one, stands for the first chord step, as which it would come out. Steps are
+    corrected by those before them, by Broyden's method (C. T. Kelley, Iterative Methods for Linear and Nonlinear
+    Equations, SIAM 1995, chapter 7); the change of second order is not used where the equations contradict it, as at
+    a stop that is just touched.
+
+    A step above `CHORD_RATE` times the one before ends the iteration. The largest ratio of a step to the one before
+    predicts how much smaller the next one will be. Without a change of second order the ratio of the first step to the
+    prediction gives the order of magnitude, since the prediction is a chord step except for terms of second order:
+    `PREDICTION_RATE` times it exceeded all but two of a hundred observed rates.
 
     Where ∂g/∂z is nearly singular, steps with the factors of another point are wrong in the direction that it makes
     smallest, and of the wrong sign where the stiffness in that direction has changed its sign. So this direction takes
@@ -79,7 +82,8 @@ def newton_chord(
     in this direction, in units of that of the factors; `left` (points, states) the weights of the equations that are
     largest for a residual in this direction; `right` the direction, scaled to a stiffness of 1 for the ∂g/∂z of the
     factors. If `polish`, the steps go on until one is below `POLISHED` or at rounding level, for derivatives of the
-    outputs. `states`, `change` and `taken` (steps, points, states) are work arrays.
+    outputs. `second` is the change of second order; `states`, `change` and `taken` (steps, points, states) are work
+    arrays.
     """
     residual = grid_function_at(functions.residual)
     inputs, parameters, frequency, drift = setting
@@ -89,7 +93,7 @@ def newton_chord(
     if not (stiffness > LEAST_STIFFNESS and stiffness < MOST_STIFFNESS):
         return False, 0, 0.0
     correction, tolerance = 1.0 / stiffness - 1.0, STEP_TOLERANCE * min(1.0, stiffness)
-    previous, moved, rate, converged = predicted, 0.0, PREDICTION_RATE, False
+    previous, moved, rate, converged, guessed = predicted, 0.0, 0.0, False, False
     squares, scale = np.empty(MAX_CHORDS + 1), np.empty(count)
     for s in range(count):
         scale[s] = 1.0 / amplitude[s] ** 2 if amplitude[s] > 0.0 else 0.0
@@ -102,7 +106,7 @@ def newton_chord(
             position[k] += guess[k]
         copy(second, taken[0])
         squares[0] = weighted_dot(second, second, scale)
-        previous, moved, rate, known = first, first, NEXT_RATE, 1
+        previous, moved, known, guessed = first, first, 1, True
     for iteration in range(MAX_CHORDS):
         differentiate(z, drift, grid, frequency, states)
         residual(states, inputs, parameters, grid.tau, frequency, change)
@@ -135,10 +139,15 @@ def newton_chord(
             return True, iteration + 1, moved
         if not full < OFF_ANCHOR or (iteration > 0 and not full < CHORD_RATE * previous):
             return False, iteration + 1, moved
-        converged = converged or full <= tolerance or rate * full**2 <= tolerance * previous
+        ratio = full / previous
+        if iteration > 0 or guessed:
+            rate = max(rate, ratio)
+        else:
+            ratio *= PREDICTION_RATE
+        converged = converged or full <= tolerance or max(rate, ratio) * full <= tolerance
         if converged and (full <= POLISHED or not polish):
             return True, iteration + 1, moved
-        previous, rate = full, NEXT_RATE
+        previous = full
     return converged, MAX_CHORDS, moved
 
 
