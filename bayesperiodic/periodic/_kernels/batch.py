@@ -40,24 +40,11 @@ def weighted_dot(one, other, weights):
 
 @kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
-        ADDRESSES,
-        GRID,
-        SETTING,
-        VECTOR,
-        NUMBER,
-        NUMBER,
-        FLAG,
-        MATRIX,
-        MATRIX,
-        MATRIX,
-        MATRIX,
-        CUBE,
-        FACTORS,
-        MATRIX,
+        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, MATRIX, CUBE, FACTORS, MATRIX,
         MATRIX,
     ),
     **INNER,
-)
+)  # fmt: skip
 def newton_chord(
     functions, grid, setting, amplitude, stiffness, predicted, polish, z, second, states, change, taken, factors, left,
     right,
@@ -66,8 +53,7 @@ def newton_chord(
 
     The change of second order, if there is one, stands for the first chord step, as which it would come out. Steps are
     corrected by those before them, by Broyden's method (C. T. Kelley, Iterative Methods for Linear and Nonlinear
-    Equations, SIAM 1995, chapter 7); the change of second order is not used where the equations contradict it, as at
-    a stop that is just touched.
+    Equations, SIAM 1995, chapter 7).
 
     A step above `CHORD_RATE` times the one before ends the iteration. The largest ratio of a step to the one before
     predicts how much smaller the next one will be. Without a change of second order the ratio of the first step to the
@@ -97,9 +83,8 @@ def newton_chord(
     squares, scale = np.empty(MAX_CHORDS + 1), np.empty(count)
     for s in range(count):
         scale[s] = 1.0 / amplitude[s] ** 2 if amplitude[s] > 0.0 else 0.0
-    first, known = 0.0, 0
     largest(second, reached)
-    first = in_units(reached, amplitude)
+    first, known = in_units(reached, amplitude), 0
     if first > 0.0 and first < OFF_ANCHOR:
         guess = as_vector(second)
         for k in range(guess.size):
@@ -116,9 +101,7 @@ def newton_chord(
             step[k] = -(step[k] + along * direction[k])
         for k in range(known):
             part = weighted_dot(taken[k], change, scale) / squares[k]
-            if iteration == 0 and not abs(part) < CHORD_RATE:
-                known = 0
-            elif k < known - 1:
+            if k < known - 1:
                 later = as_vector(taken[k + 1])
                 for j in range(step.size):
                     step[j] += part * later[j]
