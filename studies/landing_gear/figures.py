@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
+from scipy.stats import norm
 
 import bayesperiodic as bp
 from studies.common import shared_legend, titled
@@ -19,7 +20,7 @@ from studies.landing_gear.identification import (
     Identified,
     Verdict,
 )
-from studies.landing_gear.quality import FALSE_ALARM, LIMIT, MEANINGS, Unit, deviations
+from studies.landing_gear.quality import FALSE_ALARM, MEANINGS, Tested
 from studies.landing_gear.rig import GEAR, RUNS, Run
 
 CHANNELS = {
@@ -29,6 +30,8 @@ CHANNELS = {
 ERRORS, EARLIEST = {"displacement": (1e3, "mm"), "force": (1.0, "N"), "pressure": (1e-3, "kPa")}, 0.05
 DROP_POINTS = 700
 TITLE = "SYNTHETIC data"
+# That of the smallest p-value above zero.
+LARGEST_DEVIATE = 38.0
 NORMAL_90 = 1.6448536269514722
 SIGNS = {POSITIVE: ("#009E73", "o"), UNDETERMINED: ("#999999", "D"), NEGATIVE: ("#CC79A7", "v")}
 # The scale of theta16 is linear up to here, logarithmic beyond [W/K].
@@ -162,36 +165,47 @@ def corner(verdict: Verdict, truth: str) -> Figure:
     return titled(figure, f"{name}, {model}: sign of theta16 {verdict.sign}, {adequate}")
 
 
-def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
-    """Draw the quality-control chart: every unit's deviation from the reference, a row per parameter."""
+def quality(tested: Sequence[Tested]) -> Figure:
+    """Draw the quality-control chart: every gear's deviation by its p-value, a row per parameter."""
     figure, grid = plt.subplots(len(MEANINGS), 1, figsize=(9.0, 9.5), sharex=True, layout="constrained")
-    number = np.arange(1, len(units) + 1)
-    every = [deviations(reference, unit) for unit in units]
+    number, limit = np.arange(1, len(tested) + 1), norm.isf(0.5 * tested[0][1].level)
     for axes, (name, meaning) in zip(grid, MEANINGS.items(), strict=True):
-        z = np.array([deviation[name] for deviation in every])
-        out = np.abs(z) > LIMIT
-        axes.axhspan(-LIMIT, LIMIT, color="#DDDDDD", lw=0)
-        axes.plot(number[~out], z[~out], "o", ms=3, color=bp.plot.COLOURS["map"], label='"same"')
-        axes.plot(number[out], z[out], "^", ms=4, color=bp.plot.COLOURS["laplace"], label='"different"')
-        axes.set_yscale("symlog", linthresh=10.0, linscale=2.0)
-        axes.set_yticks([-1000, -100, -10, -5, 0, 5, 10, 100, 1000])
-        axes.set_yticklabels(["−1000", "−100", "−10", "−5", "0", "5", "10", "100", "1000"], fontsize=8)
-        axes.set_ylim(-2.0 * max(10.0, np.abs(z).max()), 2.0 * max(10.0, np.abs(z).max()))
-        axes.minorticks_off()
+        rows = [test.table.loc[name] for _, test in tested]
+        sign = np.sign([row["estimate"] - row["expected"] for row in rows])
+        z = sign * np.minimum(norm.isf(0.5 * np.array([row["p"] for row in rows])), LARGEST_DEVIATE)
+        out = np.array([name in test.differing for _, test in tested])
+        axes.axhspan(-limit, limit, color="#DDDDDD", lw=0)
+        axes.plot(number[~out], z[~out], "o", ms=4, color=bp.plot.COLOURS["map"], label='"same"')
+        axes.plot(number[out], z[out], "^", ms=5, color=bp.plot.COLOURS["laplace"], label='"different"')
+        axes.set_ylim(-1.2 * max(5.0, np.abs(z).max()), 1.2 * max(5.0, np.abs(z).max()))
         axes.set_ylabel(f"{meaning}\n{name}", fontsize=9)
-    for k, kind in enumerate(dict.fromkeys(unit.kind for unit in units)):
-        members = np.flatnonzero([unit.kind == kind for unit in units])
+    for k, kind in enumerate(dict.fromkeys(kind for kind, _ in tested)):
+        members = np.flatnonzero([one == kind for one, _ in tested])
         grid[0].text(
             number[members].mean(), 1.04, kind, ha="center", va="bottom", transform=grid[0].get_xaxis_transform()
         )
         for axes in grid if k else ():
             axes.axvline(number[members[0]] - 0.5, color="black", lw=0.6)
-    grid[-1].set_xlabel("unit")
+    grid[-1].set_xlabel("gear")
     shared_legend(figure, 2)
     figure.suptitle(
-        "Deviation from the reference gear, in common standard deviations, SYNTHETIC data\n"
-        f"(grey: ±{LIMIT:.2f}, a false alarm in {FALSE_ALARM:.0%} of good units)"
+        "Deviation from the population of good gears, as the normal deviate with the same p-value, SYNTHETIC data\n"
+        f"(grey: ±{limit:.2f}; false alarms in at most {FALSE_ALARM:.0%} of good gears)",
+        fontsize="medium",
     )
+    return figure
+
+
+def over_amplitude(populations: Mapping[str, bp.Population]) -> Figure:
+    """Draw theta16 by amplitude with the population over the experiments, one column per truth."""
+    figure = plt.figure(figsize=(5.5 * len(populations), 5.0), layout="constrained")
+    for part, (truth, found) in zip(
+        figure.subfigures(1, len(populations), squeeze=False)[0], populations.items(), strict=True
+    ):
+        bp.plot.population(found, covariate="amplitude", figure=part)
+        part.axes[0].set_xlabel("amplitude [m]")
+        part.suptitle(TRUTH_NAMES[truth], fontsize="medium")
+    figure.suptitle(f"Heat conduction by experiment, {TITLE}")
     return figure
 
 
