@@ -188,9 +188,11 @@ def quality(tested: Sequence[Tested]) -> Figure:
             axes.axvline(number[members[0]] - 0.5, color="black", lw=0.6)
     grid[-1].set_xlabel("gear")
     shared_legend(figure, 2)
+    grid[-1].set_xlim(0.0, len(tested) + 1.0)
     figure.suptitle(
         "Deviation from the population of good gears, as the normal deviate with the same p-value, SYNTHETIC data\n"
-        f"(grey: ±{limit:.2f}; false alarms in at most {FALSE_ALARM:.0%} of good gears)",
+        f"(grey: ±{limit:.2f}; false alarms in at most {FALSE_ALARM:.0%} of good gears; at ±{LARGEST_DEVIATE:g} "
+        "whatever is larger)",
         fontsize="medium",
     )
     return figure

@@ -51,17 +51,22 @@ FALSE_ALARM = 0.01
 # Chains of a gear pass the stop rule with these.
 SAMPLING: dict[str, Any] = {"ensembles": 2, "walkers": 24, "progress": False}
 REFERENCE_SEED, FIRST_UNIT = 5000, 10_000
-# Spread of theta16 over the experiments, if there is one [W/K].
-CONDUCTION_SPREAD = bp.HalfNormal(5.0)
+# Spread of theta16 over the experiments, if there is one, and a prior in each that is wider than any data, as it is
+# divided out of the draws [W/K].
+CONDUCTION_SPREAD, WIDE = bp.HalfNormal(5.0), {**identification.PRIORS, CONDUCTION: bp.Normal(3.0, 100.0)}
 # A new gear: its kind and its test.
 Tested = tuple[str, bp.MembershipTest]
 
 
-def examine(kind: str, seed: int) -> bp.Posterior:
-    """Return the posterior of one gear of a kind; seeds differ in the noise of the instruments."""
+# A gear or an experiment: its problem, by which it can be sampled again under a population, and its draws.
+Drawn = tuple[bp.Problem, bp.Posterior]
+
+
+def examine(kind: str, seed: int) -> Drawn:
+    """Return the draws of one gear of a kind; seeds differ in the noise of the instruments."""
     experiments = [fold(measure(run, (), seed, FAULTS[kind]), DISPLACEMENT) for run in RUNS if run.name in CAMPAIGN]
     found = estimate(experiments, DISPLACEMENT, one_conduction=True, priors=PRIORS, fixed=FIXED, tied=TIED)
-    return bp.sample(found.problem, found.fit, seed=seed, **SAMPLING)
+    return found.problem, bp.sample(found.problem, found.fit, seed=seed, **SAMPLING)
 
 
 def examine_all(references: int, each: Mapping[str, int], seed: int) -> tuple[bp.Population, list[Tested]]:
@@ -69,10 +74,10 @@ def examine_all(references: int, each: Mapping[str, int], seed: int) -> tuple[bp
     kinds = [kind for kind, count in each.items() for _ in range(count)]
     tasks = [(GOOD, REFERENCE_SEED * (seed + 1) + k) for k in range(references)]
     tasks += [(kind, FIRST_UNIT * (seed + 1) + k) for k, kind in enumerate(kinds)]
-    posteriors = list(common.each(examine, tasks))
-    units = {f"gear {k + 1}": posterior for k, posterior in enumerate(posteriors[:references])}
+    gears = list(common.each(examine, tasks))
+    units = {f"gear {k + 1}": gear for k, gear in enumerate(gears[:references])}
     population = bp.population(units, list(PRIORS), spread=SPREADS, seed=seed, progress=False)
-    tests = [population.test(one, false_alarm=FALSE_ALARM) for one in posteriors[references:]]
+    tests = [population.test(one, false_alarm=FALSE_ALARM) for one in gears[references:]]
     return population, list(zip(kinds, tests, strict=True))
 
 
@@ -110,16 +115,16 @@ def table(found: Mapping[str, Any]) -> str:
     )
 
 
-def drawn_run(run: Run, truth: str, seed: int) -> bp.Posterior:
-    """Return the posterior of one experiment, as the study samples it."""
-    found = estimate([fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)], DISPLACEMENT)
-    return identification.draw(found, seed, quick=False).posterior
+def drawn_run(run: Run, truth: str, seed: int) -> Drawn:
+    """Return the draws of one experiment with the displacement given."""
+    found = estimate([fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)], DISPLACEMENT, priors=WIDE)
+    return found.problem, identification.draw(found, seed, quick=False).posterior
 
 
 def conductions(runs: Sequence[Run], truth: str, seed: int) -> bp.Population:
     """Return theta16 as a population over the experiments, with the amplitude as covariate [m]."""
-    posteriors = common.each(drawn_run, [(run, truth, seed) for run in runs])
-    units = {run.name: posterior for run, posterior in zip(runs, posteriors, strict=True)}
+    drawn = common.each(drawn_run, [(run, truth, seed) for run in runs])
+    units = {run.name: one for run, one in zip(runs, drawn, strict=True)}
     amplitude = {run.name: run.stroke for run in runs}
     return bp.population(
         units, [CONDUCTION], spread={CONDUCTION: CONDUCTION_SPREAD}, covariates={"amplitude": amplitude}, seed=seed,
