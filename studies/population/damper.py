@@ -78,7 +78,7 @@ def damper_population(
         for group in groups:
             others = fit([name for name in posteriors if name not in group])
             rows |= {name: _predicted(others, name, posteriors[name]) for name in group}
-        predicted[what] = {"tests": rows, "covered_90": _coverage(list(rows.values()))}
+        predicted[what] = {"tests": rows, "covered_90": coverage(list(rows.values()))}
     return result, account(result) | {"tests": len(posteriors), "predicted": predicted}
 
 
@@ -97,12 +97,14 @@ def _predicted(others: bp.Population, name: str, posterior: bp.Posterior) -> dic
     try:
         test = others.test(posterior, covariates=at)
     except ValueError as error:
-        print(f"  {name}: membership is not decided: {error}")
+        print(f"  {name}: membership is not decided: {error}", flush=True)
         return found | {"p": None, "member": None}
-    return found | {"p": test.table["p"].to_dict(), "member": test.member}
+    p = test.table["p"].to_dict()
+    print(f"  {name} by the others: {', '.join(f'p = {p[n]:.2f} for {n}' for n in DAMPER_NAMES)}", flush=True)
+    return found | {"p": p, "member": test.member}
 
 
-def _coverage(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def coverage(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return how many estimates are within the 90 % intervals predicted for them, by parameter, of those decided."""
     decided = [row["p"] for row in rows if row["p"] is not None]
     counts = {name: sum(p[name] >= 1.0 - LEVEL for p in decided) for name in DAMPER_NAMES}
