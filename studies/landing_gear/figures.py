@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
-from scipy.stats import norm
 
 import bayesperiodic as bp
 from studies.common import shared_legend, titled
@@ -20,7 +19,7 @@ from studies.landing_gear.identification import (
     Identified,
     Verdict,
 )
-from studies.landing_gear.quality import FALSE_ALARM, MEANINGS, Tested
+from studies.landing_gear.quality import LARGEST_DEVIATE, MEANINGS
 from studies.landing_gear.rig import GEAR, RUNS, Run
 
 CHANNELS = {
@@ -30,8 +29,6 @@ CHANNELS = {
 ERRORS, EARLIEST = {"displacement": (1e3, "mm"), "force": (1.0, "N"), "pressure": (1e-3, "kPa")}, 0.05
 DROP_POINTS = 700
 TITLE = "SYNTHETIC data"
-# That of the smallest p-value above zero.
-LARGEST_DEVIATE = 38.0
 NORMAL_90 = 1.6448536269514722
 SIGNS = {POSITIVE: ("#009E73", "o"), UNDETERMINED: ("#999999", "D"), NEGATIVE: ("#CC79A7", "v")}
 # The scale of theta16 is linear up to here, logarithmic beyond [W/K].
@@ -165,34 +162,31 @@ def corner(verdict: Verdict, truth: str) -> Figure:
     return titled(figure, f"{name}, {model}: sign of theta16 {verdict.sign}, {adequate}")
 
 
-def quality(tested: Sequence[Tested]) -> Figure:
+def quality(found: Mapping[str, Any]) -> Figure:
     """Draw the quality-control chart: every gear's deviation by its p-value, a row per parameter."""
     figure, grid = plt.subplots(len(MEANINGS), 1, figsize=(9.0, 9.5), sharex=True, layout="constrained")
-    number, limit = np.arange(1, len(tested) + 1), norm.isf(0.5 * tested[0][1].level)
+    limit, kinds = found["limit"], found["kinds"].values()
+    counts = [one["units"] for one in kinds]
+    number, ends = np.arange(1, sum(counts) + 1), np.cumsum([0, *counts])
     for axes, (name, meaning) in zip(grid, MEANINGS.items(), strict=True):
-        rows = [test.table.loc[name] for _, test in tested]
-        sign = np.sign([row["estimate"] - row["expected"] for row in rows])
-        z = sign * np.minimum(norm.isf(0.5 * np.array([row["p"] for row in rows])), LARGEST_DEVIATE)
-        out = np.array([name in test.differing for _, test in tested])
+        z = np.concatenate([one["deviates"][name] for one in kinds])
+        out, most = np.abs(z) > limit, 1.2 * max(5.0, np.abs(z).max())
         axes.axhspan(-limit, limit, color="#DDDDDD", lw=0)
         axes.plot(number[~out], z[~out], "o", ms=4, color=bp.plot.COLOURS["map"], label='"same"')
         axes.plot(number[out], z[out], "^", ms=5, color=bp.plot.COLOURS["laplace"], label='"different"')
-        axes.set_ylim(-1.2 * max(5.0, np.abs(z).max()), 1.2 * max(5.0, np.abs(z).max()))
+        axes.set_ylim(-most, most)
         axes.set_ylabel(f"{meaning}\n{name}", fontsize=9)
-    for k, kind in enumerate(dict.fromkeys(kind for kind, _ in tested)):
-        members = np.flatnonzero([one == kind for one, _ in tested])
-        grid[0].text(
-            number[members].mean(), 1.04, kind, ha="center", va="bottom", transform=grid[0].get_xaxis_transform()
-        )
-        for axes in grid if k else ():
-            axes.axvline(number[members[0]] - 0.5, color="black", lw=0.6)
-    grid[-1].set_xlabel("gear")
+        for end in ends[1:-1]:
+            axes.axvline(end + 0.5, color="black", lw=0.6)
+    for kind, start, end in zip(found["kinds"], ends[:-1], ends[1:], strict=True):
+        words, middle = kind.replace(" ", "\n", 1), 0.5 * (start + end + 1)
+        grid[0].text(middle, 1.04, words, ha="center", va="bottom", transform=grid[0].get_xaxis_transform())
+    grid[-1].set(xlabel="gear", xlim=(0.0, number[-1] + 1.0))
     shared_legend(figure, 2)
-    grid[-1].set_xlim(0.0, len(tested) + 1.0)
     figure.suptitle(
         "Deviation from the population of good gears, as the normal deviate with the same p-value, SYNTHETIC data\n"
-        f"(grey: ±{limit:.2f}; false alarms in at most {FALSE_ALARM:.0%} of good gears; at ±{LARGEST_DEVIATE:g} "
-        "whatever is larger)",
+        f"(grey: ±{limit:.2f}; false alarms in at most {found['false_alarm_rate']:.0%} of good gears; at "
+        f"±{LARGEST_DEVIATE:g} whatever is larger)",
         fontsize="medium",
     )
     return figure
@@ -206,6 +200,7 @@ def over_amplitude(populations: Mapping[str, bp.Population]) -> Figure:
     ):
         bp.plot.population(found, covariate="amplitude", figure=part)
         part.axes[0].set_xlabel("amplitude [m]")
+        part.axes[0].axhline(0.0, color="black", lw=0.6)
         part.suptitle(TRUTH_NAMES[truth], fontsize="medium")
     figure.suptitle(f"Heat conduction by experiment, {TITLE}")
     return figure

@@ -9,7 +9,8 @@ theta5/theta6. And theta16 as a population over the experiments on one gear: whe
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from scipy.stats import binomtest
+import numpy as np
+from scipy.stats import binomtest, norm
 
 import bayesperiodic as bp
 from studies import common
@@ -54,6 +55,8 @@ REFERENCE_SEED, FIRST_UNIT = 5000, 10_000
 # Spread of theta16 over the experiments, if there is one, and a prior in each that is wider than any data, as it is
 # divided out of the draws [W/K].
 CONDUCTION_SPREAD, WIDE = bp.HalfNormal(5.0), {**identification.PRIORS, CONDUCTION: bp.Normal(3.0, 100.0)}
+# That of the smallest p-value above zero.
+LARGEST_DEVIATE = 38.0
 # A new gear: its kind and its test.
 Tested = tuple[str, bp.MembershipTest]
 
@@ -85,7 +88,7 @@ def account(population: bp.Population, tested: Sequence[Tested]) -> dict[str, An
     """Return the entries of results.json: how often each parameter is called different, by kind of unit."""
     found: dict[str, Any] = {
         "experiments": list(CAMPAIGN), "false_alarm_rate": FALSE_ALARM, "reference": account_of_population(population),
-        "kinds": {},
+        "limit": float(norm.isf(0.5 * tested[0][1].level)), "kinds": {},
     }  # fmt: skip
     for kind, changes in CHANGES.items():
         every = [test for one, test in tested if one == kind]
@@ -102,9 +105,17 @@ def account(population: bp.Population, tested: Sequence[Tested]) -> dict[str, An
                 "of": len(every),
                 "interval_95": list(binomtest(wrong, len(every)).proportion_ci(0.95)),
             },
+            "deviates": {name: [deviate(test, name) for test in every] for name in PRIORS},
             "example": every[0].verdict,
         }
     return found
+
+
+def deviate(test: bp.MembershipTest, name: str) -> float:
+    """Return the normal deviate with the p-value of a parameter, with the sign of its deviation, of limited size."""
+    row = test.table.loc[name]
+    size = min(float(norm.isf(0.5 * row["p"])), LARGEST_DEVIATE)
+    return float(np.copysign(size, row["estimate"] - row["expected"]))
 
 
 def table(found: Mapping[str, Any]) -> str:

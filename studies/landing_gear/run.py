@@ -31,7 +31,7 @@ LARGE, SMALL, FIGURE_1 = "0.2 Hz 80 mm", "3 Hz 4 mm", "1 Hz 18 mm"
 QUICK = tuple(run for run in RUNS if run.name in (FIGURE_1, SMALL))
 DROPS, QUICK_DROPS = 200, 20
 # Good gears of the population; new gears of each kind; every so many experiments of a quick run.
-REFERENCES, QUICK_REFERENCES, GOOD_GEARS, FAULTY_GEARS, QUICK_STEP = 10, 4, 40, 5, 4
+REFERENCES, QUICK_REFERENCES, GOOD_GEARS, FAULTY_GEARS, QUICK_STEP = 10, 4, 20, 5, 4
 LARGE_STROKE, TOLERANCE = 0.06, 0.25
 
 
@@ -133,7 +133,7 @@ def _populations(truths: Sequence[str], options: argparse.Namespace, watch: comm
         print(conductions[truth])
     found["theta16"] = {truth: quality.account_of_population(one) for truth, one in conductions.items()}
     drawn = {
-        "quality": landing_gear_figures.quality(tested),
+        "quality": landing_gear_figures.quality(found["quality"]),
         "theta16": landing_gear_figures.over_amplitude(conductions),
     }
     folder = options.out / "populations"

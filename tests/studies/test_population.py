@@ -28,7 +28,7 @@ def test_coverage_counts_the_estimates_that_are_as_near_as_nine_tenths_of_them()
 
 @pytest.mark.slow
 def test_a_quick_run_finds_what_differs_between_springs(tmp_path):
-    """A member is called different in 1 % of populations at most; the stiffer spring is 30 % stiffer than all others."""
+    """A member is called different in 1 % of populations at most; the stiffer spring is so by 30 %."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         assert main(["population", "--quick", "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))["springs"]
