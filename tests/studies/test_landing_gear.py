@@ -238,19 +238,27 @@ def test_quality_control_names_the_fault(populations):
     assert named == {
         "good": set(), "low gas charge": {"theta5"}, "worn friction": {"theta8"}, "leaking oil": {"theta5", "theta6"},
     }  # fmt: skip
-    assert results["quality"]["reference"]["converged"]
+    signs = {kind: {n: np.sign(one["deviates"][n][0]) for n in named[kind]} for kind, one in kinds.items()}
+    assert signs["low gas charge"] == {"theta5": -1} and signs["worn friction"] == {"theta8": -1}
+    assert signs["leaking oil"] == {"theta5": -1, "theta6": 1}, "theta6, -1 over the length of the gas, is nearer zero"
+    assert results["quality"]["reference"]["converged"] and "no importance sample" not in printed
     assert all(one["units_with_all_verdicts_right"] == 1 for one in kinds.values())
     assert kinds["good"]["error_rate"]["interval_95"] == pytest.approx([0.0, 0.975], abs=1e-3)
     assert "quality control" in printed
 
 
 @pytest.mark.slow
-def test_theta16_is_constant_over_the_experiments_on_a_gear_that_obeys_equation_9(populations):
-    """Of truth A no spread is seen; four experiments, a Bayes factor for a spread above 20 comes in 5 % at most."""
+def test_theta16_is_constant_over_the_experiments_only_on_a_gear_that_obeys_equation_9(populations):
+    """Four experiments: of truth A a Bayes factor for a spread above 20 comes in 5 % at most.
+
+    Of truth B the estimate at 4 Hz is four of its standard deviations below those at 80 mm.
+    """
     drawn, results, _ = populations
     assert set(drawn) == {"quality", "theta16"} and set(results["theta16"]) == {"A", "B"}
-    assert results["theta16"]["A"]["converged"]
-    assert "not explained by noise" not in results["theta16"]["A"]["verdicts"]["theta16"]
+    assert all(one["converged"] for one in results["theta16"].values())
+    verdicts = {truth: one["verdicts"]["theta16"] for truth, one in results["theta16"].items()}
+    assert "not explained by noise" not in verdicts["A"] and "No spread" in verdicts["A"]
+    assert "not explained by noise, but perhaps by the error of the model" in verdicts["B"]
     for figure in drawn.values():
         assert any("synthetic" in text.get_text().lower() for text in figure.findobj(Text))
 
