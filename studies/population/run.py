@@ -3,10 +3,9 @@
 Simulated springs with a known spread of the damping and none of the stiffness, one more like them and one that is not.
 Measured: twelve steady-sine tests of a banded rotary friction damper with backlash (github.com/ARTS-Laboratory/
 Dataset-Friction-Damper-with-Backlash, commit 0e09aa9d), friction force Kw and sharpness rho of Dahl's model by
-amplitude, frequency and band tension; with ``--replicates N`` the first N tests are predicted from all others, and the
-repeats (test 3) from the tests that they repeat (test 2). Without the files only the springs. ``--scaling`` only counts
-the evaluations that springs one by one take, and in one problem; with ``--replicates N`` it measures each stage of
-populations of 10, 100, …, N stored units instead.
+amplitude, frequency and band tension; with ``--replicates N`` the first N tests are predicted from all others. Without
+the files only the springs. ``--scaling`` only counts the evaluations that springs one by one take, and in one problem;
+with ``--replicates N`` it measures each stage of populations of 10, 100, …, N stored units instead.
 """
 
 import argparse
@@ -16,7 +15,7 @@ from matplotlib.figure import Figure
 
 import bayesperiodic as bp
 from studies import common
-from studies.population.damper import ADDRESS, REPEATS, damper_population, find_tests, sampled_test
+from studies.population.damper import ADDRESS, damper_population, find_tests, sampled_test
 from studies.population.scaling import scaling, table
 from studies.population.springs import QUICK_SPRINGS, SPRINGS, spring_population
 from studies.population.stored import stored, stored_table
@@ -49,9 +48,7 @@ def run(options: argparse.Namespace) -> None:
             every = {path.stem: sampled_test(path, options.seed) for path in paths}
             posteriors = {name: draws for name, draws in every.items() if draws is not None}
         with watch.part("dampers", "sampling their population, and that of all but one"):
-            chosen = list(posteriors)[: options.replicates]
-            repeats = [name for name in posteriors if name.startswith(REPEATS)] if chosen else []
-            left_out = {"one": [[name] for name in chosen], "repeats": [repeats] if repeats else []}
+            left_out = list(posteriors)[: options.replicates]
             dampers, results["dampers"] = damper_population(posteriors, left_out, options.seed)
             title = f"Friction damper, {len(posteriors)} tests"
             figures["forest"] = _titled(bp.plot.population(dampers), title)
