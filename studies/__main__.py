@@ -37,6 +37,9 @@ def main(arguments: list[str] | None = None) -> int:
     workers.add_argument("--mpi", action="store_true", help="calibration: MPI, below mpiexec … -m mpi4py.futures")
     parser.add_argument("--truth", choices=("A", "B"), help="landing-gear: which damper (default both)")
     parser.add_argument("--missing", action="store_true", help="landing-gear: what missing_terms finds, only that")
+    parser.add_argument(
+        "--populations", action="store_true", help="landing-gear: gears and theta16 as populations, only"
+    )
     parser.add_argument("--scaling", action="store_true", help="calibration, population: measure the cost, only that")
     parser.add_argument("--guard", action="store_true", help="benchmark: a quick run's ratios against those kept")
     parser.add_argument("--cold-start", action="store_true", help="benchmark: times in new environments, only that")

@@ -143,9 +143,43 @@ def landing_gear():
         f"first 2.5 s; for the other the error reaches {off['B']:.2f} mm, and the band contains it for "
         f"{share['B']:.1f} %."
     )
-    kinds = d["quality"]["kinds"]
-    assert all(one["units_with_any"] == one["units"] for kind, one in kinds.items() if kind != "good")
-    yield f"call {kinds['good']['units_with_any']} of {kinds['good']['units']} good units different"
+
+
+@on("docs/studies/landing_gear.md")
+def landing_gear_populations():
+    d = results("landing_gear/populations")
+    of = d["theta16"]
+    a, b = of["A"], of["B"]
+    assert a["converged"] and b["converged"] and not a["remarks"]
+    assert "6 Hz 4 mm lies outside" in b["remarks"][0] and "misspecified in 14 of 14" in b["remarks"][1]
+    assert "No spread of theta16 is seen" in a["verdicts"]["theta16"]
+    assert "not explained by noise, but perhaps by the error of the model" in b["verdicts"]["theta16"]
+    factor = {
+        truth: float(re.search(r"at least ([\d.e+]+)\)", one["verdicts"]["theta16"])[1]) for truth, one in of.items()
+    }
+    mean, slope, spread = ({truth: one["summary"][name] for truth, one in of.items()} for name in LABELS)
+    yield (
+        f"below {spread['A']['q95']:.2f} W/K with a probability of 95 %, the Bayes factor for no spread is at least "
+        f"{factor['A']:.0f}, and the mean is {mean['A']['mean']:.2f} ± {mean['A']['sd']:.2f} W/K"
+    )
+    yield (
+        f"it is {spread['B']['mean']:.1f} ± {spread['B']['sd']:.1f} W/K beside a trend of "
+        f"{1e-2 * slope['B']['mean']:.1f} ± {1e-2 * slope['B']['sd']:.1f} W/K per centimetre of amplitude, and noise "
+        f"does not explain it (Bayes factor for a spread at least {factor['B']:,.0f})"
+    )
+    q = d["quality"]
+    kinds, good = q["kinds"], q["kinds"]["good"]
+    assert q["reference"]["converged"] and not q["reference"]["remarks"]
+    assert all(one["units_with_all_verdicts_right"] == one["units"] for one in kinds.values())
+    (faulty,) = {one["units"] for kind, one in kinds.items() if kind != "good"}
+    most = 100 * good["error_rate"]["interval_95"][1]
+    yield (
+        f"are named in all {WORDS[faulty]} gears that have them, and {good['units_with_any']} of {good['units']} good "
+        f"gears are called different (95 % interval of the rate: 0 to {most:.0f} %)"
+    )
+
+
+LABELS = "mean[theta16]", "slope[theta16, amplitude]", "spread[theta16]"
 
 
 def cost_of_the_gear():

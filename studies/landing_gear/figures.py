@@ -19,7 +19,7 @@ from studies.landing_gear.identification import (
     Identified,
     Verdict,
 )
-from studies.landing_gear.quality import FALSE_ALARM, LIMIT, MEANINGS, Unit, deviations
+from studies.landing_gear.quality import LARGEST_DEVIATE, MEANINGS
 from studies.landing_gear.rig import GEAR, RUNS, Run
 
 CHANNELS = {
@@ -162,36 +162,47 @@ def corner(verdict: Verdict, truth: str) -> Figure:
     return titled(figure, f"{name}, {model}: sign of theta16 {verdict.sign}, {adequate}")
 
 
-def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
-    """Draw the quality-control chart: every unit's deviation from the reference, a row per parameter."""
+def quality(found: Mapping[str, Any]) -> Figure:
+    """Draw the quality-control chart: every gear's deviation by its p-value, a row per parameter."""
     figure, grid = plt.subplots(len(MEANINGS), 1, figsize=(9.0, 9.5), sharex=True, layout="constrained")
-    number = np.arange(1, len(units) + 1)
-    every = [deviations(reference, unit) for unit in units]
+    limit, kinds = found["limit"], found["kinds"].values()
+    counts = [one["units"] for one in kinds]
+    number, ends = np.arange(1, sum(counts) + 1), np.cumsum([0, *counts])
     for axes, (name, meaning) in zip(grid, MEANINGS.items(), strict=True):
-        z = np.array([deviation[name] for deviation in every])
-        out = np.abs(z) > LIMIT
-        axes.axhspan(-LIMIT, LIMIT, color="#DDDDDD", lw=0)
-        axes.plot(number[~out], z[~out], "o", ms=3, color=bp.plot.COLOURS["map"], label='"same"')
-        axes.plot(number[out], z[out], "^", ms=4, color=bp.plot.COLOURS["laplace"], label='"different"')
-        axes.set_yscale("symlog", linthresh=10.0, linscale=2.0)
-        axes.set_yticks([-1000, -100, -10, -5, 0, 5, 10, 100, 1000])
-        axes.set_yticklabels(["−1000", "−100", "−10", "−5", "0", "5", "10", "100", "1000"], fontsize=8)
-        axes.set_ylim(-2.0 * max(10.0, np.abs(z).max()), 2.0 * max(10.0, np.abs(z).max()))
-        axes.minorticks_off()
+        z = np.concatenate([one["deviates"][name] for one in kinds])
+        out, most = np.abs(z) > limit, 1.2 * max(5.0, np.abs(z).max())
+        axes.axhspan(-limit, limit, color="#DDDDDD", lw=0)
+        axes.plot(number[~out], z[~out], "o", ms=4, color=bp.plot.COLOURS["map"], label='"same"')
+        axes.plot(number[out], z[out], "^", ms=5, color=bp.plot.COLOURS["laplace"], label='"different"')
+        axes.set_ylim(-most, most)
         axes.set_ylabel(f"{meaning}\n{name}", fontsize=9)
-    for k, kind in enumerate(dict.fromkeys(unit.kind for unit in units)):
-        members = np.flatnonzero([unit.kind == kind for unit in units])
-        grid[0].text(
-            number[members].mean(), 1.04, kind, ha="center", va="bottom", transform=grid[0].get_xaxis_transform()
-        )
-        for axes in grid if k else ():
-            axes.axvline(number[members[0]] - 0.5, color="black", lw=0.6)
-    grid[-1].set_xlabel("unit")
+        for end in ends[1:-1]:
+            axes.axvline(end + 0.5, color="black", lw=0.6)
+    for kind, start, end in zip(found["kinds"], ends[:-1], ends[1:], strict=True):
+        words, middle = kind.replace(" ", "\n", 1), 0.5 * (start + end + 1)
+        grid[0].text(middle, 1.04, words, ha="center", va="bottom", transform=grid[0].get_xaxis_transform())
+    grid[-1].set(xlabel="gear", xlim=(0.0, number[-1] + 1.0))
     shared_legend(figure, 2)
     figure.suptitle(
-        "Deviation from the reference gear, in common standard deviations, SYNTHETIC data\n"
-        f"(grey: ±{LIMIT:.2f}, a false alarm in {FALSE_ALARM:.0%} of good units)"
+        "Deviation from the population of good gears, as the normal deviate with the same p-value, SYNTHETIC data\n"
+        f"(grey: ±{limit:.2f}; false alarms in at most {found['false_alarm_rate']:.0%} of good gears; at "
+        f"±{LARGEST_DEVIATE:g} whatever is larger)",
+        fontsize="medium",
     )
+    return figure
+
+
+def over_amplitude(populations: Mapping[str, bp.Population]) -> Figure:
+    """Draw theta16 by amplitude with the population over the experiments, one column per truth."""
+    figure = plt.figure(figsize=(5.5 * len(populations), 5.0), layout="constrained")
+    for part, (truth, found) in zip(
+        figure.subfigures(1, len(populations), squeeze=False)[0], populations.items(), strict=True
+    ):
+        bp.plot.population(found, covariate="amplitude", figure=part)
+        part.axes[0].set_xlabel("amplitude [m]")
+        part.axes[0].axhline(0.0, color="black", lw=0.6)
+        part.suptitle(TRUTH_NAMES[truth], fontsize="medium")
+    figure.suptitle(f"Heat conduction by experiment, {TITLE}")
     return figure
 
 

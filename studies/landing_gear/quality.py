@@ -1,22 +1,23 @@
-"""Quality control as the paper proposes it: whether a new gear equals the reference, and which parameter differs.
+"""Quality control as the paper proposes it: whether a new gear is like the good ones, or which parameter differs.
 
-SYNTHETIC units under three experiments each, good or with too little gas, worn friction, or less oil. A parameter is
-called "different" if it deviates from the reference, which is measured several times, by more than their combined
-standard deviations allow, at a false-alarm rate of 1 % per unit over all parameters. The area theta4 is machined and
-known; the gas's heat capacity theta15 is proportional to its amount, theta5/theta6.
+SYNTHETIC gears under three experiments each. Good ones, which are equal, are the population; new ones are good too, or
+have too little gas, worn friction, or less oil, and each is tested by `Population.test` at a false-alarm rate of 1 %
+per gear. The area theta4 is machined and known; the gas's heat capacity theta15 is proportional to its amount,
+theta5/theta6. And theta16 as a population over the experiments on one gear: whether it is constant.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import binom, norm
+from scipy.stats import binomtest, norm
 
 import bayesperiodic as bp
 from studies import common
-from studies.landing_gear.identification import DISPLACEMENT, estimate, fold
-from studies.landing_gear.rig import GEAR, RUNS, Changed, measure
+from studies.landing_gear import identification
+from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, estimate, fold
+from studies.landing_gear.rig import GEAR, RUNS, TRUTHS, Changed, Run, measure
+from studies.population.account import account as account_of_population
 
 CAMPAIGN = ("0.2 Hz 80 mm", "1 Hz 36 mm", "4 Hz 8 mm")
 PRIORS = {
@@ -42,87 +43,101 @@ CHANGES: dict[str, dict[str, float]] = {
     "leaking oil": {name: GEAR[name] / (1 + LOST_OIL) for name in ("theta5", "theta6")},
 }
 FAULTS: dict[str, Changed] = {kind: frozenset(changes.items()) for kind, changes in CHANGES.items()}
+# Differences between good gears that are expected, by parameter; of positive ones relative.
+SPREADS = {
+    "theta3": bp.HalfNormal(0.02), "theta5": bp.HalfNormal(2e-3), "theta6": bp.HalfNormal(0.01),
+    "theta8": bp.HalfNormal(0.02), "theta16": bp.HalfNormal(0.2),
+}  # fmt: skip
 FALSE_ALARM = 0.01
-LIMIT = float(norm.isf(0.5 * FALSE_ALARM / len(PRIORS)))
-POWER = 0.9
-# More tasks than that are shared among processes.
-SERIALLY = 10
+# Chains of a gear pass the stop rule with these.
+SAMPLING: dict[str, Any] = {"ensembles": 2, "walkers": 24, "progress": False}
 REFERENCE_SEED, FIRST_UNIT = 5000, 10_000
+# Spread of theta16 over the experiments, if there is one, and a prior in each that is wider than any data, as it is
+# divided out of the draws [W/K].
+CONDUCTION_SPREAD, WIDE = bp.HalfNormal(5.0), {**identification.PRIORS, CONDUCTION: bp.Normal(3.0, 100.0)}
+# That of the smallest p-value above zero.
+LARGEST_DEVIATE = 38.0
+# A new gear: its kind and its test.
+Tested = tuple[str, bp.MembershipTest]
 
 
-@dataclass(frozen=True)
-class Unit:
-    """Estimate of one gear."""
-
-    kind: str
-    theta: dict[str, float]
-    sd: dict[str, float]
-    converged: bool
+# A gear or an experiment: its problem, by which it can be sampled again under a population, and its draws.
+Drawn = tuple[bp.Problem, bp.Posterior]
 
 
-def examine(kind: str, seed: int) -> Unit:
-    """Return the estimate of one unit of a kind; seeds differ in the noise of the instruments."""
+def examine(kind: str, seed: int) -> Drawn:
+    """Return the draws of one gear of a kind; seeds differ in the noise of the instruments."""
     experiments = [fold(measure(run, (), seed, FAULTS[kind]), DISPLACEMENT) for run in RUNS if run.name in CAMPAIGN]
-    fit = estimate(experiments, DISPLACEMENT, one_conduction=True, priors=PRIORS, fixed=FIXED, tied=TIED).fit
-    return Unit(kind, dict(fit.theta), dict(fit.sd), fit.converged)
+    found = estimate(experiments, DISPLACEMENT, one_conduction=True, priors=PRIORS, fixed=FIXED, tied=TIED)
+    return found.problem, bp.sample(found.problem, found.fit, seed=seed, **SAMPLING)
 
 
-def examine_all(references: int, each: int, seed: int) -> tuple[Unit, list[Unit]]:
-    """Return the reference, the mean of its measurements, and `each` units of each kind."""
+def examine_all(references: int, each: Mapping[str, int], seed: int) -> tuple[bp.Population, list[Tested]]:
+    """Return the population of good gears, and the tests of so many new ones of each kind."""
+    kinds = [kind for kind, count in each.items() for _ in range(count)]
     tasks = [(GOOD, REFERENCE_SEED * (seed + 1) + k) for k in range(references)]
-    tasks += [(kind, FIRST_UNIT * (seed + 1) + k) for k, kind in enumerate(np.repeat(list(FAULTS), each).tolist())]
-    found = list(common.each(examine, tasks, here=len(tasks) <= SERIALLY))
-    units = found[:references]
-    theta = {name: float(np.mean([unit.theta[name] for unit in units])) for name in PRIORS}
-    sd = {name: float(np.sqrt(np.mean([unit.sd[name] ** 2 for unit in units]) / references)) for name in PRIORS}
-    return Unit(GOOD, theta, sd, all(unit.converged for unit in units)), found[references:]
+    tasks += [(kind, FIRST_UNIT * (seed + 1) + k) for k, kind in enumerate(kinds)]
+    gears = list(common.each(examine, tasks))
+    units = {f"gear {k + 1}": gear for k, gear in enumerate(gears[:references])}
+    population = bp.population(units, list(PRIORS), spread=SPREADS, seed=seed, progress=False)
+    tests = [population.test(one, false_alarm=FALSE_ALARM) for one in gears[references:]]
+    return population, list(zip(kinds, tests, strict=True))
 
 
-def deviations(reference: Unit, unit: Unit) -> dict[str, float]:
-    """Return the deviation of a unit from the reference in combined standard deviations, by parameter."""
-    return {n: (unit.theta[n] - reference.theta[n]) / float(np.hypot(unit.sd[n], reference.sd[n])) for n in PRIORS}
-
-
-def account(reference: Unit, units: Sequence[Unit]) -> dict[str, Any]:
+def account(population: bp.Population, tested: Sequence[Tested]) -> dict[str, Any]:
     """Return the entries of results.json: how often each parameter is called different, by kind of unit."""
-    typical = {name: np.sqrt(np.mean([unit.sd[name] ** 2 for unit in units])) for name in PRIORS}
     found: dict[str, Any] = {
-        "experiments": list(CAMPAIGN),
-        "limit": LIMIT,
-        "false_alarm_rate": FALSE_ALARM,
-        "reference": {"theta": reference.theta, "sd": reference.sd},
-        "relative_change_found_in_90_percent": {
-            name: float((LIMIT + norm.ppf(POWER)) * np.hypot(typical[name], reference.sd[name]) / abs(GEAR[name]))
-            for name in PRIORS
-        },
-        "kinds": {},
-    }
-    for kind in CHANGES:
-        every = [deviations(reference, unit) for unit in units if unit.kind == kind]
-        different = {name: sum(abs(z[name]) > LIMIT for z in every) for name in PRIORS}
-        flagged = sum(any(abs(v) > LIMIT for v in z.values()) for z in every)
-        right = sum(all((abs(z[n]) > LIMIT) == (n in CHANGES[kind]) for n in PRIORS) for z in every)
+        "experiments": list(CAMPAIGN), "false_alarm_rate": FALSE_ALARM, "reference": account_of_population(population),
+        "limit": float(norm.isf(0.5 * tested[0][1].level)), "kinds": {},
+    }  # fmt: skip
+    for kind, changes in CHANGES.items():
+        every = [test for one, test in tested if one == kind]
+        flagged = sum(not test.member for test in every)
+        wrong = flagged if kind == GOOD else len(every) - flagged
         found["kinds"][kind] = {
-            "changed": {name: value / GEAR[name] - 1.0 for name, value in CHANGES[kind].items()},
+            "changed": {name: value / GEAR[name] - 1.0 for name, value in changes.items()},
             "units": len(every),
-            "not_converged": sum(not unit.converged for unit in units if unit.kind == kind),
-            "called_different": different,
+            "called_different": {name: sum(name in test.differing for test in every) for name in PRIORS},
             "units_with_any": flagged,
-            "units_with_all_verdicts_right": right,
-            "error_rate": _rate(flagged if kind == GOOD else len(every) - flagged, len(every)),
+            "units_with_all_verdicts_right": sum({*test.differing} == {*changes} & {*PRIORS} for test in every),
+            "error_rate": {
+                "wrong": wrong,
+                "of": len(every),
+                "interval_95": list(binomtest(wrong, len(every)).proportion_ci(0.95)),
+            },
+            "deviates": {name: [deviate(test, name) for test in every] for name in PRIORS},
+            "example": every[0].verdict,
         }
     return found
 
 
-def _rate(wrong: int, count: int) -> dict[str, Any]:
-    """Return a rate with the exact 95 % interval of a binomial share."""
-    chances = np.linspace(0.0, 1.0, 2001)
-    inside = chances[(binom.cdf(wrong, count, chances) >= 0.025) & (binom.sf(wrong - 1, count, chances) >= 0.025)]
-    return {"wrong": wrong, "of": count, "rate": wrong / count, "interval_95": [float(inside[0]), float(inside[-1])]}
+def deviate(test: bp.MembershipTest, name: str) -> float:
+    """Return the normal deviate with the p-value of a parameter, with the sign of its deviation, of limited size."""
+    row = test.table.loc[name]
+    size = min(float(norm.isf(0.5 * row["p"])), LARGEST_DEVIATE)
+    return float(np.copysign(size, row["estimate"] - row["expected"]))
 
 
 def table(found: Mapping[str, Any]) -> str:
     """Return the counts to print."""
-    title = f"quality control: units that differ by more than {found['limit']:.2f} standard deviations, by kind of unit"
     different = [f"called_different.{name}" for name in PRIORS]
-    return common.shown(title, found["kinds"], ["units", "units_with_any", *different])
+    return common.shown(
+        "quality control: gears called different", found["kinds"], ["units", "units_with_any", *different]
+    )
+
+
+def drawn_run(run: Run, truth: str, seed: int) -> Drawn:
+    """Return the draws of one experiment with the displacement given."""
+    found = estimate([fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)], DISPLACEMENT, priors=WIDE)
+    return found.problem, identification.draw(found, seed, quick=False).posterior
+
+
+def conductions(runs: Sequence[Run], truth: str, seed: int) -> bp.Population:
+    """Return theta16 as a population over the experiments, with the amplitude as covariate [m]."""
+    drawn = common.each(drawn_run, [(run, truth, seed) for run in runs])
+    units = {run.name: one for run, one in zip(runs, drawn, strict=True)}
+    amplitude = {run.name: run.stroke for run in runs}
+    return bp.population(
+        units, [CONDUCTION], spread={CONDUCTION: CONDUCTION_SPREAD}, covariates={"amplitude": amplitude}, seed=seed,
+        progress=False,
+    )  # fmt: skip

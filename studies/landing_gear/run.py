@@ -30,8 +30,8 @@ PARTS = "parts"
 LARGE, SMALL, FIGURE_1 = "0.2 Hz 80 mm", "3 Hz 4 mm", "1 Hz 18 mm"
 QUICK = tuple(run for run in RUNS if run.name in (FIGURE_1, SMALL))
 DROPS, QUICK_DROPS = 200, 20
-# Measurements of the reference, units of each kind.
-UNITS, QUICK_UNITS = (10, 60), (1, 1)
+# Good gears of the population; new gears of each kind; every so many experiments of a quick run.
+REFERENCES, QUICK_REFERENCES, GOOD_GEARS, FAULTY_GEARS, QUICK_STEP = 10, 4, 20, 5, 4
 LARGE_STROKE, TOLERANCE = 0.06, 0.25
 
 
@@ -50,7 +50,8 @@ class OfTruth:
 def run(options: argparse.Namespace) -> None:
     """Run the study, or with ``--replicates`` campaigns of truth A, with ``--missing`` searches for missing terms.
 
-    Both together repeat the first step of these searches on new data.
+    Both together repeat the first step of these searches on new data. ``--populations`` is about gears that differ and
+    a theta16 that differs between experiments.
     """
     watch, runs = common.Stopwatch(), QUICK if options.quick else RUNS
     if options.replicates and options.missing:
@@ -75,6 +76,9 @@ def run(options: argparse.Namespace) -> None:
         common.finish(options.out / "campaigns", found, watch, synthetic=True)
         return
     truths = [options.truth] if options.truth else list(TRUTHS)
+    if options.populations:
+        _populations(truths, options, watch)
+        return
     if options.missing:
         searches: dict[str, Any] = {"synthetic": True, "seed": options.seed}
         for truth in truths:
@@ -112,6 +116,28 @@ def run(options: argparse.Namespace) -> None:
     results["study"] = {"synthetic": True, "seed": options.seed, "quick": options.quick}
     common.finish(options.out, results, watch, paths, synthetic=True)
     shutil.rmtree(options.out / PARTS, ignore_errors=True)
+
+
+def _populations(truths: Sequence[str], options: argparse.Namespace, watch: common.Stopwatch) -> None:
+    """Test new gears against a population of good ones, and theta16 for a spread over the experiments."""
+    each = {k: 1 if options.quick else GOOD_GEARS if k == quality.GOOD else FAULTY_GEARS for k in quality.CHANGES}
+    with watch.part("quality", "quality control: a population of good gears, and new ones, good and faulty"):
+        population, tested = quality.examine_all(QUICK_REFERENCES if options.quick else REFERENCES, each, options.seed)
+    found: dict[str, Any] = {"synthetic": True, "seed": options.seed, "quality": quality.account(population, tested)}
+    print(population, quality.table(found["quality"]), sep="\n")
+    conductions = {}
+    for truth in truths:
+        with watch.part(f"theta16 {truth}", f"truth {truth}: theta16 as a population over the experiments"):
+            runs = RUNS[::QUICK_STEP] if options.quick else RUNS
+            conductions[truth] = quality.conductions(runs, truth, options.seed)
+        print(conductions[truth])
+    found["theta16"] = {truth: quality.account_of_population(one) for truth, one in conductions.items()}
+    drawn = {
+        "quality": landing_gear_figures.quality(found["quality"]),
+        "theta16": landing_gear_figures.over_amplitude(conductions),
+    }
+    folder = options.out / "populations"
+    common.finish(folder, found, watch, common.save_figures(folder, drawn), synthetic=True)
 
 
 def _source(options: argparse.Namespace, truth: str) -> str:
@@ -166,11 +192,6 @@ def _of_all(
         results["repair"] = repair.account(fits)
         print(repair.table(results["repair"]))
         drawn["repair"] = landing_gear_figures.repaired(results["repair"])
-    with watch.part("quality", "quality control: a reference gear and units, good and faulty"):
-        units = quality.examine_all(*(QUICK_UNITS if options.quick else UNITS), options.seed)
-    results["quality"] = quality.account(*units)
-    print(quality.table(results["quality"]))
-    drawn["quality"] = landing_gear_figures.quality(*units)
     with watch.part("slope", "the friction's slope"):
         results["friction_slope"] = force.slope_account(runs)
     print(force.slope_line(results["friction_slope"]))
