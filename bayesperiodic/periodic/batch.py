@@ -36,7 +36,7 @@ SMALLEST_BLOCK, PARTS_EACH = 4, 4
 INVERSE_ITERATIONS = 3
 SMALL_DISTANCE = 1e-4
 # Number of parameters up to which terms of second order cost less than the chord step that they save.
-MOST_CURVED = 8
+MOST_OF_SECOND_ORDER = 8
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Batch:
         parameters, z = np.stack([a.parameters for a in anchors]), np.stack([a.z for a in anchors])
         near = first.kernels.OFF_ANCHOR * ratios.min(axis=1)
         moving = np.flatnonzero(sensitivities.any(axis=(0, 2, 3)))
-        moving = moving if moving.size <= MOST_CURVED else moving[:0]
+        moving = moving if moving.size <= MOST_OF_SECOND_ORDER else moving[:0]
         pairs = moving.size * (moving.size + 1) // 2
         of_second_order = moving, np.empty((len(sets), pairs, *z.shape[1:]))
         known = parameters, z, sensitivities, amplitude, gradient, near, factors, left, right

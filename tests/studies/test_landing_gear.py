@@ -229,7 +229,7 @@ def test_with_the_force_given_standard_deviations_are_those_of_the_errors():
     assert np.mean(np.square(errors["exact"]), axis=0)[[*PRIORS].index("theta16")] > 4.0
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_quality_control_names_the_fault(populations):
     """One gear of each kind; a false alarm comes in 1 % of gears, the faults are 20 standard deviations and more."""
     _, results, printed = populations
@@ -247,7 +247,7 @@ def test_quality_control_names_the_fault(populations):
     assert "quality control" in printed
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_theta16_is_constant_over_the_experiments_only_on_a_gear_that_obeys_equation_9(populations):
     """Four experiments: of truth A a Bayes factor for a spread above 20 comes in 5 % at most.
 
