@@ -113,6 +113,7 @@ WITHOUT_RESULTS = {
         UNSTORED: ("Of 400 simulated recordings of period one",),
     },
     "docs/how_to/priors.md": {DEFINITION: ("a spread of 0.7 is a factor of two",)},
+    "docs/how_to/my_model.md": {ELSEWHERE: ("(MATLAB, version 1.3)", "(Python, pyHarm-os 1.2.2)")},
     "docs/how_to/noise_model.md": {
         UNSTORED: ("90 % intervals contain the truth in 82 to 86 %; with three and more in 89 to 94 %",),
     },
