@@ -164,11 +164,12 @@ def corner(verdict: Verdict, truth: str) -> Figure:
 
 def quality(found: Mapping[str, Any]) -> Figure:
     """Draw the quality-control chart: every gear's deviation by its p-value, a row per parameter."""
-    figure, grid = plt.subplots(len(MEANINGS), 1, figsize=(9.0, 9.5), sharex=True, layout="constrained")
+    shape: dict[str, Any] = {"figsize": (9.0, 9.5), "sharex": True, "squeeze": False, "layout": "constrained"}
+    figure, grid = plt.subplots(len(MEANINGS), 1, **shape)
     limit, kinds = found["limit"], found["kinds"].values()
     counts = [one["units"] for one in kinds]
     number, ends = np.arange(1, sum(counts) + 1), np.cumsum([0, *counts])
-    for axes, (name, meaning) in zip(grid, MEANINGS.items(), strict=True):
+    for axes, (name, meaning) in zip(grid[:, 0], MEANINGS.items(), strict=True):
         z = np.concatenate([one["deviates"][name] for one in kinds])
         out, most = np.abs(z) > limit, 1.2 * max(5.0, np.abs(z).max())
         axes.axhspan(-limit, limit, color="#DDDDDD", lw=0)
@@ -180,8 +181,8 @@ def quality(found: Mapping[str, Any]) -> Figure:
             axes.axvline(end + 0.5, color="black", lw=0.6)
     for kind, start, end in zip(found["kinds"], ends[:-1], ends[1:], strict=True):
         words, middle = kind.replace(" ", "\n", 1), 0.5 * (start + end + 1)
-        grid[0].text(middle, 1.04, words, ha="center", va="bottom", transform=grid[0].get_xaxis_transform())
-    grid[-1].set(xlabel="gear", xlim=(0.0, number[-1] + 1.0))
+        grid[0, 0].text(middle, 1.04, words, ha="center", va="bottom", transform=grid[0, 0].get_xaxis_transform())
+    grid[-1, 0].set(xlabel="gear", xlim=(0.0, number[-1] + 1.0))
     shared_legend(figure, 2)
     figure.suptitle(
         "Deviation from the population of good gears, as the normal deviate with the same p-value, SYNTHETIC data\n"
