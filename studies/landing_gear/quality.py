@@ -59,8 +59,6 @@ CONDUCTION_SPREAD, WIDE = bp.HalfNormal(5.0), {**identification.PRIORS, CONDUCTI
 LARGEST_DEVIATE = 38.0
 # A new gear: its kind and its test.
 Tested = tuple[str, bp.MembershipTest]
-
-
 # A gear or an experiment: its problem, by which it can be sampled again under a population, and its draws.
 Drawn = tuple[bp.Problem, bp.Posterior]
 
