@@ -70,8 +70,7 @@ def population(
     spread : mapping of str to HalfNormal, Uniform or float, optional
         Prior of the standard deviation of a parameter between units, in sampling coordinates; a number is a known
         spread. By default ``HalfNormal(0.5)`` for a parameter that is sampled in its logarithm (a factor of 1.65);
-        required for any other. Give the size that you expect: few units leave the spread to its prior, and where that
-        is a hundred times wider than their standard deviations, the chains may fail to converge, which is warned of.
+        required for any other. Give the size that you expect: few units leave the spread to its prior.
     common : sequence of str
         Those of `names` with the same value in all units. They have a spread of a fifth of the smallest standard
         deviation of a unit, which widens their intervals by at most 2 %.

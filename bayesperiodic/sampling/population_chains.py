@@ -8,6 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from bayesperiodic.sampling.convergence import PASSES, autocorrelation_time, unmet_criteria
+from bayesperiodic.sampling.population_coordinates import Decoupled
 from bayesperiodic.sampling.population_density import PopulationDensity
 from bayesperiodic.sampling.proposals import (
     MIXTURE_STEPS,
@@ -38,7 +39,7 @@ class Chains:
 class _Run:
     """State of a run in coordinates u, x = origin + axes·u."""
 
-    def __init__(self, density: PopulationDensity, seed: int, bar: Any):
+    def __init__(self, density: Decoupled, seed: int, bar: Any):
         self.density, self._bar, self.calls = density, bar, 0
         dimension, (centre, scale) = density.dimension, density.start
         self.walkers = max(LEAST_WALKERS, 2 * (dimension + dimension % 2))
@@ -95,7 +96,8 @@ def sample_chains(density: PopulationDensity, seed: int, *, progress: bool) -> C
     Where nearly all proposals are independent of the walkers, tau needs no further check.
     """
     with tqdm(unit="step", desc="population", disable=not progress) as bar:
-        run = _Run(density, seed, bar)
+        coordinates = Decoupled(density)
+        run = _Run(coordinates, seed, bar)
         run.adapt()
         kept: list[np.ndarray] = []
         passes, following, missing = 0, 2, ["no check yet"]
@@ -108,7 +110,8 @@ def sample_chains(density: PopulationDensity, seed: int, *, progress: bool) -> C
             missing = unmet_criteria(chains, times, times, density.labels)
             passes = 0 if missing else passes + 1
             following = len(kept) + max(1, len(kept) // 4)
-    chains = run.transform.unwhiten(np.concatenate(kept, axis=1))
+    inside = run.transform.unwhiten(np.concatenate(kept, axis=1))
+    chains = coordinates.natural(inside.reshape(-1, density.dimension))[0].reshape(inside.shape)
     converged = passes >= PASSES
     ended = f"stop rule passed after {chains.shape[1]} steps" if converged else f"most steps with {', '.join(missing)}"
     tau = dict(zip(density.labels, autocorrelation_time(chains).tolist(), strict=True))

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from itertools import combinations
 from pathlib import Path
 from types import ModuleType
@@ -17,6 +17,8 @@ from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.priors.single import LOG_ROOT_TWO_PI
 from bayesperiodic.sampling.population_units import UnitDraws
 
+# Largest artanh of a partial correlation, 1 − |ρ| = 2e-6, beyond which covariances are singular in double precision.
+MOST_CORRELATED = 7.0
 # Values of a block of units and points that are in memory at once.
 BLOCK_VALUES = 300_000
 
@@ -117,6 +119,7 @@ class Hierarchy:
             beta = 1.0 + 0.5 * (len(self.free) - 2 - tree)
             log_rest = 2.0 * (np.log(2.0) - np.logaddexp(points[:, place], -points[:, place]))  # ln(1 − tanh²)
             total += beta * log_rest - (2.0 * beta - 1.0) * np.log(2.0) - betaln(beta, beta)
+            total[np.abs(points[:, place]) > MOST_CORRELATED] = -np.inf
         return total
 
 
@@ -267,22 +270,3 @@ class PopulationDensity:
         """Return the means (units, points, members·names) for covariates (units, members, covariates)."""
         moved = np.einsum("imc,wdc->iwmd", covariates, parameters.slopes)
         return (parameters.means[None, :, None] + moved).reshape(*moved.shape[:2], -1)
-
-    @cached_property
-    def start(self) -> tuple[np.ndarray, np.ndarray]:
-        """A point near the posterior, and its uncertainty by coordinate."""
-        structure, size = self.structure, len(self.structure.names)
-        means = np.concatenate([unit.mean.reshape(-1, size) for unit in self.units])
-        widths = np.concatenate([np.sqrt(np.diag(unit.covariance)).reshape(-1, size) for unit in self.units])
-        least = 0.3 * np.sqrt((widths**2).mean(axis=0))
-        spread = np.maximum(means.std(axis=0), least)
-        error = spread / np.sqrt(len(means)) + least / np.sqrt(len(means))
-        at = [structure.names.index(name) for name in structure.free]
-        first = [
-            np.clip(spread[k], *structure.spread[name].quantile(np.array([0.05, 0.95])))
-            for k, name in zip(at, structure.free, strict=True)
-        ]
-        slopes = np.array([error[structure.names.index(name)] for name, _ in structure.sloped])
-        count = len(structure.pairs)
-        point = np.concatenate([means.mean(axis=0), np.zeros(slopes.size), np.log(first), np.zeros(count)])
-        return point, np.concatenate([error, slopes, np.full(len(at), 0.3), np.full(count, 0.3)])

@@ -8,6 +8,7 @@ from scipy.special import logsumexp
 
 from bayesperiodic.sampling.evidence import bridge
 from bayesperiodic.sampling.population_chains import Chains, sample_chains
+from bayesperiodic.sampling.population_coordinates import Decoupled
 from bayesperiodic.sampling.population_density import PopulationDensity
 
 # Draws at which the density at zero is averaged, points of its normalisation, and the spread that is taken for zero,
@@ -42,10 +43,9 @@ def evidence_for_spread(density: PopulationDensity, chains: Chains, seed: int) -
 
 
 def _log_evidence(density: PopulationDensity, chains: Chains, seed: int) -> tuple[float, float]:
-    generator = np.random.default_rng(seed)
-    first, second = (
-        bridge(density, chains.draws[k::2], chains.draws[1 - k :: 2], 0.0, generator) for k in (0, 1)
-    )  # fmt: skip
+    generator, coordinates, draws = np.random.default_rng(seed), Decoupled(density), chains.draws
+    inside = coordinates.decoupled(draws.reshape(-1, density.dimension)).reshape(draws.shape)
+    first, second = (bridge(coordinates, inside[k::2], inside[1 - k :: 2], 0.0, generator) for k in (0, 1))
     return 0.5 * (first.log + second.log), 0.5 * float(np.hypot(first.error, second.error))
 
 

@@ -21,7 +21,8 @@ COUNTS = [
 
 def grid_draws(density, count, generator):
     """Return draws (count, 2) of mean and ln spread from splines of their log-density, located on a coarse grid."""
-    centre, width = density.start[0][0], density.start[1][0]
+    means = np.array([unit.mean[0] for unit in density.units])
+    centre, width = means.mean(), (means.std() + 0.05) / np.sqrt(len(means))
     ends = np.array([[centre - 6.0 * width, centre + 6.0 * width], np.log([1e-3, 1.0])])
     for sizes in ((13, 11), (13, 13)):
         axes = [np.linspace(*pair, size) for pair, size in zip(ends, sizes, strict=True)]
