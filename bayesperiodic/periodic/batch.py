@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,8 @@ from bayesperiodic.periodic.equations import (
 SMALLEST_BLOCK, PARTS_EACH = 4, 4
 INVERSE_ITERATIONS = 3
 SMALL_DISTANCE = 1e-4
+# Number of parameters up to which terms of second order cost less than the chord step that they save.
+MOST_OF_SECOND_ORDER = 8
 
 
 @dataclass(frozen=True)
@@ -108,11 +111,18 @@ class Batch:
         ratios = np.divide(ranges, amplitude, out=np.full(ranges.shape, np.inf), where=amplitude > 0.0)
         parameters, z = np.stack([a.parameters for a in anchors]), np.stack([a.z for a in anchors])
         near = first.kernels.OFF_ANCHOR * ratios.min(axis=1)
-        self._anchors = Anchors(parameters, z, sensitivities, amplitude, gradient, near, factors, left, right)
+        moving = np.flatnonzero(sensitivities.any(axis=(0, 2, 3)))
+        moving = moving if moving.size <= MOST_OF_SECOND_ORDER else moving[:0]
+        pairs = moving.size * (moving.size + 1) // 2
+        of_second_order = moving, np.empty((len(sets), pairs, *z.shape[1:]))
+        known = parameters, z, sensitivities, amplitude, gradient, near, factors, left, right
+        self._anchors = Anchors(*known, *of_second_order)
+        if pairs:
+            self._compiled[0].fill_curvature(self._compiled[1], first.grid.packed, self._sets, self._anchors)
 
     @cached_property
-    def _compiled(self) -> tuple[Callable[..., None], Functions]:
-        return kernels("batch", self._first.count, self._first.grid.stencil).solve_many, self._first.functions
+    def _compiled(self) -> tuple[Any, Functions]:
+        return kernels("batch", self._first.count, self._first.grid.stencil), self._first.functions
 
     def solve(
         self,
@@ -142,10 +152,12 @@ class Batch:
         solution.frequency[:] = self._sets.frequency[:, None]
         if without is not None:
             solution.status[without] = STALLED
-        solve_many, functions = self._compiled
+        compiled, functions = self._compiled
         before = functions, grid.packed, grid.periods, self._sets, self._anchors, every
         after = polish, first.model.kernels.output_rates, solution
-        in_blocks(lambda block: solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads)
+        in_blocks(
+            lambda block: compiled.solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads
+        )
         return solution
 
     def vjp(self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, moving: tuple[int, ...]) -> np.ndarray:

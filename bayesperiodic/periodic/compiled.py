@@ -154,6 +154,8 @@ class Anchors(NamedTuple):
     factors: Factors  # of ∂g/∂z; the first of `ends` is −1 where there are none
     left: np.ndarray  # (sets, points, states), see `batch.smallest_singular_vectors`
     right: np.ndarray
+    moving: np.ndarray  # (moving,), indices of the parameters that the prediction of second order depends on
+    curvature: np.ndarray  # (sets, pairs, points, states), its coefficients; the pairs i ≤ j in the order of i, then j
 
 
 class CycleAnchors(NamedTuple):
@@ -225,7 +227,9 @@ SETS = types.NamedTuple([CUBE, VECTOR, MATRIX], Sets)
 ALL_FACTORS = types.NamedTuple(
     [CUBE, INDICES, GAINS, types.Array(NUMBER, 5, "C"), GAINS, INDICES, MATRIX, INDICES], Factors
 )
-ANCHORS = types.NamedTuple([MATRIX, CUBE, GAINS, MATRIX, MATRIX, VECTOR, ALL_FACTORS, CUBE, CUBE], Anchors)
+ANCHORS = types.NamedTuple(
+    [MATRIX, CUBE, GAINS, MATRIX, MATRIX, VECTOR, ALL_FACTORS, CUBE, CUBE, PLACES, GAINS], Anchors
+)
 ALL_BORDERS = types.NamedTuple([CUBE, CUBE, CUBE, CUBE, INDICES], Border)
 CYCLE_ANCHORS = types.NamedTuple(
     [MATRIX, CUBE, VECTOR, GAINS, MATRIX, CUBE, INDICES, ALL_BORDERS, VECTOR, VECTOR], CycleAnchors

@@ -113,6 +113,6 @@ def sample_chains(density: PopulationDensity, seed: int, *, progress: bool) -> C
     inside = run.transform.unwhiten(np.concatenate(kept, axis=1))
     chains = coordinates.natural(inside.reshape(-1, density.dimension))[0].reshape(inside.shape)
     converged = passes >= PASSES
-    ended = f"stop rule passed after {chains.shape[1]} steps" if converged else f"most steps with {', '.join(missing)}"
+    ended = f"stop rule passed after {inside.shape[1]} steps" if converged else f"most steps with {', '.join(missing)}"
     tau = dict(zip(density.labels, autocorrelation_time(chains).tolist(), strict=True))
     return Chains(chains, converged, ended, tau, run.calls)

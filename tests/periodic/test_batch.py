@@ -98,6 +98,40 @@ def test_small_changes_need_no_factorisation(equations):
     assert np.all(np.ptp(outputs, axis=1) > 0)
 
 
+def test_prediction_of_second_order_leaves_one_chord_step_after_a_tiny_change(equations):
+    """Of a change by 1e-3 the third order is 1e-9; without the second order, or its mixed terms, two steps are taken.
+
+    The step after the prediction would be 1e-6 of the amplitude, and shows whether the coefficients are right.
+    """
+    signs = np.array([[a, b, c, d] for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 1) for d in (-1, 0, 1)])
+    parameters = DUFFING * (1.0 + 1e-3 * signs)
+    _, (outputs,), _, (status,), (iterations,) = Batch([equations], [anchored(equations)]).solve(parameters)
+    assert not status.any() and np.all(iterations == 1)
+    for theta, y in zip(parameters[::7], outputs[::7], strict=True):
+        assert y[:, 0] == pytest.approx(alone(equations, theta), abs=1e-8 * np.ptp(y))
+
+
+STOPPED = bp.Model(
+    "stopped", states=["q"], inputs=["force"], parameters=["c", "k", "stop", "gap"], outputs={"displacement": "q"},
+    equations=["ddq + c*dq + k*q + 0.5*stop*(q - gap + abs(q - gap)) - force"],
+)  # fmt: skip
+
+
+def test_second_derivatives_that_a_stop_does_not_have_lose_no_solve():
+    """At a contact that begins or ends the equations have no second derivative, and differences give any value."""
+    theta, force = np.array([10.0, 900.0, 300.0, 0.01]), 20.0 * np.cos(2 * np.pi * grid(200))
+    equations = PeriodicEquations.build(STOPPED, {"force": force}, frequency=2.0, samples=force.size)
+    solved = equations.solve(theta, equations.static_guess(theta))
+    assert solved.code == CONVERGED and solved.z.max() > 0.012
+    changed = theta * (1 + 0.02 * np.random.default_rng(3).standard_normal((200, 4)))
+    _, (outputs,), _, (status,), _ = Batch([equations], [Anchor.at(equations, theta, solved.z)]).solve(changed)
+    assert not status.any()
+    for one, y in zip(changed, outputs, strict=True):
+        newton = equations.solve(one, solved.z)
+        assert newton.code == CONVERGED
+        assert y[:, 0] == pytest.approx(newton.z[:, 0], abs=1e-7 * np.ptp(y))
+
+
 def test_unconverged_anchor_gives_the_exact_solution(equations):
     guess = Anchor(DUFFING, equations.static_guess(DUFFING), equations.frequency)
     _, (outputs,), _, (status,), _ = Batch([equations], [guess]).solve(DUFFING[None])

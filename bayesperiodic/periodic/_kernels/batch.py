@@ -15,6 +15,7 @@ PREDICTION_RATE = 30.0
 LEAST_STIFFNESS, MOST_STIFFNESS = 0.3, 3.0
 POLISHED = 1e-12
 LARGEST_PART = 1.0 / 16.0
+SECOND_DISTANCE = 1e-2
 
 
 @inlined(NUMBER(VECTOR, VECTOR), **INNER)
@@ -27,20 +28,36 @@ def in_units(reached, amplitude):
     return result
 
 
+@inlined(NUMBER(MATRIX, MATRIX, VECTOR), fastmath={"reassoc"}, **INNER)
+def weighted_dot(one, other, weights):
+    """Return the sum of products with a weight for each state, in any order."""
+    total = 0.0
+    for i in range(one.shape[0]):
+        for s in range(STATES if STATES > 0 else one.shape[1]):
+            total += weights[s] * one[i, s] * other[i, s]
+    return total
+
+
 @kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
-        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, FACTORS, MATRIX, MATRIX
+        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, MATRIX, CUBE, FACTORS, MATRIX,
+        MATRIX,
     ),
     **INNER,
-)
+)  # fmt: skip
 def newton_chord(
-    functions, grid, setting, amplitude, stiffness, predicted, polish, z, states, change, factors, left, right
-):
+    functions, grid, setting, amplitude, stiffness, predicted, polish, z, second, states, change, taken, factors, left,
+    right,
+):  # fmt: skip
     """Improve z in place with the factors of a nearby solution; return whether it converged, the steps, their length.
 
-    `states` are left as they were before the last step. A step above `CHORD_RATE` times the one before ends it. The
-    ratio of two steps predicts how much smaller the next one will be. The ratio of the first step to the prediction
-    gives the order of magnitude, since the prediction is a chord step except for terms of second order:
+    The change of second order, if there is one, stands for the first chord step, as which it would come out. Steps are
+    corrected by those before them, by Broyden's method (C. T. Kelley, Iterative Methods for Linear and Nonlinear
+    Equations, SIAM 1995, chapter 7).
+
+    A step above `CHORD_RATE` times the one before ends the iteration. The largest ratio of a step to the one before
+    predicts how much smaller the next one will be. Without a change of second order the ratio of the first step to the
+    prediction gives the order of magnitude, since the prediction is a chord step except for terms of second order:
     `PREDICTION_RATE` times it exceeded all but two of a hundred observed rates.
 
     Where ∂g/∂z is nearly singular, steps with the factors of another point are wrong in the direction that it makes
@@ -51,7 +68,8 @@ def newton_chord(
     in this direction, in units of that of the factors; `left` (points, states) the weights of the equations that are
     largest for a residual in this direction; `right` the direction, scaled to a stiffness of 1 for the ∂g/∂z of the
     factors. If `polish`, the steps go on until one is below `POLISHED` or at rounding level, for derivatives of the
-    outputs. `states` and `change` are work arrays.
+    outputs. `second` is the change of second order; `states`, `change` and `taken` (steps, points, states) are work
+    arrays.
     """
     residual = grid_function_at(functions.residual)
     inputs, parameters, frequency, drift = setting
@@ -61,15 +79,40 @@ def newton_chord(
     if not (stiffness > LEAST_STIFFNESS and stiffness < MOST_STIFFNESS):
         return False, 0, 0.0
     correction, tolerance = 1.0 / stiffness - 1.0, STEP_TOLERANCE * min(1.0, stiffness)
-    previous, moved, rate, converged = predicted, 0.0, PREDICTION_RATE, False
+    previous, moved, rate, converged, guessed = predicted, 0.0, 0.0, False, False
+    squares, scale = np.empty(MAX_CHORDS + 1), np.empty(count)
+    for s in range(count):
+        scale[s] = 1.0 / amplitude[s] ** 2 if amplitude[s] > 0.0 else 0.0
+    largest(second, reached)
+    first, known = in_units(reached, amplitude), 0
+    if first > 0.0 and first < OFF_ANCHOR:
+        guess = as_vector(second)
+        for k in range(guess.size):
+            position[k] += guess[k]
+        copy(second, taken[0])
+        squares[0] = weighted_dot(second, second, scale)
+        previous, moved, known, guessed = first, first, 1, True
     for iteration in range(MAX_CHORDS):
         differentiate(z, drift, grid, frequency, states)
         residual(states, inputs, parameters, grid.tau, frequency, change)
         along = correction * dot(weights, step) if correction != 0.0 else 0.0
         back_substitute(grid, factors, change)
         for k in range(step.size):
-            step[k] += along * direction[k]
-            position[k] -= step[k]
+            step[k] = -(step[k] + along * direction[k])
+        for k in range(known):
+            part = weighted_dot(taken[k], change, scale) / squares[k]
+            if k < known - 1:
+                later = as_vector(taken[k + 1])
+                for j in range(step.size):
+                    step[j] += part * later[j]
+            else:
+                for j in range(step.size):
+                    step[j] /= 1.0 - part
+        squares[known] = weighted_dot(change, change, scale)
+        copy(change, taken[known])
+        known += 1
+        for k in range(step.size):
+            position[k] += step[k]
         if not dot(step, step) < np.inf:
             return False, iteration + 1, moved
         largest(change, reached)
@@ -79,10 +122,15 @@ def newton_chord(
             return True, iteration + 1, moved
         if not full < OFF_ANCHOR or (iteration > 0 and not full < CHORD_RATE * previous):
             return False, iteration + 1, moved
-        converged = converged or full <= tolerance or rate * full**2 <= tolerance * previous
+        ratio = full / previous
+        if iteration > 0 or guessed:
+            rate = max(rate, ratio)
+        else:
+            ratio *= PREDICTION_RATE
+        converged = converged or full <= tolerance or max(rate, ratio) * full <= tolerance
         if converged and (full <= POLISHED or not polish):
             return True, iteration + 1, moved
-        previous, rate = full, 1.0
+        previous = full
     return converged, MAX_CHORDS, moved
 
 
@@ -137,6 +185,94 @@ def continue_from_anchor(
     return CONVERGED, used
 
 
+@inlined(types.void(CUBE, PLACES, VECTOR, VECTOR, MATRIX), **INNER)
+def fill_second_order(curvature, moving, anchor_parameters, parameters, second):
+    """Fill the terms of second order of the prediction."""
+    flat, row = as_vector(second), 0
+    second[:] = 0.0
+    for i in range(moving.size):
+        for j in range(i, moving.size):
+            p, q = moving[i], moving[j]
+            factor = (parameters[p] - anchor_parameters[p]) * (parameters[q] - anchor_parameters[q])
+            if factor != 0.0:
+                terms = as_vector(curvature[row])
+                for k in range(flat.size):
+                    flat[k] += factor * terms[k]
+            row += 1
+
+
+@inlined(COUNT(COUNT, COUNT), **INNER)
+def diagonal_row(i, size):
+    """Return the row of the coefficient of a parameter's square."""
+    return i * size - i * (i - 1) // 2
+
+
+@kernel(types.void(ADDRESSES, GRID, SETS, ANCHORS), **OPTIONS)
+def fill_curvature(functions, grid, sets, anchors):
+    """Fill the coefficients of the anchors' predictions of second order, zero where they are not known.
+
+    They are by central differences of the equations along the linear prediction: second derivatives of the equations by
+    a parameter, or the sum of two, are balanced by a change of z. The differences change z by `SECOND_DISTANCE` of the
+    amplitude, a parameter by no more than this fraction of itself.
+    """
+    residual, moving = grid_function_at(functions.residual), anchors.moving
+    points, count = anchors.z.shape[1], STATES if STATES > 0 else anchors.z.shape[2]
+    states, z, value = np.empty((points, 3 * count)), np.empty((points, count)), np.empty((points, count))
+    small, reached = np.empty(moving.size), np.empty(count)
+    bands, pivots, inverses, gains, transfers, ends, interfaces, interface_pivots = anchors.factors
+    for e in range(anchors.z.shape[0]):
+        curvature, at, before = anchors.curvature[e], anchors.z[e], anchors.parameters[e]
+        curvature[:] = 0.0
+        if ends[e, 0] == NO_FACTORS:
+            continue
+        factors = Factors(
+            bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], interfaces[e], interface_pivots[e]
+        )
+        for i in range(moving.size):
+            largest(anchors.sensitivities[e, moving[i]], reached)
+            reach, parameter = in_units(reached, anchors.amplitude[e]), abs(before[moving[i]])
+            small[i] = SECOND_DISTANCE / reach if reach > 0.0 else 0.0
+            if parameter > 0.0:
+                small[i] = min(small[i], SECOND_DISTANCE * parameter)
+        finite, row = True, 0
+        for i in range(moving.size):
+            for j in range(i, moving.size):
+                terms = curvature[row]
+                row += 1
+                if not (small[i] > 0.0 and small[j] > 0.0):
+                    continue
+                for side in (-1.0, 0.0, 1.0):
+                    theta = before.copy()
+                    theta[moving[i]] += side * small[i]
+                    if j > i:
+                        theta[moving[j]] += side * small[j]
+                    predict(at, anchors.sensitivities[e], before, theta, 1.0, z)
+                    differentiate(z, sets.drift[e], grid, sets.frequency[e], states)
+                    residual(states, sets.inputs[e], theta, grid.tau, sets.frequency[e], value)
+                    for k in range(points):
+                        for s in range(count):
+                            terms[k, s] -= value[k, s] if side != 0.0 else -2.0 * value[k, s]
+                back_substitute(grid, factors, terms)
+                finite = finite and dot(as_vector(terms), as_vector(terms)) < np.inf
+        row = 0
+        for i in range(moving.size):
+            for j in range(i, moving.size):
+                if j > i:
+                    first, last = diagonal_row(i, moving.size), diagonal_row(j, moving.size)
+                    for k in range(points):
+                        for s in range(count):
+                            curvature[row, k, s] -= curvature[first, k, s] + curvature[last, k, s]
+                row += 1
+        row = 0
+        for i in range(moving.size):
+            for j in range(i, moving.size):
+                scale = 0.5 / (small[i] * small[j]) if finite and small[i] * small[j] > 0.0 else 0.0
+                for k in range(points):
+                    for s in range(count):
+                        curvature[row, k, s] = scale * curvature[row, k, s] if scale > 0.0 else 0.0
+                row += 1
+
+
 @kernel(types.void(ADDRESSES, GRID, COUNT, SETS, ANCHORS, CUBE, COUNT, COUNT, FLAG, FLAG, SOLUTION), **OPTIONS)
 def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop, polish, rates, solution):
     """Solve for input sets times parameter vectors, those of the flat indices start … stop (vectors run fastest).
@@ -164,6 +300,7 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
         np.empty_like(interface_pivots[0]),
     )  # fmt: skip
     work = Workspace(states, columns, np.empty((0, 0)), fresh)
+    taken, second = np.empty((MAX_CHORDS + 1, points, count)), np.empty((points, count))
     nothing, table = np.empty(0), np.empty((0, 0))
     unknowns = Unknowns(nothing, nothing, nothing, table, np.empty((0, 0, 0)), -1)
     border = Border(table, table, table, table, np.empty(0, dtype=np.int64))
@@ -186,12 +323,13 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
                     change[i, s] = predicted[i, s] - at[i, s]
             largest(change, reached)
             amplitude = anchors.amplitude[e]
+            fill_second_order(anchors.curvature[e], anchors.moving, anchor_parameters, theta, second)
             factors = Factors(
                 bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], interfaces[e], interface_pivots[e]
             )
             close, used, moved = newton_chord(
-                functions, grid, setting, amplitude, stiffness, in_units(reached, amplitude), polish, z, states,
-                change, factors, anchors.left[e], anchors.right[e],
+                functions, grid, setting, amplitude, stiffness, in_units(reached, amplitude), polish, z, second,
+                states, change, taken, factors, anchors.left[e], anchors.right[e],
             )  # fmt: skip
         if not close:
             moved = np.inf
