@@ -149,7 +149,8 @@ class Anchors(NamedTuple):
     z: np.ndarray
     sensitivities: np.ndarray
     amplitude: np.ndarray  # (sets, states), largest absolute value of each state
-    stiffness_gradient: np.ndarray  # (sets, parameters), see `batch.stiffness_gradient`
+    stiffness_gradient: np.ndarray  # (sets, parameters), of left · (∂g/∂z) · right along the solutions
+    along: np.ndarray  # (sets, parameters), the parts of the sensitivities along `right`
     near: np.ndarray  # (sets,), length of the path of chord steps in amplitudes below which an orbit cannot be far
     factors: Factors  # of ∂g/∂z; the first of `ends` is −1 where there are none
     left: np.ndarray  # (sets, points, states), see `batch.smallest_singular_vectors`
@@ -228,7 +229,7 @@ ALL_FACTORS = types.NamedTuple(
     [CUBE, INDICES, GAINS, types.Array(NUMBER, 5, "C"), GAINS, INDICES, MATRIX, INDICES], Factors
 )
 ANCHORS = types.NamedTuple(
-    [MATRIX, CUBE, GAINS, MATRIX, MATRIX, VECTOR, ALL_FACTORS, CUBE, CUBE, PLACES, GAINS], Anchors
+    [MATRIX, CUBE, GAINS, MATRIX, MATRIX, MATRIX, VECTOR, ALL_FACTORS, CUBE, CUBE, PLACES, GAINS], Anchors
 )
 ALL_BORDERS = types.NamedTuple([CUBE, CUBE, CUBE, CUBE, INDICES], Border)
 CYCLE_ANCHORS = types.NamedTuple(

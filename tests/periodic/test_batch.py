@@ -132,6 +132,39 @@ def test_second_derivatives_that_a_stop_does_not_have_lose_no_solve():
         assert y[:, 0] == pytest.approx(newton.z[:, 0], abs=1e-7 * np.ptp(y))
 
 
+def near_a_jump():
+    """Return equations 0.1 % below the frequency of a jump down, theta and the orbit of large amplitude there.
+
+    With 30 % less damping its phase turns by 42 degrees at nearly the same amplitude, which a line makes 3.5 times.
+    """
+    theta, force = np.array([1.0, 0.05, 1.0, 0.3]), 0.1 * np.cos(2 * np.pi * grid(64))
+    low, high, z = 0.12, 0.5, None
+    while high - low > 1e-6:
+        middle = min(1.01 * low, 0.5 * (low + high)) if z is not None else low
+        equations = build(force, middle)
+        solved = equations.solve(theta, equations.static_guess(theta) if z is None else z)
+        if solved.code == CONVERGED and (z is None or np.ptp(solved.z) > 0.9 * np.ptp(z)):
+            low, z = middle, solved.z
+        else:
+            high = middle
+    equations = build(force, 0.999 * low)
+    return equations, theta, equations.solve(theta, z).z
+
+
+def test_near_a_fold_chords_reach_where_a_line_does_not():
+    """Of every size of change in the damping; the anchor's symmetry once hid the direction that is nearly singular."""
+    equations, theta, z = near_a_jump()
+    factors = np.linspace(1.0, 0.7, 61)
+    parameters = np.repeat(theta[None], factors.size, axis=0)
+    parameters[:, 1] *= factors
+    _, (outputs,), _, (status,), (iterations,) = Batch([equations], [Anchor.at(equations, theta, z)]).solve(parameters)
+    assert not status.any()
+    assert iterations.max() <= 6
+    for one, y in zip(parameters, outputs, strict=True):
+        z = equations.solve(one, z).z
+        assert y[:, 0] == pytest.approx(z[:, 0], abs=1e-7 * np.ptp(z))
+
+
 def test_unconverged_anchor_gives_the_exact_solution(equations):
     guess = Anchor(DUFFING, equations.static_guess(DUFFING), equations.frequency)
     _, (outputs,), _, (status,), _ = Batch([equations], [guess]).solve(DUFFING[None])

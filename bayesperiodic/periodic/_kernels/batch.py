@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
 
 MAX_CHORDS = 6
 PREDICTION_RATE = 30.0
-LEAST_STIFFNESS, MOST_STIFFNESS = 0.3, 3.0
+LEAST_STIFFNESS, MOST_STIFFNESS = 0.3, 10.0
 POLISHED = 1e-12
 LARGEST_PART = 1.0 / 16.0
 SECOND_DISTANCE = 1e-2
@@ -40,25 +40,20 @@ def weighted_dot(one, other, weights):
 
 @kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
-        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, MATRIX, CUBE, FACTORS, MATRIX,
-        MATRIX,
+        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, CUBE, FACTORS, MATRIX, MATRIX
     ),
     **INNER,
-)  # fmt: skip
+)
 def newton_chord(
-    functions, grid, setting, amplitude, stiffness, predicted, polish, z, second, states, change, taken, factors, left,
-    right,
-):  # fmt: skip
+    functions, grid, setting, amplitude, stiffness, predicted, polish, z, states, change, taken, factors, left, right
+):
     """Improve z in place with the factors of a nearby solution; return whether it converged, the steps, their length.
 
-    The change of second order, if there is one, stands for the first chord step, as which it would come out. Steps are
-    corrected by those before them, by Broyden's method (C. T. Kelley, Iterative Methods for Linear and Nonlinear
-    Equations, SIAM 1995, chapter 7).
-
-    A step above `CHORD_RATE` times the one before ends the iteration. The largest ratio of a step to the one before
-    predicts how much smaller the next one will be. Without a change of second order the ratio of the first step to the
-    prediction gives the order of magnitude, since the prediction is a chord step except for terms of second order:
-    `PREDICTION_RATE` times it exceeded all but two of a hundred observed rates.
+    Steps are corrected by those before them, by Broyden's method (C. T. Kelley, Iterative Methods for Linear and
+    Nonlinear Equations, SIAM 1995, chapter 7). A step above `CHORD_RATE` times the one before ends the iteration. The
+    largest ratio of a step to the one before predicts how much smaller the next one will be. The ratio of the first
+    step to the prediction gives the order of magnitude: `PREDICTION_RATE` times it exceeded all but two of a hundred
+    observed rates of linear predictions.
 
     Where ∂g/∂z is nearly singular, steps with the factors of another point are wrong in the direction that it makes
     smallest, and of the wrong sign where the stiffness in that direction has changed its sign. So this direction takes
@@ -68,8 +63,7 @@ def newton_chord(
     in this direction, in units of that of the factors; `left` (points, states) the weights of the equations that are
     largest for a residual in this direction; `right` the direction, scaled to a stiffness of 1 for the ∂g/∂z of the
     factors. If `polish`, the steps go on until one is below `POLISHED` or at rounding level, for derivatives of the
-    outputs. `second` is the change of second order; `states`, `change` and `taken` (steps, points, states) are work
-    arrays.
+    outputs. `states`, `change` and `taken` (steps, points, states) are work arrays.
     """
     residual = grid_function_at(functions.residual)
     inputs, parameters, frequency, drift = setting
@@ -79,19 +73,10 @@ def newton_chord(
     if not (stiffness > LEAST_STIFFNESS and stiffness < MOST_STIFFNESS):
         return False, 0, 0.0
     correction, tolerance = 1.0 / stiffness - 1.0, STEP_TOLERANCE * min(1.0, stiffness)
-    previous, moved, rate, converged, guessed = predicted, 0.0, 0.0, False, False
-    squares, scale = np.empty(MAX_CHORDS + 1), np.empty(count)
+    previous, moved, rate, converged = predicted, 0.0, 0.0, False
+    squares, scale = np.empty(MAX_CHORDS), np.empty(count)
     for s in range(count):
         scale[s] = 1.0 / amplitude[s] ** 2 if amplitude[s] > 0.0 else 0.0
-    largest(second, reached)
-    first, known = in_units(reached, amplitude), 0
-    if first > 0.0 and first < OFF_ANCHOR:
-        guess = as_vector(second)
-        for k in range(guess.size):
-            position[k] += guess[k]
-        copy(second, taken[0])
-        squares[0] = weighted_dot(second, second, scale)
-        previous, moved, known, guessed = first, first, 1, True
     for iteration in range(MAX_CHORDS):
         differentiate(z, drift, grid, frequency, states)
         residual(states, inputs, parameters, grid.tau, frequency, change)
@@ -99,18 +84,17 @@ def newton_chord(
         back_substitute(grid, factors, change)
         for k in range(step.size):
             step[k] = -(step[k] + along * direction[k])
-        for k in range(known):
+        for k in range(iteration):
             part = weighted_dot(taken[k], change, scale) / squares[k]
-            if k < known - 1:
+            if k < iteration - 1:
                 later = as_vector(taken[k + 1])
                 for j in range(step.size):
                     step[j] += part * later[j]
             else:
                 for j in range(step.size):
                     step[j] /= 1.0 - part
-        squares[known] = weighted_dot(change, change, scale)
-        copy(change, taken[known])
-        known += 1
+        squares[iteration] = weighted_dot(change, change, scale)
+        copy(change, taken[iteration])
         for k in range(step.size):
             position[k] += step[k]
         if not dot(step, step) < np.inf:
@@ -123,7 +107,7 @@ def newton_chord(
         if not full < OFF_ANCHOR or (iteration > 0 and not full < CHORD_RATE * previous):
             return False, iteration + 1, moved
         ratio = full / previous
-        if iteration > 0 or guessed:
+        if iteration > 0:
             rate = max(rate, ratio)
         else:
             ratio *= PREDICTION_RATE
@@ -201,54 +185,99 @@ def fill_second_order(curvature, moving, anchor_parameters, parameters, second):
             row += 1
 
 
+@inlined(types.void(NUMBER, NUMBER, NUMBER, MATRIX, MATRIX, MATRIX), **INNER)
+def add_higher_orders(change_of_stiffness, stiffness, along, right, second, predicted):
+    """Add to a linear prediction its terms of second order, and those of all orders that a near fold makes large.
+
+    In the direction in which ∂g/∂z is smallest the equation is x + κ x²/(2 x₁) = x₁ but for other terms of second
+    order, κ being the relative change of stiffness expected linearly and x₁ the linear prediction; the stiffness at its
+    solution x = 2 x₁/(1 + √(1 + 2κ)) is √(1 + 2κ). The terms of second order are those at x in place of x₁, since this
+    direction contributes most of them.
+    """
+    ratio = 2.0 / (1.0 + stiffness)
+    part = along * (ratio - 1.0 + 0.5 * change_of_stiffness * ratio**2)
+    flat, more, direction = as_vector(predicted), as_vector(second), as_vector(right)
+    for k in range(flat.size):
+        flat[k] += ratio**2 * more[k] + part * direction[k]
+
+
 @inlined(COUNT(COUNT, COUNT), **INNER)
 def diagonal_row(i, size):
     """Return the row of the coefficient of a parameter's square."""
     return i * size - i * (i - 1) // 2
 
 
-@kernel(types.void(ADDRESSES, GRID, SETS, ANCHORS), **OPTIONS)
-def fill_curvature(functions, grid, sets, anchors):
-    """Fill the coefficients of the anchors' predictions of second order, zero where they are not known.
+@inlined(types.void(ADDRESSES, GRID, SETS, ANCHORS, COUNT, VECTOR, VECTOR, NUMBER, MATRIX, MATRIX, MATRIX), **INNER)
+def residual_beside(functions, grid, sets, anchors, e, theta, before, distance, z, states, value):
+    """Fill the residual at other parameters, at the linear prediction and a distance from it along `right`."""
+    residual = grid_function_at(functions.residual)
+    predict(anchors.z[e], anchors.sensitivities[e], before, theta, 1.0, z)
+    if distance != 0.0:
+        position, direction = as_vector(z), as_vector(anchors.right[e])
+        for k in range(position.size):
+            position[k] += distance * direction[k]
+    differentiate(z, sets.drift[e], grid, sets.frequency[e], states)
+    residual(states, sets.inputs[e], theta, grid.tau, sets.frequency[e], value)
 
-    They are by central differences of the equations along the linear prediction: second derivatives of the equations by
-    a parameter, or the sum of two, are balanced by a change of z. The differences change z by `SECOND_DISTANCE` of the
-    amplitude, a parameter by no more than this fraction of itself.
+
+@kernel(types.void(ADDRESSES, GRID, SETS, ANCHORS), **OPTIONS)
+def fill_predictions(functions, grid, sets, anchors):
+    """Fill what the anchors' predictions of higher order need: changes of stiffness, and coefficients of second order.
+
+    Both are by central differences of the equations along the linear prediction: the derivatives of the stiffness
+    left · (∂g/∂z) · right by each parameter, and second derivatives of the equations by a parameter, or the sum of two,
+    which are balanced by a change of z. The differences change z by `SECOND_DISTANCE` of the amplitude, a parameter by
+    no more than this fraction of itself. Where they are not finite, there are no factors, and no second order.
     """
-    residual, moving = grid_function_at(functions.residual), anchors.moving
+    moving, total = anchors.moving, anchors.parameters.shape[1]
     points, count = anchors.z.shape[1], STATES if STATES > 0 else anchors.z.shape[2]
     states, z, value = np.empty((points, 3 * count)), np.empty((points, count)), np.empty((points, count))
-    small, reached = np.empty(moving.size), np.empty(count)
+    small, reached = np.empty(total), np.empty(count)
     bands, pivots, inverses, gains, transfers, ends, interfaces, interface_pivots = anchors.factors
     for e in range(anchors.z.shape[0]):
-        curvature, at, before = anchors.curvature[e], anchors.z[e], anchors.parameters[e]
+        curvature, before, gradient = anchors.curvature[e], anchors.parameters[e], anchors.stiffness_gradient[e]
         curvature[:] = 0.0
+        gradient[:] = 0.0
         if ends[e, 0] == NO_FACTORS:
             continue
         factors = Factors(
             bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], interfaces[e], interface_pivots[e]
         )
-        for i in range(moving.size):
-            largest(anchors.sensitivities[e, moving[i]], reached)
-            reach, parameter = in_units(reached, anchors.amplitude[e]), abs(before[moving[i]])
-            small[i] = SECOND_DISTANCE / reach if reach > 0.0 else 0.0
+        for p in range(total):
+            largest(anchors.sensitivities[e, p], reached)
+            reach, parameter = in_units(reached, anchors.amplitude[e]), abs(before[p])
+            small[p] = SECOND_DISTANCE / reach if reach > 0.0 else 0.0
             if parameter > 0.0:
-                small[i] = min(small[i], SECOND_DISTANCE * parameter)
+                small[p] = min(small[p], SECOND_DISTANCE * parameter)
+        largest(anchors.right[e], reached)
+        aside = SECOND_DISTANCE / in_units(reached, anchors.amplitude[e])
+        for p in range(total):
+            if not small[p] > 0.0:
+                continue
+            for side in (-1.0, 1.0):
+                theta = before.copy()
+                theta[p] += side * small[p]
+                for to in (-1.0, 1.0):
+                    residual_beside(functions, grid, sets, anchors, e, theta, before, to * aside, z, states, value)
+                    gradient[p] += side * to * dot(as_vector(anchors.left[e]), as_vector(value))
+            gradient[p] /= 4.0 * small[p] * aside
+        if not dot(gradient, gradient) < np.inf:
+            gradient[:] = 0.0
+            ends[e, 0] = NO_FACTORS
+            continue
         finite, row = True, 0
         for i in range(moving.size):
             for j in range(i, moving.size):
-                terms = curvature[row]
+                terms, p, q = curvature[row], moving[i], moving[j]
                 row += 1
-                if not (small[i] > 0.0 and small[j] > 0.0):
+                if not (small[p] > 0.0 and small[q] > 0.0):
                     continue
                 for side in (-1.0, 0.0, 1.0):
                     theta = before.copy()
-                    theta[moving[i]] += side * small[i]
+                    theta[p] += side * small[p]
                     if j > i:
-                        theta[moving[j]] += side * small[j]
-                    predict(at, anchors.sensitivities[e], before, theta, 1.0, z)
-                    differentiate(z, sets.drift[e], grid, sets.frequency[e], states)
-                    residual(states, sets.inputs[e], theta, grid.tau, sets.frequency[e], value)
+                        theta[q] += side * small[q]
+                    residual_beside(functions, grid, sets, anchors, e, theta, before, 0.0, z, states, value)
                     for k in range(points):
                         for s in range(count):
                             terms[k, s] -= value[k, s] if side != 0.0 else -2.0 * value[k, s]
@@ -266,7 +295,8 @@ def fill_curvature(functions, grid, sets, anchors):
         row = 0
         for i in range(moving.size):
             for j in range(i, moving.size):
-                scale = 0.5 / (small[i] * small[j]) if finite and small[i] * small[j] > 0.0 else 0.0
+                product = small[moving[i]] * small[moving[j]]
+                scale = 0.5 / product if finite and product > 0.0 else 0.0
                 for k in range(points):
                     for s in range(count):
                         curvature[row, k, s] = scale * curvature[row, k, s] if scale > 0.0 else 0.0
@@ -277,11 +307,11 @@ def fill_curvature(functions, grid, sets, anchors):
 def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop, polish, rates, solution):
     """Solve for input sets times parameter vectors, those of the flat indices start … stop (vectors run fastest).
 
-    Each solve starts from the linear prediction of its set's anchor: chord steps with the anchor's factors, else
-    the Newton iteration, else that from the anchor itself. Where all fail, or the result is far from the prediction of
-    a solved anchor or of a shorter period than it, the orbit is followed in small steps from the anchor's parameters;
-    if a step leaps, or the period becomes shorter, the status is "other orbit". The results do not depend on the order
-    of the solves.
+    Each solve starts from the prediction of its set's anchor, which is linear beyond a fold: chord steps with the
+    anchor's factors, else the Newton iteration, else that from the anchor itself. Where all fail, or the result is far
+    from the prediction of a solved anchor or of a shorter period than it, the orbit is followed in small steps from the
+    anchor's parameters; if a step leaps, or the period becomes shorter, the status is "other orbit". The results do not
+    depend on the order of the solves.
 
     `parameters` is (sets, solves, parameters); for `polish` see `newton_chord`; `rates` tells whether the outputs
     depend on q̇ or q̈. The solution is filled except for the frequency, z only if it has entries; solves whose status is
@@ -300,7 +330,7 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
         np.empty_like(interface_pivots[0]),
     )  # fmt: skip
     work = Workspace(states, columns, np.empty((0, 0)), fresh)
-    taken, second = np.empty((MAX_CHORDS + 1, points, count)), np.empty((points, count))
+    taken, second = np.empty((MAX_CHORDS, points, count)), np.empty((points, count))
     nothing, table = np.empty(0), np.empty((0, 0))
     unknowns = Unknowns(nothing, nothing, nothing, table, np.empty((0, 0, 0)), -1)
     border = Border(table, table, table, table, np.empty(0, dtype=np.int64))
@@ -315,21 +345,25 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
         copy(predicted, z)
         known, close, used, code, doubtful, moved = ends[e, 0] != NO_FACTORS, False, 0, CONVERGED, False, np.inf
         if known:
-            stiffness = 1.0
+            amplitude, change_of_stiffness, along = anchors.amplitude[e], 0.0, 0.0
             for p in range(theta.size):
-                stiffness += anchors.stiffness_gradient[e, p] * (theta[p] - anchor_parameters[p])
+                change_of_stiffness += anchors.stiffness_gradient[e, p] * (theta[p] - anchor_parameters[p])
+                along += anchors.along[e, p] * (theta[p] - anchor_parameters[p])
+            fill_second_order(anchors.curvature[e], anchors.moving, anchor_parameters, theta, second)
+            stiffness = np.sqrt(max(1.0 + 2.0 * change_of_stiffness, 0.0))
+            if stiffness > LEAST_STIFFNESS:
+                add_higher_orders(change_of_stiffness, stiffness, along, anchors.right[e], second, predicted)
+                copy(predicted, z)
             for i in range(points):
                 for s in range(count):
                     change[i, s] = predicted[i, s] - at[i, s]
             largest(change, reached)
-            amplitude = anchors.amplitude[e]
-            fill_second_order(anchors.curvature[e], anchors.moving, anchor_parameters, theta, second)
             factors = Factors(
                 bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], interfaces[e], interface_pivots[e]
             )
             close, used, moved = newton_chord(
-                functions, grid, setting, amplitude, stiffness, in_units(reached, amplitude), polish, z, second,
-                states, change, taken, factors, anchors.left[e], anchors.right[e],
+                functions, grid, setting, amplitude, stiffness, in_units(reached, amplitude), polish, z, states,
+                change, taken, factors, anchors.left[e], anchors.right[e],
             )  # fmt: skip
         if not close:
             moved = np.inf
