@@ -11,9 +11,9 @@ from bayesperiodic.sampling.population_density import BLOCK_VALUES, Members, Pop
 
 # Spreads up to this multiple of the units' standard deviations, and down to one over it, and correlations up to tanh 3
 # change the scale of the means.
-FAR, CORRELATED = 1e6, 3.0
+FAR_SPREAD, FAR_CORRELATION = 1e6, 3.0
 # First spread, at least, relative to the units' standard deviations; width of the first walkers.
-LEAST_SPREAD, START_WIDTH = 0.3, 0.3
+FIRST_SPREAD, START_WIDTH = 0.3, 0.3
 
 
 class Decoupled:
@@ -40,7 +40,7 @@ class Decoupled:
         self._middle = np.concatenate([np.log(self._first_spreads()), np.zeros(count)])
         self._slope = np.concatenate([np.ones(len(structure.free)), np.full(count, 0.5)])
         widths = np.concatenate([np.sqrt(np.diag(unit.covariance)) for unit in density.units])
-        self._limits = np.log(widths.min() / FAR), np.log(widths.max() * FAR)
+        self._limits = np.log(widths.min() / FAR_SPREAD), np.log(widths.max() * FAR_SPREAD)
         self._prior = np.diag(
             [0.0] * len(structure.names) + [structure.slope_scale[name] ** -2.0 for name, _ in structure.sloped]
         )
@@ -50,7 +50,7 @@ class Decoupled:
         structure, size = self.density.structure, len(self.density.structure.names)
         means = np.concatenate([unit.mean.reshape(-1, size) for unit in self.density.units])
         variances = np.concatenate([np.diag(unit.covariance).reshape(-1, size) for unit in self.density.units])
-        spread = np.maximum(means.std(axis=0), LEAST_SPREAD * np.sqrt(variances.mean(axis=0)))
+        spread = np.maximum(means.std(axis=0), FIRST_SPREAD * np.sqrt(variances.mean(axis=0)))
         likely = np.array([0.05, 0.95])
         first = [
             np.clip(spread[structure.names.index(name)], *structure.spread[name].quantile(likely))
@@ -74,7 +74,7 @@ class Decoupled:
         structure, limited = self.density.structure, points.copy()
         first, last = self._linear, self._linear + len(structure.free)
         limited[:, first:last] = np.clip(points[:, first:last], *self._limits)
-        limited[:, last:] = np.clip(points[:, last:], -CORRELATED, CORRELATED)
+        limited[:, last:] = np.clip(points[:, last:], -FAR_CORRELATION, FAR_CORRELATION)
         return structure.parameters(limited).covariance
 
     def _conditional(self, points: np.ndarray) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
@@ -128,5 +128,5 @@ class Decoupled:
     def evaluate(self, points: np.ndarray, threads: int | None = None) -> Evaluation:
         """Return the log-density over z at points (points, dimension)."""
         natural, log_det = self.natural(points)
-        found = self.density.evaluate(natural, threads)
-        return found._replace(log_prob=found.log_prob + log_det)
+        evaluation = self.density.evaluate(natural, threads)
+        return evaluation._replace(log_prob=evaluation.log_prob + log_det)
