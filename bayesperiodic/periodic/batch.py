@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -34,8 +33,7 @@ from bayesperiodic.periodic.equations import (
 
 SMALLEST_BLOCK, PARTS_EACH = 4, 4
 INVERSE_ITERATIONS = 3
-# Number of parameters up to which terms of second order cost less than the chord step that they save.
-MOST_OF_SECOND_ORDER = 8
+SMALL_DISTANCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -90,8 +88,7 @@ class Batch:
         factors.ends[:, 0] = NO_FACTORS
         sensitivities = np.zeros((len(sets), len(first.model.parameters), first.grid.points, first.count))
         left, right = np.zeros((2, len(sets), first.grid.points, first.count))
-        along, gradient = np.zeros((2, *sensitivities.shape[:2]))
-        amplitude = np.stack([np.abs(a.z).max(axis=0) for a in anchors])
+        gradient, amplitude = np.zeros(sensitivities.shape[:2]), np.stack([np.abs(a.z).max(axis=0) for a in anchors])
         for e, (equations, anchor) in enumerate(zip(sets, anchors, strict=True)):
             if anchor.sensitivities is None:
                 continue
@@ -102,27 +99,20 @@ class Batch:
                 anchored.ends[0] = NO_FACTORS
             with np.errstate(all="ignore"):  # of an orbit near the ends of the numbers, at which chords are not used
                 weights, change = smallest_singular_vectors(equations, anchor.z, columns)
-            if not (np.isfinite(weights).all() and np.isfinite(change).all()):
+                slope = stiffness_gradient(equations, anchor.z, anchor.parameters, sensitivities[e], weights, change)
+            if not (np.isfinite(weights).all() and np.isfinite(change).all() and np.isfinite(slope).all()):
                 anchored.ends[0] = NO_FACTORS
                 continue
-            left[e], right[e], units = weights, change, np.where(amplitude[e] > 0.0, amplitude[e], 1.0)
-            direction = change / units**2
-            along[e] = np.tensordot(sensitivities[e], direction, 2) / np.sum(change * direction)
+            left[e], right[e], gradient[e] = weights, change[:, : first.count], slope
         ranges = np.stack([np.ptp(a.z, axis=0) for a in anchors])
         ratios = np.divide(ranges, amplitude, out=np.full(ranges.shape, np.inf), where=amplitude > 0.0)
         parameters, z = np.stack([a.parameters for a in anchors]), np.stack([a.z for a in anchors])
         near = first.kernels.OFF_ANCHOR * ratios.min(axis=1)
-        moving = np.flatnonzero(sensitivities.any(axis=(0, 2, 3)))
-        moving = moving if moving.size <= MOST_OF_SECOND_ORDER else moving[:0]
-        pairs = moving.size * (moving.size + 1) // 2
-        of_second_order = moving, np.empty((len(sets), pairs, *z.shape[1:]))
-        known = parameters, z, sensitivities, amplitude, gradient, along, near, factors, left, right
-        self._anchors = Anchors(*known, *of_second_order)
-        self._compiled[0].fill_predictions(self._compiled[1], first.grid.packed, self._sets, self._anchors)
+        self._anchors = Anchors(parameters, z, sensitivities, amplitude, gradient, near, factors, left, right)
 
     @cached_property
-    def _compiled(self) -> tuple[Any, Functions]:
-        return kernels("batch", self._first.count, self._first.grid.stencil), self._first.functions
+    def _compiled(self) -> tuple[Callable[..., None], Functions]:
+        return kernels("batch", self._first.count, self._first.grid.stencil).solve_many, self._first.functions
 
     def solve(
         self,
@@ -152,12 +142,10 @@ class Batch:
         solution.frequency[:] = self._sets.frequency[:, None]
         if without is not None:
             solution.status[without] = STALLED
-        compiled, functions = self._compiled
+        solve_many, functions = self._compiled
         before = functions, grid.packed, grid.periods, self._sets, self._anchors, every
         after = polish, first.model.kernels.output_rates, solution
-        in_blocks(
-            lambda block: compiled.solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads
-        )
+        in_blocks(lambda block: solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads)
         return solution
 
     def vjp(self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, moving: tuple[int, ...]) -> np.ndarray:
@@ -259,17 +247,46 @@ def smallest_singular_vectors(
     """Return approximate singular vectors of the smallest singular value of a regular ∂g/∂z, by inverse iteration.
 
     States are in units of their largest values, equations in those of their largest terms. The left vector (points,
-    states) is over the equations; the right one (points, states) is scaled so that left · (∂g/∂z) · right is 1.
+    states) is over the equations; the right one (points, 3·states) is the change of the states and of their time
+    derivatives, scaled so that left · (∂g/∂z) · change is 1.
     """
     factors, amplitude = equations.factors(columns), np.abs(z).max(axis=0)
     size = equations.sizes(z, columns)
     units, terms = np.where(amplitude > 0, amplitude, 1.0), np.where(size > 0, size, 1.0)
-    # Without the symmetry of any orbit, which the iteration would keep; states at rest remain there.
-    right = amplitude * np.random.default_rng(0).standard_normal(z.shape)
+    right = np.broadcast_to(units, z.shape)
     for _ in range(INVERSE_ITERATIONS):
         left = factors.solve_transposed(right / units**2) * terms**2
         left /= np.linalg.norm(left / terms)
         right = factors.solve(left)
-        length = np.linalg.norm(right / units)
-        right /= length
-    return left / terms**2 * length, right
+        right /= np.linalg.norm(right / units)
+    left = left / terms**2
+    change = equations.changes(right[None])[0]
+    g_q = columns[:, equations.count :].reshape(len(z), equations.count, -1)
+    return left / np.dot(left.ravel(), np.einsum("neq,nq->ne", g_q, change).ravel()), change
+
+
+def stiffness_gradient(
+    equations: PeriodicEquations,
+    z: np.ndarray,
+    parameters: np.ndarray,
+    sensitivities: np.ndarray,
+    left: np.ndarray,
+    right: np.ndarray,
+) -> np.ndarray:
+    """Return the derivatives (parameters,) of left · (∂g/∂z) · right along the solutions, by central differences.
+
+    The derivative by a parameter whose sensitivities (points, states) are zero is 0.
+    """
+    amplitude, result = np.abs(z).max(axis=0), np.zeros(parameters.size)
+    units = np.where(amplitude > 0.0, amplitude, 1.0)
+    weights = np.einsum("ne,nq->neq", left, right).ravel()
+    for p in np.flatnonzero(sensitivities.any(axis=(1, 2))):
+        small = SMALL_DISTANCE / np.max(np.abs(sensitivities[p]) / units)
+        small = min(small, SMALL_DISTANCE * abs(parameters[p])) if parameters[p] != 0.0 else small
+        ends = []
+        for step in (small, -small):
+            moved = parameters + step * (np.arange(parameters.size) == p)
+            columns = equations.residual_jacobian(z + step * sensitivities[p], moved)
+            ends.append(np.dot(weights, columns[:, equations.count :].ravel()))
+        result[p] = (ends[0] - ends[1]) / (2.0 * small)
+    return result
