@@ -195,6 +195,15 @@ def parse(argument: str, text: Any, names: Iterable[str], note: str = "") -> Exp
     return Expression(parser.text, appearing, tuple(stack[0]))
 
 
+def parse_any(argument: str, text: Any) -> Expression:
+    """Parse a text with any names, see `parse`; pi is the constant."""
+    nodes = [*ast.walk(_Parser(argument, text, (), "").tree())]
+    functions = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
+    named = [node for node in nodes if isinstance(node, ast.Name) and id(node) not in functions]
+    places = {node.id: (node.lineno, node.col_offset) for node in reversed(named) if node.id not in CONSTANTS}
+    return parse(argument, text, sorted(places, key=places.__getitem__))
+
+
 def parse_all(
     argument: str, expressions: Any, names: Iterable[str], reserved: Iterable[str] = (), note: str = ""
 ) -> dict[str, Expression]:

@@ -9,6 +9,7 @@ import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
+from bayesperiodic._expressions import parse_any
 from bayesperiodic.models.hysteresis import Hysteretic
 from bayesperiodic.models.names import DERIVATIVES, Names
 from bayesperiodic.models.structure import CONSTANT_PART, POWERS, Matrices, MatrixStructure
@@ -108,8 +109,12 @@ def structure(
     forces: Mapping[str, Any],
     outputs: Mapping[str, tuple[Any, str]],
     elements: Iterable[Element],
+    shapes: np.ndarray | None = None,
 ) -> MatrixStructure:
-    """Return the checked structure of matrices by name; see `Model.from_matrices`."""
+    """Return the checked structure of matrices by name; see `Model.from_matrices`.
+
+    Places are degrees of freedom, or points whose displacements are `shapes` (points, n) times these.
+    """
     parts = {kind: _parts(kind, given) for kind, given in matrices.items()}
     count = len(next(iter(parts["mass"].values())))
     for kind, named in parts.items():
@@ -125,10 +130,51 @@ def structure(
         _checks.instance("elements", element, Element)
     _checks.mapping("forces", forces, "{'force': 0}")
     _checks.mapping("outputs", outputs, "{'x': (0, 'displacement')}")
-    inputs = {name: _weights(f"forces[{name!r}]", place, count) for name, place in forces.items()}
-    measured = {name: _measured(f"outputs[{name!r}]", given, count) for name, given in outputs.items()}
-    weights = [_weights(f"place of element {e.name!r}", e.place, count) for e in placed]
+    at = np.eye(count) if shapes is None else shapes
+    inputs = {name: _weights(f"forces[{name!r}]", place, at) for name, place in forces.items()}
+    measured = {name: _measured(f"outputs[{name!r}]", given, at) for name, given in outputs.items()}
+    weights = [_weights(f"place of element {e.name!r}", e.place, at) for e in placed]
     return MatrixStructure(Matrices(parts), inputs, measured, placed, np.array(weights).reshape(-1, count))
+
+
+def of_modes(
+    frequencies: Any,
+    damping_ratios: Any,
+    shapes: Any,
+    forces: Mapping[str, Any],
+    outputs: Mapping[str, tuple[Any, str]],
+    elements: Iterable[Element],
+) -> MatrixStructure:
+    """Return the structure of modes of unit modal mass; see `Model.from_modes`."""
+    at = _checks.real_array("shapes", shapes)
+    if at.ndim != 2 or not at.size or not np.isfinite(at).all():
+        raise ValueError(f"shapes: must be a finite array (points, modes), got the shape {at.shape}.")
+    count = at.shape[1]
+    if isinstance(damping_ratios, str | int | float):
+        damping_ratios = [damping_ratios] * count
+    pairs = ("frequencies", frequencies), ("damping_ratios", damping_ratios)
+    each = zip(*(_of_modes(argument, given, count) for argument, given in pairs), strict=True)
+    matrices: dict[str, dict[str, np.ndarray]] = {"damping": {}, "stiffness": {}}
+    for mode, (frequency, ratio) in enumerate(each):
+        if not isinstance(frequency, str) and not frequency > 0.0:
+            raise ValueError(f"frequencies: must be > 0, got {frequency:g}; give a rigid motion a soft support.")
+        factors = {"damping": f"4*pi*({ratio!s})*({frequency!s})", "stiffness": f"(2*pi*({frequency!s}))**2"}
+        for kind, factor in factors.items():
+            expression = parse_any(kind, factor)
+            known = not expression.names
+            part = matrices[kind].setdefault(CONSTANT_PART if known else factor, np.zeros((count, count)))
+            part[mode, mode] = expression.value({}) if known else 1.0
+    return structure({"mass": np.eye(count)} | matrices, forces, outputs, elements, at)
+
+
+def _of_modes(argument: str, given: Any, count: int) -> list[float | str]:
+    values = list(given) if isinstance(given, Iterable) and not isinstance(given, str) else []
+    if len(values) != count:
+        raise ValueError(f"{argument}: must be one of each of the {count} modes in shapes, got {given!r}.")
+    for value in values:
+        if isinstance(value, str):
+            parse_any(argument, value)
+    return [value if isinstance(value, str) else _checks.finite_number(argument, value) for value in values]
 
 
 def definition(given: MatrixStructure) -> dict[str, Any]:
@@ -139,7 +185,8 @@ def definition(given: MatrixStructure) -> dict[str, Any]:
         total: list[sp.Expr] = [sp.S.Zero] * given.degrees
         for kind, power in POWERS.items():
             for name, matrix in given.parts[kind].items():
-                factor = sp.S.One if name == CONSTANT_PART else p[name]
+                expression = given.factors[name]
+                factor = expression.symbolic(kind, {n: p[n] for n in expression.names})[0]
                 for i, row in enumerate(matrix):
                     total[i] += factor * _combined(row, [s[DERIVATIVES[power] + x] for x in degrees])
         internal: list[sp.Expr] = []
@@ -152,11 +199,10 @@ def definition(given: MatrixStructure) -> dict[str, Any]:
             total = [sum_ - _number(w) * u[name] if w else sum_ for sum_, w in zip(total, at, strict=True)]
         return [*total, *internal]
 
-    factors = [name for named in given.parts.values() for name in named if name != CONSTANT_PART]
     return {
         "states": [*degrees, *(state for e in given.elements for state in e.states)],
         "inputs": [*given.inputs],
-        "parameters": [*dict.fromkeys(factors), *(f"{e.name}_{name}" for e in given.elements for name in e.parameters)],
+        "parameters": [*given.parameters, *(f"{e.name}_{name}" for e in given.elements for name in e.parameters)],
         "equations": equations,
         "outputs": lambda s, p, u: {
             name: _combined(at, [s[DERIVATIVES[order] + x] for x in degrees])
@@ -177,14 +223,22 @@ def _parts(kind: str, given: Any) -> dict[str, np.ndarray]:
         dense = _checks.real_array(kind, matrix.toarray() if hasattr(matrix, "toarray") else matrix)
         if dense.ndim != 2 or dense.shape[0] != dense.shape[1] or not dense.size:
             raise ValueError(f"{kind}: must be a square matrix, got the shape {dense.shape}.")
+        _checks.identifiers(kind, parse_any(kind, name).names)
         if not np.isfinite(dense).all():
             raise ValueError(f"{kind}: must be finite, got a matrix with other values.")
         result[name] = dense
     return result
 
 
-def _weights(argument: str, place: Any, count: int) -> np.ndarray:
-    """Return the weights of all degrees of freedom in a place."""
+def _weights(argument: str, place: Any, shapes: np.ndarray) -> np.ndarray:
+    """Return the weights of all degrees of freedom in a place, whose displacements are `shapes` (points, n)."""
+    weights = _weights_of_points(argument, place, len(shapes)) @ shapes
+    if not weights.any():
+        raise ValueError(f"{argument}: must be moved by at least one mode, got {place!r}, a node of all.")
+    return np.asarray(weights)
+
+
+def _weights_of_points(argument: str, place: Any, count: int) -> np.ndarray:
     if isinstance(place, np.ndarray) and place.ndim:
         weights = _checks.real_array(argument, place)
         if weights.shape != (count,) or not np.isfinite(weights).all() or not weights.any():
@@ -206,11 +260,11 @@ def _weights(argument: str, place: Any, count: int) -> np.ndarray:
     return weights
 
 
-def _measured(argument: str, given: Any, count: int) -> tuple[np.ndarray, int]:
+def _measured(argument: str, given: Any, shapes: np.ndarray) -> tuple[np.ndarray, int]:
     if not isinstance(given, tuple) or len(given) != 2 or not isinstance(given[1], str):
         raise ValueError(f"{argument}: must be a place and a kind, such as (0, 'acceleration'), got {given!r}.")
     _checks.one_of(argument, given[1], KINDS_OF_MOTION)
-    return _weights(argument, given[0], count), KINDS_OF_MOTION[given[1]]
+    return _weights(argument, given[0], shapes), KINDS_OF_MOTION[given[1]]
 
 
 def _combined(weights: np.ndarray, symbols: list[sp.Symbol]) -> sp.Expr:

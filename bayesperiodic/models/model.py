@@ -2,7 +2,7 @@
 
 import inspect
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cache, cached_property
@@ -20,7 +20,7 @@ from bayesperiodic._compile.code_generation import Kernels, SymbolicModel, VjpKe
 from bayesperiodic._compile.grid_function import GridFunction
 from bayesperiodic._expressions import parse
 from bayesperiodic._printing import Printed
-from bayesperiodic.models.matrices import definition, structure
+from bayesperiodic.models.matrices import definition, of_modes, structure
 from bayesperiodic.models.names import DERIVATIVES, Names, with_derivatives
 from bayesperiodic.models.structure import CONSTANT_PART, MatrixStructure
 
@@ -186,8 +186,8 @@ class Model(Printed):
         ----------
         name : str
         mass, stiffness, damping : array (n, n), sparse matrix, or mapping of str to such
-            Of a mapping, the sum of name·matrix with the name of a parameter, and of the matrix of the name "1", for
-            example ``damping={"alpha": M, "beta": K}``. No damping without `damping`.
+            Of a mapping, the sum of factor·matrix with an expression of parameters as the factor, for example
+            ``damping={"alpha": M, "beta": K}`` or ``stiffness={"1": K0, "E*t**3": K1}``. No damping without `damping`.
         forces : mapping of str to place
             Where each input acts: the number of a degree of freedom, from 0; a tuple (i, j) of two between which it
             acts, positive on i; or an array (n,) of weights, such as a direction or the values of modes at a point.
@@ -220,7 +220,63 @@ class Model(Printed):
         (('x0', 'x1', 'joint'), ('alpha', 'joint_stiffness', 'joint_limit'))
         """
         matrices = {"mass": mass, "damping": damping, "stiffness": stiffness}
-        given = structure(matrices, forces, outputs, elements)
+        return cls._of_structure(name, structure(matrices, forces, outputs, elements), condensed)
+
+    @classmethod
+    def from_modes(
+        cls,
+        name: str,
+        *,
+        frequencies: Sequence[float | str],
+        damping_ratios: Sequence[float | str] | float | str,
+        shapes: Any,
+        forces: Mapping[str, Any],
+        outputs: Mapping[str, tuple[Any, str]],
+        elements: Iterable[Any] = (),
+        condensed: bool | None = None,
+    ) -> "Model":
+        """Return the model of modes with nonlinear elements between points of the structure.
+
+        The equations are q̈ + 4π ζ f q̇ + (2π f)² q = shapesᵀ (forces − elements), one of each mode; the states x0, x1,
+        … are the modal coordinates q, and the displacements of the points are shapes·q. So priors stand on frequencies
+        and damping ratios, as modal tests give them. What other modes bend statically is left out: take those that
+        matter at the elements, not only those in the range of frequencies.
+
+        Parameters
+        ----------
+        name : str
+        frequencies : sequence of number or str, (modes,)
+            Of the undamped modes [Hz]; a text is a parameter, or an expression of parameters such as ``"1.02*f"``.
+        damping_ratios : sequence of number or str, (modes,), or one for all
+            Damping over critical damping, ζ.
+        shapes : array (points, modes)
+            Mode shapes at the points of forces, outputs and elements, for unit modal mass [1/√kg].
+        forces, outputs, elements, condensed
+            As in `from_matrices`, with the numbers of points for those of degrees of freedom.
+
+        Returns
+        -------
+        Model
+
+        Raises
+        ------
+        ValueError
+            For other numbers of frequencies or ratios than modes, a frequency that is not > 0, a place that does not
+            exist or that no mode moves, and as for `from_matrices`.
+
+        Examples
+        --------
+        >>> model = bp.Model.from_modes("plate", frequencies=["f1", 31.0], damping_ratios=["zeta", "zeta"],
+        ...     shapes=[[0.5, 0.7], [0.9, -0.4]], forces={"force": 0}, outputs={"a": (1, "acceleration")},
+        ...     elements=[bp.elements.Element("mount", bp.elements.cubic, 1)])
+        >>> model.parameters
+        ('zeta', 'f1', 'mount_k3')
+        """
+        given = of_modes(frequencies, damping_ratios, shapes, forces, outputs, elements)
+        return cls._of_structure(name, given, condensed)
+
+    @classmethod
+    def _of_structure(cls, name: str, given: MatrixStructure, condensed: bool | None) -> "Model":
         if condensed is None:
             condensed = given.memoryless and bool(given.inputs) and given.degrees > MOST_SYMBOLIC
         return CondensedModel(name, given) if condensed else cls(name, **definition(given))
@@ -420,8 +476,7 @@ class CondensedModel(Model):
         ):
             forces.append(self._element_force(element.evaluate(d, v, s, p).force))
         self.element_forces = tuple(forces)
-        of_matrices = {factor for named in structure.parts.values() for factor in named}
-        self._warn_of_unused(forces, [n for n in self.parameters if n not in of_matrices])
+        self._warn_of_unused(forces, [n for n in self.parameters if n not in structure.parameters])
         # Functions cannot be pickled; what they returned is kept.
         self.structure = replace(structure, elements=())
         self.angles, self.units, self.orders = (), {}, dict.fromkeys(self.states, 2)
@@ -519,7 +574,9 @@ class CondensedModel(Model):
         sums = []
         for kind, letter, motion in (("mass", "M", r"\ddot{x}"), ("damping", "C", r"\dot{x}"), ("stiffness", "K", "x")):
             for number, factor in enumerate(self.structure.parts[kind]):
-                scale = "" if factor == CONSTANT_PART else written[self.parameter_symbols[factor]] + r"\,"
+                expression, _ = self.structure.factors[factor].symbolic(kind, self.parameter_symbols)
+                scale = "" if factor == CONSTANT_PART else sp.latex(expression, symbol_names=written) + r"\,"
+                scale = rf"\left({scale[:-2]}\right)\," if expression.is_Add else scale
                 sums.append(f"{scale}{letter}_{{{number}}} {motion}")
         forces = [
             f"f_{{{number + 1}}} &= {sp.latex(f, symbol_names=written)}" for number, f in enumerate(self.element_forces)

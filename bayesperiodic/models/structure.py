@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
+from bayesperiodic._expressions import Expression, parse_any
+
 CONSTANT_PART = "1"
 POWERS = {"mass": 2, "damping": 1, "stiffness": 0}  # of iω
 # Largest entry beside the diagonal of a part in the modes' coordinates, relative to the diagonal.
@@ -30,7 +32,7 @@ class Modes:
 
 @dataclass(frozen=True, eq=False)
 class Matrices:
-    """Sums of parts times factors, which are parameters or 1."""
+    """Sums of parts times factors, which are expressions of parameters, such as "k", "2*zeta*omega" or "1"."""
 
     parts: dict[str, dict[str, np.ndarray]]  # by "mass", "damping", "stiffness" and factor, each (n, n)
 
@@ -84,6 +86,16 @@ class MatrixStructure:
     def parts(self) -> dict[str, dict[str, np.ndarray]]:
         """Parts of the matrices by kind and factor."""
         return self.matrices.parts
+
+    @cached_property
+    def factors(self) -> dict[str, Expression]:
+        """The factors of the parts, by their text."""
+        return {text: parse_any(kind, text) for kind, named in self.parts.items() for text in named}
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names in the factors."""
+        return tuple(dict.fromkeys(name for factor in self.factors.values() for name in factor.names))
 
     @property
     def degrees(self) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.linalg
 
 from bayesperiodic._compile.cache import load
+from bayesperiodic._expressions import Expression
 from bayesperiodic.models.structure import CONSTANT_PART, LEAST_REGULAR, POWERS, MatrixStructure
 
 # Arrays at the same point that are not computed again, and rows beyond which they are not kept.
@@ -37,8 +38,9 @@ class LowestModes(NamedTuple):
 class Receptance:
     """LinearResponse R·(−(kω)² M + ikω C + K)⁻¹·S of displacements along rows R to forces along columns S.
 
-    M, C and K are sums of parts times factors, which are parameters or 1. Where one basis of real modes diagonalises
-    all parts, as with Rayleigh or modal damping, it is computed once; else one matrix is factorised per harmonic.
+    M, C and K are sums of parts times factors, which are expressions of parameters. Where one basis of real modes
+    diagonalises all parts, as with Rayleigh or modal damping, it is computed once; else one matrix is factorised per
+    harmonic.
 
     Parameters
     ----------
@@ -53,7 +55,13 @@ class Receptance:
         self._structure, self._rows, self._columns = structure, rows, columns
         parts = [(POWERS[kind], name, a) for kind, named in structure.parts.items() for name, a in named.items()]
         self._powers = np.array([power for power, _, _ in parts])
-        self._factors = np.array([-1 if n == CONSTANT_PART else parameters.index(n) for _, n, _ in parts])
+        # Factors that are parameters, or 1 (−1), are taken by their place, others by their expression.
+        expressions = [structure.factors[n] for _, n, _ in parts]
+        self._factors = np.array([parameters.index(e.text) if e.text in parameters else -1 for e in expressions])
+        self._expressions = {
+            k: e for k, e in enumerate(expressions) if e.text not in parameters and e.text != CONSTANT_PART
+        }
+        self._names = tuple(parameters)
         self._matrices = np.stack([a for *_, a in parts])
         self._size, self._regular = len(parameters), False
         self._recent: dict[tuple[Any, ...], Any] = {}
@@ -105,11 +113,11 @@ class Receptance:
         if modes is not None:
             factors = self._values(parameters)
             mass, damping, stiffness = ((factors * (self._powers == power)) @ modes.diagonals for power in (2, 1, 0))
-            at, squares = places @ modes.vectors / np.sqrt(mass), stiffness / mass
-            compliance = at[:, count:] / squares[count:] @ at[:, count:].T
-            return LowestModes(
-                np.diag(squares[:count]), np.diag((damping / mass)[:count]), at[:, :count].copy(), compliance
-            )
+            at, squares, rates = places @ modes.vectors / np.sqrt(mass), stiffness / mass, damping / mass
+            order = np.argsort(squares)  # factors may change it
+            low, high = order[:count], order[count:]
+            compliance = at[:, high] / squares[high] @ at[:, high].T
+            return LowestModes(np.diag(squares[low]), np.diag(rates[low]), at[:, low], compliance)
         vectors, (mass, damping, stiffness) = self.lowest_modes(parameters, count), self.sums(parameters)
         vectors = vectors / np.sqrt(np.sum(vectors * (mass @ vectors), axis=0))
         inverse = np.linalg.inv(vectors.T @ mass @ vectors)
@@ -136,7 +144,13 @@ class Receptance:
     def _values(self, parameters: np.ndarray) -> np.ndarray:
         """Return the factors (…, parts) of the parts at parameters (…, parameters)."""
         constant = np.ones((*parameters.shape[:-1], 1))
-        return np.asarray(np.concatenate([parameters, constant], axis=-1)[..., self._factors])
+        result = np.concatenate([parameters, constant], axis=-1)[..., self._factors]
+        for place, expression in self._expressions.items():
+            result[..., place] = expression.value(self._named(parameters, expression))
+        return np.asarray(result)
+
+    def _named(self, parameters: np.ndarray, expression: Expression) -> dict[str, np.ndarray]:
+        return {name: parameters[..., self._names.index(name)] for name in expression.names}
 
     def coefficients(self, parameters: np.ndarray, rates: np.ndarray) -> np.ndarray:
         """Return the factor of each part, (harmonics, parts), at the angular frequencies `rates` [1/s]."""
@@ -198,7 +212,7 @@ class Receptance:
     @property
     def matrix_parameters(self) -> tuple[int, ...]:
         """Indices of the parameters that are factors of matrices."""
-        return tuple(sorted({int(i) for i in self._factors if i >= 0}))
+        return tuple(sorted(map(self._names.index, self._structure.parameters)))
 
     def _slope(
         self, direction: int, parameters: np.ndarray, rates: np.ndarray, factors: np.ndarray, frequency: float
@@ -206,7 +220,10 @@ class Receptance:
         """Return the derivative of `coefficients` by a parameter or by the frequency."""
         if direction == self._size:
             return factors * self._powers / frequency
-        moved = np.where(self._factors == direction, 1.0, 0.0)
+        moved, name = np.where(self._factors == direction, 1.0, 0.0), self._names[direction]
+        for place, expression in self._expressions.items():
+            if name in expression.names:
+                moved[place] = expression.gradient(self._named(parameters, expression), [name])[name]
         return (1j * rates[:, None]) ** self._powers * moved
 
 
