@@ -8,7 +8,8 @@ from scipy.integrate import DOP853, solve_ivp
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.recording import Recording
-from bayesperiodic.models.model import Model, integration_kernels, parameter_vector
+from bayesperiodic.models.integration import integration_kernels
+from bayesperiodic.models.model import Model, parameter_vector
 
 RELATIVE_TOLERANCE = 1e-10
 SIXTH_ORDER = {

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import bayesperiodic as bp
 from bayesperiodic._checks import MOST_LETTERS
-from bayesperiodic.models.model import RESERVED
+from bayesperiodic.models.names import RESERVED
 from tests.known import formula_model, grid
 
 identifiers = st.one_of(

@@ -1,36 +1,29 @@
 """Models: differential and output equations in symbolic form, and their time integration."""
 
-import inspect
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from functools import cache, cached_property
+from functools import cached_property
 from hashlib import sha256
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic._compile.cache import load
 from bayesperiodic._compile.code_generation import Kernels, SymbolicModel, VjpKernels, grid_functions
 from bayesperiodic._compile.grid_function import GridFunction
 from bayesperiodic._expressions import parse
 from bayesperiodic._printing import Printed
 from bayesperiodic.models.matrices import definition, of_modes, structure
-from bayesperiodic.models.names import DERIVATIVES, Names, with_derivatives
+from bayesperiodic.models.names import DERIVATIVES, RESERVED, Names, called, check_derivative_names, with_derivatives
 from bayesperiodic.models.structure import CONSTANT_PART, MatrixStructure
 
-RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
 LARGEST_FLOAT = np.finfo(float).max
 # Degrees of freedom above which models of matrices are condensed.
 MOST_SYMBOLIC = 10
 VJP_FUNCTIONS = ("outputs_vjp", "equations_vjp")
-# Texts of the TypeErrors of NumPy, math and `if` when they are given symbols.
-NUMERIC_ONLY = ("ufunc", "truth value", "expression to float", "to integer", "'Symbol'")
 
 
 class Model(Printed):
@@ -110,7 +103,7 @@ class Model(Printed):
             Names("parameters", self.parameter_symbols),
             Names("inputs", self.input_symbols),
         )
-        written = _called("equations", equations, spaces)
+        written = called("equations", equations, spaces)
         if isinstance(written, sp.Basic | str) or not isinstance(written, Iterable):
             raise ValueError(f"equations: must return a list, one expression per state, got {written} alone.")
         self.equations = tuple(self._expression("equations", e) for e in written)
@@ -119,7 +112,7 @@ class Model(Printed):
                 f"equations: must be {len(self.states)}, one for each of the states {list(self.states)}, got "
                 f"{len(self.equations)}. An equation may contain s.dd{self.states[0]}, so that rates need no states."
             )
-        given = dict(_checks.mapping("outputs", _called("outputs", outputs, spaces), "{'displacement': s.x}"))
+        given = dict(_checks.mapping("outputs", called("outputs", outputs, spaces), "{'displacement': s.x}"))
         self.outputs = _checks.identifiers("outputs", given, (*RESERVED, *self.inputs))
         self.output_expressions = tuple(self._expression("outputs", given[n]) for n in self.outputs)
         if not self.outputs:
@@ -144,7 +137,7 @@ class Model(Printed):
         self.inputs = _checks.identifiers("inputs", inputs, (*RESERVED, *self.states))
         self.parameters = _checks.identifiers("parameters", parameters, RESERVED)
         for argument, space, names in (("states", "s", self.states), ("inputs", "u", self.inputs)):
-            _check_derivative_names(argument, space, names)
+            check_derivative_names(argument, space, names)
         if not self.states:
             raise ValueError("states: must have at least one name, got none.")
         self.state_symbols = with_derivatives("s", self.states)
@@ -237,10 +230,9 @@ class Model(Printed):
     ) -> "Model":
         """Return the model of modes with nonlinear elements between points of the structure.
 
-        The equations are q̈ + 4π ζ f q̇ + (2π f)² q = shapesᵀ (forces − elements), one of each mode; the states x0, x1,
-        … are the modal coordinates q, and the displacements of the points are shapes·q. So priors stand on frequencies
-        and damping ratios, as modal tests give them. What other modes bend statically is left out: take those that
-        matter at the elements, not only those in the range of frequencies.
+        The equations are q̈ + 4π ζ f q̇ + (2π f)² q = shapesᵀ (forces − elements); the states x0, x1, … are the modal
+        coordinates q, and the points are displaced by shapes·q. What other modes bend statically is left out: take
+        those that matter at the elements, not only those in the range of frequencies.
 
         Parameters
         ----------
@@ -261,8 +253,8 @@ class Model(Printed):
         Raises
         ------
         ValueError
-            For other numbers of frequencies or ratios than modes, a frequency that is not > 0, a place that does not
-            exist or that no mode moves, and as for `from_matrices`.
+            For other numbers of frequencies or ratios than modes, a frequency that is not > 0, a place that no mode
+            moves, and as for `from_matrices`.
 
         Examples
         --------
@@ -594,54 +586,11 @@ class CondensedModel(Model):
         }
 
 
-def _called(argument: str, given: Any, spaces: tuple[Names, ...]) -> Any:
-    """Return what the function of (s, p, u) returns, or `given` itself if it is no function."""
-    if not callable(given):
-        return given
-    try:
-        inspect.signature(given).bind(*spaces)
-    except TypeError as error:
-        raise ValueError(f"{argument}: must be a function of (s, p, u), got {given!r}: {error}.") from None
-    try:
-        return given(*spaces)
-    except TypeError as error:
-        if not any(text in str(error) for text in NUMERIC_ONLY):
-            raise
-        raise ValueError(
-            f"{argument}: must use SymPy's functions of states, parameters and inputs (import sympy as sp; "
-            "sp.cos(s.x), sp.sign(s.dx), and sp.Piecewise instead of if), got an error of a function of numbers: "
-            f"{error}"
-        ) from error
-
-
 def _symbols(expressions: Iterable[sp.Expr]) -> set[sp.Symbol]:
     return set().union(*(e.free_symbols for e in expressions))
-
-
-def _check_derivative_names(argument: str, space: str, names: tuple[str, ...]) -> None:
-    for name in names:
-        for derivative in (f"d{name}", f"dd{name}"):
-            if derivative in names:
-                raise ValueError(
-                    f"{argument}: must not contain derivatives, got {derivative!r} and {name!r}; leave {derivative!r} "
-                    f"out and write {space}.{derivative}."
-                )
-    _checks.identifiers(argument, [d + n for d in DERIVATIVES for n in names], RESERVED)
 
 
 def parameter_vector(model: Model, parameters: Mapping[str, float]) -> np.ndarray:
     """Return the value of every parameter, (parameters,); raise a ValueError for other names and values."""
     _checks.same_names("parameters", parameters, model.parameters)
     return np.array([_checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
-
-
-@cache
-def dense_kernels(path: Path | None = None) -> ModuleType:
-    """Return the compiled solution of small dense systems, or the compiled functions of a source that uses it."""
-    text = (path or Path(__file__).with_name("_kernels") / "dense.py").read_text(encoding="utf-8")
-    return load(text, shared=dense_kernels() if path else None)
-
-
-def integration_kernels() -> ModuleType:
-    """Return the compiled functions of time integration."""
-    return dense_kernels(Path(__file__).with_name("_kernels") / "integrate.py")

@@ -19,7 +19,7 @@ from types import ModuleType
 
 import numpy as np
 
-from bayesperiodic.models.model import dense_kernels
+from bayesperiodic.models.integration import dense_kernels
 
 STENCIL = 8
 GAUSS_NODES = np.array([0.5 - np.sqrt(15) / 10, 0.5, 0.5 + np.sqrt(15) / 10])

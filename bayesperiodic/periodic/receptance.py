@@ -117,7 +117,8 @@ class Receptance:
             order = np.argsort(squares)  # factors may change it
             low, high = order[:count], order[count:]
             compliance = at[:, high] / squares[high] @ at[:, high].T
-            return LowestModes(np.diag(squares[low]), np.diag(rates[low]), at[:, low], compliance)
+            within = np.ascontiguousarray(at[:, low])
+            return LowestModes(np.diag(squares[low]), np.diag(rates[low]), within, np.ascontiguousarray(compliance))
         vectors, (mass, damping, stiffness) = self.lowest_modes(parameters, count), self.sums(parameters)
         vectors = vectors / np.sqrt(np.sum(vectors * (mass @ vectors), axis=0))
         inverse = np.linalg.inv(vectors.T @ mass @ vectors)

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic.models.model import Model, integration_kernels, parameter_vector
+from bayesperiodic.models.integration import integration_kernels
+from bayesperiodic.models.model import Model, parameter_vector
 from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, OTHER_ORBIT, SINGULAR, STATUSES
 from bayesperiodic.periodic.condensed import (

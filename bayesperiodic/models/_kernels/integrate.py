@@ -7,7 +7,7 @@ from numba import njit
 
 from bayesperiodic._compile.grid_function import grid_function_at
 
-if TYPE_CHECKING:  # defined in this module by `model.dense_kernels`
+if TYPE_CHECKING:  # defined in this module by `integration.dense_kernels`
     from bayesperiodic.models._kernels.dense import solve
 
 ARRAY_2D, ARRAY_1D = "float64[:,::1]", "float64[::1]"

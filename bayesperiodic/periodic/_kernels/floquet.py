@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
-if TYPE_CHECKING:  # defined in this module by `model.dense_kernels`
+if TYPE_CHECKING:  # defined in this module by `integration.dense_kernels`
     from bayesperiodic.models._kernels.dense import solve
 
 STAGES = 3
