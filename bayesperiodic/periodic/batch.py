@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -253,6 +253,13 @@ def phase_bordered(equations: PeriodicEquations, parameters: np.ndarray, z: np.n
     return equations.bordered(columns, slope[None], equations.phase_row(z)[None])
 
 
+@cache
+def _smooth_noise(points: int, states: int) -> np.ndarray:
+    """Return random numbers of low harmonics: without symmetry, and without the motions that differences do not see."""
+    parts = np.random.default_rng(0).standard_normal((2, max(2, points // 8), states))
+    return np.fft.irfft(parts[0] + 1j * parts[1], points, axis=0)
+
+
 def smallest_singular_vectors(
     equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -264,8 +271,7 @@ def smallest_singular_vectors(
     factors, amplitude = equations.factors(columns), np.abs(z).max(axis=0)
     size = equations.sizes(z, columns)
     units, terms = np.where(amplitude > 0, amplitude, 1.0), np.where(size > 0, size, 1.0)
-    # Without the symmetry of any orbit, which the iteration would keep; states at rest remain there.
-    right = amplitude * np.random.default_rng(0).standard_normal(z.shape)
+    right = amplitude * _smooth_noise(*z.shape)  # states at rest remain there
     for _ in range(INVERSE_ITERATIONS):
         left = factors.solve_transposed(right / units**2) * terms**2
         left /= np.linalg.norm(left / terms)

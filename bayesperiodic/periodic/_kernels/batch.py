@@ -40,20 +40,23 @@ def weighted_dot(one, other, weights):
 
 @kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
-        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, CUBE, FACTORS, MATRIX, MATRIX
+        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, CUBE, FACTORS, MATRIX,
+        MATRIX,
     ),
     **INNER,
-)
+)  # fmt: skip
 def newton_chord(
-    functions, grid, setting, amplitude, stiffness, predicted, polish, z, states, change, taken, factors, left, right
-):
+    functions, grid, setting, amplitude, stiffness, predicted, beyond, polish, z, states, change, taken, factors, left,
+    right,
+):  # fmt: skip
     """Improve z in place with the factors of a nearby solution; return whether it converged, the steps, their length.
 
     Steps are corrected by those before them, by Broyden's method (C. T. Kelley, Iterative Methods for Linear and
     Nonlinear Equations, SIAM 1995, chapter 7). A step above `CHORD_RATE` times the one before ends the iteration. The
-    largest ratio of a step to the one before predicts how much smaller the next one will be. The ratio of the first
-    step to the prediction gives the order of magnitude: `PREDICTION_RATE` times it exceeded all but two of a hundred
-    observed rates of linear predictions.
+    largest ratio of a step to the one before predicts how much smaller the next one will be. For the first step the
+    ratio of the terms of second order to the linear ones gives the order of magnitude: `PREDICTION_RATE` times it
+    exceeded all but two of a hundred observed rates. Those of the prediction are `beyond`; without them, the first step
+    is as long.
 
     Where ∂g/∂z is nearly singular, steps with the factors of another point are wrong in the direction that it makes
     smallest, and of the wrong sign where the stiffness in that direction has changed its sign. So this direction takes
@@ -110,7 +113,7 @@ def newton_chord(
         if iteration > 0:
             rate = max(rate, ratio)
         else:
-            ratio *= PREDICTION_RATE
+            ratio = PREDICTION_RATE * max(full, beyond) / predicted
         converged = converged or full <= tolerance or max(rate, ratio) * full <= tolerance
         if converged and (full <= POLISHED or not polish):
             return True, iteration + 1, moved
@@ -349,21 +352,27 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
             for p in range(theta.size):
                 change_of_stiffness += anchors.stiffness_gradient[e, p] * (theta[p] - anchor_parameters[p])
                 along += anchors.along[e, p] * (theta[p] - anchor_parameters[p])
-            fill_second_order(anchors.curvature[e], anchors.moving, anchor_parameters, theta, second)
-            stiffness = np.sqrt(max(1.0 + 2.0 * change_of_stiffness, 0.0))
-            if stiffness > LEAST_STIFFNESS:
-                add_higher_orders(change_of_stiffness, stiffness, along, anchors.right[e], second, predicted)
-                copy(predicted, z)
             for i in range(points):
                 for s in range(count):
                     change[i, s] = predicted[i, s] - at[i, s]
             largest(change, reached)
+            linear, beyond = in_units(reached, amplitude), 0.0
+            fill_second_order(anchors.curvature[e], anchors.moving, anchor_parameters, theta, second)
+            stiffness = np.sqrt(max(1.0 + 2.0 * change_of_stiffness, 0.0))
+            if stiffness > LEAST_STIFFNESS:
+                add_higher_orders(change_of_stiffness, stiffness, along, anchors.right[e], second, predicted)
+                for i in range(points):
+                    for s in range(count):
+                        change[i, s] = predicted[i, s] - z[i, s]
+                largest(change, reached)
+                beyond = in_units(reached, amplitude)
+                copy(predicted, z)
             factors = Factors(
                 bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], interfaces[e], interface_pivots[e]
             )
             close, used, moved = newton_chord(
-                functions, grid, setting, amplitude, stiffness, in_units(reached, amplitude), polish, z, states,
-                change, taken, factors, anchors.left[e], anchors.right[e],
+                functions, grid, setting, amplitude, stiffness, linear, beyond, polish, z, states, change, taken,
+                factors, anchors.left[e], anchors.right[e],
             )  # fmt: skip
         if not close:
             moved = np.inf
