@@ -28,7 +28,6 @@ from bayesperiodic.estimation.covariance import (
 )
 from bayesperiodic.estimation.frequencies import updated_frequencies
 from bayesperiodic.estimation.gauss_newton import (
-    CLIMB_ENDED,
     MAX_STEPS,
     End,
     Iterate,
@@ -73,8 +72,6 @@ MOST_LINEARISATIONS, STEPS_BETWEEN, SETTLED_INPUTS = 40, 5, 1e-5
 SHOWN_AFTER = 2.0
 # Choices of the sheets of tables' branches that are tried after the first.
 MOST_SHEET_CHANGES = 5
-# Step [standard deviations] that ends a climb in tables with larger errors, whose end is a start.
-START_STEP = 1e-2
 
 
 @in_one_thread
@@ -308,7 +305,7 @@ def _in_wide_tables(problem: Problem, theta: np.ndarray, draws: np.ndarray, prog
     if not (wide and first):
         return []
     objective = _objective(wide, first.here)
-    ends: list[End] = [_on_best_sheets(wide, _climb(objective, first, progress, enough=START_STEP), progress)]
+    ends: list[End] = [_on_best_sheets(wide, _climb(objective, first, progress), progress)]
     lost = []
     for draw in draws:
         end = _from_draw(objective, ends, draw, progress)
@@ -332,10 +329,9 @@ def _from_draw(objective: Objective, ends: Sequence[End], theta: np.ndarray, pro
 
 
 def _climb(
-    objective: Objective, first: Iterate, progress: bool, most: int = MAX_STEPS, ends: Sequence[End] = (),
-    enough: float = 0.0,
-) -> End:  # fmt: skip
-    """Climb with a progress bar, until steps are smaller than `enough`; next to one of the ends, that is returned."""
+    objective: Objective, first: Iterate, progress: bool, most: int = MAX_STEPS, ends: Sequence[End] = ()
+) -> End:
+    """Climb with a progress bar; where an iterate comes close to one of the ends, that is returned."""
     reached: list[End] = []
     with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress, delay=SHOWN_AFTER) as bar:
 
@@ -344,12 +340,10 @@ def _climb(
             bar.update()
             known = optimum_of(objective, iterate, ends) if size < SEPARATE_SDS else None
             reached.extend([known] if known else [])
-            return known is not None or size < enough
+            return known is not None
 
         end = climb(objective, first, report=report, most=most)
-    if reached:
-        return reached[0]
-    return end._replace(status="converged") if end.status == CLIMB_ENDED else end
+    return reached[0] if reached else end
 
 
 def _on_best_sheets(problem: Problem, end: End, progress: bool) -> End:

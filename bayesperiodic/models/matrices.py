@@ -150,7 +150,7 @@ def of_modes(
     if at.ndim != 2 or not at.size or not np.isfinite(at).all():
         raise ValueError(f"shapes: must be a finite array (points, modes), got the shape {at.shape}.")
     count = at.shape[1]
-    if isinstance(damping_ratios, str | int | float):
+    if np.ndim(damping_ratios) == 0:
         damping_ratios = [damping_ratios] * count
     pairs = ("frequencies", frequencies), ("damping_ratios", damping_ratios)
     each = zip(*(_of_modes(argument, given, count) for argument, given in pairs), strict=True)
@@ -158,6 +158,8 @@ def of_modes(
     for mode, (frequency, ratio) in enumerate(each):
         if not isinstance(frequency, str) and not frequency > 0.0:
             raise ValueError(f"frequencies: must be > 0, got {frequency:g}; give a rigid motion a soft support.")
+        if not isinstance(ratio, str) and not ratio < 1.0:
+            raise ValueError(f"damping_ratios: must be < 1, got {ratio:g}; give 0.02 for two percent.")
         factors = {"damping": f"4*pi*({ratio!s})*({frequency!s})", "stiffness": f"(2*pi*({frequency!s}))**2"}
         for kind, factor in factors.items():
             expression = parse_any(kind, factor)

@@ -567,8 +567,9 @@ class CondensedModel(Model):
         for kind, letter, motion in (("mass", "M", r"\ddot{x}"), ("damping", "C", r"\dot{x}"), ("stiffness", "K", "x")):
             for number, factor in enumerate(self.structure.parts[kind]):
                 expression, _ = self.structure.factors[factor].symbolic(kind, self.parameter_symbols)
-                scale = "" if factor == CONSTANT_PART else sp.latex(expression, symbol_names=written) + r"\,"
-                scale = rf"\left({scale[:-2]}\right)\," if expression.is_Add else scale
+                scale = sp.latex(expression, symbol_names=written)
+                scale = rf"\left({scale}\right)" if expression.is_Add else scale
+                scale = "" if factor == CONSTANT_PART else rf"{scale}\,"
                 sums.append(f"{scale}{letter}_{{{number}}} {motion}")
         forces = [
             f"f_{{{number + 1}}} &= {sp.latex(f, symbol_names=written)}" for number, f in enumerate(self.element_forces)

@@ -31,11 +31,7 @@ class Decoupled:
         self.density, structure = density, density.structure
         self._linear = len(structure.names) + len(structure.sloped)
         self._designs = [self._design(group) for group in density.groups]
-        self._units = [
-            (np.stack([density.units[k].mean for k in group.places]),
-             np.stack([density.units[k].covariance for k in group.places]))
-            for group in density.groups
-        ]  # fmt: skip
+        self._covariances = [np.stack([density.units[k].covariance for k in g.places]) for g in density.groups]
         count = len(structure.pairs)
         self._middle = np.concatenate([np.log(self._first_spreads()), np.zeros(count)])
         self._slope = np.concatenate([np.ones(len(structure.free)), np.full(count, 0.5)])
@@ -85,11 +81,12 @@ class Decoupled:
             between = self._between(points[part])
             precision = np.broadcast_to(self._prior, (len(between), *self._prior.shape)).copy()
             right = np.zeros((len(between), self._linear))
-            for design, (mean, covariance) in zip(self._designs, self._units, strict=True):
+            of_groups = zip(self.density.groups, self._designs, self._covariances, strict=True)
+            for group, design, covariance in of_groups:
                 spread = np.kron(np.eye(design.shape[1] // between.shape[1]), between)
                 weighted = np.linalg.solve(covariance[:, None] + spread, design[:, None])
                 precision += np.einsum("iwdp,idq->wpq", weighted, design)
-                right += np.einsum("iwdp,id->wp", weighted, mean)
+                right += np.einsum("iwdp,id->wp", weighted, group.centre)
             yield part, np.linalg.solve(precision, right[..., None])[..., 0], np.linalg.cholesky(precision)
 
     @property

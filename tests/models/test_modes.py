@@ -119,7 +119,8 @@ def test_frequency_and_damping_ratio_of_a_mode_are_estimated():
     ("changes", "message"),
     [
         ({"frequencies": [1.0, 2.0]}, "frequencies: must be one of each of the 3 modes"),
-        ({"damping_ratios": None}, "damping_ratios: must be one of each of the 3 modes"),
+        ({"damping_ratios": [0.01]}, "damping_ratios: must be one of each of the 3 modes"),
+        ({"damping_ratios": 2}, "damping_ratios: must be < 1, got 2; give 0.02 for two percent"),
         ({"frequencies": "f1"}, "frequencies: must be one of each"),
         ({"frequencies": [0.0, "f2", "f3"]}, "frequencies: must be > 0, got 0; give a rigid motion"),
         ({"frequencies": ["f1;", "f2", "f3"]}, "frequencies: must consist of numbers, names"),
