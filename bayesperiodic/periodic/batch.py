@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,8 @@ from bayesperiodic.periodic.equations import (
 
 SMALLEST_BLOCK, PARTS_EACH = 4, 4
 INVERSE_ITERATIONS = 3
-SMALL_DISTANCE = 1e-4
+# Number of parameters up to which terms of second order cost less than the chord step that they save.
+MOST_OF_SECOND_ORDER = 8
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,8 @@ class Batch:
         factors.ends[:, 0] = NO_FACTORS
         sensitivities = np.zeros((len(sets), len(first.model.parameters), first.grid.points, first.count))
         left, right = np.zeros((2, len(sets), first.grid.points, first.count))
-        gradient, amplitude = np.zeros(sensitivities.shape[:2]), np.stack([np.abs(a.z).max(axis=0) for a in anchors])
+        along, gradient = np.zeros((2, *sensitivities.shape[:2]))
+        amplitude = np.stack([np.abs(a.z).max(axis=0) for a in anchors])
         for e, (equations, anchor) in enumerate(zip(sets, anchors, strict=True)):
             if anchor.sensitivities is None:
                 continue
@@ -99,20 +102,27 @@ class Batch:
                 anchored.ends[0] = NO_FACTORS
             with np.errstate(all="ignore"):  # of an orbit near the ends of the numbers, at which chords are not used
                 weights, change = smallest_singular_vectors(equations, anchor.z, columns)
-                slope = stiffness_gradient(equations, anchor.z, anchor.parameters, sensitivities[e], weights, change)
-            if not (np.isfinite(weights).all() and np.isfinite(change).all() and np.isfinite(slope).all()):
+            if not (np.isfinite(weights).all() and np.isfinite(change).all()):
                 anchored.ends[0] = NO_FACTORS
                 continue
-            left[e], right[e], gradient[e] = weights, change[:, : first.count], slope
+            left[e], right[e], units = weights, change, np.where(amplitude[e] > 0.0, amplitude[e], 1.0)
+            direction = change / units**2
+            along[e] = np.tensordot(sensitivities[e], direction, 2) / np.sum(change * direction)
         ranges = np.stack([np.ptp(a.z, axis=0) for a in anchors])
         ratios = np.divide(ranges, amplitude, out=np.full(ranges.shape, np.inf), where=amplitude > 0.0)
         parameters, z = np.stack([a.parameters for a in anchors]), np.stack([a.z for a in anchors])
         near = first.kernels.OFF_ANCHOR * ratios.min(axis=1)
-        self._anchors = Anchors(parameters, z, sensitivities, amplitude, gradient, near, factors, left, right)
+        moving = np.flatnonzero(sensitivities.any(axis=(0, 2, 3)))
+        moving = moving if moving.size <= MOST_OF_SECOND_ORDER else moving[:0]
+        pairs = moving.size * (moving.size + 1) // 2
+        of_second_order = moving, np.empty((len(sets), pairs, *z.shape[1:]))
+        known = parameters, z, sensitivities, amplitude, gradient, along, near, factors, left, right
+        self._anchors = Anchors(*known, *of_second_order)
+        self._compiled[0].fill_predictions(self._compiled[1], first.grid.packed, self._sets, self._anchors)
 
     @cached_property
-    def _compiled(self) -> tuple[Callable[..., None], Functions]:
-        return kernels("batch", self._first.count, self._first.grid.stencil).solve_many, self._first.functions
+    def _compiled(self) -> tuple[Any, Functions]:
+        return kernels("batch", self._first.count, self._first.grid.stencil), self._first.functions
 
     def solve(
         self,
@@ -142,10 +152,12 @@ class Batch:
         solution.frequency[:] = self._sets.frequency[:, None]
         if without is not None:
             solution.status[without] = STALLED
-        solve_many, functions = self._compiled
+        compiled, functions = self._compiled
         before = functions, grid.packed, grid.periods, self._sets, self._anchors, every
         after = polish, first.model.kernels.output_rates, solution
-        in_blocks(lambda block: solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads)
+        in_blocks(
+            lambda block: compiled.solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads
+        )
         return solution
 
     def vjp(self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, moving: tuple[int, ...]) -> np.ndarray:
@@ -241,52 +253,29 @@ def phase_bordered(equations: PeriodicEquations, parameters: np.ndarray, z: np.n
     return equations.bordered(columns, slope[None], equations.phase_row(z)[None])
 
 
+@cache
+def _smooth_noise(points: int, states: int) -> np.ndarray:
+    """Return random numbers of low harmonics: without symmetry, and without the motions that differences do not see."""
+    parts = np.random.default_rng(0).standard_normal((2, max(2, points // 8), states))
+    return np.fft.irfft(parts[0] + 1j * parts[1], points, axis=0)
+
+
 def smallest_singular_vectors(
     equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return approximate singular vectors of the smallest singular value of a regular ∂g/∂z, by inverse iteration.
 
     States are in units of their largest values, equations in those of their largest terms. The left vector (points,
-    states) is over the equations; the right one (points, 3·states) is the change of the states and of their time
-    derivatives, scaled so that left · (∂g/∂z) · change is 1.
+    states) is over the equations; the right one (points, states) is scaled so that left · (∂g/∂z) · right is 1.
     """
     factors, amplitude = equations.factors(columns), np.abs(z).max(axis=0)
     size = equations.sizes(z, columns)
     units, terms = np.where(amplitude > 0, amplitude, 1.0), np.where(size > 0, size, 1.0)
-    right = np.broadcast_to(units, z.shape)
+    right = amplitude * _smooth_noise(*z.shape)  # states at rest remain there
     for _ in range(INVERSE_ITERATIONS):
         left = factors.solve_transposed(right / units**2) * terms**2
         left /= np.linalg.norm(left / terms)
         right = factors.solve(left)
-        right /= np.linalg.norm(right / units)
-    left = left / terms**2
-    change = equations.changes(right[None])[0]
-    g_q = columns[:, equations.count :].reshape(len(z), equations.count, -1)
-    return left / np.dot(left.ravel(), np.einsum("neq,nq->ne", g_q, change).ravel()), change
-
-
-def stiffness_gradient(
-    equations: PeriodicEquations,
-    z: np.ndarray,
-    parameters: np.ndarray,
-    sensitivities: np.ndarray,
-    left: np.ndarray,
-    right: np.ndarray,
-) -> np.ndarray:
-    """Return the derivatives (parameters,) of left · (∂g/∂z) · right along the solutions, by central differences.
-
-    The derivative by a parameter whose sensitivities (points, states) are zero is 0.
-    """
-    amplitude, result = np.abs(z).max(axis=0), np.zeros(parameters.size)
-    units = np.where(amplitude > 0.0, amplitude, 1.0)
-    weights = np.einsum("ne,nq->neq", left, right).ravel()
-    for p in np.flatnonzero(sensitivities.any(axis=(1, 2))):
-        small = SMALL_DISTANCE / np.max(np.abs(sensitivities[p]) / units)
-        small = min(small, SMALL_DISTANCE * abs(parameters[p])) if parameters[p] != 0.0 else small
-        ends = []
-        for step in (small, -small):
-            moved = parameters + step * (np.arange(parameters.size) == p)
-            columns = equations.residual_jacobian(z + step * sensitivities[p], moved)
-            ends.append(np.dot(weights, columns[:, equations.count :].ravel()))
-        result[p] = (ends[0] - ends[1]) / (2.0 * small)
-    return result
+        length = np.linalg.norm(right / units)
+        right /= length
+    return left / terms**2 * length, right

@@ -149,11 +149,14 @@ class Anchors(NamedTuple):
     z: np.ndarray
     sensitivities: np.ndarray
     amplitude: np.ndarray  # (sets, states), largest absolute value of each state
-    stiffness_gradient: np.ndarray  # (sets, parameters), see `batch.stiffness_gradient`
+    stiffness_gradient: np.ndarray  # (sets, parameters), of left · (∂g/∂z) · right along the solutions
+    along: np.ndarray  # (sets, parameters), the parts of the sensitivities along `right`
     near: np.ndarray  # (sets,), length of the path of chord steps in amplitudes below which an orbit cannot be far
     factors: Factors  # of ∂g/∂z; the first of `ends` is −1 where there are none
     left: np.ndarray  # (sets, points, states), see `batch.smallest_singular_vectors`
     right: np.ndarray
+    moving: np.ndarray  # (moving,), indices of the parameters that the prediction of second order depends on
+    curvature: np.ndarray  # (sets, pairs, points, states), its coefficients; the pairs i ≤ j in the order of i, then j
 
 
 class CycleAnchors(NamedTuple):
@@ -225,7 +228,9 @@ SETS = types.NamedTuple([CUBE, VECTOR, MATRIX], Sets)
 ALL_FACTORS = types.NamedTuple(
     [CUBE, INDICES, GAINS, types.Array(NUMBER, 5, "C"), GAINS, INDICES, MATRIX, INDICES], Factors
 )
-ANCHORS = types.NamedTuple([MATRIX, CUBE, GAINS, MATRIX, MATRIX, VECTOR, ALL_FACTORS, CUBE, CUBE], Anchors)
+ANCHORS = types.NamedTuple(
+    [MATRIX, CUBE, GAINS, MATRIX, MATRIX, MATRIX, VECTOR, ALL_FACTORS, CUBE, CUBE, PLACES, GAINS], Anchors
+)
 ALL_BORDERS = types.NamedTuple([CUBE, CUBE, CUBE, CUBE, INDICES], Border)
 CYCLE_ANCHORS = types.NamedTuple(
     [MATRIX, CUBE, VECTOR, GAINS, MATRIX, CUBE, INDICES, ALL_BORDERS, VECTOR, VECTOR], CycleAnchors

@@ -12,9 +12,10 @@ if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
 
 MAX_CHORDS = 6
 PREDICTION_RATE = 30.0
-LEAST_STIFFNESS, MOST_STIFFNESS = 0.3, 3.0
+LEAST_STIFFNESS, MOST_STIFFNESS = 0.3, 10.0
 POLISHED = 1e-12
 LARGEST_PART = 1.0 / 16.0
+SECOND_DISTANCE = 1e-2
 
 
 @inlined(NUMBER(VECTOR, VECTOR), **INNER)
@@ -27,21 +28,35 @@ def in_units(reached, amplitude):
     return result
 
 
+@inlined(NUMBER(MATRIX, MATRIX, VECTOR), fastmath={"reassoc"}, **INNER)
+def weighted_dot(one, other, weights):
+    """Return the sum of products with a weight for each state, in any order."""
+    total = 0.0
+    for i in range(one.shape[0]):
+        for s in range(STATES if STATES > 0 else one.shape[1]):
+            total += weights[s] * one[i, s] * other[i, s]
+    return total
+
+
 @kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
-        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, FACTORS, MATRIX, MATRIX
+        ADDRESSES, GRID, SETTING, VECTOR, NUMBER, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, CUBE, FACTORS, MATRIX,
+        MATRIX,
     ),
     **INNER,
-)
+)  # fmt: skip
 def newton_chord(
-    functions, grid, setting, amplitude, stiffness, predicted, polish, z, states, change, factors, left, right
-):
+    functions, grid, setting, amplitude, stiffness, predicted, beyond, polish, z, states, change, taken, factors, left,
+    right,
+):  # fmt: skip
     """Improve z in place with the factors of a nearby solution; return whether it converged, the steps, their length.
 
-    `states` are left as they were before the last step. A step above `CHORD_RATE` times the one before ends it. The
-    ratio of two steps predicts how much smaller the next one will be. The ratio of the first step to the prediction
-    gives the order of magnitude, since the prediction is a chord step except for terms of second order:
-    `PREDICTION_RATE` times it exceeded all but two of a hundred observed rates.
+    Steps are corrected by those before them, by Broyden's method (C. T. Kelley, Iterative Methods for Linear and
+    Nonlinear Equations, SIAM 1995, chapter 7). A step above `CHORD_RATE` times the one before ends the iteration. The
+    largest ratio of a step to the one before predicts how much smaller the next one will be. For the first step the
+    ratio of the terms of second order to the linear ones gives the order of magnitude: `PREDICTION_RATE` times it
+    exceeded all but two of a hundred observed rates. Those of the prediction are `beyond`; without them, the first step
+    is as long.
 
     Where ∂g/∂z is nearly singular, steps with the factors of another point are wrong in the direction that it makes
     smallest, and of the wrong sign where the stiffness in that direction has changed its sign. So this direction takes
@@ -51,7 +66,7 @@ def newton_chord(
     in this direction, in units of that of the factors; `left` (points, states) the weights of the equations that are
     largest for a residual in this direction; `right` the direction, scaled to a stiffness of 1 for the ∂g/∂z of the
     factors. If `polish`, the steps go on until one is below `POLISHED` or at rounding level, for derivatives of the
-    outputs. `states` and `change` are work arrays.
+    outputs. `states`, `change` and `taken` (steps, points, states) are work arrays.
     """
     residual = grid_function_at(functions.residual)
     inputs, parameters, frequency, drift = setting
@@ -61,15 +76,30 @@ def newton_chord(
     if not (stiffness > LEAST_STIFFNESS and stiffness < MOST_STIFFNESS):
         return False, 0, 0.0
     correction, tolerance = 1.0 / stiffness - 1.0, STEP_TOLERANCE * min(1.0, stiffness)
-    previous, moved, rate, converged = predicted, 0.0, PREDICTION_RATE, False
+    previous, moved, rate, converged = predicted, 0.0, 0.0, False
+    squares, scale = np.empty(MAX_CHORDS), np.empty(count)
+    for s in range(count):
+        scale[s] = 1.0 / amplitude[s] ** 2 if amplitude[s] > 0.0 else 0.0
     for iteration in range(MAX_CHORDS):
         differentiate(z, drift, grid, frequency, states)
         residual(states, inputs, parameters, grid.tau, frequency, change)
         along = correction * dot(weights, step) if correction != 0.0 else 0.0
         back_substitute(grid, factors, change)
         for k in range(step.size):
-            step[k] += along * direction[k]
-            position[k] -= step[k]
+            step[k] = -(step[k] + along * direction[k])
+        for k in range(iteration):
+            part = weighted_dot(taken[k], change, scale) / squares[k]
+            if k < iteration - 1:
+                later = as_vector(taken[k + 1])
+                for j in range(step.size):
+                    step[j] += part * later[j]
+            else:
+                for j in range(step.size):
+                    step[j] /= 1.0 - part
+        squares[iteration] = weighted_dot(change, change, scale)
+        copy(change, taken[iteration])
+        for k in range(step.size):
+            position[k] += step[k]
         if not dot(step, step) < np.inf:
             return False, iteration + 1, moved
         largest(change, reached)
@@ -79,10 +109,15 @@ def newton_chord(
             return True, iteration + 1, moved
         if not full < OFF_ANCHOR or (iteration > 0 and not full < CHORD_RATE * previous):
             return False, iteration + 1, moved
-        converged = converged or full <= tolerance or rate * full**2 <= tolerance * previous
+        ratio = full / previous
+        if iteration > 0:
+            rate = max(rate, ratio)
+        else:
+            ratio = PREDICTION_RATE * max(full, beyond) / predicted
+        converged = converged or full <= tolerance or max(rate, ratio) * full <= tolerance
         if converged and (full <= POLISHED or not polish):
             return True, iteration + 1, moved
-        previous, rate = full, 1.0
+        previous = full
     return converged, MAX_CHORDS, moved
 
 
@@ -137,15 +172,149 @@ def continue_from_anchor(
     return CONVERGED, used
 
 
+@inlined(types.void(CUBE, PLACES, VECTOR, VECTOR, MATRIX), **INNER)
+def fill_second_order(curvature, moving, anchor_parameters, parameters, second):
+    """Fill the terms of second order of the prediction."""
+    flat, row = as_vector(second), 0
+    second[:] = 0.0
+    for i in range(moving.size):
+        for j in range(i, moving.size):
+            p, q = moving[i], moving[j]
+            factor = (parameters[p] - anchor_parameters[p]) * (parameters[q] - anchor_parameters[q])
+            if factor != 0.0:
+                terms = as_vector(curvature[row])
+                for k in range(flat.size):
+                    flat[k] += factor * terms[k]
+            row += 1
+
+
+@inlined(types.void(NUMBER, NUMBER, NUMBER, MATRIX, MATRIX, MATRIX), **INNER)
+def add_higher_orders(change_of_stiffness, stiffness, along, right, second, predicted):
+    """Add to a linear prediction its terms of second order, and those of all orders that a near fold makes large.
+
+    In the direction in which ∂g/∂z is smallest the equation is x + κ x²/(2 x₁) = x₁ but for other terms of second
+    order, κ being the relative change of stiffness expected linearly and x₁ the linear prediction; the stiffness at its
+    solution x = 2 x₁/(1 + √(1 + 2κ)) is √(1 + 2κ). The terms of second order are those at x in place of x₁, since this
+    direction contributes most of them.
+    """
+    ratio = 2.0 / (1.0 + stiffness)
+    part = along * (ratio - 1.0 + 0.5 * change_of_stiffness * ratio**2)
+    flat, more, direction = as_vector(predicted), as_vector(second), as_vector(right)
+    for k in range(flat.size):
+        flat[k] += ratio**2 * more[k] + part * direction[k]
+
+
+@inlined(COUNT(COUNT, COUNT), **INNER)
+def diagonal_row(i, size):
+    """Return the row of the coefficient of a parameter's square."""
+    return i * size - i * (i - 1) // 2
+
+
+@inlined(types.void(ADDRESSES, GRID, SETS, ANCHORS, COUNT, VECTOR, VECTOR, NUMBER, MATRIX, MATRIX, MATRIX), **INNER)
+def residual_beside(functions, grid, sets, anchors, e, theta, before, distance, z, states, value):
+    """Fill the residual at other parameters, at the linear prediction and a distance from it along `right`."""
+    residual = grid_function_at(functions.residual)
+    predict(anchors.z[e], anchors.sensitivities[e], before, theta, 1.0, z)
+    if distance != 0.0:
+        position, direction = as_vector(z), as_vector(anchors.right[e])
+        for k in range(position.size):
+            position[k] += distance * direction[k]
+    differentiate(z, sets.drift[e], grid, sets.frequency[e], states)
+    residual(states, sets.inputs[e], theta, grid.tau, sets.frequency[e], value)
+
+
+@kernel(types.void(ADDRESSES, GRID, SETS, ANCHORS), **OPTIONS)
+def fill_predictions(functions, grid, sets, anchors):
+    """Fill what the anchors' predictions of higher order need: changes of stiffness, and coefficients of second order.
+
+    Both are by central differences of the equations along the linear prediction: the derivatives of the stiffness
+    left · (∂g/∂z) · right by each parameter, and second derivatives of the equations by a parameter, or the sum of two,
+    which are balanced by a change of z. The differences change z by `SECOND_DISTANCE` of the amplitude, a parameter by
+    no more than this fraction of itself. Where they are not finite, there are no factors, and no second order.
+    """
+    moving, total = anchors.moving, anchors.parameters.shape[1]
+    points, count = anchors.z.shape[1], STATES if STATES > 0 else anchors.z.shape[2]
+    states, z, value = np.empty((points, 3 * count)), np.empty((points, count)), np.empty((points, count))
+    small, reached = np.empty(total), np.empty(count)
+    bands, pivots, inverses, gains, transfers, ends, interfaces, interface_pivots = anchors.factors
+    for e in range(anchors.z.shape[0]):
+        curvature, before, gradient = anchors.curvature[e], anchors.parameters[e], anchors.stiffness_gradient[e]
+        curvature[:] = 0.0
+        gradient[:] = 0.0
+        if ends[e, 0] == NO_FACTORS:
+            continue
+        factors = Factors(
+            bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], interfaces[e], interface_pivots[e]
+        )
+        for p in range(total):
+            largest(anchors.sensitivities[e, p], reached)
+            reach, parameter = in_units(reached, anchors.amplitude[e]), abs(before[p])
+            small[p] = SECOND_DISTANCE / reach if reach > 0.0 else 0.0
+            if parameter > 0.0:
+                small[p] = min(small[p], SECOND_DISTANCE * parameter)
+        largest(anchors.right[e], reached)
+        aside = SECOND_DISTANCE / in_units(reached, anchors.amplitude[e])
+        for p in range(total):
+            if not small[p] > 0.0:
+                continue
+            for side in (-1.0, 1.0):
+                theta = before.copy()
+                theta[p] += side * small[p]
+                for to in (-1.0, 1.0):
+                    residual_beside(functions, grid, sets, anchors, e, theta, before, to * aside, z, states, value)
+                    gradient[p] += side * to * dot(as_vector(anchors.left[e]), as_vector(value))
+            gradient[p] /= 4.0 * small[p] * aside
+        if not dot(gradient, gradient) < np.inf:
+            gradient[:] = 0.0
+            ends[e, 0] = NO_FACTORS
+            continue
+        finite, row = True, 0
+        for i in range(moving.size):
+            for j in range(i, moving.size):
+                terms, p, q = curvature[row], moving[i], moving[j]
+                row += 1
+                if not (small[p] > 0.0 and small[q] > 0.0):
+                    continue
+                for side in (-1.0, 0.0, 1.0):
+                    theta = before.copy()
+                    theta[p] += side * small[p]
+                    if j > i:
+                        theta[q] += side * small[q]
+                    residual_beside(functions, grid, sets, anchors, e, theta, before, 0.0, z, states, value)
+                    for k in range(points):
+                        for s in range(count):
+                            terms[k, s] -= value[k, s] if side != 0.0 else -2.0 * value[k, s]
+                back_substitute(grid, factors, terms)
+                finite = finite and dot(as_vector(terms), as_vector(terms)) < np.inf
+        row = 0
+        for i in range(moving.size):
+            for j in range(i, moving.size):
+                if j > i:
+                    first, last = diagonal_row(i, moving.size), diagonal_row(j, moving.size)
+                    for k in range(points):
+                        for s in range(count):
+                            curvature[row, k, s] -= curvature[first, k, s] + curvature[last, k, s]
+                row += 1
+        row = 0
+        for i in range(moving.size):
+            for j in range(i, moving.size):
+                product = small[moving[i]] * small[moving[j]]
+                scale = 0.5 / product if finite and product > 0.0 else 0.0
+                for k in range(points):
+                    for s in range(count):
+                        curvature[row, k, s] = scale * curvature[row, k, s] if scale > 0.0 else 0.0
+                row += 1
+
+
 @kernel(types.void(ADDRESSES, GRID, COUNT, SETS, ANCHORS, CUBE, COUNT, COUNT, FLAG, FLAG, SOLUTION), **OPTIONS)
 def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop, polish, rates, solution):
     """Solve for input sets times parameter vectors, those of the flat indices start … stop (vectors run fastest).
 
-    Each solve starts from the linear prediction of its set's anchor: chord steps with the anchor's factors, else
-    the Newton iteration, else that from the anchor itself. Where all fail, or the result is far from the prediction of
-    a solved anchor or of a shorter period than it, the orbit is followed in small steps from the anchor's parameters;
-    if a step leaps, or the period becomes shorter, the status is "other orbit". The results do not depend on the order
-    of the solves.
+    Each solve starts from the prediction of its set's anchor, which is linear beyond a fold: chord steps with the
+    anchor's factors, else the Newton iteration, else that from the anchor itself. Where all fail, or the result is far
+    from the prediction of a solved anchor or of a shorter period than it, the orbit is followed in small steps from the
+    anchor's parameters; if a step leaps, or the period becomes shorter, the status is "other orbit". The results do not
+    depend on the order of the solves.
 
     `parameters` is (sets, solves, parameters); for `polish` see `newton_chord`; `rates` tells whether the outputs
     depend on q̇ or q̈. The solution is filled except for the frequency, z only if it has entries; solves whose status is
@@ -164,6 +333,7 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
         np.empty_like(interface_pivots[0]),
     )  # fmt: skip
     work = Workspace(states, columns, np.empty((0, 0)), fresh)
+    taken, second = np.empty((MAX_CHORDS, points, count)), np.empty((points, count))
     nothing, table = np.empty(0), np.empty((0, 0))
     unknowns = Unknowns(nothing, nothing, nothing, table, np.empty((0, 0, 0)), -1)
     border = Border(table, table, table, table, np.empty(0, dtype=np.int64))
@@ -178,20 +348,31 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
         copy(predicted, z)
         known, close, used, code, doubtful, moved = ends[e, 0] != NO_FACTORS, False, 0, CONVERGED, False, np.inf
         if known:
-            stiffness = 1.0
+            amplitude, change_of_stiffness, along = anchors.amplitude[e], 0.0, 0.0
             for p in range(theta.size):
-                stiffness += anchors.stiffness_gradient[e, p] * (theta[p] - anchor_parameters[p])
+                change_of_stiffness += anchors.stiffness_gradient[e, p] * (theta[p] - anchor_parameters[p])
+                along += anchors.along[e, p] * (theta[p] - anchor_parameters[p])
             for i in range(points):
                 for s in range(count):
                     change[i, s] = predicted[i, s] - at[i, s]
             largest(change, reached)
-            amplitude = anchors.amplitude[e]
+            linear, beyond = in_units(reached, amplitude), 0.0
+            fill_second_order(anchors.curvature[e], anchors.moving, anchor_parameters, theta, second)
+            stiffness = np.sqrt(max(1.0 + 2.0 * change_of_stiffness, 0.0))
+            if stiffness > LEAST_STIFFNESS:
+                add_higher_orders(change_of_stiffness, stiffness, along, anchors.right[e], second, predicted)
+                for i in range(points):
+                    for s in range(count):
+                        change[i, s] = predicted[i, s] - z[i, s]
+                largest(change, reached)
+                beyond = in_units(reached, amplitude)
+                copy(predicted, z)
             factors = Factors(
                 bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], interfaces[e], interface_pivots[e]
             )
             close, used, moved = newton_chord(
-                functions, grid, setting, amplitude, stiffness, in_units(reached, amplitude), polish, z, states,
-                change, factors, anchors.left[e], anchors.right[e],
+                functions, grid, setting, amplitude, stiffness, linear, beyond, polish, z, states, change, taken,
+                factors, anchors.left[e], anchors.right[e],
             )  # fmt: skip
         if not close:
             moved = np.inf
