@@ -26,7 +26,7 @@ from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
 from bayesperiodic.periodic.condensed import CondensedEquations
 from bayesperiodic.periodic.condensed_batch import CondensedBatch
 from bayesperiodic.periodic.condensed_solution import described, modal_multipliers
-from bayesperiodic.periodic.equations import PeriodicEquations, Solved
+from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved
 from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
 from bayesperiodic.periodic.solution import PeriodicSolution, as_guess, logarithmic_jacobian
 from bayesperiodic.periodic.solve import solve_driven, solve_free
@@ -86,6 +86,7 @@ class ResponseSolver:
     def anchored(self, theta: np.ndarray) -> "ResponseSolver":
         """Return the solver anchored at θ (names,), solved from the present anchors, else from the guesses."""
         simulation, anchors = self.solve(theta[None], keep=True, polish=True), {}
+        derivatives = self._derivatives(simulation)
         lost = [name for name, orbit in self.anchors.items() if simulation.statuses(name)[0] != CONVERGED]
         again = {}
         if any(self.anchors[name].sheet is not None for name in lost):
@@ -99,11 +100,26 @@ class ResponseSolver:
                 anchors[name] = _placed(self.problem, name, theta, orbit.guess, again[name])
             elif name in lost or orbit.sheet is None:
                 solved = None if name in lost else self._solved(simulation, name)
-                anchors[name] = _initial_orbit(self.problem, name, theta, orbit.guess, solved)
+                known = derivatives.get(name) if solved else None
+                anchors[name] = _initial_orbit(self.problem, name, theta, orbit.guess, solved, known)
             else:
                 here = Place(orbit.sheet, *self._solved(simulation, name), not self._is_beyond(name, simulation))
-                anchors[name] = _placed(self.problem, name, theta, orbit.guess, here)
+                known = derivatives.get(name)
+                anchors[name] = _placed(self.problem, name, theta, orbit.guess, here, known)
         return ResponseSolver(self.problem, anchors)
+
+    def _derivatives(self, simulation: Simulation) -> dict[str, tuple[np.ndarray, Sensitivities | None]]:
+        """Return indices of parameters and the derivatives by them, of the experiments that are solved by a `Batch`.
+
+        They are those at the first of the solves, which are meaningless where it failed.
+        """
+        result: dict[str, tuple[np.ndarray, Sensitivities | None]] = {}
+        for (experiments, maps, batch, _), solved in zip(self._batches, simulation.groups, strict=True):
+            if isinstance(batch, Batch):
+                moving = np.array(maps.moving, dtype=int)
+                every = batch.sensitivities(solved.parameters[:, 0], solved.z[:, 0], moving)
+                result |= {e.name: (moving, one) for e, one in zip(experiments, every, strict=True)}
+        return result
 
     def on_best_sheets(self, theta: np.ndarray) -> "ResponseSolver":
         """Return the solver with the points of tables on the sheets that fit the data best at θ (names,)."""
@@ -442,8 +458,12 @@ def _initial_orbit(
     theta: np.ndarray,
     guess: Any,
     solved: tuple[PeriodicEquations, np.ndarray] | None = None,
+    known: tuple[np.ndarray, Sensitivities | None] | None = None,
 ) -> InitialOrbit:
-    """Return the orbit at θ (names,): one that is solved, or solved from the guess with all fallbacks."""
+    """Return the orbit at θ (names,): one that is solved, or solved from the guess with all fallbacks.
+
+    `known` are indices of parameters and the derivatives by them, if they are known.
+    """
     specials = _specials(problem)
     if experiment in specials:
         return _special_orbit(problem, experiment, theta, specials[experiment], None)
@@ -461,22 +481,31 @@ def _initial_orbit(
         z, code, *_ = here.find(parameters, z)[0]
         if code != CONVERGED:
             return InitialOrbit(guess, Anchor(parameters, z, equations.frequency), None)
-    parameter_map = problem.parameter_maps[experiment]
-    moving = np.flatnonzero(parameter_map.slopes(theta)[: parameter_map.count].any(axis=1))
-    directions = np.eye(parameters.size)[moving]
-    derivative = here.sensitivities_along(z, parameters, directions)
-    by_all = derivative and PointDerivatives(
-        np.tensordot(directions, derivative.outputs, (0, 0)),
-        directions.T @ derivative.frequency,
-        np.zeros(parameters.size),
-    )
+    if known is None:
+        parameter_map = problem.parameter_maps[experiment]
+        moving = np.flatnonzero(parameter_map.slopes(theta)[: parameter_map.count].any(axis=1))
+        known = moving, here.sensitivities_along(z, parameters, np.eye(parameters.size)[moving])
+    (moving, derivative), by_all = known, None
+    if derivative is not None:
+        by_all = PointDerivatives(
+            np.zeros((parameters.size, *derivative.outputs.shape[1:])), *np.zeros((2, parameters.size))
+        )
+        by_all.outputs[moving], by_all.frequency[moving] = derivative.outputs, derivative.frequency
     return InitialOrbit(guess, Anchor.of(here, parameters, z, derivative, moving), by_all)
 
 
-def _placed(problem: Description, experiment: str, theta: np.ndarray, guess: Any, place: Place) -> InitialOrbit:
+def _placed(
+    problem: Description,
+    experiment: str,
+    theta: np.ndarray,
+    guess: Any,
+    place: Place,
+    known: tuple[np.ndarray, Sensitivities | None] | None = None,
+) -> InitialOrbit:
     """Return the orbit of a point of a table on its branch; without derivatives if the branch does not reach it."""
     if place.reached:
-        return _initial_orbit(problem, experiment, theta, guess, (place.equations, place.z))._replace(sheet=place.sheet)
+        solved = place.equations, place.z
+        return _initial_orbit(problem, experiment, theta, guess, solved, known)._replace(sheet=place.sheet)
     parameters = problem.parameters(theta[None], experiment)[0]
     measured = problem.equations[experiment].frequency
     return InitialOrbit(guess, Anchor(parameters, place.z, measured), None, place.sheet)

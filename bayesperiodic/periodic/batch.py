@@ -18,7 +18,6 @@ from bayesperiodic.periodic.compiled import (
     BatchSolution,
     Border,
     CycleAnchors,
-    Factors,
     Functions,
     Sets,
     kernels,
@@ -33,7 +32,6 @@ from bayesperiodic.periodic.equations import (
 )
 
 SMALLEST_BLOCK, PARTS_EACH = 4, 4
-INVERSE_ITERATIONS = 3
 # Number of parameters up to which terms of second order cost less than the chord step that they save.
 MOST_OF_SECOND_ORDER = 8
 
@@ -91,23 +89,10 @@ class Batch:
         sensitivities = np.zeros((len(sets), len(first.model.parameters), first.grid.points, first.count))
         left, right = np.zeros((2, len(sets), first.grid.points, first.count))
         along, gradient = np.zeros((2, *sensitivities.shape[:2]))
+        for e, anchor in enumerate(anchors):
+            if anchor.sensitivities is not None:
+                sensitivities[e], factors.ends[e, 0] = anchor.sensitivities, 0
         amplitude = np.stack([np.abs(a.z).max(axis=0) for a in anchors])
-        for e, (equations, anchor) in enumerate(zip(sets, anchors, strict=True)):
-            if anchor.sensitivities is None:
-                continue
-            anchored = Factors(*(part[e] for part in factors))
-            sensitivities[e] = anchor.sensitivities
-            columns = equations.residual_jacobian(anchor.z, anchor.parameters)
-            if not equations.factorise(columns, anchor.z, anchored):
-                anchored.ends[0] = NO_FACTORS
-            with np.errstate(all="ignore"):  # of an orbit near the ends of the numbers, at which chords are not used
-                weights, change = smallest_singular_vectors(equations, anchor.z, columns)
-            if not (np.isfinite(weights).all() and np.isfinite(change).all()):
-                anchored.ends[0] = NO_FACTORS
-                continue
-            left[e], right[e], units = weights, change, np.where(amplitude[e] > 0.0, amplitude[e], 1.0)
-            direction = change / units**2
-            along[e] = np.tensordot(sensitivities[e], direction, 2) / np.sum(change * direction)
         ranges = np.stack([np.ptp(a.z, axis=0) for a in anchors])
         ratios = np.divide(ranges, amplitude, out=np.full(ranges.shape, np.inf), where=amplitude > 0.0)
         parameters, z = np.stack([a.parameters for a in anchors]), np.stack([a.z for a in anchors])
@@ -118,7 +103,8 @@ class Batch:
         of_second_order = moving, np.empty((len(sets), pairs, *z.shape[1:]))
         known = parameters, z, sensitivities, amplitude, gradient, along, near, factors, left, right
         self._anchors = Anchors(*known, *of_second_order)
-        self._compiled[0].fill_predictions(self._compiled[1], first.grid.packed, self._sets, self._anchors)
+        compiled, functions = self._compiled
+        compiled.prepare(functions, first.grid.packed, self._sets, self._anchors, _smooth_noise(*z.shape[1:]))
 
     @cached_property
     def _compiled(self) -> tuple[Any, Functions]:
@@ -159,6 +145,19 @@ class Batch:
             lambda block: compiled.solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads
         )
         return solution
+
+    def sensitivities(self, parameters: np.ndarray, z: np.ndarray, moving: np.ndarray) -> list[Sensitivities | None]:
+        """Return the derivatives by the parameters `moving` at one solution of every input set; None if singular.
+
+        `parameters` is (sets, parameters), z (sets, points, states).
+        """
+        first, points = self._first, [np.ascontiguousarray(part) for part in (parameters, z)]
+        shape = self._size, moving.size, first.grid.points
+        states, outputs = np.empty((*shape, first.count)), np.empty((*shape, first.model.kernels.channels))
+        regular, (compiled, functions) = np.empty(self._size, dtype=np.int64), self._compiled
+        compiled.respond_many(functions, first.grid.packed, self._sets, *points, moving, states, outputs, regular)
+        still = np.zeros(moving.size)
+        return [Sensitivities(states[e], outputs[e], still) if regular[e] else None for e in range(self._size)]
 
     def vjp(self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, moving: tuple[int, ...]) -> np.ndarray:
         """Return Σ weights · ∂ŷ/∂θ (sets, moving) at one solution of every input set; NaN where it is singular.
@@ -258,24 +257,3 @@ def _smooth_noise(points: int, states: int) -> np.ndarray:
     """Return random numbers of low harmonics: without symmetry, and without the motions that differences do not see."""
     parts = np.random.default_rng(0).standard_normal((2, max(2, points // 8), states))
     return np.fft.irfft(parts[0] + 1j * parts[1], points, axis=0)
-
-
-def smallest_singular_vectors(
-    equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return approximate singular vectors of the smallest singular value of a regular ∂g/∂z, by inverse iteration.
-
-    States are in units of their largest values, equations in those of their largest terms. The left vector (points,
-    states) is over the equations; the right one (points, states) is scaled so that left · (∂g/∂z) · right is 1.
-    """
-    factors, amplitude = equations.factors(columns), np.abs(z).max(axis=0)
-    size = equations.sizes(z, columns)
-    units, terms = np.where(amplitude > 0, amplitude, 1.0), np.where(size > 0, size, 1.0)
-    right = amplitude * _smooth_noise(*z.shape)  # states at rest remain there
-    for _ in range(INVERSE_ITERATIONS):
-        left = factors.solve_transposed(right / units**2) * terms**2
-        left /= np.linalg.norm(left / terms)
-        right = factors.solve(left)
-        length = np.linalg.norm(right / units)
-        right /= length
-    return left / terms**2 * length, right

@@ -153,7 +153,7 @@ class Anchors(NamedTuple):
     along: np.ndarray  # (sets, parameters), the parts of the sensitivities along `right`
     near: np.ndarray  # (sets,), length of the path of chord steps in amplitudes below which an orbit cannot be far
     factors: Factors  # of ∂g/∂z; the first of `ends` is −1 where there are none
-    left: np.ndarray  # (sets, points, states), see `batch.smallest_singular_vectors`
+    left: np.ndarray  # (sets, points, states), see `prepare_anchor` of `_kernels/batch.py`
     right: np.ndarray
     moving: np.ndarray  # (moving,), indices of the parameters that the prediction of second order depends on
     curvature: np.ndarray  # (sets, pairs, points, states), its coefficients; the pairs i ≤ j in the order of i, then j

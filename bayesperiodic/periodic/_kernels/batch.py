@@ -16,6 +16,54 @@ LEAST_STIFFNESS, MOST_STIFFNESS = 0.3, 10.0
 POLISHED = 1e-12
 LARGEST_PART = 1.0 / 16.0
 SECOND_DISTANCE = 1e-2
+INVERSE_ITERATIONS = 3
+
+
+@njit(inline="always")
+def substitute_transposed(flat, pivots, below, reach, x):
+    """Solve Aᵀ·x = b in place for one right-hand side (size,)."""
+    size, one = np.uint64(x.size), np.uint64(1)
+    next_row = below + reach
+    inside, known, half = size - min(below, size), min(reach, size), reach // np.uint64(2)
+    for i in range(known):
+        diagonal = i * (next_row + one) + below
+        value = x[i]
+        for k in range(i):
+            value -= flat[diagonal - (i - k) * next_row] * x[k]
+        x[i] = value * flat[diagonal]
+    for i in range(known, size):
+        diagonal = i * (next_row + one) + below
+        value, far = x[i], 0.0
+        for k in range(half):
+            far += flat[diagonal - (reach - k) * next_row] * x[i - (reach - k)]
+        value -= far
+        for k in range(half, reach):
+            value -= flat[diagonal - (reach - k) * next_row] * x[i - (reach - k)]
+        x[i] = value * flat[diagonal]
+    for back in range(size):
+        j = size - one - back
+        diagonal = j * (next_row + one) + below
+        value = x[j]
+        if j < inside:
+            for k in range(below):
+                value -= flat[diagonal + (below - k) * next_row] * x[j + below - k]
+        else:
+            for k in range(back):
+                value -= flat[diagonal + (back - k) * next_row] * x[j + back - k]
+        pivot = np.uint64(pivots[j])
+        x[j] = x[pivot]
+        x[pivot] = value
+
+
+@kernel(types.void(MATRIX, COUNT, COUNT, PLACES, MATRIX), **OPTIONS)
+def solve_transposed(band, lower, upper, pivots, right):
+    """Solve Aᵀ·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
+    flat = as_vector(band)
+    for c in range(right.shape[0]):
+        if LOWER > 0 and lower == LOWER and upper == LOWER:
+            substitute_transposed(flat, pivots, np.uint64(LOWER), np.uint64(2 * LOWER), right[c])
+        else:
+            substitute_transposed(flat, pivots, np.uint64(lower), np.uint64(lower + upper), right[c])
 
 
 @inlined(NUMBER(VECTOR, VECTOR), **INNER)
@@ -223,11 +271,91 @@ def residual_beside(functions, grid, sets, anchors, e, theta, before, distance, 
     residual(states, sets.inputs[e], theta, grid.tau, sets.frequency[e], value)
 
 
-@kernel(types.void(ADDRESSES, GRID, SETS, ANCHORS), **OPTIONS)
-def fill_predictions(functions, grid, sets, anchors):
-    """Fill what the anchors' predictions of higher order need: changes of stiffness, and coefficients of second order.
+@inlined(types.void(MATRIX, PLACES, GRID, MATRIX, FLAG, MATRIX), **INNER)
+def solve_by_band(band, pivots, grid, folded, transposed, right):
+    """Solve ∂g/∂z·x = b, or that of its transpose, in place, b (points, states), with the factors of the whole band."""
+    lower = grid.half_width * right.shape[1] + right.shape[1] - 1
+    fold(right, grid, folded[0])
+    if transposed:
+        solve_transposed(band, lower, lower, pivots, folded)
+    else:
+        solve(band, lower, lower, pivots, folded)
+    unfold(folded[0], grid, right)
 
-    Both are by central differences of the equations along the linear prediction: the derivatives of the stiffness
+
+@kernel(FLAG(ADDRESSES, GRID, SETS, ANCHORS, COUNT, MATRIX, FACTORS), **INNER)
+def prepare_anchor(functions, grid, sets, anchors, e, start, factors):
+    """Fill an anchor's factors and the direction in which they are nearly singular; return False if there are none.
+
+    `right` and `left` are approximate singular vectors of the smallest singular value of ∂g/∂z by inverse iteration
+    from `start` (points, states), states in units of their largest values, equations in those of their largest terms.
+    The left vector is over the equations; the right one is scaled so that left · (∂g/∂z) · right is 1.
+    """
+    residual_jacobian = grid_function_at(functions.residual_jacobian)
+    z, left, right, amplitude = anchors.z[e], anchors.left[e], anchors.right[e], anchors.amplitude[e]
+    frequency = sets.frequency[e]
+    points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
+    states, columns = np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count)))
+    units, terms, rounding, weight = np.empty(count), np.empty(count), np.empty(count), np.empty((count, count))
+    band, pivots, folded = np.empty_like(factors.band), np.empty_like(factors.pivots), np.empty((1, points * count))
+    differentiate(z, sets.drift[e], grid, frequency, states)
+    residual_jacobian(states, sets.inputs[e], anchors.parameters[e], grid.tau, frequency, columns)
+    for s in range(count):
+        units[s] = amplitude[s] if amplitude[s] > 0.0 else 1.0
+    if not factorise(columns, grid, frequency, units, factors):
+        return False
+    lower = grid.half_width * count + count - 1
+    assemble(columns, grid, count, frequency, band)
+    if not factor(band, lower, lower, pivots):
+        return False
+    scales(columns, states, grid, amplitude, frequency, terms, rounding, weight)
+    for s in range(count):
+        terms[s] = terms[s] if terms[s] > 0.0 else 1.0
+        for i in range(points):
+            right[i, s] = amplitude[s] * start[i, s]  # states at rest remain there
+    length = 0.0
+    for _ in range(INVERSE_ITERATIONS):
+        for i in range(points):
+            for s in range(count):
+                left[i, s] = right[i, s] / units[s] ** 2
+        solve_by_band(band, pivots, grid, folded, True, left)
+        length = 0.0
+        for i in range(points):
+            for s in range(count):
+                left[i, s] *= terms[s]
+                length += left[i, s] ** 2
+        length = np.sqrt(length)
+        for i in range(points):
+            for s in range(count):
+                left[i, s] *= terms[s] / length
+                right[i, s] = left[i, s]
+        solve_by_band(band, pivots, grid, folded, False, right)
+        length = 0.0
+        for i in range(points):
+            for s in range(count):
+                length += (right[i, s] / units[s]) ** 2
+        length = np.sqrt(length)
+        for i in range(points):
+            for s in range(count):
+                right[i, s] /= length
+    total = 0.0
+    for i in range(points):
+        for s in range(count):
+            left[i, s] *= length / terms[s] ** 2
+            total += (right[i, s] / units[s]) ** 2
+    for p in range(anchors.along.shape[1]):
+        anchors.along[e, p] = 0.0
+        for i in range(points):
+            for s in range(count):
+                anchors.along[e, p] += anchors.sensitivities[e, p, i, s] * right[i, s] / units[s] ** 2 / total
+    return dot(as_vector(left), as_vector(left)) + total < np.inf
+
+
+@kernel(types.void(ADDRESSES, GRID, SETS, ANCHORS, MATRIX), **OPTIONS)
+def prepare(functions, grid, sets, anchors, start):
+    """Fill what solves need: see `prepare_anchor`; and the changes of stiffness, and coefficients of second order.
+
+    The latter are by central differences of the equations along the linear prediction: the derivatives of the stiffness
     left · (∂g/∂z) · right by each parameter, and second derivatives of the equations by a parameter, or the sum of two,
     which are balanced by a change of z. The differences change z by `SECOND_DISTANCE` of the amplitude, a parameter by
     no more than this fraction of itself. Where they are not finite, there are no factors, and no second order.
@@ -246,6 +374,9 @@ def fill_predictions(functions, grid, sets, anchors):
         factors = Factors(
             bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], interfaces[e], interface_pivots[e]
         )
+        if not prepare_anchor(functions, grid, sets, anchors, e, start, factors):
+            ends[e, 0] = NO_FACTORS
+            continue
         for p in range(total):
             largest(anchors.sensitivities[e, p], reached)
             reach, parameter = in_units(reached, anchors.amplitude[e]), abs(before[p])
@@ -304,6 +435,49 @@ def fill_predictions(functions, grid, sets, anchors):
                     for s in range(count):
                         curvature[row, k, s] = scale * curvature[row, k, s] if scale > 0.0 else 0.0
                 row += 1
+
+
+@kernel(types.void(ADDRESSES, GRID, SETS, MATRIX, CUBE, PLACES, GAINS, GAINS, PLACES), **OPTIONS)
+def respond_many(functions, grid, sets, parameters, z, moving, z_changes, output_changes, regular):
+    """Fill the derivatives of z and of the outputs by the parameters `moving`, at one solution of each input set.
+
+    `z_changes` is (sets, moving, points, states), `output_changes` (sets, moving, points, channels), `regular` (sets,)
+    is zero where ∂g/∂z is singular.
+    """
+    residual_jacobian = grid_function_at(functions.residual_jacobian)
+    derivatives = grid_function_at(functions.derivatives)
+    points, count = z.shape[1], STATES if STATES > 0 else z.shape[2]
+    total, channels = parameters.shape[1], output_changes.shape[3]
+    lower, size = grid.half_width * count + count - 1, points * count
+    states, columns = np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count)))
+    of_inputs = sets.inputs.shape[2] + 1  # with the frequency
+    by_states = count * (total + of_inputs)
+    by_parameters = by_states + channels * 3 * count
+    table = np.empty((points, by_parameters + channels * (total + of_inputs)))
+    band, pivots = np.empty((size, 3 * lower + 1)), np.empty(size, dtype=np.int64)
+    folded, still = np.empty((1, size)), np.zeros(count)
+    for e in range(z.shape[0]):
+        frequency = sets.frequency[e]
+        differentiate(z[e], sets.drift[e], grid, frequency, states)
+        residual_jacobian(states, sets.inputs[e], parameters[e], grid.tau, frequency, columns)
+        derivatives(states, sets.inputs[e], parameters[e], grid.tau, frequency, table)
+        assemble(columns, grid, count, frequency, band)
+        regular[e] = 1 if factor(band, lower, lower, pivots) else 0
+        if regular[e] == 0:
+            continue
+        for m in range(moving.size):
+            change, moved = z_changes[e, m], output_changes[e, m]
+            for i in range(points):
+                for s in range(count):
+                    change[i, s] = -table[i, s * total + moving[m]]
+            solve_by_band(band, pivots, grid, folded, False, change)
+            differentiate(change, still, grid, frequency, states)
+            for i in range(points):
+                for c in range(channels):
+                    value = table[i, by_parameters + c * total + moving[m]]
+                    for k in range(3 * count):
+                        value += table[i, by_states + c * 3 * count + k] * states[i, k]
+                    moved[i, c] = value
 
 
 @kernel(types.void(ADDRESSES, GRID, COUNT, SETS, ANCHORS, CUBE, COUNT, COUNT, FLAG, FLAG, SOLUTION), **OPTIONS)
@@ -405,50 +579,3 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
         if kept.size > 0:
             copy(z, kept[e, b])
         solution.status[e, b], solution.iterations[e, b] = code, used
-
-
-@njit(inline="always")
-def substitute_transposed(flat, pivots, below, reach, x):
-    """Solve Aᵀ·x = b in place for one right-hand side (size,)."""
-    size, one = np.uint64(x.size), np.uint64(1)
-    next_row = below + reach
-    inside, known, half = size - min(below, size), min(reach, size), reach // np.uint64(2)
-    for i in range(known):
-        diagonal = i * (next_row + one) + below
-        value = x[i]
-        for k in range(i):
-            value -= flat[diagonal - (i - k) * next_row] * x[k]
-        x[i] = value * flat[diagonal]
-    for i in range(known, size):
-        diagonal = i * (next_row + one) + below
-        value, far = x[i], 0.0
-        for k in range(half):
-            far += flat[diagonal - (reach - k) * next_row] * x[i - (reach - k)]
-        value -= far
-        for k in range(half, reach):
-            value -= flat[diagonal - (reach - k) * next_row] * x[i - (reach - k)]
-        x[i] = value * flat[diagonal]
-    for back in range(size):
-        j = size - one - back
-        diagonal = j * (next_row + one) + below
-        value = x[j]
-        if j < inside:
-            for k in range(below):
-                value -= flat[diagonal + (below - k) * next_row] * x[j + below - k]
-        else:
-            for k in range(back):
-                value -= flat[diagonal + (back - k) * next_row] * x[j + back - k]
-        pivot = np.uint64(pivots[j])
-        x[j] = x[pivot]
-        x[pivot] = value
-
-
-@kernel(types.void(MATRIX, COUNT, COUNT, PLACES, MATRIX), **OPTIONS)
-def solve_transposed(band, lower, upper, pivots, right):
-    """Solve Aᵀ·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
-    flat = as_vector(band)
-    for c in range(right.shape[0]):
-        if LOWER > 0 and lower == LOWER and upper == LOWER:
-            substitute_transposed(flat, pivots, np.uint64(LOWER), np.uint64(2 * LOWER), right[c])
-        else:
-            substitute_transposed(flat, pivots, np.uint64(lower), np.uint64(lower + upper), right[c])
