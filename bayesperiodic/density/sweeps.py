@@ -1,7 +1,8 @@
 """Periodic orbits of the points of response tables, from the branch that leads through them.
 
 The branch of a table is followed once from its first point through all frequencies and round the folds, see
-`periodic.table_branch`. Each point is on one of its stable sheets: in a sweep the sheet does not change but at jumps,
+`periodic.table_branch`; if the response from rest at the last point is not on it, as where the folds between them are
+far outside the table, the branch through that one too. Each point is on one of its stable sheets: in a sweep the sheet does not change but at jumps,
 from one sheet to a later one. Among these choices the one is taken that the measured values fit best.
 
 In solves at other θ a sheet may end at a fold before a measured frequency. The orbit of such a point is that at the
@@ -86,31 +87,42 @@ def early_jumps(problem: Description, theta: np.ndarray, sheets: Mapping[str, in
 def _all_choices(problem: Description, theta: np.ndarray, table: Sequence[Experiment]) -> list[list[Place]]:
     """Return the choices of every point of a table."""
     with np.errstate(all="ignore"):
-        passages = _branch(problem, theta, table)
-    return [_choices(passages, k) for k in range(len(table))]
+        branches = _branches(problem, theta, table)
+    return [_choices(branches, k) for k in range(len(table))]
 
 
-def _branch(problem: Description, theta: np.ndarray, table: Sequence[Experiment]) -> list[Passage]:
-    """Return the branch through a table from its first point, which is solved from rest."""
+def _branches(problem: Description, theta: np.ndarray, table: Sequence[Experiment]) -> list[list[Passage]]:
+    """Return the branch through a table from its first point, which is solved from rest, and perhaps from its last."""
     equations = [problem.equations[e.name] for e in table]
     parameters = [problem.parameters(theta[None], e.name)[0] for e in table]
-    first, _ = solve_driven(equations[0], parameters[0], "static")
-    return list(follow(equations, parameters, 0, first.z)) if first.code == CONVERGED else []
+    branches: list[list[Passage]] = []
+    for start, heading in ((0, 1), (len(table) - 1, -1)):
+        rest, _ = solve_driven(equations[start], parameters[start], "static")
+        known = [p.z for branch in branches for p in branch if p.point == start]
+        if rest.code == CONVERGED and not any(distance(z, rest.z) < SAME_ORBIT for z in known):
+            branches.append(list(follow(equations, parameters, start, rest.z, heading)))
+    return branches
 
 
-def _choices(passages: Sequence[Passage], point: int) -> list[Place]:
-    """Return the place of a point on each stable sheet: its orbit, or the fold of the sheet that is nearest to it."""
-    result = []
-    for sheet in sorted({p.sheet for p in passages if p.sheet % 2 == 0}):
-        at = [p for p in passages if p.sheet == sheet and p.point == point]
-        if at:
-            result.append(Place(sheet, at[0].equations, at[0].z, True))
-            continue
-        points = [p.point for p in passages if p.sheet == sheet and p.point is not None]
-        ends_before = bool(points) and max(points) < point
-        fold = [p for p in passages if p.is_fold and p.sheet == (sheet if ends_before else sheet - 1)]
-        if points and fold:
-            result.append(Place(sheet, fold[0].equations, fold[0].z, False))
+def _choices(branches: Sequence[Sequence[Passage]], point: int) -> list[Place]:
+    """Return the place of a point on each stable sheet: its orbit, or the fold of the sheet that is nearest to it.
+
+    Sheets of a second branch come after those of the first.
+    """
+    result, count = [], 0
+    for passages in branches:
+        forwards = passages[0].point == 0
+        for sheet in sorted({p.sheet for p in passages if p.sheet % 2 == 0}):
+            at = [p for p in passages if p.sheet == sheet and p.point == point]
+            if at:
+                result.append(Place(count + sheet, at[0].equations, at[0].z, True))
+                continue
+            points = [p.point for p in passages if p.sheet == sheet and p.point is not None]
+            ends_before = bool(points) and max(points) < point
+            fold = [p for p in passages if p.is_fold and p.sheet == (sheet if ends_before == forwards else sheet - 1)]
+            if points and fold:
+                result.append(Place(count + sheet, fold[0].equations, fold[0].z, False))
+        count += 2 + 2 * (passages[-1].sheet // 2)
     return result
 
 

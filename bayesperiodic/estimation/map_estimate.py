@@ -294,8 +294,18 @@ def _first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:
 def _linearised(problem: Problem, theta: np.ndarray, initial: InitialEstimate | None) -> Linearisation:
     """Return residuals and Jacobian where orbits and parameters fit together, or else at θ."""
     if initial is None or not initial.states:
-        return problem.density().linearise(theta)
+        return _on_sheets(problem, problem.density().linearise(theta))
     return LogPosterior(problem, ResponseSolver.start(problem, initial.theta, initial.states)).linearise(initial.theta)
+
+
+def _on_sheets(problem: Problem, here: Linearisation) -> Linearisation:
+    """Return the same with the points of tables on the sheets of their branches that fit the data best at this θ.
+
+    Orbits that are followed from another θ, at which the branch has other folds, may be on others.
+    """
+    if not tables(problem):
+        return here
+    return LogPosterior(problem, here.solver.on_best_sheets(here.theta)).linearise(here.theta)
 
 
 def _in_wide_tables(problem: Problem, theta: np.ndarray, draws: np.ndarray, progress: bool) -> list[np.ndarray]:
