@@ -154,9 +154,7 @@ def structure(
     )
 
 
-def _base(
-    argument: str, given: Any, mass: dict[str, np.ndarray], shapes: np.ndarray | None
-) -> tuple[Base, np.ndarray]:
+def _base(argument: str, given: Any, mass: dict[str, np.ndarray], shapes: np.ndarray | None) -> tuple[Base, np.ndarray]:
     """Return a base, and the displacements of the points for a unit displacement of it."""
     size = 2 if shapes is None else 3
     if not isinstance(given, tuple) or len(given) != size or not isinstance(given[1], str):
@@ -164,7 +162,7 @@ def _base(
         raise ValueError(f"{argument}: must be a direction and a kind, such as {example}, got {given!r}.")
     _checks.one_of(argument, given[1], KINDS_OF_MOTION)
     points = len(mass[next(iter(mass))]) if shapes is None else len(shapes)
-    if not isinstance(given[0], Mapping) and np.ndim(given[0]) != 1:
+    if isinstance(given[0], tuple) or (not isinstance(given[0], Mapping) and np.ndim(given[0]) != 1):
         raise ValueError(
             f"{argument}: must have a direction of {points} displacements, those of all degrees of freedom with a unit "
             f"displacement of the base, got {given[0]!r}."
@@ -262,7 +260,10 @@ def definition(given: MatrixStructure) -> dict[str, Any]:
         "equations": equations,
         "outputs": lambda s, p, u: {
             name: _combined(at, [s[DERIVATIVES[order] + x] for x in degrees])
-            + sum(_number(w) * u[DERIVATIVES[order - given.bases[b].order] + b] for b, w in given.carried.get(name, {}).items())
+            + sum(
+                _number(w) * u[DERIVATIVES[order - given.bases[b].order] + b]
+                for b, w in given.carried.get(name, {}).items()
+            )
             for name, (at, order) in given.measured.items()
         },
     }
