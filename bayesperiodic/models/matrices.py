@@ -344,8 +344,8 @@ def _measured(
             carried[name] = float(terms.sum())
     if carried and kind in KINDS_OF_MOTION:
         raise ValueError(
-            f"{argument}: must be {ABSOLUTE + kind!r}, as of an accelerometer, or {RELATIVE + kind!r}, to the base, got "
-            f"{kind!r} of a place that moves with the base {next(iter(carried))!r}."
+            f"{argument}: must be {ABSOLUTE + kind!r}, as of an accelerometer, or {RELATIVE + kind!r}, to the base, "
+            f"got {kind!r} of a place that moves with the base {next(iter(carried))!r}."
         )
     said = (ABSOLUTE, RELATIVE) if carried else ("",)
     _checks.one_of(argument, kind, [one + plain for one in said for plain in KINDS_OF_MOTION])
@@ -358,7 +358,8 @@ def _measured(
             known_kind = [*KINDS_OF_MOTION][known]
             raise ValueError(
                 f"{argument}: must be a derivative of the input {name!r}, the base's {known_kind}, got {kind!r}, which "
-                f"is an integral of it; take {RELATIVE + plain!r} or {ABSOLUTE + known_kind!r}, or give the base's {plain}."
+                f"is an integral of it; take {RELATIVE + plain!r} or {ABSOLUTE + known_kind!r}, or give the base's "
+                f"{plain}."
             )
     return _weights(argument, place, shapes), order, carried
 

@@ -78,8 +78,8 @@ def _diagonal(
 class Base:
     """Motion of all supports together along a direction r; displacements are relative to it.
 
-    The equation of motion has the forces −M r times the acceleration, `loads` being M_i r (n,) by the factor of the part
-    of the mass. The input is the derivative of this order of the displacement.
+    The equation of motion has the forces −M r times the acceleration, `loads` being M_i r (n,) by the factor of the
+    part of the mass. The input is the derivative of this order of the displacement.
     """
 
     loads: dict[str, np.ndarray]

@@ -38,9 +38,9 @@ class LowestModes(NamedTuple):
 class Receptance:
     """LinearResponse R·(−(kω)² M + ikω C + K)⁻¹·S of displacements along rows R to forces along columns S.
 
-    Behind the columns given are those of the motions of the base, −M r times the acceleration. M, C and K are sums of parts times factors, which are expressions of parameters. Where one basis of real modes
-    diagonalises all parts, as with Rayleigh or modal damping, it is computed once; else one matrix is factorised per
-    harmonic.
+    Behind the columns given are those of the motions of the base, −M r times the acceleration. M, C and K are sums of
+    parts times factors, which are expressions of parameters. Where one basis of real modes diagonalises all parts, as
+    with Rayleigh or modal damping, it is computed once; else one matrix is factorised per harmonic.
 
     Parameters
     ----------
