@@ -3,6 +3,7 @@
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -278,6 +279,8 @@ def _parts(kind: str, given: Any) -> dict[str, np.ndarray]:
         raise ValueError(f"{kind}: must have at least one matrix, got none.")
     result = {}
     for name, matrix in named.items():
+        if isinstance(matrix, str | Path):
+            raise ValueError(f"{kind}: must be a matrix, got {str(matrix)!r}; read a file by read_matrix(path, name).")
         dense = _checks.real_array(kind, matrix.toarray() if hasattr(matrix, "toarray") else matrix)
         if dense.ndim != 2 or dense.shape[0] != dense.shape[1] or not dense.size:
             raise ValueError(f"{kind}: must be a square matrix, got the shape {dense.shape}.")
