@@ -76,6 +76,15 @@ def beam(**changes):
     return bp.Model.from_matrices("beam", **(settings | changes))
 
 
+def case(modal):
+    """Return a beam, its parameters, and what else `expected` takes; with modes the density of all masses is one."""
+    if not modal:
+        return beam(), VALUES, {}
+    mass, whole = of_beam()
+    model = beam(mass={"density": mass}, damping={"beta": whole[1:, 1:]})
+    return model, {"density": 1.2, "beta": 0.002}, {"m_half": 0.0, "alpha": 0.0}
+
+
 def expected(m_half, alpha, beta, frequency=FREQUENCY, given=FREQUENCY, density=1.0):
     """Return the base's acceleration, the force, and the outputs, by the absolute coordinates of the beam.
 
@@ -102,15 +111,19 @@ def expected(m_half, alpha, beta, frequency=FREQUENCY, given=FREQUENCY, density=
     return {"ground": (-(rates**2) * ground @ WAVES).real, "shaker": (force @ WAVES).real}, outputs
 
 
-def test_beam_moves_as_that_whose_clamp_is_prescribed():
-    """Outputs, absolute and relative, and their derivatives by factors of the mass, damping and the frequency."""
-    inputs, outputs = expected(**VALUES)
-    solution = bp.solve_periodic(beam(), VALUES, inputs, frequency=FREQUENCY, samples=POINTS)
+@pytest.mark.parametrize("modal", [True, False])
+def test_beam_moves_as_that_whose_clamp_is_prescribed(modal):
+    """Outputs, absolute and relative, states, and derivatives by factors of mass and damping and by the frequency."""
+    model, values, known = case(modal)
+    inputs, outputs = expected(**(known | values))
+    solution = bp.solve_periodic(model, values, inputs, frequency=FREQUENCY, samples=POINTS)
     for name, exact in outputs.items():
         np.testing.assert_allclose(solution.outputs[name], exact, atol=1e-9 * np.abs(exact).max())
-    at = VALUES | {"frequency": FREQUENCY}
+    bent = solution.states[f"x{COUNT - 1}"] - solution.states["x5"]
+    np.testing.assert_allclose(bent, outputs["bent"], atol=1e-9 * np.abs(bent).max())
+    at = values | {"frequency": FREQUENCY}
     for parameter, value in at.items():
-        above, below = (expected(**(at | {parameter: value * (1 + sign * 1e-5)}))[1] for sign in (1, -1))
+        above, below = (expected(**(known | at | {parameter: value * (1 + sign * 1e-5)}))[1] for sign in (1, -1))
         for name, by_parameter in solution.sensitivities.items():
             slope = (above[name] - below[name]) / (2e-5 * value)
             np.testing.assert_allclose(by_parameter[parameter], slope, atol=1e-6 * np.abs(slope).max())
@@ -118,22 +131,20 @@ def test_beam_moves_as_that_whose_clamp_is_prescribed():
 
 @pytest.mark.parametrize("modal", [True, False])
 def test_density_of_many_points_is_that_of_the_prescribed_clamp(modal):
-    """Far from the anchors too; with modes the free factor is the density of all masses."""
-    free = {"density": 1.0} if modal else {"m_half": 0.4}
-    fixed = {"beta": 0.002} if modal else {"alpha": 0.04, "beta": 0.002}
-    mass, whole = of_beam()
-    changes = {"mass": {"density": mass}, "damping": {"beta": whole[1:, 1:]}} if modal else {}
-    base = {"m_half": 0.0, "alpha": 0.0} if modal else {}
-    inputs, outputs = expected(**(base | free | fixed))
+    """Far from the anchors too."""
+    model, values, known = case(modal)
+    name, *others = values
+    inputs, outputs = expected(**(known | values))
     outputs.pop("near")
     noisy = {n: y + 0.01 * np.ptp(y) * np.random.default_rng(1).standard_normal(POINTS) for n, y in outputs.items()}
     run = bp.Experiment("run", FREQUENCY, noisy, inputs, samples=POINTS)
-    (name, middle), variances = next(iter(free.items())), {f"variance[{n}]": np.var(y) for n, y in noisy.items()}
+    variances = {f"variance[{n}]": np.var(y) for n, y in noisy.items()}
     problem = bp.Problem(
-        beam(**changes), [run], priors={name: bp.LogNormal(middle, 0.3)}, fixed=fixed, input_noise="exact"
-    )
-    for value in middle * np.array([0.7, 0.99, 1.2]):
-        _, exact = expected(**(base | fixed | {name: value}))
+        model, [run], priors={name: bp.LogNormal(values[name], 0.3)}, fixed={n: values[n] for n in others},
+        input_noise="exact",
+    )  # fmt: skip
+    for value in values[name] * np.array([0.7, 0.99, 1.2]):
+        _, exact = expected(**(known | values | {name: value}))
         log_likelihood = sum(
             -0.5 * np.sum((noisy[n] - exact[n]) ** 2) / v - 0.5 * POINTS * np.log(v)
             for n, v in zip(noisy, variances.values(), strict=True)
