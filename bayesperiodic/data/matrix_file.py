@@ -143,7 +143,7 @@ def _market_values(file: Path) -> np.ndarray:
         raise ValueError(f"it has {rows} x {columns} values, more than {LARGEST_ARRAY / 1e9:.3g} GB")
     if (entries if layout == "coordinate" else entries // 2) > file.stat().st_size:
         raise ValueError(f"it says that it has {entries} values, more than it has bytes")
-    matrix = scipy.io.mmread(str(file))
+    matrix: Any = scipy.io.mmread(str(file))
     if layout != "coordinate":
         return np.asarray(matrix)
     places = matrix.row.astype(np.int64) * columns + matrix.col
@@ -159,7 +159,7 @@ def _scipy_values(file: Path, whole: Contents) -> np.ndarray:
     shape = [int(n) for n in np.ravel(arrays["shape"])]
     if len(shape) != 2 or min(shape) < 0 or 8 * shape[0] * shape[1] > LARGEST_ARRAY:
         raise ValueError(f"it has the shape {shape}")
-    matrix = scipy.sparse.load_npz(file)
+    matrix: Any = scipy.sparse.load_npz(file)
     if matrix.format in ("csr", "csc", "bsr"):
         matrix.check_format(full_check=True)
     return np.asarray(matrix.toarray())

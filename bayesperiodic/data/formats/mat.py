@@ -275,8 +275,8 @@ def _variable(data: memoryview, order: str) -> tuple[str, int, list[int], Iterat
 
 def _array(name: str, flags: int, shape: list[int], parts: Iterator[tuple[int, memoryview]], order: str) -> np.ndarray:
     if flags & (CLASS | COMPLEX) == SPARSE:
-        places, starts, values = (np.frombuffer(part, f"{order}{STORED[kind]}") for kind, part in parts)
-        return _dense(name, (shape[0], shape[1]), places, starts, values)
+        places, starts, stored = (np.frombuffer(part, f"{order}{STORED[kind]}") for kind, part in parts)
+        return _dense(name, (shape[0], shape[1]), places, starts, stored)
     if flags & CLASS not in NUMERIC or flags & COMPLEX:
         other = "complex" if flags & COMPLEX else f"of MATLAB class {flags & CLASS}"
         raise ValueError(f"its variable {name!r} is no array of real numbers, but {other}")
