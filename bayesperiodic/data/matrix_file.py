@@ -24,7 +24,7 @@ FORMATS_OF_MATRICES = "a MatrixMarket, NPZ, NPY, MAT or HDF5 file"
 def read_matrix(path: str | Path, name: str | None = None, unit: str | None = None) -> np.ndarray:
     """Return a matrix from a file of MatrixMarket (.mtx), NPZ, NPY, MAT (version 5 or 7.3) or HDF5.
 
-    The format is recognised by the first bytes. Sparse matrices of MatrixMarket, MATLAB and `scipy.sparse.save_npz`
+    The format is recognised by the first bytes. Sparse matrices of MatrixMarket, MATLAB and SciPy (``save_npz``)
     become arrays; of a symmetric matrix of MatrixMarket, of which a file has one triangle, both are returned. Links to
     other files and pickled objects are not followed.
 
