@@ -9,6 +9,7 @@ from .data.experiment import Experiment as Experiment
 from .data.file_inspection import FileChannel as FileChannel
 from .data.file_inspection import FileInspection as FileInspection
 from .data.file_inspection import inspect as inspect
+from .data.matrix_file import read_matrix as read_matrix
 from .data.recording import Recording as Recording
 from .data.recording_check import Finding as Finding
 from .data.recording_check import RecordingCheck as RecordingCheck

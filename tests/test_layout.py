@@ -15,6 +15,8 @@ REASONS = {
     "resonance_point": "what was measured, with standard deviations; four are required, the rest have defaults",
     "Finding": "one field per fact about a fault; made by `Recording.check`",
     "Model": "the definition of a model: name, variables, equations, outputs, units; five are required",
+    "Model.from_matrices": "the definition of a structure; mass, stiffness, outputs and the name are required",
+    "Model.from_modes": "the same for modes; frequencies, damping ratios, shapes, outputs and the name are required",
     "Problem": "model, experiments, parameters and noise; two and the priors are required, the rest are keywords",
     "Recording.from_file": "the meaning of the channels, and what a text does not show; two arguments are required",
     "population": "what the population is, and settings with defaults; units, names and the seed are required",

@@ -3,6 +3,7 @@
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,13 @@ from bayesperiodic import _checks
 from bayesperiodic._expressions import parse_any
 from bayesperiodic.models.hysteresis import Hysteretic
 from bayesperiodic.models.names import DERIVATIVES, Names
-from bayesperiodic.models.structure import CONSTANT_PART, POWERS, Matrices, MatrixStructure
+from bayesperiodic.models.structure import CONSTANT_PART, POWERS, Base, Matrices, MatrixStructure
 
 KINDS_OF_MOTION = {"displacement": 0, "velocity": 1, "acceleration": 2}  # order of the derivative
+# Of a place that moves with a base, what its motion is measured against.
+ABSOLUTE, RELATIVE = "absolute ", "relative "
+# Share of the sizes of its terms below which a sum of weights is zero.
+NO_MOTION = 1e-12
 # Arguments of the functions of elements that are no parameters.
 OF_THE_MOTION = ("d", "v", "s", "name", "names")
 
@@ -30,8 +35,9 @@ class Element:
     force : callable
         A function of `bp.elements`, or your own: of d, the relative displacement [m], and v, the relative velocity
         [m/s], if it has these arguments, and of its parameters by name. It returns an expression or `Hysteretic`.
-    place : int, tuple (i, j) or array (n,)
-        A degree of freedom; two of them, d being x_i − x_j; or weights, d being their sum with all displacements.
+    place : int, tuple (i, j), mapping of int to number, or array (n,)
+        A degree of freedom; two of them, d being x_i − x_j; or weights of some or all of them, d being the sum of
+        weight times displacement, such as ``{0: 0.8, 1: 0.6}`` for an inclined direction, along which the force acts.
     constants : mapping of str to number, optional
         Arguments that are no parameters of the model, such as a width; of `iwan` also the `names` of its states.
 
@@ -106,7 +112,8 @@ class Element:
 
 def structure(
     matrices: Mapping[str, Any],
-    forces: Mapping[str, Any],
+    forces: Mapping[str, Any] | None,
+    base: Mapping[str, tuple[Any, ...]] | None,
     outputs: Mapping[str, tuple[Any, str]],
     elements: Iterable[Element],
     shapes: np.ndarray | None = None,
@@ -128,20 +135,60 @@ def structure(
     placed = tuple(elements)
     for element in placed:
         _checks.instance("elements", element, Element)
-    _checks.mapping("forces", forces, "{'force': 0}")
+    forces = _checks.mapping("forces", {} if forces is None else forces, "{'force': 0}")
+    base = _checks.mapping("base", {} if base is None else base, "{'ground': (np.ones(3), 'acceleration')}")
     _checks.mapping("outputs", outputs, "{'x': (0, 'displacement')}")
     at = np.eye(count) if shapes is None else shapes
-    inputs = {name: _weights(f"forces[{name!r}]", place, at) for name, place in forces.items()}
-    measured = {name: _measured(f"outputs[{name!r}]", given, at) for name, given in outputs.items()}
+    moving = {name: _base(f"base[{name!r}]", given, parts["mass"], shapes) for name, given in base.items()}
+    if repeated := [name for name in moving if name in forces]:
+        raise ValueError(f"base: must have names that differ from those of forces, got {repeated[0]!r}.")
+    measured = {name: _measured(f"outputs[{name!r}]", given, at, moving) for name, given in outputs.items()}
     weights = [_weights(f"place of element {e.name!r}", e.place, at) for e in placed]
-    return MatrixStructure(Matrices(parts), inputs, measured, placed, np.array(weights).reshape(-1, count))
+    return MatrixStructure(
+        matrices=Matrices(parts),
+        inputs={name: _weights(f"forces[{name!r}]", place, at) for name, place in forces.items()},
+        bases={name: one for name, (one, _) in moving.items()},
+        measured={name: (place, order) for name, (place, order, _) in measured.items()},
+        carried={name: carried for name, (*_, carried) in measured.items() if carried},
+        elements=placed,
+        weights=np.array(weights).reshape(-1, count),
+    )
+
+
+def _base(argument: str, given: Any, mass: dict[str, np.ndarray], shapes: np.ndarray | None) -> tuple[Base, np.ndarray]:
+    """Return a base, and the displacements of the points for a unit displacement of it."""
+    size = 2 if shapes is None else 3
+    if not isinstance(given, tuple) or len(given) != size or not isinstance(given[1], str):
+        example = "(np.ones(3), 'acceleration'" + (")" if shapes is None else ", participation), of the modes")
+        raise ValueError(f"{argument}: must be a direction and a kind, such as {example}, got {given!r}.")
+    _checks.one_of(argument, given[1], KINDS_OF_MOTION)
+    points = len(mass[next(iter(mass))]) if shapes is None else len(shapes)
+    if isinstance(given[0], tuple) or (not isinstance(given[0], Mapping) and np.ndim(given[0]) != 1):
+        raise ValueError(
+            f"{argument}: must have a direction of {points} displacements, those of all degrees of freedom with a unit "
+            f"displacement of the base, got {given[0]!r}."
+        )
+    direction = given[0] if isinstance(given[0], Mapping) else np.asarray(given[0])
+    direction = _weights_of_points(argument, direction, points)
+    if shapes is None:
+        loads = {factor: part @ direction for factor, part in mass.items()}
+    else:
+        participation = _checks.real_array(argument, given[2])
+        if participation.shape != (shapes.shape[1],) or not np.isfinite(participation).all():
+            raise ValueError(
+                f"{argument}: must have a finite participation factor of each of the {shapes.shape[1]} modes, got the "
+                f"shape {participation.shape}."
+            )
+        loads = {CONSTANT_PART: participation}
+    return Base(loads, KINDS_OF_MOTION[given[1]]), direction
 
 
 def of_modes(
     frequencies: Any,
     damping_ratios: Any,
     shapes: Any,
-    forces: Mapping[str, Any],
+    forces: Mapping[str, Any] | None,
+    base: Mapping[str, tuple[Any, ...]] | None,
     outputs: Mapping[str, tuple[Any, str]],
     elements: Iterable[Element],
 ) -> MatrixStructure:
@@ -166,7 +213,7 @@ def of_modes(
             known = not expression.names
             part = matrices[kind].setdefault(CONSTANT_PART if known else factor, np.zeros((count, count)))
             part[mode, mode] = expression.value({}) if known else 1.0
-    return structure({"mass": np.eye(count)} | matrices, forces, outputs, elements, at)
+    return structure({"mass": np.eye(count)} | matrices, forces, base, outputs, elements, at)
 
 
 def _of_modes(argument: str, given: Any, count: int) -> list[float | str]:
@@ -199,15 +246,25 @@ def definition(given: MatrixStructure) -> dict[str, Any]:
             total = [sum_ + _number(w) * part.force if w else sum_ for sum_, w in zip(total, at, strict=True)]
         for name, at in given.inputs.items():
             total = [sum_ - _number(w) * u[name] if w else sum_ for sum_, w in zip(total, at, strict=True)]
+        for name, base in given.bases.items():
+            for factor, at in base.loads.items():
+                expression = given.factors[factor]
+                acceleration = expression.symbolic("mass", {n: p[n] for n in expression.names})[0]
+                acceleration *= u[DERIVATIVES[2 - base.order] + name]
+                total = [sum_ + _number(w) * acceleration if w else sum_ for sum_, w in zip(total, at, strict=True)]
         return [*total, *internal]
 
     return {
         "states": [*degrees, *(state for e in given.elements for state in e.states)],
-        "inputs": [*given.inputs],
+        "inputs": [*given.drives],
         "parameters": [*given.parameters, *(f"{e.name}_{name}" for e in given.elements for name in e.parameters)],
         "equations": equations,
         "outputs": lambda s, p, u: {
             name: _combined(at, [s[DERIVATIVES[order] + x] for x in degrees])
+            + sum(
+                _number(w) * u[DERIVATIVES[order - given.bases[b].order] + b]
+                for b, w in given.carried.get(name, {}).items()
+            )
             for name, (at, order) in given.measured.items()
         },
     }
@@ -222,6 +279,8 @@ def _parts(kind: str, given: Any) -> dict[str, np.ndarray]:
         raise ValueError(f"{kind}: must have at least one matrix, got none.")
     result = {}
     for name, matrix in named.items():
+        if isinstance(matrix, str | Path):
+            raise ValueError(f"{kind}: must be a matrix, got {str(matrix)!r}; read a file by read_matrix(path, name).")
         dense = _checks.real_array(kind, matrix.toarray() if hasattr(matrix, "toarray") else matrix)
         if dense.ndim != 2 or dense.shape[0] != dense.shape[1] or not dense.size:
             raise ValueError(f"{kind}: must be a square matrix, got the shape {dense.shape}.")
@@ -241,6 +300,13 @@ def _weights(argument: str, place: Any, shapes: np.ndarray) -> np.ndarray:
 
 
 def _weights_of_points(argument: str, place: Any, count: int) -> np.ndarray:
+    if isinstance(place, Mapping):
+        weights = np.zeros(count)
+        for number, weight in place.items():
+            weights[_degree(argument, number, count)] = _checks.finite_number(argument, weight)
+        if not weights.any():
+            raise ValueError(f"{argument}: must have a weight that is not zero, got {place!r}.")
+        return weights
     if isinstance(place, np.ndarray) and place.ndim:
         weights = _checks.real_array(argument, place)
         if weights.shape != (count,) or not np.isfinite(weights).all() or not weights.any():
@@ -251,22 +317,54 @@ def _weights_of_points(argument: str, place: Any, count: int) -> np.ndarray:
     numbers = place if isinstance(place, tuple) else (place,)
     if isinstance(place, list) or len(numbers) not in (1, 2) or numbers[1:] == numbers[:1]:
         raise ValueError(
-            f"{argument}: must be one degree of freedom, a tuple of two different ones, or an array of {count} "
-            f"weights, got {place!r}."
+            f"{argument}: must be one degree of freedom, a tuple of two different ones, a mapping of some to their "
+            f"weights, or an array of {count} weights, got {place!r}."
         )
     weights = np.zeros(count)
     for number, sign in zip(numbers, (1.0, -1.0), strict=False):
-        if _checks.integer(argument, number, minimum=0) >= count:
-            raise ValueError(f"{argument}: must be below {count}, the number of degrees of freedom, got {number}.")
-        weights[number] = sign
+        weights[_degree(argument, number, count)] = sign
     return weights
 
 
-def _measured(argument: str, given: Any, shapes: np.ndarray) -> tuple[np.ndarray, int]:
+def _degree(argument: str, number: Any, count: int) -> int:
+    if _checks.integer(argument, number, minimum=0) >= count:
+        raise ValueError(f"{argument}: must be below {count}, the number of degrees of freedom, got {number}.")
+    return int(number)
+
+
+def _measured(
+    argument: str, given: Any, shapes: np.ndarray, bases: Mapping[str, tuple[Base, np.ndarray]]
+) -> tuple[np.ndarray, int, dict[str, float]]:
+    """Return the weights of an output, the order of its derivative, and what a unit displacement of each base adds."""
     if not isinstance(given, tuple) or len(given) != 2 or not isinstance(given[1], str):
         raise ValueError(f"{argument}: must be a place and a kind, such as (0, 'acceleration'), got {given!r}.")
-    _checks.one_of(argument, given[1], KINDS_OF_MOTION)
-    return _weights(argument, given[0], shapes), KINDS_OF_MOTION[given[1]]
+    place, kind = given
+    weights = _weights_of_points(argument, place, len(shapes))
+    carried = {}
+    for name, (_, direction) in bases.items():
+        terms = weights * direction
+        if abs(terms.sum()) > NO_MOTION * np.abs(terms).sum():
+            carried[name] = float(terms.sum())
+    if carried and kind in KINDS_OF_MOTION:
+        raise ValueError(
+            f"{argument}: must be {ABSOLUTE + kind!r}, as of an accelerometer, or {RELATIVE + kind!r}, to the base, "
+            f"got {kind!r} of a place that moves with the base {next(iter(carried))!r}."
+        )
+    said = (ABSOLUTE, RELATIVE) if carried else ("",)
+    _checks.one_of(argument, kind, [one + plain for one in said for plain in KINDS_OF_MOTION])
+    plain = kind.removeprefix(ABSOLUTE).removeprefix(RELATIVE)
+    order = KINDS_OF_MOTION[plain]
+    if not kind.startswith(ABSOLUTE):
+        carried = {}
+    for name in carried:
+        if order < (known := bases[name][0].order):
+            known_kind = [*KINDS_OF_MOTION][known]
+            raise ValueError(
+                f"{argument}: must be a derivative of the input {name!r}, the base's {known_kind}, got {kind!r}, which "
+                f"is an integral of it; take {RELATIVE + plain!r} or {ABSOLUTE + known_kind!r}, or give the base's "
+                f"{plain}."
+            )
+    return _weights(argument, place, shapes), order, carried
 
 
 def _combined(weights: np.ndarray, symbols: list[sp.Symbol]) -> sp.Expr:

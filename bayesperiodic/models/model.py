@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
-from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from bayesperiodic._expressions import parse
 from bayesperiodic._printing import Printed
 from bayesperiodic.models.matrices import definition, of_modes, structure
 from bayesperiodic.models.names import DERIVATIVES, RESERVED, Names, called, check_derivative_names, with_derivatives
-from bayesperiodic.models.structure import CONSTANT_PART, MatrixStructure
+from bayesperiodic.models.structure import MatrixStructure
 
 LARGEST_FLOAT = np.finfo(float).max
 # Degrees of freedom above which models of matrices are condensed.
@@ -163,12 +162,13 @@ class Model(Printed):
         mass: Any,
         stiffness: Any,
         damping: Any = None,
-        forces: Mapping[str, Any],
+        forces: Mapping[str, Any] | None = None,
+        base: Mapping[str, tuple[Any, ...]] | None = None,
         outputs: Mapping[str, tuple[Any, str]],
         elements: Iterable[Any] = (),
         condensed: bool | None = None,
     ) -> "Model":
-        """Return the model M ẍ + C ẋ + K x + elements = forces.
+        """Return the model M ẍ + C ẋ + K x + elements = forces − M r z̈, with the motion z of a base.
 
         The states are x0, x1, …, in the order of the matrices, and those of the elements. A condensed model is solved
         in the displacements of its elements alone, to which the linear rest is condensed by its frequency response, see
@@ -181,12 +181,19 @@ class Model(Printed):
         mass, stiffness, damping : array (n, n), sparse matrix, or mapping of str to such
             Of a mapping, the sum of factor·matrix with an expression of parameters as the factor, for example
             ``damping={"alpha": M, "beta": K}`` or ``stiffness={"1": K0, "E*t**3": K1}``. No damping without `damping`.
-        forces : mapping of str to place
+        forces : mapping of str to place, optional
             Where each input acts: the number of a degree of freedom, from 0; a tuple (i, j) of two between which it
-            acts, positive on i; or an array (n,) of weights, such as a direction or the values of modes at a point.
+            acts, positive on i; a mapping of some to their weights, such as ``{0: 0.8, 1: 0.6}`` for an inclined
+            direction; or an array (n,) of all weights.
+        base : mapping of str to (direction, kind), optional
+            Supports that move together: by the name of the input, how the structure is displaced if it follows a unit
+            displacement of them without deformation, an array (n,) or a mapping, and whether the input is their
+            "acceleration", "velocity" or "displacement". The states are relative to the base then, and so are the
+            elements, of which those of one degree of freedom end at the base.
         outputs : mapping of str to (place, kind)
             What is measured: "displacement", "velocity" or "acceleration", of a place like those of `forces`; of a
-            tuple (i, j) the difference of i and j.
+            tuple (i, j) the difference of i and j. Of places that a base carries, "absolute acceleration" (of an
+            accelerometer) or "relative acceleration" (to the base), and so on.
         elements : sequence of elements.Element
             Nonlinear parts. Each parameter of an element is a parameter of the model, called element_parameter.
         condensed : bool, optional
@@ -201,8 +208,8 @@ class Model(Printed):
         ------
         ValueError
             For matrices that are not square, of different sizes or not finite, a singular mass matrix, a place that
-            does not exist, a condensed model without force or with an element that has internal states, and as for
-            `Model`.
+            does not exist, an output that may be absolute or relative, an absolute one that needs the integral of the
+            input, a condensed model without input or with an element that has internal states, and as for `Model`.
 
         Examples
         --------
@@ -213,7 +220,7 @@ class Model(Printed):
         (('x0', 'x1', 'joint'), ('alpha', 'joint_stiffness', 'joint_limit'))
         """
         matrices = {"mass": mass, "damping": damping, "stiffness": stiffness}
-        return cls._of_structure(name, structure(matrices, forces, outputs, elements), condensed)
+        return cls._of_structure(name, structure(matrices, forces, base, outputs, elements), condensed)
 
     @classmethod
     def from_modes(
@@ -223,7 +230,8 @@ class Model(Printed):
         frequencies: Sequence[float | str],
         damping_ratios: Sequence[float | str] | float | str,
         shapes: Any,
-        forces: Mapping[str, Any],
+        forces: Mapping[str, Any] | None = None,
+        base: Mapping[str, tuple[Any, ...]] | None = None,
         outputs: Mapping[str, tuple[Any, str]],
         elements: Iterable[Any] = (),
         condensed: bool | None = None,
@@ -245,6 +253,10 @@ class Model(Printed):
             Mode shapes at the points of forces, outputs and elements, for unit modal mass [1/√kg].
         forces, outputs, elements, condensed
             As in `from_matrices`, with the numbers of points for those of degrees of freedom.
+        base : mapping of str to (direction, kind, participation), optional
+            As in `from_matrices`, with the direction at the points, and the participation factors shapesᵀ M r of the
+            modes, (modes,) [√kg], which shapes at some points do not determine; programs of finite elements print
+            them.
 
         Returns
         -------
@@ -264,13 +276,13 @@ class Model(Printed):
         >>> model.parameters
         ('zeta', 'f1', 'mount_k3')
         """
-        given = of_modes(frequencies, damping_ratios, shapes, forces, outputs, elements)
+        given = of_modes(frequencies, damping_ratios, shapes, forces, base, outputs, elements)
         return cls._of_structure(name, given, condensed)
 
     @classmethod
     def _of_structure(cls, name: str, given: MatrixStructure, condensed: bool | None) -> "Model":
         if condensed is None:
-            condensed = given.memoryless and bool(given.inputs) and given.degrees > MOST_SYMBOLIC
+            condensed = given.memoryless and bool(given.drives) and given.degrees > MOST_SYMBOLIC
         return CondensedModel(name, given) if condensed else cls(name, **definition(given))
 
     def _expression(self, argument: str, given: Any) -> sp.Expr:
@@ -451,9 +463,9 @@ class CondensedModel(Model):
                 "elements: must be functions of displacement and velocity in a condensed model, got one with internal "
                 "states or an argument s; take condensed=False, or a memoryless element."
             )
-        if not structure.inputs:
+        if not structure.drives:
             raise ValueError(
-                "forces: must have at least one force in a condensed model, got none; take condensed=False."
+                "forces: must have at least one force or a base in a condensed model, got none; take condensed=False."
             )
         given = definition(structure)
         self._set_names(name, given["states"], given["inputs"], given["parameters"])
@@ -523,12 +535,7 @@ class CondensedModel(Model):
     def definition(self) -> str:
         """All that solutions depend on, as text; equal for equal models."""
         names = self.states, self.inputs, self.parameters, self.outputs, "condensed"
-        arrays = [m for named in self.structure.parts.values() for m in named.values()]
-        arrays += [*self.structure.inputs.values(), *(at for at, _ in self.structure.measured.values())]
-        content = sha256(b"".join(a.tobytes() for a in [*arrays, self.structure.weights])).hexdigest()
-        factors = {kind: [*named] for kind, named in self.structure.parts.items()}
-        orders = [order for _, order in self.structure.measured.values()]
-        return "\n".join([repr(names), repr(factors), repr(orders), content, *map(sp.srepr, self.element_forces)])
+        return "\n".join([repr(names), self.structure.digest, *map(sp.srepr, self.element_forces)])
 
     @cached_property
     def element_kernels(self) -> Kernels:
@@ -548,13 +555,14 @@ class CondensedModel(Model):
     def with_all_outputs(self) -> "CondensedModel":
         """The model whose outputs are the displacements of all degrees of freedom."""
         other, places = copy(self), np.eye(len(self.states))
-        other.structure = replace(self.structure, measured={x: (places[i], 0) for i, x in enumerate(self.states)})
+        everywhere = {x: (places[i], 0) for i, x in enumerate(self.states)}
+        other.structure = replace(self.structure, measured=everywhere, carried={})
         other.outputs = self.states
         return other
 
     def input_derivatives(self) -> dict[str, int]:
-        """Return 0 for every input."""
-        return dict.fromkeys(self.inputs, 0)
+        """Return 0 for every force, and how often the motion of a base is differentiated to be its acceleration."""
+        return dict.fromkeys(self.inputs, 0) | {name: 2 - base.order for name, base in self.structure.bases.items()}
 
     def latex(self) -> str:
         """Return the equation of motion, and the forces of the elements, as a LaTeX ``aligned`` environment."""
@@ -563,18 +571,10 @@ class CondensedModel(Model):
         for number in range(count):
             for order, mark in enumerate(("d", r"\dot{d}")):
                 written[self.element_symbols[order * count + number]] = f"{mark}_{{{number + 1}}}"
-        sums = []
-        for kind, letter, motion in (("mass", "M", r"\ddot{x}"), ("damping", "C", r"\dot{x}"), ("stiffness", "K", "x")):
-            for number, factor in enumerate(self.structure.parts[kind]):
-                expression, _ = self.structure.factors[factor].symbolic(kind, self.parameter_symbols)
-                scale = sp.latex(expression, symbol_names=written)
-                scale = rf"\left({scale}\right)" if expression.is_Add else scale
-                scale = "" if factor == CONSTANT_PART else rf"{scale}\,"
-                sums.append(f"{scale}{letter}_{{{number}}} {motion}")
         forces = [
             f"f_{{{number + 1}}} &= {sp.latex(f, symbol_names=written)}" for number, f in enumerate(self.element_forces)
         ]
-        motion = " + ".join([*sums, *(["W^T f"] if count else [])]) + r" &= B u"
+        motion = self.structure.latex(self.parameter_symbols, written)
         return (
             "\\begin{aligned}\n"
             + " \\\\\n".join([motion, *(["d &= W x"] if count else []), *forces])

@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from hashlib import sha256
 from inspect import signature
 from typing import Any
 
 import numpy as np
 import scipy.linalg
+import sympy as sp
 
 from bayesperiodic._expressions import Expression, parse_any
 
@@ -72,15 +74,34 @@ def _diagonal(
     return diagonal if np.all(beside <= OFF_DIAGONAL * np.outer(sizes, sizes)) else None
 
 
+@dataclass(frozen=True, eq=False)
+class Base:
+    """Motion of all supports together along a direction r; displacements are relative to it.
+
+    The equation of motion has the forces −M r times the acceleration, `loads` being M_i r (n,) by the factor of the
+    part of the mass. The input is the derivative of this order of the displacement.
+    """
+
+    loads: dict[str, np.ndarray]
+    order: int
+
+
 @dataclass(frozen=True)
 class MatrixStructure:
     """What `Model.from_matrices` was given, checked: the matrices, the places, and the elements."""
 
     matrices: Matrices
-    inputs: dict[str, np.ndarray]  # weights (n,) of the place of each input
+    inputs: dict[str, np.ndarray]  # weights (n,) of the place of each force
+    bases: dict[str, Base]
     measured: dict[str, tuple[np.ndarray, int]]  # weights (n,) of each output, and the order of its derivative
+    carried: dict[str, dict[str, float]]  # of absolute outputs, what a unit displacement of each base adds
     elements: tuple[Any, ...]
     weights: np.ndarray  # (elements, n)
+
+    @property
+    def drives(self) -> tuple[str, ...]:
+        """Names of the inputs, forces before motions of the base."""
+        return (*self.inputs, *self.bases)
 
     @property
     def parts(self) -> dict[str, dict[str, np.ndarray]]:
@@ -106,3 +127,34 @@ class MatrixStructure:
     def memoryless(self) -> bool:
         """Whether the elements' forces are functions of displacement and velocity, without internal states."""
         return not any(e.states or "s" in signature(e.force).parameters for e in self.elements)
+
+    @property
+    def digest(self) -> str:
+        """Text that is equal for equal matrices, places and outputs."""
+        arrays = [m for named in self.parts.values() for m in named.values()]
+        arrays += [*self.inputs.values(), *(at for at, _ in self.measured.values()), self.weights]
+        arrays += [load for base in self.bases.values() for load in base.loads.values()]
+        factors = {kind: [*named] for kind, named in self.parts.items()}
+        orders = [order for _, order in self.measured.values()]
+        bases = {name: base.order for name, base in self.bases.items()}
+        content = sha256(b"".join(a.tobytes() for a in arrays)).hexdigest()
+        return "\n".join([repr(factors), repr(orders), repr(bases), repr(self.carried), content])
+
+    def latex(self, parameters: dict[str, sp.Symbol], written: dict[sp.Symbol, str]) -> str:
+        """Return the equation of motion in LaTeX; symbols of the parameters by name, and how symbols are written."""
+        kinds = {"mass": ("M", r"\ddot{x}"), "damping": ("C", r"\dot{x}"), "stiffness": ("K", "x")}
+        sums, masses = [], []
+        for kind, (letter, motion) in kinds.items():
+            for number, factor in enumerate(self.parts[kind]):
+                expression, _ = self.factors[factor].symbolic(kind, parameters)
+                scale = sp.latex(expression, symbol_names=written)
+                scale = rf"\left({scale}\right)" if expression.is_Add else scale
+                scale = "" if factor == CONSTANT_PART else rf"{scale}\,"
+                sums.append(f"{scale}{letter}_{{{number}}} {motion}")
+                masses += [f"{scale}{letter}_{{{number}}}"] if kind == "mass" else []
+        mass = masses[0] if len(masses) == 1 else rf"\left({' + '.join(masses)}\right)"
+        right = ["B u"] if self.inputs or not self.bases else []
+        for number, (name, base) in enumerate(self.bases.items()):
+            dots = {0: r"\ddot", 1: r"\dot", 2: ""}[base.order]
+            right.append(rf"- {mass} r_{{{number}}} {dots}{{\mathrm{{{name}}}}}")
+        return " + ".join([*sums, *(["W^T f"] if len(self.weights) else [])]) + f" &= {' '.join(right)}"

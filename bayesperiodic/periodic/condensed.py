@@ -207,17 +207,19 @@ class CondensedEquations(PeriodicEquations):
         numbers = np.arange(points // 2) / self.grid.periods
         response = self._receptance(parameters, self.frequency, numbers, directions)
         here, changes = (self._parts(values) for values in (response.values, response.derivatives))
+        carried, by_frequency = self._receptance.carried(self.frequency, numbers)
         orders = self._orders / self.frequency
         for number, direction in enumerate(directions):
             if direction == len(self.model.parameters):
                 changes.y_f[number] += here.y_f * orders[:, None]
-                changes.y_u[number] += here.y_u * orders[:, None]
-        return here, changes
+                changes.y_u[number] += here.y_u * orders[:, None] + by_frequency
+        return here._replace(y_u=here.y_u + carried), changes
 
     def many_matrices(self, parameters: np.ndarray, points: int) -> ResponseMatrices:
         """Return the frequency response for parameter vectors (vectors, parameters)."""
         numbers = np.arange(points // 2) / self.grid.periods
-        return self._parts(self._receptance.many(parameters, self.frequency, numbers))
+        response = self._parts(self._receptance.many(parameters, self.frequency, numbers))
+        return response._replace(y_u=response.y_u + self._receptance.carried(self.frequency, numbers)[0])
 
     @property
     def _orders(self) -> np.ndarray:

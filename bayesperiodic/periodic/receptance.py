@@ -38,9 +38,9 @@ class LowestModes(NamedTuple):
 class Receptance:
     """LinearResponse R·(−(kω)² M + ikω C + K)⁻¹·S of displacements along rows R to forces along columns S.
 
-    M, C and K are sums of parts times factors, which are expressions of parameters. Where one basis of real modes
-    diagonalises all parts, as with Rayleigh or modal damping, it is computed once; else one matrix is factorised per
-    harmonic.
+    Behind the columns given are those of the motions of the base, −M r times the acceleration. M, C and K are sums of
+    parts times factors, which are expressions of parameters. Where one basis of real modes diagonalises all parts, as
+    with Rayleigh or modal damping, it is computed once; else one matrix is factorised per harmonic.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Receptance:
     parameters : sequence of str
         Names of the model's parameters.
     rows, columns : array (…, n)
-        Weights of the degrees of freedom.
+        Weights of the degrees of freedom; the columns without those of the base.
     """
 
     def __init__(self, structure: MatrixStructure, parameters: Sequence[str], rows: np.ndarray, columns: np.ndarray):
@@ -64,7 +64,28 @@ class Receptance:
         self._names = tuple(parameters)
         self._matrices = np.stack([a for *_, a in parts])
         self._size, self._regular = len(parameters), False
+        if structure.bases:
+            self._add_bases([name for _, name, _ in parts])
         self._recent: dict[tuple[Any, ...], Any] = {}
+
+    def _add_bases(self, names: list[str]) -> None:
+        """Add a column −M_i r for each base and part of the mass; their sums times factors are those of the bases.
+
+        `_mixing` (parts + 1, columns with parts, columns) are the weights of these sums by factor, and without one.
+        """
+        given, bases = len(self._columns), [*self._structure.bases.values()]
+        loads = [(number, factor, load) for number, base in enumerate(bases) for factor, load in base.loads.items()]
+        self._columns = np.array([*self._columns, *(-load for *_, load in loads)])
+        self._mixing = np.zeros((len(names) + 1, len(self._columns), given + len(bases)))
+        self._mixing[-1, :given, :given] = np.eye(given)
+        for place, (number, factor, _) in enumerate(loads, given):
+            self._mixing[names.index(factor), place, given + number] = 1.0
+        self._orders = np.array([0] * given + [2 - base.order for base in bases])
+
+    def _mixed(self, factors: np.ndarray, rates: np.ndarray) -> np.ndarray:
+        """Return the weights of the columns with parts in all columns, (…, harmonics, columns with parts, columns)."""
+        weights = np.tensordot(factors, self._mixing[:-1], (-1, 0)) + self._mixing[-1]
+        return np.asarray(weights[..., None, :, :] * (1j * rates[:, None, None]) ** self._orders)
 
     def recent(self, key: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         """Return arrays that are computed, or were so recently with the same key."""
@@ -96,7 +117,10 @@ class Receptance:
         self, parameters: np.ndarray, frequency: float, harmonics: np.ndarray, forces: np.ndarray
     ) -> np.ndarray:
         """Return the displacements (…, harmonics, n) for forces (…, harmonics, columns)."""
-        factors = self.coefficients(parameters, 2 * np.pi * frequency * harmonics)
+        rates = 2 * np.pi * frequency * harmonics
+        factors = self.coefficients(parameters, rates)
+        if self._structure.bases:
+            forces = (self._mixed(self._values(parameters), rates) @ forces[..., None])[..., 0]
         if self._modes is not None:
             diagonals, _, columns = self._modes
             modes = self._structure.matrices.modes
@@ -184,7 +208,34 @@ class Receptance:
                 )
                 parts = np.einsum("kna,inj,kjb->kiab", left, self._matrices, right, optimize=True)
                 changes = [-np.einsum("ki,kiab->kab", s, parts) for s in slopes]
+        if self._structure.bases:
+            mixed = self._mixed(self._values(parameters), rates)
+            changes = [
+                change @ mixed + values @ self._mixed_slope(d, parameters, rates, frequency, mixed)
+                for d, change in zip(directions, changes, strict=True)
+            ]
+            values = values @ mixed
         return LinearResponse(values, np.array(changes).reshape(len(slopes), *values.shape))
+
+    def _mixed_slope(
+        self, direction: int, parameters: np.ndarray, rates: np.ndarray, frequency: float, mixed: np.ndarray
+    ) -> np.ndarray:
+        """Return the derivative of the weights of columns by a parameter or by the frequency."""
+        if direction == self._size:
+            return mixed * self._orders / frequency
+        moved = self._factor_slope(direction, parameters)
+        return self._mixed(moved, rates) - self._mixed(np.zeros_like(moved), rates)
+
+    def carried(self, frequency: float, harmonics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what the base itself adds to outputs, (harmonics, outputs, inputs), and its slope by the frequency."""
+        given = self._structure
+        size, orders = np.zeros((2, len(given.measured), len(given.drives)))
+        for i, (output, (_, order)) in enumerate(given.measured.items()):
+            for name, weight in given.carried.get(output, {}).items():
+                j = given.drives.index(name)
+                size[i, j], orders[i, j] = weight, order - given.bases[name].order
+        values = size * (2j * np.pi * frequency * harmonics[:, None, None]) ** orders
+        return values, values * orders / frequency
 
     def _check_regular(self, parameters: np.ndarray) -> None:
         """Raise a ValueError for a structure that can move without being deformed."""
@@ -207,8 +258,10 @@ class Receptance:
         parts = [(factors * (self._powers == power)) @ diagonals for power in (2, 1, 0)]
         products = np.ascontiguousarray(self._products.real.T)
         result = np.empty((len(parameters), len(harmonics), len(products)), dtype=complex)
-        compiled().modal_responses(products, *parts, 2 * np.pi * frequency * harmonics, result)
-        return result.reshape(*result.shape[:2], len(rows), len(columns))
+        rates = 2 * np.pi * frequency * harmonics
+        compiled().modal_responses(products, *parts, rates, result)
+        values = result.reshape(*result.shape[:2], len(rows), len(columns))
+        return values @ self._mixed(factors, rates) if self._structure.bases else values
 
     @property
     def matrix_parameters(self) -> tuple[int, ...]:
@@ -221,11 +274,15 @@ class Receptance:
         """Return the derivative of `coefficients` by a parameter or by the frequency."""
         if direction == self._size:
             return factors * self._powers / frequency
+        return (1j * rates[:, None]) ** self._powers * self._factor_slope(direction, parameters)
+
+    def _factor_slope(self, direction: int, parameters: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the factors by a parameter, (parts,)."""
         moved, name = np.where(self._factors == direction, 1.0, 0.0), self._names[direction]
         for place, expression in self._expressions.items():
             if name in expression.names:
                 moved[place] = expression.gradient(self._named(parameters, expression), [name])[name]
-        return (1j * rates[:, None]) ** self._powers * moved
+        return moved
 
 
 @cache

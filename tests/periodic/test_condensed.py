@@ -277,7 +277,7 @@ def free_bar(**changes):
     [
         ({"elements": [Element("joint", bp.elements.jenkins, 0, {"width": 0.1})]}, "elements: must be functions of"),
         ({"elements": [Element("late", lambda s, k: k * s.tau, 0)]}, "elements: must be functions of"),
-        ({"forces": {}}, "forces: must have at least one force in a condensed model"),
+        ({"forces": {}}, "forces: must have at least one force or a base in a condensed model"),
     ],
 )
 def test_what_cannot_be_condensed_is_refused(changes, message):

@@ -18,8 +18,8 @@ from bayesperiodic.data.formats.hdf5_attributes import attributes
 # Of MAT files, version 5: types of elements and of numbers, classes of arrays, flag of complex arrays, and the bytes in
 # which the name of a variable ends.
 INT32, MAT_MATRIX, COMPRESSED, COMPLEX, HEADER_BYTES = 5, 14, 15, 0x800, 4096
-# Classes: those of the flags, of structures and of objects such as tables.
-CLASS, STRUCTURE, OPAQUE = 0xFF, 2, 17
+# Classes: those of the flags, of structures, sparse matrices and objects such as tables.
+CLASS, STRUCTURE, SPARSE, OPAQUE = 0xFF, 2, 5, 17
 # Structures in structures that are searched.
 DEEPEST_STRUCTURE = 8
 STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", INT32: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -68,10 +68,16 @@ def _hdf5_channels(file: Path) -> Iterator[StoredChannel]:
                 try:
                     item = _hdf5.dataset(archive, name)
                     yield _hdf5_channel(file, "", name, item)
-                except ValueError:  # no array: refused when it is read
-                    yield StoredChannel(name, 0, partial(_hdf5_values, file, "", name))
+                except ValueError:  # no array: refused when it is read, if it is no sparse matrix
+                    if not _sparse_rows(archive, name):
+                        yield StoredChannel(name, 0, partial(_hdf5_values, file, "", name))
         for group, name, field in _hdf5.walk(archive):  # fields of structures
-            if group and not group.startswith("#") and field is not None and not field.dtype.hasobject:
+            if group and name == "jc" and (rows := _sparse_rows(archive, group)):
+                whole, columns = group.replace("/", "."), int(field.size if field is not None else 1) - 1
+                yield StoredChannel(whole, rows * columns, partial(_hdf5_sparse, file, group))
+            elif group and _sparse_rows(archive, group):
+                continue
+            elif group and not group.startswith("#") and field is not None and not field.dtype.hasobject:
                 yield _hdf5_channel(file, group, name, field)
 
 
@@ -93,7 +99,49 @@ def _hdf5_values(file: Path, group: str, name: str) -> Any:
         kind = str(stored.get("MATLAB_class", "double"))
         if kind not in NUMERIC_KINDS or stored.get("MATLAB_empty"):
             raise ValueError(f"its variable {name!r} is empty or no array of numbers, but {kind}")
-        return _hdf5.values(item, LARGEST_ARRAY, OTHERWISE)
+        return np.transpose(_hdf5.values(item, LARGEST_ARRAY, OTHERWISE))
+
+
+def _sparse_rows(archive: Any, path: str) -> int:
+    """Return the number of rows of a sparse matrix of version 7.3, which is a group; 0 for others."""
+    try:
+        _hdf5.at(archive, path, "jc")
+        return int(attributes(archive[path]).get("MATLAB_sparse", 0))
+    except (ValueError, TypeError):
+        return 0
+
+
+def _hdf5_sparse(file: Path, path: str) -> np.ndarray:
+    import h5py
+
+    with h5py.File(file, "r") as archive:
+        rows, names = _sparse_rows(archive, path), ("jc", "ir", "data")
+        empty = "data" not in archive[path] and "ir" not in archive[path]
+        arrays = [
+            np.ravel(_hdf5.values(_hdf5.at(archive, path, name), LARGEST_ARRAY, OTHERWISE))
+            for name in (names[:1] if empty else names)
+        ]
+    starts, places, values = (arrays[0], np.zeros(0, int), np.zeros(0)) if empty else arrays
+    return _dense(path, (rows, len(starts) - 1), places, starts, values)
+
+
+def _dense(name: str, shape: tuple[int, int], places: Any, starts: Any, values: Any) -> np.ndarray:
+    """Return a sparse matrix of rows and starts of columns, as an array."""
+    if values.dtype.kind not in "fiub":
+        raise ValueError(f"its variable {name!r} is no matrix of real numbers")
+    if 8 * math.prod(shape) > LARGEST_ARRAY:
+        raise ValueError(f"its matrix {name!r} has more than {LARGEST_ARRAY / 1e9:.3g} GB; {OTHERWISE}")
+    counts, places = np.diff(starts.astype(np.int64)), places.astype(np.int64)
+    used = int(starts[-1]) if len(starts) else -1
+    if len(counts) != shape[1] or not 0 <= used <= min(len(places), len(values)) or starts[0] or min(counts) < 0:
+        raise ValueError(f"its matrix {name!r} has other starts of columns than its size")
+    columns, places, result = np.repeat(np.arange(shape[1]), counts), places[:used], np.zeros(shape)
+    if used and not 0 <= places.min() <= places.max() < shape[0]:
+        raise ValueError(f"its matrix {name!r} has rows beyond its size")
+    if len(np.unique(places * shape[1] + columns)) < used:
+        raise ValueError(f"its matrix {name!r} has two values in one place")
+    result[places, columns] = values[:used]
+    return result
 
 
 def _mat5_channels(file: Path) -> Iterator[StoredChannel]:
@@ -167,7 +215,7 @@ def _fields(name: str, data: memoryview, order: str) -> Iterator[tuple[str, int,
             continue
         path = f"{name}.{label}"
         _, flags, shape, parts = _variable(member, order)
-        if flags & CLASS in NUMERIC:
+        if flags & CLASS in (*NUMERIC, SPARSE):
             yield path, math.prod(shape), ""
         elif flags & CLASS == OPAQUE:
             yield path, 0, object_refusal(_class_of(parts), path)
@@ -226,6 +274,9 @@ def _variable(data: memoryview, order: str) -> tuple[str, int, list[int], Iterat
 
 
 def _array(name: str, flags: int, shape: list[int], parts: Iterator[tuple[int, memoryview]], order: str) -> np.ndarray:
+    if flags & (CLASS | COMPLEX) == SPARSE:
+        places, starts, stored = (np.frombuffer(part, f"{order}{STORED[kind]}") for kind, part in parts)
+        return _dense(name, (shape[0], shape[1]), places, starts, stored)
     if flags & CLASS not in NUMERIC or flags & COMPLEX:
         other = "complex" if flags & COMPLEX else f"of MATLAB class {flags & CLASS}"
         raise ValueError(f"its variable {name!r} is no array of real numbers, but {other}")
@@ -233,4 +284,4 @@ def _array(name: str, flags: int, shape: list[int], parts: Iterator[tuple[int, m
     array = np.frombuffer(values, f"{order}{STORED[kind]}")
     if next(parts, None) is not None or min(shape) < 0 or array.size != math.prod(shape):
         raise ValueError(f"its variable {name!r} has another size than its header says")
-    return array.reshape(shape)
+    return array.reshape(shape, order="F")
