@@ -128,6 +128,7 @@ def structure(
     placed = tuple(elements)
     for element in placed:
         _checks.instance("elements", element, Element)
+    _checks.identifiers("elements", [element.name for element in placed])
     _checks.mapping("forces", forces, "{'force': 0}")
     _checks.mapping("outputs", outputs, "{'x': (0, 'displacement')}")
     at = np.eye(count) if shapes is None else shapes
@@ -196,9 +197,9 @@ def definition(given: MatrixStructure) -> dict[str, Any]:
             d, v = (_combined(at, [s[derivative + x] for x in degrees]) for derivative in DERIVATIVES[:2])
             part = element.evaluate(d, v, s, p)
             internal += part.equations
-            total = [sum_ + _number(w) * part.force if w else sum_ for sum_, w in zip(total, at, strict=True)]
+            total = [sum_ + number_of(w) * part.force if w else sum_ for sum_, w in zip(total, at, strict=True)]
         for name, at in given.inputs.items():
-            total = [sum_ - _number(w) * u[name] if w else sum_ for sum_, w in zip(total, at, strict=True)]
+            total = [sum_ - number_of(w) * u[name] if w else sum_ for sum_, w in zip(total, at, strict=True)]
         return [*total, *internal]
 
     return {
@@ -270,10 +271,10 @@ def _measured(argument: str, given: Any, shapes: np.ndarray) -> tuple[np.ndarray
 
 
 def _combined(weights: np.ndarray, symbols: list[sp.Symbol]) -> sp.Expr:
-    terms = (_number(w) * symbol for w, symbol in zip(weights, symbols, strict=True) if w)
+    terms = (number_of(w) * symbol for w, symbol in zip(weights, symbols, strict=True) if w)
     return sum(terms, sp.S.Zero)
 
 
-def _number(value: float) -> sp.Expr:
+def number_of(value: float) -> sp.Expr:
     """Return a coefficient, 1 and −1 as such."""
     return sp.Integer(int(value)) if abs(value) == 1.0 else sp.Float(float(value))
