@@ -141,14 +141,18 @@ class CondensedParametrised(ParametrisedEquations):
     def solve(
         self, z: np.ndarray, values: np.ndarray, conditions: Change, targets: np.ndarray, scales: np.ndarray
     ) -> Solved:
-        """Solve for z and the unknown with a condition rows·z + corner·value = target; see `ParametrisedEquations`."""
+        """Solve for z and the unknown with a condition rows·z + corner·value = target; see `ParametrisedEquations`.
+
+        The history is that of the steps with a matrix of their own, by whose number the branch adapts its steps.
+        """
         d, value, target = harmonics(z), float(values[0]), float(targets[0])
         (row,), corner = conditions[0], float(conditions[1][0, 0])
         history: list[tuple[float, float, float]] = []
         before, inverse, code, times_low = np.inf, None, STALLED, 1
         for _ in range(MOST_BRANCH_CORRECTIONS):
             here = np.array([value])
-            residual, size = self._residual(d, here, [] if inverse else self._directions)
+            fresh = inverse is None
+            residual, size = self._residual(d, here, self._directions if fresh else [])
             if not np.isfinite(residual).all():
                 code = NOT_FINITE
                 break
@@ -161,7 +165,8 @@ class CondensedParametrised(ParametrisedEquations):
             step, move = inverse(residual, left)
             d, value = d - step, value - move
             length = float(np.hypot(np.linalg.norm(step) / size, move / scales[0]))
-            history.append((float(np.linalg.norm(residual)) / size, length, 1.0))
+            if fresh:
+                history.append((float(np.linalg.norm(residual)) / size, length, 1.0))
             ratio = length / before
             if length <= LAST_BRANCH_CORRECTION or (before < np.inf and length * ratio <= LAST_BRANCH_CORRECTION):
                 code = CONVERGED
