@@ -254,6 +254,11 @@ class CondensedEquations(PeriodicEquations):
         """Return the displacements of the elements (points, elements) for those of all degrees of freedom."""
         return states @ self.model.structure.weights.T
 
+    def states(self, z: np.ndarray, drift: np.ndarray | None = None) -> np.ndarray:
+        """Return d, ḋ, d̈ of the elements side by side, (points, 3·elements)."""
+        d, rates = harmonics(z), self.rates(len(z))
+        return on_grid(np.concatenate([(1j * rates[:, None]) ** order * d for order in range(3)], axis=1), len(z))
+
     def on_points(self, harmonics: np.ndarray) -> np.ndarray:
         """Return values (…, points, columns) on the experiment's grid from harmonics (…, harmonics, columns)."""
         return sampled(harmonics, self.grid.points)
@@ -496,18 +501,32 @@ class CondensedEquations(PeriodicEquations):
 
         `inputs` (directions, grid points, inputs) are changes of the inputs.
         """
-        d, points, rates = harmonics(z), len(z), self.rates(len(z))
+        d, points = harmonics(z), len(z)
         used = np.flatnonzero(directions.any(axis=0))
         forces, matrices, of_d, of_y = self.slopes(d, parameters, used.tolist())
         right, explicit = (np.tensordot(directions[:, used], part, (1, 0)) for part in (of_d, of_y))
         if inputs is not None:
             more = self.input_harmonics(points, inputs)
             right, explicit = right + times(matrices.d_u, more), explicit + times(matrices.y_u, more)
+        return self._moved(forces, matrices, right, explicit)
+
+    def moved_by_forces(self, z: np.ndarray, parameters: np.ndarray, change: np.ndarray) -> Sensitivities | None:
+        """Return derivatives along changes of the elements' forces (directions, points, elements); None if singular."""
+        matrices, f = self.matrices(parameters, len(z))[0], harmonics(change)
+        forces = self.forces(harmonics(z), parameters)
+        return self._moved(forces, matrices, -times(matrices.d_f, f), -times(matrices.y_f, f))
+
+    def _moved(
+        self, forces: Forces, matrices: ResponseMatrices, right: np.ndarray, explicit: np.ndarray
+    ) -> Sensitivities | None:
+        """Return derivatives along what is added to d and the outputs, (directions, harmonics, …), with d held."""
+        points = len(forces.values)
+        rates = self.rates(points)
         moved = _linear_solve(forces, rates, matrices.d_f, right)
         if moved is None:
             return None
         outputs = explicit - times(matrices.y_f, _linearised(forces, rates, moved))
-        return Sensitivities(on_grid(moved, points), self.on_points(outputs), np.zeros(len(directions)))
+        return Sensitivities(on_grid(moved, points), self.on_points(outputs), np.zeros(len(right)))
 
 
 _RECEPTANCES: WeakKeyDictionary[CondensedModel, Receptance] = WeakKeyDictionary()
