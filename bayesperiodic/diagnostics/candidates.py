@@ -100,7 +100,7 @@ def of_elements(model: CondensedModel) -> Model:
     names = [d + name for d in DERIVATIVES for name in model.element_names]
     other: Model = copy(model)
     other.state_symbols, other.input_symbols = dict(zip(names, model.element_symbols, strict=True)), {}
-    other.orders = dict.fromkeys(model.element_names, 1)
+    other.states, other.inputs, other.orders = model.element_names, (), dict.fromkeys(model.element_names, 1)
     return other
 
 
