@@ -512,6 +512,9 @@ class CondensedEquations(PeriodicEquations):
 
     def moved_by_forces(self, z: np.ndarray, parameters: np.ndarray, change: np.ndarray) -> Sensitivities | None:
         """Return derivatives along changes of the elements' forces (directions, points, elements); None if singular."""
+        if not change.size:
+            outputs = np.zeros((len(change), self.grid.points, len(self.model.outputs)))
+            return Sensitivities(np.zeros(change.shape), outputs, np.zeros(len(change)))
         matrices, f = self.matrices(parameters, len(z))[0], harmonics(change)
         forces = self.forces(harmonics(z), parameters)
         return self._moved(forces, matrices, -times(matrices.d_f, f), -times(matrices.y_f, f))

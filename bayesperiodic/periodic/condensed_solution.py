@@ -27,6 +27,8 @@ LEAST_STEP_TURN = 1e-7  # of an undamped mode in a step, below which the formula
 class CondensedSolution(PeriodicSolution):
     """A periodic solution of a condensed model, see `Model.from_matrices`; a `PeriodicSolution` but for the following.
 
+    The stability is unknown where the error of the largest multiplier leaves the side of the unit circle open.
+
     Attributes
     ----------
     linearisation, twice_the_points : array
