@@ -1,7 +1,7 @@
 """Models: differential and output equations in symbolic form, and their time integration."""
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
@@ -18,7 +18,7 @@ from bayesperiodic._expressions import parse
 from bayesperiodic._printing import Printed
 from bayesperiodic.models.matrices import definition, of_modes, structure
 from bayesperiodic.models.names import DERIVATIVES, RESERVED, Names, called, check_derivative_names, with_derivatives
-from bayesperiodic.models.structure import POWERS, MatrixStructure
+from bayesperiodic.models.structure import MatrixStructure
 
 LARGEST_FLOAT = np.finfo(float).max
 # Degrees of freedom above which models of matrices are condensed.
@@ -557,12 +557,6 @@ class CondensedModel(Model):
         """Return 0 for every input."""
         return dict.fromkeys(self.inputs, 0)
 
-    def linear_terms(self) -> Iterator[tuple[sp.Expr, str, int, int]]:
-        """Yield the linear terms: factor, letter and number of the matrix, and the derivative of x."""
-        for (kind, order), letter in zip(POWERS.items(), "MCK", strict=True):
-            for number, factor in enumerate(self.structure.parts[kind]):
-                yield self.structure.factors[factor].symbolic(kind, self.parameter_symbols)[0], letter, number, order
-
     def latex(self) -> str:
         """Return the equation of motion, and the forces of the elements, as a LaTeX ``aligned`` environment."""
         written = {symbol: sp.latex(sp.Symbol(name)) for name, symbol in self.parameter_symbols.items()}
@@ -571,7 +565,7 @@ class CondensedModel(Model):
             for order, mark in enumerate(("d", r"\dot{d}")):
                 written[self.element_symbols[order * count + number]] = f"{mark}_{{{number + 1}}}"
         sums, moved = [], ("x", r"\dot{x}", r"\ddot{x}")
-        for factor, letter, number, order in self.linear_terms():
+        for factor, letter, number, order in self.structure.linear_terms(self.parameter_symbols):
             scale = sp.latex(factor, symbol_names=written)
             scale = rf"\left({scale}\right)" if factor.is_Add else scale
             scale = "" if factor == 1 else rf"{scale}\,"

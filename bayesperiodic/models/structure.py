@@ -1,5 +1,6 @@
 """Matrices, places and elements of a model made by `Model.from_matrices`, without its symbolic equations."""
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from inspect import signature
@@ -7,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+import sympy as sp
 
 from bayesperiodic._expressions import Expression, parse_any
 
@@ -91,6 +93,12 @@ class MatrixStructure:
     def factors(self) -> dict[str, Expression]:
         """The factors of the parts, by their text."""
         return {text: parse_any(kind, text) for kind, named in self.parts.items() for text in named}
+
+    def linear_terms(self, symbols: Mapping[str, sp.Symbol]) -> Iterator[tuple[sp.Expr, str, int, int]]:
+        """Yield the linear terms: factor, letter and number of the matrix, and the derivative of x."""
+        for (kind, order), letter in zip(POWERS.items(), "MCK", strict=True):
+            for number, factor in enumerate(self.parts[kind]):
+                yield self.factors[factor].symbolic(kind, symbols)[0], letter, number, order
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, SINGULAR, STALLED
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, sampled
-from bayesperiodic.periodic.receptance import Receptance
+from bayesperiodic.periodic.receptance import Receptance, unresolved
 from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
 # Points of the grid of the elements, and relative change of the outputs below which they are not doubled.
@@ -543,19 +543,6 @@ def receptance(model: CondensedModel) -> Receptance:
         columns = np.array([*given.weights, *given.inputs.values()])
         _RECEPTANCES[model] = Receptance(given, model.parameters, rows, columns)
     return _RECEPTANCES[model]
-
-
-def unresolved(largest: np.ndarray, f: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return a bound of the relative error of the outputs by the number of points, (…).
-
-    Sampled forces f (…, harmonics, elements) have the harmonics beyond half the points added to the low ones. They are
-    smaller than the largest of the upper half of the harmonics, which is taken to act at that where the frequency
-    response to it is `largest` (outputs, elements). Outputs y are (…, harmonics, outputs).
-    """
-    upper = f[..., f.shape[-2] // 2 :, :]
-    above = np.sqrt(np.max(upper.real**2 + upper.imag**2, axis=-2))
-    size = np.sqrt(np.einsum("...kc,...kc->...c", y.real, y.real) + np.einsum("...kc,...kc->...c", y.imag, y.imag))
-    return np.asarray(np.max(above @ largest.T / np.maximum(size, np.finfo(float).tiny), axis=-1))
 
 
 def _stacked(amplitudes: np.ndarray, unit: float) -> np.ndarray:

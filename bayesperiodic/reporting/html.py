@@ -181,7 +181,7 @@ def _condensed_equations(model: CondensedModel) -> list[Markup]:
     numbers = range(1, count + 1)
     moving = zip(model.element_symbols, ((f"d_{k}", order) for order in range(3) for k in numbers), strict=True)
     printer, terms = _MathPrinter(_names(model) | dict(moving)), []
-    for factor, letter, number, order in model.linear_terms():
+    for factor, letter, number, order in model.structure.linear_terms(model.parameter_symbols):
         scale = printer.text(factor) if factor != 1 else ""
         scale = f"<mrow><mo>(</mo>{scale}<mo>)</mo></mrow>" if factor.is_Add else scale
         terms.append(f"{scale}{printer.named(f'{letter}_{number}')}{printer.named('x', order)}")
