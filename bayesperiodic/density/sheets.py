@@ -1,8 +1,8 @@
 """Points of one sheet of a table's branch at many θ, those beyond its folds included.
 
 Where a solve from the anchor fails, the branch may have no orbit at that frequency. Its fold is solved from that of the
-anchors, for all θ at once, and points beyond it get the orbit there. Where this does not explain all failures, the
-branch is followed from the nearest points that are solved.
+anchors, for all θ at once, and points beyond it get the orbit there. Where this does not explain all failures, and
+for condensed models, the branch is followed from the nearest points that are solved.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,7 +15,9 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.observation import GroupSolution
 from bayesperiodic.periodic.batch import Anchor
 from bayesperiodic.periodic.compiled import CONVERGED, STALLED, SpecialSolution
+from bayesperiodic.periodic.condensed import CondensedEquations
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, null_vector
+from bayesperiodic.periodic.harmonics import harmonics, sampled
 from bayesperiodic.periodic.special import SpecialPoint
 from bayesperiodic.periodic.special_batch import SpecialAnchor, SpecialBatch
 from bayesperiodic.periodic.special_start import fold_equations
@@ -163,7 +165,7 @@ class Sheet:
 
     def _found_fold(self, heading: int, last: int) -> SpecialBatch | None:
         known = [point for point in self.points if point.known]
-        if not (known and self._alike):
+        if not (known and self._alike) or isinstance(self._table[0], CondensedEquations):
             return None
         start = known[-1 if heading > 0 else 0]
         parameters = start.anchor.parameters
@@ -209,7 +211,9 @@ class Sheet:
             for k, equations_there, orbit in _further(equations, parameters, start, z, heading, good):
                 group, member = groups[self.points[k].group], self.points[k].member
                 group.outputs[member, b] = equations_there.outputs(orbit, parameters[k])
-                group.z[member, b], group.frequency[member, b] = orbit, equations_there.frequency
+                points = group.z.shape[2]  # those of a condensed model differ
+                group.z[member, b] = orbit if len(orbit) == points else sampled(harmonics(orbit), points)
+                group.frequency[member, b] = equations_there.frequency
                 group.status[member, b] = CONVERGED
 
 

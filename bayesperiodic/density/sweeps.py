@@ -19,6 +19,7 @@ from bayesperiodic.data.sweep import Sweep
 from bayesperiodic.likelihood.observation import Response
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.equations import PeriodicEquations
+from bayesperiodic.periodic.harmonics import harmonics, sampled
 from bayesperiodic.periodic.solve import solve_driven
 from bayesperiodic.periodic.table_branch import Passage, follow
 from bayesperiodic.problem.description import Description
@@ -158,8 +159,8 @@ def _sheets(choices: Sequence[Sequence[Place]], costs: Sequence[np.ndarray], *, 
 
 def distance(z: np.ndarray, other: np.ndarray) -> float:
     """Return the largest square of the distance of two orbits (points, states), in units of their ranges."""
-    if z.shape != other.shape:
-        return np.inf
+    if len(z) != len(other):  # of a condensed model
+        other = sampled(harmonics(other), len(z))
     size = np.maximum(np.ptp(z, axis=0), np.finfo(float).tiny)
     with np.errstate(over="ignore"):  # orbits of extreme parameters are infinitely far apart
-        return float(np.max(np.square((z - other) / size)))
+        return float(np.max(np.square((z - other) / size), initial=0.0))

@@ -13,8 +13,8 @@ import sympy as sp
 
 from bayesperiodic import _checks
 from bayesperiodic.models.elements import smooth_abs, smooth_sign
-from bayesperiodic.models.model import Model
-from bayesperiodic.models.names import DERIVATIVES, Names, with_derivatives
+from bayesperiodic.models.model import CondensedModel, Model
+from bayesperiodic.models.names import DERIVATIVES, Names, check_derivative_names, with_derivatives
 from bayesperiodic.models.units import Unit, parsed, product, unit_of, written
 
 HIGHEST_DEGREE, HIGHEST_POWER = 3, 5
@@ -51,7 +51,23 @@ def generated(model: Model, where: Iterable[str], deviations: Mapping[str, float
     `deviations` are the standard deviations of the variables along the measured orbits, by name; variables that are
     constant are left out.
     """
-    smooth, steepest = factors(model)
+    if isinstance(model, CondensedModel):
+        each = zip(places(model), _elements_variables(model), strict=True)
+        of_place = {place: _expressions(variables, {}, deviations)[1] for place, variables in each if place in where}
+        return [Term(place, text, e) for place, texts in of_place.items() for text, e in texts.items()]
+    moving, expressions = _expressions(*factors(model), deviations)
+    plain = [Term(place, text, e) for place in where for text, e in expressions.items()]
+    return plain + [
+        Term(place, f"lag({name}) - {f'({name})' if ' ' in name else name}", MEMORY - e, e)
+        for place in where
+        for name, e in (moving | _forces(model, place)).items()
+    ]
+
+
+def _expressions(
+    smooth: Factors, steepest: Factors, deviations: Mapping[str, float]
+) -> tuple[dict[str, sp.Expr], dict[str, sp.Expr]]:
+    """Return the variables that are not constant, and the terms of them, by text."""
     moving = {name: e for name, e in smooth.items() if deviations.get(name, 1.0) > 0.0}
     expressions: dict[str, sp.Expr] = {"1": sp.Integer(1)}
     for degree in range(1, HIGHEST_DEGREE + 1):
@@ -66,12 +82,26 @@ def generated(model: Model, where: Iterable[str], deviations: Mapping[str, float
         expressions |= {f"{other}*abs({name})": factor * size for other, factor in moving.items()}
         expressions[f"sign({name})"] = smooth_sign(e, SIGN_WIDTH * widths[name])
     expressions |= {name: e for name, e in steepest.items() if deviations.get(name, 1.0) > 0.0}
-    plain = [Term(place, text, e) for place in where for text, e in expressions.items()]
-    return plain + [
-        Term(place, f"lag({name}) - {f'({name})' if ' ' in name else name}", MEMORY - e, e)
-        for place in where
-        for name, e in (moving | _forces(model, place)).items()
+    return moving, expressions
+
+
+def _elements_variables(model: CondensedModel) -> list[dict[str, sp.Expr]]:
+    """Return displacement and velocity of each element of a condensed model, by name."""
+    count = len(model.element_names)
+    return [
+        {DERIVATIVES[order] + name: model.element_symbols[order * count + k] for order in range(2)}
+        for k, name in enumerate(model.element_names)
     ]
+
+
+def of_elements(model: CondensedModel) -> Model:
+    """Return a condensed model with the motion of its elements in place of states, and without inputs."""
+    check_derivative_names("elements", "s", model.element_names)
+    names = [d + name for d in DERIVATIVES for name in model.element_names]
+    other: Model = copy(model)
+    other.state_symbols, other.input_symbols = dict(zip(names, model.element_symbols, strict=True)), {}
+    other.states, other.inputs, other.orders = model.element_names, (), dict.fromkeys(model.element_names, 1)
+    return other
 
 
 def _forces(model: Model, place: str) -> dict[str, sp.Expr]:
@@ -93,15 +123,20 @@ def _forces(model: Model, place: str) -> dict[str, sp.Expr]:
 
 
 def places(model: Model) -> tuple[str, ...]:
-    """Return the names of outputs and equations, as `Term` has them."""
+    """Return the names of outputs and equations, as `Term` has them; of a condensed model those of its forces."""
+    if isinstance(model, CondensedModel):
+        return tuple(f"force of {name}" for name in model.element_names)
     return *model.outputs, *(f"equation of {state}" for state in model.states)
 
 
 def factors(model: Model) -> tuple[dict[str, sp.Expr], dict[str, sp.Expr]]:
     """Return the variables whose products are candidates, and the highest derivatives, which are so by themselves.
 
-    Of an angle these are its sine and cosine. Of an input its rate is a variable if the model contains it.
+    Of an angle these are its sine and cosine. Of an input its rate is a variable if the model contains it. Of a
+    condensed model the variables are displacements and velocities of the elements.
     """
+    if isinstance(model, CondensedModel):
+        return {name: symbol for variables in _elements_variables(model) for name, symbol in variables.items()}, {}
     known: dict[str, sp.Expr] = {}
     steepest: dict[str, sp.Expr] = {}
     for state, order in model.orders.items():
@@ -124,6 +159,9 @@ def factors(model: Model) -> tuple[dict[str, sp.Expr], dict[str, sp.Expr]]:
 def given(model: Model, candidates: Mapping[str, Iterable[Any]]) -> list[Term]:
     """Return candidates that were given by place, as texts or functions of (s, p, u)."""
     _checks.mapping("candidates", candidates, "{'force': ['x**2']}")
+    every = model
+    if isinstance(every, CondensedModel):
+        model = of_elements(every)
     spaces = (
         Names("states", model.state_symbols | model.time_symbols),
         Names("parameters", model.parameter_symbols),
@@ -132,7 +170,7 @@ def given(model: Model, candidates: Mapping[str, Iterable[Any]]) -> list[Term]:
     added = []
     for place, terms in candidates.items():
         argument = f"candidates[{place!r}]"
-        _checks.one_of("candidates", place, places(model))
+        _checks.one_of("candidates", place, places(every))
         if isinstance(terms, str) or not isinstance(terms, Iterable):
             raise ValueError(f"{argument}: must be a list of texts or functions of (s, p, u), got {terms!r}.")
         for term in terms:
@@ -143,12 +181,28 @@ def given(model: Model, candidates: Mapping[str, Iterable[Any]]) -> list[Term]:
             for part in (expression, memory):
                 if part is not None:
                     _check_order(model, argument, text, part, place)
+            if isinstance(every, CondensedModel):
+                _check_force(every, argument, text, expression, memory, place)
             added.append(Term(place, text, expression if memory is None else MEMORY + expression, memory))
             try:
-                coefficient_unit(model, added[-1])
+                coefficient_unit(every, added[-1])
             except ValueError as error:
                 raise ValueError(f"{argument}: must add quantities of the same unit, got {text!r}: {error}.") from None
     return added
+
+
+def _check_force(
+    model: CondensedModel, argument: str, text: str, expression: sp.Expr, memory: sp.Expr | None, place: str
+) -> None:
+    """Refuse terms that are no function of the motion of the place's element and of parameters."""
+    variables = _elements_variables(model)[places(model).index(place)]
+    if memory is not None:
+        raise ValueError(f"{argument}: must be without memory for {model.name!r}, which is condensed, got {text!r}.")
+    if expression.free_symbols - {*variables.values(), *model.parameter_symbols.values()}:
+        raise ValueError(
+            f"{argument}: must contain only {' and '.join(variables)} and parameters, for {model.name!r} is condensed, "
+            f"got {text!r}."
+        )
 
 
 def _lagged(argument: str, text: str) -> tuple[str | None, str]:
@@ -221,6 +275,8 @@ def coefficient_unit(model: Model, term: Term) -> str:
 
     A ValueError is raised for a term that adds quantities of different dimensions.
     """
+    if isinstance(model, CondensedModel):  # whose states have no units
+        return ""
     units, index = symbol_units(model), places(model).index(term.place)
     if term.force is not None and (memory := unit_of(term.force, units)) is not None:
         units[MEMORY] = memory
@@ -273,6 +329,12 @@ def extended(model: Model, terms: Mapping[str, Term]) -> Model:
     other.state_symbols = with_derivatives("s", other.states)
     other.orders = model.orders | dict.fromkeys(other.states[len(model.states) :], 1)
     other.units = model.units | {name: coefficient_unit(model, term) for name, term in terms.items()}
+    if isinstance(model, CondensedModel) and isinstance(other, CondensedModel):
+        forces = list(model.element_forces)
+        for name, term in terms.items():
+            forces[places(model).index(term.place)] += symbols[name] * term.expression
+        other.element_forces = tuple(forces)
+        return other
     equations, outputs = list(model.equations), list(model.output_expressions)
     for name, term in terms.items():
         index, expression = places(model).index(term.place), term.expression

@@ -23,7 +23,7 @@ from bayesperiodic.estimation.modes import NOTABLE, found_from, notable
 from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
-from bayesperiodic.models.model import Model
+from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.models.sensed import DELAY, sensor_name
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.problem.parameters import SHIFT
@@ -33,12 +33,14 @@ from bayesperiodic.symmetry.sensors import with_sensors
 from bayesperiodic.symmetry.structure import Structure, analyse_structure
 
 
-def structure_of(problem: Problem) -> Structure:
+def structure_of(problem: Problem) -> Structure | None:
     """Return the structural identifiability of a problem: its model, measured channels, free parameters and ties.
 
     A parameter that is fixed at zero in every experiment is removed from the equations, any other fixed one is known. A
-    local parameter counts as one.
+    local parameter counts as one. None for a condensed model, which has no symbolic equations.
     """
+    if isinstance(problem.model, CondensedModel):
+        return None
     free = set(problem.plain_names.values())
     known = tuple(name for name in problem.model.parameters if name in problem.fixed and name not in free)
     zeros = tuple(sorted(name for name in known if set(problem.fixed[name].values()) == {0.0}))
@@ -156,6 +158,10 @@ PRIOR_DRAWS = 20_000
 BOTH_SIGNS = "both signs fit the data: use a prior of one sign, or measure an output that is odd in it"
 # Columns of the printed table, by their titles.
 COLUMN_TITLES = {"data sd": "together", "others known": "alone", "prior sensitivity": "prior_sensitivity"}
+NO_STRUCTURE = (
+    "The model is condensed, without symbolic equations: structural symmetries, and other values of the same "
+    "likelihood by them, were not searched. Combinations are those of the Fisher information at the estimate."
+)
 OTHER_VALUES = "give a prior that excludes the other value, or measure an output that differs between them"
 
 
@@ -187,8 +193,9 @@ class Identifiability(Result):
     experiments : DataFrame
         Candidates for a further experiment, the most informative first: expected gain in nats, and the remaining
         fraction of each parameter's sd.
-    structure : Structure
-        Of the free parameters, from the measured channels.
+    structure : Structure or None
+        Of the free parameters, from the measured channels; None for a condensed model (`Model.from_matrices`), which
+        has no symbolic equations.
     converged : bool
         False if there are draws that have not converged.
     basis : str
@@ -206,7 +213,7 @@ class Identifiability(Result):
     spectrum: np.ndarray
     condition: float
     experiments: pd.DataFrame
-    structure: Structure
+    structure: Structure | None
     converged: bool
     basis: str
 
@@ -262,7 +269,8 @@ def identifiability(
     4. "only with the prior": the profile (Raue et al., Bioinformatics 25 (2009) 1923-1929) ends at the support of the
        prior on one side, although the parameter is not collinear with others.
     5. "not determined": with all other parameters known, the data have less than 1 % of the information of the prior.
-    6. "only in combination": a structural symmetry of the equations contains the parameter, see `structure`.
+    6. "only in combination": a structural symmetry of the equations contains the parameter, see `structure`. Not
+       examined for condensed models.
     7. "determined": with the other parameters unknown, the data alone leave less than a third of the prior sd.
     8. "only in combination" if the other parameters increase its sd at least fivefold, otherwise "only with the prior".
 
@@ -336,6 +344,7 @@ def identifiability(
             row["remedy"] = advice
         row["remarks"] = ", ".join(remarks)
         row["evidence"] = ", ".join([*_numbers(row), *remarks])
+    wrong = misfit(problem, fit)
     return Identifiability(
         pd.DataFrame.from_dict(rows, orient="index"),
         directions,
@@ -344,7 +353,9 @@ def identifiability(
         experiments,
         structure,
         converged=posterior is None or posterior.converged,
-        basis="\n".join([_basis(fit, posterior), *([f"{wrong}."] if (wrong := misfit(problem, fit)) else [])]),
+        basis="\n".join(
+            filter(None, [_basis(fit, posterior), "" if structure else NO_STRUCTURE, wrong and f"{wrong}."])
+        ),
     )
 
 
@@ -362,13 +373,13 @@ def _basis(fit: MapEstimate, posterior: Posterior | None) -> str:
     return f"No draws: the verdicts rest on the Laplace approximation at the only optimum {found_from(starts)}."
 
 
-def _structural_images(problem: Problem, fit: MapEstimate, structure: Structure) -> dict[str, list[float]]:
+def _structural_images(problem: Problem, fit: MapEstimate, structure: Structure | None) -> dict[str, list[float]]:
     """Return the values of parameters at images of the estimate under discrete symmetries that the prior allows.
 
     There the likelihood is the same; the prior density must be more than 1 % of that at the estimate.
     """
     images: dict[str, list[float]] = {}
-    for change in structure.discrete:
+    for change in structure.discrete if structure else ():
         moves = {name: image for name, image in change.transformation.items() if name in change.parameters}
         if moves.keys() <= fit.theta.keys():
             values = {
@@ -381,9 +392,10 @@ def _structural_images(problem: Problem, fit: MapEstimate, structure: Structure)
     return images
 
 
-def _partners(structure: Structure, plain: str) -> str:
+def _partners(structure: Structure | None, plain: str) -> str:
     """Return the parameters of the structural symmetries that contain one, itself included."""
-    names = [p for symmetry in structure.symmetries if plain in symmetry.parameters for p in symmetry.parameters]
+    symmetries = structure.symmetries if structure else ()
+    names = [p for symmetry in symmetries if plain in symmetry.parameters for p in symmetry.parameters]
     return ", ".join(dict.fromkeys(names))
 
 
@@ -498,7 +510,7 @@ def _remarks(row: dict) -> list[str]:
     return causes + ([f"{others} at another optimum with more than 1 % of the mass"] if others else [])
 
 
-def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame, structure: Structure) -> str:
+def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame, known: Structure | None) -> str:
     if row["verdict"] in (DETERMINED, SEVERAL):
         return "" if row["verdict"] == DETERMINED else OTHER_VALUES
     if row["verdict"] == CONFLICT:
@@ -506,7 +518,7 @@ def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.Data
     if row["verdict"] == COMBINATION:
         rows = directions[[name in members.split(", ") for members in directions["parameters"]]]
         rows = rows[rows["gain"] < UNDETERMINED_GAIN]
-        members, combos = row["structural"], ", ".join(structure.combinations)
+        members, combos = row["structural"], ", ".join(known.combinations if known else ())
         if not members and len(rows):
             members, combos = rows.iloc[0][["parameters", "combinations"]]
         if members:

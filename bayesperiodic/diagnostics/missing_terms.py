@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -294,12 +293,18 @@ def missing_terms(
     a free parameter. Where the data determine only the product of coefficient and τ, the coefficient is tested at the
     estimate of τ.
 
+    Of a condensed model (`Model.from_matrices`) the terms are forces of its elements. Those in "force of joint", of the
+    element joint, are functions of its displacement ``joint`` and its velocity ``djoint``; terms in outputs and terms
+    with memory are not searched. Give the model elements without a force, such as
+    ``Element("probe", lambda: 0, (3, 4))``, where a force may be missing.
+
     Parameters
     ----------
     problem : Problem
     fit : MapEstimate
     candidates : mapping of str to list, optional
-        Further terms by place, an output or "equation of x": texts in the model's names, or functions of (s, p, u).
+        Further terms by place, an output, "equation of x", or "force of joint" of a condensed model: texts in the
+        model's names, or functions of (s, p, u).
         A text may begin with the lag of an expression, ``"lag(x**2)"`` or ``"lag(x**2) - x**2"``.
     equations, outputs : bool
         Whether terms of the model's variables are candidates in the equations, and in the outputs.
@@ -346,8 +351,8 @@ def missing_terms(
         raise ValueError(f"false_discovery_rate: must be between 0 and 1, got {false_discovery_rate!r}.")
     model = problem.settings["model"]
     terms = given(model, candidates or {})
-    wanted = (outputs,) * len(model.outputs) + (equations,) * len(model.states)
-    terms += generated(model, list(compress(places(model), wanted)), variable_deviations(stated, fit))
+    wanted = [place for place in places(model) if (outputs if place in model.outputs else equations)]
+    terms += generated(model, wanted, variable_deviations(stated, fit))
     left_out = {exclude} if isinstance(exclude, str) else set(exclude)
     chosen = {str(t): t for t in terms if not {t.text, t.place, str(t)} & left_out}
     return _Search(problem, list(chosen.values()), false_discovery_rate, keep, lags_to_try(fit)).run(fit, max_terms)

@@ -17,7 +17,6 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.quantities import peak_to_peak
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.equations import PeriodicEquations
-from bayesperiodic.periodic.solution import as_guess
 from bayesperiodic.periodic.solve import solve_driven
 from bayesperiodic.periodic.table_branch import between, follow
 
@@ -123,8 +122,7 @@ def curves(problem: Problem, fit: MapEstimate) -> dict[Sweep, Curve]:
             fine += [between(rows[k - 1], rows[k], part / parts) for part in range(1, parts)] + [rows[k]]
             at += [parameters[k - 1]] * (parts - 1) + [parameters[k]]
         first = fit.solutions[table[0].name]
-        start = as_guess(rows[0], first) if first.frequency == rows[0].frequency else None
-        z = solve_driven(rows[0], at[0], "static")[0].z if start is None else start
+        z = solve_driven(rows[0], at[0], first if first.frequency == rows[0].frequency else "static")[0].z
         with np.errstate(all="ignore"):
             passages = list(follow(fine, at, 0, z))
         folds, last, given = np.array([p.is_fold for p in passages]), 0, []

@@ -11,12 +11,13 @@ from bayesperiodic import _fourier
 from bayesperiodic._linalg import column_space
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.diagnostics.candidates import MEMORY, Term, factors, places, values
+from bayesperiodic.diagnostics.candidates import MEMORY, Term, factors, of_elements, places, values
 from bayesperiodic.estimation.adequacy import Whitened, used
 from bayesperiodic.estimation.covariance import predicted_changes, residual_variances
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.quantities import Quantities
+from bayesperiodic.periodic.condensed import CondensedEquations
 from bayesperiodic.periodic.equations import PeriodicEquations, respond
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 
@@ -142,6 +143,11 @@ def along_orbit(
 ) -> np.ndarray:
     """Return expressions of the model's symbols along an orbit (terms, points)."""
     equations, z, parameters = _at(problem, theta, experiment, solution)
+    if isinstance(equations, CondensedEquations):
+        none, still = np.empty((len(z), 0)), np.zeros(len(z))
+        return values(
+            of_elements(equations.model), terms, equations.states(z), none, parameters, still, equations.frequency
+        )
     return values(
         problem.model, terms, equations.states(z), equations.inputs, parameters, equations.grid.tau, equations.frequency
     )
@@ -168,7 +174,10 @@ def _at(
     """Return equations, z (points, states) and the model's parameters of an orbit."""
     equations = problem.equations[experiment.name].at_frequency(solution.frequency)
     parameters = problem.parameters(theta[None], experiment.name)[0]
-    return equations, periodic_part(equations, solution.states), parameters
+    z = periodic_part(equations, solution.states)
+    if isinstance(equations, CondensedEquations):  # on as many points as it takes
+        z = equations.find(parameters, z)[0].z
+    return equations, z, parameters
 
 
 def _effects(
@@ -179,7 +188,7 @@ def _effects(
     NaN for terms that are not finite along an orbit.
     """
     where = np.array([places(problem.model).index(term.place) for term in terms], dtype=int)
-    outputs, effects = len(problem.model.outputs), []
+    outputs, effects = sum(place in problem.model.outputs for place in places(problem.model)), []
     for e in problem.experiments:
         equations, z, parameters = _at(problem, theta, e, solutions[e.name])
         listed = [term.expression.xreplace({MEMORY: sp.Integer(0)}) for term in terms]
@@ -191,8 +200,11 @@ def _effects(
         added = np.zeros((len(terms), len(z), outputs + equations.count))
         added[np.arange(len(terms)), :, where] = np.where(finite[:, None], along, 0.0)
         f, g = np.ascontiguousarray(added[..., :outputs]), np.ascontiguousarray(added[..., outputs:])
-        columns, derivatives = equations.residual_jacobian(z, parameters), equations.derivatives(z, parameters)
-        moved = respond(equations, z, columns, derivatives, g, f)
+        if isinstance(equations, CondensedEquations):
+            moved = equations.moved_by_forces(z, parameters, g)
+        else:
+            columns, derivatives = equations.residual_jacobian(z, parameters), equations.derivatives(z, parameters)
+            moved = respond(equations, z, columns, derivatives, g, f)
         sizes = [block.size for block in problem.observations[e.name].blocks]
         caused = np.full((len(terms), sum(sizes)), np.nan)
         if moved is not None:

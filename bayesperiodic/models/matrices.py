@@ -135,6 +135,7 @@ def structure(
     placed = tuple(elements)
     for element in placed:
         _checks.instance("elements", element, Element)
+    _checks.identifiers("elements", [element.name for element in placed])
     forces = _checks.mapping("forces", {} if forces is None else forces, "{'force': 0}")
     base = _checks.mapping("base", {} if base is None else base, "{'ground': (np.ones(3), 'acceleration')}")
     _checks.mapping("outputs", outputs, "{'x': (0, 'displacement')}")
@@ -243,15 +244,15 @@ def definition(given: MatrixStructure) -> dict[str, Any]:
             d, v = (_combined(at, [s[derivative + x] for x in degrees]) for derivative in DERIVATIVES[:2])
             part = element.evaluate(d, v, s, p)
             internal += part.equations
-            total = [sum_ + _number(w) * part.force if w else sum_ for sum_, w in zip(total, at, strict=True)]
+            total = [sum_ + number_of(w) * part.force if w else sum_ for sum_, w in zip(total, at, strict=True)]
         for name, at in given.inputs.items():
-            total = [sum_ - _number(w) * u[name] if w else sum_ for sum_, w in zip(total, at, strict=True)]
+            total = [sum_ - number_of(w) * u[name] if w else sum_ for sum_, w in zip(total, at, strict=True)]
         for name, base in given.bases.items():
             for factor, at in base.loads.items():
                 expression = given.factors[factor]
                 acceleration = expression.symbolic("mass", {n: p[n] for n in expression.names})[0]
                 acceleration *= u[DERIVATIVES[2 - base.order] + name]
-                total = [sum_ + _number(w) * acceleration if w else sum_ for sum_, w in zip(total, at, strict=True)]
+                total = [sum_ + number_of(w) * acceleration if w else sum_ for sum_, w in zip(total, at, strict=True)]
         return [*total, *internal]
 
     return {
@@ -262,7 +263,7 @@ def definition(given: MatrixStructure) -> dict[str, Any]:
         "outputs": lambda s, p, u: {
             name: _combined(at, [s[DERIVATIVES[order] + x] for x in degrees])
             + sum(
-                _number(w) * u[DERIVATIVES[order - given.bases[b].order] + b]
+                number_of(w) * u[DERIVATIVES[order - given.bases[b].order] + b]
                 for b, w in given.carried.get(name, {}).items()
             )
             for name, (at, order) in given.measured.items()
@@ -368,10 +369,10 @@ def _measured(
 
 
 def _combined(weights: np.ndarray, symbols: list[sp.Symbol]) -> sp.Expr:
-    terms = (_number(w) * symbol for w, symbol in zip(weights, symbols, strict=True) if w)
+    terms = (number_of(w) * symbol for w, symbol in zip(weights, symbols, strict=True) if w)
     return sum(terms, sp.S.Zero)
 
 
-def _number(value: float) -> sp.Expr:
+def number_of(value: float) -> sp.Expr:
     """Return a coefficient, 1 and −1 as such."""
     return sp.Integer(int(value)) if abs(value) == 1.0 else sp.Float(float(value))

@@ -481,6 +481,7 @@ class CondensedModel(Model):
             forces.append(self._element_force(element.evaluate(d, v, s, p).force))
         self.element_forces = tuple(forces)
         self._warn_of_unused(forces, [n for n in self.parameters if n not in structure.parameters])
+        self.element_names = tuple(element.name for element in structure.elements)
         # Functions cannot be pickled; what they returned is kept.
         self.structure = replace(structure, elements=())
         self.angles, self.units, self.orders = (), {}, dict.fromkeys(self.states, 2)

@@ -1,5 +1,6 @@
 """Matrices, places and elements of a model made by `Model.from_matrices`, without its symbolic equations."""
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
@@ -113,6 +114,12 @@ class MatrixStructure:
         """The factors of the parts, by their text."""
         return {text: parse_any(kind, text) for kind, named in self.parts.items() for text in named}
 
+    def linear_terms(self, symbols: Mapping[str, sp.Symbol]) -> Iterator[tuple[sp.Expr, str, int, int]]:
+        """Yield the linear terms: factor, letter and number of the matrix, and the derivative of x."""
+        for (kind, order), letter in zip(POWERS.items(), "MCK", strict=True):
+            for number, factor in enumerate(self.parts[kind]):
+                yield self.factors[factor].symbolic(kind, symbols)[0], letter, number, order
+
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names in the factors."""
@@ -142,16 +149,13 @@ class MatrixStructure:
 
     def latex(self, parameters: dict[str, sp.Symbol], written: dict[sp.Symbol, str]) -> str:
         """Return the equation of motion in LaTeX; symbols of the parameters by name, and how symbols are written."""
-        kinds = {"mass": ("M", r"\ddot{x}"), "damping": ("C", r"\dot{x}"), "stiffness": ("K", "x")}
-        sums, masses = [], []
-        for kind, (letter, motion) in kinds.items():
-            for number, factor in enumerate(self.parts[kind]):
-                expression, _ = self.factors[factor].symbolic(kind, parameters)
-                scale = sp.latex(expression, symbol_names=written)
-                scale = rf"\left({scale}\right)" if expression.is_Add else scale
-                scale = "" if factor == CONSTANT_PART else rf"{scale}\,"
-                sums.append(f"{scale}{letter}_{{{number}}} {motion}")
-                masses += [f"{scale}{letter}_{{{number}}}"] if kind == "mass" else []
+        sums, masses, moved = [], [], ("x", r"\dot{x}", r"\ddot{x}")
+        for factor, letter, number, order in self.linear_terms(parameters):
+            scale = sp.latex(factor, symbol_names=written)
+            scale = rf"\left({scale}\right)" if factor.is_Add else scale
+            matrix = f"{letter}_{{{number}}}" if factor == 1 else rf"{scale}\,{letter}_{{{number}}}"
+            sums.append(f"{matrix} {moved[order]}")
+            masses += [matrix] if order == POWERS["mass"] else []
         mass = masses[0] if len(masses) == 1 else rf"\left({' + '.join(masses)}\right)"
         right = ["B u"] if self.inputs or not self.bases else []
         for number, (name, base) in enumerate(self.bases.items()):

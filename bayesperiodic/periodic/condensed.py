@@ -25,7 +25,7 @@ from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, SINGULAR, STALLED
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, sampled
-from bayesperiodic.periodic.receptance import Receptance
+from bayesperiodic.periodic.receptance import Receptance, unresolved
 from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
 # Points of the grid of the elements, and relative change of the outputs below which they are not doubled.
@@ -255,6 +255,11 @@ class CondensedEquations(PeriodicEquations):
     def reduced(self, states: np.ndarray) -> np.ndarray:
         """Return the displacements of the elements (points, elements) for those of all degrees of freedom."""
         return states @ self.model.structure.weights.T
+
+    def states(self, z: np.ndarray, drift: np.ndarray | None = None) -> np.ndarray:
+        """Return d, ḋ, d̈ of the elements side by side, (points, 3·elements)."""
+        d, rates = harmonics(z), self.rates(len(z))
+        return on_grid(np.concatenate([(1j * rates[:, None]) ** order * d for order in range(3)], axis=1), len(z))
 
     def on_points(self, harmonics: np.ndarray) -> np.ndarray:
         """Return values (…, points, columns) on the experiment's grid from harmonics (…, harmonics, columns)."""
@@ -498,18 +503,35 @@ class CondensedEquations(PeriodicEquations):
 
         `inputs` (directions, grid points, inputs) are changes of the inputs.
         """
-        d, points, rates = harmonics(z), len(z), self.rates(len(z))
+        d, points = harmonics(z), len(z)
         used = np.flatnonzero(directions.any(axis=0))
         forces, matrices, of_d, of_y = self.slopes(d, parameters, used.tolist())
         right, explicit = (np.tensordot(directions[:, used], part, (1, 0)) for part in (of_d, of_y))
         if inputs is not None:
             more = self.input_harmonics(points, inputs)
             right, explicit = right + times(matrices.d_u, more), explicit + times(matrices.y_u, more)
+        return self._moved(forces, matrices, right, explicit)
+
+    def moved_by_forces(self, z: np.ndarray, parameters: np.ndarray, change: np.ndarray) -> Sensitivities | None:
+        """Return derivatives along changes of the elements' forces (directions, points, elements); None if singular."""
+        if not change.size:
+            outputs = np.zeros((len(change), self.grid.points, len(self.model.outputs)))
+            return Sensitivities(np.zeros(change.shape), outputs, np.zeros(len(change)))
+        matrices, f = self.matrices(parameters, len(z))[0], harmonics(change)
+        forces = self.forces(harmonics(z), parameters)
+        return self._moved(forces, matrices, -times(matrices.d_f, f), -times(matrices.y_f, f))
+
+    def _moved(
+        self, forces: Forces, matrices: ResponseMatrices, right: np.ndarray, explicit: np.ndarray
+    ) -> Sensitivities | None:
+        """Return derivatives along what is added to d and the outputs, (directions, harmonics, …), with d held."""
+        points = len(forces.values)
+        rates = self.rates(points)
         moved = _linear_solve(forces, rates, matrices.d_f, right)
         if moved is None:
             return None
         outputs = explicit - times(matrices.y_f, _linearised(forces, rates, moved))
-        return Sensitivities(on_grid(moved, points), self.on_points(outputs), np.zeros(len(directions)))
+        return Sensitivities(on_grid(moved, points), self.on_points(outputs), np.zeros(len(right)))
 
 
 _RECEPTANCES: WeakKeyDictionary[CondensedModel, Receptance] = WeakKeyDictionary()
@@ -523,19 +545,6 @@ def receptance(model: CondensedModel) -> Receptance:
         columns = np.array([*given.weights, *given.inputs.values()])
         _RECEPTANCES[model] = Receptance(given, model.parameters, rows, columns)
     return _RECEPTANCES[model]
-
-
-def unresolved(largest: np.ndarray, f: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return a bound of the relative error of the outputs by the number of points, (…).
-
-    Sampled forces f (…, harmonics, elements) have the harmonics beyond half the points added to the low ones. They are
-    smaller than the largest of the upper half of the harmonics, which is taken to act at that where the frequency
-    response to it is `largest` (outputs, elements). Outputs y are (…, harmonics, outputs).
-    """
-    upper = f[..., f.shape[-2] // 2 :, :]
-    above = np.sqrt(np.max(upper.real**2 + upper.imag**2, axis=-2))
-    size = np.sqrt(np.einsum("...kc,...kc->...c", y.real, y.real) + np.einsum("...kc,...kc->...c", y.imag, y.imag))
-    return np.asarray(np.max(above @ largest.T / np.maximum(size, np.finfo(float).tiny), axis=-1))
 
 
 def _stacked(amplitudes: np.ndarray, unit: float) -> np.ndarray:

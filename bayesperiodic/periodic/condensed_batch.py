@@ -11,10 +11,9 @@ from bayesperiodic.periodic.condensed import (
     CondensedEquations,
     Preconditioner,
     ResponseMatrices,
-    unresolved,
 )
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized
-from bayesperiodic.periodic.receptance import compiled
+from bayesperiodic.periodic.receptance import compiled, unresolved
 
 FEWEST_CONDENSED_SOLVES = 4
 # Parts of the way from an anchor in which a solution is followed, and largest correction in units of the predicted

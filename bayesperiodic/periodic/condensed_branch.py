@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -19,9 +20,11 @@ from bayesperiodic.periodic.condensed import (
     residual_of,
     times,
 )
-from bayesperiodic.periodic.equations import FREQUENCY, Solved
+from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized
 
+# Factor of the number of coupled harmonics where corrections do not contract, and size of these below which it is so.
+MORE_COUPLED, SMALL_CORRECTION = 4, 1e-2
 # Corrections of a point, their largest ratio, relative size of the last one, and that below which a matrix is reused.
 MOST_BRANCH_CORRECTIONS, BRANCH_CONTRACTION, LAST_BRANCH_CORRECTION, REUSED = 15, 0.7, 1e-10, 0.1
 
@@ -34,11 +37,18 @@ class _Bordered:
     """
 
     def __init__(
-        self, given: tuple[Forces, np.ndarray, ResponseMatrices], slope: np.ndarray, row: np.ndarray, corner: float
+        self,
+        given: tuple[Forces, np.ndarray, ResponseMatrices],
+        slope: np.ndarray,
+        row: np.ndarray,
+        corner: float,
+        times_low: int,
     ):
-        forces, rates, matrices = given
+        (forces, rates, matrices), points = given, len(row)
         inverse = Preconditioner(forces, rates, matrices.d_f)
-        self._low, self._slope, points = inverse.low, slope, len(row)
+        if times_low > 1:
+            inverse = Preconditioner(forces, rates, matrices.d_f, min(times_low * inverse.low, points // 2))
+        self._low, self._slope = inverse.low, slope
         self._row = harmonics(row) * np.where(np.arange(points // 2) == 0, points, 2 * points)[:, None]
         size = len(inverse.matrix)
         matrix = np.empty((size + 1, size + 1))
@@ -68,7 +78,8 @@ class _Bordered:
 class CondensedParametrised(ParametrisedEquations):
     """Condensed equations that depend on one unknown: the frequency, a parameter, or the factor of `input_change`.
 
-    See `arclength.ParametrisedEquations`. z has any number of points that is a power of two.
+    See `arclength.ParametrisedEquations`, also for inputs that depend on the frequency. z has any number of points that
+    is a power of two.
     """
 
     equations: CondensedEquations
@@ -84,7 +95,10 @@ class CondensedParametrised(ParametrisedEquations):
         if self.free[0] == INPUTS:
             return replace(equations, inputs=equations.inputs + value * self.input_change), self.parameters
         if self.free[0] == FREQUENCY:
-            return equations.at_frequency(value), self.parameters
+            here = equations.at_frequency(value)
+            if self.input_change.size:
+                here = replace(here, inputs=here.inputs + value * self.input_change)
+            return here, self.parameters
         return equations, np.where(np.arange(self.parameters.size) == self._index, value, self.parameters)
 
     @property
@@ -98,17 +112,21 @@ class CondensedParametrised(ParametrisedEquations):
         matrices, load = equations.matrices(theta, 2 * len(d), directions)[0], equations.input_harmonics(2 * len(d))
         return residual_of(d, equations.forces(d, theta), matrices, times(matrices.d_u, load))
 
-    def _bordered(self, d: np.ndarray, values: np.ndarray, row: np.ndarray, corner: float) -> _Bordered:
-        """Return the factors of the linearised equations and a condition row·z + corner·value."""
+    def _bordered(
+        self, d: np.ndarray, values: np.ndarray, row: np.ndarray, corner: float, times_low: int = 1
+    ) -> _Bordered:
+        """Return the factors of the linearised equations and a condition row·z + corner·value.
+
+        `times_low` times as many harmonics as elsewhere are taken as coupled.
+        """
         equations, theta = self.at(values)
         points = 2 * len(d)
         forces, matrices, of_d, _ = equations.slopes(d, theta, self._directions)
-        if self._directions:
-            slope = -of_d[0]
-        else:
+        slope = -of_d[0] if self._directions else np.zeros_like(d)
+        if self.input_change.size:
             change = self.input_change[:, : len(equations.model.inputs)]
-            slope = -times(matrices.d_u, equations.input_harmonics(points, change))
-        return _Bordered((forces, equations.rates(points), matrices), slope, row, corner)
+            slope = slope - times(matrices.d_u, equations.input_harmonics(points, change))
+        return _Bordered((forces, equations.rates(points), matrices), slope, row, corner, times_low)
 
     def along(self, z: np.ndarray, values: np.ndarray, conditions: Change) -> Change | None:
         """Return the change along the branch for which the condition is 1; None if it is not unique."""
@@ -123,19 +141,23 @@ class CondensedParametrised(ParametrisedEquations):
     def solve(
         self, z: np.ndarray, values: np.ndarray, conditions: Change, targets: np.ndarray, scales: np.ndarray
     ) -> Solved:
-        """Solve for z and the unknown with a condition rows·z + corner·value = target; see `ParametrisedEquations`."""
+        """Solve for z and the unknown with a condition rows·z + corner·value = target; see `ParametrisedEquations`.
+
+        The history is that of the steps with a matrix of their own, by whose number the branch adapts its steps.
+        """
         d, value, target = harmonics(z), float(values[0]), float(targets[0])
         (row,), corner = conditions[0], float(conditions[1][0, 0])
         history: list[tuple[float, float, float]] = []
-        before, inverse, code = np.inf, None, STALLED
+        before, inverse, code, times_low = np.inf, None, STALLED, 1
         for _ in range(MOST_BRANCH_CORRECTIONS):
             here = np.array([value])
-            residual, size = self._residual(d, here, [] if inverse else self._directions)
+            fresh = inverse is None
+            residual, size = self._residual(d, here, self._directions if fresh else [])
             if not np.isfinite(residual).all():
                 code = NOT_FINITE
                 break
             try:
-                inverse = inverse or self._bordered(d, here, row, corner)
+                inverse = inverse or self._bordered(d, here, row, corner, times_low)
             except np.linalg.LinAlgError:
                 code = SINGULAR
                 break
@@ -143,13 +165,17 @@ class CondensedParametrised(ParametrisedEquations):
             step, move = inverse(residual, left)
             d, value = d - step, value - move
             length = float(np.hypot(np.linalg.norm(step) / size, move / scales[0]))
-            history.append((float(np.linalg.norm(residual)) / size, length, 1.0))
+            if fresh:
+                history.append((float(np.linalg.norm(residual)) / size, length, 1.0))
             ratio = length / before
             if length <= LAST_BRANCH_CORRECTION or (before < np.inf and length * ratio <= LAST_BRANCH_CORRECTION):
                 code = CONVERGED
                 break
             if ratio > BRANCH_CONTRACTION:
-                break
+                if times_low > 1 or before > SMALL_CORRECTION:
+                    break
+                # Close to a fold the coupling of the higher harmonics counts, however weak.
+                times_low = MORE_COUPLED
             inverse, before = inverse if ratio < REUSED else None, length
         z = on_grid(d, len(z))
         if code == CONVERGED and len(z) >= MOST_ELEMENT_POINTS and not self._bound(z, value) <= LARGEST_OUTPUT_CHANGE:
@@ -167,6 +193,12 @@ class CondensedParametrised(ParametrisedEquations):
     def on_twice_the_points(self, z: np.ndarray) -> np.ndarray:
         """Return the same series of harmonics on twice the points."""
         return on_grid(resized(harmonics(z), 2 * len(z)), 2 * len(z))
+
+
+def with_unknowns(equations: PeriodicEquations, *given: Any, **settings: Any) -> ParametrisedEquations:
+    """Return the equations with further unknowns, condensed or discretised; see `ParametrisedEquations`."""
+    kind = CondensedParametrised if isinstance(equations, CondensedEquations) else ParametrisedEquations
+    return kind(equations, *given, **settings)  # type: ignore[arg-type]
 
 
 def _flat(amplitudes: np.ndarray) -> np.ndarray:

@@ -25,7 +25,10 @@ LEAST_STEP_TURN = 1e-7  # of an undamped mode in a step, below which the formula
 
 @dataclass(frozen=True, repr=False)
 class CondensedSolution(PeriodicSolution):
-    """A periodic solution of a condensed model, see `Model.from_matrices`; a `PeriodicSolution` but for the following.
+    """A periodic solution of a condensed model, see `Model.from_matrices`.
+
+    It is a `bayesperiodic.PeriodicSolution` but for the following. The stability is unknown where the error of the
+    largest multiplier leaves the side of the unit circle open.
 
     Attributes
     ----------

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from scipy.optimize import brentq
@@ -20,7 +20,7 @@ from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.arclength import INPUTS, BranchPoint, ParametrisedEquations, Tracer, trace
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR
 from bayesperiodic.periodic.condensed import CondensedEquations
-from bayesperiodic.periodic.condensed_branch import CondensedParametrised
+from bayesperiodic.periodic.condensed_branch import with_unknowns
 from bayesperiodic.periodic.condensed_solution import described
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved, null_vector
 from bayesperiodic.periodic.solution import (
@@ -326,7 +326,6 @@ def _parametrised(
 ) -> tuple[ParametrisedEquations, np.ndarray]:
     """Return the equations with the varied quantity (and an autonomous model's frequency) free, and its values."""
     model = equations.model
-    kind: Any = CondensedParametrised if isinstance(equations, CondensedEquations) else ParametrisedEquations
     allowed = [*model.parameters, *model.inputs, *([] if model.autonomous else [FREQUENCY])]
     _checks.one_of("vary", vary, allowed)
     free, frequency = ((FREQUENCY,), [equations.frequency]) if model.autonomous else ((), [])
@@ -335,9 +334,9 @@ def _parametrised(
         change = np.zeros_like(equations.inputs)
         change[:, column::width] = equations.inputs[:, column::width]
         base = replace(equations, inputs=equations.inputs - change)
-        return kind(base, parameters, (INPUTS, *free), change), np.array([1.0, *frequency])
+        return with_unknowns(base, parameters, (INPUTS, *free), change), np.array([1.0, *frequency])
     value = equations.frequency if vary == FREQUENCY else parameters[model.parameters.index(vary)]
-    return kind(equations, parameters, (vary, *free)), np.array([value, *frequency])
+    return with_unknowns(equations, parameters, (vary, *free)), np.array([value, *frequency])
 
 
 def _solution(parametrised: ParametrisedEquations, point: BranchPoint, sensitivities: bool = False) -> PeriodicSolution:

@@ -285,6 +285,19 @@ class Receptance:
         return moved
 
 
+def unresolved(largest: np.ndarray, f: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return a bound of the relative error of the outputs by the number of points, (…).
+
+    Sampled forces f (…, harmonics, elements) have the harmonics beyond half the points added to the low ones. They are
+    smaller than the largest of the upper half of the harmonics, which is taken to act at that where the frequency
+    response to it is `largest` (outputs, elements). Outputs y are (…, harmonics, outputs).
+    """
+    upper = f[..., f.shape[-2] // 2 :, :]
+    above = np.sqrt(np.max(upper.real**2 + upper.imag**2, axis=-2))
+    size = np.sqrt(np.einsum("...kc,...kc->...c", y.real, y.real) + np.einsum("...kc,...kc->...c", y.imag, y.imag))
+    return np.asarray(np.max(above @ largest.T / np.maximum(size, np.finfo(float).tiny), axis=-1))
+
+
 @cache
 def compiled() -> ModuleType:
     """Return the compiled functions of condensed equations."""

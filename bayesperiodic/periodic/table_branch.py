@@ -13,6 +13,8 @@ import numpy as np
 
 from bayesperiodic.periodic.arclength import BranchPoint, ParametrisedEquations, Tracer, trace
 from bayesperiodic.periodic.compiled import CONVERGED
+from bayesperiodic.periodic.condensed import CondensedEquations
+from bayesperiodic.periodic.condensed_branch import with_unknowns
 from bayesperiodic.periodic.continuation import FOLD, located
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations
 
@@ -126,9 +128,9 @@ def _interpolated(here: PeriodicEquations, there: PeriodicEquations, parameters:
     """Return the equations between two points of the table, whose unknown is the frequency."""
     slope = input_slope(here, there)
     if slope is None:
-        return ParametrisedEquations(here, parameters, (FREQUENCY,))
+        return with_unknowns(here, parameters, (FREQUENCY,))
     base = replace(here, inputs=here.inputs - here.frequency * slope)
-    return ParametrisedEquations(base, parameters, (FREQUENCY,), input_change=slope)
+    return with_unknowns(base, parameters, (FREQUENCY,), input_change=slope)
 
 
 def _between(
@@ -160,5 +162,8 @@ def _beyond(table: Sequence[PeriodicEquations], at: int, heading: int) -> Period
 
 def _polished(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> np.ndarray | None:
     """Return the solution at a point of the table itself; None if the solve fails."""
-    solved = equations.checked(equations.solve(parameters, z))
+    if isinstance(equations, CondensedEquations):  # on as many points as it takes there
+        solved = equations.find(parameters, z)[0]
+    else:
+        solved = equations.checked(equations.solve(parameters, z))
     return solved.z if solved.code == CONVERGED else None

@@ -12,9 +12,12 @@ from matplotlib.ticker import NullFormatter
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
+from bayesperiodic.diagnostics.candidates import of_elements
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.score_tests import along_orbit
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.models.model import CondensedModel, Model
+from bayesperiodic.periodic.harmonics import harmonics, sampled
 from bayesperiodic.plot import style
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, styled
 from bayesperiodic.problem.fingerprint import check_results, fingerprint
@@ -128,7 +131,7 @@ def _residuals(panels: list[Axes], problem: Problem, search: MissingTerms, shown
 
 def _variables(problem: Problem, fit: MapEstimate, search: MissingTerms, e: Experiment) -> dict[str, np.ndarray]:
     """Return the variables of the first term along an orbit, by their labels; the time for a term without any."""
-    model = problem.model
+    model = of_elements(problem.model) if isinstance(problem.model, CondensedModel) else problem.model
     if search._terms:
         term, _ = search._terms[search.steps[0].name]
         expression = term.force or term.expression
@@ -142,13 +145,14 @@ def _variables(problem: Problem, fit: MapEstimate, search: MissingTerms, e: Expe
         if chosen:
             listed = [names[name] for name in chosen]
             values = along_orbit(problem, problem.vector(fit.theta), e, fit.solutions[e.name], listed)
-            return {_label(problem, name): column for name, column in zip(chosen, values, strict=True)}
+            if values.shape[1] != e.time.size:  # of a condensed model
+                values = sampled(harmonics(values.T), e.time.size).T
+            return {_label(model, name): column for name, column in zip(chosen, values, strict=True)}
     return {"time in the period [s]": e.time}
 
 
-def _label(problem: Problem, name: str) -> str:
+def _label(model: Model, name: str) -> str:
     """Return the label of a variable of the model by its name there, of a derivative as that of the variable."""
-    model = problem.model
     order = next(k for k in range(3) if name[k:] in (*model.states, *model.inputs))
     plain, unit = name[order:], model.units.get(name[order:], "")
     text = ("", "rate of ", "second derivative of ")[order] + plain

@@ -94,7 +94,7 @@ def fixed_values(name: str, given: Any, runs: list[str], local: bool) -> dict[st
 def _check_condensed(e: Experiment, model: Model) -> None:
     """Refuse what is not known of condensed models."""
     unknown: dict[str, Any] = {
-        "multipliers": e.multipliers, "condition": e.condition, "sweep": e.sweep, "guess": e.guess == DATA and DATA,
+        "multipliers": e.multipliers, "condition": e.condition, "guess": e.guess == DATA and DATA,
     }  # fmt: skip
     for name, value in unknown.items():
         if value is not None and value is not False:

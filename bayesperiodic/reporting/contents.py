@@ -29,6 +29,7 @@ from bayesperiodic.estimation.map_estimate import estimation_warnings
 from bayesperiodic.estimation.modes import missed_by
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import FROM_CYCLES, JOINT
+from bayesperiodic.models.model import CondensedModel
 from bayesperiodic.periodic.schemes import find_scheme
 from bayesperiodic.problem.fingerprint import check_results, fingerprint
 from bayesperiodic.problem.parameters import SHIFT, local_name, squared
@@ -88,8 +89,15 @@ class ReportInputs:
         return any(e.synthetic for e in self.problem.experiments)
 
     @property
+    def condensed(self) -> bool:
+        """Whether the model has no symbolic equations."""
+        return isinstance(self.problem.model, CondensedModel)
+
+    @property
     def clocks(self) -> set[str]:
         """The time symbols, of "tau" and "frequency", that the model contains."""
+        if self.condensed:  # whose elements are functions of their motion alone
+            return set()
         model = self.problem.model
         used = set().union(*(e.free_symbols for e in (*model.equations, *model.output_expressions)))
         return {name for name in ("tau", "frequency") if model.time_symbols[name] in used}

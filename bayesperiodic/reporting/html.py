@@ -9,6 +9,7 @@ from math import floor, isfinite, isinf, isnan, log10
 from typing import Any
 from xml.dom.minidom import parseString
 
+import numpy as np
 import sympy as sp
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
@@ -16,7 +17,9 @@ from sympy.printing.mathml import MathMLPresentationPrinter
 from sympy.printing.pretty.pretty_symbology import greek_unicode
 
 from bayesperiodic._verdicts import BAD, CAUTION, GOOD, NEUTRAL
-from bayesperiodic.models.model import Model
+from bayesperiodic.models.matrices import number_of
+from bayesperiodic.models.model import CondensedModel, Model
+from bayesperiodic.models.names import DERIVATIVES
 
 # A badge shows its tone by a sign as well as by a colour.
 SIGNS = {GOOD: "✓", CAUTION: "!", BAD: "✕", NEUTRAL: "•"}
@@ -135,6 +138,9 @@ class Rounding:
 
 
 DOTS = ("", "˙", "¨")
+TRANSPOSED = "<msup><mi>{}</mi><mi>T</mi></msup>"
+# Displacements of an output or element of a condensed model that are written out.
+MOST_WRITTEN = 6
 # Space between factors, because some of them are words.
 AS_READ = {
     "<mo>-</mo>": "<mo>−</mo>",
@@ -149,7 +155,12 @@ TAGS = {
 
 
 def equations(model: Model) -> list[Markup]:
-    """Return the equations of motion, one per state, with the terms that contain no state on the right-hand side."""
+    """Return the equations of motion, one per state, with the terms that contain no state on the right-hand side.
+
+    Of a condensed model they are that of all degrees of freedom with matrices, and the forces of the elements.
+    """
+    if isinstance(model, CondensedModel):
+        return _condensed_equations(model)
     printer, states = _MathPrinter(_names(model)), model.state_symbols.values()
     sides = [equation.as_independent(*states, as_Add=True) for equation in model.equations]
     return [printer.equation(left, -right) for right, left in sides]
@@ -158,8 +169,37 @@ def equations(model: Model) -> list[Markup]:
 def outputs(model: Model) -> list[Markup]:
     """Return the output equations, one per channel."""
     printer = _MathPrinter(_names(model))
+    if isinstance(model, CondensedModel):
+        measured = model.structure.measured.items()
+        return [printer.displayed(printer.named(name), _moved(model, printer, *given)) for name, given in measured]
     each = zip(model.outputs, model.output_expressions, strict=True)
     return [printer.equation(sp.Symbol(name), expression) for name, expression in each]
+
+
+def _condensed_equations(model: CondensedModel) -> list[Markup]:
+    count = len(model.element_forces)
+    numbers = range(1, count + 1)
+    moving = zip(model.element_symbols, ((f"d_{k}", order) for order in range(3) for k in numbers), strict=True)
+    printer, terms = _MathPrinter(_names(model) | dict(moving)), []
+    for factor, letter, number, order in model.structure.linear_terms(model.parameter_symbols):
+        scale = printer.text(factor) if factor != 1 else ""
+        scale = f"<mrow><mo>(</mo>{scale}<mo>)</mo></mrow>" if factor.is_Add else scale
+        terms.append(f"{scale}{printer.named(f'{letter}_{number}')}{printer.named('x', order)}")
+    terms += [f"{TRANSPOSED.format('W')}{printer.named('f')}"] if count else []
+    rows = [printer.displayed("<mo>+</mo>".join(terms), printer.named("B") + printer.named("u"))]
+    each = zip(numbers, model.structure.weights, model.element_forces, strict=True)
+    for k, at, force in each:
+        rows.append(printer.displayed(printer.named(f"d_{k}"), _moved(model, printer, at, 0)))
+        rows.append(printer.displayed(printer.named(f"f_{k}"), printer.text(force)))
+    return rows
+
+
+def _moved(model: CondensedModel, printer: "_MathPrinter", weights: np.ndarray, order: int) -> str:
+    """Return the weighted sum of displacements or of their derivatives, as a product where it has many terms."""
+    if np.count_nonzero(weights) > MOST_WRITTEN:
+        return f"{TRANSPOSED.format('w')}{printer.named('x', order)}"
+    moved = (model.state_symbols[DERIVATIVES[order] + name] for name in model.states)
+    return printer.text(sp.Add(*(number_of(w) * x for w, x in zip(weights, moved, strict=True) if w)))
 
 
 def symbol(name: str) -> Markup:
@@ -185,7 +225,15 @@ class _MathPrinter(MathMLPresentationPrinter):
 
     def equation(self, *sides: sp.Expr) -> Markup:
         """Return a displayed equation."""
-        return Markup(f'<math display="block">{"<mo>=</mo>".join(map(self.text, sides))}</math>')
+        return self.displayed(*map(self.text, sides))
+
+    def displayed(self, *sides: str) -> Markup:
+        """Return a displayed equation of typeset sides."""
+        return Markup(f'<math display="block">{"<mo>=</mo>".join(sides)}</math>')
+
+    def named(self, name: str, order: int = 0) -> str:
+        """Return a typeset name, with dots for time derivatives."""
+        return str(self._symbol(name, order).toxml())
 
     def text(self, expression: sp.Expr) -> str:
         """Return an expression as text, with entities replaced by characters."""
@@ -199,7 +247,9 @@ class _MathPrinter(MathMLPresentationPrinter):
         return TAGS.get(type(e).__name__) or super().mathml_tag(e)
 
     def _print_Symbol(self, sym: sp.Symbol, style: str = "plain") -> Any:
-        name, order = self._names.get(sym, (sym.name, 0))
+        return self._symbol(*self._names.get(sym, (sym.name, 0)))
+
+    def _symbol(self, name: str, order: int) -> Any:
         pieces = [greek_unicode.get(piece, piece) for piece in re.findall(r"\d+|[^\d_]+", name)]
         base, *below = (f"<mn>{piece}</mn>" if piece.isdigit() else f"<mi>{escape(piece)}</mi>" for piece in pieces)
         if order:

@@ -112,6 +112,32 @@ def test_draws_have_the_spread_of_the_laplace_approximation():
 
 
 @pytest.mark.parametrize(
+    "special",
+    [
+        bp.jump("special", 0.05, {"force": 0.2}, direction="up", step=0.01, samples=SAMPLES),
+        bp.resonance_point(
+            "special", 0.05, {"x": 0.3}, {"force": 0.2}, frequency_sd=0.001, amplitude_sd=0.01, samples=SAMPLES
+        ),
+    ],
+)
+def test_jumps_and_resonance_points_are_refused(special):
+    with pytest.raises(ValueError, match="condition of experiment 'special': must be absent.*condensed=False"):
+        bp.Problem(beam(12), [run(0.03), special], priors=PRIORS)
+
+
+@pytest.mark.parametrize("unknown", [{"gain": bp.LogNormal(1.0, 0.1)}, {"delay": bp.Normal(0.0, 0.1)}])
+def test_unknown_entries_of_the_inputs_sensors_are_refused(unknown):
+    with pytest.raises(ValueError, match=r"must have symbolic equations for this.*condensed=False"):
+        bp.Problem(beam(12), [run(0.03)], priors=PRIORS, sensors={"force": bp.Sensor(**unknown)})
+
+
+def test_joint_errors_of_inputs_are_refused():
+    noisy = replace(run(0.03), cycles=10, amplitude_variance={"force": np.full(9, 1e-4)})
+    with pytest.raises(ValueError, match=r"must have symbolic equations for this.*condensed=False"):
+        bp.Problem(beam(12), [noisy], priors=PRIORS, input_noise="joint")
+
+
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"guess": "data"}, "guess of experiment"),
