@@ -12,7 +12,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
 from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
-from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, ReturnMap, check_chaos, estimate_noise
+from bayesperiodic.orbits.return_map import FEWEST_FOLLOWED, KERNEL_REACH, Atlas, ReturnMap, check_chaos, estimate_noise
 from bayesperiodic.orbits.section import PoincareSection, wrapped
 
 SEARCHES = ("chained", "boxes")
@@ -81,7 +81,7 @@ def find_orbits(
     [1, 2]
     """
     _checks.instance("section", section, PoincareSection)
-    wanted = _periods(periods, len(section))
+    wanted = _periods(periods, section)
     _checks.one_of("method", method, SEARCHES)
     neighbours, box = _checks.integer("neighbours", neighbours, 16), _checks.positive("box", box)
     maps, size = _scaled(section, neighbours)
@@ -95,14 +95,21 @@ def find_orbits(
     return Orbits(_finished(orbits, maps, size), values=section.values, method=method)
 
 
-def _periods(periods: Iterable[int], count: int) -> list[int]:
+def _periods(periods: Iterable[int], section: PoincareSection) -> list[int]:
     try:
         wanted = sorted({_checks.integer("periods", p, 1) for p in periods})
     except TypeError:
         raise ValueError(f"periods: must be a collection such as range(1, 6), got {periods!r}.") from None
-    if not wanted or wanted[-1] > count // 20:
+    count, longest, where = len(section), len(section) // 20, ""
+    if section.stretches is not None:
+        lengths = np.unique(section.stretches, return_counts=True)[1]
+        returns = (int(np.maximum(lengths - p, 0).sum()) for p in range(1, longest + 1))
+        longest = sum(many >= FEWEST_FOLLOWED for many in returns)
+        where = f" in {lengths.size} unbroken stretches"
+    if not wanted or wanted[-1] > longest:
         raise ValueError(
-            f"periods: must have at least one entry and, with {count} points, none above {count // 20}, got {wanted}."
+            f"periods: must have at least one entry and, with {count} points{where}, none above {longest}, got "
+            f"{wanted}."
         )
     return wanted
 
@@ -116,7 +123,7 @@ def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.nd
         )
     turn = np.array([2.0 * np.pi if name in section.angles else np.inf for name in section.coordinates]) / size
     noise = np.zeros(2) if section.noise is None else section.noise / size
-    maps = ReturnMap(section.points / size, section.increments / size, turn, section.winds, noise)
+    maps = ReturnMap(section.points / size, section.increments / size, turn, section.winds, noise, section.stretches)
     check_chaos(maps)
     if section.noise is None:
         maps.noise = estimate_noise(maps, neighbours)
