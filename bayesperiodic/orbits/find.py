@@ -23,6 +23,8 @@ SEARCH_WIDTH = 4.0
 LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
+# Standard deviations from which a determinant is impossible.
+IMPOSSIBLE = 3.0
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
 STILL_RANGE, STILL_NOISE = 0.02, 20.0
 
@@ -175,6 +177,7 @@ def _orbit(
     covariance = estimate.covariance[np.ix_(index, index)] * np.outer(units, units)
     sd = np.sqrt(np.diag(covariance))
     covariance += np.outer(bias, bias)
+    remark = _remark(estimate.eigenvalues, covariance[-2:, -2:])
     for k in (-2, -1):
         if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
@@ -192,8 +195,18 @@ def _orbit(
         name="", coordinates=section.coordinates, angles=section.angles, frequency=section.frequency, period=period,
         winding=round(estimate.turns) if section.winds else None, points=points, joint_covariance=covariance,
         eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[-2:], returns=candidate.returns, quality=quality,
-        cycle=cycle, equilibrium=still, synthetic=section.synthetic,
+        cycle=cycle, equilibrium=still, synthetic=section.synthetic, remark=remark,
     )  # fmt: skip
+
+
+def _remark(eigenvalues: np.ndarray, covariance: np.ndarray) -> str:
+    """Return what is impossible about the determinant of a flow's map, given the covariance of log|eigenvalue|."""
+    determinant, sd = float(np.prod(eigenvalues).real), float(np.sqrt(covariance.sum()))
+    if determinant < 0.0 and IMPOSSIBLE * sd < 1.0:
+        return f"determinant {determinant:.3g} ± {-determinant * sd:.2g}, negative in no flow"
+    if determinant > 1.0 and np.log(determinant) > IMPOSSIBLE * sd:
+        return f"determinant {determinant:.3g} ± {determinant * sd:.2g}, above one in no damped flow"
+    return ""
 
 
 def _quality(maps: ReturnMap, candidate: MapCycle, estimate: Estimate, neighbours: int) -> float:

@@ -307,7 +307,8 @@ def check_chaos(maps: ReturnMap) -> None:
     if images > UNPREDICTED * random:
         raise ValueError(
             f"section: must show a return map, got images of neighbouring points {images / random:.0%} as far apart as "
-            "random points. Check for a wrong frequency and for noise as large as the motion."
+            "random points. Check for a wrong frequency, for noise as large as the motion, and for states that the two "
+            "coordinates do not determine."
         )
     later = np.median(maps.distance(section[centre + DIVERGING_STEPS], section[neighbour + DIVERGING_STEPS]))
     if later < DIVERGED * now:
