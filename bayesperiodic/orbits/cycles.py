@@ -162,9 +162,10 @@ def _cells(maps: ReturnMap, chains: np.ndarray, size: float) -> np.ndarray:
 def _close_returns(maps: ReturnMap, period: int) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the first point of the closest return in each cell of chains, and the first points of all in that cell."""
     section, noise = maps.points, float(maps.noise.max())
-    distance = maps.distance(section[period:], section[:-period])
-    close = np.flatnonzero(distance < CLOSE + 2.0 * noise)
-    close = close[np.argsort(distance[close], kind="stable")]
+    returning = maps.followed(period)
+    distance = maps.distance(section[returning + period], section[returning])
+    near = np.flatnonzero(distance < CLOSE + 2.0 * noise)
+    close = returning[near[np.argsort(distance[near], kind="stable")]]
     cells = _cells(maps, section[close[:, None] + np.arange(period)], max(CELL, noise))
     _, first, owner, counts = np.unique(cells, axis=0, return_index=True, return_inverse=True, return_counts=True)
     order = np.argsort(owner.ravel(), kind="stable")
@@ -213,7 +214,7 @@ def refine(maps: ReturnMap, points: np.ndarray, neighbours: int) -> Estimate | N
     slope_bias = (np.log(np.abs(wide_values)) - np.log(np.abs(values))) / SLOPE_GROWTH
     point_bias = maps.wrap(wide[0] - cycle).ravel() / VALUE_GROWTH
     turns = _turns(maps, np.sum(fit.value - cycle, axis=0))
-    return Estimate(maps.wrap(cycle), values, _joint_covariance(fit), np.append(point_bias, slope_bias), turns)
+    return Estimate(maps.wrap(cycle), values, _joint_covariance(maps, fit), np.append(point_bias, slope_bias), turns)
 
 
 def _turns(maps: ReturnMap, run: np.ndarray) -> float:
@@ -275,7 +276,7 @@ def _eigenvectors(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vectors[0], np.roll(vectors[1], -1, axis=1)
 
 
-def _joint_covariance(fit: LocalFit) -> np.ndarray:
+def _joint_covariance(maps: ReturnMap, fit: LocalFit) -> np.ndarray:
     """Return the joint covariance of the points of a cycle and of log|eigenvalue|, by the delta method.
 
     Consecutive pairs of points share the noise of a point, so errors are summed over runs of consecutive pairs.
@@ -291,7 +292,7 @@ def _joint_covariance(fit: LocalFit) -> np.ndarray:
         points = influence[:, 0] @ by_value[:, 2 * j : 2 * j + 2].T
         slopes = np.einsum("kil,nli->nk", by_slope[:, j], influence[:, 1:3])
         rows.append(np.concatenate([points, slopes + points @ by_point.reshape(2, -1).T], axis=1))
-    pairs, owner = np.unique(fit.neighbours.ravel(), return_inverse=True)
+    pairs, owner = np.unique(maps.positions[fit.neighbours.ravel()], return_inverse=True)
     runs = np.concatenate([[0], np.cumsum(np.diff(pairs) > 1)])
     errors = np.zeros((runs[-1] + 1, 2 * p + 2))
     np.add.at(errors, runs[owner], np.concatenate(rows))
@@ -324,7 +325,7 @@ def box_orbits(maps: ReturnMap, period: int, neighbours: int, box: float) -> lis
         estimate = Estimate(
             points,
             eigenvalues(fits[-1].jacobian),
-            transfer @ _joint_covariance(fits[-1]) @ transfer.T,
+            transfer @ _joint_covariance(iterates[-1], fits[-1]) @ transfer.T,
             np.zeros(2 * period + 2),
             _turns(maps, fits[-1].value[0] - points[0]),
         )
@@ -336,8 +337,10 @@ def box_orbits(maps: ReturnMap, period: int, neighbours: int, box: float) -> lis
 
 
 def _iterated(maps: ReturnMap, steps: int) -> ReturnMap:
-    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(maps.increments, axis=0)])
-    return ReturnMap(maps.points, sums[steps:] - sums[:-steps], maps.turn, maps.winds, np.zeros(2))
+    single = np.full((len(maps.points) - 1, 2), np.nan)
+    single[maps.positions] = maps.increments
+    several = np.lib.stride_tricks.sliding_window_view(single, steps, axis=0).sum(axis=-1)
+    return ReturnMap(maps.points, several, maps.turn, maps.winds, np.zeros(2), maps.stretches)
 
 
 def _recurrent_boxes(maps: ReturnMap, period: int, box: float) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -346,9 +349,10 @@ def _recurrent_boxes(maps: ReturnMap, period: int, box: float) -> list[tuple[np.
     cell = np.floor(maps.wrap_points(section) / box).astype(np.int64)
     cell -= cell.min(axis=0)
     cells_per_turn = np.ceil(maps.turn / box)
-    step = np.abs(cell[period:] - cell[:-period]).astype(float)
+    returning = maps.followed(period)
+    step = np.abs(cell[returning + period] - cell[returning]).astype(float)
     step = np.minimum(step, np.where(np.isfinite(cells_per_turn), cells_per_turn - step, step))
-    back = np.flatnonzero(step.max(1) <= 1)
+    back = returning[step.max(1) <= 1]
     counts = np.zeros(cell.max(axis=0) + 1, dtype=np.int64)
     np.add.at(counts, tuple(cell[back].T), 1)
     groups, number = label(counts >= FEWEST_RETURNS, structure=np.ones((3, 3)))

@@ -12,7 +12,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
 from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
-from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, ReturnMap, check_chaos, estimate_noise
+from bayesperiodic.orbits.return_map import FEWEST_FOLLOWED, KERNEL_REACH, Atlas, ReturnMap, check_chaos, estimate_noise
 from bayesperiodic.orbits.section import PoincareSection, wrapped
 
 SEARCHES = ("chained", "boxes")
@@ -23,6 +23,8 @@ SEARCH_WIDTH = 4.0
 LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
+# Standard deviations from which a determinant is impossible.
+IMPOSSIBLE = 3.0
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
 STILL_RANGE, STILL_NOISE = 0.02, 20.0
 
@@ -81,7 +83,7 @@ def find_orbits(
     [1, 2]
     """
     _checks.instance("section", section, PoincareSection)
-    wanted = _periods(periods, len(section))
+    wanted = _periods(periods, section)
     _checks.one_of("method", method, SEARCHES)
     neighbours, box = _checks.integer("neighbours", neighbours, 16), _checks.positive("box", box)
     maps, size = _scaled(section, neighbours)
@@ -95,14 +97,21 @@ def find_orbits(
     return Orbits(_finished(orbits, maps, size), values=section.values, method=method)
 
 
-def _periods(periods: Iterable[int], count: int) -> list[int]:
+def _periods(periods: Iterable[int], section: PoincareSection) -> list[int]:
     try:
         wanted = sorted({_checks.integer("periods", p, 1) for p in periods})
     except TypeError:
         raise ValueError(f"periods: must be a collection such as range(1, 6), got {periods!r}.") from None
-    if not wanted or wanted[-1] > count // 20:
+    count, longest, where = len(section), len(section) // 20, ""
+    if section.stretches is not None:
+        lengths = np.unique(section.stretches, return_counts=True)[1]
+        returns = (int(np.maximum(lengths - p, 0).sum()) for p in range(1, longest + 1))
+        longest = sum(many >= FEWEST_FOLLOWED for many in returns)
+        where = f" in {lengths.size} unbroken stretches"
+    if not wanted or wanted[-1] > longest:
         raise ValueError(
-            f"periods: must have at least one entry and, with {count} points, none above {count // 20}, got {wanted}."
+            f"periods: must have at least one entry and, with {count} points{where}, none above {longest}, got "
+            f"{wanted}."
         )
     return wanted
 
@@ -116,7 +125,7 @@ def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.nd
         )
     turn = np.array([2.0 * np.pi if name in section.angles else np.inf for name in section.coordinates]) / size
     noise = np.zeros(2) if section.noise is None else section.noise / size
-    maps = ReturnMap(section.points / size, section.increments / size, turn, section.winds, noise)
+    maps = ReturnMap(section.points / size, section.increments / size, turn, section.winds, noise, section.stretches)
     check_chaos(maps)
     if section.noise is None:
         maps.noise = estimate_noise(maps, neighbours)
@@ -168,6 +177,7 @@ def _orbit(
     covariance = estimate.covariance[np.ix_(index, index)] * np.outer(units, units)
     sd = np.sqrt(np.diag(covariance))
     covariance += np.outer(bias, bias)
+    remark = _remark(estimate.eigenvalues, covariance[-2:, -2:])
     for k in (-2, -1):
         if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
@@ -185,8 +195,18 @@ def _orbit(
         name="", coordinates=section.coordinates, angles=section.angles, frequency=section.frequency, period=period,
         winding=round(estimate.turns) if section.winds else None, points=points, joint_covariance=covariance,
         eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[-2:], returns=candidate.returns, quality=quality,
-        cycle=cycle, equilibrium=still, synthetic=section.synthetic,
+        cycle=cycle, equilibrium=still, synthetic=section.synthetic, remark=remark,
     )  # fmt: skip
+
+
+def _remark(eigenvalues: np.ndarray, covariance: np.ndarray) -> str:
+    """Return what is impossible about the determinant of a flow's map, given the covariance of log|eigenvalue|."""
+    determinant, sd = float(np.prod(eigenvalues).real), float(np.sqrt(covariance.sum()))
+    if determinant < 0.0 and IMPOSSIBLE * sd < 1.0:
+        return f"determinant {determinant:.3g} ± {-determinant * sd:.2g}, negative in no flow"
+    if determinant > 1.0 and np.log(determinant) > IMPOSSIBLE * sd:
+        return f"determinant {determinant:.3g} ± {determinant * sd:.2g}, above one in no damped flow"
+    return ""
 
 
 def _quality(maps: ReturnMap, candidate: MapCycle, estimate: Estimate, neighbours: int) -> float:

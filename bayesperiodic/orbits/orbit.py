@@ -24,7 +24,7 @@ MOST_BIAS = 0.5
 TURN = 2.0 * np.pi
 _COLUMNS = (
     "name", "period", "winding", "returns", "quality", "multiplier", "multiplier_sd", "contraction", "contraction_sd",
-    "estimated", "modulus", "sd_first", "sd_second", "partner", "equilibrium", "rejected",
+    "estimated", "modulus", "sd_first", "sd_second", "partner", "equilibrium", "remark", "rejected",
 )  # fmt: skip
 
 
@@ -65,6 +65,11 @@ class Orbit(Result):
         Whether it is a state of rest, which contains little information about the parameters.
     synthetic : bool
         True if the data were simulated.
+    remark : str
+        What is impossible, by three standard deviations and the estimated bias, about the determinant of the linearised
+        return map: that of a flow is positive, with damping everywhere it is below one. Another one means that the two
+        coordinates do not determine the next point, or that there is no such orbit. Empty otherwise, also where the
+        error is too large to tell, as is frequent for strong contraction.
 
     Examples
     --------
@@ -93,6 +98,7 @@ class Orbit(Result):
     solution: PeriodicSolution | None = None
     equilibrium: bool = False
     synthetic: bool = False
+    remark: str = ""
 
     def __repr__(self) -> str:
         kind = ", at rest" if self.equilibrium else ""
@@ -100,7 +106,8 @@ class Orbit(Result):
         shown = f"{large.real:.5g}" if np.isreal(large) else f"{large.real:.4g} ± {abs(large.imag):.4g}i"
         sd = self.eigenvalue_sd[0]
         error = f"sd {sd:.2g}" if np.isfinite(sd) else "sd not estimated"
-        return f"Orbit({self.name!r}{kind}: eigenvalue {shown} ({error}), {self.returns} returns)"
+        remark = f"; {self.remark}" if self.remark else ""
+        return f"Orbit({self.name!r}{kind}: eigenvalue {shown} ({error}), {self.returns} returns{remark})"
 
     @property
     def covariance(self) -> np.ndarray:
@@ -220,7 +227,7 @@ class Orbits(Result):
 
         `winding` is missing if unknown; `multiplier` and `contraction` are the two eigenvalues, whose standard
         deviations are NaN if not estimated; `sd_first` and `sd_second` are the largest standard deviations of a point
-        in the two coordinates.
+        in the two coordinates; `remark` says which determinants are impossible (see `Orbit`).
         """
         import pandas as pd
 
@@ -232,10 +239,11 @@ class Orbits(Result):
         if not self.orbits:
             return f"Orbits(none, {len(self.rejected)} rejected)"
         counts = [(p, sum(o.period == p for o in self.orbits)) for p in sorted({o.period for o in self.orbits})]
+        table, empty = self.table, ["rejected"] + ["remark"] * (not any(orbit.remark for orbit in self.orbits))
         listed = ", ".join(f"{count} of period {period}" for period, count in counts)
         return (
             f"Orbits({listed}; {len(self.rejected)} rejected; method {self.method!r}, from {self.values:,} numbers)\n"
-            f"{self.table.drop(columns=['rejected']).head(len(self.orbits)).to_string(index=False)}"
+            f"{table.drop(columns=empty).head(len(self.orbits)).to_string(index=False)}"
         )
 
     def __len__(self) -> int:
@@ -347,5 +355,5 @@ def _row(orbit: Orbit, names: list[str], reason: str) -> tuple[Any, ...]:
     return (
         orbit.name, orbit.period, orbit.winding, orbit.returns, orbit.quality, multiplier, multiplier_sd, contraction,
         contraction_sd, bool(np.isfinite(multiplier_sd)), float(abs(orbit.eigenvalues[0])), *sds, partner,
-        orbit.equilibrium, reason,
+        orbit.equilibrium, orbit.remark, reason,
     )  # fmt: skip

@@ -57,15 +57,26 @@ class ReturnMap:
     the normal equations unbiased and so remove the attenuation of the slopes.
     """
 
-    def __init__(self, points: np.ndarray, increments: np.ndarray, turn: np.ndarray, winds: bool, noise: np.ndarray):
-        self.points = points  # in the order of time; images of the last ones may be unknown, (count, 2)
-        self.arguments = points[: len(increments)]  # points with a known image, (n, 2)
-        self.increments = increments  # image minus argument, (n, 2)
+    def __init__(
+        self, points: np.ndarray, increments: np.ndarray, turn: np.ndarray, winds: bool, noise: np.ndarray,
+        stretches: np.ndarray | None = None,
+    ):  # fmt: skip
+        self.points = points  # in the order of time, (count, 2)
+        # Number of each point's unbroken stretch, (count,).
+        self.stretches = np.zeros(len(points), dtype=np.int64) if stretches is None else stretches
+        # Images are unknown where increments are NaN or missing at the end.
+        self.positions = np.flatnonzero(np.isfinite(increments).all(axis=1))  # of points with a known image, (n,)
+        self.arguments = points[self.positions]  # points with a known image, (n, 2)
+        self.increments = increments[self.positions]  # image minus argument, (n, 2)
         self.turn = turn  # one turn in these units; infinite for coordinates that are not angles, (2,)
         self.winds = winds  # whether the increments of angles include whole turns
         self.noise = noise  # standard deviation of the arguments, (2,)
         self.angle = np.isfinite(turn)
         self._tree = self.tree(self.arguments)
+
+    def followed(self, steps: int) -> np.ndarray:
+        """Return the positions of the points whose stretch contains the point `steps` later."""
+        return np.flatnonzero(self.stretches[steps:] == self.stretches[:-steps])
 
     def tree(self, points: np.ndarray) -> cKDTree:
         """Return a search tree of points, periodic in the angles."""
@@ -264,29 +275,40 @@ SAME_POINT, UNPREDICTED = 0.05, 0.2
 DIVERGED, DIVERGING_STEPS = 2.5, 6
 DIVERGING_PROBES = 400
 NEIGHBOUR = 8
+# Fewest points from which as many returns as needed are in their stretch.
+FEWEST_FOLLOWED = 100
 
 
 def check_chaos(maps: ReturnMap) -> None:
     """Raise a ValueError, which names the kind of motion, unless the points show a chaotic return map."""
     section, generator = maps.points, np.random.default_rng(0)
+    starts = maps.followed(DIVERGING_STEPS + 1)
+    if starts.size < FEWEST_FOLLOWED:
+        raise ValueError(
+            f"section: must have at least {FEWEST_FOLLOWED} points with {DIVERGING_STEPS + 1} returns in their "
+            f"unbroken stretch, to show whether neighbours diverge, got {starts.size}. Record longer pieces, or "
+            "without gaps."
+        )
     one, other = generator.integers(len(section), size=(2, 4 * DIVERGING_PROBES))
     random = np.median(maps.distance(section[one], section[other]))
     for period in range(1, min(LONGEST_PERIOD, len(section) // 10) + 1):
-        if np.median(maps.distance(section[period:], section[:-period])) < SAME_POINT * random:
+        back = maps.followed(period)
+        if back.size < FEWEST_FOLLOWED:
+            break
+        if np.median(maps.distance(section[back + period], section[back])) < SAME_POINT * random:
             raise ValueError(
                 f"section: must be of a chaotic motion, got one of period {period}. Use recording.fold with "
                 f"periods={period} instead."
             )
-    centre = generator.choice(
-        len(maps.arguments) - DIVERGING_STEPS, min(DIVERGING_PROBES, len(section) // 4), replace=False
-    )
-    neighbour = _neighbours(maps, centre)
+    probes = min(DIVERGING_PROBES, len(section) // 4, starts.size)
+    centre, neighbour = _neighbours(maps, starts[generator.choice(starts.size, probes, replace=False)])
     now = np.median(maps.distance(section[centre], section[neighbour]))
     images = np.median(maps.distance(section[centre + 1], section[neighbour + 1]))
     if images > UNPREDICTED * random:
         raise ValueError(
             f"section: must show a return map, got images of neighbouring points {images / random:.0%} as far apart as "
-            "random points. Check for a wrong frequency and for noise as large as the motion."
+            "random points. Check for a wrong frequency, for noise as large as the motion, and for states that the two "
+            "coordinates do not determine."
         )
     later = np.median(maps.distance(section[centre + DIVERGING_STEPS], section[neighbour + DIVERGING_STEPS]))
     if later < DIVERGED * now:
@@ -296,10 +318,12 @@ def check_chaos(maps: ReturnMap) -> None:
         )
 
 
-def _neighbours(maps: ReturnMap, centre: np.ndarray) -> np.ndarray:
-    """Return a neighbour of each point that is distant in time and has later points."""
-    _, index = maps.nearest(maps.arguments[centre], NEIGHBOUR + 2 * DIVERGING_STEPS)
-    far = (np.abs(index - centre[:, None]) > DIVERGING_STEPS) & (index < len(maps.arguments) - DIVERGING_STEPS)
+def _neighbours(maps: ReturnMap, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and a neighbour of each that is distant in time and has later points, where there is one."""
+    _, index = maps.nearest(maps.points[centre], NEIGHBOUR + 2 * DIVERGING_STEPS)
+    near = maps.positions[index]
+    far = (np.abs(near - centre[:, None]) > DIVERGING_STEPS) & np.isin(near, maps.followed(DIVERGING_STEPS + 1))
     rank = np.cumsum(far, axis=1)
     column = np.argmax(rank >= np.minimum(NEIGHBOUR, rank[:, -1:]), axis=1)
-    return index[np.arange(len(centre)), column]
+    some = far.any(axis=1)
+    return centre[some], near[some, column[some]]

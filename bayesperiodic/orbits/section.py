@@ -10,16 +10,21 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.data.recording import Recording
+from bayesperiodic.orbits.stretches import (
+    FEWEST_SAMPLES,
+    LONGEST_STEP,
+    SMALLEST_WINDOW,
+    Stretches,
+    joined,
+    local_fit,
+    smoothed,
+    usual_step,
+)
 
 DEGREES = 180.0 / np.pi
-FEWEST_SAMPLES, FEWEST_POINTS, CYCLE_SAMPLES = 8, 200, 64
-# Local polynomials: degree for the values; degree and number of samples for the variance of the noise.
-VALUE_DEGREE, NOISE_DEGREE, NOISE_SAMPLES = 7, 11, 14
-# Half the number of samples in the smallest window.
-SMALLEST_WINDOW = (VALUE_DEGREE + 1) // 2
-# The window is narrower by this factor than the first window with a significant bias.
-WINDOW_MARGIN = 1.6
-CROSSINGS_EACH = 20_000
+FEWEST_POINTS, CYCLE_SAMPLES = 200, 64
+# A signal must go so far below a level between two crossings, in standard deviations, so that noise adds none.
+CROSSING_BAND = 0.1
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,8 @@ class PoincareSection(Result):
     frequency : float
         Forcing frequency [Hz]; for crossings of a plane, returns per second.
     increments : array (count − 1, 2)
-        Next point minus point. Angles include whole turns; where `winds` is False they are in half a turn either way.
+        Next point minus point, NaN across a break. Angles include whole turns; where `winds` is False they are in half
+        a turn either way.
     winds : bool
         Whether the whole turns between the points are known.
     noise : array (2,) or None
@@ -48,6 +54,13 @@ class PoincareSection(Result):
         Number of measured values.
     synthetic : bool
         True if the data were simulated.
+    stretches : array (count,) of int, or None
+        Number of the unbroken stretch of each point: a point and the one n places later are n returns apart where their
+        numbers are equal. None if there is no break.
+    starts : array of int, or None
+        First sample of each stretch, by its number; None for points alone, or if there is no break.
+    left_out : int
+        Number of returns between the first and the last point of which the points are in gaps; 0 for crossings.
 
     Examples
     --------
@@ -74,9 +87,11 @@ class PoincareSection(Result):
     signals: np.ndarray | None = None
     values: int = 0
     synthetic: bool = False
+    stretches: np.ndarray | None = None
+    starts: np.ndarray | None = None
+    left_out: int = 0
 
     @classmethod
-    @in_one_thread
     def from_recording(
         cls,
         recording: Recording,
@@ -89,12 +104,14 @@ class PoincareSection(Result):
         """Evaluate a recording once a forcing period, at whole tau.
 
         Values come from local polynomials, in windows as wide as the signal allows without bias, so that points of a
-        densely sampled recording have less noise than single samples.
+        densely sampled recording have less noise than single samples. Nothing is interpolated across a gap, a step of
+        time above three usual ones (with few samples a period, above an eighth of one), and no orbit uses points from
+        both sides of it.
 
         Parameters
         ----------
         recording : Recording
-            At least 8 samples a period; the steps may differ.
+            At least 8 samples a period; the steps may differ. For several, see `from_recordings`.
         coordinates : sequence of two str
             Outputs, such as ``("angle", "rate")``.
         frequency : float
@@ -113,21 +130,76 @@ class PoincareSection(Result):
         ValueError
             For an unknown coordinate, too few samples or periods, or an angle that does not seem to be in radians.
         """
+        if not isinstance(recording, Recording):
+            raise ValueError(
+                f"recording: must be a Recording, got {type(recording).__name__}; from_recordings takes several."
+            )
+        return cls.from_recordings([recording], coordinates, frequency=frequency, origin=origin, angles=angles)
+
+    @classmethod
+    @in_one_thread
+    def from_recordings(
+        cls,
+        recordings: Iterable[Recording],
+        coordinates: Sequence[str],
+        *,
+        frequency: float,
+        origin: float = 0.0,
+        angles: Iterable[str] = (),
+    ) -> "PoincareSection":
+        """Evaluate recordings of one motion at the same phase of the forcing, as one section.
+
+        Recordings that follow each other by one sample interval, between a half and one and a half, are joined. Between
+        others there is a break, as at the gaps of each: nothing is interpolated across it, and no orbit uses points
+        from both sides. Points in gaps are left out and counted (`left_out`).
+
+        Parameters
+        ----------
+        recordings : sequence of Recording
+            In any order, with times counted from one instant, so that the phase of the forcing is that of its
+            `frequency` in all of them.
+        coordinates, frequency, origin, angles
+            As for `from_recording`.
+
+        Returns
+        -------
+        PoincareSection
+
+        Raises
+        ------
+        ValueError
+            As for `from_recording`, for no recording, and for recordings that overlap in time.
+
+        Examples
+        --------
+        The recording of `PoincareSection` as three files, of which the third does not continue the second:
+
+        >>> recording = bp.simulate(bp.models.pendulum, pendulum_parameters, frequency=1.4467, duration=200,
+        ...                         sampling_rate=60, start={"phi": 1})
+        >>> files = [recording.between(*times) for times in ((0, 50), (50.01, 120), (130, 200))]
+        >>> section = bp.PoincareSection.from_recordings(files, ("angle", "rate"), frequency=1.4467, angles=["angle"])
+        >>> section  # doctest: +NORMALIZE_WHITESPACE
+        PoincareSection(275 points of angle, rate at 1.4467 Hz from 11402 samples in 2 unbroken stretches;
+        15 points in gaps left out)
+        """
         frequency = _checks.positive("frequency", frequency)
         origin = _checks.finite_number("origin", origin)
-        names, angle_names, signals = _signals(recording, coordinates, angles)
-        time = recording.time
-        if recording.sampling_rate < FEWEST_SAMPLES * frequency:
-            rate = f"{recording.sampling_rate / frequency:.3g}"
+        given = _recordings(recordings)
+        signals = []
+        for recording in given:
+            names, angle_names, values = _signals(recording, coordinates, angles)
+            signals.append(values)
+        samples = _unwrapped(joined(given, signals, frequency), np.isin(names, angle_names))
+        if samples.sampling_rate < FEWEST_SAMPLES * frequency:
+            rate = f"{samples.sampling_rate / frequency:.3g}"
             raise ValueError(
                 f"recording: must have at least {FEWEST_SAMPLES} samples a period, got {rate}. For samples taken once "
                 "a period, use from_points."
             )
-        first = int(np.ceil((time[0] - origin) * frequency - 1e-9))
-        last = int(np.floor((time[-1] - origin) * frequency + 1e-9))
-        instants = origin + np.arange(first, last + 1) / frequency
-        section = cls._of(recording, names, angle_names, signals, instants, frequency)
-        if np.all(np.ptp(np.cumsum(section.increments, axis=0), axis=0) < 1e-2 * np.ptp(signals, axis=0)):
+        instants, stretch, left_out = samples.instants(frequency, origin)
+        synthetic = any(recording.synthetic for recording in given)
+        section = cls._of(samples, names, angle_names, instants, stretch, left_out, synthetic, frequency)
+        if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * np.ptp(samples.signals, axis=0)):
             raise ValueError(
                 "recording: must be chaotic, got a motion of period 1, whose section points coincide. Use "
                 "recording.fold instead."
@@ -172,8 +244,17 @@ class PoincareSection(Result):
         level = _checks.finite_number("level", level)
         if direction not in (1, -1):
             raise ValueError(f"direction: must be 1 (upwards) or -1 (downwards), got {direction!r}.")
-        instants = _upward_crossings(recording.time, direction * (recording.outputs[channel] - level))
-        return cls._of(recording, names, angle_names, signals, instants)
+        samples = _unwrapped(joined([recording], [signals], None), np.isin(names, angle_names))
+        height = direction * (recording.outputs[channel] - level)
+        band, crossings = CROSSING_BAND * height.std(), []
+        for start, stop in zip(samples.starts, samples.stops, strict=True):
+            long = stop - start >= 2 * SMALLEST_WINDOW
+            crossings.append(
+                _upward_crossings(recording.time[start:stop], height[start:stop], band) if long else np.empty(0)
+            )
+        stretch = np.repeat(np.arange(len(crossings)), [one.size for one in crossings])
+        instants = np.concatenate(crossings)
+        return cls._of(samples, names, angle_names, instants, stretch, 0, recording.synthetic)
 
     @classmethod
     def from_points(
@@ -183,8 +264,9 @@ class PoincareSection(Result):
 
         Parameters
         ----------
-        points : array (count, 2)
-            All consecutive points in the order of time; angles [rad] with any number of turns.
+        points : array (count, 2), or sequence of such arrays
+            All consecutive points in the order of time; angles [rad] with any number of turns. Several arrays are
+            unbroken stretches: the first point of one does not follow the last point of another.
         coordinates, frequency, angles
             As for `from_recording`.
 
@@ -199,9 +281,12 @@ class PoincareSection(Result):
         """
         frequency = _checks.positive("frequency", frequency)
         names, angle_names = _names(coordinates, angles)
-        values = _checks.real_array("points", points)
-        if values.ndim != 2 or values.shape[1] != 2:
-            raise ValueError(f"points: must have the shape (count, 2), got {values.shape}.")
+        several = isinstance(points, Sequence) and len(points) > 0 and all(np.ndim(part) == 2 for part in points)
+        parts = [_checks.real_array("points", part) for part in (points if several else [points])]
+        for part in parts:
+            if part.ndim != 2 or part.shape[1] != 2:
+                raise ValueError(f"points: must have the shape (count, 2), got {part.shape}.")
+        values = np.concatenate(parts)
         turning = np.isin(names, angle_names)
         for k, name in enumerate(names):
             extent = np.ptp(_checks.finite_vector(f"points[:, {k}] ({name})", values[:, k]))
@@ -211,28 +296,31 @@ class PoincareSection(Result):
                     "be in degrees: convert it with numpy.radians."
                 )
         _check_count(len(values))
-        increments = wrapped(np.diff(values, axis=0), turning)
+        stretch = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        increments = _within(wrapped(np.diff(values, axis=0), turning), stretch)
         points = wrapped(values, turning)
-        return cls(points, names, angle_names, frequency, increments, not angle_names, values=values.size)
+        stretches = stretch if len(parts) > 1 else None
+        return cls(
+            points, names, angle_names, frequency, increments, not angle_names, values=values.size, stretches=stretches
+        )
 
     @classmethod
     def _of(
-        cls,
-        recording: Recording,
-        names: tuple[str, str],
-        angles: tuple[str, ...],
-        signals: np.ndarray,
-        instants: np.ndarray,
-        frequency: float | None = None,
-    ) -> "PoincareSection":
+        cls, samples: Stretches, names: tuple[str, str], angles: tuple[str, ...], instants: np.ndarray,
+        stretch: np.ndarray, left_out: int, synthetic: bool, frequency: float | None = None,
+    ) -> "PoincareSection":  # fmt: skip
         """Return the section of signals at given instants; the frequency is by default that of the instants."""
         _check_count(instants.size)
-        frequency = frequency or float((instants.size - 1) / (instants[-1] - instants[0]))
-        time = recording.time
-        values, noise = _estimate(time, signals, np.clip(instants, time[0], time[-1]))
-        points, increments = wrapped(values, np.isin(names, angles)), np.diff(values, axis=0)
-        measured = (instants, time, signals, signals.size, recording.synthetic)
-        return cls(points, names, angles, frequency, increments, True, noise, *measured)
+        if frequency is None:
+            returns = np.diff(instants)[np.diff(stretch) == 0]
+            frequency = float(returns.size / returns.sum())
+        time = samples.time
+        at = np.clip(instants, time[samples.starts[stretch]], time[samples.stops[stretch] - 1])
+        values, noise = smoothed(samples, at, stretch)
+        points, increments = wrapped(values, np.isin(names, angles)), _within(np.diff(values, axis=0), stretch)
+        breaks = (stretch, samples.starts, left_out) if samples.starts.size > 1 else (None, None, left_out)
+        measured = (instants, time, samples.signals, samples.signals.size, synthetic)
+        return cls(points, names, angles, frequency, increments, True, noise, *measured, *breaks)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -249,26 +337,67 @@ class PoincareSection(Result):
         -------
         dict of str to array (samples·period,), or None
             By coordinate; angles start in (−π, π] and are continuous. None for a section of points alone.
+
+        Raises
+        ------
+        ValueError
+            If the returns are not in one unbroken stretch.
         """
         if self.instants is None or self.time is None or self.signals is None:
             return None
+        inside = 0 <= index and index + period < len(self)
+        if not inside or (self.stretches is not None and self.stretches[index] != self.stretches[index + period]):
+            raise ValueError(
+                f"index, period: must be a point and a number of returns in one unbroken stretch, got {index!r} and "
+                f"{period!r} in {self!r}."
+            )
+        starts = np.zeros(1, dtype=np.int64) if self.starts is None else self.starts
+        recorded = Stretches(self.time, self.signals, starts)
+        stretch = np.full(samples * period, 0 if self.stretches is None else self.stretches[index])
         knots = np.arange(period + 1)
         at = np.interp(np.arange(samples * period) / samples, knots, self.instants[index : index + period + 1])
-        values = _fit(self.time, self.signals, at)[0]
-        shift = self.points[index] - _fit(self.time, self.signals, self.instants[index : index + 1])[0][0]
+        values = local_fit(recorded, at, stretch)[0]
+        shift = self.points[index] - values[0]
         turns = np.where(np.isin(self.coordinates, self.angles), np.round(shift / (2.0 * np.pi)), 0.0)
         values += 2.0 * np.pi * turns
         return dict(zip(self.coordinates, values.T, strict=True))
 
     def __repr__(self) -> str:
         source = "points alone" if self.signals is None else f"a recording of {len(self.signals)} samples"
+        if self.stretches is not None:
+            source = f"{source.removeprefix('a recording of ')} in {np.unique(self.stretches).size} unbroken stretches"
+        lost = f"; {self.left_out} points in gaps left out" if self.left_out else ""
         names = ", ".join(self.coordinates)
-        return f"PoincareSection({len(self.points)} points of {names} at {self.frequency:.6g} Hz from {source})"
+        return f"PoincareSection({len(self.points)} points of {names} at {self.frequency:.6g} Hz from {source}{lost})"
 
 
 def wrapped(values: np.ndarray, turning: np.ndarray | bool = True) -> np.ndarray:
     """Return values (…, coordinates), with those that are turning angles in (−π, π]."""
     return np.where(turning, np.pi - (np.pi - values) % (2.0 * np.pi), values)
+
+
+def _within(increments: np.ndarray, stretch: np.ndarray) -> np.ndarray:
+    """Return increments (count − 1, 2) with NaN where the next point (count,) is in another stretch."""
+    return np.where((np.diff(stretch) == 0)[:, None], increments, np.nan)
+
+
+def _recordings(recordings: Iterable[Recording]) -> list[Recording]:
+    if isinstance(recordings, Recording) or not isinstance(recordings, Iterable):
+        raise ValueError(
+            f"recordings: must be a list of recordings, got {type(recordings).__name__}; from_recording takes one."
+        )
+    given = list(recordings)
+    if not given:
+        raise ValueError("recordings: must be one or more, got none.")
+    for k, recording in enumerate(given):
+        _checks.instance(f"recordings[{k}]", recording, Recording)
+    return given
+
+
+def _unwrapped(samples: Stretches, turning: np.ndarray) -> Stretches:
+    """Return signals whose angles are continuous where recordings are joined."""
+    signals = np.where(turning, np.unwrap(samples.signals, axis=0), samples.signals)
+    return samples._replace(signals=signals)
 
 
 def _names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple[tuple[str, str], tuple[str, ...]]:
@@ -336,8 +465,10 @@ def _check_angle(name: str, values: np.ndarray) -> None:
 
 def _check_rate(name: str, other: str, time: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> None:
     """Raise a ValueError if the other coordinate is the rate of the unwrapped angle in another unit."""
-    measured = np.diff(angle)
-    expected = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)
+    step = np.diff(time)
+    short = step <= LONGEST_STEP * usual_step(time)
+    measured = np.diff(angle)[short]
+    expected = (0.5 * (rate[1:] + rate[:-1]) * step)[short]
     scale, product = np.sqrt(np.sum(measured**2) * np.sum(expected**2)), np.sum(measured * expected)
     if scale == 0.0 or product < 0.98 * scale:
         return
@@ -350,12 +481,8 @@ def _check_rate(name: str, other: str, time: np.ndarray, angle: np.ndarray, rate
             )
 
 
-def _upward_crossings(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
-    """Return the times at which a signal crosses zero upwards.
-
-    Between two crossings the signal must go below minus a tenth of its standard deviation, so that noise adds none.
-    """
-    band = 0.1 * signal.std()
+def _upward_crossings(time: np.ndarray, signal: np.ndarray, band: float) -> np.ndarray:
+    """Return the times at which a signal crosses zero upwards; between two of them it must go below minus the band."""
     marks = np.flatnonzero(np.abs(signal) > band)
     up = np.flatnonzero((signal[marks[:-1]] < 0.0) & (signal[marks[1:]] > 0.0))
     crossings = []
@@ -368,61 +495,3 @@ def _upward_crossings(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
         if inside.size:
             crossings.append(inside[np.argmin(np.abs(inside - centre))])
     return np.array(crossings)
-
-
-def _estimate(time: np.ndarray, signals: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return signals (instants, channels) at given instants, and the standard deviation of their errors (channels,).
-
-    Polynomials of degree 7 are fitted in windows of increasing width. For white noise the expected squared difference
-    between a narrow and a wide estimate is known except for the squared bias of the wide one; the excess is tested for
-    significance. Bias is proportional to the eighth power of the width, so in a window 1.6 times narrower than the
-    first significant one it is 40 times smaller, and negligible even in averages over hundreds of instants.
-    """
-    narrow, narrow_gain, _ = _fit(time, signals, at)
-    # A higher degree on few samples: noise dominates the residual.
-    variance = _fit(time, signals, at, NOISE_SAMPLES // 2, NOISE_DEGREE)[2].mean(0)
-    count = signals.shape[1]
-    halves, unbiased = [SMALLEST_WINDOW], np.ones(count, dtype=bool)
-    widest = max(SMALLEST_WINDOW, int(0.5 * (time.size - 1) / (time[-1] - time[0]) * np.median(np.diff(at))))
-    first_biased = np.full(count, widest)
-    while (half := halves[-1] + max(1, halves[-1] // 5)) <= widest and unbiased.any():
-        wide, gain, _ = _fit(time, signals, at, half)
-        squared = (wide - narrow) ** 2
-        bias = squared.mean(0) - variance * (narrow_gain.mean() - gain.mean())
-        biased = unbiased & (bias > 2.0 * squared.std(0) / np.sqrt(len(at)))
-        first_biased[biased], unbiased[biased] = half, False
-        halves.append(half)
-    values, sd = narrow.copy(), np.sqrt(variance * narrow_gain.mean())
-    for channel in range(count):
-        half = max(h for h in halves if h == SMALLEST_WINDOW or h * WINDOW_MARGIN <= first_biased[channel])
-        if half > SMALLEST_WINDOW:
-            fitted, gain, _ = _fit(time, signals[:, [channel]], at, half)
-            values[:, channel], sd[channel] = fitted[:, 0], np.sqrt(variance[channel] * gain.mean())
-    return values, sd
-
-
-def _fit(
-    time: np.ndarray, signals: np.ndarray, at: np.ndarray, half: int = SMALLEST_WINDOW, degree: int = VALUE_DEGREE
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return values, their variance for unit noise, and the residual variance of polynomials on 2·half samples each."""
-    count = 2 * half
-    first = np.clip(np.searchsorted(time, at) - half, 0, time.size - count)
-    centre = np.polynomial.legendre.legvander(np.zeros(1), degree)[0]
-    free = max(count - degree - 1, 1)
-    values, gains, residuals = [], [], []
-    for k in range(0, len(at), CROSSINGS_EACH):
-        index = first[k : k + CROSSINGS_EACH, None] + np.arange(count)
-        width = 0.5 * (time[index[:, -1]] - time[index[:, 0]])
-        basis = np.polynomial.legendre.legvander(
-            (time[index] - at[k : k + CROSSINGS_EACH, None]) / width[:, None], degree
-        )
-        normal = basis.transpose(0, 2, 1) @ basis
-        local = signals[index]
-        reference = local[:, half]
-        local = local - reference[:, None]
-        weights = basis @ np.linalg.solve(normal, np.broadcast_to(centre[:, None], (len(index), degree + 1, 1)))
-        values.append(reference + (weights.transpose(0, 2, 1) @ local)[:, 0])
-        gains.append((weights[..., 0] ** 2).sum(1))
-        residual = local - basis @ np.linalg.solve(normal, basis.transpose(0, 2, 1) @ local)
-        residuals.append((residual**2).sum(1) / free)
-    return np.concatenate(values), np.concatenate(gains), np.concatenate(residuals)
