@@ -25,6 +25,7 @@ from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, SINGULAR, STALLED
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, sampled
+from bayesperiodic.periodic.memory import Memory, remembered
 from bayesperiodic.periodic.receptance import Receptance
 from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
@@ -48,11 +49,15 @@ MOST_LOAD_CORRECTIONS, LOAD_CONTRACTION, LOAD_ERROR, STRAIGHT_TANGENTS = 10, 0.6
 
 
 class Forces(NamedTuple):
-    """Forces of the elements on a grid, (points, elements), and their derivatives by displacement and velocity."""
+    """Forces of the elements on a grid, (points, elements), and their derivatives by displacement and velocity.
+
+    The latter are with the internal states held.
+    """
 
     values: np.ndarray
     stiffness: np.ndarray
     damping: np.ndarray
+    memory: Memory | None = None  # by internal states
 
 
 class ResponseMatrices(NamedTuple):
@@ -79,13 +84,16 @@ class Preconditioner:
         points, self.elements = forces.values.shape
         self.low = low = low or self.strongly_coupled(forces, rates, d_f)
         numbers = np.arange(low)
-        stiffness, damping = (np.fft.fft(part, axis=0).T / points for part in forces[1:])
+        stiffness, damping = (np.fft.fft(part, axis=0).T / points for part in forces[1:3])
         difference, total = (numbers[:, None] - numbers) % points, (numbers[:, None] + numbers) % points
         turning = 1j * rates[:low]
         same = stiffness[:, difference] + damping[:, difference] * turning
         mirrored = stiffness[:, total] - damping[:, total] * turning
         mirrored[:, :, 0] = 0.0
-        sums = [np.einsum("kab,bkl->kalb", d_f[:low], part) for part in (same + mirrored, 1j * (same - mirrored))]
+        by_part = [same + mirrored, 1j * (same - mirrored)]
+        if forces.memory is not None:
+            by_part = [a + b for a, b in zip(by_part, _of_units(forces.memory, rates, low), strict=True)]
+        sums = [np.einsum("kab,bkl->kalb", d_f[:low], part) for part in by_part]
         unit = np.einsum("kl,ab->kalb", np.eye(low), np.eye(self.elements))
         by_real, by_imaginary = (s + u for s, u in zip(sums, (unit, 1j * unit), strict=True))
         blocks = [[by_real.real, by_imaginary.real], [by_real.imag, by_imaginary.imag]]
@@ -109,6 +117,8 @@ class Preconditioner:
     def strongly_coupled(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> int:
         """Return the number of low harmonics beyond which all are coupled weakly."""
         steepest = np.abs(forces.stiffness).max(axis=0) + rates[:, None] * np.abs(forces.damping).max(axis=0)
+        if forces.memory is not None:
+            steepest = steepest + forces.memory.steepest(rates)
         coupling = np.sqrt(np.sum(np.abs(d_f * steepest[:, None, :]) ** 2, axis=(1, 2)))
         return min(len(rates), int(np.flatnonzero(~(coupling < WEAK_COUPLING)).max(initial=0)) + 1)
 
@@ -267,22 +277,50 @@ class CondensedEquations(PeriodicEquations):
         return self._receptance.recent(key, lambda: self._forces(d, parameters))
 
     def _forces(self, d: np.ndarray, parameters: np.ndarray) -> Forces:
-        values, given = self._evaluated("residual_jacobian", d, parameters), self.count
-        f, slopes = values[:, :given], values[:, given:].reshape(len(values), given, 3, given)
-        diagonal = np.arange(given)
-        return Forces(f, slopes[:, diagonal, 0, diagonal], slopes[:, diagonal, 1, diagonal])
+        states, given, memory = self._motion(d), self.count, None
+        if self.model.state_owners:
+            period = self.grid.periods / self.frequency
+            memory = remembered(self.model, states, parameters, self.frequency, period)
+            if memory is None:
+                unknown = np.full((len(states), given), np.nan)
+                return Forces(unknown, unknown, unknown)
+        values = self._evaluated("residual_jacobian", states, parameters) if memory is None else memory.columns
+        every, diagonal = given + len(self.model.state_owners), np.arange(given)
+        f, slopes = values[:, :given], values[:, every:].reshape(len(values), every, 3, every)
+        return Forces(f, slopes[:, diagonal, 0, diagonal], slopes[:, diagonal, 1, diagonal], memory)
 
     def forces_by_parameters(self, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return the derivatives of the forces by the parameters, (points, elements, parameters)."""
         if not self.count:
             return np.zeros((2 * len(d), 0, parameters.size))
-        values = self._evaluated("derivatives", d, parameters)[:, : self.count * parameters.size]
-        return values.reshape(len(values), self.count, -1)
+        memory = self.forces(d, parameters).memory
+        states = self._motion(d) if memory is None else memory.states
+        every = self.count + len(self.model.state_owners)
+        values = self._evaluated("derivatives", states, parameters)[:, : every * parameters.size]
+        slopes = values.reshape(len(values), every, -1)
+        of_forces = slopes[:, : self.count]
+        return of_forces if memory is None else of_forces + memory.change(slopes[:, self.count :])
 
-    def _evaluated(self, name: str, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        points, kernels = 2 * len(d), self.model.element_kernels
-        states = np.zeros((points, 3 * self.count))
-        states[:, : 2 * self.count] = on_grid(np.concatenate([d, 1j * self.rates(points)[:, None] * d], axis=1), points)
+    def _by_frequency(self, d: np.ndarray, forces: Forces) -> np.ndarray:
+        """Return the derivatives of the forces by the frequency, (points, elements), with harmonics d held."""
+        v = on_grid(1j * self.rates(2 * len(d))[:, None] * d, 2 * len(d)) / self.frequency
+        change, memory = forces.damping * v, forces.memory
+        if memory is None:
+            return np.asarray(change)
+        # In units of the period, the rates of the states are inversely proportional to the frequency.
+        added = memory.by_velocity * v[:, memory.owners] - memory.rates / self.frequency
+        return np.asarray(change + memory.change(added[..., None])[..., 0])
+
+    def _motion(self, d: np.ndarray) -> np.ndarray:
+        """Return displacements and velocities of the elements as states of their kernels (points, 3·variables)."""
+        points, every = 2 * len(d), self.count + len(self.model.state_owners)
+        states, both = np.zeros((points, 3 * every)), np.concatenate([d, 1j * self.rates(points)[:, None] * d], axis=1)
+        motion = on_grid(both, points)
+        states[:, : self.count], states[:, every : every + self.count] = np.split(motion, 2, axis=1)
+        return states
+
+    def _evaluated(self, name: str, states: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        kernels, points = self.model.element_kernels, len(states)
         return kernels.evaluate(name, states, np.empty((points, 0)), parameters, np.zeros(points), self.frequency)
 
     def solve(self, parameters: np.ndarray, guess: np.ndarray, *_: Any) -> Solved:
@@ -469,7 +507,7 @@ class CondensedEquations(PeriodicEquations):
         `directions` are indices of parameters, their number standing for the frequency; the latter are (directions,
         harmonics, elements) and (directions, harmonics, outputs).
         """
-        points, rates = 2 * len(d), self.rates(2 * len(d))
+        points = 2 * len(d)
         matrices, changes = self.matrices(parameters, points, directions)
         forces = self.forces(d, parameters)
         f, load = harmonics(forces.values), self.input_harmonics(points)
@@ -480,7 +518,7 @@ class CondensedEquations(PeriodicEquations):
                 ..., [directions[n] for n in of_elements]
             ]
         for index in (i for i, n in enumerate(directions) if n == size):
-            slopes[..., index] = forces.damping * on_grid(1j * rates[:, None] * d, points) / self.frequency
+            slopes[..., index] = self._by_frequency(d, forces)
         of_forces = harmonics(slopes.reshape(points, self.count * len(directions))).reshape(
             len(d), self.count, len(directions)
         )
@@ -561,8 +599,30 @@ def residual_of(
 def _linearised(forces: Forces, rates: np.ndarray, moved: np.ndarray) -> np.ndarray:
     """Return the change of the forces for a change of d, harmonics (…, harmonics, elements) both."""
     points = len(forces.values)
-    change = forces.stiffness * on_grid(moved, points) + forces.damping * on_grid(1j * rates[:, None] * moved, points)
+    d, v = on_grid(moved, points), on_grid(1j * rates[:, None] * moved, points)
+    change = forces.stiffness * d + forces.damping * v
+    if forces.memory is not None:
+        columns = [np.moveaxis(part.reshape(-1, *d.shape[-2:]), 0, -1) for part in (d, v)]
+        change = change + np.moveaxis(forces.memory.along(*columns), -1, 0).reshape(change.shape)
     return harmonics(change)
+
+
+def _of_units(memory: Memory, rates: np.ndarray, low: int) -> list[np.ndarray]:
+    """Return changes of the forces by internal states for unit real and imaginary harmonics of d.
+
+    They are (elements, harmonics, harmonics), the latter those of d, of as many low harmonics.
+    """
+    points, result = len(memory.states), []
+    for unit in (1.0, 1j):
+        columns = np.zeros((2, points // 2, low), dtype=complex)
+        numbers = np.arange(low)
+        columns[0, numbers, numbers] = unit
+        columns[1, numbers, numbers] = 1j * rates[:low] * unit
+        d, v = (np.repeat(part[:, None], memory.elements, axis=1) for part in on_grid(columns, points))
+        change = memory.along(d, v)
+        by_harmonic = harmonics(change.reshape(points, -1))[:low].reshape(low, memory.elements, low)
+        result.append(by_harmonic.transpose(1, 0, 2))
+    return result
 
 
 def _linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.ndarray) -> np.ndarray | None:

@@ -179,7 +179,7 @@ class _Linearised:
     def _couplings(self, points: int) -> tuple[np.ndarray, np.ndarray]:
         """Return springs and dampers of the elements in series with the other modes, (points, elements, elements)."""
         unit, forces = np.eye(self._elements), self._equations.forces(resized(self._d, points), self._theta)
-        springs, dampers = (part[..., None] * unit for part in forces[1:])
+        springs, dampers = (part[..., None] * unit for part in forces[1:3])
         if self.modes.compliance.any():
             series = np.linalg.inv(unit + springs @ self.modes.compliance)
             springs, dampers = series @ springs, series @ dampers @ series.transpose(0, 2, 1)
