@@ -466,7 +466,14 @@ class CondensedModel(Model):
         count, symbols = len(structure.elements), with_derivatives("s", inner)
         moving = with_derivatives("e", tuple(f"d{number}" for number in range(count)))
         d, v, a = (tuple(moving.values())[order * count : (order + 1) * count] for order in range(3))
-        s, p, forces, rates, blocks, owners = Names("states", symbols), Names("parameters", self.parameter_symbols), [], {}, [], {}
+        s, p, forces, rates, blocks, owners = (
+            Names("states", symbols),
+            Names("parameters", self.parameter_symbols),
+            [],
+            {},
+            [],
+            {},
+        )
         for number, element in enumerate(structure.elements):
             part = element.evaluate(d[number], v[number], s, p)
             mine = [symbols[state] for state in element.states]
@@ -483,7 +490,9 @@ class CondensedModel(Model):
         names = [next(name for name, symbol in symbols.items() if symbol == state) for state in order]
         slopes, bends = ([symbols[mark + name] for name in names] for mark in ("d", "dd"))
         self.element_symbols = (*d, *order, *v, *slopes, *a, *bends)
-        self._warn_of_unused([*forces, *self.element_rates], [n for n in self.parameters if n not in structure.parameters])
+        self._warn_of_unused(
+            [*forces, *self.element_rates], [n for n in self.parameters if n not in structure.parameters]
+        )
         # Functions cannot be pickled; what they returned is kept.
         self.structure = replace(structure, elements=())
         self.angles, self.units, self.orders = (), {}, dict.fromkeys(self.states, 2)

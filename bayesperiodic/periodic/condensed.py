@@ -31,6 +31,8 @@ from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
 # Points of the grid of the elements, and relative change of the outputs below which they are not doubled.
 FEWEST_ELEMENT_POINTS, MOST_ELEMENT_POINTS, RESOLVED_CHANGE = 32, 4096, 1e-6
+# The latter with internal states, whose formula is of order two at kinks: it leaves about a third of the change.
+RESOLVED_CHANGE_OF_MEMORY = 5e-5
 # Bound of the error of the outputs, see `unresolved`, above which points are doubled too.
 RESOLVED_SHARE = 1e-4
 # The largest change or bound of outputs that count as resolved by the most points; the smallest relative harmonic of an
@@ -395,7 +397,8 @@ class CondensedEquations(PeriodicEquations):
         """Double the points of a solution until its outputs are resolved; return it, the code and Newton's history."""
         history, change = np.empty((0, 3)), np.nan
         before, share = self._outputs(d, parameters)
-        while not (change <= RESOLVED_CHANGE and share <= RESOLVED_SHARE):
+        enough = RESOLVED_CHANGE_OF_MEMORY if self.model.state_owners else RESOLVED_CHANGE
+        while not (change <= enough and share <= RESOLVED_SHARE):
             if 2 * len(d) >= MOST_ELEMENT_POINTS:
                 worst = np.fmax(change, share)
                 return d, CONVERGED if worst <= LARGEST_OUTPUT_CHANGE else NOT_RESOLVED, history
@@ -470,7 +473,21 @@ class CondensedEquations(PeriodicEquations):
     def _output_harmonics(self, d: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, float]:
         matrices, f = self.matrices(parameters, 2 * len(d))[0], harmonics(self.forces(d, parameters).values)
         y = times(matrices.y_u, self.input_harmonics(2 * len(d))) - times(matrices.y_f, f)
-        return y, float(unresolved(matrices.largest, f, y))
+        bound = float(unresolved(matrices.largest, f, y))
+        return y, max(bound, self.error_of_memory(d, f, y, parameters))
+
+    def error_of_memory(self, d: np.ndarray, f: np.ndarray, y: np.ndarray, parameters: np.ndarray) -> float:
+        """Return the relative error of the outputs by that of internal states, d being held; 0 without such states.
+
+        It is a third of their change if half of the points give the forces' harmonics f, since the formula is of order
+        two at kinks.
+        """
+        if not self.model.state_owners:
+            return 0.0
+        fewer = harmonics(self._forces(resized(d, len(d)), parameters).values)
+        change = np.linalg.norm(times(self.matrices(parameters, len(d))[0].y_f, fewer - f[: len(fewer)]), axis=0)
+        worst = np.max(change / np.maximum(np.linalg.norm(y, axis=0), np.finfo(float).tiny), initial=0.0)
+        return float(worst) / 3.0 if np.isfinite(worst) else np.inf
 
     def error_bound(self, z: np.ndarray, parameters: np.ndarray) -> float:
         """Return the bound of the relative error of the outputs by the number of points, see `unresolved`."""

@@ -31,7 +31,7 @@ class CondensedSolution(PeriodicSolution):
     ----------
     linearisation, twice_the_points : array
         Empty.
-    of_modes : complex array (2·modes,)
+    of_modes : complex array (2·modes + internal states of elements,)
         The multipliers, those of the 16 lowest modes at most; the elements bend the other modes statically. Those below
         about 1e-12 are rounding errors. None unless converged.
     multiplier_error : float
@@ -51,12 +51,12 @@ class CondensedSolution(PeriodicSolution):
 
     @property
     def multipliers(self) -> np.ndarray:
-        """Floquet multipliers over the response period, complex (2·modes,), largest modulus first."""
+        """Floquet multipliers over the response period, complex as `of_modes`, largest modulus first."""
         return self.of_modes
 
     @property
     def exponents(self) -> np.ndarray:
-        """Floquet exponents log(multiplier)/period [1/s], complex (2·modes,)."""
+        """Floquet exponents log(multiplier)/period [1/s], complex as `of_modes`."""
         return self._others / self.period
 
     @property
@@ -174,16 +174,31 @@ class _Linearised:
         self._forcing = np.ascontiguousarray(np.concatenate([zero, modes.at], axis=1).T)
         self._diagonal = not any((a - np.diag(np.diag(a))).any() for a in (modes.stiffness, modes.damping))
         self._size, self._elements = size, elements
+        self._inner = len(equations.model.state_owners)
         self._known = self._couplings(max(2 * len(d), MODE_ERROR_STEPS))
 
-    def _couplings(self, points: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return springs and dampers of the elements in series with the other modes, (points, elements, elements)."""
+    def _couplings(self, points: int) -> tuple[np.ndarray, ...]:
+        """Return springs and dampers of the elements in series with the other modes, (points, elements, elements).
+
+        With internal states w, also the derivatives of the forces by w, and those of the rates of w by displacements,
+        velocities and w.
+        """
         unit, forces = np.eye(self._elements), self._equations.forces(resized(self._d, points), self._theta)
         springs, dampers = (part[..., None] * unit for part in forces[1:3])
-        if self.modes.compliance.any():
-            series = np.linalg.inv(unit + springs @ self.modes.compliance)
+        flexible, series = self.modes.compliance, np.broadcast_to(unit, springs.shape)
+        if flexible.any():
+            series = np.linalg.inv(unit + springs @ flexible)
             springs, dampers = series @ springs, series @ dampers @ series.transpose(0, 2, 1)
-        return springs, dampers
+        if forces.memory is None:
+            return springs, dampers
+        slopes, count = forces.memory.slopes, self._elements
+        of_states = series @ slopes[:, :count, 0, count:]
+        by_d, by_v = slopes[:, count:, 0, :count], slopes[:, count:, 1, :count]
+        # The other modes take part of displacements and velocities; changes of `series` in time are neglected.
+        left = unit - flexible @ springs
+        own = slopes[:, count:, 0, count:] - by_d @ flexible @ of_states
+        relaxed = np.linalg.inv(np.eye(self._inner) + by_v @ flexible @ of_states)
+        return springs, dampers, of_states, relaxed @ by_d @ left, relaxed @ by_v @ left, relaxed @ own
 
     def _free(self, length: float) -> np.ndarray:
         """Return the motion without elements over a time."""
@@ -203,7 +218,7 @@ class _Linearised:
         return result
 
     def monodromy(self, steps: int) -> np.ndarray:
-        """Return the map of (q, q̇) over the period in steps, of second order.
+        """Return the map of (q, q̇) and internal states over the period in steps, of second order.
 
         Each step is the exact motion of the linear structure between two points, at which the elements act for half of
         the step ([1]_), with their mean over it.
@@ -215,19 +230,49 @@ class _Linearised:
         """
         if steps > len(self._known[0]):
             self._known = self._couplings(steps)
-        length, unit = self._period / steps, np.eye(self._elements)
-        springs, dampers = (_means(part, steps) for part in self._known)
-        result = np.eye(2 * self._size)
+        length, means = self._period / steps, [_means(part, steps) for part in self._known]
+        result = np.eye(2 * self._size + self._inner)
+        kicks = self._kicks_of_states(length, *means) if self._inner else self._kicks(length, *means)
+        free = self._free(length)
+        compiled().monodromy(free, self._diagonal, self._places, self._forcing, kicks, result)
+        return result
+
+    def _kicks(self, length: float, springs: np.ndarray, dampers: np.ndarray) -> np.ndarray:
+        """Return the impulses of the elements in steps, by their displacements and velocities."""
         # The middle rule of velocities; two halves of a step make the kick of a whole one.
         halves = 0.5 * length * np.concatenate([springs, dampers], axis=2)
         kicks = 2.0 * halves
         if dampers.any():
+            unit = np.eye(self._elements)
             halves = np.linalg.solve(unit + 0.25 * length * dampers @ (self.modes.at @ self.modes.at.T), halves)
             kicks = 2.0 * halves - halves @ (self._places @ self._forcing) @ halves
         kicks[0] = halves[0]
-        free = self._free(length)
-        compiled().monodromy(free, self._diagonal, self._places, self._forcing, kicks, result)
-        return result
+        return kicks
+
+    def _kicks_of_states(
+        self,
+        length: float,
+        springs: np.ndarray,
+        dampers: np.ndarray,
+        of_states: np.ndarray,
+        by_d: np.ndarray,
+        by_v: np.ndarray,
+        by_states: np.ndarray,
+    ) -> np.ndarray:
+        """Return impulses and internal states w after steps, by displacements, velocities and w; see `_couplings`."""
+        count, inner = self._elements, self._inner
+        forces = np.concatenate([springs, dampers, of_states], axis=2)
+        rates = np.concatenate([by_d, by_v, by_states], axis=2)
+        # Velocities and w change by the middle rule in half of a step, displacements being held.
+        change = np.concatenate([-(self.modes.at @ self.modes.at.T) @ forces, rates], axis=1)
+        unit, still = np.eye(2 * count + inner), np.zeros((len(forces), count, 2 * count + inner))
+        change = np.concatenate([still, change], axis=1)
+        middle = np.linalg.inv(unit - 0.25 * length * change)
+        half = middle @ (unit + 0.25 * length * change)
+        impulses = 0.5 * length * forces @ middle
+        kicks = np.concatenate([impulses + impulses @ half, (half @ half)[:, 2 * count :]], axis=1)
+        kicks[0] = np.concatenate([impulses[0], half[0, 2 * count :]])
+        return np.ascontiguousarray(kicks)
 
 
 def _means(values: np.ndarray, count: int) -> np.ndarray:

@@ -97,9 +97,7 @@ def remembered(
     """
     kernels, given = model.element_kernels, states.shape[1] // 3
     columns, step = np.empty((len(states), given * (1 + 3 * given))), 2 * period / len(states)
-    blocks, owners = np.array(model.state_blocks), np.array(model.state_owners)
-    if not compiled().march(
-        kernels.residual_jacobian.address, states, columns, parameters, frequency, step, blocks
-    ):
+    blocks, owners = (np.array(given, dtype=np.int64) for given in (model.state_blocks, model.state_owners))
+    if not compiled().march(kernels.residual_jacobian.address, states, columns, parameters, frequency, step, blocks):
         return None
     return Memory(states, columns, step, blocks, owners)

@@ -311,17 +311,18 @@ def tangent(out, changes, step, sizes):
 
 
 @njit(
-    f"void(int64, {COMPLEX_ROWS}, {REALS}, float64, float64, complex128[::1], int64[::1], float64[:,::1],"
-    f"float64[:,::1], complex128[::1], {COMPLEX_ROWS})",
+    f"void(int64, {COMPLEX_ROWS}, {REALS}, float64, float64, complex128[::1], int64[::1], int64[::1], {ROWS},"
+    f"{ROWS}, complex128[::1], {COMPLEX_ROWS})",
     **CONDENSED_OPTIONS,
 )
-def forces(address, d, parameters, rate, periods, turns, place, states, out, work, f):
+def forces(address, d, parameters, rate, periods, turns, place, blocks, states, out, work, f):
     """Fill the harmonics f of the elements' forces at harmonics d (harmonics, elements).
 
     The displacement and the velocity over `rate`, 2π times the frequency [Hz], are real and imaginary part of one
-    series; so are the forces of two elements.
+    series; so are the forces of two elements. With `blocks` of internal states see `march`, which starts at those in
+    `states`; f is not finite if they are not found.
     """
-    count, elements, points = d.shape[0], d.shape[1], turns.size * 2
+    count, elements, points, variables = d.shape[0], d.shape[1], turns.size * 2, states.shape[1] // 3
     for e in range(elements):
         work[0], work[count] = d[0, e].real, 0.0
         for k in range(1, count):
@@ -331,10 +332,17 @@ def forces(address, d, parameters, rate, periods, turns, place, states, out, wor
         transform(work, turns, place, True)
         for i in range(points):
             states[i, e] = work[i].real
-            states[i, elements + e] = rate * work[i].imag
+            states[i, variables + e] = rate * work[i].imag
     if elements == 0:
         return
-    grid_function_at(address)(states, np.empty((points, 0)), parameters, np.zeros(points), rate, out)
+    if blocks.size == 0:
+        grid_function_at(address)(states, np.empty((points, 0)), parameters, np.zeros(points), rate, out)
+    elif not march(
+        address, states, out, parameters, rate / (2.0 * np.pi), 4.0 * np.pi * periods / (rate * points), blocks
+    ):
+        f[:] = np.nan
+        states[0] = 0.0
+        return
     for e in range(0, elements, 2):
         both = e + 1 < elements
         for i in range(points):
@@ -349,13 +357,13 @@ def forces(address, d, parameters, rate, periods, turns, place, states, out, wor
 
 @njit(
     "void(int64, complex128[:,:,:,:,::1], complex128[:,:,:,::1], float64[:,:,::1], int64, float64[:,:,::1],"
-    "float64[::1], float64, complex128[::1], int64[::1], boolean, int64, int64, float64[:,::1],"
+    "float64[::1], float64, complex128[::1], int64[::1], int64[::1], boolean, int64, int64, float64[:,::1],"
     "complex128[:,:,:,::1], complex128[:,:,:,::1], int64[:,::1], int64[:,::1])",
     **CONDENSED_OPTIONS,
 )
 def correct_many(
-    address, d_f, free, inverse, low, parameters, rate, periods, turns, place, polish, start, stop, moved, d, f, lost,
-    steps,
+    address, d_f, free, inverse, low, parameters, rate, periods, turns, place, blocks, polish, start, stop, moved, d, f,
+    lost, steps,
 ):  # fmt: skip
     """Correct predicted harmonics d (sets, solves, harmonics, elements) in place, and fill those of the forces, f.
 
@@ -367,7 +375,9 @@ def correct_many(
     """
     solves, count, elements = d.shape[1], d.shape[2], d.shape[3]
     points, size = 2 * count, low * elements
-    states, out = np.zeros((points, 3 * elements)), np.empty((points, elements))
+    variables = elements + blocks.sum()
+    columns = variables if blocks.size == 0 else variables * (1 + 3 * variables)
+    states, out = np.zeros((points, 3 * variables)), np.empty((points, columns))
     work, residual, step = (
         np.empty(points, dtype=np.complex128),
         np.empty((count, elements), dtype=np.complex128),
@@ -378,9 +388,10 @@ def correct_many(
         if lost[e, b] != 0:
             continue
         response, unforced = d_f[e, b if d_f.shape[1] > 1 else 0], free[e, b if free.shape[1] > 1 else 0]
+        states[0] = 0.0
         x, theta, y, before, done = d[e, b], parameters[e, b], f[e, b], np.inf, False
         for iteration in range(MOST_CORRECTIONS):
-            forces(address, x, theta, rate[e], periods, turns, place, states, out, work, y)
+            forces(address, x, theta, rate[e], periods, turns, place, blocks, states, out, work, y)
             steps[e, b] = iteration + 1
             if done:
                 break
@@ -461,14 +472,18 @@ def modal_responses(products, mass, damping, stiffness, rates, result):
     **CONDENSED_OPTIONS,
 )
 def monodromy(free, diagonal, places, forcing, kicks, state):
-    """Replace state, columns of (q, q̇), by those a period later.
+    """Replace state, columns of (q, q̇, w), by those a period later; w are internal states of elements, if any.
 
-    In each step the elements change the state by −forcing·kick·places·state, the first one for half of a step also at
-    the end; then it moves by `free`, of four diagonal blocks if `diagonal`.
+    In each step the elements change q̇ by −forcing·force, and w, of kick·(places·(q, q̇), w) = (force, w), the first one
+    for half of a step also at the end; then q and q̇ move by `free`, of four diagonal blocks if `diagonal`.
     """
     steps, elements = kicks.shape[0], forcing.shape[1]
-    size, columns = state.shape[0] // 2, state.shape[1]
-    seen, force, moved = np.empty((2 * elements, columns)), np.empty(columns), np.empty_like(state)
+    size, columns, inner = forcing.shape[0] // 2, state.shape[1], state.shape[0] - forcing.shape[0]
+    seen, force, moved = (
+        np.empty((2 * elements + inner, columns)),
+        np.empty((elements + inner, columns)),
+        np.empty_like(state),
+    )
     for i in range(steps + 1):
         kick = kicks[i % steps]
         seen[:] = 0.0
@@ -478,17 +493,22 @@ def monodromy(free, diagonal, places, forcing, kicks, state):
                 weight = places[a, j]
                 for c in range(columns):
                     seen[a, c] += weight * state[j, c]
-        for e in range(elements):
-            force[:] = 0.0
-            for a in range(2 * elements):
+        for a in range(inner):
+            seen[2 * elements + a] = state[2 * size + a]
+        for e in range(elements + inner):
+            force[e] = 0.0
+            for a in range(2 * elements + inner):
                 weight = kick[e, a]
                 if weight != 0.0:
                     for c in range(columns):
-                        force[c] += weight * seen[a, c]
+                        force[e, c] += weight * seen[a, c]
+        for e in range(elements):
             for j in range(size, 2 * size):
                 weight = forcing[j, e]
                 for c in range(columns):
-                    state[j, c] -= weight * force[c]
+                    state[j, c] -= weight * force[e, c]
+        for a in range(inner):
+            state[2 * size + a] = force[elements + a]
         if i == steps:
             return
         if diagonal:
@@ -506,4 +526,4 @@ def monodromy(free, diagonal, places, forcing, kicks, state):
                     weight = free[j, n]
                     for c in range(columns):
                         moved[j, c] += weight * state[n, c]
-            state[:] = moved
+            state[: 2 * size] = moved[: 2 * size]
