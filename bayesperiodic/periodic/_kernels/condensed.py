@@ -126,20 +126,22 @@ def march(address, states, out, theta, rate, step, sizes):
     near, value = np.zeros((2, width)), np.empty((2, out.shape[1]))
     a, flow = np.empty((2 * largest, 3 * largest + 1)), np.empty((blocks, largest, largest))
     begin, end, scale, errors = np.empty(inner), np.empty(inner), np.zeros(inner), np.full(blocks, np.inf)
-    begin[:] = states[0, offset:variables]
+    for k in range(inner):
+        begin[k] = states[0, offset + k]
     known, moving = np.zeros((2, blocks), dtype=np.bool_)
     for _ in range(MOST_PERIODS):
-        states[0, offset:variables] = begin
+        for k in range(inner):
+            states[0, offset + k], scale[k] = begin[k], 0.0
         grid_function_at(address)(states[:1], empty[:1], theta, tau[:1], rate, out[:1])
-        flow[:] = 0.0
         for b in range(blocks):
             for r in range(sizes[b]):
-                flow[b, r, r] = 1.0
-        scale[:] = 0.0
-        moving[:] = False
+                for c in range(sizes[b]):
+                    flow[b, r, c] = 1.0 if r == c else 0.0
+            moving[b] = False
         for i in range(0, points, 2):
             middle, last = i + 1, (i + 2) % points
-            near[0], near[1] = states[middle], states[last]
+            for k in range(width):
+                near[0, k], near[1, k] = states[middle, k], states[last, k]
             for k in range(offset, variables):
                 near[0, k] = near[1, k] = states[i, k]
                 scale[k - offset] = max(scale[k - offset], abs(states[i, k]) + step * abs(out[i, k]))
@@ -183,13 +185,16 @@ def march(address, states, out, theta, rate, step, sizes):
                     for c in range(size):
                         flow[b, r, c] = a[size + r, 2 * size + c]
                 first += size
-            states[middle, offset:variables] = near[0, offset:variables]
-            out[middle] = value[0]
-            if last > 0:
-                states[last, offset:variables] = near[1, offset:variables]
-                out[last] = value[1]
-            else:
-                end[:] = near[1, offset:variables]
+            for k in range(offset, variables):
+                states[middle, k] = near[0, k]
+                if last > 0:
+                    states[last, k] = near[1, k]
+                else:
+                    end[k - offset] = near[1, k]
+            for k in range(value.shape[1]):
+                out[middle, k] = value[0, k]
+                if last > 0:
+                    out[last, k] = value[1, k]
         done, first = True, 0
         for b in range(blocks):
             size, error, level = sizes[b], 0.0, 0.0
@@ -247,11 +252,13 @@ def tangent(out, changes, step, sizes):
     first = 0
     for size in sizes:
         total = np.zeros((size, columns))
-        previous = changes[0, first : first + size].copy()
-        begun = previous.copy()
-        flows[0] = 0.0
+        previous, begun = np.empty((2, size, columns))
         for r in range(size):
-            flows[0, r, r] = 1.0
+            for c in range(columns):
+                previous[r, c] = begun[r, c] = changes[0, first + r, c]
+        for r in range(size):
+            for c in range(size):
+                flows[0, r, c] = 1.0 if r == c else 0.0
         at = offset + first
         for i in range(0, points, 2):
             middle, last = i + 1, (i + 2) % points
@@ -494,9 +501,10 @@ def monodromy(free, diagonal, places, forcing, kicks, state):
                 for c in range(columns):
                     seen[a, c] += weight * state[j, c]
         for a in range(inner):
-            seen[2 * elements + a] = state[2 * size + a]
+            for c in range(columns):
+                seen[2 * elements + a, c] = state[2 * size + a, c]
+        force[:] = 0.0
         for e in range(elements + inner):
-            force[e] = 0.0
             for a in range(2 * elements + inner):
                 weight = kick[e, a]
                 if weight != 0.0:
@@ -508,7 +516,8 @@ def monodromy(free, diagonal, places, forcing, kicks, state):
                 for c in range(columns):
                     state[j, c] -= weight * force[e, c]
         for a in range(inner):
-            state[2 * size + a] = force[elements + a]
+            for c in range(columns):
+                state[2 * size + a, c] = force[elements + a, c]
         if i == steps:
             return
         if diagonal:
@@ -526,4 +535,6 @@ def monodromy(free, diagonal, places, forcing, kicks, state):
                     weight = free[j, n]
                     for c in range(columns):
                         moved[j, c] += weight * state[n, c]
-            state[: 2 * size] = moved[: 2 * size]
+            for j in range(2 * size):
+                for c in range(columns):
+                    state[j, c] = moved[j, c]
