@@ -20,6 +20,8 @@ MOST_MODES, MODE_ERROR_STEPS = 16, 128
 # Steps in time, and relative change of the largest modulus by twice as many, below which these are enough; with many
 # steps, also that in units of the distance from the unit circle.
 FEWEST_MODAL_STEPS, MANY_MODAL_STEPS, MOST_MODAL_STEPS, MODAL_ERROR, CLEAR_OF_CIRCLE = 64, 1024, 4096, 1e-8, 1e-3
+# Points at which the linearised equations of internal states are evaluated, one after the other, and points a step.
+POINTS_OF_MEMORY, POINTS_A_STEP = (4096, 8192, 16384), 8
 LEAST_STEP_TURN = 1e-7  # of an undamped mode in a step, below which the formula of a critically damped one is taken
 
 
@@ -35,7 +37,8 @@ class CondensedSolution(PeriodicSolution):
         The multipliers, those of the 16 lowest modes at most; the elements bend the other modes statically. Those below
         about 1e-12 are rounding errors. None unless converged.
     multiplier_error : float
-        Estimated error of the largest modulus: its change with half of the steps in time, and with half of the modes.
+        Estimated error of the largest modulus: its change with half of the steps in time (with internal states of
+        elements, the largest of two such changes), and with half of the modes.
     changes : dict of str to float
         See `error_estimate`.
     """
@@ -135,7 +138,7 @@ def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.nd
     """Return the Floquet multipliers in the lowest modes, largest first, and the error of the largest modulus.
 
     The maps over the period with steps h, h/2, h/4, … are extrapolated in even powers of h ([1]_) until the largest
-    modulus does not change any more.
+    modulus does not change any more. With internal states of elements, which have kinks, they are not extrapolated.
 
     References
     ----------
@@ -143,6 +146,16 @@ def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.nd
        Analysis 2 (1965) 384-403.
     """
     motion = _Linearised(equations, theta, harmonics(z), MOST_MODES)
+    values, error = _of_memory(motion) if equations.model.state_owners else _extrapolated(motion)
+    if len(motion.modes.stiffness) < len(equations.model.states):
+        fewer = _Linearised(equations, theta, harmonics(z), MOST_MODES // 2)
+        of_fewer, of_all = (np.abs(np.linalg.eigvals(m.monodromy(MODE_ERROR_STEPS))).max() for m in (fewer, motion))
+        error += abs(float(of_fewer - of_all))
+    return values[np.argsort(-np.abs(values), kind="stable")], error
+
+
+def _extrapolated(motion: "_Linearised") -> tuple[np.ndarray, float]:
+    """Return the multipliers for steps that become small, and the error of the largest modulus."""
     steps, row, largest = FEWEST_MODAL_STEPS, [motion.monodromy(FEWEST_MODAL_STEPS)], []
     while True:
         values = np.linalg.eigvals(row[-1]).astype(complex)
@@ -150,16 +163,23 @@ def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.nd
         error = abs(largest[-1] - largest[-2]) if len(largest) > 1 else np.inf
         clear = CLEAR_OF_CIRCLE * abs(largest[-1] - 1.0) if steps >= MANY_MODAL_STEPS else 0.0
         if steps >= MOST_MODAL_STEPS or (len(row) > 2 and error <= max(clear, MODAL_ERROR * largest[-1])):
-            break
+            return values, error
         steps, before, row = 2 * steps, row, [motion.monodromy(2 * steps)]
         for order, coarse in enumerate(before, start=1):
             row.append(row[-1] + (row[-1] - coarse) / (4.0**order - 1.0))
-    values = values[np.argsort(-np.abs(values), kind="stable")]
-    if len(motion.modes.stiffness) < len(equations.model.states):
-        fewer = _Linearised(equations, theta, harmonics(z), MOST_MODES // 2)
-        of_fewer, of_all = (np.abs(np.linalg.eigvals(m.monodromy(MODE_ERROR_STEPS))).max() for m in (fewer, motion))
-        error += abs(float(of_fewer - of_all))
-    return values, error
+
+
+def _of_memory(motion: "_Linearised") -> tuple[np.ndarray, float]:
+    """Return the multipliers with internal states, and the error of the largest modulus.
+
+    Elements begin to slide and reverse between two points: the error is of order one and irregular in their number,
+    and the larger of the last two changes estimates it.
+    """
+    largest = []
+    for points in POINTS_OF_MEMORY:
+        values = np.linalg.eigvals(motion.monodromy(points // POINTS_A_STEP, points)).astype(complex)
+        largest.append(float(np.abs(values).max()))
+    return values, float(np.abs(np.diff(largest)).max())
 
 
 class _Linearised:
@@ -217,8 +237,10 @@ class _Linearised:
         result[v, q], result[v, v] = -squares * odd, even - decay * odd
         return result
 
-    def monodromy(self, steps: int) -> np.ndarray:
+    def monodromy(self, steps: int, points: int = 0) -> np.ndarray:
         """Return the map of (q, q̇) and internal states over the period in steps, of second order.
+
+        The elements are evaluated at these points, by default at those of the solution, or the steps if more.
 
         Each step is the exact motion of the linear structure between two points, at which the elements act for half of
         the step ([1]_), with their mean over it.
@@ -228,8 +250,9 @@ class _Linearised:
         .. [1] G. Strang, On the construction and comparison of difference schemes, SIAM Journal on Numerical Analysis 5
            (1968) 506-517.
         """
-        if steps > len(self._known[0]):
-            self._known = self._couplings(steps)
+        points = points or max(steps, len(self._known[0]))
+        if points != len(self._known[0]):
+            self._known = self._couplings(points)
         length, means = self._period / steps, [_means(part, steps) for part in self._known]
         result = np.eye(2 * self._size + self._inner)
         kicks = self._kicks_of_states(length, *means) if self._inner else self._kicks(length, *means)
