@@ -42,6 +42,9 @@ LARGEST_OUTPUT_CHANGE, LEAST_HARMONIC = 1e-2, 1e-12
 MOST_STARTING_POINTS, STARTING_RATIO = 512, 4
 # Share of a step that is left by harmonics whose coupling by the elements is neglected in Newton's matrix.
 WEAK_COUPLING = 0.05
+# The same with internal states, by which a change at one moment lasts; corrections of Newton's step with such states,
+# and their last one relative to it.
+WEAK_COUPLING_OF_MEMORY, MOST_STEP_SWEEPS, LAST_STEP_SWEEP = 0.0125, 20, 1e-4
 MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40, 10, 1e-10, 1e-13
 MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR = 200, 1e-13
 # Steps of the load along the branch, in units of the load and of the linear response; corrections, their largest ratio,
@@ -119,10 +122,11 @@ class Preconditioner:
     def strongly_coupled(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> int:
         """Return the number of low harmonics beyond which all are coupled weakly."""
         steepest = np.abs(forces.stiffness).max(axis=0) + rates[:, None] * np.abs(forces.damping).max(axis=0)
+        weak = WEAK_COUPLING
         if forces.memory is not None:
-            steepest = steepest + forces.memory.steepest(rates)
+            steepest, weak = steepest + forces.memory.steepest(rates), WEAK_COUPLING_OF_MEMORY
         coupling = np.sqrt(np.sum(np.abs(d_f * steepest[:, None, :]) ** 2, axis=(1, 2)))
-        return min(len(rates), int(np.flatnonzero(~(coupling < WEAK_COUPLING)).max(initial=0)) + 1)
+        return min(len(rates), int(np.flatnonzero(~(coupling < weak)).max(initial=0)) + 1)
 
     def __call__(self, right: np.ndarray) -> np.ndarray:
         """Return the approximate solution (…, harmonics, elements) for a right-hand side of that shape."""
@@ -345,7 +349,7 @@ class CondensedEquations(PeriodicEquations):
                 return d, NOT_FINITE, np.array(history).reshape(-1, 3)
             before = float(np.linalg.norm(residual))
             try:
-                step = Preconditioner(forces, rates, matrices.d_f)(residual)
+                step = _newton_step(forces, rates, matrices.d_f, residual)
             except np.linalg.LinAlgError:
                 return d, SINGULAR, np.array(history).reshape(-1, 3)
             share = 1.0
@@ -640,6 +644,22 @@ def _of_units(memory: Memory, rates: np.ndarray, low: int) -> list[np.ndarray]:
         by_harmonic = harmonics(change.reshape(points, -1))[:low].reshape(low, memory.elements, low)
         result.append(by_harmonic.transpose(1, 0, 2))
     return result
+
+
+def _newton_step(forces: Forces, rates: np.ndarray, d_f: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Return Newton's step; with internal states, in which the higher harmonics count too, it is corrected."""
+    inverse = Preconditioner(forces, rates, d_f)
+    first = step = inverse(residual)
+    if forces.memory is None:
+        return step
+    for _ in range(MOST_STEP_SWEEPS):
+        more = inverse(residual - step - times(d_f, _linearised(forces, rates, step)))
+        step, size = step + more, float(np.linalg.norm(more))
+        if size <= LAST_STEP_SWEEP * np.linalg.norm(step):
+            return step
+        if not size <= np.linalg.norm(first):
+            break
+    return first
 
 
 def _linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.ndarray) -> np.ndarray | None:
