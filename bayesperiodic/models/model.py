@@ -466,14 +466,11 @@ class CondensedModel(Model):
         count, symbols = len(structure.elements), with_derivatives("s", inner)
         moving = with_derivatives("e", tuple(f"d{number}" for number in range(count)))
         d, v, a = (tuple(moving.values())[order * count : (order + 1) * count] for order in range(3))
-        s, p, forces, rates, blocks, owners = (
-            Names("states", symbols),
-            Names("parameters", self.parameter_symbols),
-            [],
-            {},
-            [],
-            {},
-        )
+        s, p = Names("states", symbols), Names("parameters", self.parameter_symbols)
+        forces: list[sp.Expr] = []
+        rates: dict[sp.Symbol, sp.Expr] = {}
+        blocks: list[list[sp.Symbol]] = []
+        owners: dict[sp.Symbol, int] = {}
         for number, element in enumerate(structure.elements):
             part = element.evaluate(d[number], v[number], s, p)
             mine = [symbols[state] for state in element.states]

@@ -154,7 +154,7 @@ def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.nd
     return values[np.argsort(-np.abs(values), kind="stable")], error
 
 
-def _extrapolated(motion: "_Linearised") -> tuple[np.ndarray, float]:
+def _extrapolated(motion: _Linearised) -> tuple[np.ndarray, float]:
     """Return the multipliers for steps that become small, and the error of the largest modulus."""
     steps, row, largest = FEWEST_MODAL_STEPS, [motion.monodromy(FEWEST_MODAL_STEPS)], []
     while True:
@@ -169,7 +169,7 @@ def _extrapolated(motion: "_Linearised") -> tuple[np.ndarray, float]:
             row.append(row[-1] + (row[-1] - coarse) / (4.0**order - 1.0))
 
 
-def _of_memory(motion: "_Linearised") -> tuple[np.ndarray, float]:
+def _of_memory(motion: _Linearised) -> tuple[np.ndarray, float]:
     """Return the multipliers with internal states, and the error of the largest modulus.
 
     Elements begin to slide and reverse between two points: the error is of order one and irregular in their number,

@@ -74,7 +74,7 @@ class Memory(NamedTuple):
         return result
 
     def change(self, added: np.ndarray) -> np.ndarray:
-        """Return the change of the forces (points, elements, columns) by changes of the rates (points, states, columns).
+        """Return changes of the forces (points, elements, columns) by those of the rates (points, states, columns).
 
         Those are with all states held.
         """
