@@ -141,8 +141,8 @@ class CondensedBatch:
         shares = np.stack([unresolved(*of_set) for of_set in zip(self._largest, f, every_y, strict=True)])
         if blocks.size:
             for e, b in np.argwhere(status == CONVERGED):
-                more = self._sets[e].error_of_memory(d[e, b], f[e, b], every_y[e][b], every[e, b])
-                shares[e, b] = max(shares[e, b], more)
+                given = d[e, b], f[e, b], every_y[e][b], every[e, b]
+                shares[e, b] = max(shares[e, b], self._sets[e].error_of_memory(*given))
         finer = {}
         for e, b in np.argwhere((status == CONVERGED) & ~(shares <= RESOLVED_SHARE)):
             equations, theta = self._sets[e], every[e, b]

@@ -216,9 +216,9 @@ class _Linearised:
         by_d, by_v = slopes[:, count:, 0, :count], slopes[:, count:, 1, :count]
         # The other modes take part of displacements and velocities; changes of `series` in time are neglected.
         left = unit - flexible @ springs
-        own = slopes[:, count:, 0, count:] - by_d @ flexible @ of_states
+        inside = slopes[:, count:, 0, count:] - by_d @ flexible @ of_states
         relaxed = np.linalg.inv(np.eye(self._inner) + by_v @ flexible @ of_states)
-        return springs, dampers, of_states, relaxed @ by_d @ left, relaxed @ by_v @ left, relaxed @ own
+        return springs, dampers, of_states, relaxed @ by_d @ left, relaxed @ by_v @ left, relaxed @ inside
 
     def _free(self, length: float) -> np.ndarray:
         """Return the motion without elements over a time."""

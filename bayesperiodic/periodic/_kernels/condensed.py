@@ -15,9 +15,15 @@ MOST_CORRECTIONS, CORRECTION_RATE, FIRST_CORRECTION, LAST_CORRECTION, LAST_POLIS
 )
 # Periods over which internal states are followed, Newton's steps between two points, those that are whole ones, and
 # their last one; the last correction of the start of a period.
-MOST_PERIODS, MOST_STATE_STEPS, WHOLE_STATE_STEPS, LAST_STATE_STEP, LAST_START_CORRECTION = 100, 60, 15, 1e-9, 1e-12
-ROUNDING = 1e-16
-REALS, ROWS, COMPLEX_ROWS, CUBE = "float64[::1]", "float64[:,::1]", "complex128[:,::1]", "float64[:,:,::1]"
+MOST_MARCHED_PERIODS, MOST_STATE_STEPS, WHOLE_STATE_STEPS, LAST_STATE_STEP, LAST_START_CORRECTION = (
+    100,
+    60,
+    15,
+    1e-9,
+    1e-12,
+)
+STATE_ROUNDING = 1e-16
+REALS, ROWS, COMPLEX_ROWS, STACKED_ROWS = "float64[::1]", "float64[:,::1]", "complex128[:,::1]", "float64[:,:,::1]"
 
 
 @njit("void(complex128[::1], complex128[::1], int64[::1], boolean)", **CONDENSED_OPTIONS)
@@ -129,7 +135,7 @@ def march(address, states, out, theta, rate, step, sizes):
     for k in range(inner):
         begin[k] = states[0, offset + k]
     known, moving = np.zeros((2, blocks), dtype=np.bool_)
-    for _ in range(MOST_PERIODS):
+    for _ in range(MOST_MARCHED_PERIODS):
         for k in range(inner):
             states[0, offset + k], scale[k] = begin[k], 0.0
         grid_function_at(address)(states[:1], empty[:1], theta, tau[:1], rate, out[:1])
@@ -210,9 +216,9 @@ def march(address, states, out, theta, rate, step, sizes):
                     a[r, size] = end[first + r] - begin[first + r]
                 regular, length = eliminate(a, size, 1), 0.0
                 for r in range(size):
-                    regular = regular and abs(a[r, r]) > points * ROUNDING
+                    regular = regular and abs(a[r, r]) > points * STATE_ROUNDING
                     length = max(length, abs(a[r, size]))
-                if not regular and error <= points * ROUNDING * level:
+                if not regular and error <= points * STATE_ROUNDING * level:
                     return False
                 if not (regular and length < np.inf) or (known[b] and error > 0.5 * errors[b]):
                     # Where Newton's step did not help, a further period.
@@ -223,7 +229,7 @@ def march(address, states, out, theta, rate, step, sizes):
                 else:
                     known[b] = True
                     settled = length <= LAST_START_CORRECTION * level
-                if not settled and error > points * ROUNDING * level:
+                if not settled and error > points * STATE_ROUNDING * level:
                     done = False
                     for r in range(size):
                         begin[first + r] += a[r, size]
@@ -234,7 +240,7 @@ def march(address, states, out, theta, rate, step, sizes):
     return False
 
 
-@njit(f"void({ROWS}, {CUBE}, float64, int64[::1])", **CONDENSED_OPTIONS)
+@njit(f"void({ROWS}, {STACKED_ROWS}, float64, int64[::1])", **CONDENSED_OPTIONS)
 def tangent(out, changes, step, sizes):
     """Replace changes (points, internal states, columns) of the rates by the periodic changes of internal states.
 
