@@ -25,11 +25,14 @@ from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, SINGULAR, STALLED
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, sampled
+from bayesperiodic.periodic.memory import Memory, remembered
 from bayesperiodic.periodic.receptance import Receptance, unresolved
 from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
 # Points of the grid of the elements, and relative change of the outputs below which they are not doubled.
 FEWEST_ELEMENT_POINTS, MOST_ELEMENT_POINTS, RESOLVED_CHANGE = 32, 4096, 1e-6
+# The latter with internal states, whose formula is of order two at kinks: it leaves about a third of the change.
+RESOLVED_CHANGE_OF_MEMORY = 5e-5
 # Bound of the error of the outputs, see `unresolved`, above which points are doubled too.
 RESOLVED_SHARE = 1e-4
 # The largest change or bound of outputs that count as resolved by the most points; the smallest relative harmonic of an
@@ -39,6 +42,9 @@ LARGEST_OUTPUT_CHANGE, LEAST_HARMONIC = 1e-2, 1e-12
 MOST_STARTING_POINTS, STARTING_RATIO = 512, 4
 # Share of a step that is left by harmonics whose coupling by the elements is neglected in Newton's matrix.
 WEAK_COUPLING = 0.05
+# The same with internal states, by which a change at one moment lasts; corrections of Newton's step with such states,
+# and their last one relative to it.
+WEAK_COUPLING_OF_MEMORY, MOST_STEP_SWEEPS, LAST_STEP_SWEEP = 0.0125, 20, 1e-4
 MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40, 10, 1e-10, 1e-13
 MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR = 200, 1e-13
 # Steps of the load along the branch, in units of the load and of the linear response; corrections, their largest ratio,
@@ -48,11 +54,15 @@ MOST_LOAD_CORRECTIONS, LOAD_CONTRACTION, LOAD_ERROR, STRAIGHT_TANGENTS = 10, 0.6
 
 
 class Forces(NamedTuple):
-    """Forces of the elements on a grid, (points, elements), and their derivatives by displacement and velocity."""
+    """Forces of the elements on a grid, (points, elements), and their derivatives by displacement and velocity.
+
+    The latter are with the internal states held.
+    """
 
     values: np.ndarray
     stiffness: np.ndarray
     damping: np.ndarray
+    memory: Memory | None = None  # by internal states
 
 
 class ResponseMatrices(NamedTuple):
@@ -79,13 +89,16 @@ class Preconditioner:
         points, self.elements = forces.values.shape
         self.low = low = low or self.strongly_coupled(forces, rates, d_f)
         numbers = np.arange(low)
-        stiffness, damping = (np.fft.fft(part, axis=0).T / points for part in forces[1:])
+        stiffness, damping = (np.fft.fft(part, axis=0).T / points for part in forces[1:3])
         difference, total = (numbers[:, None] - numbers) % points, (numbers[:, None] + numbers) % points
         turning = 1j * rates[:low]
         same = stiffness[:, difference] + damping[:, difference] * turning
         mirrored = stiffness[:, total] - damping[:, total] * turning
         mirrored[:, :, 0] = 0.0
-        sums = [np.einsum("kab,bkl->kalb", d_f[:low], part) for part in (same + mirrored, 1j * (same - mirrored))]
+        by_part = [same + mirrored, 1j * (same - mirrored)]
+        if forces.memory is not None:
+            by_part = [a + b for a, b in zip(by_part, _of_units(forces.memory, rates, low), strict=True)]
+        sums = [np.einsum("kab,bkl->kalb", d_f[:low], part) for part in by_part]
         unit = np.einsum("kl,ab->kalb", np.eye(low), np.eye(self.elements))
         by_real, by_imaginary = (s + u for s, u in zip(sums, (unit, 1j * unit), strict=True))
         blocks = [[by_real.real, by_imaginary.real], [by_real.imag, by_imaginary.imag]]
@@ -109,8 +122,11 @@ class Preconditioner:
     def strongly_coupled(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> int:
         """Return the number of low harmonics beyond which all are coupled weakly."""
         steepest = np.abs(forces.stiffness).max(axis=0) + rates[:, None] * np.abs(forces.damping).max(axis=0)
+        weak = WEAK_COUPLING
+        if forces.memory is not None:
+            steepest, weak = steepest + forces.memory.steepest(rates), WEAK_COUPLING_OF_MEMORY
         coupling = np.sqrt(np.sum(np.abs(d_f * steepest[:, None, :]) ** 2, axis=(1, 2)))
-        return min(len(rates), int(np.flatnonzero(~(coupling < WEAK_COUPLING)).max(initial=0)) + 1)
+        return min(len(rates), int(np.flatnonzero(~(coupling < weak)).max(initial=0)) + 1)
 
     def __call__(self, right: np.ndarray) -> np.ndarray:
         """Return the approximate solution (…, harmonics, elements) for a right-hand side of that shape."""
@@ -274,22 +290,50 @@ class CondensedEquations(PeriodicEquations):
         return self._receptance.recent(key, lambda: self._forces(d, parameters))
 
     def _forces(self, d: np.ndarray, parameters: np.ndarray) -> Forces:
-        values, given = self._evaluated("residual_jacobian", d, parameters), self.count
-        f, slopes = values[:, :given], values[:, given:].reshape(len(values), given, 3, given)
-        diagonal = np.arange(given)
-        return Forces(f, slopes[:, diagonal, 0, diagonal], slopes[:, diagonal, 1, diagonal])
+        states, given, memory = self._motion(d), self.count, None
+        if self.model.state_owners:
+            period = self.grid.periods / self.frequency
+            memory = remembered(self.model, states, parameters, self.frequency, period)
+            if memory is None:
+                unknown = np.full((len(states), given), np.nan)
+                return Forces(unknown, unknown, unknown)
+        values = self._evaluated("residual_jacobian", states, parameters) if memory is None else memory.columns
+        every, diagonal = given + len(self.model.state_owners), np.arange(given)
+        f, slopes = values[:, :given], values[:, every:].reshape(len(values), every, 3, every)
+        return Forces(f, slopes[:, diagonal, 0, diagonal], slopes[:, diagonal, 1, diagonal], memory)
 
     def forces_by_parameters(self, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return the derivatives of the forces by the parameters, (points, elements, parameters)."""
         if not self.count:
             return np.zeros((2 * len(d), 0, parameters.size))
-        values = self._evaluated("derivatives", d, parameters)[:, : self.count * parameters.size]
-        return values.reshape(len(values), self.count, -1)
+        memory = self.forces(d, parameters).memory
+        states = self._motion(d) if memory is None else memory.states
+        every = self.count + len(self.model.state_owners)
+        values = self._evaluated("derivatives", states, parameters)[:, : every * parameters.size]
+        slopes = values.reshape(len(values), every, -1)
+        of_forces = slopes[:, : self.count]
+        return of_forces if memory is None else of_forces + memory.change(slopes[:, self.count :])
 
-    def _evaluated(self, name: str, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        points, kernels = 2 * len(d), self.model.element_kernels
-        states = np.zeros((points, 3 * self.count))
-        states[:, : 2 * self.count] = on_grid(np.concatenate([d, 1j * self.rates(points)[:, None] * d], axis=1), points)
+    def _by_frequency(self, d: np.ndarray, forces: Forces) -> np.ndarray:
+        """Return the derivatives of the forces by the frequency, (points, elements), with harmonics d held."""
+        v = on_grid(1j * self.rates(2 * len(d))[:, None] * d, 2 * len(d)) / self.frequency
+        change, memory = forces.damping * v, forces.memory
+        if memory is None:
+            return np.asarray(change)
+        # In units of the period, the rates of the states are inversely proportional to the frequency.
+        added = memory.by_velocity * v[:, memory.owners] - memory.rates / self.frequency
+        return np.asarray(change + memory.change(added[..., None])[..., 0])
+
+    def _motion(self, d: np.ndarray) -> np.ndarray:
+        """Return displacements and velocities of the elements as states of their kernels (points, 3·variables)."""
+        points, every = 2 * len(d), self.count + len(self.model.state_owners)
+        states, both = np.zeros((points, 3 * every)), np.concatenate([d, 1j * self.rates(points)[:, None] * d], axis=1)
+        motion = on_grid(both, points)
+        states[:, : self.count], states[:, every : every + self.count] = np.split(motion, 2, axis=1)
+        return states
+
+    def _evaluated(self, name: str, states: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        kernels, points = self.model.element_kernels, len(states)
         return kernels.evaluate(name, states, np.empty((points, 0)), parameters, np.zeros(points), self.frequency)
 
     def solve(self, parameters: np.ndarray, guess: np.ndarray, *_: Any) -> Solved:
@@ -312,7 +356,7 @@ class CondensedEquations(PeriodicEquations):
                 return d, NOT_FINITE, np.array(history).reshape(-1, 3)
             before = float(np.linalg.norm(residual))
             try:
-                step = Preconditioner(forces, rates, matrices.d_f)(residual)
+                step = _newton_step(forces, rates, matrices.d_f, residual)
             except np.linalg.LinAlgError:
                 return d, SINGULAR, np.array(history).reshape(-1, 3)
             share = 1.0
@@ -364,7 +408,8 @@ class CondensedEquations(PeriodicEquations):
         """Double the points of a solution until its outputs are resolved; return it, the code and Newton's history."""
         history, change = np.empty((0, 3)), np.nan
         before, share = self._outputs(d, parameters)
-        while not (change <= RESOLVED_CHANGE and share <= RESOLVED_SHARE):
+        enough = RESOLVED_CHANGE_OF_MEMORY if self.model.state_owners else RESOLVED_CHANGE
+        while not (change <= enough and share <= RESOLVED_SHARE):
             if 2 * len(d) >= MOST_ELEMENT_POINTS:
                 worst = np.fmax(change, share)
                 return d, CONVERGED if worst <= LARGEST_OUTPUT_CHANGE else NOT_RESOLVED, history
@@ -439,7 +484,21 @@ class CondensedEquations(PeriodicEquations):
     def _output_harmonics(self, d: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, float]:
         matrices, f = self.matrices(parameters, 2 * len(d))[0], harmonics(self.forces(d, parameters).values)
         y = times(matrices.y_u, self.input_harmonics(2 * len(d))) - times(matrices.y_f, f)
-        return y, float(unresolved(matrices.largest, f, y))
+        bound = float(unresolved(matrices.largest, f, y))
+        return y, max(bound, self.error_of_memory(d, f, y, parameters))
+
+    def error_of_memory(self, d: np.ndarray, f: np.ndarray, y: np.ndarray, parameters: np.ndarray) -> float:
+        """Return the relative error of the outputs by that of internal states, d being held; 0 without such states.
+
+        It is a third of their change if half of the points give the forces' harmonics f, since the formula is of order
+        two at kinks.
+        """
+        if not self.model.state_owners:
+            return 0.0
+        fewer = harmonics(self._forces(resized(d, len(d)), parameters).values)
+        change = np.linalg.norm(times(self.matrices(parameters, len(d))[0].y_f, fewer - f[: len(fewer)]), axis=0)
+        worst = np.max(change / np.maximum(np.linalg.norm(y, axis=0), np.finfo(float).tiny), initial=0.0)
+        return float(worst) / 3.0 if np.isfinite(worst) else np.inf
 
     def error_bound(self, z: np.ndarray, parameters: np.ndarray) -> float:
         """Return the bound of the relative error of the outputs by the number of points, see `unresolved`."""
@@ -476,7 +535,7 @@ class CondensedEquations(PeriodicEquations):
         `directions` are indices of parameters, their number standing for the frequency; the latter are (directions,
         harmonics, elements) and (directions, harmonics, outputs).
         """
-        points, rates = 2 * len(d), self.rates(2 * len(d))
+        points = 2 * len(d)
         matrices, changes = self.matrices(parameters, points, directions)
         forces = self.forces(d, parameters)
         f, load = harmonics(forces.values), self.input_harmonics(points)
@@ -487,7 +546,7 @@ class CondensedEquations(PeriodicEquations):
                 ..., [directions[n] for n in of_elements]
             ]
         for index in (i for i, n in enumerate(directions) if n == size):
-            slopes[..., index] = forces.damping * on_grid(1j * rates[:, None] * d, points) / self.frequency
+            slopes[..., index] = self._by_frequency(d, forces)
         of_forces = harmonics(slopes.reshape(points, self.count * len(directions))).reshape(
             len(d), self.count, len(directions)
         )
@@ -572,8 +631,46 @@ def residual_of(
 def _linearised(forces: Forces, rates: np.ndarray, moved: np.ndarray) -> np.ndarray:
     """Return the change of the forces for a change of d, harmonics (…, harmonics, elements) both."""
     points = len(forces.values)
-    change = forces.stiffness * on_grid(moved, points) + forces.damping * on_grid(1j * rates[:, None] * moved, points)
+    d, v = on_grid(moved, points), on_grid(1j * rates[:, None] * moved, points)
+    change = forces.stiffness * d + forces.damping * v
+    if forces.memory is not None:
+        columns = [np.moveaxis(part.reshape(-1, *d.shape[-2:]), 0, -1) for part in (d, v)]
+        change = change + np.moveaxis(forces.memory.along(*columns), -1, 0).reshape(change.shape)
     return harmonics(change)
+
+
+def _of_units(memory: Memory, rates: np.ndarray, low: int) -> list[np.ndarray]:
+    """Return changes of the forces by internal states for unit real and imaginary harmonics of d.
+
+    They are (elements, harmonics, harmonics), the latter those of d, of as many low harmonics.
+    """
+    points, result = len(memory.states), []
+    for unit in (1.0, 1j):
+        columns = np.zeros((2, points // 2, low), dtype=complex)
+        numbers = np.arange(low)
+        columns[0, numbers, numbers] = unit
+        columns[1, numbers, numbers] = 1j * rates[:low] * unit
+        d, v = (np.repeat(part[:, None], memory.elements, axis=1) for part in on_grid(columns, points))
+        change = memory.along(d, v)
+        by_harmonic = harmonics(change.reshape(points, -1))[:low].reshape(low, memory.elements, low)
+        result.append(by_harmonic.transpose(1, 0, 2))
+    return result
+
+
+def _newton_step(forces: Forces, rates: np.ndarray, d_f: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Return Newton's step; with internal states, in which the higher harmonics count too, it is corrected."""
+    inverse = Preconditioner(forces, rates, d_f)
+    first = step = inverse(residual)
+    if forces.memory is None:
+        return step
+    for _ in range(MOST_STEP_SWEEPS):
+        more = inverse(residual - step - times(d_f, _linearised(forces, rates, step)))
+        step, size = step + more, float(np.linalg.norm(more))
+        if size <= LAST_STEP_SWEEP * np.linalg.norm(step):
+            return step
+        if not size <= np.linalg.norm(first):
+            break
+    return first
 
 
 def _linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.ndarray) -> np.ndarray | None:
