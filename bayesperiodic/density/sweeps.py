@@ -2,8 +2,9 @@
 
 The branch of a table is followed once from its first point through all frequencies and round the folds, see
 `periodic.table_branch`; if the response from rest at the last point is not on it, as where the folds between them are
-far outside the table, the branch through that one too. Each point is on one of its stable sheets: in a sweep the sheet does not change but at jumps,
-from one sheet to a later one. Among these choices the one is taken that the measured values fit best.
+far outside the table, the branch through that one too. Each point is on one of the stable sheets: in a sweep the sheet
+does not change but at jumps, from one sheet to a later one. Among these choices the one is taken that the measured
+values fit best.
 
 In solves at other θ a sheet may end at a fold before a measured frequency. The orbit of such a point is that at the
 fold, see `sheets` and `likelihood.reach`.
