@@ -12,7 +12,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.orbits.stretches import (
     FEWEST_SAMPLES,
-    LONGEST_STEP,
+    LONGEST_USUAL_STEP,
     SMALLEST_WINDOW,
     Stretches,
     joined,
@@ -57,7 +57,7 @@ class PoincareSection(Result):
     stretches : array (count,) of int, or None
         Number of the unbroken stretch of each point: a point and the one n places later are n returns apart where their
         numbers are equal. None if there is no break.
-    starts : array of int, or None
+    starts : array (stretches,) of int, or None
         First sample of each stretch, by its number; None for points alone, or if there is no break.
     left_out : int
         Number of returns between the first and the last point of which the points are in gaps; 0 for crossings.
@@ -466,7 +466,7 @@ def _check_angle(name: str, values: np.ndarray) -> None:
 def _check_rate(name: str, other: str, time: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> None:
     """Raise a ValueError if the other coordinate is the rate of the unwrapped angle in another unit."""
     step = np.diff(time)
-    short = step <= LONGEST_STEP * usual_step(time)
+    short = step <= LONGEST_USUAL_STEP * usual_step(time)
     measured = np.diff(angle)[short]
     expected = (0.5 * (rate[1:] + rate[:-1]) * step)[short]
     scale, product = np.sqrt(np.sum(measured**2) * np.sum(expected**2)), np.sum(measured * expected)

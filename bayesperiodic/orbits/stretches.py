@@ -9,7 +9,7 @@ from bayesperiodic.data.recording import Recording
 
 # Samples a period at least; a step of time is a gap if it is longer than that and than the first number of usual steps,
 # or longer than the second number of them. The usual step is a high quantile, because the steps may differ.
-FEWEST_SAMPLES, LONG_STEP, LONGEST_STEP, USUAL_STEP = 8, 1.5, 3.0, 0.9
+FEWEST_SAMPLES, SMALLEST_GAP, LONGEST_USUAL_STEP, USUAL_STEP = 8, 1.5, 3.0, 0.9
 # A recording continues the one before if it starts between these multiples of the usual step after its end.
 EARLIEST, LATEST = 0.5, 1.5
 # Local polynomials: degree for the values; degree and number of samples for the variance of the noise.
@@ -82,9 +82,9 @@ def joined(recordings: Sequence[Recording], signals: Sequence[np.ndarray], frequ
             away = time[0] - end
         if position == 0 or not all(EARLIEST * one <= away <= LATEST * one for one in (usual, last_usual)):
             starts.append(np.array([size]))
-        limit = LONGEST_STEP * usual
+        limit = LONGEST_USUAL_STEP * usual
         if frequency is not None:
-            limit = max(LONG_STEP * usual, min(limit, 1.0 / (FEWEST_SAMPLES * frequency)))
+            limit = max(SMALLEST_GAP * usual, min(limit, 1.0 / (FEWEST_SAMPLES * frequency)))
         starts.append(size + 1 + np.flatnonzero(step > limit))
         size, last_usual = size + time.size, usual
     values = np.concatenate([signals[k] for k in order])

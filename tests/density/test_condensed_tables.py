@@ -7,7 +7,7 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.density.responses import ResponseSolver
-from bayesperiodic.density.sweeps import _branch as branch_of
+from bayesperiodic.density.sweeps import _branches as branches_of
 from bayesperiodic.density.sweeps import tables
 from tests.density.test_sweeps import THETA, F, folds, predicted
 from tests.response_tables import FORCE, PRIORS, TRUTH, noisy, swept
@@ -92,7 +92,8 @@ def test_forces_that_change_along_the_table_are_interpolated():
     passages = []
     for problem in given:
         (table,) = tables(problem).values()
-        passages.append(branch_of(problem, THETA, table))
+        [branch] = branches_of(problem, THETA, table)
+        passages.append(branch)
     ours, other = passages
     assert [(p.sheet, p.point) for p in ours] == [(p.sheet, p.point) for p in other]
     assert sum(p.is_fold for p in ours) == 2
