@@ -21,7 +21,7 @@ from bayesperiodic.periodic.harmonics import harmonics, sampled
 from bayesperiodic.periodic.special import SpecialPoint
 from bayesperiodic.periodic.special_batch import SpecialAnchor, SpecialBatch
 from bayesperiodic.periodic.special_start import fold_equations
-from bayesperiodic.periodic.table_branch import follow, input_slope, neighbour
+from bayesperiodic.periodic.table_branch import follow, input_change, input_slope, neighbour
 from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.parameters import ParameterMaps
 
@@ -165,7 +165,8 @@ class Sheet:
 
     def _found_fold(self, heading: int, last: int) -> SpecialBatch | None:
         known = [point for point in self.points if point.known]
-        if not (known and self._alike) or isinstance(self._table[0], CondensedEquations):
+        here, there = self._interval(heading, last)
+        if not (known and self._alike) or isinstance(here, CondensedEquations) or here.frequency == there.frequency:
             return None
         start = known[-1 if heading > 0 else 0]
         parameters = start.anchor.parameters
@@ -174,7 +175,6 @@ class Sheet:
         fold = next((passage for passage in passages if passage.is_fold), None)
         if fold is None:
             return None
-        here, there = self._interval(heading, last)
         direction = "up" if heading * self._sign > 0 else "down"
         special = fold_equations(here, FREQUENCY, direction, input_slope=input_slope(here, there))
         columns = fold.equations.residual_jacobian(fold.z, parameters)
@@ -198,7 +198,7 @@ class Sheet:
     @cached_property
     def _inputs_change(self) -> bool:
         """Whether the inputs are not those of the first point in the whole table."""
-        return any(input_slope(self._table[0], here) is not None for here in self._table[1:])
+        return any(input_change(self._table[0], here) is not None for here in self._table[1:])
 
     def _follow(self, groups: Sequence[GroupSolution], b: int, good: Sequence[bool]) -> None:
         """Fill in the missing points of one solve, from their neighbours."""

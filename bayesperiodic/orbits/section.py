@@ -151,7 +151,7 @@ class PoincareSection(Result):
 
         Recordings that follow each other by one sample interval, between a half and one and a half, are joined. Between
         others there is a break, as at the gaps of each: nothing is interpolated across it, and no orbit uses points
-        from both sides. Points in gaps are left out and counted (`left_out`).
+        from both sides. Points in gaps are left out and counted (attribute ``left_out``).
 
         Parameters
         ----------

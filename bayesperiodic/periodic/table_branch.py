@@ -102,14 +102,20 @@ def between(here: PeriodicEquations, there: PeriodicEquations, share: float) -> 
     return replace(here, inputs=inputs).at_frequency(frequency)
 
 
-def input_slope(here: PeriodicEquations, there: PeriodicEquations) -> np.ndarray | None:
+def input_change(here: PeriodicEquations, there: PeriodicEquations) -> np.ndarray | None:
     """Return the change of the inputs between two points of the table, (points, 3·inputs), at the frequency of `here`.
 
-    It is per Hz; None if the inputs are the same.
+    None if the inputs are the same.
     """
     change, width = there.at_frequency(here.frequency).inputs - here.inputs, len(here.model.inputs)
     # Of equal inputs the rates, which are converted, differ by rounding errors.
-    return change / (there.frequency - here.frequency) if change[:, :width].any() else None
+    return change if change[:, :width].any() else None
+
+
+def input_slope(here: PeriodicEquations, there: PeriodicEquations) -> np.ndarray | None:
+    """Return `input_change` per Hz, between points of different frequencies."""
+    change = input_change(here, there)
+    return None if change is None else change / (there.frequency - here.frequency)
 
 
 def neighbour(table: Sequence[PeriodicEquations], at: int, heading: int) -> PeriodicEquations:
