@@ -170,8 +170,11 @@ def outputs(model: Model) -> list[Markup]:
     """Return the output equations, one per channel."""
     printer = _MathPrinter(_names(model))
     if isinstance(model, CondensedModel):
-        measured = model.structure.measured.items()
-        return [printer.displayed(printer.named(name), _moved(model, printer, *given)) for name, given in measured]
+        measured, carried = model.structure.measured.items(), model.structure.carried
+        return [
+            printer.displayed(printer.named(name), _moved(model, printer, *given, carried.get(name, {})))
+            for name, given in measured
+        ]
     each = zip(model.outputs, model.output_expressions, strict=True)
     return [printer.equation(sp.Symbol(name), expression) for name, expression in each]
 
@@ -180,13 +183,21 @@ def _condensed_equations(model: CondensedModel) -> list[Markup]:
     count = len(model.element_forces)
     numbers = range(1, count + 1)
     moving = zip(model.element_symbols, ((f"d_{k}", order) for order in range(3) for k in numbers), strict=True)
-    printer, terms = _MathPrinter(_names(model) | dict(moving)), []
+    printer, terms, masses = _MathPrinter(_names(model) | dict(moving)), [], []
     for factor, letter, number, order in model.structure.linear_terms(model.parameter_symbols):
         scale = printer.text(factor) if factor != 1 else ""
         scale = f"<mrow><mo>(</mo>{scale}<mo>)</mo></mrow>" if factor.is_Add else scale
-        terms.append(f"{scale}{printer.named(f'{letter}_{number}')}{printer.named('x', order)}")
+        matrix = f"{scale}{printer.named(f'{letter}_{number}')}"
+        terms.append(f"{matrix}{printer.named('x', order)}")
+        masses += [matrix] if letter == "M" else []
     terms += [f"{TRANSPOSED.format('W')}{printer.named('f')}"] if count else []
-    rows = [printer.displayed("<mo>+</mo>".join(terms), printer.named("B") + printer.named("u"))]
+    mass = masses[0] if len(masses) == 1 else f"<mrow><mo>(</mo>{'<mo>+</mo>'.join(masses)}<mo>)</mo></mrow>"
+    loads = [printer.named("B") + printer.named("u")] * bool(model.structure.inputs)
+    loads += [
+        f"<mo>−</mo>{mass}{printer.named(f'r_{number}')}{printer.named(name, 2 - base.order)}"
+        for number, (name, base) in enumerate(model.structure.bases.items())
+    ]
+    rows = [printer.displayed("<mo>+</mo>".join(terms), "".join(loads))]
     each = zip(numbers, model.structure.weights, model.element_forces, strict=True)
     for k, at, force in each:
         rows.append(printer.displayed(printer.named(f"d_{k}"), _moved(model, printer, at, 0)))
@@ -194,12 +205,26 @@ def _condensed_equations(model: CondensedModel) -> list[Markup]:
     return rows
 
 
-def _moved(model: CondensedModel, printer: "_MathPrinter", weights: np.ndarray, order: int) -> str:
-    """Return the weighted sum of displacements or of their derivatives, as a product where it has many terms."""
-    if np.count_nonzero(weights) > MOST_WRITTEN:
-        return f"{TRANSPOSED.format('w')}{printer.named('x', order)}"
+def _moved(
+    model: CondensedModel,
+    printer: "_MathPrinter",
+    weights: np.ndarray,
+    order: int,
+    carried: Mapping[str, float] | None = None,
+) -> str:
+    """Return the weighted sum of displacements or of their derivatives, as a product where it has many terms.
+
+    `carried` is the weight of the motion of each base, by which an absolute motion differs from a relative one.
+    """
     moved = (model.state_symbols[DERIVATIVES[order] + name] for name in model.states)
-    return printer.text(sp.Add(*(number_of(w) * x for w, x in zip(weights, moved, strict=True) if w)))
+    text = f"{TRANSPOSED.format('w')}{printer.named('x', order)}"
+    if np.count_nonzero(weights) <= MOST_WRITTEN:
+        text = printer.text(sp.Add(*(number_of(w) * x for w, x in zip(weights, moved, strict=True) if w)))
+    for name, weight in (carried or {}).items():
+        size = printer.text(number_of(abs(weight))) if abs(weight) != 1.0 else ""
+        dots = order - model.structure.bases[name].order
+        text += f"<mo>{'+' if weight > 0.0 else '−'}</mo>{size}{printer.named(name, dots)}"
+    return text
 
 
 def symbol(name: str) -> Markup:

@@ -1,6 +1,7 @@
 import re
 import xml.etree.ElementTree as ElementTree
 
+import numpy as np
 import pytest
 import sympy as sp
 
@@ -102,3 +103,18 @@ def test_numbers_units_and_intervals_have_raised_powers():
     assert html.Rounding.of(5e-3, 2e-6).text(5e-3) == "5.00000×10⁻³"
     assert html.Rounding(-3, 1).interval(4e-3, 5.1e-3) == "(4.0 … 5.1)×10⁻³"
     assert html.Rounding(0, 1).interval(-1.0, 2.0) == "−1.0 … 2.0"
+
+
+def test_base_of_a_condensed_model_is_shown():
+    """The load is −M·r times the acceleration, and an absolute motion is the relative one and that of the base."""
+    model = bp.Model.from_matrices(
+        "tower",
+        mass={"m": np.eye(2)},
+        stiffness=np.eye(2),
+        base={"table": (np.array([1.0, 0.5]), "velocity")},
+        outputs={"top": (1, "absolute acceleration"), "drift": (0, "relative displacement")},
+        condensed=True,
+    )
+    (motion,) = html.equations(model)
+    assert shown(motion) == "mM0x¨+K0x=−mM0r0table˙"
+    assert [shown(row) for row in html.outputs(model)] == ["top=x¨1+0.5table˙", "drift=x0"]
