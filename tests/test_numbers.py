@@ -277,6 +277,17 @@ def population_cost():
     yield f"The joint chains of {listed(stopped)} springs ended before the stop rule had passed"
 
 
+@on("docs/studies/population.md")
+def dampers_predicted():
+    d = results("population")["dampers"]
+    inside, predicted = d["inside_90"], d["predicted"]
+    assert all(all(one["inside"].values()) for one in predicted.values() if one["member"] is not None)
+    assert not any(one["member"] is False for one in predicted.values())
+    yield f"in {inside['Kw']} of {len(predicted)} tests for the friction force, and in {inside['rho']} of"
+    yield f"expected, {0.9 * len(predicted):.1f} on average"
+    yield f"belong to {['no', 'one', 'two'][sum(one['member'] is None for one in predicted.values())]} tests"
+
+
 @on("docs/studies/damper.md")
 def damper():
     d = results("damper")
