@@ -283,9 +283,17 @@ def dampers_predicted():
     inside, predicted = d["inside_90"], d["predicted"]
     assert all(all(one["inside"].values()) for one in predicted.values() if one["member"] is not None)
     assert not any(one["member"] is False for one in predicted.values())
-    yield f"in {inside['Kw']} of {len(predicted)} tests for the friction force, and in {inside['rho']} of"
+    words = {11: "eleven", 10: "ten", 2: "two"}
+    undecided = [name.split("_")[2:] for name, one in predicted.items() if one["member"] is None]
+    count, less = words[len(predicted)], words[len(predicted) - 1]
+    yield f"Each of the {count} tests is predicted from the {less} others. The 90 % interval of a new"
+    yield f"in {inside['Kw']} of {len(predicted)} tests for the friction force"
+    yield f"in {inside['rho']} of {len(predicted)} for the sharpness"
     yield f"expected, {0.9 * len(predicted):.1f} on average"
-    yield f"belong to {['no', 'one', 'two'][sum(one['member'] is None for one in predicted.values())]} tests"
+    (first, *case), (second, *same) = undecided
+    assert case == same == ["1Hz", "1.5in"]
+    yield f"belongs to {words[len(undecided)]} tests, {first[:2]} lb and {second[:2]} lb at 1 Hz and 1.5 in, whose"
+    yield f"The data of {words[len(undecided)]} tests determine"
 
 
 @on("docs/studies/damper.md")
