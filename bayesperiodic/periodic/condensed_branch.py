@@ -197,8 +197,8 @@ class CondensedParametrised(ParametrisedEquations):
 
 def with_unknowns(equations: PeriodicEquations, *given: Any, **settings: Any) -> ParametrisedEquations:
     """Return the equations with further unknowns, condensed or discretised; see `ParametrisedEquations`."""
-    kind = CondensedParametrised if isinstance(equations, CondensedEquations) else ParametrisedEquations
-    return kind(equations, *given, **settings)  # type: ignore[arg-type]
+    kind: Any = CondensedParametrised if isinstance(equations, CondensedEquations) else ParametrisedEquations
+    return kind(equations, *given, **settings)
 
 
 def _flat(amplitudes: np.ndarray) -> np.ndarray:

@@ -9,7 +9,13 @@ import bayesperiodic as bp
 from bayesperiodic.density.responses import ResponseSolver
 from bayesperiodic.density.sweeps import _branches as branches_of
 from bayesperiodic.density.sweeps import tables
-from tests.density.test_sweeps import THETA, F, folds, predicted
+from tests.density.test_sweeps import (
+    THETA,
+    check_that_a_sweep_starts_on_the_right_side_of_the_jump,
+    check_that_points_one_by_one_may_be_on_any_stable_part,
+    folds,
+    predicted,
+)
 from tests.response_tables import FORCE, PRIORS, TRUTH, noisy, swept
 
 Element = bp.elements.Element
@@ -40,17 +46,11 @@ def problem_of(frequencies, amplitudes, sweep, condensed=True, force=FORCE, **mo
 
 @pytest.mark.parametrize("direction", ["up", "down"])
 def test_a_sweep_starts_on_the_right_side_of_the_jump(direction):
-    expected = swept(F, direction)
-    solver = ResponseSolver.start(problem_of(F, noisy(expected, 0.01, 1), direction), THETA)
-    amplitudes, frequencies, simulation = predicted(solver)
-    assert simulation.status.tolist() == [0] and frequencies == pytest.approx(F, rel=1e-12)
-    assert amplitudes == pytest.approx(expected, abs=1e-3)
+    check_that_a_sweep_starts_on_the_right_side_of_the_jump(problem_of, direction)
 
 
 def test_points_measured_one_by_one_may_be_on_any_stable_part():
-    mixed = np.where(np.arange(40) % 2 == 0, swept(F, "up"), swept(F, "down"))
-    amplitudes, *_ = predicted(ResponseSolver.start(problem_of(F, mixed, None), THETA))
-    assert amplitudes == pytest.approx(mixed, abs=1e-3)
+    check_that_points_one_by_one_may_be_on_any_stable_part(problem_of)
 
 
 @pytest.mark.parametrize("solves", [1, 12])
