@@ -162,3 +162,23 @@ def test_estimates_start_on_the_sheets_that_fit_best(start):
     assert fit.converged and not fit.misspecified
     for name, value in truth.items():
         assert abs(fit.theta[name] - value) < 4.5 * fit.sd[name]
+
+
+def test_points_are_found_that_the_branch_from_the_first_one_does_not_lead_to():
+    """With little damping a softening peak has no fold in the table: the last points have a branch of their own.
+
+    They are compared with time integration from rest.
+    """
+    theta = {"c": 0.04, "k": 1.0, "k3": -0.16}
+    table = Table(cubic, {"c": 0.05, "k": 1.0, "k3": -0.15}, 0.3, *rows(0.18, 0.12, 25, 0.06), "down", settling=120)
+    columns = {"f": table.frequency, "A": np.abs(integrated(table)[:, 1])}
+    runs = bp.response_table(
+        columns, frequency="f", outputs={"x": "A"}, inputs={"force": 0.06}, sd={"x": "1%"}, sweep="down", samples=128
+    )
+    priors = {name: bp.Normal(value, 0.01) for name, value in theta.items()}  # whose medians are the first anchors
+    problem = bp.Problem(model_of("softening_without_end", list(theta), cubic), runs, priors=priors)
+    orbits = sorted(problem.solve(theta).values(), key=lambda orbit: orbit.frequency)
+    amplitude = [2 * np.abs(np.fft.rfft(orbit.outputs["x"])[1]) / orbit.outputs["x"].size for orbit in orbits]
+    low = integrated(table._replace(truth=theta, frequency=np.linspace(0.12, 0.14, 9), force=np.full(9, 0.06)))
+    assert amplitude[:9] == pytest.approx(np.abs(low[:, 1]), rel=0.01)
+    assert min(amplitude[9:14]) > 0.8
