@@ -205,7 +205,9 @@ def classes_in_files() -> set[type]:
         if isinstance(kind, type) and kind.__module__.startswith("bayesperiodic.") and kind not in kinds:
             if dataclasses.is_dataclass(kind):
                 kinds.add(kind)
-                hints = typing.get_type_hints(kind, localns={"pd": pd})  # which some modules import for types alone
+                hints = typing.get_type_hints(
+                    kind, localns={"pd": pd, "xr": xr}
+                )  # which some modules import for types alone
                 for field in dataclasses.fields(kind):
                     if field.metadata != _io.NOT_STORED:
                         visit(hints[field.name])

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from bayesperiodic.data.cycle_findings import HARMLESS_PHASE, stepped
 from bayesperiodic.data.recording_check import RUINOUS, RUINOUS_BIAS, SERIOUS, Finding
@@ -192,7 +192,7 @@ def drifts(phases: Phases, used: np.ndarray, steps: Sequence[np.ndarray]) -> Ite
         basis = np.linalg.qr(np.column_stack([others, polynomials]))[0].T[others.shape[1] - 1 :]
         component = basis @ (phases.turns[numbers, row] - phases.turns[numbers, 0])
         noise, size = _noise(phases, numbers, row, basis[3:], component[3:]), abs(float(component[1]))
-        limit = float(student.isf(0.5 * level, orders)) * noise
+        limit = -float(stdtrit(orders, 0.5 * level)) * noise
         per_cycle = float(basis[1] @ middle)
         if abs(per_cycle) < LEAST_DETERMINED * float(np.linalg.norm(middle)):
             continue  # the drive drifts likewise

@@ -3,8 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import erf, erfc, pdtrc
-from scipy.stats import binom
+from scipy.special import bdtr, bdtrc, erf, erfc, pdtrc
 
 from bayesperiodic.data.quantisation import step_of
 from bayesperiodic.data.saturation import Saturation
@@ -210,7 +209,7 @@ def heavy_tails(residuals: np.ndarray, outliers: np.ndarray, predicted: np.ndarr
         result = sizes.size * np.maximum(relative, 1.0) ** -index > RARE_IN_TAIL
     elif far.size >= FEWEST_IMPULSES:
         above = int(np.count_nonzero(residuals[far] > middle))
-        p_value = 2.0 * min(binom.cdf(above, far.size, 0.5), binom.sf(above - 1, far.size, 0.5))
+        p_value = 2.0 * min(bdtr(above, far.size, 0.5), bdtrc(above - 1, far.size, 0.5))
         spread = np.quantile(distance[far], 0.9) > SPREAD_SIZES * np.quantile(distance[far], 0.1)
         replaced = abs(np.corrcoef(residuals[far], predicted[far])[0, 1]) > REPLACED / np.sqrt(far.size)
         result[:] = spread and p_value > BOTH_SIDES and not replaced

@@ -6,8 +6,7 @@ from functools import cached_property
 import numpy as np
 from scipy.fft import next_fast_len
 from scipy.linalg import solve_toeplitz, solveh_banded
-from scipy.special import fdtri
-from scipy.stats import t as student
+from scipy.special import fdtri, stdtrit
 
 from bayesperiodic import _fourier
 from bayesperiodic.data.coverage import covered_harmonics
@@ -75,7 +74,7 @@ class Pace:
     def differs(self, difference: float, duration: float, error: float = 0.0) -> bool:
         """Return whether a frequency with a standard error differs significantly, and by a phase that matters."""
         spread = np.hypot(self.se, error)
-        significant = abs(difference) > spread * student.isf(0.5 * PHASE_FALSE_ALARM, self.freedom)
+        significant = abs(difference) > spread * -stdtrit(self.freedom, 0.5 * PHASE_FALSE_ALARM)
         return bool(significant and abs(difference) * duration > NEGLIGIBLE_PHASE)
 
 
@@ -196,7 +195,7 @@ def pace_of(score: np.ndarray, quadrature: np.ndarray, power: float, information
     slope, bent = (noise, noise) if walk is None else np.maximum(walk.slopes[1:], noise)
     curvature = phase[2] * basis[2]
     bend = float(np.ptp(curvature))
-    limit = student.isf(0.5 * PHASE_FALSE_ALARM, others.size)
+    limit = -stdtrit(others.size, 0.5 * PHASE_FALSE_ALARM)
     sign = float(np.sign(curvature[0] - curvature[score.size // 2]))
     return Pace(
         float(np.sqrt(slope * power / information)),

@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from bayesperiodic import _fourier
 from bayesperiodic.data.changes import LONGEST_CUT, LONGEST_CUT_FREE, POSSIBLE, PROBABLE, TRANSIENT, Changes, changes
@@ -293,7 +293,7 @@ def _change(sizes: np.ndarray) -> np.ndarray:
     memory = np.clip(memory, 0.0, LONGEST_MEMORY)
     error *= np.sqrt((1.0 + memory) / (1.0 - memory))
     change = slope * count / np.abs(sizes.mean(axis=0))
-    significant = np.abs(slope) > error * student.isf(0.5 * SLOPE_FALSE_ALARM, count - 2)
+    significant = np.abs(slope) > error * -stdtrit(count - 2, 0.5 * SLOPE_FALSE_ALARM)
     return np.where(significant, change, 0.0)
 
 

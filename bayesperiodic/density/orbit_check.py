@@ -8,7 +8,7 @@ same orbit, but its residual is large.
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from bayesperiodic import _fourier
 from bayesperiodic.likelihood.observation import Observation, Response
@@ -106,12 +106,12 @@ def _significant(observation: Observation, channel: str, lines: np.ndarray, powe
         noise = np.full(lines[-1] + 1, 2.0 * e.scatter[channel] ** 2 / e.cycles / (lines[-1] + 0.5))
     if noise is not None:
         power = power / np.maximum(noise[lines], np.finfo(float).tiny)
-        return bool(f_distribution.sf(power.mean(), 2 * lines.size, freedom) < ORBIT_LEVEL)
+        return bool(fdtrc(2 * lines.size, freedom, power.mean()) < ORBIT_LEVEL)
     low, high = np.array_split(power, 2)
     if not high.size:
         return True
     ratio = low.mean() / max(high.mean(), np.finfo(float).tiny)
-    return bool(f_distribution.sf(ratio, 2 * low.size, 2 * high.size) < ORBIT_LEVEL)
+    return bool(fdtrc(2 * low.size, 2 * high.size, ratio) < ORBIT_LEVEL)
 
 
 def _log_likelihood(observation: Observation, response: Response, ahead: int) -> float:

@@ -1,10 +1,12 @@
 """Posterior prediction of branches of periodic solutions, such as response curves."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from tqdm import tqdm
 
 from bayesperiodic import _checks
@@ -15,6 +17,9 @@ from bayesperiodic.periodic.continuation import FOLD, Branch, continue_periodic
 from bayesperiodic.periodic.equations import FREQUENCY
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.sampling.draws import Posterior
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 BAND_MEASURES = AMPLITUDE, MAXIMUM = "amplitude", "maximum"
 # Values of the varied quantity in a band, and the fraction of the draws that must have an orbit at them.
@@ -65,6 +70,8 @@ class BranchPrediction(Result):
     @property
     def folds(self) -> pd.DataFrame:
         """Median and central 90 % of the varied quantity at each fold, and the number of draws that have it."""
+        import pandas as pd
+
         at = self.curves[self.curves["kind"] == FOLD].groupby("part")["value"]
         levels = {name: at.quantile(q) for name, q in zip(("median", "low", "high"), BAND_QUANTILES, strict=True)}
         return pd.DataFrame(levels | {"draws": at.count()}).reset_index(drop=True)
@@ -97,6 +104,8 @@ class BranchPrediction(Result):
         >>> curves.band(measure="maximum").columns.tolist()
         ['part', 'value', 'median', 'low', 'high', 'stable', 'fraction']
         """
+        import pandas as pd
+
         output = self.outputs[0] if output is None else output
         _checks.one_of("output", output, self.outputs)
         _checks.one_of("measure", measure, BAND_MEASURES)
@@ -177,6 +186,8 @@ def predict_branch(
     >>> curves = bp.predict_branch(problem, posterior, "frequency", until=0.2, draws=5, progress=False)
     >>> figure = bp.plot.branch(curves)
     """
+    import pandas as pd
+
     _checks.instance("problem", problem, Problem)
     count = _checks.integer("draws", draws, 1)
     names = [e.name for e in problem.experiments]
@@ -207,6 +218,8 @@ def predict_branch(
 
 def _curve(draw: int, branches: Sequence[Branch]) -> pd.DataFrame:
     """Return the orbits of a draw, those of the first branch in reverse order if there are two."""
+    import pandas as pd
+
     first, *more = branches
     order = [(branch, i) for branch in more for i in range(1, len(branch))]
     backwards = range(len(first))[::-1] if more else range(len(first))

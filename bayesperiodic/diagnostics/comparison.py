@@ -1,14 +1,14 @@
 """Comparison of the Laplace approximation with MCMC, per parameter and jointly."""
 
+from __future__ import annotations
+
 import html
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import zip_longest
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
-from scipy.stats import skew
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
@@ -36,6 +36,9 @@ from bayesperiodic.problem.parameters import unit
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.draws import Posterior, refuse_robust
 from bayesperiodic.sampling.starts import laplace_approximation
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 SAMPLING = "sampling"
 COORDINATES = (NATURAL, SAMPLING)
@@ -113,12 +116,16 @@ class Comparison(Result):
         return f"{title}\n{short.to_string()}\n{joint}"
 
     def _repr_html_(self) -> str:
+        import pandas as pd
+
         title, short, joint = self._parts(html.escape, _coloured)
         with pd.option_context("display.max_colwidth", None):
             return f"<p>{title}</p>{short.to_html(escape=False, border=0)}<p>{joint}</p>"
 
     def _parts(self, text: Callable[[str], str], mark: Callable[[str], str]) -> tuple[str, pd.DataFrame, str]:
         """Return the title, the main columns of the table and a sentence, with texts and verdicts formatted."""
+        import pandas as pd
+
         table, joint = self.table, self.joint
         columns: dict[str, Any] = {c: table[c].map("{:.5g}".format) for c in ("map", "mean")}
         columns |= {c: table[c].map("{:.3g}".format) for c in ("laplace_sd", "sd")}
@@ -381,6 +388,8 @@ def _consistent(joint: str, rows: set[str]) -> str:
 
 def _row(sample: Sample, mean: float, sd: float) -> dict[str, float]:
     """Return the statistics of one quantity and their Monte Carlo errors, see `Comparison.table`."""
+    from scipy.stats import skew
+
     own_mean, mean_error = sample.estimate(lambda x: x.mean(axis=-1))
     draws_sd, spread = sample.estimate(lambda x: np.std(x, axis=-1, ddof=1))
     row = {"map": mean, "laplace_sd": sd, "mean": own_mean, "sd": draws_sd}
@@ -397,6 +406,8 @@ def _row(sample: Sample, mean: float, sd: float) -> dict[str, float]:
 
 
 def _table(scored: Scores, cured: Scores | None) -> pd.DataFrame:
+    import pandas as pd
+
     laplace, rows = scored.laplace, {}
     for i, name in enumerate(laplace.names):
         verdict, sd = scored.verdicts[name], float(laplace.sds[i])

@@ -1,13 +1,14 @@
 """Fisher information of the data in prior units, and the expected gain of further experiments."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pandas as pd
 from scipy.special import ndtr
 
 from bayesperiodic import _checks
@@ -16,6 +17,9 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.problem.arguments import refuse_special_points
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 ONE_SD = float(ndtr(1.0))
 SMALLEST_EIGENVALUE, NEGLIGIBLE_COMPONENT = 1e-12, 1e-3
@@ -36,7 +40,7 @@ class Information:
     prior_sd: np.ndarray
 
     @classmethod
-    def of(cls, problem: Problem, fit: MapEstimate) -> "Information":
+    def of(cls, problem: Problem, fit: MapEstimate) -> Information:
         """Compute the information at an estimate with known noise parameters."""
         theta, logs = problem.vector({name: fit.theta[name] for name in problem.names}), problem.logarithmic
         guesses = {e.name: fit.solutions[e.name].states for e in problem.experiments}
@@ -143,6 +147,8 @@ def rank_candidates(
     initial guess. Candidates without an orbit have NaN. Columns: run, frequency, scale, gain and one per parameter; the
     most informative first.
     """
+    import pandas as pd
+
     runs, unit = {e.name: e for e in problem.experiments}, np.outer(information.prior_sd, information.prior_sd)
     before = information.matrix * unit + np.eye(len(unit))
     now, rows = np.sqrt(np.diag(np.linalg.inv(before))), []

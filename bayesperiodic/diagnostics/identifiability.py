@@ -1,12 +1,13 @@
 """Identifiability of each parameter: verdict, evidence and recommendation."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import sympy as sp
 from scipy.special import ndtr, softmax, stdtr
 
@@ -31,6 +32,9 @@ from bayesperiodic.sampling.draws import Posterior
 from bayesperiodic.symmetry.determining import system_of, with_signs
 from bayesperiodic.symmetry.sensors import with_sensors
 from bayesperiodic.symmetry.structure import Structure, analyse_structure
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def structure_of(problem: Problem) -> Structure | None:
@@ -223,6 +227,8 @@ class Identifiability(Result):
         return dict(self.table["verdict"])
 
     def __repr__(self) -> str:
+        import pandas as pd
+
         table = self.table
         columns: dict[str, Any] = {"verdict": table["verdict"]}
         for name, column in {"contraction": "contraction", "P(negative)": "p_negative"}.items():
@@ -302,6 +308,8 @@ def identifiability(
     >>> bp.identifiability(problem, fit, profile=False).verdicts
     {'c': 'determined', 'k': 'determined'}
     """
+    import pandas as pd
+
     problem = check_results(problem, fit=fit, **({} if posterior is None else {"posterior": posterior}))
     fit, information, structure = with_joint(problem, fit), Information.of(problem, fit), structure_of(problem)
     shapes = profile_of(problem, fit).shape if profile is True else profile.shape if profile else {}
@@ -539,6 +547,8 @@ def _directions(information: Information) -> pd.DataFrame:
 
     Directions without information are reduced to as few parameters as possible.
     """
+    import pandas as pd
+
     gains, vectors = information.gains, information.directions.T
     uninformed = gains < UNINFORMED_GAIN * gains.max()
     shown = vectors.copy()

@@ -1,13 +1,13 @@
 """Search for terms that a misspecified model lacks: score tests of candidates, and fits with the best ones."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
-from scipy import stats
 
 from bayesperiodic import _checks
 from bayesperiodic._io import NOT_STORED, Result, Storable
@@ -39,6 +39,9 @@ from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
 from bayesperiodic.problem.arguments import refuse_special_points
 from bayesperiodic.problem.fingerprint import check_results
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Ratio of the errors in experiments that are left out from which on these tell two terms apart.
 WORSE_RATIO = 2.0
@@ -218,6 +221,8 @@ class MissingTerms(Result):
     @property
     def table(self) -> pd.DataFrame:
         """One row per model, the given one first: what is left unexplained, and the tests of it."""
+        import pandas as pd
+
         rows = {}
         for k, step in enumerate((self.before, *self.steps)):
             row: dict[str, Any] = {"term": step.term, "place": step.place}
@@ -449,6 +454,9 @@ class _Search:
 
     def scores(self, state: Optimum) -> pd.DataFrame:
         """Return the table of the score tests of candidates that are not yet chosen, the best first."""
+        import pandas as pd
+        from scipy.stats import false_discovery_control
+
         left = [key for key in self.terms if self.names[key] not in state.names and key not in self.refused]
         lags = [self.lags if self.terms[key].force is not None else [np.nan] for key in left]
         each = [replace(self.terms[key], lag=lag) for key, choices in zip(left, lags, strict=True) for lag in choices]
@@ -467,7 +475,7 @@ class _Search:
             rows.append((key, term.place, term.text, term.lag, same, tests.explained[most], tests.p[most]))
         columns = ["candidate", "place", "term", "lag", "same", "explains", "p"]
         table = pd.DataFrame(rows, [str(i) for i in range(1, len(rows) + 1)], columns)
-        table["p_adjusted"] = stats.false_discovery_control(table["p"]) if len(table) else table["p"]
+        table["p_adjusted"] = false_discovery_control(table["p"]) if len(table) else table["p"]
         return table
 
     def best(

@@ -1,13 +1,13 @@
 """Comparison of models by their evidence and by what they predict of values and experiments left out."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
-import xarray as xr
 from scipy.optimize import brentq
 from scipy.special import expit, softmax
 
@@ -27,6 +27,10 @@ from bayesperiodic.sampling.draws import Posterior, refuse_robust
 from bayesperiodic.sampling.evidence import evidence
 from bayesperiodic.sampling.groups import OBSERVATION, log_likelihood_terms
 from bayesperiodic.sampling.sample import sample
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
 
 # Log evidence ratio of a probability of 95 %. A difference of ELPD below 4 is too small for its standard error to be
 # reliable, and so is a standard error from fewer than 5 experiments.
@@ -247,6 +251,8 @@ def _evidences(models: Models, notes: list[str]) -> np.ndarray:
 
 def _leave_one_out(terms: xr.DataArray, efficiency: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the ELPD of each term (chain, draw, …) left out by PSIS-LOO, and k̂; `efficiency` see `_terms`."""
+    import xarray as xr
+
     tree, az = xr.DataTree.from_dict({"log_likelihood": xr.Dataset({"data": terms})}), convergence.arviz()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large k̂, which is part of the result
@@ -297,6 +303,8 @@ def _sum_error(values: np.ndarray) -> float:
 
 def _experiments(models: Models, held_out: bool, notes: list[str]) -> pd.DataFrame:
     """Return the table of held-out experiments."""
+    import pandas as pd
+
     rows: list[dict[str, Any]] = []
     runs = [e.name for e in next(iter(models.values()))[0].experiments] if held_out else []
     if len(runs) == 1:
@@ -327,6 +335,8 @@ def _experiments(models: Models, held_out: bool, notes: list[str]) -> pd.DataFra
 
 def _joint(problem: Problem, terms: xr.DataArray) -> xr.DataArray:
     """Return the log-likelihood (chain, draw, experiment) of each experiment from terms (chain, draw, observation)."""
+    import xarray as xr
+
     members = [problem.likelihood.labels[EXPERIMENT] == e.name for e in problem.experiments]
     return xr.DataArray(terms.to_numpy() @ np.array(members, dtype=float).T, dims=(CHAIN, DRAW, EXPERIMENT))
 
@@ -443,6 +453,8 @@ class _Scores:
 
     def table(self, first: str) -> pd.DataFrame:
         """Return the numbers of `ModelComparison.table`."""
+        import pandas as pd
+
         rows = {}
         for name in self.names:
             change, loo = self.differences(name, first), self._loo[name]

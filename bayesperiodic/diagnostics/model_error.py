@@ -1,19 +1,23 @@
 """Size of the error of a model: how far its predicted periods are from the true ones, with an interval."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pandas as pd
-from scipy import stats
 from scipy.optimize import brentq
+from scipy.special import chdtr, gammaincinv
 
 from bayesperiodic._linalg import TINY, column_space
 from bayesperiodic.data.experiment import Experiment, LeftOut
 from bayesperiodic.density.log_posterior import Linearisation
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.adequacy import ALL, Whitened, measured_freedom
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MODEL_ERROR = ("model_error", "model_error_low", "model_error_high")
 # Column of the highest harmonic that the error contains.
@@ -47,12 +51,12 @@ class ErrorPart(NamedTuple):
         """
         levels = (np.arange(NOISE_SCALES) + 0.5) / NOISE_SCALES
         scale, beside = (
-            np.ones(1) if np.isinf(freedom) else freedom / stats.chi2.ppf(levels, freedom)
+            np.ones(1) if np.isinf(freedom) else 0.5 * freedom / gammaincinv(0.5 * freedom, levels)
             for freedom in (self.freedom, self.few)
         )
         mean = error + scale[:, None] * self.noise
         freedom = 2.0 * mean**2 / (scale[:, None] ** 2 * self.variance + 4.0 * error * beside * self.along)
-        return float(np.mean(stats.chi2.cdf(freedom * square / mean, freedom)))
+        return float(np.mean(chdtr(freedom, freedom * square / mean)))
 
     def error(self) -> tuple[float, float, float]:
         """Return the sum of squares of the error of the model, and the ends of its 90 % interval.
@@ -84,7 +88,7 @@ class Residual:
     freedom: float
     dependent: float
 
-    def with_harmonics(self, size: int, amplitudes: np.ndarray, without: LeftOut) -> "Residual":
+    def with_harmonics(self, size: int, amplitudes: np.ndarray, without: LeftOut) -> Residual:
         """Return the same with complex amplitudes of further harmonics, scaled as components of a block of this size.
 
         The real and imaginary parts of an amplitude share a variance.
@@ -116,7 +120,11 @@ class Residual:
             few = float(parts.sum()) ** 2 / uncertain if uncertain > 0.0 else np.inf
             variance = 2.0 * self.dependent * float(self.variances @ self.variances)
             return ErrorPart(square, float(self.variances.sum()), variance, along, self.freedom, few).error()
-        return np.nan, 0.0, square * values / stats.chi2.ppf(TAIL_PROBABILITY, values) if values >= 1.0 else np.inf
+        return (
+            np.nan,
+            0.0,
+            0.5 * square * values / gammaincinv(0.5 * values, TAIL_PROBABILITY) if values >= 1.0 else np.inf,
+        )
 
 
 def _root(falling: Callable[[float], float], scale: float) -> float:
@@ -139,6 +147,8 @@ def model_errors(problem: Problem, here: Linearisation, noise: np.ndarray) -> pd
     only an upper end, for which all of the residual may be error of the model. `noise` are parameters of the noise
     model (noise_names,).
     """
+    import pandas as pd
+
     if problem.likelihood.correlated:
         return pd.DataFrame(columns=[*MODEL_ERROR])
     white, likelihood = Whitened(problem, here, noise), problem.likelihood
@@ -181,6 +191,8 @@ def model_errors(problem: Problem, here: Linearisation, noise: np.ndarray) -> pd
 
 def with_model_error(table: pd.DataFrame, errors: pd.DataFrame) -> pd.DataFrame:
     """Return the table of `Prediction` with the columns of `model_errors`, the largest in the row "all"."""
+    import pandas as pd
+
     if errors.empty or not np.isfinite(errors[MODEL_ERROR[2]]).all():
         return table.join(errors)
     errors = errors.astype(float)

@@ -1,12 +1,14 @@
 """Posterior predictions of periods and transients, and tests of the model."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from scipy.special import ndtri
 from tqdm import tqdm
 
@@ -38,6 +40,9 @@ from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.problem.parameters import CHAIN, DRAW
 from bayesperiodic.sampling.draws import Posterior, refuse_robust
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 PROBABILITY = 0.9
 # Of the median and of the ends of the central band.
@@ -537,6 +542,8 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     >>> float(expected.table.loc["synthetic duffing", "inside"])
     1.0
     """
+    import pandas as pd
+
     _checks.instance("problem", problem, Problem)
     count = _checks.integer("draws", draws, 20)
     theta = problem.joint_prior.sample(count, np.random.default_rng(_checks.integer("seed", seed, 0)))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import sympy as sp
-from scipy import stats
+from scipy.special import fdtrc
 
 from bayesperiodic import _fourier
 from bayesperiodic._linalg import column_space
@@ -97,7 +97,7 @@ class ScoreTests:
             freedom = np.full(len(tests.effects), max(tests.freedom - 1.0, 1.0))
             gains = tests.gains()
             statistic = gains * freedom / np.maximum(tests.square - gains, np.finfo(float).tiny)
-        return np.where(self.identifiable, stats.f.sf(statistic, 1.0, freedom), 1.0)
+        return np.where(self.identifiable, fdtrc(1.0, freedom, statistic), 1.0)
 
     def groups(self, among: Container[int]) -> Iterator[list[int]]:
         """Yield the indices of identifiable terms with the same effect on the data, sorted, by what they explain."""

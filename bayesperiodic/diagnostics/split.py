@@ -1,11 +1,13 @@
 """Estimates from parts of the experiments: which parameters move with what, and by how many standard deviations."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
-from scipy import stats
+from scipy.special import chdtrc
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
@@ -15,6 +17,9 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.adequacy import holm
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 BY_AMPLITUDE, BY_FREQUENCY = "amplitude", "frequency"
 # Relative difference below which amplitudes and frequencies of experiments are the same.
@@ -185,6 +190,8 @@ def amplitude(experiment: Experiment) -> float:
 
 def _table(fits: Mapping[str, MapEstimate], names: list[str]) -> pd.DataFrame:
     """Return the table of `SplitCheck`."""
+    import pandas as pd
+
     values = np.array([[fit.theta[name] for name in names] for fit in fits.values()])
     table = pd.DataFrame(values.T, index=names, columns=[*fits])
     for kind, of in (("laplace", "sd"), ("robust", "robust_sd")):
@@ -194,7 +201,7 @@ def _table(fits: Mapping[str, MapEstimate], names: list[str]) -> pd.DataFrame:
         difference = np.abs(values[:, None] - values) / np.sqrt(sd[:, None] ** 2 + sd**2)
         mean = np.sum(values / sd**2, axis=0) / np.sum(sd**-2.0, axis=0)
         table[kind] = difference.max(axis=(0, 1))
-        table[f"p_{kind}"] = stats.chi2.sf(np.sum(((values - mean) / sd) ** 2, axis=0), len(fits) - 1)
+        table[f"p_{kind}"] = chdtrc(len(fits) - 1, np.sum(((values - mean) / sd) ** 2, axis=0))
     p_laplace, p_robust = (holm(table[f"p_{kind}"].to_numpy()) for kind in ("laplace", "robust"))
     unknown = np.isnan(p_laplace) | np.isnan(p_robust)
     rules = [unknown, p_robust < SPLIT_LEVEL, p_laplace < SPLIT_LEVEL]

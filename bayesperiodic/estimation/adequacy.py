@@ -1,12 +1,13 @@
 """Tests of the model: discrepancy of every experiment and channel, and the verdict."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from itertools import compress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
-from scipy import stats
+from scipy.special import chdtrc, fdtrc, stdtr
 
 from bayesperiodic._verdicts import BAD, CAUTION, GOOD, NEUTRAL, with_tone
 from bayesperiodic.data.experiment import Experiment
@@ -19,14 +20,17 @@ from bayesperiodic.estimation.table_tests import rows_of, serial_correlation
 from bayesperiodic.estimation.unexplained import NOT_TESTED, Unexplained, testable, used
 from bayesperiodic.likelihood.block import Block
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 def excess(variance: float, freedom: float, known: float, known_freedom: float) -> float:
     """Return p of the one-sided test of a variance against a known or independently estimated one."""
     if not freedom > 0.0 or not known > 0.0:
         return NOT_TESTED
     if np.isinf(known_freedom):
-        return float(stats.chi2.sf(freedom * variance / known, freedom))
-    return float(stats.f.sf(variance / known, freedom, known_freedom))
+        return float(chdtrc(freedom, freedom * variance / known))
+    return float(fdtrc(freedom, known_freedom, variance / known))
 
 
 def consistency(parts: Sequence[tuple[np.ndarray, np.ndarray, str]], known: frozenset[str]) -> float:
@@ -84,6 +88,8 @@ def adequacy(
     The linearisation is that at a draw near the best fit. Noise parameters are draws (draws, noise_names), replicates
     of the data (draws, points) by experiment and channel, NaN outside the mask and for failed solves.
     """
+    import pandas as pd
+
     shapes = np.median(noise, axis=0)[None] if problem.likelihood.white else noise[:: max(1, len(noise) // SHAPES)]
     rows: dict[str, dict[str, Any]] = {}
     white = [Whitened(problem, here, shape) for shape in shapes]
@@ -120,7 +126,7 @@ def adequacy(
     return table
 
 
-def _table_row(problem: Problem, quantity: str, white: "Whitened") -> dict[str, Any]:
+def _table_row(problem: Problem, quantity: str, white: Whitened) -> dict[str, Any]:
     """Return the tests of a quantity that was measured in several experiments."""
     members = rows_of(problem, quantity)
     r, j, _ = (np.concatenate(parts, axis=-1) for parts in zip(*(white.parts[b] for b in members), strict=True))
@@ -196,6 +202,8 @@ def concerns_noise(table: pd.DataFrame) -> bool:
 
     A measured spectrum of the noise, or a residual larger than the measured noise, tells the two apart.
     """
+    import pandas as pd
+
     rejected = pd.DataFrame(adjusted_p(table) < ADEQUACY_LEVEL, table.index, ADEQUACY_TESTS)
     measured = rejected[["whiteness", "harmonics"]][table["spectrum"] == MEASURED_SPECTRUM]
     return table.loc[ALL, "verdict"] == MISSPECIFIED and not (rejected["size"].any() or measured.any(axis=None))
@@ -309,7 +317,7 @@ def _size(problem: Problem, here: Linearisation, index: int, white: Whitened) ->
     variance = unexplained.square / unexplained.freedom
     share = max(0.0, 1.0 - 1.0 / variance) if variance > 0.0 else 0.0
     if (relative := white.in_measured_units(index)) is not None:
-        return float(stats.chi2.sf(relative.square, relative.freedom)), share
+        return float(chdtrc(relative.freedom, relative.square)) if relative.freedom else NOT_TESTED, share
     return excess(variance, unexplained.freedom * evenness, 1.0, behind), share
 
 
@@ -363,4 +371,4 @@ def _amplitude(problem: Problem, block: Block, replicates: Mapping[tuple[str, st
     if not sd > 0.0:
         return NOT_TESTED
     score = (e.outputs[block.channel][mask].std() - rms.mean()) / (sd * np.sqrt(1.0 + 1.0 / rms.size))
-    return float(2.0 * stats.t.sf(abs(score), rms.size - 1))
+    return float(2.0 * stdtr(rms.size - 1, -abs(score)))

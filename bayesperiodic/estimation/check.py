@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
@@ -123,6 +122,8 @@ def checked(
     objective: Objective, estimate: Iterate, uncertain: Uncertainty, solutions: Mapping[str, PeriodicSolution]
 ) -> FitCheck:
     """Return the checks of an estimate."""
+    import pandas as pd
+
     problem: Any = objective.density.problem
     names, lost, inverse, covariance = list(problem.names), uncertain.lost, uncertain.inverse, uncertain.covariance
     shift = doubling_shift(problem, estimate, solutions, covariance)

@@ -1,11 +1,12 @@
 """Conflict between prior and data: the prior predictive distribution of the estimate by the data alone."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from scipy.special import chdtrc, chdtri, ndtr, ndtri, stdtrit
 
 from bayesperiodic._io import Storable
@@ -16,6 +17,9 @@ from bayesperiodic.estimation.gauss_newton import Iterate, Objective, bias_corre
 from bayesperiodic.priors.joint import MultivariateNormal
 from bayesperiodic.priors.single import LogNormal, TruncatedNormal
 from bayesperiodic.problem.description import written_out
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 CONFLICT_LEVEL = 0.01
 # Largest error, in widths of the prior, of a direction that is tested: the data have 1 % of the prior's information.
@@ -176,6 +180,8 @@ def _widened(problem: Problem, factor: np.ndarray) -> dict[Any, Any]:
 
 def _tested(problem: Problem, estimate: Iterate) -> PriorConflict:
     """Return the test at the estimate by the data, in units of the prior's widths."""
+    import pandas as pd
+
     prior, logs = problem.joint_prior, problem.logarithmic
     slopes, centre = np.where(logs, estimate.theta, 1.0), prior.median()
     width = np.where(logs, prior.log_widths, prior.widths)

@@ -1,9 +1,11 @@
 """Frequencies of experiments as the data and the model together determine them."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.covariance import estimated_inputs
@@ -11,11 +13,16 @@ from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.likelihood.orbit_frequency import FREQUENCY
 from bayesperiodic.periodic.solution import PeriodicSolution
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 def updated_frequencies(
     problem: Problem, estimate: Iterate, solutions: Mapping[str, PeriodicSolution], covariance: np.ndarray
 ) -> pd.DataFrame:
     """Return measured and estimated frequencies of experiments whose frequency is uncertain, see `MapEstimate`."""
+    import pandas as pd
+
     likelihood, given, rows = problem.likelihood, estimated_inputs(problem, estimate).covariances, {}
     spread = np.nan_to_num(covariance, posinf=0.0)
     for e in problem.experiments:

@@ -1,17 +1,22 @@
 """Laplace approximation over all sampling coordinates, from the exact Hessian; directions without information."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from bayesperiodic._io import Storable
 from bayesperiodic._linalg import covariance_eigh, hessian_eigh, hessian_scale, scaled
 from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.estimation.gauss_newton import NO_CURVATURE, Iterate, Objective, climb
 from bayesperiodic.problem.description import Description
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 THETA_STEP = 1e-3
 NOISE_STEP = 1e-4
@@ -32,6 +37,8 @@ def joint_laplace(density: LogPosterior, start: Iterate) -> JointLaplace:
     The Hessian over θ comes from central differences of the exact gradient; parameters local to experiments are changed
     together, because each experiment depends on its own only.
     """
+    import pandas as pd
+
     problem, objective = density.problem, Objective(density)
     first = objective.at(start.theta, start.here, start.noise)
     labels = [*problem.names, *problem.free_noise]

@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import pandas as pd
 from tqdm import tqdm
 
 from bayesperiodic import _checks
@@ -417,6 +416,8 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
 def _describe(
     problem: Problem, objective: Objective, modes: Sequence[End], starts: tuple[dict[str, float], ...], checks: bool
 ) -> MapEstimate:
+    import pandas as pd
+
     best, status, history = modes[0]
     names, noise_names = problem.names, problem.likelihood.counts
     factor = objective.log_variance_factor

@@ -1,11 +1,13 @@
 """Separate optima of the log-posterior, and their masses by the Laplace approximation."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from scipy.special import softmax
 
 from bayesperiodic._io import Storable
@@ -14,6 +16,9 @@ from bayesperiodic.estimation.gauss_newton import NO_CURVATURE, End, Iterate, Ob
 from bayesperiodic.estimation.laplace import JointLaplace
 from bayesperiodic.periodic.schemes import FourierScheme, find_scheme
 from bayesperiodic.problem.description import Description
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Default number of starts: at most 8, and at most this number of unknowns of all starts and experiments. A dense
 # scheme counts as many times more as its grid is longer than 50 points.

@@ -1,12 +1,13 @@
 """Profiles: the maximum of the log-density for every value of one parameter, followed from the estimate."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 from scipy.special import ndtri
@@ -20,6 +21,9 @@ from bayesperiodic.estimation.check import at_estimate
 from bayesperiodic.estimation.gauss_newton import PRESSED, Iterate, Objective, climb
 from bayesperiodic.estimation.result import MapEstimate, written
 from bayesperiodic.priors.single import Prior
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Distance of points, as the change of the root of the drop; growth, shortening and smallest size of steps.
 ROOT_SPACING, STEP_WIDENING, SHORTENED, SHORTEST_STEP = 0.5, 3.0, 0.25, 0.01
@@ -295,6 +299,8 @@ class Profile(Result):
     @property
     def table(self) -> pd.DataFrame:
         """One row per profile: map, sd, the 90 % intervals of Laplace and of the profile, shape, points and failed."""
+        import pandas as pd
+
         half = float(ndtri(0.95))
         rows: dict[str, dict[str, object]] = {}
         for name, (low, high) in self.interval(0.9).items():

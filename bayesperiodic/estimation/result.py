@@ -1,12 +1,13 @@
 """Results: the MAP point with its Laplace approximations, and the checks of an estimate."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse_all
@@ -20,6 +21,9 @@ from bayesperiodic.likelihood.noise import Relative
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.priors.joint import MultivariateNormal
 from bayesperiodic.problem.parameters import checked_key, in_experiment, local_hint, local_names
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Fraction of a channel's variance below which its residual consists of rounding errors of the periodic solves.
 ROUNDING_VARIANCE = 1e-16
@@ -114,6 +118,8 @@ class FitCheck(Result):
     misfit: str | None = None
 
     def __repr__(self) -> str:
+        import pandas as pd
+
         columns = {"robust sd": self.robust_sd, "shift on twice the points": self.doubling_shift}
         lines = ["FitCheck", pd.DataFrame(columns).map("{:.3g}".format).to_string()]
         if rows := self.by_channel():
@@ -177,7 +183,7 @@ class Search(Storable):
 def _part(group: str, name: str) -> Any:
     """Return a property that reads a field of a group, and raises a ValueError if the estimate is without it."""
 
-    def read(self: "MapEstimate") -> Any:
+    def read(self: MapEstimate) -> Any:
         if (values := getattr(self, group)) is None:
             raise ValueError(
                 f"{group}: must be computed before {name!r} is used, got an estimate with checks=False; take "
@@ -310,6 +316,8 @@ class MapEstimate(Result):
     @property
     def modes(self) -> pd.DataFrame:
         """Separate optima, the estimate first: objective, fraction of the mass by Laplace, and parameters."""
+        import pandas as pd
+
         best = {"objective": float(self.history[-1]), "mass": 1.0 - sum(mode.mass for mode in self.other_modes)}
         rows = [{"objective": mode.objective, "mass": mode.mass} | mode.theta for mode in self.other_modes]
         return pd.DataFrame([best | self.theta, *rows])
@@ -347,6 +355,8 @@ class MapEstimate(Result):
     @property
     def correlations(self) -> pd.DataFrame:
         """Correlations of the parameters, from `covariance`."""
+        import pandas as pd
+
         sd = np.sqrt(np.diag(self.covariance))
         return pd.DataFrame(self.covariance / np.outer(sd, sd))
 
@@ -431,6 +441,8 @@ class MapEstimate(Result):
                         value      sd
         damping_ratio  0.0996  0.0003
         """
+        import pandas as pd
+
         if experiment is not None:
             _checks.one_of("experiment", experiment, self.solutions)
         named = in_experiment(self.theta, experiment)
@@ -546,6 +558,8 @@ class MapEstimate(Result):
         return tuple(c for c, part in self.fvu.items() if names & {c, Relative.pooled} and part < ROUNDING_VARIANCE)
 
     def __repr__(self) -> str:
+        import pandas as pd
+
         status = self.status if self.converged else f"NOT CONVERGED: {self.status}; try another start, or starts=8"
         if self.without_noise:
             status = f"{self.status}; {', '.join(self.without_noise)} without noise"

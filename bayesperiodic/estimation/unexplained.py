@@ -3,7 +3,7 @@
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri, fdtrc
 
 from bayesperiodic._linalg import TINY, column_space
 from bayesperiodic.estimation.result import Whiteness
@@ -43,8 +43,8 @@ class Unexplained:
         first = cls(components, jacobian, harmonic)
         square, freedom = first.explained(np.eye(first.harmonics.size, dtype=bool))
         free = np.maximum(freedom, 1)
-        p = np.maximum(stats.f.sf(square / free, free, behind[first.harmonics]), np.finfo(float).tiny)
-        known = np.where((freedom > 0) & (square > 0.0), stats.chi2.isf(p, free), square)
+        p = np.maximum(fdtrc(free, behind[first.harmonics], square / free), np.finfo(float).tiny)
+        known = np.where((freedom > 0) & (square > 0.0), chdtri(free, p), square)
         factor = np.sqrt(np.divide(known, square, out=np.ones_like(square), where=known > 0.0))[first._group]
         return cls(components * factor, jacobian * factor, harmonic)
 
@@ -90,7 +90,7 @@ class Unexplained:
             return NOT_TESTED, NOT_TESTED
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = square / freedom / (np.maximum(self.square - square, 0.0) / rest)
-        p = np.where(tested, stats.f.sf(np.nan_to_num(ratio, nan=0.0, posinf=np.inf), freedom, rest), 1.0)
+        p = np.where(tested, fdtrc(freedom, rest, np.maximum(np.nan_to_num(ratio, nan=0.0, posinf=np.inf), 0.0)), 1.0)
         _, _, power, size = self._sums
         return min(1.0, float(p.min() * tested.sum())), float(self.harmonics[np.argmax(power / size)])
 
@@ -110,13 +110,15 @@ def of_periodogram(power: np.ndarray) -> Whiteness:
 
     NaN of fewer than two of them, and if all are zero.
     """
+    from scipy.stats import kstest
+
     if power.size < 2 or power.sum() == 0.0:
         return Whiteness(NOT_TESTED, NOT_TESTED)
     harmonic = np.arange(1, power.size + 1)
     cumulative = np.cumsum(power)[:-1] / power.sum()
     lag = 2.0 * np.pi / (2 * power.size + 1)
     return Whiteness(
-        float(stats.kstest(cumulative, "uniform").pvalue), float(np.sum(power * np.cos(lag * harmonic)) / power.sum())
+        float(kstest(cumulative, "uniform").pvalue), float(np.sum(power * np.cos(lag * harmonic)) / power.sum())
     )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
@@ -222,7 +222,7 @@ def _quality(maps: ReturnMap, candidate: MapCycle, estimate: Estimate, neighbour
         fit = maps.fit(point[None], count, QUALITY_DEGREE, influence=False)
         residual = maps.wrap(there - (maps.predict(fit, here[None])[0] - fit.value[0]))
         statistic += float(np.sum(residual**2 / maps.residual_variance(point[None], fit)[0]))
-    return float(chi2.sf(statistic, 2 * period))
+    return float(chdtrc(2 * period, statistic))
 
 
 def _finished(orbits: list[Orbit], maps: ReturnMap, size: np.ndarray) -> tuple[Orbit, ...]:

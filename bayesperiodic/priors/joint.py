@@ -7,9 +7,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 from scipy.linalg import solve_triangular
-from scipy.stats.distributions import rv_frozen
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import covariance_cholesky
@@ -187,6 +186,8 @@ class FromScipy(Univariate):
         return float(self.distribution.ppf(0.75) - self.distribution.ppf(0.25))
 
     def __repr__(self) -> str:
+        from scipy import stats
+
         text = as_written(self.distribution)
         known = getattr(stats, self.distribution.dist.name or "", None)
         if type(known) is type(self.distribution.dist):
@@ -204,6 +205,8 @@ class FromScipy(Univariate):
 
 def as_written(distribution: Any) -> str:
     """Return a frozen distribution as it was written, with all digits."""
+    from scipy import stats
+
     arguments = [repr(np.asarray(a).tolist()) for a in distribution.args]
     arguments += [f"{name}={np.asarray(a).tolist()!r}" for name, a in sorted(distribution.kwds.items())]
     dist = distribution.dist
@@ -405,6 +408,11 @@ def as_prior(argument: str, value: Any) -> Prior:
         raise ValueError(
             f"{argument}: must be a prior of one parameter, got {value!r}. Give a tuple of names as its key."
         )
+    if isinstance(value, Prior) and not isinstance(value, type):
+        return value
+    from scipy import stats  # takes longer to import than most models to compile
+    from scipy.stats.distributions import rv_frozen
+
     if isinstance(value, rv_frozen):
         text = as_written(value)
         if not isinstance(value.dist, stats.rv_continuous):
@@ -416,13 +424,13 @@ def as_prior(argument: str, value: Any) -> Prior:
         return FromScipy(value)
     if isinstance(value, stats.rv_continuous):
         raise ValueError(f"{argument}: must be frozen, got scipy.stats.{value.name}. Give scipy.stats.{value.name}(…).")
-    if isinstance(value, type) or not isinstance(value, Prior):
-        raise ValueError(f"{argument}: must be {ALLOWED_PRIOR}, got {value!r}.")
-    return value
+    raise ValueError(f"{argument}: must be {ALLOWED_PRIOR}, got {value!r}.")
 
 
 def _joint(key: tuple[str, ...], value: Any) -> MultivariateNormal:
     if not isinstance(value, MultivariateNormal):
+        from scipy.stats.distributions import rv_frozen
+
         text = as_written(value) if isinstance(value, rv_frozen) else repr(value)
         raise ValueError(
             f"priors[{key!r}]: must be MultivariateNormal(mean, covariance) for a tuple of names, got {text}."

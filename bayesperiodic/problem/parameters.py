@@ -4,19 +4,23 @@ A parameter local to an experiment is called ``theta16[run 7]``; its draws are o
 "experiment". The parameters of sensors are called ``delay[force]``, local ones ``delay[force, run 7]``.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.models.sensed import SHIFT
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 CHAIN, DRAW, CHANNEL, EXPERIMENT = "chain", "draw", "channel", "experiment"
 NOISE = "noise"
@@ -103,7 +107,7 @@ class ParameterMap:
         experiment: str,
         fixed_by_run: Mapping[str, Mapping[str, float]],
         tied: Mapping[str, Any],
-    ) -> "ParameterMap":
+    ) -> ParameterMap:
         """Return the checked map of an experiment; `names` are those of θ, `sensors` parameters of sensors."""
         fixed = {name: values[experiment] for name, values in fixed_by_run.items() if experiment in values}
         every = (*parameters, *sensors, SHIFT)
@@ -139,7 +143,7 @@ class ParameterMap:
         return np.ascontiguousarray(values[: self.count]), values[self.count :]
 
     @cached_property
-    def _alone(self) -> "ParameterMaps":
+    def _alone(self) -> ParameterMaps:
         return ParameterMaps([self])
 
     def slopes(self, theta: np.ndarray) -> np.ndarray:

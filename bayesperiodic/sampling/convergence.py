@@ -6,20 +6,22 @@ from which ArviZ counts effective draws is that along the walkers. Step by step 
 neighbouring draws and count ten times too many.
 """
 
+from __future__ import annotations
+
 import tempfile
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from types import ModuleType
-from typing import Any
-from unittest import mock
+from typing import TYPE_CHECKING, Any
 
-import emcee
 import numpy as np
-import xarray as xr
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from bayesperiodic.problem.parameters import CHAIN, DRAW
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 FEWEST_WEIGHTS, EQUAL_WEIGHTS, LARGEST_LOG_RATIO = 0.25, 1e-6, 700.0
 WINDOW = 5.0  # of the sum of autocorrelations, in autocorrelation times
@@ -28,6 +30,8 @@ QUANTILE_LEVELS = np.array([0.05, 0.5, 0.95])
 
 def arviz() -> ModuleType:
     """Return the arviz module, imported without the notice of version 0.23, also if no cache folder can be written."""
+    from unittest import mock
+
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=FutureWarning, module="arviz")
         with suppress(OSError):  # version 0.23 keeps the date of its notice in the cache folder of the user
@@ -71,6 +75,8 @@ def mean_error(values: np.ndarray) -> float:
 
 
 def _of_arviz(statistic: str, values: np.ndarray, method: str) -> float:
+    import xarray as xr
+
     data = xr.Dataset({"x": ((CHAIN, DRAW), values)})
     return float(getattr(arviz(), statistic)(data, method=method)["x"])
 
@@ -82,8 +88,10 @@ def autocorrelation_time(chains: np.ndarray) -> np.ndarray:
     at 50 autocorrelation times. The factor 1 + (2·window + 1)/steps corrects that to first order (U. Wolff, Monte Carlo
     errors with less errors, Computer Physics Communications 156 (2004) 143-153).
     """
+    from emcee.autocorr import integrated_time
+
     with np.errstate(invalid="ignore"):  # a walker that has not moved yet
-        times = [emcee.autocorr.integrated_time(e, c=WINDOW, tol=0, quiet=True, has_walkers=True) for e in chains]
+        times = [integrated_time(e, c=WINDOW, tol=0, quiet=True, has_walkers=True) for e in chains]
     mean = np.mean(times, axis=0)
     return mean * (1.0 + (2.0 * WINDOW * mean + 1.0) / chains.shape[1])
 
@@ -96,7 +104,8 @@ def quantile_spread(chains: np.ndarray) -> np.ndarray:
     """
     pooled = np.quantile(chains.reshape(-1, chains.shape[-1]), QUANTILE_LEVELS, axis=0)
     below = np.stack([np.mean(chains <= quantile, axis=(1, 2)) for quantile in pooled])
-    return np.max(np.ptp(below, axis=1) / norm.pdf(norm.ppf(QUANTILE_LEVELS))[:, None], axis=0)
+    density = np.exp(-0.5 * ndtri(QUANTILE_LEVELS) ** 2) / np.sqrt(2.0 * np.pi)
+    return np.max(np.ptp(below, axis=1) / density[:, None], axis=0)
 
 
 def pareto_k(log_weights: np.ndarray) -> float:
@@ -105,6 +114,8 @@ def pareto_k(log_weights: np.ndarray) -> float:
     Equal weights, to within a millionth, have no tail: 0. The logarithm of a weight of zero is −∞. From A. Vehtari et
     al., Pareto smoothed importance sampling, Journal of Machine Learning Research 25 (2024) 1-58.
     """
+    import xarray as xr
+
     positive = np.isfinite(log_weights)
     if positive.mean() < FEWEST_WEIGHTS:
         return np.inf

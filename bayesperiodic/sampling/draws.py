@@ -1,16 +1,15 @@
 """Posterior: draws with their convergence diagnostics."""
 
+from __future__ import annotations
+
 import importlib.metadata
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import emcee
 import numpy as np
-import pandas as pd
-import xarray as xr
 
 from bayesperiodic import _checks
 from bayesperiodic._expressions import parse_all
@@ -51,6 +50,10 @@ from bayesperiodic.sampling.groups import (
 )
 from bayesperiodic.sampling.proposals import CallCount
 from bayesperiodic.sampling.robust import MISFIT, ROBUST, no_robust, robust_group, with_robust_covariance
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
 
 ROBUST_DRAWS = (
     "sd and interval are robust; draws_sd, that of the draws, takes the error of the model for noise that is "
@@ -158,6 +161,8 @@ class Posterior(Result):
 
         Columns: mass, the fraction of the draws, its Monte Carlo error mcse_mass, and the mean of every quantity there.
         """
+        import pandas as pd
+
         stats = self.tree["sample_stats"].to_dataset()
         if MODE not in stats:
             return pd.DataFrame()
@@ -246,13 +251,13 @@ class Posterior(Result):
         return ROBUST in self.tree.attrs
 
     @cached_property
-    def headline(self) -> "Posterior":
+    def headline(self) -> Posterior:
         """The draws whose intervals are valid: of a misspecified model those by `robust`, otherwise these."""
         if ROBUST not in self.tree.children:
             return self
         return self._stretched(self.tree[ROBUST].to_dataset())
 
-    def robust(self, fit: MapEstimate) -> "Posterior":
+    def robust(self, fit: MapEstimate) -> Posterior:
         """Return draws whose covariance in sampling coordinates is the robust one of an estimate.
 
         Use them for quantities that depend on the parameters (`derive`, `predict_branch`, `as_prior`) where the model
@@ -293,8 +298,10 @@ class Posterior(Result):
             raise ValueError(f"fit: must describe these draws by a robust covariance, got {reason}.")
         return self._stretched(robust_group(fit, self._group))
 
-    def _stretched(self, robust: xr.Dataset) -> "Posterior":
+    def _stretched(self, robust: xr.Dataset) -> Posterior:
         """Return the draws with a robust covariance; groups of the posterior density are left out."""
+        import xarray as xr
+
         group = with_robust_covariance(self._group, robust)
         tree = self.tree.drop_nodes([ROBUST, LOG_LIKELIHOOD, POSTERIOR_PREDICTIVE], errors="ignore")
         tree["posterior"], tree.attrs = xr.DataTree(group), self.tree.attrs | {ROBUST: 1}
@@ -326,6 +333,8 @@ class Posterior(Result):
         ValueError
             For a mode without draws.
         """
+        import pandas as pd
+
         if mode is not None:
             _checks.one_of("mode", mode, self.modes.index.tolist())
             inside = self.tree["sample_stats"][MODE].to_numpy().ravel() == mode
@@ -453,6 +462,8 @@ def _moments(draws: np.ndarray) -> dict[str, float]:
 
 
 def _table(rows: dict[str, dict[str, float]]) -> pd.DataFrame:
+    import pandas as pd
+
     table = pd.DataFrame.from_dict(rows, orient="index")
     table.attrs["interval"] = "90 % equal-tailed: q05 to q95"
     return table
@@ -509,6 +520,8 @@ def tree(
     density: LogPosterior, kept: np.ndarray, log_density: np.ndarray, seed: int, modes: np.ndarray | None = None
 ) -> xr.DataTree:
     """Return draws (ensembles, steps, walkers, coordinates) as the groups of `Posterior.tree`."""
+    import xarray as xr
+
     problem, lp = density.problem, convergence.as_chains(log_density)
     steps, walkers = log_density.shape[1:]
     moved = np.full(log_density.shape, np.nan)
@@ -546,13 +559,15 @@ def tree(
         "fingerprint": fingerprint(problem),
         "synthetic": int(any(e.synthetic for e in problem.experiments)),
         "bayesperiodic": importlib.metadata.version("bayesperiodic"),
-        "emcee": emcee.__version__,
+        "emcee": importlib.metadata.version("emcee"),
     }
     return result
 
 
 def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr.Dataset:
     """Return θ (chains, draws, names) and noise parameters (chains, draws, noise_names) as labelled variables."""
+    import xarray as xr
+
     columns = {name: theta[..., i] for i, name in enumerate(problem.names)}
     columns |= _fixed_locals(problem, theta.shape[:-1])
     columns |= {name: noise[..., i] for i, name in enumerate(problem.noise_names)}

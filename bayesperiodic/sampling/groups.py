@@ -1,14 +1,19 @@
 """Groups of draws that are computed with the model: replicates of the data, and terms of the log-likelihood."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
-import xarray as xr
 
 from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.parameters import CHAIN, DRAW, EXPERIMENT, column
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 STEP, WALKER, OBSERVATION = "step", "walker", "observation"
 LOG_LIKELIHOOD, POSTERIOR_PREDICTIVE = "log_likelihood", "posterior_predictive"
@@ -24,6 +29,8 @@ def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, seed: int
     (chain, draw, number), and ``largest_multiplier``, the modulus
     of the largest Floquet multiplier, with dims (chain, draw, experiment); NaN where a solve fails.
     """
+    import xarray as xr
+
     problem = density.problem
     chosen, theta, noise = _some(problem, posterior, REPLICATES)
     shape = chosen.sizes[CHAIN], chosen.sizes[DRAW]
@@ -61,6 +68,8 @@ def log_likelihood_terms(density: LogPosterior, posterior: xr.Dataset) -> xr.Dat
 
     The observations have the coordinates experiment, channel, harmonic and weight, see `Likelihood.labels`.
     """
+    import xarray as xr
+
     likelihood = density.problem.likelihood
     most = min(max(MOST_TERMS // len(likelihood.observations), TERM_DRAWS[0]), TERM_DRAWS[1])
     chosen, theta, noise = _some(density.problem, posterior, most)
@@ -81,5 +90,7 @@ def time_axis(experiment: str) -> str:
 
 def signals(problem: Description, by_run: Mapping[str, Mapping[str, np.ndarray]]) -> xr.Dataset:
     """Return signals (points,) by experiment and name as variables ``<experiment> <name>`` over time."""
+    import xarray as xr
+
     values = {f"{run} {name}": (time_axis(run), x) for run, each in by_run.items() for name, x in each.items()}
     return xr.Dataset(values, coords={time_axis(e.name): e.time for e in problem.experiments})

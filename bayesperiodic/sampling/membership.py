@@ -1,18 +1,21 @@
 """Whether a unit belongs to a population: tests with a stated false-alarm rate."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pandas as pd
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtr
 
 from bayesperiodic._io import Result
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.population_density import Parameters
 from bayesperiodic.sampling.population_units import UnitDraws
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Pareto k̂ above which, and effective draws below which, a unit's draws are no importance sample.
 USABLE_WEIGHTS, FEWEST_EFFECTIVE = 0.7, 50.0
@@ -108,7 +111,7 @@ class Expected(NamedTuple):
     @classmethod
     def of(
         cls, parameters: Parameters, covariates: np.ndarray, degrees: float, weights: np.ndarray | None = None
-    ) -> "Expected":
+    ) -> Expected:
         """Return what is expected of a unit with covariates (covariates,)."""
         means = parameters.means + parameters.slopes @ covariates
         count = len(means)
@@ -130,8 +133,9 @@ class Expected(NamedTuple):
         """Return the p-value of each parameter (d,): that a member's estimate deviates at least as much."""
         sd = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2) + np.diag(given.covariance))
         size, offset = np.abs(given.mean - self.centre), self.means - self.centre
-        tail = norm.sf if np.isinf(self.degrees) else student(self.degrees).sf
-        return np.minimum(self.weights @ (tail((size - offset) / sd) + tail((size + offset) / sd)), 1.0)
+        # of a normal distribution if `degrees` is infinite
+        tails = stdtr(self.degrees, (offset - size) / sd) + stdtr(self.degrees, -(size + offset) / sd)
+        return np.minimum(self.weights @ tails, 1.0)
 
     def joint(self, given: UnitEstimate, generator: np.random.Generator) -> float:
         """Return the p-value of all parameters together, by simulated units; at least 1/SIMULATED_UNITS."""
@@ -150,8 +154,8 @@ class Expected(NamedTuple):
 def _repeats(difference: float, spread: float, variance: float, level: float) -> float:
     """Return how many repeats find a deviation of this size; infinite if the spread of the population hides it."""
     counts = np.arange(1, MOST_REPEATS + 1)
-    limit = norm.isf(0.5 * level) * np.sqrt(spread**2 + variance / counts)
-    enough = difference >= limit + norm.ppf(REQUIRED_POWER) * np.sqrt(variance / counts)
+    limit = -ndtri(0.5 * level) * np.sqrt(spread**2 + variance / counts)
+    enough = difference >= limit + ndtri(REQUIRED_POWER) * np.sqrt(variance / counts)
     return float(counts[enough][0]) if enough.any() else np.inf
 
 
@@ -159,6 +163,8 @@ def membership(
     name: str, unit: UnitDraws, names: Sequence[str], expected: Expected, false_alarm: float, seed: int
 ) -> MembershipTest:
     """Return the test of one unit."""
+    import pandas as pd
+
     given = estimate(unit)
     if not given.pareto_k <= USABLE_WEIGHTS:
         raise ValueError(

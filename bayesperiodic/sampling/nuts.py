@@ -8,7 +8,6 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from tqdm import tqdm
 
 from bayesperiodic._parallel import Terminated
@@ -195,6 +194,8 @@ class _Chains:
 
     def posterior(self, version: str, seed: int) -> Posterior:
         """End the chains and return their draws with nutpie's statistics."""
+        import xarray as xr
+
         statistics = [chain.sampler.abort()["sample_stats"] for chain in self.chains]
         stats = {
             ours: np.stack([np.asarray(one[theirs])[0, : self.steps] for one in statistics])

@@ -8,16 +8,15 @@ import numpy as np
 from tqdm import tqdm
 
 from bayesperiodic.sampling.convergence import PASSES, autocorrelation_time, unmet_criteria
+from bayesperiodic.sampling.moves import MixtureMove, moves
 from bayesperiodic.sampling.population_coordinates import Decoupled
 from bayesperiodic.sampling.population_density import PopulationDensity
 from bayesperiodic.sampling.proposals import (
     MIXTURE_STEPS,
     AffineTransform,
-    MixtureMove,
     StudentMixture,
     expected_time,
     fit_mixture,
-    moves,
 )
 
 CHAINS, LEAST_WALKERS, STEPS_A_ROUND, MOST_ROUNDS = 4, 16, 50, 200

@@ -1,15 +1,20 @@
 """Evidence for a spread against none: by the density at zero, and by bridge sampling where that is undecided."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from scipy.special import logsumexp
 
 from bayesperiodic.sampling.evidence import bridge
 from bayesperiodic.sampling.population_chains import Chains, sample_chains
 from bayesperiodic.sampling.population_coordinates import Decoupled
 from bayesperiodic.sampling.population_density import PopulationDensity
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Draws at which the density at zero is averaged, points of its normalisation, and the spread that is taken for zero,
 # relative to the smallest kernel.
@@ -27,6 +32,8 @@ def evidence_for_spread(density: PopulationDensity, chains: Chains, seed: int) -
     of each unit's draws that matter without a spread, which are few where units are far apart; bridge and bridge_error,
     by bridge sampling of both populations, NaN where the first is beyond ±5.
     """
+    import pandas as pd
+
     rows = {}
     for name in density.structure.free:
         log, error = _density_at_zero(density, chains, name)

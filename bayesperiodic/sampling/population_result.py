@@ -1,13 +1,13 @@
 """Result of a population: its parameters, its units, and what it predicts."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
-import xarray as xr
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
@@ -19,6 +19,10 @@ from bayesperiodic.sampling.convergence import QUANTILE_LEVELS
 from bayesperiodic.sampling.membership import FEWEST_EFFECTIVE, USABLE_WEIGHTS, Expected, MembershipTest, membership
 from bayesperiodic.sampling.population_density import Parameters
 from bayesperiodic.sampling.population_units import Coordinate, carried_out, task_of, unit_draws
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
 
 POPULATION_UNIT, PARAMETER, UNIT_GROUP = "unit", "parameter", "units"
 # Draws of the population in results.
@@ -162,6 +166,8 @@ class Population(Result):
         -------
         DataFrame
         """
+        import pandas as pd
+
         rows = {}
         for label in self.labels:
             values = self.draws(label)
@@ -409,6 +415,8 @@ def gather_population(
     seed: int,
 ) -> Population:
     """Return the result of chains and shrunken units; see `population.fitted`."""
+    import xarray as xr
+
     density, chains, shrunken = fit.density, fit.chains, fit.shrunken
     structure, first = density.structure, density.units[0]
     logs = np.array([at.logarithmic for at in first.coordinates])
@@ -493,6 +501,8 @@ def _unit_table(
     again: frozenset[str],
 ) -> pd.DataFrame:  # fmt: skip
     """Return the table of units."""
+    import pandas as pd
+
     rows, member, size = [], 0, len(density.structure.names)
     for unit in density.units:
         for place, label in enumerate(unit.members):

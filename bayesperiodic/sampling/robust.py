@@ -1,11 +1,17 @@
 """Draws with the robust covariance: what a misspecified model still says of its parameters."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
-import xarray as xr
 
 from bayesperiodic._linalg import covariance_eigh, scaled
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.problem.parameters import CHAIN, DRAW, column, places, support
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 # Group of the robust covariance in draws of a misspecified model; attribute of draws that have this covariance.
 ROBUST, MISFIT = "robust", "misfit"
@@ -27,6 +33,8 @@ def no_robust(fit: MapEstimate, optima: int) -> str:
 
 def add_robust(tree: xr.DataTree, fit: MapEstimate, optima: int) -> None:
     """Add to draws of a misspecified model why it is, and the robust covariance of its estimate if it has one."""
+    import xarray as xr
+
     if fit.misspecified:
         tree.attrs[MISFIT] = fit.misfit
         if not no_robust(fit, optima):
@@ -35,6 +43,8 @@ def add_robust(tree: xr.DataTree, fit: MapEstimate, optima: int) -> None:
 
 def robust_group(fit: MapEstimate, posterior: xr.Dataset) -> xr.Dataset:
     """Return the robust covariance (names, names) in sampling coordinates as a dataset, with the names of the rows."""
+    import xarray as xr
+
     names = [*fit.theta]
     slopes = [1.0 / fit.theta[n] if support(posterior, n) == (0.0, np.inf) else 1.0 for n in names]
     covariance = scaled(fit.robust_covariance.loc[names, names].to_numpy(), np.array(slopes))

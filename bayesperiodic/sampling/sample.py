@@ -1,5 +1,7 @@
 """Sampling of θ and the noise parameters with emcee."""
 
+from __future__ import annotations
+
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -8,11 +10,9 @@ from dataclasses import astuple
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import emcee
 import numpy as np
-import xarray as xr
 from tqdm import tqdm
 
 from bayesperiodic import _checks
@@ -39,7 +39,6 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.problem.fingerprint import digest
-from bayesperiodic.sampling.checkpoint import Checkpoint
 from bayesperiodic.sampling.convergence import PASSES, stop_rule
 from bayesperiodic.sampling.draws import Posterior, gather
 from bayesperiodic.sampling.nuts import refuse_for_nuts, sample_nuts
@@ -47,14 +46,18 @@ from bayesperiodic.sampling.proposals import (
     MIXTURE_STEPS,
     AffineTransform,
     CallCount,
-    MixtureMove,
     StudentMixture,
     expected_time,
     fit_mixture,
-    moves,
 )
 from bayesperiodic.sampling.robust import add_robust
 from bayesperiodic.sampling.starts import FROM_LAPLACE, STARTS, laplace_mixture, mode_of, sampling_axes, start_points
+
+if TYPE_CHECKING:
+    import emcee
+    import xarray as xr
+
+    from bayesperiodic.sampling.checkpoint import Checkpoint
 
 EMCEE, NUTS = "emcee", "nuts"
 FEWEST_STEPS, FEWEST_KEPT = 50, 10
@@ -189,6 +192,10 @@ def sample(
     >>> draws.reason.split(" with ")[0], draws.failures
     ('max_steps = 250 reached', {})
     """
+    import emcee
+
+    from bayesperiodic.sampling.checkpoint import Checkpoint
+
     _checks.instance("problem", problem, Problem)
     _checks.integer("ensembles", ensembles, 2)
     _checks.integer("max_steps", max_steps, FEWEST_STEPS)
@@ -264,6 +271,8 @@ class _EnsembleRun:
         backend: emcee.backends.Backend,
         state: dict[str, Any],
     ):
+        import emcee
+
         self.seed, self.density, self.fit, self.backend = seed, density, fit, backend
         self.ensembles, self.walkers = shape
         first, redraws, axes = np.random.SeedSequence(seed).spawn(3)
@@ -350,6 +359,10 @@ class _EnsembleRun:
 
     def _advance(self, until: int, evaluate: Evaluate, bar: tqdm) -> None:
         """Advance all ensembles to a number of steps."""
+        import emcee
+
+        from bayesperiodic.sampling.moves import MixtureMove, moves
+
         mixture = self.state["mixture"] and MixtureMove(StudentMixture.from_lists(self.state["mixture"]))
         calls = CallCount()
 
@@ -449,6 +462,8 @@ class _EnsembleRun:
 
     def posterior(self) -> Posterior:
         """Return the draws, with draws of the variances that were integrated out."""
+        import xarray as xr
+
         kept, first = self._kept(), self._first_kept
         log_density = self._by_ensemble(self.backend.get_log_prob(discard=first))
         modes = mode_of(self.density, self.fit, kept)
@@ -476,6 +491,8 @@ class _EnsembleRun:
 
         Its components are those of the coordinates u, straightened by `curvature`, of origin + axes·u.
         """
+        import xarray as xr
+
         mixture = StudentMixture.from_lists(self.state["mixture"])
         (accepted, proposed), where = self.state["tries"], ("component", "axis")
         return xr.Dataset(

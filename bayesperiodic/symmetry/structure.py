@@ -1,10 +1,11 @@
 """Structural identifiability: parameters and combinations that the equations and measured channels can determine."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-import pandas as pd
 import sympy as sp
 
 from bayesperiodic import _checks
@@ -24,6 +25,9 @@ from bayesperiodic.symmetry.determining import (
 from bayesperiodic.symmetry.discrete import discrete_flows
 from bayesperiodic.symmetry.invariants import Directions, Flow
 from bayesperiodic.symmetry.sensors import DELAY_OF, with_sensors
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @runtime_checkable
@@ -391,6 +395,8 @@ def _table(
     coefficients: Mapping[sp.Expr, bool],
     combinations: Mapping[sp.Expr, str],
 ) -> pd.DataFrame:
+    import pandas as pd
+
     moved = directions.moved
     unsure = {whole.parameters[n] for n in moved}
     rows = {}

@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from bayesperiodic.sampling.moves import MixtureMove, WithinEnsembles, moves
 from bayesperiodic.sampling.proposals import (
-    MixtureMove,
     StudentMixture,
-    WithinEnsembles,
     expected_time,
     fit_mixture,
-    moves,
 )
 
 
