@@ -76,6 +76,17 @@ def test_solving_loads_neither_the_sampler_nor_the_plots():
     assert done.stdout == "[]\n"
 
 
+def test_names_of_an_identification_load_no_tables_plots_samplers_or_distributions():
+    names = "models Model Experiment Recording Normal Problem map_estimate sample identifiability predict load"
+    slow = ["pandas", "xarray", "arviz", "emcee", "matplotlib", "sklearn", "pint", "scipy.stats", "scipy.optimize"]
+    program = (
+        f"import sys; from bayesperiodic import {', '.join(names.split())};"
+        f"print([m for m in {slow} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
 def test_listing_the_studies_compiles_nothing():
     program = "from studies.__main__ import main; main([]); import sys; print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular, toeplitz
-from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 # Probabilities before the data: of a transient where the start was left out or not, of a drift, a step and a line
@@ -55,6 +54,8 @@ class Courses:
 
     def refined(self, index: int, shape: np.ndarray) -> "Courses":
         """Return the courses and one more: the best fit to components (cycles, components) near one of them."""
+        from scipy.optimize import minimize
+
         count = len(shape)
         cycle = np.arange(count, dtype=float)
         tone = self.kind[index] == TONE

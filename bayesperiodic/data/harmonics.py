@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.fft import next_fast_len
 from scipy.linalg import solve_toeplitz, solveh_banded
 from scipy.special import fdtri, stdtrit
 
@@ -239,6 +238,8 @@ def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
 
     The lag is the smallest one whose peak reaches 90 % of the highest.
     """
+    from scipy.fft import next_fast_len
+
     samples = time.size
     length = next_fast_len(2 * samples, real=True)
     step = (time[-1] - time[0]) / (samples - 1)

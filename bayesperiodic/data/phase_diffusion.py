@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import dst
 from scipy.special import softmax
 
 # Cycles from which a random walk is looked for.
@@ -29,6 +28,8 @@ def phase_diffusion(phase: np.ndarray, basis: np.ndarray, least: float) -> Diffu
     is `least`, that of the samples' white noise, or its maximum above; the result is the mean over q/v, with a prior
     flat in its logarithm. `basis` (orders, cycles) are the polynomials.
     """
+    from scipy.fft import dst
+
     differences = np.diff(phase)
     count = differences.size
     if phase.size < FEWEST_PHASES:

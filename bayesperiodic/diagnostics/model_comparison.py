@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import expit, softmax
 
 from bayesperiodic import _checks, _fourier
@@ -376,6 +375,8 @@ def bennett(without: np.ndarray, given: np.ndarray, efficiencies: tuple[float, f
 
     `efficiencies` are the numbers of independent draws per draw of the two sets.
     """
+    from scipy.optimize import brentq
+
     sizes = [efficiency * draws.size for efficiency, draws in zip(efficiencies, (without, given), strict=True)]
     ratio, finite = np.log(sizes[1] / sizes[0]), np.concatenate([without, given])
     finite = finite[np.isfinite(finite)]

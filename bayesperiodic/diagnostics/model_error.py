@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import chdtr, gammaincinv
 
 from bayesperiodic._linalg import TINY, column_space
@@ -120,15 +119,15 @@ class Residual:
             few = float(parts.sum()) ** 2 / uncertain if uncertain > 0.0 else np.inf
             variance = 2.0 * self.dependent * float(self.variances @ self.variances)
             return ErrorPart(square, float(self.variances.sum()), variance, along, self.freedom, few).error()
-        return (
-            np.nan,
-            0.0,
-            0.5 * square * values / gammaincinv(0.5 * values, TAIL_PROBABILITY) if values >= 1.0 else np.inf,
-        )
+        if values < 1.0:
+            return np.nan, 0.0, np.inf
+        return np.nan, 0.0, 0.5 * square * values / float(gammaincinv(0.5 * values, TAIL_PROBABILITY))
 
 
 def _root(falling: Callable[[float], float], scale: float) -> float:
     """Return where a falling function of a positive number is zero; 0 if it is negative there."""
+    from scipy.optimize import brentq
+
     if falling(0.0) <= 0.0:
         return 0.0
     high = scale

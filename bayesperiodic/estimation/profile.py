@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
-from scipy.optimize import brentq
 from scipy.special import ndtri
 
 from bayesperiodic import _checks
@@ -324,6 +322,9 @@ def _crossing(values: np.ndarray, roots: np.ndarray, level: float, limit: float)
 
     Infinite if they stay below it up to the limit; NaN if solves fail before, or no root is below the level.
     """
+    from scipy.interpolate import PchipInterpolator
+    from scipy.optimize import brentq
+
     top = int(np.nanargmin(roots))
     finite = top + np.flatnonzero(np.isfinite(roots[top:]))
     values, roots = values[finite], roots[finite]

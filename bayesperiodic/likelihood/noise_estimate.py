@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import minimize
 
 from bayesperiodic._linalg import TINY
 from bayesperiodic.likelihood.likelihood import Likelihood
@@ -72,6 +71,8 @@ def _maximise(
     of_total: bool,
 ) -> np.ndarray:
     """Return the best noise parameters (names,) from a start and from a centre, within bounds about the centre."""
+    from scipy.optimize import minimize
+
     free = [part.names.index(name) for name in part.free]
 
     def complete(logarithms: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import chndtrix, i0e, i1e, ndtr
 
 from bayesperiodic import _fourier
@@ -397,6 +396,8 @@ def _rice(a: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 def likeliest_amplitude(measured: float) -> float:
     """Return the true amplitude that makes a measured one likeliest, both in standard deviations."""
+    from scipy.optimize import brentq
+
     if measured**2 <= 2.0:
         return 0.0
     low = 1e-3 * math.sqrt(measured**2 - 2.0)

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.fft import dct
 
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.block import Block, ComparedSignals, Timed, common, measured_channels
@@ -60,4 +59,6 @@ class Samples(Timed):
 
     def along_period(self, part: np.ndarray) -> np.ndarray:
         """Return the values as cosine components along the period."""
+        from scipy.fft import dct
+
         return np.asarray(dct(part, norm="ortho", axis=-1))

@@ -6,7 +6,6 @@ All coordinates are in units of the attractor's size.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 # Powers of the two coordinates, degree by degree, and the factorials that make the coefficients derivatives.
@@ -247,6 +246,8 @@ def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
     propagated one of the argument's error. The densest neighbourhoods are used, where curvature matters least, and
     widened until they are large compared with the noise.
     """
+    from scipy.optimize import nnls
+
     centres = maps.arguments[:: max(1, len(maps.arguments) // NOISE_CENTRES)]
     noise, count = np.zeros(2), int(2.25 * neighbours)
     for _ in range(3):

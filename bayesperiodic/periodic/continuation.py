@@ -10,7 +10,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, overload
 
 import numpy as np
-from scipy.optimize import brentq
 from tqdm import tqdm
 
 from bayesperiodic import _checks
@@ -364,6 +363,8 @@ def located(
     tracer: Tracer, before: BranchPoint, after: BranchPoint, kind: str, test: Callable[[BranchPoint], float]
 ) -> list[BranchPoint]:
     """Return the point where a test function is zero, in a list that is empty if a correction fails."""
+    from scipy.optimize import brentq
+
     span = after.distance - before.distance
     known: dict[float, BranchPoint] = {0.0: before, span: after}
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.optimize import brentq
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
@@ -91,6 +90,8 @@ def hopf_points(
     >>> abs(point.value) < 1e-9, round(point.frequency, 6)
     (True, 0.95493)
     """
+    from scipy.optimize import brentq
+
     _checks.instance("model", model, Model)
     if not model.autonomous:
         raise ValueError(f"model: must be autonomous, got {model.name!r}, which is driven and has no equilibrium.")
