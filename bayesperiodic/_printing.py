@@ -1,6 +1,8 @@
 """Printed texts."""
 
 import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 
 def printable(text: str) -> str:
@@ -21,3 +23,15 @@ class Printed:
 
     def __str__(self) -> str:
         return printable(repr(self))
+
+
+def as_text(rows: Mapping[str, Any], columns: Sequence[str] | None = None) -> str:
+    """Return texts by row, as dicts by column or in the order of `columns`, as a table."""
+    import pandas as pd
+
+    return pd.DataFrame.from_dict(dict(rows), orient="index", columns=columns).to_string()
+
+
+def written(theta: Mapping[str, float]) -> str:
+    """Return the names and values of parameters, as in messages."""
+    return ", ".join(f"{name} = {value:.6g}" for name, value in theta.items())

@@ -10,6 +10,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
+from bayesperiodic._printing import written
 from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
 from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
 from bayesperiodic.density.problem import Problem
@@ -27,8 +28,8 @@ from bayesperiodic.estimation.covariance import (
     uncertainty,
 )
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, at_ends, bias_correction
-from bayesperiodic.estimation.laplace import IN_COMBINATION, SILENT, joint_laplace, undetermined
-from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit, Whiteness, sds, written
+from bayesperiodic.estimation.laplace import IN_COMBINATION, SILENT, joint_laplace, sds, undetermined
+from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit, Whiteness
 from bayesperiodic.estimation.unexplained import Unexplained, testable, used
 from bayesperiodic.estimation.units import unit_error
 from bayesperiodic.likelihood.input_noise import EXACT, FEWEST_CYCLES, ROUGH

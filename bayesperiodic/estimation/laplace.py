@@ -303,3 +303,9 @@ def by_sums(direction: np.ndarray, theta: np.ndarray, names: Sequence[str]) -> t
     text = ", ".join(f"{names[int(i)]} -> {names[int(i)]} {b} {a}t" for i, (a, b) in zip(shown, terms, strict=True))
     scale = np.min(np.where(theta != 0.0, np.abs(theta), 1.0)[shown] / np.abs(ratios[shown]))
     return text, theta + TESTED_CHANGE * scale * ratios
+
+
+def sds(covariance: pd.DataFrame) -> dict[str, float]:
+    """Return the roots of the diagonal of a covariance."""
+    with np.errstate(invalid="ignore"):
+        return dict(zip(covariance.index, np.sqrt(np.diag(covariance)).tolist(), strict=True))

@@ -14,10 +14,11 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import hessian_scale, in_one_thread, scaled
 from bayesperiodic._parallel import TaskPool, checked_executor
+from bayesperiodic._printing import written
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.check import at_estimate
 from bayesperiodic.estimation.gauss_newton import PRESSED, Iterate, Objective, climb
-from bayesperiodic.estimation.result import MapEstimate, written
+from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.priors.single import Prior
 
 if TYPE_CHECKING:

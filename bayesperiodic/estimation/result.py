@@ -12,9 +12,10 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse_all
 from bayesperiodic._io import Result, Storable
+from bayesperiodic._printing import as_text
 from bayesperiodic.estimation.conflict import PriorConflict
 from bayesperiodic.estimation.intervals import carried_covariance, log_normal_interval, shortest_interval
-from bayesperiodic.estimation.laplace import JointLaplace
+from bayesperiodic.estimation.laplace import JointLaplace, sds
 from bayesperiodic.estimation.modes import Mode, notable
 from bayesperiodic.likelihood.input_noise import InputErrors
 from bayesperiodic.likelihood.noise import Relative
@@ -118,12 +119,11 @@ class FitCheck(Result):
     misfit: str | None = None
 
     def __repr__(self) -> str:
-        import pandas as pd
-
-        columns = {"robust sd": self.robust_sd, "shift on twice the points": self.doubling_shift}
-        lines = ["FitCheck", pd.DataFrame(columns).map("{:.3g}".format).to_string()]
-        if rows := self.by_channel():
-            lines += ["Residuals", pd.DataFrame(rows).T.to_string()]
+        columns = "robust sd", "shift on twice the points"
+        rows = {name: (f"{sd:.3g}", f"{self.doubling_shift[name]:.3g}") for name, sd in self.robust_sd.items()}
+        lines = ["FitCheck", as_text(rows, columns)]
+        if channels := self.by_channel():
+            lines += ["Residuals", as_text(channels)]
         return "\n".join([*lines, *self.remarks()])
 
     def by_channel(self) -> dict[str, dict[str, str]]:
@@ -355,10 +355,8 @@ class MapEstimate(Result):
     @property
     def correlations(self) -> pd.DataFrame:
         """Correlations of the parameters, from `covariance`."""
-        import pandas as pd
-
         sd = np.sqrt(np.diag(self.covariance))
-        return pd.DataFrame(self.covariance / np.outer(sd, sd))
+        return self.covariance / np.outer(sd, sd)
 
     @property
     def misspecified(self) -> bool:
@@ -558,8 +556,6 @@ class MapEstimate(Result):
         return tuple(c for c, part in self.fvu.items() if names & {c, Relative.pooled} and part < ROUNDING_VARIANCE)
 
     def __repr__(self) -> str:
-        import pandas as pd
-
         status = self.status if self.converged else f"NOT CONVERGED: {self.status}; try another start, or starts=8"
         if self.without_noise:
             status = f"{self.status}; {', '.join(self.without_noise)} without noise"
@@ -569,15 +565,14 @@ class MapEstimate(Result):
             name: (f"{value:.6g}", *(f"{spreads[column][name]:.3g}" for column in columns[1:]))
             for name, value in self.theta.items()
         } | {name: (f"{value:.4g}", *"-" * len(spreads)) for name, value in self.noise.items()}
-        estimates = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
         more = self.checks.by_channel() if self.checks else {}
         channels = {
             channel: {"rms": f"{rms:.4g}", "unexplained variance": f"{self.fvu[channel]:.2%}"} | more.get(channel, {})
             for channel, rms in self.rms.items()
         }
-        lines = [f"MapEstimate ({status})", estimates.to_string()]
+        lines = [f"MapEstimate ({status})", as_text(rows, columns)]
         lines += [ROBUST_TAKEN] if self.misspecified else []
-        lines += ["Residuals", pd.DataFrame.from_dict(channels, orient="index").to_string()] if channels else []
+        lines += ["Residuals", as_text(channels)] if channels else []
         lines += [f"The noise has the {self.noise_prior}."] if self.noise else []
         if self.noisy_inputs and self.checks:
             caused = ", ".join(f"{sd:.3g} in {channel}" for channel, sd in self.checks.input_noise.items())
@@ -597,18 +592,7 @@ class MapEstimate(Result):
         return "\n".join(lines)
 
 
-def sds(covariance: pd.DataFrame) -> dict[str, float]:
-    """Return the roots of the diagonal of a covariance."""
-    with np.errstate(invalid="ignore"):
-        return dict(zip(covariance.index, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-
-
 def orbit_advice(fit: MapEstimate) -> str:
     """Return what to do first if orbits of a fit are not the measured ones; empty otherwise."""
     runs = ", ".join(map(repr, fit.other_orbits))
     return f"first fit the measured orbit of {runs}, see fit.other_orbits" if runs else ""
-
-
-def written(theta: dict[str, float]) -> str:
-    """Return the names and values of parameters, as in messages."""
-    return ", ".join(f"{name} = {value:.6g}" for name, value in theta.items())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -17,36 +16,31 @@ from bayesperiodic._io import Result
 from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.input_noise import InputErrors
-from bayesperiodic.likelihood.section_points import SCALE
-from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 from bayesperiodic.priors.joint import MultivariateNormal
 from bayesperiodic.priors.stored import PRIORS, as_text
-from bayesperiodic.problem.description import Description
-from bayesperiodic.problem.fingerprint import check_fingerprint, fingerprint
+from bayesperiodic.problem.fingerprint import check_fingerprint
 from bayesperiodic.problem.parameters import (
     CHAIN,
-    CHANNEL,
-    DRAW,
     EXPERIMENT,
     NOISE,
     checked_key,
     column,
-    full_name,
     in_experiment,
     local_hint,
-    pack,
     places,
-    squared,
 )
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.groups import (
+    CAUSED,
+    EXPECTED,
+    INPUT_NOISE,
+    LOADINGS,
     LOG_LIKELIHOOD,
+    MODE,
     POSTERIOR_PREDICTIVE,
     STEP,
     WALKER,
-    log_likelihood_terms,
-    posterior_predictive,
-    signals,
+    tree,
 )
 from bayesperiodic.sampling.proposals import CallCount
 from bayesperiodic.sampling.robust import MISFIT, ROBUST, no_robust, robust_group, with_robust_covariance
@@ -478,10 +472,6 @@ def refuse_robust(posterior: Posterior) -> None:
         )
 
 
-MODE = "mode"
-INPUT_NOISE, EXPECTED, LOADINGS, CAUSED = "input_noise", "expected errors", "loadings", "caused"
-
-
 def gather(
     density: LogPosterior,
     kept: np.ndarray,
@@ -514,101 +504,3 @@ def gather(
         log_posterior_calls=calls.points,
         seed=seed,
     )
-
-
-def tree(
-    density: LogPosterior, kept: np.ndarray, log_density: np.ndarray, seed: int, modes: np.ndarray | None = None
-) -> xr.DataTree:
-    """Return draws (ensembles, steps, walkers, coordinates) as the groups of `Posterior.tree`."""
-    import xarray as xr
-
-    problem, lp = density.problem, convergence.as_chains(log_density)
-    steps, walkers = log_density.shape[1:]
-    moved = np.full(log_density.shape, np.nan)
-    moved[:, 1:] = np.any(np.diff(kept[..., : len(problem.names)], axis=1) != 0.0, axis=-1)
-    theta, noise = density.to_natural(convergence.as_chains(kept))
-    best = theta.reshape(-1, theta.shape[-1])[np.argmax(lp)]
-    step, walker = (convergence.as_chains(index[None])[0] for index in np.indices((steps, walkers)))
-    coords = {CHAIN: np.arange(len(lp)), DRAW: np.arange(lp.shape[1]), STEP: (DRAW, step), WALKER: (DRAW, walker)}
-    posterior = _variables(problem, theta, noise).assign_coords(coords)
-    status = np.where(np.isfinite(lp), CONVERGED, NOT_FINITE).astype(np.int8)
-    flags = " ".join(s.replace(" ", "_") for s in STATUSES)
-    meanings = {"flag_values": list(range(len(STATUSES))), "flag_meanings": flags}
-    stats = {"lp": ((CHAIN, DRAW), lp), "status": ((CHAIN, DRAW), status, meanings)}
-    stats |= {"acceptance_rate": ((CHAIN, DRAW), convergence.as_chains(moved))}
-    if modes is not None:
-        stats |= {MODE: ((CHAIN, DRAW), convergence.as_chains(modes.astype(np.int8)))}
-    groups = {
-        "posterior": posterior,
-        "sample_stats": xr.Dataset(stats, coords=coords),
-        LOG_LIKELIHOOD: log_likelihood_terms(density, posterior),
-        POSTERIOR_PREDICTIVE: posterior_predictive(density, posterior, seed),
-        "orbits": signals(problem, {run: s.states for run, s in density.solver.solutions(best).items()}),
-        "observed_data": signals(problem, {e.name: e.outputs for e in problem.experiments}),
-        "constant_data": signals(problem, {e.name: e.inputs for e in problem.experiments}),
-    }
-    if problem.input_errors:
-        variables: dict[str, Any] = {}
-        for name, errors in problem.input_errors.items():
-            variables[f"{name} {EXPECTED}"] = ((f"{name} error",), errors.expected)
-            variables[f"{name} {LOADINGS}"] = ((f"{name} component", f"{name} error"), errors.loadings)
-            variables[f"{name} {CAUSED}"] = ((f"{name} component",), errors.caused)
-        groups[INPUT_NOISE] = xr.Dataset(variables)
-    result = xr.DataTree.from_dict(groups)
-    result.attrs = {
-        "fingerprint": fingerprint(problem),
-        "synthetic": int(any(e.synthetic for e in problem.experiments)),
-        "bayesperiodic": importlib.metadata.version("bayesperiodic"),
-        "emcee": importlib.metadata.version("emcee"),
-    }
-    return result
-
-
-def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr.Dataset:
-    """Return θ (chains, draws, names) and noise parameters (chains, draws, noise_names) as labelled variables."""
-    import xarray as xr
-
-    columns = {name: theta[..., i] for i, name in enumerate(problem.names)}
-    columns |= _fixed_locals(problem, theta.shape[:-1])
-    columns |= {name: noise[..., i] for i, name in enumerate(problem.noise_names)}
-    dims = {plain: (EXPERIMENT,) * (plain != name) for name, plain in problem.plain_names.items()}
-    dims |= {name.partition("[")[0]: _noise_dims(problem, name) for name in problem.noise_names}
-    channels = [*problem.channels, *problem.quantities, *filter(None, [problem.noise.pooled])]
-    coords = {CHANNEL: channels, EXPERIMENT: [e.name for e in problem.experiments]}
-    noises = {name.partition("[")[0] for name in problem.noise_names}
-    attributes = {v: _noise_attributes(problem, v) if v in noises else _attributes(problem, v) for v in dims}
-    packed = pack(columns, dims, coords)
-    return xr.Dataset({v: (*values, attributes[v]) for v, values in packed.items()}, coords=coords)
-
-
-def _fixed_locals(problem: Description, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
-    """Return the values of local parameters in the experiments where they are fixed."""
-    return {
-        full_name(plain, (run,)): np.full(shape, parameter_map.fixed[plain])
-        for plain in {plain for name, plain in problem.plain_names.items() if plain != name}
-        for run, parameter_map in problem.parameter_maps.items()
-        if plain in parameter_map.fixed
-    }
-
-
-def _noise_dims(problem: Description, name: str) -> tuple[str, ...]:
-    """Return the dims, after chain and draw, of the variable of a noise parameter's full name."""
-    if "[" not in name:
-        return ()
-    if name.startswith(f"{SCALE}["):
-        return (EXPERIMENT,)
-    return (CHANNEL,) if problem.noise.per == CHANNEL else (CHANNEL, EXPERIMENT)
-
-
-def _attributes(problem: Description, parameter: str) -> dict[str, Any]:
-    """Return the unit of a parameter, and the support of its prior, one for each experiment that has its own."""
-    supports = problem.joint_prior.supports.items()
-    each = {f"support of {name}": list(ends) for name, ends in supports if problem.plain_names[name] == parameter}
-    return {"units": problem.units.get(parameter, "")} | each
-
-
-def _noise_attributes(problem: Description, variable: str) -> dict[str, str]:
-    """Return the noise model's name, and the unit of each channel's variance."""
-    units = {c: problem.model.units.get(c, "") for c in problem.channels} | problem.quantities
-    squares = {f"units of {c}": squared(unit) for c, unit in units.items() if unit and variable == "variance"}
-    return {NOISE: problem.noise.name} | squares

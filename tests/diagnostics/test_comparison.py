@@ -11,7 +11,8 @@ from scipy import stats
 import bayesperiodic as bp
 from bayesperiodic.diagnostics.comparison import importance_k
 from bayesperiodic.diagnostics.verdicts import Sample, joint_verdict, marginal_verdict
-from bayesperiodic.sampling.draws import gather, tree
+from bayesperiodic.sampling.draws import gather
+from bayesperiodic.sampling.groups import tree
 from bayesperiodic.sampling.proposals import CallCount
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 from tests.sampling.test_targets import known, model, run

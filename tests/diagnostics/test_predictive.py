@@ -7,7 +7,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic import _fourier
 from bayesperiodic.estimation.adequacy import ADEQUACY_TESTS, adequacy
-from bayesperiodic.sampling.draws import tree
+from bayesperiodic.sampling.groups import tree
 from tests.known import LINEAR, NOISES, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors
 from tests.problems import CASES, DUFFING, DUFFING_PRIORS, SAMPLES
 
