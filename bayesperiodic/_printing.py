@@ -1,7 +1,7 @@
 """Printed texts."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 
@@ -25,7 +25,7 @@ class Printed:
         return printable(repr(self))
 
 
-def as_text(rows: Mapping[str, Any], columns: Sequence[str] | None = None) -> str:
+def as_text(rows: Mapping[str, Any], columns: list[str] | None = None) -> str:
     """Return texts by row, as dicts by column or in the order of `columns`, as a table."""
     import pandas as pd
 

@@ -119,7 +119,7 @@ class FitCheck(Result):
     misfit: str | None = None
 
     def __repr__(self) -> str:
-        columns = "robust sd", "shift on twice the points"
+        columns = ["robust sd", "shift on twice the points"]
         rows = {name: (f"{sd:.3g}", f"{self.doubling_shift[name]:.3g}") for name, sd in self.robust_sd.items()}
         lines = ["FitCheck", as_text(rows, columns)]
         if channels := self.by_channel():
@@ -356,7 +356,7 @@ class MapEstimate(Result):
     def correlations(self) -> pd.DataFrame:
         """Correlations of the parameters, from `covariance`."""
         sd = np.sqrt(np.diag(self.covariance))
-        return self.covariance / np.outer(sd, sd)
+        return self.covariance.div(np.outer(sd, sd))
 
     @property
     def misspecified(self) -> bool:
