@@ -1,16 +1,8 @@
-"""Models: equations, compiled functions, and a library of models (the attributes of this package)."""
+"""Models: equations, compiled functions, and a library of models (the attributes of this package).
 
-from bayesperiodic.models import elements as elements
-from bayesperiodic.models.library import (
-    chain,
-    dahl,
-    duffing,
-    flutter,
-    landing_gear,
-    pendulum,
-    rl_diode,
-    silverbox,
-    van_der_pol,
-)
+The names are listed in ``__init__.pyi`` and imported at their first use.
+"""
 
-__all__ = ["chain", "dahl", "duffing", "flutter", "landing_gear", "pendulum", "rl_diode", "silverbox", "van_der_pol"]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
