@@ -6,7 +6,7 @@ import sys
 
 RECORDED_PACKAGES = (
     "bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "xarray", "pandas", "matplotlib", "h5py",
-    "h5netcdf", "corner", "scikit-learn", "nutpie", "dask", "mpi4py",
+    "h5netcdf", "corner", "nutpie", "dask", "mpi4py",
 )  # fmt: skip
 
 

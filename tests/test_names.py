@@ -78,7 +78,7 @@ def test_solving_loads_neither_the_sampler_nor_the_plots():
 
 def test_names_of_an_identification_load_no_tables_plots_samplers_or_distributions():
     names = "models Model Experiment Recording Normal Problem map_estimate sample identifiability predict load"
-    slow = ["pandas", "xarray", "arviz", "emcee", "matplotlib", "sklearn", "pint", "scipy.stats", "scipy.optimize"]
+    slow = ["pandas", "xarray", "arviz", "emcee", "matplotlib", "pint", "scipy.stats", "scipy.optimize"]
     program = (
         f"import sys; from bayesperiodic import {', '.join(names.split())};"
         f"print([m for m in {slow} if m in sys.modules])"

@@ -4,14 +4,12 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from functools import cache
 from typing import Any
 
 import numpy as np
 from scipy.special import gammaln, logsumexp
-from threadpoolctl import ThreadpoolController
 
-from bayesperiodic._linalg import covariance_eigh
+from bayesperiodic._linalg import TINY, covariance_eigh, in_one_thread
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 
 # Numbers of components and degrees of freedom that are tried; a larger mixture must raise the mean log-density of the
@@ -21,6 +19,8 @@ WIDER_WEIGHT, WIDER_FACTOR = 0.1, 2.0
 # Most draws used in a fit, and draws needed per coordinate and component.
 MOST_FITTED_DRAWS, PER_COMPONENT = 6000, 20
 REGULAR = 1e-6
+# Iterations of a fit, and the gain in mean log-density at which it ends.
+MOST_ITERATIONS, ENOUGH_GAIN = 100, 1e-2
 # Most coordinates whose products describe curvature, and ridge of that regression, relative to the mean square.
 MOST_CURVED, CURVATURE_RIDGE = 20, 1e-6
 
@@ -173,27 +173,55 @@ def _curvature(points: np.ndarray, bent: int) -> np.ndarray:
 
 
 def _fitted(draws: np.ndarray, count: int, curvature: np.ndarray) -> StudentMixture:
-    """Return Student t distributions with weights, means and scale matrices of normal distributions fitted to draws.
-
-    In one thread: the sums of several depend on their order.
-    """
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.mixture import GaussianMixture
-
+    """Return Student t distributions with weights, means and scale matrices of normal distributions fitted to draws."""
     none = np.empty(0)
     draws = StudentMixture(none, none, none, none, curvature).straightened(draws)
-    fit = GaussianMixture(count, reg_covar=REGULAR * draws.var(axis=0).min(), random_state=0, tol=1e-2).fit
-    with _libraries().limit(limits=1), warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # a mixture that is not the best one is a proposal too
-        mixture = fit(draws)
-    factors = np.linalg.cholesky(mixture.covariances_)
-    return StudentMixture(mixture.weights_, mixture.means_, factors, np.full(count, HEAVY_TAILS), curvature)
+    weights, means, covariances = normal_mixture(draws, count)
+    return StudentMixture(weights, means, np.linalg.cholesky(covariances), np.full(count, HEAVY_TAILS), curvature)
 
 
-@cache
-def _libraries() -> ThreadpoolController:
-    """Return the libraries that have threads, those of scikit-learn included, which are loaded by then."""
-    return ThreadpoolController()
+@in_one_thread  # the sums of several threads depend on their order
+def normal_mixture(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return weights, means and covariances of normal distributions, fitted to points by expectation maximisation.
+
+    The first members are clusters of k-means. It ends where the mean log-density rises by less than ENOUGH_GAIN: a
+    mixture that is not the best one is a proposal too. From A. P. Dempster, N. M. Laird, D. B. Rubin, Journal of the
+    Royal Statistical Society B 39 (1977) 1-38.
+
+    Parameters
+    ----------
+    points : array (points, dimension)
+    count : int
+        Number of normal distributions.
+
+    Returns
+    -------
+    weights : array (count,)
+    means : array (count, dimension)
+    covariances : array (count, dimension, dimension)
+        With REGULAR times the smallest variance of the points added to the diagonal.
+    """
+    from scipy.cluster.vq import kmeans2
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of clusters without points, which have no weight
+        _, labels = kmeans2(points, count, 30, minit="++", seed=np.random.default_rng(0))
+    members, score = np.eye(count)[labels], -np.inf
+    regular = REGULAR * points.var(axis=0).min() * np.eye(points.shape[1])
+    for _ in range(MOST_ITERATIONS):
+        sizes = members.sum(axis=0) + TINY
+        means = members.T @ points / sizes[:, None]
+        away = points - means[:, None]
+        covariances = (members.T[..., None] * away).swapaxes(1, 2) @ away / sizes[:, None, None] + regular
+        factors = np.linalg.cholesky(covariances)
+        squares = np.sum((away @ np.linalg.inv(factors).swapaxes(1, 2)) ** 2, axis=2)
+        roots = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)
+        logs = (np.log(sizes / sizes.sum()) - roots)[:, None] - 0.5 * squares
+        total = logsumexp(logs, axis=0)
+        members, before, score = np.exp(logs - total).T, score, float(total.mean())
+        if score - before < ENOUGH_GAIN:
+            break
+    return sizes / sizes.sum(), means, covariances
 
 
 def _with_wider(mixture: StudentMixture, degrees: float | None = None) -> StudentMixture:

@@ -12,6 +12,7 @@ from bayesperiodic.sampling.proposals import (
     StudentMixture,
     expected_time,
     fit_mixture,
+    normal_mixture,
 )
 
 
@@ -96,6 +97,38 @@ def test_a_mixture_is_fitted_with_as_many_components_as_the_draws_show():
     weights = [fitted.weights[fitted.means[:, 0] * sign > 0.0].sum() for sign in (1.0, -1.0)]
     assert weights == pytest.approx([0.7, 0.3], abs=0.03)
     assert len(fit_mixture(generator.standard_normal((4, 1500, 2))).weights) == 2
+
+
+@pytest.mark.parametrize("distance", [0.0, 20.0])
+def test_normal_distributions_fitted_to_groups_far_apart_have_the_moments_of_each(distance):
+    """Members of one group only, or of all: shares, means and covariances of the points in each."""
+    generator = np.random.default_rng(6)
+    groups = [[3.0, 1.0] * generator.standard_normal((900, 2)), 0.5 * generator.standard_normal((300, 2)) + distance]
+    groups = groups if distance else [np.concatenate(groups)]
+    points = generator.permutation(np.concatenate(groups))
+    weights, means, covariances = normal_mixture(points, len(groups))
+    order, regular = np.argsort(-weights), 1e-6 * points.var(axis=0).min() * np.eye(2)
+    assert weights[order] == pytest.approx([len(group) / len(points) for group in groups])
+    assert means[order] == pytest.approx(np.array([group.mean(axis=0) for group in groups]))
+    expected = np.array([np.cov(group.T, bias=True) + regular for group in groups])
+    assert covariances[order] == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_fitted_normal_distributions_are_at_least_as_likely_as_the_true_ones():
+    """Three that overlap, in five coordinates, but for the gain at which the fit ends."""
+    generator = np.random.default_rng(7)
+    truth = np.array([0.5, 0.3, 0.2]), 2.5 * generator.standard_normal((3, 5)), np.array([1.0, 2.0, 0.5])
+    group = generator.choice(3, 4000, p=truth[0])
+    points = truth[1][group] + np.sqrt(truth[2][group])[:, None] * generator.standard_normal((4000, 5))
+
+    def mean_log_density(weights, means, covariances):
+        parts = zip(weights, means, covariances, strict=True)
+        return np.log(sum(w * stats.multivariate_normal(m, c).pdf(points) for w, m, c in parts)).mean()
+
+    known = mean_log_density(*truth[:2], truth[2][:, None, None] * np.eye(5))
+    assert mean_log_density(*normal_mixture(points, 3)) > known - 0.01
+    again = [normal_mixture(points, 3) for _ in range(2)]
+    assert all(np.array_equal(*pair) for pair in zip(*again, strict=True))
 
 
 def test_the_expected_time_of_a_proposal_equal_to_the_target_is_that_of_independent_draws():
