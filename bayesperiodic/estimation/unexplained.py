@@ -1,6 +1,6 @@
 """What the parameters leave of a residual, and tests of it: whiteness and harmonic content."""
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.special import chdtri, fdtrc
@@ -110,16 +110,23 @@ def of_periodogram(power: np.ndarray) -> Whiteness:
 
     NaN of fewer than two of them, and if all are zero.
     """
-    from scipy.stats import kstest
-
     if power.size < 2 or power.sum() == 0.0:
         return Whiteness(NOT_TESTED, NOT_TESTED)
     harmonic = np.arange(1, power.size + 1)
-    cumulative = np.cumsum(power)[:-1] / power.sum()
+    cumulative, count = np.cumsum(power)[:-1] / power.sum(), power.size - 1
+    distance = max(np.max(harmonic[:-1] / count - cumulative), np.max(cumulative - (harmonic[:-1] - 1) / count))
     lag = 2.0 * np.pi / (2 * power.size + 1)
     return Whiteness(
-        float(kstest(cumulative, "uniform").pvalue), float(np.sum(power * np.cos(lag * harmonic)) / power.sum())
+        kolmogorov_tail(float(distance), count), float(np.sum(power * np.cos(lag * harmonic)) / power.sum())
     )
+
+
+@lru_cache(maxsize=4096)  # which takes milliseconds; checks and tests of the model ask for the same ones
+def kolmogorov_tail(distance: float, count: int) -> float:
+    """Return the probability of a larger Kolmogorov-Smirnov distance of `count` uniform values, without rounding."""
+    from scipy.stats import kstwo
+
+    return float(kstwo.sf(distance, count))
 
 
 def testable(r: np.ndarray, j: np.ndarray) -> bool:

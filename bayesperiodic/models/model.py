@@ -372,7 +372,7 @@ class Model(Printed):
             transitions=tuple(sign.args[0] for sign in self.smooth_signs),
         )
 
-    @property
+    @cached_property
     def definition(self) -> str:
         """All that solutions and residuals depend on, as text; equal for equal models."""
         names = self.states, self.inputs, self.parameters, self.outputs, self.angles
@@ -532,7 +532,7 @@ class CondensedModel(Model):
         """None: the points of the grid are doubled until the forces are resolved."""
         return ()
 
-    @property
+    @cached_property
     def definition(self) -> str:
         """All that solutions depend on, as text; equal for equal models."""
         names = self.states, self.inputs, self.parameters, self.outputs, "condensed"
