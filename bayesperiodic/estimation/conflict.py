@@ -38,6 +38,8 @@ SCORES, MASSES = 0.5 * (EDGES[1:] + EDGES[:-1]), np.diff(ndtr(EDGES))
 PEAKS = slice(5, -5, 10)
 # Width of each part of a prior, in its spacing, for a density without ripples.
 SMOOTHING = 0.75
+# Distance in standard deviations at which the exponential function of a normal density is zero in floating point.
+VANISHING = 39.0
 VARIANCES = (np.arange(32) + 0.5) / 32
 INTERVAL_TAILS = np.array([0.05, 0.95])
 SMALLEST_PROBABILITY = 1e-300
@@ -246,9 +248,11 @@ def _scores(prior: np.ndarray, value: float, sd: np.ndarray) -> np.ndarray:
     """
     spacing = np.gradient(prior)
     spread, smooth = (np.sqrt(sd[:, None] ** 2 + (share * spacing) ** 2) for share in (12**-0.5, SMOOTHING))
+    reach, weights, exponents = VANISHING * smooth.max(axis=0), MASSES / smooth, -0.5 / smooth**2
 
     def density(at: float) -> np.ndarray:
-        return np.exp(-0.5 * ((at - prior) / smooth) ** 2) / smooth @ MASSES
+        near = np.abs(at - prior) < reach
+        return np.sum(np.exp((at - prior[near]) ** 2 * exponents[:, near]) * weights[:, near], axis=1)
 
     each = (value - prior) / spread
     below, above = (np.maximum(ndtr(sign * each) @ MASSES, SMALLEST_PROBABILITY) for sign in (1.0, -1.0))

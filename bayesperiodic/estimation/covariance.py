@@ -142,7 +142,7 @@ def _residual_variance(
     misfit = square.sum(axis=1) / size + np.einsum("ga,ab,gb->g", step, others, step) + 2.0 * step @ score
     logarithms = block.weight * np.sum(np.log(size[:, None] * shape), axis=1) + np.linalg.slogdet(total)[1]
     logarithms += PRIOR_VALUES * (np.log(size) + 1.0 / size)
-    ratios = [_smoothed(block, *one) for one in zip(square / size[:, None], left, strict=True)]
+    ratios = _smoothed(block, square / size[:, None], left)
     return softmax(log_prior - 0.5 * (misfit + logarithms)) @ (size[:, None] * shape * ratios)
 
 
@@ -156,18 +156,26 @@ def _shapes(block: Block, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _smoothed(block: Block, square: np.ndarray, left: np.ndarray) -> np.ndarray:
-    """Return squares over their expectation (size,), smoothed over harmonics, as the mean of an unknown variance."""
-    highest = int(block.harmonic.max())
-    half = int(np.ceil(np.sqrt(highest + 1.0)))
+    """Return squares over their expectation, smoothed over harmonics, as the means of unknown variances.
+
+    All are arrays (spectra, size).
+    """
+    from scipy.ndimage import convolve1d
+
+    count = int(block.harmonic.max()) + 1
+    half = int(np.ceil(np.sqrt(count)))
     window = 1.0 - (np.arange(-half, half + 1) / (half + 1.0)) ** 2
-    middle = slice(half, half + highest + 1)
+    place = (count * np.arange(len(left))[:, None] + block.harmonic).ravel()
+    squares, values = (
+        np.bincount(place, part.ravel(), count * len(left)).reshape(-1, count) for part in (square, left)
+    )
     power, expected, doubled = (
-        np.convolve(np.bincount(block.harmonic, values, highest + 1), weights)[middle]
-        for values, weights in ((square, window), (left, window), (left, window**2))
+        convolve1d(part, weights, mode="constant")
+        for part, weights in ((squares, window), (values, window), (values, window**2))
     )
     freedom = expected**2 / np.maximum(doubled, LEAST_INFORMATION)
-    ratio = (power + PRIOR_VALUES) / (expected + PRIOR_VALUES) * _excess(freedom) / _excess(np.sum(left))
-    return ratio[block.harmonic]
+    ratio = (power + PRIOR_VALUES) / (expected + PRIOR_VALUES) * _excess(freedom)
+    return (ratio / _excess(left.sum(axis=1, keepdims=True)))[:, block.harmonic]
 
 
 def _excess(freedom: np.ndarray) -> np.ndarray:
