@@ -156,23 +156,16 @@ def _shapes(block: Block, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _smoothed(block: Block, square: np.ndarray, left: np.ndarray) -> np.ndarray:
-    """Return squares over their expectation, smoothed over harmonics, as the means of unknown variances.
-
-    All are arrays (spectra, size).
-    """
+    """Return squares over their expectation (spectra, size), smoothed over harmonics, as means of unknown variances."""
     from scipy.ndimage import convolve1d
 
     count = int(block.harmonic.max()) + 1
     half = int(np.ceil(np.sqrt(count)))
     window = 1.0 - (np.arange(-half, half + 1) / (half + 1.0)) ** 2
     place = (count * np.arange(len(left))[:, None] + block.harmonic).ravel()
-    squares, values = (
-        np.bincount(place, part.ravel(), count * len(left)).reshape(-1, count) for part in (square, left)
-    )
-    power, expected, doubled = (
-        convolve1d(part, weights, mode="constant")
-        for part, weights in ((squares, window), (values, window), (values, window**2))
-    )
+    sums = [np.bincount(place, part.ravel(), count * len(left)).reshape(-1, count) for part in (square, left)]
+    power, expected = (convolve1d(part, window, mode="constant") for part in sums)
+    doubled = convolve1d(sums[1], window**2, mode="constant")
     freedom = expected**2 / np.maximum(doubled, LEAST_INFORMATION)
     ratio = (power + PRIOR_VALUES) / (expected + PRIOR_VALUES) * _excess(freedom)
     return (ratio / _excess(left.sum(axis=1, keepdims=True)))[:, block.harmonic]

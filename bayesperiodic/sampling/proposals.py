@@ -20,7 +20,7 @@ WIDER_WEIGHT, WIDER_FACTOR = 0.1, 2.0
 MOST_FITTED_DRAWS, PER_COMPONENT = 6000, 20
 REGULAR = 1e-6
 # Iterations of a fit, and the gain in mean log-density at which it ends.
-MOST_ITERATIONS, ENOUGH_GAIN = 100, 1e-2
+FIT_ITERATIONS, ENOUGH_GAIN = 100, 1e-2
 # Most coordinates whose products describe curvature, and ridge of that regression, relative to the mean square.
 MOST_CURVED, CURVATURE_RIDGE = 20, 1e-6
 
@@ -208,7 +208,7 @@ def normal_mixture(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarr
         _, labels = kmeans2(points, count, 30, minit="++", seed=np.random.default_rng(0))
     members, score = np.eye(count)[labels], -np.inf
     regular = REGULAR * points.var(axis=0).min() * np.eye(points.shape[1])
-    for _ in range(MOST_ITERATIONS):
+    for _ in range(FIT_ITERATIONS):
         sizes = members.sum(axis=0) + TINY
         means = members.T @ points / sizes[:, None]
         away = points - means[:, None]
