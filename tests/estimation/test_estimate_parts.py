@@ -46,8 +46,9 @@ def smoothed(square, left):
 
 def test_squares_are_smoothed_over_neighbouring_harmonics():
     generator = np.random.default_rng(0)
-    square, left = generator.exponential(size=19), generator.uniform(0.3, 0.8, 19)
-    assert covariance._smoothed(BLOCK, square, left) == pytest.approx(smoothed(square, left))
+    square, left = generator.exponential(size=(2, 19)), generator.uniform(0.3, 0.8, (2, 19))
+    each = [smoothed(*one) for one in zip(square, left, strict=True)]
+    assert covariance._smoothed(BLOCK, square, left) == pytest.approx(np.array(each))
 
 
 def spectra(unit):
