@@ -6,6 +6,7 @@ together until the maps along the chain close it.
 
 from collections.abc import Callable
 from functools import reduce
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +44,7 @@ Images = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 class MapCycle(NamedTuple):
     """A cycle of the local maps, not yet refined."""
 
-    points: np.ndarray  # (period, 2)
+    points: np.ndarray  # (period, d)
     returns: int  # number of close returns that led to it
     closest: int  # position of the first point of the closest measured cycle
     shift: int  # the cycle's point that this first point belongs to
@@ -52,47 +53,54 @@ class MapCycle(NamedTuple):
 class Estimate(NamedTuple):
     """A refined cycle of the local maps."""
 
-    points: np.ndarray  # (period, 2)
-    eigenvalues: np.ndarray  # (2,)
-    covariance: np.ndarray  # of the points and of log|eigenvalue|, (2·period + 2, 2·period + 2)
-    bias: np.ndarray  # estimated, (2·period + 2,)
+    points: np.ndarray  # (period, d)
+    eigenvalues: np.ndarray  # (d,)
+    covariance: np.ndarray  # of the points and of log|eigenvalue|, (d·period + d, d·period + d)
+    bias: np.ndarray  # estimated, (d·period + d,)
     turns: float  # of the angle, from the fits
 
 
 def newton_step(defect: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-    """Return corrections (m, p, 2) that close chains of linearised maps; defects are images minus the next points."""
-    m, p = defect.shape[:2]
-    system = _closing_matrix(jacobian) + 1e-14 * np.eye(2 * p)
-    return -np.linalg.solve(system, defect.reshape(m, 2 * p, 1)).reshape(m, p, 2)
+    """Return corrections (m, p, d) that close chains of linearised maps; defects are images minus the next points."""
+    m, p, d = defect.shape
+    system = _closing_matrix(jacobian) + 1e-14 * np.eye(d * p)
+    return -np.linalg.solve(system, defect.reshape(m, d * p, 1)).reshape(m, p, d)
 
 
 def _closing_matrix(jacobian: np.ndarray) -> np.ndarray:
-    """Return the derivatives (m, 2p, 2p) of the defects by the points."""
-    m, p = jacobian.shape[:2]
-    system = np.zeros((m, p, 2, p, 2))
+    """Return the derivatives (m, d·p, d·p) of the defects by the points."""
+    m, p, d = jacobian.shape[:3]
+    system = np.zeros((m, p, d, p, d))
     for j in range(p):
         system[:, j, :, j] += jacobian[:, j]
-        system[:, j, :, (j + 1) % p] -= np.eye(2)
-    return system.reshape(m, 2 * p, 2 * p)
+        system[:, j, :, (j + 1) % p] -= np.eye(d)
+    return system.reshape(m, d * p, d * p)
 
 
 def _monodromy(jacobian: np.ndarray) -> np.ndarray:
-    """Return the product (2, 2) of the derivatives (p, 2, 2) along a chain."""
+    """Return the product (d, d) of the derivatives (p, d, d) along a chain."""
     return reduce(lambda product, matrix: matrix @ product, jacobian)
 
 
 def eigenvalues(jacobian: np.ndarray) -> np.ndarray:
-    """Return the eigenvalues of the monodromy matrix of a chain (p, 2, 2), larger modulus first.
+    """Return the eigenvalues of the monodromy matrix of a chain (p, d, d), largest modulus first.
 
-    The smaller one follows from the determinants, which preserves its relative accuracy.
+    The product of the k largest is the largest eigenvalue of the product of the k-th compound matrices, of the minors of
+    size k (F. R. Gantmacher, The Theory of Matrices 1, 1959). Ratios of these keep the relative accuracy of small ones.
     """
-    trace, determinant = np.trace(_monodromy(jacobian)), np.prod(np.linalg.det(jacobian))
-    large = 0.5 * (trace + (1.0 if trace >= 0.0 else -1.0) * np.emath.sqrt(trace**2 - 4.0 * determinant))
-    return np.array([large, determinant / large if large != 0.0 else 0.0])
+    d, before, values = jacobian.shape[-1], 1.0, []
+    for size in range(1, d + 1):
+        rows = np.array(list(combinations(range(d), size)))
+        minors = np.linalg.det(jacobian[:, rows[:, None, :, None], rows[None, :, None, :]])
+        product = np.linalg.eigvals(_monodromy(minors))
+        largest = product[np.argmax(np.abs(product))]
+        values.append(largest / before if before != 0.0 else 0.0)
+        before = largest
+    return np.real_if_close(np.array(values), tol=1e3)
 
 
 def shift_between(one: np.ndarray, other: np.ndarray, wrap: Wrap) -> tuple[float, int]:
-    """Return the smallest distance of two cycles (p, 2) under cyclic shifts of the other, and that shift."""
+    """Return the smallest distance of two cycles (p, d) under cyclic shifts of the other, and that shift."""
     steps = np.arange(len(one))
     distances = np.abs(wrap(other[(steps[:, None] + steps) % len(one)] - one)).max((1, 2))
     best = int(np.argmin(distances))
@@ -100,7 +108,7 @@ def shift_between(one: np.ndarray, other: np.ndarray, wrap: Wrap) -> tuple[float
 
 
 def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool:
-    """Return whether the points (p, 2) repeat after a divisor of p."""
+    """Return whether the points (p, d) repeat after a divisor of p."""
     p = len(points)
     divisors = [d for d in range(1, p) if p % d == 0]
     return any(np.abs(wrap(np.roll(points, -d, axis=0) - points)).max() < tolerance for d in divisors)
@@ -130,8 +138,8 @@ def _converge(
         if active.size == 0:
             break
         moved = chains[active]
-        image, jacobian, bandwidth = images(moved.reshape(-1, 2))
-        chains[active], size = _moved(maps, moved, image.reshape(moved.shape), jacobian.reshape(*moved.shape, 2))
+        image, jacobian, bandwidth = images(moved.reshape(-1, moved.shape[2]))
+        chains[active], size = _moved(maps, moved, image.reshape(moved.shape), jacobian.reshape(*moved.shape, moved.shape[2]))
         widest = bandwidth.reshape(moved.shape[:2]).max(1)
         lost = (widest > max(WIDEST_BANDWIDTH, 2.0 * noise)) | ~(size < longest)
         step[active] = np.where(lost, np.inf, size)
@@ -155,7 +163,8 @@ def _moved(
 
 
 def _cells(maps: ReturnMap, chains: np.ndarray, size: float) -> np.ndarray:
-    inside = maps.wrap_points(chains.reshape(-1, 2)).reshape(len(chains), 2 * chains.shape[1])
+    count, period, d = chains.shape
+    inside = maps.wrap_points(chains.reshape(-1, d)).reshape(count, period * d)
     return np.floor(inside / size).astype(np.int64)
 
 
@@ -242,8 +251,9 @@ def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndar
     nearest = maps.nearest(points, int(2.25 * neighbours))[0][:, -1] / KERNEL_REACH
     ladder = np.maximum(nearest, SMALLEST_REFINING * maps.noise.max()) * WIDENED ** np.arange(WIDTHS_TRIED)[:, None]
     fit = maps.fit_within(points, ladder[0], REFINING_DEGREE)
-    (right, _), (left, _) = _eigenvectors(fit.jacobian)
-    targets, sds = np.empty((2, WIDTHS_TRIED, len(points), 3))
+    (right, *_), (left, *_) = _eigenvectors(fit.jacobian)
+    d = points.shape[1]
+    targets, sds = np.empty((2, WIDTHS_TRIED, len(points), 1 + d))
     active, accepted = np.arange(len(points)), np.zeros(len(points), dtype=int)
     for size, bandwidths in enumerate(ladder):
         if size > 0:
@@ -251,9 +261,9 @@ def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndar
             if not active.size:
                 break
             fit = maps.fit_within(points[active], bandwidths[active], REFINING_DEGREE)
-        # The slope along the unstable direction, and the two values of each fit.
+        # The slope along the unstable direction, and the values of each fit.
         slope = np.einsum("pi,pij,pj->p", left[active], fit.jacobian, right[active]).real
-        slopes = np.einsum("pi,pnji,pj->pn", left[active], fit.influence[:, :, 1:3], right[active]).real
+        slopes = np.einsum("pi,pnji,pj->pn", left[active], fit.influence[:, :, 1 : 1 + d], right[active]).real
         targets[size, active] = np.column_stack([slope, fit.value])
         sds[size, active] = np.sqrt(np.column_stack([(slopes**2).sum(1), (fit.influence[:, :, 0] ** 2).sum(1)]))
         away = np.abs(targets[size, active] - targets[:size, active])
@@ -263,7 +273,7 @@ def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndar
 
 
 def _eigenvectors(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return right eigenvectors (2, p, 2) of the monodromy matrix at each point, largest modulus first, and left ones.
+    """Return right eigenvectors (d, p, d) of the monodromy matrix at each point, largest modulus first, and left ones.
 
     The left ones are those at each image.
     """
@@ -281,7 +291,7 @@ def _joint_covariance(maps: ReturnMap, fit: LocalFit) -> np.ndarray:
 
     Consecutive pairs of points share the noise of a point, so errors are summed over runs of consecutive pairs.
     """
-    jacobian, p = fit.jacobian, len(fit.value)
+    jacobian, (p, d) = fit.jacobian, fit.value.shape
     by_value = -np.linalg.inv(_closing_matrix(jacobian[None])[0])
     right, left = _eigenvectors(jacobian)
     slope = np.einsum("kpi,pij,kpj->kp", left, jacobian, right)
@@ -289,12 +299,12 @@ def _joint_covariance(maps: ReturnMap, fit: LocalFit) -> np.ndarray:
     by_point = (np.einsum("kpi,pijl,kpj->kpl", left, fit.hessian, right) / slope[..., None]).real
     rows = []
     for j, influence in enumerate(fit.influence):
-        points = influence[:, 0] @ by_value[:, 2 * j : 2 * j + 2].T
-        slopes = np.einsum("kil,nli->nk", by_slope[:, j], influence[:, 1:3])
-        rows.append(np.concatenate([points, slopes + points @ by_point.reshape(2, -1).T], axis=1))
+        points = influence[:, 0] @ by_value[:, d * j : d * (j + 1)].T
+        slopes = np.einsum("kil,nli->nk", by_slope[:, j], influence[:, 1 : 1 + d])
+        rows.append(np.concatenate([points, slopes + points @ by_point.reshape(d, -1).T], axis=1))
     pairs, owner = np.unique(maps.positions[fit.neighbours.ravel()], return_inverse=True)
     runs = np.concatenate([[0], np.cumsum(np.diff(pairs) > 1)])
-    errors = np.zeros((runs[-1] + 1, 2 * p + 2))
+    errors = np.zeros((runs[-1] + 1, d * (p + 1)))
     np.add.at(errors, runs[owner], np.concatenate(rows))
     return errors.T @ errors
 
@@ -319,14 +329,15 @@ def box_orbits(maps: ReturnMap, period: int, neighbours: int, box: float) -> lis
         if has_shorter_period(points, maps.wrap, 2.0 * box):
             continue
         # The covariance of all points follows from that of the first by the linear maps.
-        transfer = np.zeros((2 * period + 2, 4))
-        transfer[: 2 * period, :2] = np.concatenate([np.eye(2), *(f.jacobian[0] for f in fits[:-1])])
-        transfer[-2:, 2:] = np.eye(2)
+        d = centre.size
+        transfer = np.zeros((d * (period + 1), 2 * d))
+        transfer[: d * period, :d] = np.concatenate([np.eye(d), *(f.jacobian[0] for f in fits[:-1])])
+        transfer[-d:, d:] = np.eye(d)
         estimate = Estimate(
             points,
             eigenvalues(fits[-1].jacobian),
             transfer @ _joint_covariance(iterates[-1], fits[-1]) @ transfer.T,
-            np.zeros(2 * period + 2),
+            np.zeros(d * (period + 1)),
             _turns(maps, fits[-1].value[0] - points[0]),
         )
         if any(shift_between(points, other.points, maps.wrap)[0] < 2.0 * box for _, other in orbits):
@@ -337,10 +348,10 @@ def box_orbits(maps: ReturnMap, period: int, neighbours: int, box: float) -> lis
 
 
 def _iterated(maps: ReturnMap, steps: int) -> ReturnMap:
-    single = np.full((len(maps.points) - 1, 2), np.nan)
+    single = np.full((len(maps.points) - 1, maps.points.shape[1]), np.nan)
     single[maps.positions] = maps.increments
     several = np.lib.stride_tricks.sliding_window_view(single, steps, axis=0).sum(axis=-1)
-    return ReturnMap(maps.points, several, maps.turn, maps.winds, np.zeros(2), maps.stretches)
+    return ReturnMap(maps.points, several, maps.turn, maps.winds, np.zeros(len(maps.turn)), maps.stretches)
 
 
 def _recurrent_boxes(maps: ReturnMap, period: int, box: float) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -355,7 +366,7 @@ def _recurrent_boxes(maps: ReturnMap, period: int, box: float) -> list[tuple[np.
     back = returning[step.max(1) <= 1]
     counts = np.zeros(cell.max(axis=0) + 1, dtype=np.int64)
     np.add.at(counts, tuple(cell[back].T), 1)
-    groups, number = label(counts >= FEWEST_RETURNS, structure=np.ones((3, 3)))
+    groups, number = label(counts >= FEWEST_RETURNS, structure=np.ones((3,) * counts.ndim))
     owner = groups[tuple(cell[back].T)]
     result = []
     for group in range(1, number + 1):

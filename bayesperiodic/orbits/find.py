@@ -117,14 +117,14 @@ def _periods(periods: Iterable[int], section: PoincareSection) -> list[int]:
 
 
 def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.ndarray]:
-    """Return the return map in units of the attractor's size, and that size (2,)."""
+    """Return the return map in units of the attractor's size, and that size (d,)."""
     size = np.ptp(section.points, axis=0)
     if not np.all(size > 0.0):
         raise ValueError(
             "section: must be of a chaotic motion, got one of period 1: a coordinate is equal at all points."
         )
     turn = np.array([2.0 * np.pi if name in section.angles else np.inf for name in section.coordinates]) / size
-    noise = np.zeros(2) if section.noise is None else section.noise / size
+    noise = np.zeros(size.size) if section.noise is None else section.noise / size
     maps = ReturnMap(section.points / size, section.increments / size, turn, section.winds, noise, section.stretches)
     check_chaos(maps)
     if section.noise is None:
@@ -167,18 +167,18 @@ def _largest_sd(estimate: Estimate) -> float:
 def _orbit(
     section: PoincareSection, maps: ReturnMap, size: np.ndarray, candidate: MapCycle, estimate: Estimate, quality: float
 ) -> Orbit:
-    period = len(estimate.points)
+    period, d = estimate.points.shape
     # The orbit starts at the point that belongs to the start of the measured cycle.
     order = (np.arange(period) + candidate.shift) % period
-    index = np.concatenate([(2 * order[:, None] + np.arange(2)).ravel(), 2 * period + np.arange(2)])
+    index = np.concatenate([(d * order[:, None] + np.arange(d)).ravel(), d * period + np.arange(d)])
     points = wrapped(estimate.points[order] * size, maps.angle)
-    units = np.concatenate([np.tile(size, period), np.ones(2)])
+    units = np.concatenate([np.tile(size, period), np.ones(d)])
     bias = estimate.bias[index] * units
     covariance = estimate.covariance[np.ix_(index, index)] * np.outer(units, units)
     sd = np.sqrt(np.diag(covariance))
     covariance += np.outer(bias, bias)
-    remark = _remark(estimate.eigenvalues, covariance[-2:, -2:])
-    for k in (-2, -1):
+    remark = _remark(estimate.eigenvalues, covariance[-d:, -d:])
+    for k in range(-d, 0):
         if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
@@ -189,12 +189,13 @@ def _orbit(
             values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
         # It moves no more than by noise and its distance to the orbit.
         extent = np.ptp(section.signals, axis=0)
-        limit = (STILL_RANGE + STILL_NOISE * maps.noise) * np.where(maps.angle, np.minimum(extent, 2.0 * np.pi), extent)
+        extent = np.where(np.isin(list(cycle), section.angles), np.minimum(extent, 2.0 * np.pi), extent)
+        limit = (STILL_RANGE + STILL_NOISE * maps.noise.max()) * extent
         still = bool(np.all(np.ptp(np.stack(list(cycle.values())), axis=1) < limit))
     return Orbit(
         name="", coordinates=section.coordinates, angles=section.angles, frequency=section.frequency, period=period,
         winding=round(estimate.turns) if section.winds else None, points=points, joint_covariance=covariance,
-        eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[-2:], returns=candidate.returns, quality=quality,
+        eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[-d:], returns=candidate.returns, quality=quality,
         cycle=cycle, equilibrium=still, synthetic=section.synthetic, remark=remark,
     )  # fmt: skip
 
@@ -222,7 +223,7 @@ def _quality(maps: ReturnMap, candidate: MapCycle, estimate: Estimate, neighbour
         fit = maps.fit(point[None], count, QUALITY_DEGREE, influence=False)
         residual = maps.wrap(there - (maps.predict(fit, here[None])[0] - fit.value[0]))
         statistic += float(np.sum(residual**2 / maps.residual_variance(point[None], fit)[0]))
-    return float(chi2.sf(statistic, 2 * period))
+    return float(chi2.sf(statistic, estimate.points.size))
 
 
 def _finished(orbits: list[Orbit], maps: ReturnMap, size: np.ndarray) -> tuple[Orbit, ...]:
@@ -230,7 +231,7 @@ def _finished(orbits: list[Orbit], maps: ReturnMap, size: np.ndarray) -> tuple[O
     result: list[Orbit] = []
     counts: Counter[tuple[int, int | None]] = Counter()
     points = [orbit.points / size for orbit in orbits]
-    sds = [np.sqrt(np.diag(o.covariance).reshape(-1, 2).max(0) / size**2).max() for o in orbits]
+    sds = [np.sqrt(np.diag(o.covariance).reshape(o.points.shape).max(0) / size**2).max() for o in orbits]
     for number, orbit in enumerate(orbits):
         away = {
             k: cycles.shift_between(points[number], -points[k], maps.wrap)[0]

@@ -348,8 +348,8 @@ def _with_multipliers(orbit: Orbit, experiment: Experiment) -> Experiment:
 
 
 def _row(orbit: Orbit, names: list[str], reason: str) -> tuple[Any, ...]:
-    sds = np.sqrt(np.diag(orbit.covariance)).reshape(-1, 2).max(axis=0)
-    multiplier, contraction = (value.real if np.isreal(value) else value for value in orbit.eigenvalues)
+    sds = np.sqrt(np.diag(orbit.covariance)).reshape(orbit.points.shape).max(axis=0)
+    multiplier, contraction = (value.real if np.isreal(value) else value for value in orbit.eigenvalues[:2])
     partner = "" if orbit.partner is None or orbit.partner >= len(names) else names[orbit.partner]
     multiplier_sd, contraction_sd = orbit.eigenvalue_sd
     return (

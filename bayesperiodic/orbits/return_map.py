@@ -3,16 +3,16 @@
 All coordinates are in units of the attractor's size.
 """
 
+from functools import cache
+from itertools import combinations_with_replacement
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import nnls
 from scipy.spatial import cKDTree
+from scipy.special import factorial
 
-# Powers of the two coordinates, degree by degree, and the factorials that make the coefficients derivatives.
-MONOMIAL_POWERS = np.array([(degree - k, k) for degree in range(7) for k in range(degree + 1)])
-FACTORIALS = np.array([1.0, 1.0, 1.0, 2.0, 1.0, 2.0, 6.0, 2.0, 2.0, 6.0])
-TERMS = {1: 3, 2: 6, 3: 10, 4: 15, 6: 28}
 # Fewest neighbours of a fit of given bandwidth.
 FEWEST_FITTED = 30
 # Neighbours are used up to this many bandwidths, where the kernel is 1.1 % of its maximum.
@@ -24,27 +24,38 @@ MOST_LEVERAGE = 0.9
 MOST_PRODUCTS, MOST_NEIGHBOURS = 4_000_000, 6_000_000
 
 
-class LocalFit(NamedTuple):
-    """Polynomials of the return map about m centres."""
+@cache
+def monomials(coordinates: int, degree: int) -> np.ndarray:
+    """Return the powers (terms, coordinates) of all monomials up to a degree: 1, u, v, …, uu, uv, vv, …"""
+    factors = (one for n in range(degree + 1) for one in combinations_with_replacement(range(coordinates), n))
+    return np.array([np.bincount(np.array(one, dtype=int), minlength=coordinates) for one in factors])
 
-    value: np.ndarray  # image of the centre, angles continuous from the centre, (m, 2)
-    derivatives: np.ndarray  # of the image by the argument: order 0 (relative), u, v, uu, uv, vv, …, (m, terms, 2)
+
+class LocalFit(NamedTuple):
+    """Polynomials of the return map about m centres, in d coordinates."""
+
+    value: np.ndarray  # image of the centre, angles continuous from the centre, (m, d)
+    derivatives: np.ndarray  # of the image by the argument: order 0 (relative), u, v, …, uu, uv, …, (m, terms, d)
     bandwidth: np.ndarray  # (m,)
     neighbours: np.ndarray  # positions among the arguments, (m, n)
-    influence: np.ndarray  # contribution of each neighbour to the error of `derivatives`, (m, n, terms, 2)
+    influence: np.ndarray  # contribution of each neighbour to the error of `derivatives`, (m, n, terms, d)
     effective: np.ndarray  # effective number of neighbours, (m,)
 
     @property
     def jacobian(self) -> np.ndarray:
         """Derivatives of the image by the argument, (m, image, argument)."""
-        return self.derivatives[:, 1:3].transpose(0, 2, 1)
+        return self.derivatives[:, 1 : 1 + self.value.shape[1]].transpose(0, 2, 1)
 
     @property
     def hessian(self) -> np.ndarray:
         """Second derivatives (m, image, argument, argument); zero for linear fits."""
-        if self.derivatives.shape[1] <= 3:
-            return np.zeros((len(self.derivatives), 2, 2, 2))
-        return np.ascontiguousarray(self.derivatives[:, [[3, 4], [4, 5]]].transpose(0, 3, 1, 2))
+        m, terms, d = self.derivatives.shape
+        if terms <= 1 + d:
+            return np.zeros((m, d, d, d))
+        one, other = np.triu_indices(d)
+        place = np.empty((d, d), dtype=int)
+        place[one, other] = place[other, one] = 1 + d + np.arange(one.size)
+        return np.ascontiguousarray(self.derivatives[:, place].transpose(0, 3, 1, 2))
 
 
 class ReturnMap:
@@ -61,16 +72,16 @@ class ReturnMap:
         self, points: np.ndarray, increments: np.ndarray, turn: np.ndarray, winds: bool, noise: np.ndarray,
         stretches: np.ndarray | None = None,
     ):  # fmt: skip
-        self.points = points  # in the order of time, (count, 2)
+        self.points = points  # in the order of time, (count, d)
         # Number of each point's unbroken stretch, (count,).
         self.stretches = np.zeros(len(points), dtype=np.int64) if stretches is None else stretches
         # Images are unknown where increments are NaN or missing at the end.
         self.positions = np.flatnonzero(np.isfinite(increments).all(axis=1))  # of points with a known image, (n,)
-        self.arguments = points[self.positions]  # points with a known image, (n, 2)
-        self.increments = increments[self.positions]  # image minus argument, (n, 2)
-        self.turn = turn  # one turn in these units; infinite for coordinates that are not angles, (2,)
+        self.arguments = points[self.positions]  # points with a known image, (n, d)
+        self.increments = increments[self.positions]  # image minus argument, (n, d)
+        self.turn = turn  # one turn in these units; infinite for coordinates that are not angles, (d,)
         self.winds = winds  # whether the increments of angles include whole turns
-        self.noise = noise  # standard deviation of the arguments, (2,)
+        self.noise = noise  # standard deviation of the arguments, (d,)
         self.angle = np.isfinite(turn)
         self._tree = self.tree(self.arguments)
 
@@ -89,12 +100,12 @@ class ReturnMap:
         return np.where(self.angle, np.where(inside >= self.turn, 0.0, inside), points)
 
     def wrap(self, difference: np.ndarray) -> np.ndarray:
-        """Return differences (…, 2) with angles in half a turn either way."""
+        """Return differences (…, d) with angles in half a turn either way."""
         turn = np.where(self.angle, self.turn, 1.0)
         return np.where(self.angle, difference - turn * np.round(difference / turn), difference)
 
     def distance(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """Return the largest coordinate differences (n,) of points (n, 2)."""
+        """Return the largest coordinate differences (n,) of points (n, d)."""
         return np.abs(self.wrap(one - other)).max(axis=1)
 
     def nearest(self, centres: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -103,13 +114,13 @@ class ReturnMap:
         return np.asarray(distance), np.asarray(index)
 
     def count_within(self, centres: np.ndarray, bandwidths: np.ndarray) -> np.ndarray:
-        """Return the number of neighbours (m,) of fits about the centres (m, 2) with the bandwidths (m,)."""
+        """Return the number of neighbours (m,) of fits about the centres (m, d) with the bandwidths (m,)."""
         radii = KERNEL_REACH * bandwidths
         return np.asarray(self._tree.query_ball_point(self.wrap_points(centres), radii, return_length=True))
 
     def fit(self, centres: np.ndarray, count: int, degree: int, *, influence: bool = True) -> LocalFit:
-        """Fit polynomials about the centres (m, 2) to their `count` nearest neighbours; faster without `influence`."""
-        parts, size = [], max(1, MOST_PRODUCTS // (count * TERMS[2 * degree]))
+        """Fit polynomials about the centres (m, d) to their `count` nearest neighbours; faster without `influence`."""
+        parts, size = [], max(1, MOST_PRODUCTS // (count * comb(len(self.turn) + 2 * degree, 2 * degree)))
         for block in (centres[k : k + size] for k in range(0, len(centres), size)):
             distance, index = self.nearest(block, count)
             parts.append(self._fit(block, distance[:, -1] / KERNEL_REACH, index, np.array([True]), degree, influence))
@@ -118,7 +129,7 @@ class ReturnMap:
     def fit_within(
         self, centres: np.ndarray, bandwidths: np.ndarray, degree: int, *, influence: bool = True
     ) -> LocalFit:
-        """Fit polynomials about the centres (m, 2) with the bandwidths (m,), or larger ones where points are few.
+        """Fit polynomials about the centres (m, d) with the bandwidths (m,), or larger ones where points are few.
 
         The neighbours are repeated to equal numbers, without influence.
         """
@@ -135,15 +146,16 @@ class ReturnMap:
 
     @staticmethod
     def predict(fit: LocalFit, away: np.ndarray) -> np.ndarray:
-        """Return images (m, …, 2) at displacements (m, …, 2) from the centres."""
-        terms = fit.derivatives.shape[1]
-        monomials = np.stack([away[..., 0] ** a * away[..., 1] ** b for a, b in MONOMIAL_POWERS[1:terms]], axis=-1)
-        slopes = fit.derivatives[:, 1:] / FACTORIALS[1:terms, None]
-        shape = (len(away), *(1,) * (away.ndim - 2), 2)
-        return fit.value.reshape(shape) + np.einsum("m...t,mtc->m...c", monomials, slopes)
+        """Return images (m, …, d) at displacements (m, …, d) from the centres."""
+        _, terms, d = fit.derivatives.shape
+        powers = monomials(d, next(n for n in range(terms) if comb(d + n, n) == terms))[1:]
+        products = np.stack([np.prod(away**power, axis=-1) for power in powers], axis=-1)
+        slopes = fit.derivatives[:, 1:] / factorial(powers).prod(1)[:, None]
+        shape = (len(away), *(1,) * (away.ndim - 2), d)
+        return fit.value.reshape(shape) + np.einsum("m...t,mtc->m...c", products, slopes)
 
     def residual_variance(self, centres: np.ndarray, fit: LocalFit) -> np.ndarray:
-        """Return the weighted residual variances (m, 2) of the neighbours' images."""
+        """Return the weighted residual variances (m, d) of the neighbours' images."""
         away = self.wrap(self.arguments[fit.neighbours] - centres[:, None])
         residual = away + self.increments[fit.neighbours] + centres[:, None] - self.predict(fit, away)
         residual = residual if self.winds else self.wrap(residual)
@@ -162,20 +174,24 @@ class ReturnMap:
         image = image - reference
         if not self.winds:
             image = self.wrap(image)
-        one, other = _deconvoluted(away / bandwidth[:, None, None], self.noise / bandwidth[:, None], 2 * degree)
-        one *= inside[:, None]
-        powers, weight = MONOMIAL_POWERS[: TERMS[degree]], one[:, 0]
-        regressors = one[:, powers[:, 0]] * other[:, powers[:, 1]]
+        by_coordinate = _deconvoluted(away / bandwidth[:, None, None], self.noise / bandwidth[:, None], 2 * degree)
+        by_coordinate[0] *= inside[:, None]
+        d, weight = len(by_coordinate), by_coordinate[0][:, 0]
+        powers, products = monomials(d, degree), monomials(d, 2 * degree)
+        regressors = _products(by_coordinate, powers)
+        # The sums of products by powers of the last coordinate: one matrix product.
+        others = monomials(d - 1, 2 * degree)
+        table = _products(by_coordinate[:-1], others) @ by_coordinate[-1].mT
         sums = powers[:, None] + powers
-        inverse = np.linalg.pinv((one @ other.mT)[:, sums[..., 0], sums[..., 1]], rcond=1e-10, hermitian=True)
+        row = np.argmax(np.all(sums[..., None, :-1] == others, axis=-1), axis=-1)
+        inverse = np.linalg.pinv(table[:, row, sums[..., -1]], rcond=1e-10, hermitian=True)
         solution = inverse @ (regressors @ image)
         effective = weight.sum(1) ** 2 / (weight**2).sum(1)
-        scale = (FACTORIALS[: len(powers)] / bandwidth[:, None] ** powers.sum(1))[..., None]
-        influence = np.empty((len(centres), 0, len(powers), 2))
+        scale = (factorial(powers).prod(1) / bandwidth[:, None] ** powers.sum(1))[..., None]
+        influence = np.empty((len(centres), 0, len(powers), d))
         if wants_influence:
             # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
-            products = MONOMIAL_POWERS[: TERMS[2 * degree]]
-            functions = one[:, products[:, 0]] * other[:, products[:, 1]]
+            functions = _products(by_coordinate, products)
             belongs = np.all(sums[..., None, :] == products, axis=-1).astype(float)
             fitted = np.einsum("abf,mbc,mka->mkcf", belongs, solution, inverse, optimize=True)
             residual = (inverse @ regressors)[:, :, None] * image.mT[:, None]
@@ -196,13 +212,22 @@ def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.
     left = 1.0 - noise[:, None] ** 2
     kernel = np.exp(-0.5 * np.sum(away**2 / left, axis=-1)) / np.sqrt(left.prod(-1))
     moments = []
-    for k, factor in enumerate((kernel, np.ones_like(kernel))):
+    for k in range(away.shape[-1]):
+        factor = kernel if k == 0 else np.ones_like(kernel)
         mean, variance = away[..., k] / left[..., k], -(1.0 - left[..., k]) / left[..., k]
         rows = [factor, mean * factor]
         for order in range(2, highest + 1):
             rows.append(mean * rows[-1] + (order - 1) * variance * rows[-2])
         moments.append(np.stack(rows, axis=1))
     return moments
+
+
+def _products(by_coordinate: list[np.ndarray], powers: np.ndarray) -> np.ndarray:
+    """Return products (m, terms, n) of the functions of each coordinate with the given powers (terms, d)."""
+    result = by_coordinate[0][:, powers[:, 0]]
+    for functions, power in zip(by_coordinate[1:], powers.T[1:], strict=True):
+        result *= functions[:, power]
+    return result
 
 
 class Atlas:
@@ -216,7 +241,7 @@ class Atlas:
         self._tree = maps.tree(self._centres)
 
     def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return images (m, 2), derivatives (m, image, argument) and bandwidths (m,) at points (m, 2).
+        """Return images (m, d), derivatives (m, image, argument) and bandwidths (m,) at points (m, d).
 
         The bandwidth is infinite where a point is farther from the nearest centre than that.
         """
@@ -241,19 +266,20 @@ SMALLEST_BANDWIDTH = 4.0
 
 
 def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
-    """Return the standard deviations (2,) of independent errors of the two coordinates.
+    """Return the standard deviations (d,) of independent errors of the coordinates.
 
     Where the return map is quadratic, the residual variance of an image is the variance of its own error plus the
     propagated one of the argument's error. The densest neighbourhoods are used, where curvature matters least, and
     widened until they are large compared with the noise.
     """
     centres = maps.arguments[:: max(1, len(maps.arguments) // NOISE_CENTRES)]
-    noise, count = np.zeros(2), int(2.25 * neighbours)
+    d = maps.points.shape[1]
+    noise, count = np.zeros(d), int(2.25 * neighbours)
     for _ in range(3):
         width = maps.nearest(centres, count)[0][:, -1]
         dense = centres[width <= np.median(width)]
         fit = maps.fit(dense, count, 2, influence=False)
-        rows = (np.eye(2) + fit.jacobian**2).reshape(-1, 2)
+        rows = (np.eye(d) + fit.jacobian**2).reshape(-1, d)
         target = maps.residual_variance(dense, fit).reshape(-1)
         weight = 1.0 / np.maximum(target, 1e-30)
         for _ in range(NOISE_ROUNDS):

@@ -1,5 +1,6 @@
 """PoincareSection: points of a motion, once a forcing period or where it crosses a plane."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +23,8 @@ from bayesperiodic.orbits.stretches import (
 )
 
 DEGREES = 180.0 / np.pi
+# A delayed coordinate: a channel, and in brackets forcing periods after the phase of the section.
+DELAYED = re.compile(r"(.*)\[([^\[\]]*)\]", re.DOTALL)
 FEWEST_POINTS, CYCLE_SAMPLES = 200, 64
 # A signal must go so far below a level between two crossings, in standard deviations, so that noise adds none.
 CROSSING_BAND = 0.1
@@ -33,23 +36,24 @@ class PoincareSection(Result):
 
     Attributes
     ----------
-    points : array (count, 2)
-        Angles in (−π, π].
+    points : array (count, d)
+        In the d coordinates, two or more; angles in (−π, π].
     coordinates, angles : tuple of str
-        The two coordinates, and those of them that are angles, one at most.
+        The coordinates, and those of them that are angles, one at most. A delayed one is a channel and, in brackets, the
+        forcing periods after the phase of the section: ``"voltage[-0.25]"`` is the voltage a quarter period before it.
     frequency : float
         Forcing frequency [Hz]; for crossings of a plane, returns per second.
-    increments : array (count − 1, 2)
+    increments : array (count − 1, d)
         Next point minus point, NaN across a break. Angles include whole turns; where `winds` is False they are in half
         a turn either way.
     winds : bool
         Whether the whole turns between the points are known.
-    noise : array (2,) or None
+    noise : array (d,) or None
         Standard deviation of the points' errors; None if it must be estimated from the points.
     instants : array (count,) or None
         Times of the points [s].
-    time, signals : array (samples,), array (samples, 2), or None
-        The recording, angles unwrapped; None for points alone.
+    time, signals : array (samples,), array (samples, channels), or None
+        The recording, one column a channel in the order of the coordinates, angles unwrapped; None for points alone.
     values : int
         Number of measured values.
     synthetic : bool
@@ -76,7 +80,7 @@ class PoincareSection(Result):
     """
 
     points: np.ndarray
-    coordinates: tuple[str, str]
+    coordinates: tuple[str, ...]
     angles: tuple[str, ...]
     frequency: float
     increments: np.ndarray
@@ -112,8 +116,11 @@ class PoincareSection(Result):
         ----------
         recording : Recording
             At least 8 samples a period; the steps may differ. For several, see `from_recordings`.
-        coordinates : sequence of two str
-            Outputs, such as ``("angle", "rate")``.
+        coordinates : sequence of str
+            Two or more outputs that determine the next point, as many as the system has states, or more, such as
+            ``("angle", "rate")``. What is not measured is replaced by delayed coordinates, such as
+            ``("velocity", "voltage", "voltage[-0.25]")`` with the voltage a quarter of the forcing period before; see
+            Notes.
         frequency : float
             Of the forcing [Hz].
         origin : float
@@ -128,7 +135,16 @@ class PoincareSection(Result):
         Raises
         ------
         ValueError
-            For an unknown coordinate, too few samples or periods, or an angle that does not seem to be in radians.
+            For an unknown coordinate, too few samples or periods, an angle that does not seem to be in radians, or
+            delays of one channel that are too close or a period apart.
+
+        Notes
+        -----
+        Errors of the coordinates are taken as independent, and those of a point and the next one too. For white noise
+        this holds for delayed coordinates as well, because no two values of a channel use the same samples: windows are
+        narrowed to the time between them, delays of one channel must be within less than a period, and must not be
+        closer, modulo one period, than the 8 samples of the smallest window. For noise with a longer memory, standard
+        deviations are too small.
         """
         if not isinstance(recording, Recording):
             raise ValueError(
@@ -189,17 +205,25 @@ class PoincareSection(Result):
         for recording in given:
             names, angle_names, values = _signals(recording, coordinates, angles)
             signals.append(values)
-        samples = _unwrapped(joined(given, signals, frequency), np.isin(names, angle_names))
+        samples = _unwrapped(joined(given, signals, frequency), np.isin(channels_of(names), angle_names))
         if samples.sampling_rate < FEWEST_SAMPLES * frequency:
             rate = f"{samples.sampling_rate / frequency:.3g}"
             raise ValueError(
                 f"recording: must have at least {FEWEST_SAMPLES} samples a period, got {rate}. For samples taken once "
                 "a period, use from_points."
             )
-        instants, stretch, left_out = samples.instants(frequency, origin)
+        delays = _delays(names)
+        shortest = _shortest_separation(names)
+        if shortest * samples.sampling_rate < 2 * SMALLEST_WINDOW * frequency:
+            raise ValueError(
+                f"coordinates: must have values of a channel at least {2 * SMALLEST_WINDOW} samples apart, got "
+                f"{list(names)} with {samples.sampling_rate / frequency:.3g} samples a period. Choose other delays."
+            )
+        instants, stretch, left_out = samples.instants(frequency, origin, (delays.min(), delays.max()))
         synthetic = any(recording.synthetic for recording in given)
         section = cls._of(samples, names, angle_names, instants, stretch, left_out, synthetic, frequency)
-        if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * np.ptp(samples.signals, axis=0)):
+        extent = np.ptp(samples.signals, axis=0)[_columns(names)]
+        if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * extent):
             raise ValueError(
                 "recording: must be chaotic, got a motion of period 1, whose section points coincide. Use "
                 "recording.fold instead."
@@ -222,7 +246,7 @@ class PoincareSection(Result):
         Parameters
         ----------
         recording, coordinates, angles
-            As for `from_recording`.
+            As for `from_recording`, without delayed coordinates.
         channel : str
             Output whose crossings define the section; not one of the coordinates.
         level : float
@@ -240,6 +264,11 @@ class PoincareSection(Result):
             For an unknown channel, too few crossings, and as for `from_recording`.
         """
         names, angle_names, signals = _signals(recording, coordinates, angles)
+        if channels_of(names) != names:
+            raise ValueError(
+                f"coordinates: must be without delays for crossings, got {list(names)}. Delays are fractions of a "
+                "forcing period; use from_recording for a forced system."
+            )
         _checks.one_of("channel", channel, [name for name in recording.outputs if name not in names])
         level = _checks.finite_number("level", level)
         if direction not in (1, -1):
@@ -264,7 +293,7 @@ class PoincareSection(Result):
 
         Parameters
         ----------
-        points : array (count, 2), or sequence of such arrays
+        points : array (count, d), or sequence of such arrays
             All consecutive points in the order of time; angles [rad] with any number of turns. Several arrays are
             unbroken stretches: the first point of one does not follow the last point of another.
         coordinates, frequency, angles
@@ -284,8 +313,8 @@ class PoincareSection(Result):
         several = isinstance(points, Sequence) and len(points) > 0 and all(np.ndim(part) == 2 for part in points)
         parts = [_checks.real_array("points", part) for part in (points if several else [points])]
         for part in parts:
-            if part.ndim != 2 or part.shape[1] != 2:
-                raise ValueError(f"points: must have the shape (count, 2), got {part.shape}.")
+            if part.ndim != 2 or part.shape[1] != len(names):
+                raise ValueError(f"points: must have the shape (count, {len(names)}), got {part.shape}.")
         values = np.concatenate(parts)
         turning = np.isin(names, angle_names)
         for k, name in enumerate(names):
@@ -306,7 +335,7 @@ class PoincareSection(Result):
 
     @classmethod
     def _of(
-        cls, samples: Stretches, names: tuple[str, str], angles: tuple[str, ...], instants: np.ndarray,
+        cls, samples: Stretches, names: tuple[str, ...], angles: tuple[str, ...], instants: np.ndarray,
         stretch: np.ndarray, left_out: int, synthetic: bool, frequency: float | None = None,
     ) -> "PoincareSection":  # fmt: skip
         """Return the section of signals at given instants; the frequency is by default that of the instants."""
@@ -315,8 +344,16 @@ class PoincareSection(Result):
             returns = np.diff(instants)[np.diff(stretch) == 0]
             frequency = float(returns.size / returns.sum())
         time = samples.time
-        at = np.clip(instants, time[samples.starts[stretch]], time[samples.stops[stretch] - 1])
-        values, noise = smoothed(samples, at, stretch)
+        narrowest = _shortest_separation(names) * np.median(np.diff(instants))
+        values, noise = np.empty((instants.size, len(names))), np.empty(len(names))
+        delays, columns = _delays(names), _columns(names)
+        for delay in np.unique(delays):
+            here = delays == delay
+            first, last = time[samples.starts[stretch]], time[samples.stops[stretch] - 1]
+            at = np.clip(instants + delay / frequency, first, last)
+            part = samples._replace(signals=samples.signals[:, columns[here]])
+            values[:, here], noise[here] = smoothed(part, at, stretch, narrowest)
+        noise = None if np.isnan(noise).any() else noise
         points, increments = wrapped(values, np.isin(names, angles)), _within(np.diff(values, axis=0), stretch)
         breaks = (stretch, samples.starts, left_out) if samples.starts.size > 1 else (None, None, left_out)
         measured = (instants, time, samples.signals, samples.signals.size, synthetic)
@@ -336,7 +373,8 @@ class PoincareSection(Result):
         Returns
         -------
         dict of str to array (samples·period,), or None
-            By coordinate; angles start in (−π, π] and are continuous. None for a section of points alone.
+            By channel, over the time from the phase of the section to that phase; angles start in (−π, π] and are
+            continuous. None for a section of points alone.
 
         Raises
         ------
@@ -357,10 +395,10 @@ class PoincareSection(Result):
         knots = np.arange(period + 1)
         at = np.interp(np.arange(samples * period) / samples, knots, self.instants[index : index + period + 1])
         values = local_fit(recorded, at, stretch)[0]
-        shift = self.points[index] - values[0]
-        turns = np.where(np.isin(self.coordinates, self.angles), np.round(shift / (2.0 * np.pi)), 0.0)
-        values += 2.0 * np.pi * turns
-        return dict(zip(self.coordinates, values.T, strict=True))
+        channels = channels_of(self.coordinates)
+        turning = np.isin(channels, self.angles)
+        values += np.where(turning, wrapped(values[0]) - values[0], 0.0)
+        return dict(zip(channels, values.T, strict=True))
 
     def __repr__(self) -> str:
         source = "points alone" if self.signals is None else f"a recording of {len(self.signals)} samples"
@@ -400,36 +438,91 @@ def _unwrapped(samples: Stretches, turning: np.ndarray) -> Stretches:
     return samples._replace(signals=signals)
 
 
-def _names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple[tuple[str, str], tuple[str, ...]]:
-    names = _checks.identifiers("coordinates", [coordinates] if isinstance(coordinates, str) else coordinates)
-    if len(names) != 2:
-        raise ValueError(f"coordinates: must be two outputs, got {coordinates!r}.")
+def channel_and_delay(coordinate: str) -> tuple[str, float]:
+    """Return the channel of a coordinate and its delay in forcing periods after the phase of the section."""
+    match = DELAYED.fullmatch(coordinate)
+    return (match[1], float(match[2])) if match else (coordinate, 0.0)
+
+
+def channels_of(coordinates: Sequence[str]) -> tuple[str, ...]:
+    """Return the channels of coordinates, each once."""
+    return tuple(dict.fromkeys(channel_and_delay(name)[0] for name in coordinates))
+
+
+def _columns(names: Sequence[str]) -> np.ndarray:
+    """Return the position of each coordinate's channel among the channels."""
+    channels = channels_of(names)
+    return np.array([channels.index(channel_and_delay(name)[0]) for name in names])
+
+
+def _delays(names: Sequence[str]) -> np.ndarray:
+    return np.array([channel_and_delay(name)[1] for name in names])
+
+
+def _shortest_separation(names: Sequence[str]) -> float:
+    """Return the shortest time between two values of a channel, in this point or the next, in forcing periods."""
+    columns, delays = _columns(names), _delays(names)
+    phases = [np.sort(delays[columns == column] % 1.0) for column in np.unique(columns)]
+    return min(float(np.diff(one, append=one[0] + 1.0).min()) for one in phases)
+
+
+def _names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    given = [coordinates] if isinstance(coordinates, str) else list(coordinates)
+    names, delays = [], {}
+    for name in given:
+        match = DELAYED.fullmatch(name) if isinstance(name, str) else None
+        if match is None:
+            names.append(name)
+            continue
+        try:
+            delay = _checks.finite_number("delay", float(match[2]))
+        except ValueError:
+            raise ValueError(
+                f"coordinates: must have a number in brackets, the delay in forcing periods, such as "
+                f"{match[1] + '[-0.25]'!r}, got {name!r}."
+            ) from None
+        names.append(match[1])
+        delays.setdefault(match[1], []).append(delay)
+    channels = _checks.identifiers("coordinates", dict.fromkeys(names))
+    if len(names) < 2:
+        raise ValueError(f"coordinates: must be two or more outputs, got {coordinates!r}.")
+    for channel, some in delays.items():
+        several = some + [0.0] * sum(name == channel for name in given)
+        if max(several) - min(several) >= 1.0:
+            raise ValueError(f"coordinates: must have delays of {channel!r} within less than a period, got {given!r}.")
+    if len(names) - sum(map(len, delays.values())) != len({name for name in given if name in channels}):
+        raise ValueError(f"coordinates: must differ, got {given!r}.")
     angle_names = (angles,) if isinstance(angles, str) else tuple(angles)
     for name in angle_names:
-        _checks.one_of("angles", name, names)
+        _checks.one_of("angles", name, given)
     if len(angle_names) > 1:
         raise ValueError(f"angles: must name at most one coordinate, got {angle_names!r}.")
-    return (names[0], names[1]), angle_names
+    if any(channel_and_delay(name)[0] in delays for name in angle_names):
+        raise ValueError(f"coordinates: must have no delays of an angle, got {given!r}. Delay another channel.")
+    return tuple(given), angle_names
 
 
 def _signals(
     recording: Recording, coordinates: Sequence[str], angles: Iterable[str]
-) -> tuple[tuple[str, str], tuple[str, ...], np.ndarray]:
-    """Return the names of the coordinates and of their angles, and their values (samples, 2), angles unwrapped."""
+) -> tuple[tuple[str, ...], tuple[str, ...], np.ndarray]:
+    """Return the names of the coordinates and of their angles, and values (samples, channels), angles unwrapped."""
     names, angle_names = _names(coordinates, angles)
-    for name in names:
+    channels = channels_of(names)
+    for name in channels:
         _checks.one_of("coordinates", name, recording.outputs)
     if isinstance(recording.time, Mapping):
         raise ValueError(
             f"recording: must have the same times for all channels, got {recording!r}; leave other channels out, or "
             "record the coordinates together."
         )
-    signals = np.stack([recording.outputs[name] for name in names], -1)
+    signals = np.stack([recording.outputs[name] for name in channels], -1)
     for name in angle_names:
-        k = names.index(name)
+        k = channels.index(name)
         _check_angle(name, signals[:, k])
         signals[:, k] = np.unwrap(signals[:, k])
-        _check_rate(name, names[1 - k], recording.time, signals[:, k], signals[:, 1 - k])
+        for other in range(len(channels)):
+            if other != k:
+                _check_rate(name, channels[other], recording.time, signals[:, k], signals[:, other])
     return names, angle_names, signals
 
 
