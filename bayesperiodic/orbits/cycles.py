@@ -1,7 +1,7 @@
 """Cycles of local maps: search from close returns, refinement with error estimates, and the method of boxes.
 
-All coordinates are in units of the attractor's size. A chain is p consecutive points; Newton's method moves all of them
-together until the maps along the chain close it.
+All coordinates are in units of the attractor's size. A chain is the consecutive points of p returns, at every step of
+the return map; Newton's method moves all of them together until the maps along the chain close it.
 """
 
 from collections.abc import Callable
@@ -38,25 +38,25 @@ SLOPE_GROWTH, VALUE_GROWTH = WIDENED**3 - 1.0, 1.5
 FEWEST_RETURNS, FARTHEST = 3, 3.0
 
 Wrap = Callable[[np.ndarray], np.ndarray]
-Images = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+Images = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 class MapCycle(NamedTuple):
     """A cycle of the local maps, not yet refined."""
 
-    points: np.ndarray  # (period, d)
+    points: np.ndarray  # (period·steps, d)
     returns: int  # number of close returns that led to it
-    closest: int  # position of the first point of the closest measured cycle
+    closest: int  # return at which the closest measured cycle starts
     shift: int  # the cycle's point that this first point belongs to
 
 
 class Estimate(NamedTuple):
     """A refined cycle of the local maps."""
 
-    points: np.ndarray  # (period, d)
+    points: np.ndarray  # (p, d) with p = period·steps
     eigenvalues: np.ndarray  # (d,)
-    covariance: np.ndarray  # of the points and of log|eigenvalue|, (d·period + d, d·period + d)
-    bias: np.ndarray  # estimated, (d·period + d,)
+    covariance: np.ndarray  # of the points and of log|eigenvalue|, (d·p + d, d·p + d)
+    bias: np.ndarray  # estimated, (d·p + d,)
     turns: float  # of the angle, from the fits
 
 
@@ -85,8 +85,8 @@ def _monodromy(jacobian: np.ndarray) -> np.ndarray:
 def eigenvalues(jacobian: np.ndarray) -> np.ndarray:
     """Return the eigenvalues of the monodromy matrix of a chain (p, d, d), largest modulus first.
 
-    The product of the k largest is the largest eigenvalue of the product of the k-th compound matrices, of the minors of
-    size k (F. R. Gantmacher, The Theory of Matrices 1, 1959). Ratios of these keep the relative accuracy of small ones.
+    The product of the k largest is the largest eigenvalue of the product of the k-th compound matrices, of the minors
+    of size k (F. R. Gantmacher, The Theory of Matrices 1, 1959). Ratios keep the relative accuracy of small ones.
     """
     d, before, values = jacobian.shape[-1], 1.0, []
     for size in range(1, d + 1):
@@ -117,7 +117,7 @@ def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool
 def candidates(maps: ReturnMap, atlas: Atlas, period: int) -> list[MapCycle]:
     """Return the cycles of a prime period to which close returns lead."""
     starts, members = _close_returns(maps, period)
-    chains = maps.points[starts[:, None] + np.arange(period)]
+    chains = maps.points[starts[:, None] + np.arange(period * maps.steps)]
     step = np.empty(0)
     # The maps of the atlas are discontinuous between centres, so the last steps fit about the points themselves.
     for images, steps, longest in ((atlas.at, CORRECTIONS, np.inf), (atlas.exactly, EXACT_STEPS, NEARLY)):
@@ -138,8 +138,10 @@ def _converge(
         if active.size == 0:
             break
         moved = chains[active]
-        image, jacobian, bandwidth = images(moved.reshape(-1, moved.shape[2]))
-        chains[active], size = _moved(maps, moved, image.reshape(moved.shape), jacobian.reshape(*moved.shape, moved.shape[2]))
+        phases = np.tile(maps.phases(np.arange(moved.shape[1])), len(moved))
+        image, jacobian, bandwidth = images(moved.reshape(-1, moved.shape[2]), phases)
+        slopes = jacobian.reshape(*moved.shape, moved.shape[2])
+        chains[active], size = _moved(maps, moved, image.reshape(moved.shape), slopes)
         widest = bandwidth.reshape(moved.shape[:2]).max(1)
         lost = (widest > max(WIDEST_BANDWIDTH, 2.0 * noise)) | ~(size < longest)
         step[active] = np.where(lost, np.inf, size)
@@ -163,19 +165,20 @@ def _moved(
 
 
 def _cells(maps: ReturnMap, chains: np.ndarray, size: float) -> np.ndarray:
-    count, period, d = chains.shape
+    count, period, d = (chains := chains[:, :: maps.steps]).shape
     inside = maps.wrap_points(chains.reshape(-1, d)).reshape(count, period * d)
     return np.floor(inside / size).astype(np.int64)
 
 
 def _close_returns(maps: ReturnMap, period: int) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the first point of the closest return in each cell of chains, and the first points of all in that cell."""
-    section, noise = maps.points, float(maps.noise.max())
-    returning = maps.followed(period)
-    distance = maps.distance(section[returning + period], section[returning])
+    section, noise, steps = maps.points, float(maps.noise.max()), period * maps.steps
+    returning = maps.followed(steps)
+    returning = returning[maps.phases(returning) == 0]
+    distance = maps.distance(section[returning + steps], section[returning])
     near = np.flatnonzero(distance < CLOSE + 2.0 * noise)
     close = returning[near[np.argsort(distance[near], kind="stable")]]
-    cells = _cells(maps, section[close[:, None] + np.arange(period)], max(CELL, noise))
+    cells = _cells(maps, section[close[:, None] + np.arange(steps)], max(CELL, noise))
     _, first, owner, counts = np.unique(cells, axis=0, return_index=True, return_inverse=True, return_counts=True)
     order = np.argsort(owner.ravel(), kind="stable")
     return close[first], np.split(close[order], np.cumsum(counts)[:-1])
@@ -189,9 +192,10 @@ def _distinct(maps: ReturnMap, chains: np.ndarray, step: np.ndarray, members: li
     for k in np.argsort(step, kind="stable"):
         if step[k] > max(CONVERGED_CORRECTION, 0.1 * noise):
             break
-        if has_shorter_period(chains[k], maps.wrap, tolerance):
+        returns = chains[k, :: maps.steps]
+        if has_shorter_period(returns, maps.wrap, tolerance):
             continue
-        shifts = ((group, *shift_between(chains[k], cycle, maps.wrap)) for cycle, group in groups)
+        shifts = ((group, *shift_between(returns, cycle[:: maps.steps], maps.wrap)) for cycle, group in groups)
         group, shift = next(((group, shift) for group, distance, shift in shifts if distance < tolerance), ([], 0))
         if not group:
             groups.append((maps.wrap(chains[k]), group))
@@ -200,9 +204,9 @@ def _distinct(maps: ReturnMap, chains: np.ndarray, step: np.ndarray, members: li
     for cycle, group in groups:
         steps = np.arange(len(cycle) + 1)
         starts, shifts = np.concatenate(group, axis=1)
-        expected = cycle[(steps + shifts[:, None]) % len(cycle)]
+        expected = cycle[(steps + maps.steps * shifts[:, None]) % len(cycle)]
         closest = int(np.argmin(np.abs(maps.wrap(maps.points[starts[:, None] + steps] - expected)).max((1, 2))))
-        result.append(MapCycle(cycle, len(starts), int(starts[closest]), int(shifts[closest])))
+        result.append(MapCycle(cycle, len(starts), int(starts[closest]) // maps.steps, int(shifts[closest])))
     return result
 
 
@@ -235,7 +239,7 @@ def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple
     cycle, last, refined = points.copy(), np.inf, max(REFINED, REFINED_NOISE * float(maps.noise.max()))
     for step in range(REFINING_STEPS):
         final = last < refined or step == REFINING_STEPS - 1
-        fit = maps.fit_within(cycle, bandwidths, REFINING_DEGREE, influence=final)
+        fit = maps.fit_within(cycle, maps.phases(np.arange(len(cycle))), bandwidths, REFINING_DEGREE, influence=final)
         (moved,), (size,) = _moved(maps, cycle[None], fit.value[None], fit.jacobian[None])
         if not np.isfinite(size) or np.abs(maps.wrap(cycle - points)).max() > 0.1:
             return None
@@ -247,20 +251,22 @@ def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple
 
 
 def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndarray:
-    """Return the bandwidth of each point's neighbourhood, (period,)."""
-    nearest = maps.nearest(points, int(2.25 * neighbours))[0][:, -1] / KERNEL_REACH
+    """Return the bandwidth of each point's neighbourhood, (p,)."""
+    phases = maps.phases(np.arange(len(points)))
+    nearest = maps.nearest(points, phases, int(2.25 * neighbours))[0][:, -1] / KERNEL_REACH
     ladder = np.maximum(nearest, SMALLEST_REFINING * maps.noise.max()) * WIDENED ** np.arange(WIDTHS_TRIED)[:, None]
-    fit = maps.fit_within(points, ladder[0], REFINING_DEGREE)
+    fit = maps.fit_within(points, phases, ladder[0], REFINING_DEGREE)
     (right, *_), (left, *_) = _eigenvectors(fit.jacobian)
     d = points.shape[1]
     targets, sds = np.empty((2, WIDTHS_TRIED, len(points), 1 + d))
     active, accepted = np.arange(len(points)), np.zeros(len(points), dtype=int)
     for size, bandwidths in enumerate(ladder):
         if size > 0:
-            active = active[maps.count_within(points[active], bandwidths[active]) <= len(maps.arguments) // 8]
+            counts = maps.count_within(points[active], phases[active], bandwidths[active])
+            active = active[counts <= maps.count // 8]
             if not active.size:
                 break
-            fit = maps.fit_within(points[active], bandwidths[active], REFINING_DEGREE)
+            fit = maps.fit_within(points[active], phases[active], bandwidths[active], REFINING_DEGREE)
         # The slope along the unstable direction, and the values of each fit.
         slope = np.einsum("pi,pij,pj->p", left[active], fit.jacobian, right[active]).real
         slopes = np.einsum("pi,pnji,pj->pn", left[active], fit.influence[:, :, 1 : 1 + d], right[active]).real
@@ -316,15 +322,15 @@ def box_orbits(maps: ReturnMap, period: int, neighbours: int, box: float) -> lis
     recurrent points are a candidate. The nearest points and their images after `period` steps give a linear map, whose
     fixed point and eigenvalues are the orbit's.
     """
-    count = int(2.25 * neighbours)
+    count, phase = int(2.25 * neighbours), np.zeros(1)
     iterates = [_iterated(maps, k) for k in range(1, period + 1)]
     orbits: list[tuple[MapCycle, Estimate]] = []
     for centre, members in _recurrent_boxes(maps, period, box):
-        fit = iterates[-1].fit(centre[None], count, 1)
+        fit = iterates[-1].fit(centre[None], phase, count, 1)
         step = newton_step(maps.wrap(fit.value - centre)[None], fit.jacobian[None])[0, 0]
         if not np.abs(step).max() < FARTHEST * box:
             continue
-        fits = [iterate.fit((centre + step)[None], count, 1) for iterate in iterates]
+        fits = [iterate.fit((centre + step)[None], phase, count, 1) for iterate in iterates]
         points = maps.wrap(np.concatenate([(centre + step)[None], *(f.value for f in fits[:-1])]))
         if has_shorter_period(points, maps.wrap, 2.0 * box):
             continue

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
+from math import comb
 
 import numpy as np
 from scipy.stats import chi2
@@ -35,8 +36,9 @@ def find_orbits(
     *,
     periods: Iterable[int],
     method: str = "chained",
-    neighbours: int = 32,
+    neighbours: int | None = None,
     box: float = 0.01,
+    steps: int = 1,
 ) -> Orbits:
     """Find the unstable periodic orbits in a section of a chaotic motion, without a model.
 
@@ -56,10 +58,15 @@ def find_orbits(
     periods : iterable of int
         Prime periods in returns.
     method : {"chained", "boxes"}
-    neighbours : int
-        Smallest effective number of neighbours of a local fit, at least 16.
+    neighbours : int, optional
+        Smallest effective number of neighbours of a local fit, at least 16. By default 32 with two coordinates, and for
+        more in proportion to the number of terms of a cubic polynomial.
     box : float
         Size of a box for "boxes", as a fraction of the attractor's size.
+    steps : int
+        Local maps a return for "chained", from one phase of the forcing to the next, if the section is of a recording.
+        A map over a part of the period stretches less and is closer to a polynomial: more orbits are found where one
+        return stretches much, but each map needs the noise of its points to be small against its bandwidth.
 
     Returns
     -------
@@ -85,14 +92,18 @@ def find_orbits(
     _checks.instance("section", section, PoincareSection)
     wanted = _periods(periods, section)
     _checks.one_of("method", method, SEARCHES)
-    neighbours, box = _checks.integer("neighbours", neighbours, 16), _checks.positive("box", box)
+    steps, box = _checks.integer("steps", steps, 1), _checks.positive("box", box)
+    fewest = FEWEST_NEIGHBOURS * comb(len(section.coordinates) + 3, 3) // comb(5, 3)
+    neighbours = fewest if neighbours is None else _checks.integer("neighbours", neighbours, 16)
     maps, size = _scaled(section, neighbours)
     if method == "boxes":
         pairs = [pair for p in wanted for pair in cycles.box_orbits(maps, p, neighbours, box)]
     else:
+        if steps > 1:
+            maps = _with_steps(section, maps, size, steps)
         atlas = Atlas(maps, _search_count(maps, neighbours))
         pairs = [pair for p in wanted for pair in _chained(maps, atlas, p, neighbours)]
-    quality_count = _search_count(maps, FEWEST_NEIGHBOURS)
+    quality_count = _search_count(maps, fewest)
     orbits = [_orbit(section, maps, size, *pair, _quality(maps, *pair, quality_count)) for pair in pairs]
     return Orbits(_finished(orbits, maps, size), values=section.values, method=method)
 
@@ -132,12 +143,20 @@ def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.nd
     return maps, size
 
 
+def _with_steps(section: PoincareSection, maps: ReturnMap, size: np.ndarray, steps: int) -> ReturnMap:
+    """Return the return map in several steps a return, in the same units."""
+    points, increments, noise = section.between(steps)
+    stretches = np.repeat(maps.stretches, steps)
+    return ReturnMap(points / size, increments / size, maps.turn, maps.winds, noise / size, stretches, steps)
+
+
 def _search_count(maps: ReturnMap, neighbours: int) -> int:
     """Return the neighbours of a local fit in the search: enough for a bandwidth well above the noise."""
     centres = maps.arguments[:: max(1, len(maps.arguments) // 500)]
     count = int(2.25 * neighbours)
-    while count < len(maps.arguments) // 100:
-        if np.median(maps.nearest(centres, count)[0][:, -1]) / KERNEL_REACH > SEARCH_WIDTH * maps.noise.max():
+    phases = maps.phases(maps.positions[:: max(1, len(maps.arguments) // 500)])
+    while count < maps.count // 100:
+        if np.median(maps.nearest(centres, phases, count)[0][:, -1]) / KERNEL_REACH > SEARCH_WIDTH * maps.noise.max():
             break
         count = int(1.5 * count)
     return count
@@ -147,14 +166,15 @@ def _chained(maps: ReturnMap, atlas: Atlas, period: int, neighbours: int) -> lis
     pairs: list[tuple[MapCycle, Estimate]] = []
 
     def same(one: Estimate, other: Estimate) -> bool:
-        distance, _ = cycles.shift_between(one.points, other.points, maps.wrap)
+        distance, _ = cycles.shift_between(one.points[:: maps.steps], other.points[:: maps.steps], maps.wrap)
         return distance < max(1e-3, 2.0 * max(_largest_sd(one), _largest_sd(other)))
 
     for candidate in cycles.candidates(maps, atlas, period):
         estimate = cycles.refine(maps, candidate.points, neighbours)
         if estimate is None or not (sd := _largest_sd(estimate)) < LARGEST_SD:
             continue
-        repeats = cycles.has_shorter_period(estimate.points, maps.wrap, max(2e-3, 3.0 * sd))
+        returns = estimate.points[:: maps.steps]
+        repeats = cycles.has_shorter_period(returns, maps.wrap, max(2e-3, 3.0 * sd))
         if not repeats and not any(same(estimate, other) for _, other in pairs):
             pairs.append((candidate, estimate))
     return pairs
@@ -167,10 +187,11 @@ def _largest_sd(estimate: Estimate) -> float:
 def _orbit(
     section: PoincareSection, maps: ReturnMap, size: np.ndarray, candidate: MapCycle, estimate: Estimate, quality: float
 ) -> Orbit:
-    period, d = estimate.points.shape
+    count, d = estimate.points.shape
+    period = count // maps.steps
     # The orbit starts at the point that belongs to the start of the measured cycle.
-    order = (np.arange(period) + candidate.shift) % period
-    index = np.concatenate([(d * order[:, None] + np.arange(d)).ravel(), d * period + np.arange(d)])
+    order = maps.steps * ((np.arange(period) + candidate.shift) % period)
+    index = np.concatenate([(d * order[:, None] + np.arange(d)).ravel(), d * count + np.arange(d)])
     points = wrapped(estimate.points[order] * size, maps.angle)
     units = np.concatenate([np.tile(size, period), np.ones(d)])
     bias = estimate.bias[index] * units
@@ -212,15 +233,16 @@ def _remark(eigenvalues: np.ndarray, covariance: np.ndarray) -> str:
 
 def _quality(maps: ReturnMap, candidate: MapCycle, estimate: Estimate, neighbours: int) -> float:
     """Return the p-value of the closest return under the maps along the orbit."""
-    period = len(estimate.points)
-    steps = np.arange(period + 1)
-    away = maps.wrap(maps.points[candidate.closest + steps] - estimate.points[(steps + candidate.shift) % period])
+    steps = np.arange(len(estimate.points) + 1)
+    points = np.roll(estimate.points, -maps.steps * candidate.shift, axis=0)
+    away = maps.wrap(maps.points[maps.steps * candidate.closest + steps] - points[steps % len(points)])
     statistic = 0.0
-    for point, here, there in zip(np.roll(estimate.points, -candidate.shift, 0), away[:-1], away[1:], strict=True):
+    for phase, point, here, there in zip(maps.phases(steps[:-1])[:, None], points, away[:-1], away[1:], strict=True):
         count = neighbours
-        while maps.nearest(point[None], count)[0][0, -1] < 1.5 * np.abs(here).max() and 4 * count < len(maps.arguments):
+        reach = 1.5 * np.abs(here).max()
+        while maps.nearest(point[None], phase, count)[0][0, -1] < reach and 4 * count < maps.count:
             count *= 2
-        fit = maps.fit(point[None], count, QUALITY_DEGREE, influence=False)
+        fit = maps.fit(point[None], phase, count, QUALITY_DEGREE, influence=False)
         residual = maps.wrap(there - (maps.predict(fit, here[None])[0] - fit.value[0]))
         statistic += float(np.sum(residual**2 / maps.residual_variance(point[None], fit)[0]))
     return float(chi2.sf(statistic, estimate.points.size))

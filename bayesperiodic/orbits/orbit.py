@@ -24,7 +24,7 @@ MOST_BIAS = 0.5
 TURN = 2.0 * np.pi
 _COLUMNS = (
     "name", "period", "winding", "returns", "quality", "multiplier", "multiplier_sd", "contraction", "contraction_sd",
-    "estimated", "modulus", "sd_first", "sd_second", "partner", "equilibrium", "remark", "rejected",
+    "estimated", "modulus", "partner", "equilibrium", "remark", "rejected",
 )  # fmt: skip
 
 
@@ -233,7 +233,9 @@ class Orbits(Result):
 
         names = [orbit.name for orbit in self.orbits]
         rows = [_row(orbit, names, reason) for orbit, reason in (*((o, "") for o in self.orbits), *self.rejected)]
-        return pd.DataFrame(rows, columns=list(_COLUMNS)).astype({"winding": "Int64"})
+        some = [*self.orbits[:1], *(orbit for orbit, _ in self.rejected[:1])]
+        columns = [*_COLUMNS, *(f"sd[{name}]" for name in (some[0].coordinates if some else ()))]
+        return pd.DataFrame(rows, columns=columns).astype({"winding": "Int64"})
 
     def __repr__(self) -> str:
         if not self.orbits:
@@ -351,9 +353,9 @@ def _row(orbit: Orbit, names: list[str], reason: str) -> tuple[Any, ...]:
     sds = np.sqrt(np.diag(orbit.covariance)).reshape(orbit.points.shape).max(axis=0)
     multiplier, contraction = (value.real if np.isreal(value) else value for value in orbit.eigenvalues[:2])
     partner = "" if orbit.partner is None or orbit.partner >= len(names) else names[orbit.partner]
-    multiplier_sd, contraction_sd = orbit.eigenvalue_sd
+    multiplier_sd, contraction_sd = orbit.eigenvalue_sd[:2]
     return (
         orbit.name, orbit.period, orbit.winding, orbit.returns, orbit.quality, multiplier, multiplier_sd, contraction,
-        contraction_sd, bool(np.isfinite(multiplier_sd)), float(abs(orbit.eigenvalues[0])), *sds, partner,
-        orbit.equilibrium, orbit.remark, reason,
+        contraction_sd, bool(np.isfinite(multiplier_sd)), float(abs(orbit.eigenvalues[0])), partner,
+        orbit.equilibrium, orbit.remark, reason, *sds,
     )  # fmt: skip

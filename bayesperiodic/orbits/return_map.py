@@ -20,13 +20,15 @@ KERNEL_REACH = 3.0
 # Largest noise as a fraction of the bandwidth; deconvolution needs less than one.
 MOST_NOISE = 0.75
 MOST_LEVERAGE = 0.9
+# Distance of two phases in a search tree, in units of the attractor's size.
+APART = 1e3
 # Limits of memory: products of regressors in one call, neighbours of all fits of an atlas.
 MOST_PRODUCTS, MOST_NEIGHBOURS = 4_000_000, 6_000_000
 
 
 @cache
 def monomials(coordinates: int, degree: int) -> np.ndarray:
-    """Return the powers (terms, coordinates) of all monomials up to a degree: 1, u, v, …, uu, uv, vv, …"""
+    """Return the powers (terms, coordinates) of all monomials up to a degree, such as 1, u, v, uu, uv, vv."""
     factors = (one for n in range(degree + 1) for one in combinations_with_replacement(range(coordinates), n))
     return np.array([np.bincount(np.array(one, dtype=int), minlength=coordinates) for one in factors])
 
@@ -61,6 +63,9 @@ class LocalFit(NamedTuple):
 class ReturnMap:
     """The return map of a section, fitted locally on request.
 
+    It may consist of several steps a return, each from one phase to the next: a map that stretches less is closer to a
+    polynomial. Position n belongs to the phase n modulo the number of steps.
+
     Neighbours are weighted by a Gaussian kernel. The normal equations are sums of the kernel times powers of noise-free
     arguments. For normal noise in the arguments, of known variance below the kernel's, there are functions of the noisy
     arguments with exactly these expectations: a narrower Gaussian times Hermite polynomials, the deconvoluting kernels
@@ -70,8 +75,9 @@ class ReturnMap:
 
     def __init__(
         self, points: np.ndarray, increments: np.ndarray, turn: np.ndarray, winds: bool, noise: np.ndarray,
-        stretches: np.ndarray | None = None,
+        stretches: np.ndarray | None = None, steps: int = 1,
     ):  # fmt: skip
+        self.steps = steps
         self.points = points  # in the order of time, (count, d)
         # Number of each point's unbroken stretch, (count,).
         self.stretches = np.zeros(len(points), dtype=np.int64) if stretches is None else stretches
@@ -83,15 +89,24 @@ class ReturnMap:
         self.winds = winds  # whether the increments of angles include whole turns
         self.noise = noise  # standard deviation of the arguments, (d,)
         self.angle = np.isfinite(turn)
-        self._tree = self.tree(self.arguments)
+        self.count = len(self.arguments) // steps  # of points of each phase
+        self._tree = self.tree(self.arguments, self.phases(self.positions))
 
     def followed(self, steps: int) -> np.ndarray:
         """Return the positions of the points whose stretch contains the point `steps` later."""
         return np.flatnonzero(self.stretches[steps:] == self.stretches[:-steps])
 
-    def tree(self, points: np.ndarray) -> cKDTree:
-        """Return a search tree of points, periodic in the angles."""
-        return cKDTree(self.wrap_points(points), boxsize=np.where(self.angle, self.turn, 0.0))
+    def phases(self, positions: np.ndarray) -> np.ndarray:
+        """Return the phases (n,) of the points at these positions (n,)."""
+        return positions % self.steps
+
+    def tree(self, points: np.ndarray, phases: np.ndarray) -> cKDTree:
+        """Return a search tree of points (n, d) at phases (n,), periodic in the angles."""
+        return cKDTree(self.places(points, phases), boxsize=np.append(np.where(self.angle, self.turn, 0.0), 0.0))
+
+    def places(self, points: np.ndarray, phases: np.ndarray) -> np.ndarray:
+        """Return points (n, d) at phases (n,) as they are in a search tree, (n, d + 1)."""
+        return np.column_stack([self.wrap_points(points), APART * phases])
 
     def wrap_points(self, points: np.ndarray) -> np.ndarray:
         """Return points with angles in [0, turn)."""
@@ -108,34 +123,38 @@ class ReturnMap:
         """Return the largest coordinate differences (n,) of points (n, d)."""
         return np.abs(self.wrap(one - other)).max(axis=1)
 
-    def nearest(self, centres: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def nearest(self, centres: np.ndarray, phases: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return distances and positions of the nearest arguments, (m, count) each."""
-        distance, index = self._tree.query(self.wrap_points(centres), np.arange(1, count + 1))
+        distance, index = self._tree.query(self.places(centres, phases), np.arange(1, min(count, self.count) + 1))
         return np.asarray(distance), np.asarray(index)
 
-    def count_within(self, centres: np.ndarray, bandwidths: np.ndarray) -> np.ndarray:
+    def count_within(self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray) -> np.ndarray:
         """Return the number of neighbours (m,) of fits about the centres (m, d) with the bandwidths (m,)."""
         radii = KERNEL_REACH * bandwidths
-        return np.asarray(self._tree.query_ball_point(self.wrap_points(centres), radii, return_length=True))
+        return np.asarray(self._tree.query_ball_point(self.places(centres, phases), radii, return_length=True))
 
-    def fit(self, centres: np.ndarray, count: int, degree: int, *, influence: bool = True) -> LocalFit:
+    def fit(
+        self, centres: np.ndarray, phases: np.ndarray, count: int, degree: int, *, influence: bool = True
+    ) -> LocalFit:
         """Fit polynomials about the centres (m, d) to their `count` nearest neighbours; faster without `influence`."""
         parts, size = [], max(1, MOST_PRODUCTS // (count * comb(len(self.turn) + 2 * degree, 2 * degree)))
-        for block in (centres[k : k + size] for k in range(0, len(centres), size)):
-            distance, index = self.nearest(block, count)
+        for k in range(0, len(centres), size):
+            block = centres[k : k + size]
+            distance, index = self.nearest(block, phases[k : k + size], count)
             parts.append(self._fit(block, distance[:, -1] / KERNEL_REACH, index, np.array([True]), degree, influence))
         return LocalFit(*map(np.concatenate, zip(*parts, strict=True)))
 
     def fit_within(
-        self, centres: np.ndarray, bandwidths: np.ndarray, degree: int, *, influence: bool = True
+        self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray, degree: int, *, influence: bool = True
     ) -> LocalFit:
         """Fit polynomials about the centres (m, d) with the bandwidths (m,), or larger ones where points are few.
 
         The neighbours are repeated to equal numbers, without influence.
         """
-        distance, nearest = self.nearest(centres, FEWEST_FITTED)
+        fewest = max(FEWEST_FITTED, comb(len(self.turn) + degree, degree) * 3 // 2)
+        distance, nearest = self.nearest(centres, phases, fewest)
         bandwidths = np.maximum(bandwidths, distance[:, -1] / KERNEL_REACH)
-        near = self._tree.query_ball_point(self.wrap_points(centres), KERNEL_REACH * bandwidths)
+        near = self._tree.query_ball_point(self.places(centres, phases), KERNEL_REACH * bandwidths)
         counts = np.array([len(members) for members in near])[:, None]
         position = np.arange(counts.max() + 1)
         # The nearest comes first, and again in its place.
@@ -235,17 +254,19 @@ class Atlas:
 
     def __init__(self, maps: ReturnMap, count: int):
         self._maps, self._count = maps, count
-        self._centres = maps.arguments[:: -(-len(maps.arguments) * count // MOST_NEIGHBOURS)]
-        self._fit = maps.fit(self._centres, count, 2, influence=False)
+        every = -(-len(maps.arguments) * count // MOST_NEIGHBOURS)
+        kept = maps.positions // maps.steps % every == 0
+        self._centres, phases = maps.arguments[kept], maps.phases(maps.positions[kept])
+        self._fit = maps.fit(self._centres, phases, count, 2, influence=False)
         self._hessian = self._fit.hessian
-        self._tree = maps.tree(self._centres)
+        self._tree = maps.tree(self._centres, phases)
 
-    def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def at(self, points: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return images (m, d), derivatives (m, image, argument) and bandwidths (m,) at points (m, d).
 
         The bandwidth is infinite where a point is farther from the nearest centre than that.
         """
-        _, nearest = self._tree.query(self._maps.wrap_points(points))
+        _, nearest = self._tree.query(self._maps.places(points, phases))
         away = self._maps.wrap(points - self._centres[nearest])
         curved = np.einsum("mijk,mk->mij", self._hessian[nearest], away)
         jacobian = self._fit.jacobian[nearest]
@@ -254,9 +275,9 @@ class Atlas:
         outside = np.sqrt(np.sum(away**2, axis=-1)) > bandwidth
         return image, jacobian + curved, np.where(outside, np.inf, bandwidth)
 
-    def exactly(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def exactly(self, points: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the same from fits about the points themselves."""
-        fit = self._maps.fit(points, self._count, 2, influence=False)
+        fit = self._maps.fit(points, phases, self._count, 2, influence=False)
         return fit.value, fit.jacobian, fit.bandwidth
 
 
@@ -266,7 +287,7 @@ SMALLEST_BANDWIDTH = 4.0
 
 
 def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
-    """Return the standard deviations (d,) of independent errors of the coordinates.
+    """Return the standard deviations (d,) of independent errors of the coordinates, from maps of one step.
 
     Where the return map is quadratic, the residual variance of an image is the variance of its own error plus the
     propagated one of the argument's error. The densest neighbourhoods are used, where curvature matters least, and
@@ -276,9 +297,9 @@ def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
     d = maps.points.shape[1]
     noise, count = np.zeros(d), int(2.25 * neighbours)
     for _ in range(3):
-        width = maps.nearest(centres, count)[0][:, -1]
+        width = maps.nearest(centres, np.zeros(len(centres)), count)[0][:, -1]
         dense = centres[width <= np.median(width)]
-        fit = maps.fit(dense, count, 2, influence=False)
+        fit = maps.fit(dense, np.zeros(len(dense)), count, 2, influence=False)
         rows = (np.eye(d) + fit.jacobian**2).reshape(-1, d)
         target = maps.residual_variance(dense, fit).reshape(-1)
         weight = 1.0 / np.maximum(target, 1e-30)
@@ -346,7 +367,7 @@ def check_chaos(maps: ReturnMap) -> None:
 
 def _neighbours(maps: ReturnMap, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return points and a neighbour of each that is distant in time and has later points, where there is one."""
-    _, index = maps.nearest(maps.points[centre], NEIGHBOUR + 2 * DIVERGING_STEPS)
+    _, index = maps.nearest(maps.points[centre], np.zeros(len(centre)), NEIGHBOUR + 2 * DIVERGING_STEPS)
     near = maps.positions[index]
     far = (np.abs(near - centre[:, None]) > DIVERGING_STEPS) & np.isin(near, maps.followed(DIVERGING_STEPS + 1))
     rank = np.cumsum(far, axis=1)

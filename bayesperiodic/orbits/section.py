@@ -39,8 +39,8 @@ class PoincareSection(Result):
     points : array (count, d)
         In the d coordinates, two or more; angles in (−π, π].
     coordinates, angles : tuple of str
-        The coordinates, and those of them that are angles, one at most. A delayed one is a channel and, in brackets, the
-        forcing periods after the phase of the section: ``"voltage[-0.25]"`` is the voltage a quarter period before it.
+        The coordinates, and those of them that are angles, one at most. A delayed one is a channel and, in brackets,
+        the forcing periods after the phase of the section: ``"voltage[-0.25]"`` is the voltage a quarter period before.
     frequency : float
         Forcing frequency [Hz]; for crossings of a plane, returns per second.
     increments : array (count − 1, d)
@@ -136,15 +136,15 @@ class PoincareSection(Result):
         ------
         ValueError
             For an unknown coordinate, too few samples or periods, an angle that does not seem to be in radians, or
-            delays of one channel that are too close or a period apart.
+            delays of one channel that are too close modulo a period.
 
         Notes
         -----
         Errors of the coordinates are taken as independent, and those of a point and the next one too. For white noise
         this holds for delayed coordinates as well, because no two values of a channel use the same samples: windows are
-        narrowed to the time between them, delays of one channel must be within less than a period, and must not be
-        closer, modulo one period, than the 8 samples of the smallest window. For noise with a longer memory, standard
-        deviations are too small.
+        no longer than the time between them, and delays of one channel must not be closer, modulo a period (with
+        `steps` of `find_orbits`, modulo a step), than the 8 samples of the smallest window. For noise with a longer
+        memory, standard deviations are too small.
         """
         if not isinstance(recording, Recording):
             raise ValueError(
@@ -213,12 +213,7 @@ class PoincareSection(Result):
                 "a period, use from_points."
             )
         delays = _delays(names)
-        shortest = _shortest_separation(names)
-        if shortest * samples.sampling_rate < 2 * SMALLEST_WINDOW * frequency:
-            raise ValueError(
-                f"coordinates: must have values of a channel at least {2 * SMALLEST_WINDOW} samples apart, got "
-                f"{list(names)} with {samples.sampling_rate / frequency:.3g} samples a period. Choose other delays."
-            )
+        _longest_window(names, samples.sampling_rate / frequency)
         instants, stretch, left_out = samples.instants(frequency, origin, (delays.min(), delays.max()))
         synthetic = any(recording.synthetic for recording in given)
         section = cls._of(samples, names, angle_names, instants, stretch, left_out, synthetic, frequency)
@@ -344,16 +339,8 @@ class PoincareSection(Result):
             returns = np.diff(instants)[np.diff(stretch) == 0]
             frequency = float(returns.size / returns.sum())
         time = samples.time
-        narrowest = _shortest_separation(names) * np.median(np.diff(instants))
-        values, noise = np.empty((instants.size, len(names))), np.empty(len(names))
-        delays, columns = _delays(names), _columns(names)
-        for delay in np.unique(delays):
-            here = delays == delay
-            first, last = time[samples.starts[stretch]], time[samples.stops[stretch] - 1]
-            at = np.clip(instants + delay / frequency, first, last)
-            part = samples._replace(signals=samples.signals[:, columns[here]])
-            values[:, here], noise[here] = smoothed(part, at, stretch, narrowest)
-        noise = None if np.isnan(noise).any() else noise
+        usual = float(np.median(np.diff(instants)))
+        values, noise = _coordinate_values(samples, names, instants, stretch, frequency, usual)
         points, increments = wrapped(values, np.isin(names, angles)), _within(np.diff(values, axis=0), stretch)
         breaks = (stretch, samples.starts, left_out) if samples.starts.size > 1 else (None, None, left_out)
         measured = (instants, time, samples.signals, samples.signals.size, synthetic)
@@ -361,6 +348,49 @@ class PoincareSection(Result):
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def between(self, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Evaluate the recording at several phases a return.
+
+        Parameters
+        ----------
+        steps : int
+            Number of phases a return, equally spaced, the section's is the first.
+
+        Returns
+        -------
+        points : array (count·steps, d)
+            In the order of time, those of a return together; NaN from the last point of a stretch on.
+        increments : array (count·steps − 1, d)
+            Next point minus point, NaN across a break.
+        noise : array (d,)
+            Standard deviation of the errors.
+
+        Raises
+        ------
+        ValueError
+            For points alone, and for delays of a channel that are too close modulo a step.
+        """
+        steps = _checks.integer("steps", steps, 1)
+        if self.instants is None or self.time is None or self.signals is None:
+            raise ValueError(f"steps: must be 1 for points alone, got {steps}. Make the section of a recording.")
+        starts = np.zeros(1, dtype=np.int64) if self.starts is None else self.starts
+        stretch = np.zeros(len(self), dtype=np.int64) if self.stretches is None else self.stretches
+        samples = Stretches(self.time, self.signals, starts)
+        after = np.append(np.diff(self.instants), 0.0)
+        followed = np.append(np.diff(stretch) == 0, False)
+        instants = self.instants[:, None] + after[:, None] * np.arange(steps) / steps
+        present = followed[:, None] | (np.arange(steps) == 0)
+        usual = float(np.median(after)) / steps
+        each = np.broadcast_to(stretch[:, None], present.shape)[present]
+        names, frequency = self.coordinates, self.frequency
+        values, noise = _coordinate_values(samples, names, instants[present], each, frequency, usual, steps)
+        if noise is None:
+            raise ValueError(f"steps: must be 1 for stretches too short to determine the noise, got {steps}.")
+        signals = np.full((present.size, len(names)), np.nan)
+        signals[present.ravel()] = values
+        increments = _within(np.diff(signals, axis=0), np.repeat(stretch, steps))
+        return wrapped(signals, np.isin(names, self.angles)), increments, noise
 
     def cycle(self, index: int, period: int, samples: int = CYCLE_SAMPLES) -> dict[str, np.ndarray] | None:
         """Interpolate the measured motion from one point over some returns.
@@ -459,45 +489,69 @@ def _delays(names: Sequence[str]) -> np.ndarray:
     return np.array([channel_and_delay(name)[1] for name in names])
 
 
-def _shortest_separation(names: Sequence[str]) -> float:
-    """Return the shortest time between two values of a channel, in this point or the next, in forcing periods."""
+def _longest_window(names: Sequence[str], samples: float, steps: int = 1) -> float:
+    """Return the shortest distance of two values of a channel, at this step or others, as a fraction of a step.
+
+    `samples` is their number a period. Raises a ValueError if windows of the fewest samples overlap.
+    """
     columns, delays = _columns(names), _delays(names)
-    phases = [np.sort(delays[columns == column] % 1.0) for column in np.unique(columns)]
-    return min(float(np.diff(one, append=one[0] + 1.0).min()) for one in phases)
+    places = [np.sort(steps * delays[columns == column] % 1.0) for column in np.unique(columns)]
+    shortest = min(float(np.diff(one, append=one[0] + 1.0).min()) for one in places)
+    if shortest * samples < 2 * SMALLEST_WINDOW * steps * (1.0 - 1e-9):
+        modulo = "a period" if steps == 1 else f"1/{steps} of a period"
+        raise ValueError(
+            f"coordinates: must have values of a channel at least {2 * SMALLEST_WINDOW} samples apart modulo {modulo}, "
+            f"got {shortest * samples / steps:.2g} for {list(names)}. Otherwise they share their noise: choose other "
+            "delays" + ", or another number of steps." * (steps > 1) + "." * (steps == 1)
+        )
+    return shortest
+
+
+def _coordinate_values(
+    samples: Stretches, names: Sequence[str], instants: np.ndarray, stretch: np.ndarray, frequency: float,
+    usual: float, steps: int = 1,
+) -> tuple[np.ndarray, np.ndarray | None]:  # fmt: skip
+    """Return the coordinates (instants, d) at given instants, a usual time apart, and the sd (d,) of their errors."""
+    longest = usual * _longest_window(names, samples.sampling_rate / frequency, steps)
+    values, noise = np.empty((instants.size, len(names))), np.empty(len(names))
+    delays, columns = _delays(names), _columns(names)
+    first, last = samples.time[samples.starts[stretch]], samples.time[samples.stops[stretch] - 1]
+    for delay in np.unique(delays):
+        here = delays == delay
+        part = samples._replace(signals=samples.signals[:, columns[here]])
+        at = np.clip(instants + delay / frequency, first, last)
+        values[:, here], noise[here] = smoothed(part, at, stretch, longest)
+    return values, None if np.isnan(noise).any() else noise
 
 
 def _names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     given = [coordinates] if isinstance(coordinates, str) else list(coordinates)
-    names, delays = [], {}
+    names, delayed = [], set()
     for name in given:
         match = DELAYED.fullmatch(name) if isinstance(name, str) else None
         if match is None:
             names.append(name)
             continue
         try:
-            delay = _checks.finite_number("delay", float(match[2]))
+            _checks.finite_number("delay", float(match[2]))
         except ValueError:
             raise ValueError(
                 f"coordinates: must have a number in brackets, the delay in forcing periods, such as "
                 f"{match[1] + '[-0.25]'!r}, got {name!r}."
             ) from None
         names.append(match[1])
-        delays.setdefault(match[1], []).append(delay)
-    channels = _checks.identifiers("coordinates", dict.fromkeys(names))
+        delayed.add(match[1])
+    _checks.identifiers("coordinates", dict.fromkeys(names))
     if len(names) < 2:
         raise ValueError(f"coordinates: must be two or more outputs, got {coordinates!r}.")
-    for channel, some in delays.items():
-        several = some + [0.0] * sum(name == channel for name in given)
-        if max(several) - min(several) >= 1.0:
-            raise ValueError(f"coordinates: must have delays of {channel!r} within less than a period, got {given!r}.")
-    if len(names) - sum(map(len, delays.values())) != len({name for name in given if name in channels}):
+    if len(set(given)) < len(given):
         raise ValueError(f"coordinates: must differ, got {given!r}.")
     angle_names = (angles,) if isinstance(angles, str) else tuple(angles)
     for name in angle_names:
         _checks.one_of("angles", name, given)
     if len(angle_names) > 1:
         raise ValueError(f"angles: must name at most one coordinate, got {angle_names!r}.")
-    if any(channel_and_delay(name)[0] in delays for name in angle_names):
+    if any(channel_and_delay(name)[0] in delayed for name in angle_names):
         raise ValueError(f"coordinates: must have no delays of an angle, got {given!r}. Delay another channel.")
     return tuple(given), angle_names
 
