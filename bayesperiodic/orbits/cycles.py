@@ -16,9 +16,11 @@ from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, LocalFit, Retur
 
 # Search: a return this close starts a chain; chains in one cell are searched once.
 CLOSE, CELL = 0.08, 0.01
-LONGEST_CORRECTION, CORRECTIONS, CONVERGED_CORRECTION = 0.03, 14, 2e-4
-# Largest bandwidth of a map; chains closer than this are merged.
-WIDEST_BANDWIDTH, MERGED = 0.06, 2e-3
+LONGEST_CORRECTION, CORRECTIONS = 0.03, 14
+# With two coordinates and with more, where points are fewer: largest last step, largest bandwidth of a map.
+CONVERGED_CORRECTION, WIDEST_BANDWIDTH = {2: 2e-4, 3: 1e-3}, {2: 0.06, 3: 0.1}
+# Chains closer than this are merged.
+MERGED = 2e-3
 NEARLY, EXACT_STEPS = 0.02, 4
 SAME_CYCLE = 3e-3
 
@@ -128,11 +130,16 @@ def candidates(maps: ReturnMap, atlas: Atlas, period: int) -> list[MapCycle]:
     return _distinct(maps, chains, step, members)
 
 
+def _for(values: dict[int, float], maps: ReturnMap) -> float:
+    """Return the value for the number of coordinates."""
+    return values[min(len(maps.turn), 3)]
+
+
 def _converge(
     maps: ReturnMap, images: Images, chains: np.ndarray, steps: int, longest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Move chains (m, period, 2); return their last steps and the chains into which they were merged."""
-    noise, heir = float(maps.noise.max()), np.arange(len(chains))
+    noise, heir, converged = float(maps.noise.max()), np.arange(len(chains)), _for(CONVERGED_CORRECTION, maps)
     step, active = np.full(len(chains), np.inf), heir
     for _ in range(steps):
         if active.size == 0:
@@ -143,9 +150,9 @@ def _converge(
         slopes = jacobian.reshape(*moved.shape, moved.shape[2])
         chains[active], size = _moved(maps, moved, image.reshape(moved.shape), slopes)
         widest = bandwidth.reshape(moved.shape[:2]).max(1)
-        lost = (widest > max(WIDEST_BANDWIDTH, 2.0 * noise)) | ~(size < longest)
+        lost = (widest > max(_for(WIDEST_BANDWIDTH, maps), 2.0 * noise)) | ~(size < longest)
         step[active] = np.where(lost, np.inf, size)
-        active = active[(size > max(0.01 * CONVERGED_CORRECTION, 0.05 * noise)) & ~lost]
+        active = active[(size > max(0.01 * converged, 0.05 * noise)) & ~lost]
         cells = _cells(maps, chains[active], max(MERGED, noise))
         _, first, owner = np.unique(cells, axis=0, return_index=True, return_inverse=True)
         heir[active] = active[first][owner.ravel()]
@@ -190,7 +197,7 @@ def _distinct(maps: ReturnMap, chains: np.ndarray, step: np.ndarray, members: li
     # Each cycle with the first points and the shift of each of its close returns, (returns, 2).
     groups: list[tuple[np.ndarray, list[np.ndarray]]] = []
     for k in np.argsort(step, kind="stable"):
-        if step[k] > max(CONVERGED_CORRECTION, 0.1 * noise):
+        if step[k] > max(_for(CONVERGED_CORRECTION, maps), 0.1 * noise):
             break
         returns = chains[k, :: maps.steps]
         if has_shorter_period(returns, maps.wrap, tolerance):
@@ -239,7 +246,8 @@ def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple
     cycle, last, refined = points.copy(), np.inf, max(REFINED, REFINED_NOISE * float(maps.noise.max()))
     for step in range(REFINING_STEPS):
         final = last < refined or step == REFINING_STEPS - 1
-        fit = maps.fit_within(cycle, maps.phases(np.arange(len(cycle))), bandwidths, REFINING_DEGREE, influence=final)
+        phases = maps.phases(np.arange(len(cycle)))
+        fit = maps.fit_within(cycle, phases, bandwidths, REFINING_DEGREE, influence=final)
         (moved,), (size,) = _moved(maps, cycle[None], fit.value[None], fit.jacobian[None])
         if not np.isfinite(size) or np.abs(maps.wrap(cycle - points)).max() > 0.1:
             return None

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
-from math import comb
 
 import numpy as np
 from scipy.stats import chi2
@@ -36,7 +35,7 @@ def find_orbits(
     *,
     periods: Iterable[int],
     method: str = "chained",
-    neighbours: int | None = None,
+    neighbours: int = 32,
     box: float = 0.01,
     steps: int = 1,
 ) -> Orbits:
@@ -58,9 +57,8 @@ def find_orbits(
     periods : iterable of int
         Prime periods in returns.
     method : {"chained", "boxes"}
-    neighbours : int, optional
-        Smallest effective number of neighbours of a local fit, at least 16. By default 32 with two coordinates, and for
-        more in proportion to the number of terms of a cubic polynomial.
+    neighbours : int
+        Smallest effective number of neighbours of a local fit, at least 16.
     box : float
         Size of a box for "boxes", as a fraction of the attractor's size.
     steps : int
@@ -93,8 +91,7 @@ def find_orbits(
     wanted = _periods(periods, section)
     _checks.one_of("method", method, SEARCHES)
     steps, box = _checks.integer("steps", steps, 1), _checks.positive("box", box)
-    fewest = FEWEST_NEIGHBOURS * comb(len(section.coordinates) + 3, 3) // comb(5, 3)
-    neighbours = fewest if neighbours is None else _checks.integer("neighbours", neighbours, 16)
+    neighbours = _checks.integer("neighbours", neighbours, 16)
     maps, size = _scaled(section, neighbours)
     if method == "boxes":
         pairs = [pair for p in wanted for pair in cycles.box_orbits(maps, p, neighbours, box)]
@@ -103,7 +100,7 @@ def find_orbits(
             maps = _with_steps(section, maps, size, steps)
         atlas = Atlas(maps, _search_count(maps, neighbours))
         pairs = [pair for p in wanted for pair in _chained(maps, atlas, p, neighbours)]
-    quality_count = _search_count(maps, fewest)
+    quality_count = _search_count(maps, FEWEST_NEIGHBOURS)
     orbits = [_orbit(section, maps, size, *pair, _quality(maps, *pair, quality_count)) for pair in pairs]
     return Orbits(_finished(orbits, maps, size), values=section.values, method=method)
 

@@ -20,6 +20,11 @@ KERNEL_REACH = 3.0
 # Largest noise as a fraction of the bandwidth; deconvolution needs less than one.
 MOST_NOISE = 0.75
 MOST_LEVERAGE = 0.9
+# Prior standard deviation of slopes, and the distance over which a slope changes by it, in more than two coordinates:
+# there the attractor is thin in some directions, and does not determine all coefficients.
+STEEPEST_SLOPE, CURVATURE_LENGTH = 10.0, 0.1
+# Largest distance from the nearest centre of an atlas, in bandwidths, with two coordinates and with more.
+FARTHEST_FROM_CENTRE = {2: 1.0, 3: 2.0}
 # Distance of two phases in a search tree, in units of the attractor's size.
 APART = 1e3
 # Limits of memory: products of regressors in one call, neighbours of all fits of an atlas.
@@ -134,14 +139,19 @@ class ReturnMap:
         return np.asarray(self._tree.query_ball_point(self.places(centres, phases), radii, return_length=True))
 
     def fit(
-        self, centres: np.ndarray, phases: np.ndarray, count: int, degree: int, *, influence: bool = True
-    ) -> LocalFit:
-        """Fit polynomials about the centres (m, d) to their `count` nearest neighbours; faster without `influence`."""
+        self, centres: np.ndarray, phases: np.ndarray, count: int, degree: int, *, influence: bool = True,
+        shrunk: bool = False,
+    ) -> LocalFit:  # fmt: skip
+        """Fit polynomials about the centres (m, d) to their `count` nearest neighbours; faster without `influence`.
+
+        With more than two coordinates, `shrunk` reduces coefficients that the neighbours do not determine.
+        """
         parts, size = [], max(1, MOST_PRODUCTS // (count * comb(len(self.turn) + 2 * degree, 2 * degree)))
         for k in range(0, len(centres), size):
             block = centres[k : k + size]
             distance, index = self.nearest(block, phases[k : k + size], count)
-            parts.append(self._fit(block, distance[:, -1] / KERNEL_REACH, index, np.array([True]), degree, influence))
+            bandwidths = distance[:, -1] / KERNEL_REACH
+            parts.append(self._fit(block, bandwidths, index, np.array([True]), degree, influence, shrunk))
         return LocalFit(*map(np.concatenate, zip(*parts, strict=True)))
 
     def fit_within(
@@ -161,7 +171,7 @@ class ReturnMap:
         inside = (position > 0) & (position <= counts)
         index = np.repeat(nearest[:, :1], len(position), axis=1)
         index[inside] = np.concatenate(near)
-        return self._fit(centres, bandwidths, index, inside, degree, influence)
+        return self._fit(centres, bandwidths, index, inside, degree, influence, shrunk=True)
 
     @staticmethod
     def predict(fit: LocalFit, away: np.ndarray) -> np.ndarray:
@@ -184,7 +194,7 @@ class ReturnMap:
 
     def _fit(
         self, centres: np.ndarray, bandwidth: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int,
-        wants_influence: bool,
+        wants_influence: bool, shrunk: bool = False,
     ) -> LocalFit:  # fmt: skip
         bandwidth = np.maximum(bandwidth, np.max(self.noise) / MOST_NOISE)
         away = self.wrap(self.arguments[index] - centres[:, None])
@@ -203,9 +213,19 @@ class ReturnMap:
         table = _products(by_coordinate[:-1], others) @ by_coordinate[-1].mT
         sums = powers[:, None] + powers
         row = np.argmax(np.all(sums[..., None, :-1] == others, axis=-1), axis=-1)
-        inverse = np.linalg.pinv(table[:, row, sums[..., -1]], rcond=1e-10, hermitian=True)
-        solution = inverse @ (regressors @ image)
+        normal, target = table[:, row, sums[..., -1]], regressors @ image
+        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+        solution = inverse @ target
         effective = weight.sum(1) ** 2 / (weight**2).sum(1)
+        if d > 2 and shrunk:
+            rest = np.einsum("mn,mnc->mc", weight, image**2) - (solution * target).sum(1)
+            free = np.maximum(effective - len(powers), 1.0) / effective
+            variance = np.maximum(rest, 0.0).max(1) / weight.sum(1) / free
+            order = powers.sum(1)
+            prior = STEEPEST_SLOPE * bandwidth[:, None] * (bandwidth[:, None] / CURVATURE_LENGTH) ** (order - 1.0)
+            shrinkage = np.where(order > 0, variance[:, None] / prior**2, 0.0)
+            inverse = np.linalg.pinv(normal + shrinkage[:, :, None] * np.eye(len(powers)), rcond=1e-10, hermitian=True)
+            solution = inverse @ target
         scale = (factorial(powers).prod(1) / bandwidth[:, None] ** powers.sum(1))[..., None]
         influence = np.empty((len(centres), 0, len(powers), d))
         if wants_influence:
@@ -257,7 +277,7 @@ class Atlas:
         every = -(-len(maps.arguments) * count // MOST_NEIGHBOURS)
         kept = maps.positions // maps.steps % every == 0
         self._centres, phases = maps.arguments[kept], maps.phases(maps.positions[kept])
-        self._fit = maps.fit(self._centres, phases, count, 2, influence=False)
+        self._fit = maps.fit(self._centres, phases, count, 2, influence=False, shrunk=True)
         self._hessian = self._fit.hessian
         self._tree = maps.tree(self._centres, phases)
 
@@ -272,12 +292,12 @@ class Atlas:
         jacobian = self._fit.jacobian[nearest]
         image = self._fit.value[nearest] + np.einsum("mij,mj->mi", jacobian + 0.5 * curved, away)
         bandwidth = self._fit.bandwidth[nearest]
-        outside = np.sqrt(np.sum(away**2, axis=-1)) > bandwidth
+        outside = np.sqrt(np.sum(away**2, axis=-1)) > FARTHEST_FROM_CENTRE[min(points.shape[1], 3)] * bandwidth
         return image, jacobian + curved, np.where(outside, np.inf, bandwidth)
 
     def exactly(self, points: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the same from fits about the points themselves."""
-        fit = self._maps.fit(points, phases, self._count, 2, influence=False)
+        fit = self._maps.fit(points, phases, self._count, 2, influence=False, shrunk=True)
         return fit.value, fit.jacobian, fit.bandwidth
 
 
