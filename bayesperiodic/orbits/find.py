@@ -12,8 +12,16 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
 from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
-from bayesperiodic.orbits.return_map import FEWEST_FOLLOWED, KERNEL_REACH, Atlas, ReturnMap, check_chaos, estimate_noise
-from bayesperiodic.orbits.section import PoincareSection, wrapped
+from bayesperiodic.orbits.return_map import (
+    FEWEST_FOLLOWED,
+    KERNEL_REACH,
+    Atlas,
+    ReturnMap,
+    check_chaos,
+    estimate_noise,
+    prediction_error,
+)
+from bayesperiodic.orbits.section import PoincareSection, channels_of, wrapped
 
 SEARCHES = ("chained", "boxes")
 QUALITY_DEGREE, FEWEST_NEIGHBOURS = 3, 32
@@ -23,6 +31,8 @@ SEARCH_WIDTH = 4.0
 LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
+# Delays tried for a coordinate to add, in forcing periods.
+REMEDIES = (-0.25, -0.5)
 # Standard deviations from which a determinant is impossible.
 IMPOSSIBLE = 3.0
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
@@ -76,8 +86,9 @@ def find_orbits(
     Raises
     ------
     ValueError
-        For a section that is periodic, quasi-periodic or shows no return map (the message names which), for an unknown
-        method, and for periods that are not whole numbers.
+        For a section that is periodic, quasi-periodic or shows no return map, because of unknown states (the message
+        names which, and a delayed coordinate to add), for an unknown method, and for periods that are not whole
+        numbers.
 
     Examples
     --------
@@ -92,7 +103,7 @@ def find_orbits(
     _checks.one_of("method", method, SEARCHES)
     steps, box = _checks.integer("steps", steps, 1), _checks.positive("box", box)
     neighbours = _checks.integer("neighbours", neighbours, 16)
-    maps, size = _scaled(section, neighbours)
+    maps, size, prediction = _scaled(section, neighbours)
     if method == "boxes":
         pairs = [pair for p in wanted for pair in cycles.box_orbits(maps, p, neighbours, box)]
     else:
@@ -102,7 +113,8 @@ def find_orbits(
         pairs = [pair for p in wanted for pair in _chained(maps, atlas, p, neighbours)]
     quality_count = _search_count(maps, FEWEST_NEIGHBOURS)
     orbits = [_orbit(section, maps, size, *pair, _quality(maps, *pair, quality_count)) for pair in pairs]
-    return Orbits(_finished(orbits, maps, size), values=section.values, method=method)
+    finished = _finished(orbits, maps, size)
+    return Orbits(finished, values=section.values, method=method, prediction_error=prediction)
 
 
 def _periods(periods: Iterable[int], section: PoincareSection) -> list[int]:
@@ -124,8 +136,8 @@ def _periods(periods: Iterable[int], section: PoincareSection) -> list[int]:
     return wanted
 
 
-def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.ndarray]:
-    """Return the return map in units of the attractor's size, and that size (d,)."""
+def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.ndarray, tuple[float, float]]:
+    """Return the return map in units of the attractor's size, that size (d,), and errors of predictions."""
     size = np.ptp(section.points, axis=0)
     if not np.all(size > 0.0):
         raise ValueError(
@@ -134,10 +146,32 @@ def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.nd
     turn = np.array([2.0 * np.pi if name in section.angles else np.inf for name in section.coordinates]) / size
     noise = np.zeros(size.size) if section.noise is None else section.noise / size
     maps = ReturnMap(section.points / size, section.increments / size, turn, section.winds, noise, section.stretches)
-    check_chaos(maps)
+    prediction = check_chaos(maps, lambda: _remedy(section, maps))
     if section.noise is None:
         maps.noise = estimate_noise(maps, neighbours)
-    return maps, size
+    return maps, size, prediction
+
+
+def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
+    """Return which delayed coordinate would let local maps predict best, in the units of the maps."""
+    errors = {}
+    for channel in channels_of(section.coordinates):
+        for name in (f"{channel}[{delay}]" for delay in REMEDIES):
+            values = (
+                section.delayed(name) if channel not in section.angles and name not in section.coordinates else None
+            )
+            if values is not None:
+                values = values[:, None] / np.ptp(values)
+                increments = np.where(np.isfinite(section.increments[:, :1]), np.diff(values, axis=0), np.nan)
+                more = ReturnMap(
+                    np.hstack([maps.points, values]), np.hstack([section.increments / np.ptp(section.points, axis=0),
+                    increments]), np.append(maps.turn, np.inf), maps.winds, np.append(maps.noise, 0.0), maps.stretches,
+                )  # fmt: skip
+                errors[name] = prediction_error(more)[0]
+    if not errors:
+        return "another output"
+    best = min(errors, key=errors.__getitem__)
+    return f"another output or a delayed one, with {best!r} errors are {errors[best]:.1%}"
 
 
 def _with_steps(section: PoincareSection, maps: ReturnMap, size: np.ndarray, steps: int) -> ReturnMap:

@@ -202,6 +202,10 @@ class Orbits(Result):
         Number of values in the recording or section from which they were found.
     method : str
         "chained" or "boxes", see `find_orbits`.
+    prediction_error : tuple of two float
+        Median error with which local maps predict the next point, and the part that known noise explains, as fractions
+        of the distance of random points. An error well above the noise means that there are states that the
+        coordinates do not determine, or too few points; compare sections with other coordinates.
 
     Examples
     --------
@@ -220,6 +224,7 @@ class Orbits(Result):
     rejected: tuple[tuple[Orbit, str], ...] = field(default=())
     values: int = 0
     method: str = ""
+    prediction_error: tuple[float, float] = (np.nan, np.nan)
 
     @property
     def table(self) -> pd.DataFrame:

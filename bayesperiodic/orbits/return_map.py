@@ -3,6 +3,7 @@
 All coordinates are in units of the attractor's size.
 """
 
+from collections.abc import Callable
 from functools import cache
 from itertools import combinations_with_replacement
 from math import comb
@@ -192,6 +193,12 @@ class ReturnMap:
         free = np.maximum(fit.effective - fit.derivatives.shape[1], 1.0) / fit.effective
         return np.einsum("mn,mnc->mc", weight, residual**2) / weight.sum(1)[:, None] / free[:, None]
 
+    def fit_to(
+        self, centres: np.ndarray, bandwidths: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int
+    ) -> LocalFit:
+        """Fit polynomials about the centres (m, d) to those arguments of `index` (m, n) that are `inside` (m, n)."""
+        return self._fit(centres, bandwidths, index, inside, degree, False, shrunk=True)
+
     def _fit(
         self, centres: np.ndarray, bandwidth: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int,
         wants_influence: bool, shrunk: bool = False,
@@ -337,7 +344,11 @@ def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
 
 LONGEST_PERIOD = 32
 # As fractions of the median distance between two random points: points that coincide, unpredictable images.
-SAME_POINT, UNPREDICTED = 0.05, 0.2
+SAME_POINT, UNPREDICTED = 0.05, 0.08
+# Neighbours of a prediction, as a multiple of the number of terms.
+PREDICTING = 1.5
+# Median of the absolute value of a standard normal number.
+NORMAL_MEDIAN = 0.6745
 # Neighbours that diverge by less than this factor in this many steps show no chaos.
 DIVERGED, DIVERGING_STEPS = 2.5, 6
 DIVERGING_PROBES = 400
@@ -346,8 +357,12 @@ NEIGHBOUR = 8
 FEWEST_FOLLOWED = 100
 
 
-def check_chaos(maps: ReturnMap) -> None:
-    """Raise a ValueError, which names the kind of motion, unless the points show a chaotic return map."""
+def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, float]:
+    """Raise a ValueError, which names the kind of motion, unless the points show a chaotic return map.
+
+    Returns the error of predictions by local maps and the part of noise in it, as fractions of the distance of random
+    points. `remedy` returns which coordinate to add where the points do not determine the next ones.
+    """
     section, generator = maps.points, np.random.default_rng(0)
     starts = maps.followed(DIVERGING_STEPS + 1)
     if starts.size < FEWEST_FOLLOWED:
@@ -370,12 +385,13 @@ def check_chaos(maps: ReturnMap) -> None:
     probes = min(DIVERGING_PROBES, len(section) // 4, starts.size)
     centre, neighbour = _neighbours(maps, starts[generator.choice(starts.size, probes, replace=False)])
     now = np.median(maps.distance(section[centre], section[neighbour]))
-    images = np.median(maps.distance(section[centre + 1], section[neighbour + 1]))
-    if images > UNPREDICTED * random:
+    error, from_noise = prediction_error(maps)
+    if error > UNPREDICTED:
         raise ValueError(
-            f"section: must show a return map, got images of neighbouring points {images / random:.0%} as far apart as "
-            "random points. Check for a wrong frequency, for noise as large as the motion, and for states that the two "
-            "coordinates do not determine."
+            f"section: must show a return map, got images that local maps of the {section.shape[1]} coordinates "
+            f"predict with errors of {error:.0%} of the distance of random points, {from_noise:.1%} from known noise. "
+            f"If the system has more states than coordinates, add one: {remedy()}. Otherwise check for a wrong "
+            "frequency, and for noise as large as the motion."
         )
     later = np.median(maps.distance(section[centre + DIVERGING_STEPS], section[neighbour + DIVERGING_STEPS]))
     if later < DIVERGED * now:
@@ -383,6 +399,32 @@ def check_chaos(maps: ReturnMap) -> None:
             "section: must be of a chaotic motion, got a quasi-periodic one, whose neighbouring points do not diverge. "
             "Record the system where it is chaotic."
         )
+    return error, from_noise
+
+
+def prediction_error(maps: ReturnMap) -> tuple[float, float]:
+    """Return the median error with which local maps predict images, and what known noise contributes to it.
+
+    Both as fractions of the median distance of random points. Maps are linear or quadratic, whichever predicts better,
+    from neighbours distant in time. Where the coordinates determine the next point, errors fall to the noise as
+    neighbours come closer; where they do not, they are as large as the effect of the unknown states.
+    """
+    generator, d = np.random.default_rng(0), maps.points.shape[1]
+    one, other = generator.integers(len(maps.arguments), size=(2, 4 * DIVERGING_PROBES))
+    random = np.median(maps.distance(maps.arguments[one], maps.arguments[other]))
+    some = generator.choice(len(maps.arguments), min(DIVERGING_PROBES, len(maps.arguments)), replace=False)
+    centres, positions, phases = maps.arguments[some], maps.positions[some], np.zeros(some.size)
+    results = []
+    for degree in (1, 2):
+        count = int(PREDICTING * comb(d + degree, degree)) + 2 * DIVERGING_STEPS + 1
+        distance, index = maps.nearest(centres, phases, count)
+        away = np.abs(maps.positions[index] - positions[:, None]) > DIVERGING_STEPS
+        fit = maps.fit_to(centres, distance[:, -1] / KERNEL_REACH, index, away, degree)
+        error = maps.distance(fit.value, centres + maps.increments[some])
+        variance = maps.noise**2 + np.einsum("mij,j->mi", fit.jacobian**2, maps.noise**2)
+        expected = NORMAL_MEDIAN * np.median(np.sqrt(variance.max(1)))
+        results.append((float(np.median(error) / random), float(expected / random)))
+    return min(results)
 
 
 def _neighbours(maps: ReturnMap, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

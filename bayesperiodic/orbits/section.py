@@ -349,6 +349,36 @@ class PoincareSection(Result):
     def __len__(self) -> int:
         return len(self.points)
 
+    def delayed(self, coordinate: str) -> np.ndarray | None:
+        """Evaluate a channel of the section's coordinates at a delay.
+
+        Parameters
+        ----------
+        coordinate : str
+            Such as ``"voltage[-0.25]"``.
+
+        Returns
+        -------
+        array (count,), or None
+            At the section's points; of the nearest sample where the delay leads out of a stretch. None for points
+            alone.
+
+        Raises
+        ------
+        ValueError
+            For an unknown channel.
+        """
+        channel, delay = channel_and_delay(coordinate)
+        channels = channels_of(self.coordinates)
+        _checks.one_of("coordinate", channel, channels)
+        if self.instants is None or self.time is None or self.signals is None:
+            return None
+        starts = np.zeros(1, dtype=np.int64) if self.starts is None else self.starts
+        stretch = np.zeros(len(self), dtype=np.int64) if self.stretches is None else self.stretches
+        samples = Stretches(self.time, self.signals[:, [channels.index(channel)]], starts)
+        first, last = self.time[samples.starts[stretch]], self.time[samples.stops[stretch] - 1]
+        return local_fit(samples, np.clip(self.instants + delay / self.frequency, first, last), stretch)[0][:, 0]
+
     def between(self, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Evaluate the recording at several phases a return.
 
