@@ -66,10 +66,10 @@ def newton_by_blocks(defect, slopes):
 
 
 def test_delayed_coordinates_are_the_channels_at_the_delayed_instants():
-    names = ("x", "y[0.4]", "x[-0.25]", "x[-1.6]")
-    section = bp.PoincareSection.from_recording(recorded(np.arange(9000) / 23.7), names, frequency=1.0, origin=0.3)
+    names = ("x", "y[0.4]", "x[-0.32]", "x[-1.65]")
+    section = bp.PoincareSection.from_recording(recorded(np.arange(9000) / 25.7), names, frequency=1.0, origin=0.3)
     at = section.instants
-    expected = [lines(at)[0], lines(at + 0.4)[1], lines(at - 0.25)[0], lines(at - 1.6)[0]]
+    expected = [lines(at)[0], lines(at + 0.4)[1], lines(at - 0.32)[0], lines(at - 1.65)[0]]
     np.testing.assert_allclose(section.points, np.stack(expected, axis=1), atol=2e-5)
     assert section.coordinates == names
     assert section.values == 2 * 9000
@@ -106,7 +106,7 @@ def test_errors_of_delayed_coordinates_are_independent_and_of_the_stated_size():
 
 def test_steps_evaluate_the_recording_between_the_points():
     names = ("x", "y", "x[-0.25]")
-    section = bp.PoincareSection.from_recording(recorded(np.arange(9000) / 63.7), names, frequency=1.0, origin=0.3)
+    section = bp.PoincareSection.from_recording(recorded(np.arange(29000) / 98.7), names, frequency=1.0, origin=0.3)
     points, increments, _ = section.between(3)
     at = (section.instants[:, None] + np.arange(3) / 3).ravel()[: len(section) * 3 - 2]
     expected = np.stack([lines(at)[0], lines(at)[1], lines(at - 0.25)[0]], axis=1)
@@ -254,11 +254,53 @@ def compared(names, delays, steps, noise, periods):
     return known, matched, orbits, np.concatenate(points), np.array(logarithms)
 
 
+@cache
+def wells_orbits():
+    section = bp.PoincareSection.from_recordings(
+        wells.recordings(1300, (0, 0, 0)), ("v", "v[-0.25]", "y"), frequency=FREQUENCY
+    )
+    return section, bp.find_orbits(section, periods=[2])
+
+
+def test_orbits_in_delayed_coordinates_are_those_of_the_flow():
+    section, orbits = wells_orbits()
+    assert len(orbits) >= 2
+    known = [one for one, _ in wells.known_orbits(1300, 2) if len(one.states) == 2]
+    for orbit in orbits:
+        points = [wells.coordinates_of(one, [("v", 0.0), ("v", -0.25), ("y", 0.0)]) for one in known]
+        off = [[np.abs(np.roll(p, -k, axis=0) - orbit.points).max() for k in range(2)] for p in points]
+        best = int(np.argmin(np.min(off, axis=1)))
+        assert np.min(off) < 0.01 * np.ptp(section.points, axis=0).max()
+        assert abs(np.log(orbit.eigenvalues[0] / known[best].multipliers[0])) < 0.3
+
+
+def test_experiments_leave_delayed_coordinates_out():
+    orbit = wells_orbits()[1][0]
+    experiment = orbit.experiment(states={"x": "v", "y": "y"})
+    assert set(experiment.outputs) == {"v", "y"}
+    np.testing.assert_array_equal(experiment.outputs["y"][experiment.mask], orbit.points[:, 2])
+    np.testing.assert_array_equal(experiment.outputs["v"][experiment.mask], orbit.points[:, 0])
+    kept = [0, 2, 3, 5]
+    np.testing.assert_array_equal(experiment.covariance, orbit.covariance[np.ix_(kept, kept)])
+    with pytest.raises(ValueError, match="orbits: must be of a section without delayed coordinates"):
+        bp.polish_orbits(bp.models.pendulum, [orbit], dict.fromkeys(bp.models.pendulum.parameters, 1.0))
+
+
+def test_portraits_draw_the_first_two_coordinates(tmp_path):
+    section, orbits = wells_orbits()
+    assert bp.plot.section(section, orbits).axes[0].get_ylabel() == "v[-0.25]"
+    lines = bp.plot.orbits(orbits).axes[0].lines
+    x, y = lines[0].get_data()
+    np.testing.assert_allclose(y[16:], x[:-16])
+    orbits.save(tmp_path / "orbits.h5")
+    assert repr(bp.load(tmp_path / "orbits.h5")) == repr(orbits)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "noise", "fraction"),
     [
-        (STATES, (1e-4, 1e-4, 1e-5), 0.7),
+        (STATES, (1e-4, 1e-4, 1e-5), 0.9),
         (("v", "v[-0.25]", "v[-0.5]"), (0.0, 0.0, 1e-5), 0.5),
     ],
 )
@@ -271,9 +313,8 @@ def test_orbits_of_three_states_in_120_pieces(names, noise, fraction):
     delays = [(name.partition("[")[0], float(name.partition("[")[2].rstrip("]") or 0.0)) for name in names]
     known, matched, orbits, points, logarithms = compared(names, delays, 3, noise, 3120)
     logarithms = logarithms[np.isfinite(logarithms)]
-    print(
-        f"{names}: {matched} of {known} orbits, {len(orbits)} in all, of points {np.mean(np.abs(points) < 1.645):.3f}"
-    )
+    inside = np.mean(np.abs(points) < 1.645)
+    print(f"{names}: {matched} of {known} orbits, {len(orbits)} in all; {inside:.3f} of {points.size} points inside")
     assert matched >= fraction * known
     assert np.sum(np.abs(points) < 1.645) >= binom.ppf(0.005, points.size, 0.9)
     assert np.sum(np.abs(logarithms) < 1.645) >= binom.ppf(0.005, logarithms.size, 0.9)

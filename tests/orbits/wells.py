@@ -78,7 +78,7 @@ def _slopes(state):
 
 
 def orbit(guess: np.ndarray) -> KnownOrbit | None:
-    """Return the orbit near a guess of its states (period, 3), by Newton's method on the flow; None if there is none."""
+    """Return the orbit near a guess of its states (period, 3), by Newton's method on the flow; None without one."""
     states = np.array(guess)
     p = len(states)
     for _ in range(25):
