@@ -318,3 +318,41 @@ def test_orbits_of_three_states_in_120_pieces(names, noise, fraction):
     assert matched >= fraction * known
     assert np.sum(np.abs(points) < 1.645) >= binom.ppf(0.005, points.size, 0.9)
     assert np.sum(np.abs(logarithms) < 1.645) >= binom.ppf(0.005, logarithms.size, 0.9)
+
+
+@cache
+def harvester():
+    with np.load(HARVESTER) as file:
+        channels = {"velocity": file["velocity"], "voltage": file["voltage_V"]}
+        time = float(file["interval_s"][0]) * np.arange(channels["velocity"].size).reshape(120, -1)
+    return [bp.Recording(time[k], {n: v[k].astype(float) for n, v in channels.items()}, {}) for k in range(120)]
+
+
+@pytest.mark.skipif(not HARVESTER.exists(), reason="needs the recording of the harvester")
+def test_two_coordinates_of_the_harvester_are_refused_and_a_third_delayed_one_passes():
+    """The beam has three states, of which velocity and voltage are measured."""
+    section = bp.PoincareSection.from_recordings(harvester(), ("velocity", "voltage"), frequency=6.5, origin=0.25 / 6.5)
+    with pytest.raises(ValueError, match=r"return map, .* with '(velocity|voltage)\[-0\.(25|5)\]' errors are [12]\."):
+        bp.find_orbits(section, periods=[1])
+    section = bp.PoincareSection.from_recordings(
+        harvester(), ("velocity", "voltage", "voltage[-0.25]"), frequency=6.5, origin=0.25 / 6.5
+    )
+    assert bp.find_orbits(section, periods=[1]).prediction_error[0] < 0.04
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not HARVESTER.exists(), reason="needs the recording of the harvester")
+def test_an_orbit_of_the_harvester_is_the_same_half_a_period_later():
+    """The orbit of period 3 with the most returns, from independent local maps; false-alarm rate 0.3 %.
+
+    Sections half a period apart have no point in common, and the multiplier does not depend on the phase.
+    """
+    names = ("voltage", "voltage[-0.25]", "voltage[-0.5]", "voltage[-0.75]")
+    logarithms, variances = [], []
+    for origin in (0.25, 0.75):
+        section = bp.PoincareSection.from_recordings(harvester(), names, frequency=6.5, origin=origin / 6.5)
+        orbit = max(bp.find_orbits(section, periods=[3], steps=5), key=lambda one: one.returns)
+        assert orbit.returns >= 15
+        logarithms.append(np.log(orbit.eigenvalues[0].real))
+        variances.append(orbit.joint_covariance[orbit.points.size, orbit.points.size])
+    assert abs(logarithms[1] - logarithms[0]) < 3.0 * np.sqrt(sum(variances))
