@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
+from bayesperiodic.orbits.coordinates import channels_of, wrapped
 from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.return_map import (
@@ -21,7 +22,7 @@ from bayesperiodic.orbits.return_map import (
     estimate_noise,
     prediction_error,
 )
-from bayesperiodic.orbits.section import PoincareSection, channels_of, wrapped
+from bayesperiodic.orbits.section import PoincareSection
 
 SEARCHES = ("chained", "boxes")
 QUALITY_DEGREE, FEWEST_NEIGHBOURS = 3, 32
@@ -32,7 +33,7 @@ LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
 # Delays tried for a coordinate to add, in forcing periods.
-REMEDIES = (-0.25, -0.5)
+DELAYS_TRIED = (-0.25, -0.5)
 # Standard deviations from which a determinant is impossible.
 IMPOSSIBLE = 3.0
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
@@ -156,7 +157,7 @@ def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
     """Return which delayed coordinate would let local maps predict best, in the units of the maps."""
     errors = {}
     for channel in channels_of(section.coordinates):
-        for name in (f"{channel}[{delay}]" for delay in REMEDIES):
+        for name in (f"{channel}[{delay}]" for delay in DELAYS_TRIED):
             values = (
                 section.delayed(name) if channel not in section.angles and name not in section.coordinates else None
             )

@@ -12,7 +12,7 @@ import numpy as np
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.orbits.section import channel_and_delay
+from bayesperiodic.orbits.coordinates import channel_and_delay
 from bayesperiodic.periodic.solution import PeriodicSolution
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ import numpy as np
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.models.model import Model
+from bayesperiodic.orbits.coordinates import channels_of, wrapped
 from bayesperiodic.orbits.cycles import shift_between
 from bayesperiodic.orbits.orbit import TURN, Orbit, Orbits, counted_turns, resampled_cycle
-from bayesperiodic.orbits.section import channels_of, wrapped
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme

@@ -1,7 +1,6 @@
 """PoincareSection: points of a motion, once a forcing period or where it crosses a plane."""
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,20 +10,25 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.data.recording import Recording
+from bayesperiodic.orbits.coordinates import (
+    channel_and_delay,
+    channels_of,
+    columns_of,
+    coordinate_names,
+    coordinate_signals,
+    coordinate_values,
+    delays_of,
+    longest_window,
+    wrapped,
+)
 from bayesperiodic.orbits.stretches import (
     FEWEST_SAMPLES,
-    LONGEST_USUAL_STEP,
     SMALLEST_WINDOW,
     Stretches,
     joined,
     local_fit,
-    smoothed,
-    usual_step,
 )
 
-DEGREES = 180.0 / np.pi
-# A delayed coordinate: a channel, and in brackets forcing periods after the phase of the section.
-DELAYED = re.compile(r"(.*)\[([^\[\]]*)\]", re.DOTALL)
 FEWEST_POINTS, CYCLE_SAMPLES = 200, 64
 # A signal must go so far below a level between two crossings, in standard deviations, so that noise adds none.
 CROSSING_BAND = 0.1
@@ -203,7 +207,7 @@ class PoincareSection(Result):
         given = _recordings(recordings)
         signals = []
         for recording in given:
-            names, angle_names, values = _signals(recording, coordinates, angles)
+            names, angle_names, values = coordinate_signals(recording, coordinates, angles)
             signals.append(values)
         samples = _unwrapped(joined(given, signals, frequency), np.isin(channels_of(names), angle_names))
         if samples.sampling_rate < FEWEST_SAMPLES * frequency:
@@ -212,12 +216,12 @@ class PoincareSection(Result):
                 f"recording: must have at least {FEWEST_SAMPLES} samples a period, got {rate}. For samples taken once "
                 "a period, use from_points."
             )
-        delays = _delays(names)
-        _longest_window(names, samples.sampling_rate / frequency)
+        delays = delays_of(names)
+        longest_window(names, samples.sampling_rate / frequency)
         instants, stretch, left_out = samples.instants(frequency, origin, (delays.min(), delays.max()))
         synthetic = any(recording.synthetic for recording in given)
         section = cls._of(samples, names, angle_names, instants, stretch, left_out, synthetic, frequency)
-        extent = np.ptp(samples.signals, axis=0)[_columns(names)]
+        extent = np.ptp(samples.signals, axis=0)[columns_of(names)]
         if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * extent):
             raise ValueError(
                 "recording: must be chaotic, got a motion of period 1, whose section points coincide. Use "
@@ -258,7 +262,7 @@ class PoincareSection(Result):
         ValueError
             For an unknown channel, too few crossings, and as for `from_recording`.
         """
-        names, angle_names, signals = _signals(recording, coordinates, angles)
+        names, angle_names, signals = coordinate_signals(recording, coordinates, angles)
         if channels_of(names) != names:
             raise ValueError(
                 f"coordinates: must be without delays for crossings, got {list(names)}. Delays are fractions of a "
@@ -304,7 +308,7 @@ class PoincareSection(Result):
             For too few points, another shape, NaN, or an angle that seems to be in degrees.
         """
         frequency = _checks.positive("frequency", frequency)
-        names, angle_names = _names(coordinates, angles)
+        names, angle_names = coordinate_names(coordinates, angles)
         several = isinstance(points, Sequence) and len(points) > 0 and all(np.ndim(part) == 2 for part in points)
         parts = [_checks.real_array("points", part) for part in (points if several else [points])]
         for part in parts:
@@ -340,7 +344,7 @@ class PoincareSection(Result):
             frequency = float(returns.size / returns.sum())
         time = samples.time
         usual = float(np.median(np.diff(instants)))
-        values, noise = _coordinate_values(samples, names, instants, stretch, frequency, usual)
+        values, noise = coordinate_values(samples, names, instants, stretch, frequency, usual)
         points, increments = wrapped(values, np.isin(names, angles)), _within(np.diff(values, axis=0), stretch)
         breaks = (stretch, samples.starts, left_out) if samples.starts.size > 1 else (None, None, left_out)
         measured = (instants, time, samples.signals, samples.signals.size, synthetic)
@@ -414,7 +418,7 @@ class PoincareSection(Result):
         usual = float(np.median(after)) / steps
         each = np.broadcast_to(stretch[:, None], present.shape)[present]
         names, frequency = self.coordinates, self.frequency
-        values, noise = _coordinate_values(samples, names, instants[present], each, frequency, usual, steps)
+        values, noise = coordinate_values(samples, names, instants[present], each, frequency, usual, steps)
         if noise is None:
             raise ValueError(f"steps: must be 1 for stretches too short to determine the noise, got {steps}.")
         signals = np.full((present.size, len(names)), np.nan)
@@ -469,11 +473,6 @@ class PoincareSection(Result):
         return f"PoincareSection({len(self.points)} points of {names} at {self.frequency:.6g} Hz from {source}{lost})"
 
 
-def wrapped(values: np.ndarray, turning: np.ndarray | bool = True) -> np.ndarray:
-    """Return values (…, coordinates), with those that are turning angles in (−π, π]."""
-    return np.where(turning, np.pi - (np.pi - values) % (2.0 * np.pi), values)
-
-
 def _within(increments: np.ndarray, stretch: np.ndarray) -> np.ndarray:
     """Return increments (count − 1, 2) with NaN where the next point (count,) is in another stretch."""
     return np.where((np.diff(stretch) == 0)[:, None], increments, np.nan)
@@ -498,164 +497,12 @@ def _unwrapped(samples: Stretches, turning: np.ndarray) -> Stretches:
     return samples._replace(signals=signals)
 
 
-def channel_and_delay(coordinate: str) -> tuple[str, float]:
-    """Return the channel of a coordinate and its delay in forcing periods after the phase of the section."""
-    match = DELAYED.fullmatch(coordinate)
-    return (match[1], float(match[2])) if match else (coordinate, 0.0)
-
-
-def channels_of(coordinates: Sequence[str]) -> tuple[str, ...]:
-    """Return the channels of coordinates, each once."""
-    return tuple(dict.fromkeys(channel_and_delay(name)[0] for name in coordinates))
-
-
-def _columns(names: Sequence[str]) -> np.ndarray:
-    """Return the position of each coordinate's channel among the channels."""
-    channels = channels_of(names)
-    return np.array([channels.index(channel_and_delay(name)[0]) for name in names])
-
-
-def _delays(names: Sequence[str]) -> np.ndarray:
-    return np.array([channel_and_delay(name)[1] for name in names])
-
-
-def _longest_window(names: Sequence[str], samples: float, steps: int = 1) -> float:
-    """Return the shortest distance of two values of a channel, at this step or others, as a fraction of a step.
-
-    `samples` is their number a period. Raises a ValueError if windows of the fewest samples overlap.
-    """
-    columns, delays = _columns(names), _delays(names)
-    places = [np.sort(steps * delays[columns == column] % 1.0) for column in np.unique(columns)]
-    shortest = min(float(np.diff(one, append=one[0] + 1.0).min()) for one in places)
-    if shortest * samples < 2 * SMALLEST_WINDOW * steps * (1.0 - 1e-9):
-        modulo = "a period" if steps == 1 else f"1/{steps} of a period"
-        raise ValueError(
-            f"coordinates: must have values of a channel at least {2 * SMALLEST_WINDOW} samples apart modulo {modulo}, "
-            f"got {shortest * samples / steps:.2g} for {list(names)}. Otherwise they share their noise: choose other "
-            "delays" + ", or another number of steps." * (steps > 1) + "." * (steps == 1)
-        )
-    return shortest
-
-
-def _coordinate_values(
-    samples: Stretches, names: Sequence[str], instants: np.ndarray, stretch: np.ndarray, frequency: float,
-    usual: float, steps: int = 1,
-) -> tuple[np.ndarray, np.ndarray | None]:  # fmt: skip
-    """Return the coordinates (instants, d) at given instants, a usual time apart, and the sd (d,) of their errors."""
-    longest = usual * _longest_window(names, samples.sampling_rate / frequency, steps)
-    values, noise = np.empty((instants.size, len(names))), np.empty(len(names))
-    delays, columns = _delays(names), _columns(names)
-    first, last = samples.time[samples.starts[stretch]], samples.time[samples.stops[stretch] - 1]
-    for delay in np.unique(delays):
-        here = delays == delay
-        part = samples._replace(signals=samples.signals[:, columns[here]])
-        at = np.clip(instants + delay / frequency, first, last)
-        values[:, here], noise[here] = smoothed(part, at, stretch, longest)
-    return values, None if np.isnan(noise).any() else noise
-
-
-def _names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    given = [coordinates] if isinstance(coordinates, str) else list(coordinates)
-    names, delayed = [], set()
-    for name in given:
-        match = DELAYED.fullmatch(name) if isinstance(name, str) else None
-        if match is None:
-            names.append(name)
-            continue
-        try:
-            _checks.finite_number("delay", float(match[2]))
-        except ValueError:
-            raise ValueError(
-                f"coordinates: must have a number in brackets, the delay in forcing periods, such as "
-                f"{match[1] + '[-0.25]'!r}, got {name!r}."
-            ) from None
-        names.append(match[1])
-        delayed.add(match[1])
-    _checks.identifiers("coordinates", dict.fromkeys(names))
-    if len(names) < 2:
-        raise ValueError(f"coordinates: must be two or more outputs, got {coordinates!r}.")
-    if len(set(given)) < len(given):
-        raise ValueError(f"coordinates: must differ, got {given!r}.")
-    angle_names = (angles,) if isinstance(angles, str) else tuple(angles)
-    for name in angle_names:
-        _checks.one_of("angles", name, given)
-    if len(angle_names) > 1:
-        raise ValueError(f"angles: must name at most one coordinate, got {angle_names!r}.")
-    if any(channel_and_delay(name)[0] in delayed for name in angle_names):
-        raise ValueError(f"coordinates: must have no delays of an angle, got {given!r}. Delay another channel.")
-    return tuple(given), angle_names
-
-
-def _signals(
-    recording: Recording, coordinates: Sequence[str], angles: Iterable[str]
-) -> tuple[tuple[str, ...], tuple[str, ...], np.ndarray]:
-    """Return the names of the coordinates and of their angles, and values (samples, channels), angles unwrapped."""
-    names, angle_names = _names(coordinates, angles)
-    channels = channels_of(names)
-    for name in channels:
-        _checks.one_of("coordinates", name, recording.outputs)
-    if isinstance(recording.time, Mapping):
-        raise ValueError(
-            f"recording: must have the same times for all channels, got {recording!r}; leave other channels out, or "
-            "record the coordinates together."
-        )
-    signals = np.stack([recording.outputs[name] for name in channels], -1)
-    for name in angle_names:
-        k = channels.index(name)
-        _check_angle(name, signals[:, k])
-        signals[:, k] = np.unwrap(signals[:, k])
-        for other in range(len(channels)):
-            if other != k:
-                _check_rate(name, channels[other], recording.time, signals[:, k], signals[:, other])
-    return names, angle_names, signals
-
-
 def _check_count(count: int) -> None:
     if count < FEWEST_POINTS:
         raise ValueError(
             f"section: must have at least {FEWEST_POINTS} points, got {count}; thousands are better. Record more "
             "forcing periods."
         )
-
-
-def _check_angle(name: str, values: np.ndarray) -> None:
-    """Raise a ValueError for an angle that jumps by other than 2π, or moves half a turn between samples."""
-    step = np.abs(np.diff(values))
-    smooth, largest, extent = float(np.quantile(step, 0.9)), float(step.max()), float(np.ptp(values))
-    jumps = largest > 0.75 * extent and largest > 4.0 * smooth
-    if jumps and abs(extent / 360.0 - 1.0) < 0.1:
-        raise ValueError(
-            f"outputs[{name!r}]: must be an angle in radians, got jumps of {largest:.4g}. It seems to be in degrees: "
-            "convert it with numpy.radians."
-        )
-    if jumps and largest > 1.0 and abs(extent / (2.0 * np.pi) - 1.0) > 0.1:
-        raise ValueError(
-            f"outputs[{name!r}]: must be an angle that is continuous or jumps by a turn (6.283 rad), got jumps of "
-            f"{largest:.4g}. Check the unit, and whether the angle covers half a turn only (arctan instead of arctan2)."
-        )
-    if np.quantile(np.abs(wrapped(np.diff(values))), 0.9) > 0.75 * np.pi or smooth > 2.0 * np.pi:
-        raise ValueError(
-            f"outputs[{name!r}]: must move by less than half a turn (3.14 rad) between samples, got steps of "
-            f"{smooth:.4g}. Convert degrees with numpy.radians, or sample faster."
-        )
-
-
-def _check_rate(name: str, other: str, time: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> None:
-    """Raise a ValueError if the other coordinate is the rate of the unwrapped angle in another unit."""
-    step = np.diff(time)
-    short = step <= LONGEST_USUAL_STEP * usual_step(time)
-    measured = np.diff(angle)[short]
-    expected = (0.5 * (rate[1:] + rate[:-1]) * step)[short]
-    scale, product = np.sqrt(np.sum(measured**2) * np.sum(expected**2)), np.sum(measured * expected)
-    if scale == 0.0 or product < 0.98 * scale:
-        return
-    ratio = product / np.sum(expected**2)
-    for factor, quantity in ((DEGREES, "angle"), (1.0 / DEGREES, "rate")):
-        if abs(ratio / factor - 1.0) < 0.1:
-            raise ValueError(
-                f"outputs[{name!r}]: must be the integral of {other!r}, got {ratio:.3g} times it; the {quantity} seems "
-                "to be in degrees. Use radians and radians per second."
-            )
 
 
 def _upward_crossings(time: np.ndarray, signal: np.ndarray, band: float) -> np.ndarray:

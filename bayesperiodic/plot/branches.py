@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 
 from bayesperiodic import _checks
 from bayesperiodic.diagnostics.branch_prediction import BranchPrediction
+from bayesperiodic.orbits.coordinates import channel_and_delay
 from bayesperiodic.orbits.orbit import Orbit, Orbits
-from bayesperiodic.orbits.section import PoincareSection, channel_and_delay
+from bayesperiodic.orbits.section import PoincareSection
 from bayesperiodic.periodic.continuation import FOLD, PERIOD_DOUBLING, Branch
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, styled
@@ -306,7 +307,9 @@ def _portrait(ax: Axes, orbit: Orbit) -> None:
 
 def _cycles(orbit: Orbit) -> dict[str, Mapping[str, np.ndarray]]:
     """Return the measured cycle and that of the model, closed, in the first two coordinates, by their labels."""
-    cycles = {} if orbit.cycle is None else {CLOSEST_CYCLE: _delayed(orbit.cycle, orbit)}
+    cycles: dict[str, Mapping[str, np.ndarray]] = {}
+    if orbit.cycle is not None:
+        cycles[CLOSEST_CYCLE] = _delayed(orbit.cycle, orbit)
     if orbit.solution is not None:
         outputs = _delayed(orbit.solution.outputs, orbit).items()
         cycles[MODEL_CYCLE] = {c: np.append(v, v[0]) for c, v in outputs}
