@@ -9,7 +9,7 @@ import numpy as np
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.models.model import Model
-from bayesperiodic.orbits.coordinates import channels_of, wrapped
+from bayesperiodic.orbits.coordinates import channel_and_delay, wrapped
 from bayesperiodic.orbits.cycles import shift_between
 from bayesperiodic.orbits.orbit import TURN, Orbit, Orbits, counted_turns, resampled_cycle
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STATUSES
@@ -144,7 +144,7 @@ class _Polisher:
             _checks.positive(f"parameter_sd[{name!r}]", sd)
         PeriodicEquations.build(model, inputs, frequency=1.0, samples=samples, scheme=scheme)
         for orbit in orbits:
-            if channels_of(orbit.coordinates) != orbit.coordinates:
+            if any(channel_and_delay(name)[0] != name for name in orbit.coordinates):
                 raise ValueError(
                     f"orbits: must be of a section without delayed coordinates, got {orbit.coordinates}. Use the "
                     "experiments of the orbits, orbit.experiment(states=…), in a Problem."
