@@ -90,9 +90,9 @@ def test_points_whose_delays_leave_a_stretch_are_left_out():
 
 
 def test_errors_of_delayed_coordinates_are_independent_and_of_the_stated_size():
-    """White noise; correlations of about 8,000 errors within 4.5 standard errors, false-alarm rate 2e-4 for all 24."""
+    """White noise; correlations of 32,000 errors within 4.5 standard errors, false-alarm rate 2e-4 for all 24."""
     # Slow signals, for which windows would be as long as a period.
-    time = np.arange(8000 * 64) / 64
+    time = np.arange(32_000 * 64) / 64
     slow = np.stack([np.sin(0.7 * time), np.cos(1.3 * time)])
     errors = 1e-3 * np.random.default_rng(1).standard_normal(slow.shape)
     noisy, clean = (bp.Recording(time, dict(zip("xy", one, strict=True)), {}) for one in (slow + errors, slow))
