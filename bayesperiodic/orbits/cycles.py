@@ -1,11 +1,12 @@
 """Cycles of local maps: search from close returns, refinement with error estimates, and the method of boxes.
 
-All coordinates are in units of the attractor's size. A chain is p consecutive points; Newton's method moves all of them
-together until the maps along the chain close it.
+All coordinates are in units of the attractor's size. A chain is the consecutive points of p returns, at every step of
+the return map; Newton's method moves all of them together until the maps along the chain close it.
 """
 
 from collections.abc import Callable
 from functools import reduce
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -15,9 +16,11 @@ from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, LocalFit, Retur
 
 # Search: a return this close starts a chain; chains in one cell are searched once.
 CLOSE, CELL = 0.08, 0.01
-LONGEST_CORRECTION, CORRECTIONS, CONVERGED_CORRECTION = 0.03, 14, 2e-4
-# Largest bandwidth of a map; chains closer than this are merged.
-WIDEST_BANDWIDTH, MERGED = 0.06, 2e-3
+LONGEST_CORRECTION, CORRECTIONS = 0.03, 14
+# With two coordinates and with more, where points are fewer: largest last step, largest bandwidth of a map.
+CONVERGED_CORRECTION, WIDEST_BANDWIDTH = {2: 2e-4, 3: 1e-3}, {2: 0.06, 3: 0.1}
+# Chains closer than this are merged.
+MERGED = 2e-3
 NEARLY, EXACT_STEPS = 0.02, 4
 SAME_CYCLE = 3e-3
 
@@ -37,62 +40,69 @@ SLOPE_GROWTH, VALUE_GROWTH = WIDENED**3 - 1.0, 1.5
 FEWEST_RETURNS, FARTHEST = 3, 3.0
 
 Wrap = Callable[[np.ndarray], np.ndarray]
-Images = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+Images = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 class MapCycle(NamedTuple):
     """A cycle of the local maps, not yet refined."""
 
-    points: np.ndarray  # (period, 2)
+    points: np.ndarray  # (period·steps, d)
     returns: int  # number of close returns that led to it
-    closest: int  # position of the first point of the closest measured cycle
+    closest: int  # return at which the closest measured cycle starts
     shift: int  # the cycle's point that this first point belongs to
 
 
 class Estimate(NamedTuple):
     """A refined cycle of the local maps."""
 
-    points: np.ndarray  # (period, 2)
-    eigenvalues: np.ndarray  # (2,)
-    covariance: np.ndarray  # of the points and of log|eigenvalue|, (2·period + 2, 2·period + 2)
-    bias: np.ndarray  # estimated, (2·period + 2,)
+    points: np.ndarray  # (p, d) with p = period·steps
+    eigenvalues: np.ndarray  # (d,)
+    covariance: np.ndarray  # of the points and of log|eigenvalue|, (d·p + d, d·p + d)
+    bias: np.ndarray  # estimated, (d·p + d,)
     turns: float  # of the angle, from the fits
 
 
 def newton_step(defect: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-    """Return corrections (m, p, 2) that close chains of linearised maps; defects are images minus the next points."""
-    m, p = defect.shape[:2]
-    system = _closing_matrix(jacobian) + 1e-14 * np.eye(2 * p)
-    return -np.linalg.solve(system, defect.reshape(m, 2 * p, 1)).reshape(m, p, 2)
+    """Return corrections (m, p, d) that close chains of linearised maps; defects are images minus the next points."""
+    m, p, d = defect.shape
+    system = _closing_matrix(jacobian) + 1e-14 * np.eye(d * p)
+    return -np.linalg.solve(system, defect.reshape(m, d * p, 1)).reshape(m, p, d)
 
 
 def _closing_matrix(jacobian: np.ndarray) -> np.ndarray:
-    """Return the derivatives (m, 2p, 2p) of the defects by the points."""
-    m, p = jacobian.shape[:2]
-    system = np.zeros((m, p, 2, p, 2))
+    """Return the derivatives (m, d·p, d·p) of the defects by the points."""
+    m, p, d = jacobian.shape[:3]
+    system = np.zeros((m, p, d, p, d))
     for j in range(p):
         system[:, j, :, j] += jacobian[:, j]
-        system[:, j, :, (j + 1) % p] -= np.eye(2)
-    return system.reshape(m, 2 * p, 2 * p)
+        system[:, j, :, (j + 1) % p] -= np.eye(d)
+    return system.reshape(m, d * p, d * p)
 
 
 def _monodromy(jacobian: np.ndarray) -> np.ndarray:
-    """Return the product (2, 2) of the derivatives (p, 2, 2) along a chain."""
+    """Return the product (d, d) of the derivatives (p, d, d) along a chain."""
     return reduce(lambda product, matrix: matrix @ product, jacobian)
 
 
 def eigenvalues(jacobian: np.ndarray) -> np.ndarray:
-    """Return the eigenvalues of the monodromy matrix of a chain (p, 2, 2), larger modulus first.
+    """Return the eigenvalues of the monodromy matrix of a chain (p, d, d), largest modulus first.
 
-    The smaller one follows from the determinants, which preserves its relative accuracy.
+    The product of the k largest is the largest eigenvalue of the product of the k-th compound matrices, of the minors
+    of size k (F. R. Gantmacher, The Theory of Matrices 1, 1959). Ratios keep the relative accuracy of small ones.
     """
-    trace, determinant = np.trace(_monodromy(jacobian)), np.prod(np.linalg.det(jacobian))
-    large = 0.5 * (trace + (1.0 if trace >= 0.0 else -1.0) * np.emath.sqrt(trace**2 - 4.0 * determinant))
-    return np.array([large, determinant / large if large != 0.0 else 0.0])
+    d, before, values = jacobian.shape[-1], 1.0, []
+    for size in range(1, d + 1):
+        rows = np.array(list(combinations(range(d), size)))
+        minors = np.linalg.det(jacobian[:, rows[:, None, :, None], rows[None, :, None, :]])
+        product = np.linalg.eigvals(_monodromy(minors))
+        largest = product[np.argmax(np.abs(product))]
+        values.append(largest / before if before != 0.0 else 0.0)
+        before = largest
+    return np.real_if_close(np.array(values), tol=1e3)
 
 
 def shift_between(one: np.ndarray, other: np.ndarray, wrap: Wrap) -> tuple[float, int]:
-    """Return the smallest distance of two cycles (p, 2) under cyclic shifts of the other, and that shift."""
+    """Return the smallest distance of two cycles (p, d) under cyclic shifts of the other, and that shift."""
     steps = np.arange(len(one))
     distances = np.abs(wrap(other[(steps[:, None] + steps) % len(one)] - one)).max((1, 2))
     best = int(np.argmin(distances))
@@ -100,7 +110,7 @@ def shift_between(one: np.ndarray, other: np.ndarray, wrap: Wrap) -> tuple[float
 
 
 def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool:
-    """Return whether the points (p, 2) repeat after a divisor of p."""
+    """Return whether the points (p, d) repeat after a divisor of p."""
     p = len(points)
     divisors = [d for d in range(1, p) if p % d == 0]
     return any(np.abs(wrap(np.roll(points, -d, axis=0) - points)).max() < tolerance for d in divisors)
@@ -109,7 +119,7 @@ def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool
 def candidates(maps: ReturnMap, atlas: Atlas, period: int) -> list[MapCycle]:
     """Return the cycles of a prime period to which close returns lead."""
     starts, members = _close_returns(maps, period)
-    chains = maps.points[starts[:, None] + np.arange(period)]
+    chains = maps.points[starts[:, None] + np.arange(period * maps.steps)]
     step = np.empty(0)
     # The maps of the atlas are discontinuous between centres, so the last steps fit about the points themselves.
     for images, steps, longest in ((atlas.at, CORRECTIONS, np.inf), (atlas.exactly, EXACT_STEPS, NEARLY)):
@@ -120,22 +130,29 @@ def candidates(maps: ReturnMap, atlas: Atlas, period: int) -> list[MapCycle]:
     return _distinct(maps, chains, step, members)
 
 
+def _for(values: dict[int, float], maps: ReturnMap) -> float:
+    """Return the value for the number of coordinates."""
+    return values[min(len(maps.turn), 3)]
+
+
 def _converge(
     maps: ReturnMap, images: Images, chains: np.ndarray, steps: int, longest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Move chains (m, period, 2); return their last steps and the chains into which they were merged."""
-    noise, heir = float(maps.noise.max()), np.arange(len(chains))
+    noise, heir, converged = float(maps.noise.max()), np.arange(len(chains)), _for(CONVERGED_CORRECTION, maps)
     step, active = np.full(len(chains), np.inf), heir
     for _ in range(steps):
         if active.size == 0:
             break
         moved = chains[active]
-        image, jacobian, bandwidth = images(moved.reshape(-1, 2))
-        chains[active], size = _moved(maps, moved, image.reshape(moved.shape), jacobian.reshape(*moved.shape, 2))
+        phases = np.tile(maps.phases(np.arange(moved.shape[1])), len(moved))
+        image, jacobian, bandwidth = images(moved.reshape(-1, moved.shape[2]), phases)
+        slopes = jacobian.reshape(*moved.shape, moved.shape[2])
+        chains[active], size = _moved(maps, moved, image.reshape(moved.shape), slopes)
         widest = bandwidth.reshape(moved.shape[:2]).max(1)
-        lost = (widest > max(WIDEST_BANDWIDTH, 2.0 * noise)) | ~(size < longest)
+        lost = (widest > max(_for(WIDEST_BANDWIDTH, maps), 2.0 * noise)) | ~(size < longest)
         step[active] = np.where(lost, np.inf, size)
-        active = active[(size > max(0.01 * CONVERGED_CORRECTION, 0.05 * noise)) & ~lost]
+        active = active[(size > max(0.01 * converged, 0.05 * noise)) & ~lost]
         cells = _cells(maps, chains[active], max(MERGED, noise))
         _, first, owner = np.unique(cells, axis=0, return_index=True, return_inverse=True)
         heir[active] = active[first][owner.ravel()]
@@ -155,18 +172,20 @@ def _moved(
 
 
 def _cells(maps: ReturnMap, chains: np.ndarray, size: float) -> np.ndarray:
-    inside = maps.wrap_points(chains.reshape(-1, 2)).reshape(len(chains), 2 * chains.shape[1])
+    count, period, d = (chains := chains[:, :: maps.steps]).shape
+    inside = maps.wrap_points(chains.reshape(-1, d)).reshape(count, period * d)
     return np.floor(inside / size).astype(np.int64)
 
 
 def _close_returns(maps: ReturnMap, period: int) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the first point of the closest return in each cell of chains, and the first points of all in that cell."""
-    section, noise = maps.points, float(maps.noise.max())
-    returning = maps.followed(period)
-    distance = maps.distance(section[returning + period], section[returning])
+    section, noise, steps = maps.points, float(maps.noise.max()), period * maps.steps
+    returning = maps.followed(steps)
+    returning = returning[maps.phases(returning) == 0]
+    distance = maps.distance(section[returning + steps], section[returning])
     near = np.flatnonzero(distance < CLOSE + 2.0 * noise)
     close = returning[near[np.argsort(distance[near], kind="stable")]]
-    cells = _cells(maps, section[close[:, None] + np.arange(period)], max(CELL, noise))
+    cells = _cells(maps, section[close[:, None] + np.arange(steps)], max(CELL, noise))
     _, first, owner, counts = np.unique(cells, axis=0, return_index=True, return_inverse=True, return_counts=True)
     order = np.argsort(owner.ravel(), kind="stable")
     return close[first], np.split(close[order], np.cumsum(counts)[:-1])
@@ -178,11 +197,12 @@ def _distinct(maps: ReturnMap, chains: np.ndarray, step: np.ndarray, members: li
     # Each cycle with the first points and the shift of each of its close returns, (returns, 2).
     groups: list[tuple[np.ndarray, list[np.ndarray]]] = []
     for k in np.argsort(step, kind="stable"):
-        if step[k] > max(CONVERGED_CORRECTION, 0.1 * noise):
+        if step[k] > max(_for(CONVERGED_CORRECTION, maps), 0.1 * noise):
             break
-        if has_shorter_period(chains[k], maps.wrap, tolerance):
+        returns = chains[k, :: maps.steps]
+        if has_shorter_period(returns, maps.wrap, tolerance):
             continue
-        shifts = ((group, *shift_between(chains[k], cycle, maps.wrap)) for cycle, group in groups)
+        shifts = ((group, *shift_between(returns, cycle[:: maps.steps], maps.wrap)) for cycle, group in groups)
         group, shift = next(((group, shift) for group, distance, shift in shifts if distance < tolerance), ([], 0))
         if not group:
             groups.append((maps.wrap(chains[k]), group))
@@ -191,9 +211,9 @@ def _distinct(maps: ReturnMap, chains: np.ndarray, step: np.ndarray, members: li
     for cycle, group in groups:
         steps = np.arange(len(cycle) + 1)
         starts, shifts = np.concatenate(group, axis=1)
-        expected = cycle[(steps + shifts[:, None]) % len(cycle)]
+        expected = cycle[(steps + maps.steps * shifts[:, None]) % len(cycle)]
         closest = int(np.argmin(np.abs(maps.wrap(maps.points[starts[:, None] + steps] - expected)).max((1, 2))))
-        result.append(MapCycle(cycle, len(starts), int(starts[closest]), int(shifts[closest])))
+        result.append(MapCycle(cycle, len(starts), int(starts[closest]) // maps.steps, int(shifts[closest])))
     return result
 
 
@@ -226,7 +246,8 @@ def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple
     cycle, last, refined = points.copy(), np.inf, max(REFINED, REFINED_NOISE * float(maps.noise.max()))
     for step in range(REFINING_STEPS):
         final = last < refined or step == REFINING_STEPS - 1
-        fit = maps.fit_within(cycle, bandwidths, REFINING_DEGREE, influence=final)
+        phases = maps.phases(np.arange(len(cycle)))
+        fit = maps.fit_within(cycle, phases, bandwidths, REFINING_DEGREE, influence=final)
         (moved,), (size,) = _moved(maps, cycle[None], fit.value[None], fit.jacobian[None])
         if not np.isfinite(size) or np.abs(maps.wrap(cycle - points)).max() > 0.1:
             return None
@@ -238,22 +259,25 @@ def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple
 
 
 def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndarray:
-    """Return the bandwidth of each point's neighbourhood, (period,)."""
-    nearest = maps.nearest(points, int(2.25 * neighbours))[0][:, -1] / KERNEL_REACH
+    """Return the bandwidth of each point's neighbourhood, (p,)."""
+    phases = maps.phases(np.arange(len(points)))
+    nearest = maps.nearest(points, phases, int(2.25 * neighbours))[0][:, -1] / KERNEL_REACH
     ladder = np.maximum(nearest, SMALLEST_REFINING * maps.noise.max()) * WIDENED ** np.arange(WIDTHS_TRIED)[:, None]
-    fit = maps.fit_within(points, ladder[0], REFINING_DEGREE)
-    (right, _), (left, _) = _eigenvectors(fit.jacobian)
-    targets, sds = np.empty((2, WIDTHS_TRIED, len(points), 3))
+    fit = maps.fit_within(points, phases, ladder[0], REFINING_DEGREE)
+    (right, *_), (left, *_) = _eigenvectors(fit.jacobian)
+    d = points.shape[1]
+    targets, sds = np.empty((2, WIDTHS_TRIED, len(points), 1 + d))
     active, accepted = np.arange(len(points)), np.zeros(len(points), dtype=int)
     for size, bandwidths in enumerate(ladder):
         if size > 0:
-            active = active[maps.count_within(points[active], bandwidths[active]) <= len(maps.arguments) // 8]
+            counts = maps.count_within(points[active], phases[active], bandwidths[active])
+            active = active[counts <= maps.count // 8]
             if not active.size:
                 break
-            fit = maps.fit_within(points[active], bandwidths[active], REFINING_DEGREE)
-        # The slope along the unstable direction, and the two values of each fit.
+            fit = maps.fit_within(points[active], phases[active], bandwidths[active], REFINING_DEGREE)
+        # The slope along the unstable direction, and the values of each fit.
         slope = np.einsum("pi,pij,pj->p", left[active], fit.jacobian, right[active]).real
-        slopes = np.einsum("pi,pnji,pj->pn", left[active], fit.influence[:, :, 1:3], right[active]).real
+        slopes = np.einsum("pi,pnji,pj->pn", left[active], fit.influence[:, :, 1 : 1 + d], right[active]).real
         targets[size, active] = np.column_stack([slope, fit.value])
         sds[size, active] = np.sqrt(np.column_stack([(slopes**2).sum(1), (fit.influence[:, :, 0] ** 2).sum(1)]))
         away = np.abs(targets[size, active] - targets[:size, active])
@@ -263,7 +287,7 @@ def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndar
 
 
 def _eigenvectors(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return right eigenvectors (2, p, 2) of the monodromy matrix at each point, largest modulus first, and left ones.
+    """Return right eigenvectors (d, p, d) of the monodromy matrix at each point, largest modulus first, and left ones.
 
     The left ones are those at each image.
     """
@@ -281,7 +305,7 @@ def _joint_covariance(maps: ReturnMap, fit: LocalFit) -> np.ndarray:
 
     Consecutive pairs of points share the noise of a point, so errors are summed over runs of consecutive pairs.
     """
-    jacobian, p = fit.jacobian, len(fit.value)
+    jacobian, (p, d) = fit.jacobian, fit.value.shape
     by_value = -np.linalg.inv(_closing_matrix(jacobian[None])[0])
     right, left = _eigenvectors(jacobian)
     slope = np.einsum("kpi,pij,kpj->kp", left, jacobian, right)
@@ -289,12 +313,12 @@ def _joint_covariance(maps: ReturnMap, fit: LocalFit) -> np.ndarray:
     by_point = (np.einsum("kpi,pijl,kpj->kpl", left, fit.hessian, right) / slope[..., None]).real
     rows = []
     for j, influence in enumerate(fit.influence):
-        points = influence[:, 0] @ by_value[:, 2 * j : 2 * j + 2].T
-        slopes = np.einsum("kil,nli->nk", by_slope[:, j], influence[:, 1:3])
-        rows.append(np.concatenate([points, slopes + points @ by_point.reshape(2, -1).T], axis=1))
+        points = influence[:, 0] @ by_value[:, d * j : d * (j + 1)].T
+        slopes = np.einsum("kil,nli->nk", by_slope[:, j], influence[:, 1 : 1 + d])
+        rows.append(np.concatenate([points, slopes + points @ by_point.reshape(d, -1).T], axis=1))
     pairs, owner = np.unique(maps.positions[fit.neighbours.ravel()], return_inverse=True)
     runs = np.concatenate([[0], np.cumsum(np.diff(pairs) > 1)])
-    errors = np.zeros((runs[-1] + 1, 2 * p + 2))
+    errors = np.zeros((runs[-1] + 1, d * (p + 1)))
     np.add.at(errors, runs[owner], np.concatenate(rows))
     return errors.T @ errors
 
@@ -306,27 +330,28 @@ def box_orbits(maps: ReturnMap, period: int, neighbours: int, box: float) -> lis
     recurrent points are a candidate. The nearest points and their images after `period` steps give a linear map, whose
     fixed point and eigenvalues are the orbit's.
     """
-    count = int(2.25 * neighbours)
+    count, phase = int(2.25 * neighbours), np.zeros(1)
     iterates = [_iterated(maps, k) for k in range(1, period + 1)]
     orbits: list[tuple[MapCycle, Estimate]] = []
     for centre, members in _recurrent_boxes(maps, period, box):
-        fit = iterates[-1].fit(centre[None], count, 1)
+        fit = iterates[-1].fit(centre[None], phase, count, 1)
         step = newton_step(maps.wrap(fit.value - centre)[None], fit.jacobian[None])[0, 0]
         if not np.abs(step).max() < FARTHEST * box:
             continue
-        fits = [iterate.fit((centre + step)[None], count, 1) for iterate in iterates]
+        fits = [iterate.fit((centre + step)[None], phase, count, 1) for iterate in iterates]
         points = maps.wrap(np.concatenate([(centre + step)[None], *(f.value for f in fits[:-1])]))
         if has_shorter_period(points, maps.wrap, 2.0 * box):
             continue
         # The covariance of all points follows from that of the first by the linear maps.
-        transfer = np.zeros((2 * period + 2, 4))
-        transfer[: 2 * period, :2] = np.concatenate([np.eye(2), *(f.jacobian[0] for f in fits[:-1])])
-        transfer[-2:, 2:] = np.eye(2)
+        d = centre.size
+        transfer = np.zeros((d * (period + 1), 2 * d))
+        transfer[: d * period, :d] = np.concatenate([np.eye(d), *(f.jacobian[0] for f in fits[:-1])])
+        transfer[-d:, d:] = np.eye(d)
         estimate = Estimate(
             points,
             eigenvalues(fits[-1].jacobian),
             transfer @ _joint_covariance(iterates[-1], fits[-1]) @ transfer.T,
-            np.zeros(2 * period + 2),
+            np.zeros(d * (period + 1)),
             _turns(maps, fits[-1].value[0] - points[0]),
         )
         if any(shift_between(points, other.points, maps.wrap)[0] < 2.0 * box for _, other in orbits):
@@ -337,10 +362,10 @@ def box_orbits(maps: ReturnMap, period: int, neighbours: int, box: float) -> lis
 
 
 def _iterated(maps: ReturnMap, steps: int) -> ReturnMap:
-    single = np.full((len(maps.points) - 1, 2), np.nan)
+    single = np.full((len(maps.points) - 1, maps.points.shape[1]), np.nan)
     single[maps.positions] = maps.increments
     several = np.lib.stride_tricks.sliding_window_view(single, steps, axis=0).sum(axis=-1)
-    return ReturnMap(maps.points, several, maps.turn, maps.winds, np.zeros(2), maps.stretches)
+    return ReturnMap(maps.points, several, maps.turn, maps.winds, np.zeros(len(maps.turn)), maps.stretches)
 
 
 def _recurrent_boxes(maps: ReturnMap, period: int, box: float) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -355,7 +380,7 @@ def _recurrent_boxes(maps: ReturnMap, period: int, box: float) -> list[tuple[np.
     back = returning[step.max(1) <= 1]
     counts = np.zeros(cell.max(axis=0) + 1, dtype=np.int64)
     np.add.at(counts, tuple(cell[back].T), 1)
-    groups, number = label(counts >= FEWEST_RETURNS, structure=np.ones((3, 3)))
+    groups, number = label(counts >= FEWEST_RETURNS, structure=np.ones((3,) * counts.ndim))
     owner = groups[tuple(cell[back].T)]
     result = []
     for group in range(1, number + 1):

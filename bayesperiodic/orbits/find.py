@@ -10,10 +10,19 @@ from scipy.special import chdtrc
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
+from bayesperiodic.orbits.coordinates import channels_of, wrapped
 from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
-from bayesperiodic.orbits.return_map import FEWEST_FOLLOWED, KERNEL_REACH, Atlas, ReturnMap, check_chaos, estimate_noise
-from bayesperiodic.orbits.section import PoincareSection, wrapped
+from bayesperiodic.orbits.return_map import (
+    FEWEST_FOLLOWED,
+    KERNEL_REACH,
+    Atlas,
+    ReturnMap,
+    check_chaos,
+    estimate_noise,
+    prediction_error,
+)
+from bayesperiodic.orbits.section import PoincareSection
 
 SEARCHES = ("chained", "boxes")
 QUALITY_DEGREE, FEWEST_NEIGHBOURS = 3, 32
@@ -23,6 +32,8 @@ SEARCH_WIDTH = 4.0
 LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
+# Delays tried for a coordinate to add, in forcing periods.
+DELAYS_TRIED = (-0.25, -0.5)
 # Standard deviations from which a determinant is impossible.
 IMPOSSIBLE = 3.0
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
@@ -37,6 +48,7 @@ def find_orbits(
     method: str = "chained",
     neighbours: int = 32,
     box: float = 0.01,
+    steps: int = 1,
 ) -> Orbits:
     """Find the unstable periodic orbits in a section of a chaotic motion, without a model.
 
@@ -60,6 +72,10 @@ def find_orbits(
         Smallest effective number of neighbours of a local fit, at least 16.
     box : float
         Size of a box for "boxes", as a fraction of the attractor's size.
+    steps : int
+        Local maps a return for "chained", from one phase of the forcing to the next, if the section is of a recording.
+        A map over a part of the period stretches less and is closer to a polynomial: more orbits are found where one
+        return stretches much, but each map needs the noise of its points to be small against its bandwidth.
 
     Returns
     -------
@@ -71,8 +87,9 @@ def find_orbits(
     Raises
     ------
     ValueError
-        For a section that is periodic, quasi-periodic or shows no return map (the message names which), for an unknown
-        method, and for periods that are not whole numbers.
+        For a section that is periodic, quasi-periodic or shows no return map, because of unknown states (the message
+        names which, and a delayed coordinate to add), for an unknown method, and for periods that are not whole
+        numbers.
 
     Examples
     --------
@@ -85,16 +102,20 @@ def find_orbits(
     _checks.instance("section", section, PoincareSection)
     wanted = _periods(periods, section)
     _checks.one_of("method", method, SEARCHES)
-    neighbours, box = _checks.integer("neighbours", neighbours, 16), _checks.positive("box", box)
-    maps, size = _scaled(section, neighbours)
+    steps, box = _checks.integer("steps", steps, 1), _checks.positive("box", box)
+    neighbours = _checks.integer("neighbours", neighbours, 16)
+    maps, size, prediction = _scaled(section, neighbours)
     if method == "boxes":
         pairs = [pair for p in wanted for pair in cycles.box_orbits(maps, p, neighbours, box)]
     else:
+        if steps > 1:
+            maps = _with_steps(section, maps, size, steps)
         atlas = Atlas(maps, _search_count(maps, neighbours))
         pairs = [pair for p in wanted for pair in _chained(maps, atlas, p, neighbours)]
     quality_count = _search_count(maps, FEWEST_NEIGHBOURS)
     orbits = [_orbit(section, maps, size, *pair, _quality(maps, *pair, quality_count)) for pair in pairs]
-    return Orbits(_finished(orbits, maps, size), values=section.values, method=method)
+    finished = _finished(orbits, maps, size)
+    return Orbits(finished, values=section.values, method=method, prediction_error=prediction)
 
 
 def _periods(periods: Iterable[int], section: PoincareSection) -> list[int]:
@@ -116,28 +137,58 @@ def _periods(periods: Iterable[int], section: PoincareSection) -> list[int]:
     return wanted
 
 
-def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.ndarray]:
-    """Return the return map in units of the attractor's size, and that size (2,)."""
+def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.ndarray, tuple[float, float]]:
+    """Return the return map in units of the attractor's size, that size (d,), and errors of predictions."""
     size = np.ptp(section.points, axis=0)
     if not np.all(size > 0.0):
         raise ValueError(
             "section: must be of a chaotic motion, got one of period 1: a coordinate is equal at all points."
         )
     turn = np.array([2.0 * np.pi if name in section.angles else np.inf for name in section.coordinates]) / size
-    noise = np.zeros(2) if section.noise is None else section.noise / size
+    noise = np.zeros(size.size) if section.noise is None else section.noise / size
     maps = ReturnMap(section.points / size, section.increments / size, turn, section.winds, noise, section.stretches)
-    check_chaos(maps)
+    prediction = check_chaos(maps, lambda: _remedy(section, maps))
     if section.noise is None:
         maps.noise = estimate_noise(maps, neighbours)
-    return maps, size
+    return maps, size, prediction
+
+
+def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
+    """Return which delayed coordinate would let local maps predict best, in the units of the maps."""
+    errors = {}
+    for channel in channels_of(section.coordinates):
+        for name in (f"{channel}[{delay}]" for delay in DELAYS_TRIED):
+            values = (
+                section.delayed(name) if channel not in section.angles and name not in section.coordinates else None
+            )
+            if values is not None:
+                values = values[:, None] / np.ptp(values)
+                increments = np.where(np.isfinite(section.increments[:, :1]), np.diff(values, axis=0), np.nan)
+                more = ReturnMap(
+                    np.hstack([maps.points, values]), np.hstack([section.increments / np.ptp(section.points, axis=0),
+                    increments]), np.append(maps.turn, np.inf), maps.winds, np.append(maps.noise, 0.0), maps.stretches,
+                )  # fmt: skip
+                errors[name] = prediction_error(more)[0]
+    if not errors:
+        return "another output"
+    best = min(errors, key=errors.__getitem__)
+    return f"another output or a delayed one, with {best!r} errors are {errors[best]:.1%}"
+
+
+def _with_steps(section: PoincareSection, maps: ReturnMap, size: np.ndarray, steps: int) -> ReturnMap:
+    """Return the return map in several steps a return, in the same units."""
+    points, increments, noise = section.between(steps)
+    stretches = np.repeat(maps.stretches, steps)
+    return ReturnMap(points / size, increments / size, maps.turn, maps.winds, noise / size, stretches, steps)
 
 
 def _search_count(maps: ReturnMap, neighbours: int) -> int:
     """Return the neighbours of a local fit in the search: enough for a bandwidth well above the noise."""
     centres = maps.arguments[:: max(1, len(maps.arguments) // 500)]
     count = int(2.25 * neighbours)
-    while count < len(maps.arguments) // 100:
-        if np.median(maps.nearest(centres, count)[0][:, -1]) / KERNEL_REACH > SEARCH_WIDTH * maps.noise.max():
+    phases = maps.phases(maps.positions[:: max(1, len(maps.arguments) // 500)])
+    while count < maps.count // 100:
+        if np.median(maps.nearest(centres, phases, count)[0][:, -1]) / KERNEL_REACH > SEARCH_WIDTH * maps.noise.max():
             break
         count = int(1.5 * count)
     return count
@@ -147,14 +198,15 @@ def _chained(maps: ReturnMap, atlas: Atlas, period: int, neighbours: int) -> lis
     pairs: list[tuple[MapCycle, Estimate]] = []
 
     def same(one: Estimate, other: Estimate) -> bool:
-        distance, _ = cycles.shift_between(one.points, other.points, maps.wrap)
+        distance, _ = cycles.shift_between(one.points[:: maps.steps], other.points[:: maps.steps], maps.wrap)
         return distance < max(1e-3, 2.0 * max(_largest_sd(one), _largest_sd(other)))
 
     for candidate in cycles.candidates(maps, atlas, period):
         estimate = cycles.refine(maps, candidate.points, neighbours)
         if estimate is None or not (sd := _largest_sd(estimate)) < LARGEST_SD:
             continue
-        repeats = cycles.has_shorter_period(estimate.points, maps.wrap, max(2e-3, 3.0 * sd))
+        returns = estimate.points[:: maps.steps]
+        repeats = cycles.has_shorter_period(returns, maps.wrap, max(2e-3, 3.0 * sd))
         if not repeats and not any(same(estimate, other) for _, other in pairs):
             pairs.append((candidate, estimate))
     return pairs
@@ -167,18 +219,19 @@ def _largest_sd(estimate: Estimate) -> float:
 def _orbit(
     section: PoincareSection, maps: ReturnMap, size: np.ndarray, candidate: MapCycle, estimate: Estimate, quality: float
 ) -> Orbit:
-    period = len(estimate.points)
+    count, d = estimate.points.shape
+    period = count // maps.steps
     # The orbit starts at the point that belongs to the start of the measured cycle.
-    order = (np.arange(period) + candidate.shift) % period
-    index = np.concatenate([(2 * order[:, None] + np.arange(2)).ravel(), 2 * period + np.arange(2)])
+    order = maps.steps * ((np.arange(period) + candidate.shift) % period)
+    index = np.concatenate([(d * order[:, None] + np.arange(d)).ravel(), d * count + np.arange(d)])
     points = wrapped(estimate.points[order] * size, maps.angle)
-    units = np.concatenate([np.tile(size, period), np.ones(2)])
+    units = np.concatenate([np.tile(size, period), np.ones(d)])
     bias = estimate.bias[index] * units
     covariance = estimate.covariance[np.ix_(index, index)] * np.outer(units, units)
     sd = np.sqrt(np.diag(covariance))
     covariance += np.outer(bias, bias)
-    remark = _remark(estimate.eigenvalues, covariance[-2:, -2:])
-    for k in (-2, -1):
+    remark = _remark(estimate.eigenvalues, covariance[-d:, -d:])
+    for k in range(-d, 0):
         if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
@@ -189,12 +242,13 @@ def _orbit(
             values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
         # It moves no more than by noise and its distance to the orbit.
         extent = np.ptp(section.signals, axis=0)
-        limit = (STILL_RANGE + STILL_NOISE * maps.noise) * np.where(maps.angle, np.minimum(extent, 2.0 * np.pi), extent)
+        extent = np.where(np.isin(list(cycle), section.angles), np.minimum(extent, 2.0 * np.pi), extent)
+        limit = (STILL_RANGE + STILL_NOISE * maps.noise.max()) * extent
         still = bool(np.all(np.ptp(np.stack(list(cycle.values())), axis=1) < limit))
     return Orbit(
         name="", coordinates=section.coordinates, angles=section.angles, frequency=section.frequency, period=period,
         winding=round(estimate.turns) if section.winds else None, points=points, joint_covariance=covariance,
-        eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[-2:], returns=candidate.returns, quality=quality,
+        eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[-d:], returns=candidate.returns, quality=quality,
         cycle=cycle, equilibrium=still, synthetic=section.synthetic, remark=remark,
     )  # fmt: skip
 
@@ -211,18 +265,19 @@ def _remark(eigenvalues: np.ndarray, covariance: np.ndarray) -> str:
 
 def _quality(maps: ReturnMap, candidate: MapCycle, estimate: Estimate, neighbours: int) -> float:
     """Return the p-value of the closest return under the maps along the orbit."""
-    period = len(estimate.points)
-    steps = np.arange(period + 1)
-    away = maps.wrap(maps.points[candidate.closest + steps] - estimate.points[(steps + candidate.shift) % period])
+    steps = np.arange(len(estimate.points) + 1)
+    points = np.roll(estimate.points, -maps.steps * candidate.shift, axis=0)
+    away = maps.wrap(maps.points[maps.steps * candidate.closest + steps] - points[steps % len(points)])
     statistic = 0.0
-    for point, here, there in zip(np.roll(estimate.points, -candidate.shift, 0), away[:-1], away[1:], strict=True):
+    for phase, point, here, there in zip(maps.phases(steps[:-1])[:, None], points, away[:-1], away[1:], strict=True):
         count = neighbours
-        while maps.nearest(point[None], count)[0][0, -1] < 1.5 * np.abs(here).max() and 4 * count < len(maps.arguments):
+        reach = 1.5 * np.abs(here).max()
+        while maps.nearest(point[None], phase, count)[0][0, -1] < reach and 4 * count < maps.count:
             count *= 2
-        fit = maps.fit(point[None], count, QUALITY_DEGREE, influence=False)
+        fit = maps.fit(point[None], phase, count, QUALITY_DEGREE, influence=False)
         residual = maps.wrap(there - (maps.predict(fit, here[None])[0] - fit.value[0]))
         statistic += float(np.sum(residual**2 / maps.residual_variance(point[None], fit)[0]))
-    return float(chdtrc(2 * period, statistic))
+    return float(chdtrc(estimate.points.size, statistic))
 
 
 def _finished(orbits: list[Orbit], maps: ReturnMap, size: np.ndarray) -> tuple[Orbit, ...]:
@@ -230,7 +285,7 @@ def _finished(orbits: list[Orbit], maps: ReturnMap, size: np.ndarray) -> tuple[O
     result: list[Orbit] = []
     counts: Counter[tuple[int, int | None]] = Counter()
     points = [orbit.points / size for orbit in orbits]
-    sds = [np.sqrt(np.diag(o.covariance).reshape(-1, 2).max(0) / size**2).max() for o in orbits]
+    sds = [np.sqrt(np.diag(o.covariance).reshape(o.points.shape).max(0) / size**2).max() for o in orbits]
     for number, orbit in enumerate(orbits):
         away = {
             k: cycles.shift_between(points[number], -points[k], maps.wrap)[0]

@@ -12,6 +12,7 @@ import numpy as np
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.orbits.coordinates import channel_and_delay
 from bayesperiodic.periodic.solution import PeriodicSolution
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ MOST_BIAS = 0.5
 TURN = 2.0 * np.pi
 _COLUMNS = (
     "name", "period", "winding", "returns", "quality", "multiplier", "multiplier_sd", "contraction", "contraction_sd",
-    "estimated", "modulus", "sd_first", "sd_second", "partner", "equilibrium", "remark", "rejected",
+    "estimated", "modulus", "partner", "equilibrium", "remark", "rejected",
 )  # fmt: skip
 
 
@@ -37,20 +38,21 @@ class Orbit(Result):
     name : str
         Unique among the orbits of a section, such as ``"period 3, winding 1, orbit 2"``.
     coordinates, angles : tuple of str
-        The section's two coordinates, which are outputs of the model, and those of them that are angles.
+        The section's d coordinates, and those of them that are angles. Their channels are outputs of the model;
+        delayed ones are written as in `PoincareSection`.
     frequency : float
         Of the forcing [Hz].
     period : int
         Prime period in forcing periods.
     winding : int or None
         Turns of the angle per response period, 0 without an angle; None if the section does not determine it.
-    points : array (period, 2)
+    points : array (period, d)
         Section values at tau = 0, 1, …, angles in (−π, π].
-    joint_covariance : array (2·period + 2, 2·period + 2)
+    joint_covariance : array (d·period + d, d·period + d)
         Of the points, point by point, and of log|eigenvalue|, largest first; NaN where not estimated.
-    eigenvalues, eigenvalue_bias : array (2,)
+    eigenvalues, eigenvalue_bias : array (d,)
         Of the linearised return map over the period, largest modulus first, real or complex, and the estimated bias of
-        log|eigenvalue|, which is not subtracted.
+        log|eigenvalue|, which is not subtracted. With more coordinates than states, the last ones belong to no state.
     returns : int
         Number of measured close returns.
     quality : float
@@ -58,7 +60,7 @@ class Orbit(Result):
     partner : int or None
         Position of the orbit with all signs changed among the orbits; its own if it is symmetric.
     cycle : mapping of str to array (samples·period,) or None
-        The closest measured cycle by coordinate, angles continuous; None for a section of points alone.
+        The closest measured cycle by channel, angles continuous; None for a section of points alone.
     solution : PeriodicSolution or None
         The model's orbit, from `polish_orbits`.
     equilibrium : bool
@@ -67,7 +69,7 @@ class Orbit(Result):
         True if the data were simulated.
     remark : str
         What is impossible, by three standard deviations and the estimated bias, about the determinant of the linearised
-        return map: that of a flow is positive, with damping everywhere it is below one. Another one means that the two
+        return map: that of a flow is positive, with damping everywhere it is below one. Another one means that the
         coordinates do not determine the next point, or that there is no such orbit. Empty otherwise, also where the
         error is too large to tell, as is frequent for strong contraction.
 
@@ -82,7 +84,7 @@ class Orbit(Result):
     """
 
     name: str
-    coordinates: tuple[str, str]
+    coordinates: tuple[str, ...]
     angles: tuple[str, ...]
     frequency: float
     period: int
@@ -111,14 +113,24 @@ class Orbit(Result):
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance of the points, (2·period, 2·period), point by point."""
+        """Covariance of the points, (d·period, d·period), point by point."""
         size = self.points.size
         return self.joint_covariance[:size, :size]
 
     @property
     def eigenvalue_sd(self) -> np.ndarray:
-        """Standard deviations of the eigenvalues' moduli, (2,); NaN where not estimated."""
+        """Standard deviations of the eigenvalues' moduli, (d,); NaN where not estimated."""
         return np.abs(self.eigenvalues) * np.sqrt(np.diag(self.joint_covariance)[self.points.size :])
+
+    @property
+    def _undelayed(self) -> tuple[list[str], np.ndarray]:
+        """The coordinates without delay, and whether each coordinate is one of them (d,)."""
+        present = np.array([name == channel_and_delay(name)[0] for name in self.coordinates])
+        if not present.any():
+            raise ValueError(
+                f"coordinates: must have one without delay, got {self.coordinates}. Add one to those of the section."
+            )
+        return [name for name, kept in zip(self.coordinates, present, strict=True) if kept], present
 
     def experiment(
         self,
@@ -131,6 +143,7 @@ class Orbit(Result):
         """Return the orbit as an experiment: its section points at tau = 0, 1, …, as in de Kraker et al. (1997).
 
         Their covariance is known up to one factor, the noise parameter "scale", common to all orbits of a problem.
+        Delayed coordinates are left out, because all outputs of an experiment are compared at the same tau.
 
         Parameters
         ----------
@@ -154,7 +167,8 @@ class Orbit(Result):
         Raises
         ------
         ValueError
-            If the orbit is not polished and `states` or the winding are not known, if `whole` or `states` are given and
+            If all coordinates are delayed, if the orbit is not polished and `states` or the winding are not known, if
+            `whole` or `states` are given and
             there is no measured cycle, or if `samples` is not a multiple of the cycle's.
 
         Warns
@@ -167,8 +181,11 @@ class Orbit(Result):
         if winding is None:
             raise ValueError(f"winding: must be known, got None for {self.name!r}. Use polish_orbits first.")
         points = samples * self.period
-        measured = _measured_cycle(self, samples) if whole else dict(zip(self.coordinates, self.points.T, strict=True))
-        mask = np.arange(points) % (points // len(measured[self.coordinates[0]])) == 0
+        used, present = self._undelayed
+        here = dict(zip(used, self.points[:, present].T, strict=True))
+        measured = _measured_cycle(self, samples) if whole else here
+        mask = np.arange(points) % (points // len(next(iter(measured.values())))) == 0
+        rows = np.flatnonzero(np.tile(present, self.period))
         outputs = {name: np.zeros(points) for name in measured}
         for name, values in measured.items():
             outputs[name][mask] = values
@@ -182,7 +199,7 @@ class Orbit(Result):
             periods=self.period,
             winding=winding if self.solution is None else self.solution.winding,
             mask=mask,
-            covariance=None if whole else self.covariance,
+            covariance=None if whole else self.joint_covariance[np.ix_(rows, rows)],
             guess=_guess(self, samples, winding, states),
             synthetic=self.synthetic,
         )
@@ -202,6 +219,10 @@ class Orbits(Result):
         Number of values in the recording or section from which they were found.
     method : str
         "chained" or "boxes", see `find_orbits`.
+    prediction_error : tuple of two float
+        Median error with which local maps predict the next point, and the part that known noise explains, as fractions
+        of the distance of random points. An error well above the noise means that there are states that the
+        coordinates do not determine, or too few points; compare sections with other coordinates.
 
     Examples
     --------
@@ -220,20 +241,23 @@ class Orbits(Result):
     rejected: tuple[tuple[Orbit, str], ...] = field(default=())
     values: int = 0
     method: str = ""
+    prediction_error: tuple[float, float] = (np.nan, np.nan)
 
     @property
     def table(self) -> pd.DataFrame:
         """One row per orbit, followed by the rejected candidates with the reason in the column ``rejected``.
 
-        `winding` is missing if unknown; `multiplier` and `contraction` are the two eigenvalues, whose standard
-        deviations are NaN if not estimated; `sd_first` and `sd_second` are the largest standard deviations of a point
-        in the two coordinates; `remark` says which determinants are impossible (see `Orbit`).
+        `winding` is missing if unknown; `multiplier` and `contraction` are the two largest eigenvalues, whose standard
+        deviations are NaN if not estimated; `remark` says which determinants are impossible (see `Orbit`);
+        ``sd[angle]`` is the largest standard deviation of a point in the coordinate angle.
         """
         import pandas as pd
 
         names = [orbit.name for orbit in self.orbits]
         rows = [_row(orbit, names, reason) for orbit, reason in (*((o, "") for o in self.orbits), *self.rejected)]
-        return pd.DataFrame(rows, columns=list(_COLUMNS)).astype({"winding": "Int64"})
+        some = [*self.orbits[:1], *(orbit for orbit, _ in self.rejected[:1])]
+        columns = [*_COLUMNS, *(f"sd[{name}]" for name in (some[0].coordinates if some else ()))]
+        return pd.DataFrame(rows, columns=columns).astype({"winding": "Int64"})
 
     def __repr__(self) -> str:
         if not self.orbits:
@@ -264,13 +288,13 @@ def counted_turns(orbit: Orbit) -> int | None:
 
 
 def resampled_cycle(orbit: Orbit, winding: int, samples: int) -> np.ndarray:
-    """Return the measured cycle (samples·period, 2) on another grid, closed, with its significant harmonics only.
+    """Return the measured cycle (samples·period, channels) on another grid, closed, with significant harmonics only.
 
     The gap between its end and its start is distributed over the cycle.
     """
     assert orbit.cycle is not None
     tau, columns = np.arange(samples * orbit.period) / samples, []
-    for name in orbit.coordinates:
+    for name in orbit.cycle:
         values = np.asarray(orbit.cycle[name], dtype=float)
         turns = TURN * winding if name in orbit.angles else 0.0
         gap = _end(values) - values[0] - turns
@@ -293,7 +317,7 @@ def _on_grid(values: np.ndarray, points: int) -> np.ndarray:
 def _measured_cycle(orbit: Orbit, samples: int) -> Mapping[str, np.ndarray]:
     if orbit.cycle is None:
         raise ValueError(f"whole: must be False, got True; {orbit.name!r} has no measured cycle.")
-    measured = len(orbit.cycle[orbit.coordinates[0]]) // orbit.period
+    measured = len(next(iter(orbit.cycle.values()))) // orbit.period
     if samples % measured:
         raise ValueError(f"samples: must be a multiple of the cycle's {measured} a forcing period, got {samples}.")
     return orbit.cycle
@@ -308,8 +332,9 @@ def _guess(orbit: Orbit, samples: int, winding: int, states: Mapping[str, str] |
             )
         cycle = resampled_cycle(orbit, winding, samples)
         for name in states.values():
-            _checks.one_of("states", name, orbit.coordinates)
-        return {state: cycle[:, orbit.coordinates.index(name)] for state, name in states.items()}
+            _checks.one_of("states", name, orbit.cycle)
+        channels = list(orbit.cycle)
+        return {state: cycle[:, channels.index(name)] for state, name in states.items()}
     if orbit.solution is None:
         raise ValueError(
             f"states: must name the coordinate that measures each state, such as {{'phi': 'angle'}}, got None; "
@@ -343,17 +368,18 @@ def _with_multipliers(orbit: Orbit, experiment: Experiment) -> Experiment:
     values = orbit.eigenvalues[kept].real
     if experiment.covariance is None:
         return replace(experiment, multipliers=values, multiplier_sd=sd[kept])
-    rows = np.concatenate([np.arange(size), size + kept])
+    points = np.flatnonzero(np.tile(orbit._undelayed[1], orbit.period))
+    rows = np.concatenate([points, size + kept])
     return replace(experiment, multipliers=values, covariance=orbit.joint_covariance[np.ix_(rows, rows)])
 
 
 def _row(orbit: Orbit, names: list[str], reason: str) -> tuple[Any, ...]:
-    sds = np.sqrt(np.diag(orbit.covariance)).reshape(-1, 2).max(axis=0)
-    multiplier, contraction = (value.real if np.isreal(value) else value for value in orbit.eigenvalues)
+    sds = np.sqrt(np.diag(orbit.covariance)).reshape(orbit.points.shape).max(axis=0)
+    multiplier, contraction = (value.real if np.isreal(value) else value for value in orbit.eigenvalues[:2])
     partner = "" if orbit.partner is None or orbit.partner >= len(names) else names[orbit.partner]
-    multiplier_sd, contraction_sd = orbit.eigenvalue_sd
+    multiplier_sd, contraction_sd = orbit.eigenvalue_sd[:2]
     return (
         orbit.name, orbit.period, orbit.winding, orbit.returns, orbit.quality, multiplier, multiplier_sd, contraction,
-        contraction_sd, bool(np.isfinite(multiplier_sd)), float(abs(orbit.eigenvalues[0])), *sds, partner,
-        orbit.equilibrium, orbit.remark, reason,
+        contraction_sd, bool(np.isfinite(multiplier_sd)), float(abs(orbit.eigenvalues[0])), partner,
+        orbit.equilibrium, orbit.remark, reason, *sds,
     )  # fmt: skip

@@ -9,9 +9,9 @@ import numpy as np
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.models.model import Model
+from bayesperiodic.orbits.coordinates import channel_and_delay, wrapped
 from bayesperiodic.orbits.cycles import shift_between
 from bayesperiodic.orbits.orbit import TURN, Orbit, Orbits, counted_turns, resampled_cycle
-from bayesperiodic.orbits.section import wrapped
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme
@@ -76,7 +76,8 @@ def polish_orbits(
     Raises
     ------
     ValueError
-        As for `solve_periodic`, and for an autonomous model or coordinates that do not determine the model's states.
+        As for `solve_periodic`, and for an autonomous model, delayed coordinates, or coordinates that do not determine
+        the model's states.
 
     Examples
     --------
@@ -143,6 +144,11 @@ class _Polisher:
             _checks.positive(f"parameter_sd[{name!r}]", sd)
         PeriodicEquations.build(model, inputs, frequency=1.0, samples=samples, scheme=scheme)
         for orbit in orbits:
+            if any(channel_and_delay(name)[0] != name for name in orbit.coordinates):
+                raise ValueError(
+                    f"orbits: must be of a section without delayed coordinates, got {orbit.coordinates}. Use the "
+                    "experiments of the orbits, orbit.experiment(states=…), in a Problem."
+                )
             for name in orbit.coordinates:
                 _checks.one_of("coordinates", name, model.outputs)
             if (orbit.coordinates, orbit.angles) != (orbits[0].coordinates, orbits[0].angles):
@@ -226,9 +232,9 @@ class _Polisher:
         repeats = orbit.points.reshape(times, period, coordinates)
         mean = repeats[0] + wrapped(repeats - repeats[0], self.angles).mean(axis=0)
         size = orbit.points.size
-        average = np.zeros((mean.size + 2, size + 2))
+        average = np.zeros((mean.size + coordinates, size + coordinates))
         average[: mean.size, :size] = np.tile(np.eye(mean.size), times) / times
-        average[mean.size :, size:] = np.eye(2) / times
+        average[mean.size :, size:] = np.eye(coordinates) / times
         unknown = np.isnan(orbit.joint_covariance)
         covariance = average @ np.where(unknown, 0.0, orbit.joint_covariance) @ average.T
         moduli = np.abs(orbit.eigenvalues) ** (1.0 / times)
@@ -419,7 +425,7 @@ def select_orbits(
 
 
 def _slopes(orbit: Orbit, solution: PeriodicSolution, parameter: str) -> np.ndarray:
-    """Return the derivatives of the section points by a parameter, (period, 2)."""
+    """Return the derivatives of the section points by a parameter, (period, d)."""
     columns = [solution.sensitivities[name][parameter][:: solution.samples] for name in orbit.coordinates]
     return np.stack(columns, axis=-1)
 

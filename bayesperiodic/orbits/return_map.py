@@ -3,15 +3,16 @@
 All coordinates are in units of the attractor's size.
 """
 
+from collections.abc import Callable
+from functools import cache
+from itertools import combinations_with_replacement
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import factorial
 
-# Powers of the two coordinates, degree by degree, and the factorials that make the coefficients derivatives.
-MONOMIAL_POWERS = np.array([(degree - k, k) for degree in range(7) for k in range(degree + 1)])
-FACTORIALS = np.array([1.0, 1.0, 1.0, 2.0, 1.0, 2.0, 6.0, 2.0, 2.0, 6.0])
-TERMS = {1: 3, 2: 6, 3: 10, 4: 15, 6: 28}
 # Fewest neighbours of a fit of given bandwidth.
 FEWEST_FITTED = 30
 # Neighbours are used up to this many bandwidths, where the kernel is 1.1 % of its maximum.
@@ -19,35 +20,56 @@ KERNEL_REACH = 3.0
 # Largest noise as a fraction of the bandwidth; deconvolution needs less than one.
 MOST_NOISE = 0.75
 MOST_LEVERAGE = 0.9
+# Prior standard deviation of slopes, and the distance over which a slope changes by it, in more than two coordinates:
+# there the attractor is thin in some directions, and does not determine all coefficients.
+STEEPEST_SLOPE, CURVATURE_LENGTH = 10.0, 0.1
+# Largest distance from the nearest centre of an atlas, in bandwidths, with two coordinates and with more.
+FARTHEST_FROM_CENTRE = {2: 1.0, 3: 2.0}
+# Distance of two phases in a search tree, in units of the attractor's size.
+APART = 1e3
 # Limits of memory: products of regressors in one call, neighbours of all fits of an atlas.
 MOST_PRODUCTS, MOST_NEIGHBOURS = 4_000_000, 6_000_000
 
 
-class LocalFit(NamedTuple):
-    """Polynomials of the return map about m centres."""
+@cache
+def monomials(coordinates: int, degree: int) -> np.ndarray:
+    """Return the powers (terms, coordinates) of all monomials up to a degree, such as 1, u, v, uu, uv, vv."""
+    factors = (one for n in range(degree + 1) for one in combinations_with_replacement(range(coordinates), n))
+    return np.array([np.bincount(np.array(one, dtype=int), minlength=coordinates) for one in factors])
 
-    value: np.ndarray  # image of the centre, angles continuous from the centre, (m, 2)
-    derivatives: np.ndarray  # of the image by the argument: order 0 (relative), u, v, uu, uv, vv, …, (m, terms, 2)
+
+class LocalFit(NamedTuple):
+    """Polynomials of the return map about m centres, in d coordinates."""
+
+    value: np.ndarray  # image of the centre, angles continuous from the centre, (m, d)
+    derivatives: np.ndarray  # of the image by the argument: order 0 (relative), u, v, …, uu, uv, …, (m, terms, d)
     bandwidth: np.ndarray  # (m,)
     neighbours: np.ndarray  # positions among the arguments, (m, n)
-    influence: np.ndarray  # contribution of each neighbour to the error of `derivatives`, (m, n, terms, 2)
+    influence: np.ndarray  # contribution of each neighbour to the error of `derivatives`, (m, n, terms, d)
     effective: np.ndarray  # effective number of neighbours, (m,)
 
     @property
     def jacobian(self) -> np.ndarray:
         """Derivatives of the image by the argument, (m, image, argument)."""
-        return self.derivatives[:, 1:3].transpose(0, 2, 1)
+        return self.derivatives[:, 1 : 1 + self.value.shape[1]].transpose(0, 2, 1)
 
     @property
     def hessian(self) -> np.ndarray:
         """Second derivatives (m, image, argument, argument); zero for linear fits."""
-        if self.derivatives.shape[1] <= 3:
-            return np.zeros((len(self.derivatives), 2, 2, 2))
-        return np.ascontiguousarray(self.derivatives[:, [[3, 4], [4, 5]]].transpose(0, 3, 1, 2))
+        m, terms, d = self.derivatives.shape
+        if terms <= 1 + d:
+            return np.zeros((m, d, d, d))
+        one, other = np.triu_indices(d)
+        place = np.empty((d, d), dtype=int)
+        place[one, other] = place[other, one] = 1 + d + np.arange(one.size)
+        return np.ascontiguousarray(self.derivatives[:, place].transpose(0, 3, 1, 2))
 
 
 class ReturnMap:
     """The return map of a section, fitted locally on request.
+
+    It may consist of several steps a return, each from one phase to the next: a map that stretches less is closer to a
+    polynomial. Position n belongs to the phase n modulo the number of steps.
 
     Neighbours are weighted by a Gaussian kernel. The normal equations are sums of the kernel times powers of noise-free
     arguments. For normal noise in the arguments, of known variance below the kernel's, there are functions of the noisy
@@ -58,28 +80,38 @@ class ReturnMap:
 
     def __init__(
         self, points: np.ndarray, increments: np.ndarray, turn: np.ndarray, winds: bool, noise: np.ndarray,
-        stretches: np.ndarray | None = None,
+        stretches: np.ndarray | None = None, steps: int = 1,
     ):  # fmt: skip
-        self.points = points  # in the order of time, (count, 2)
+        self.steps = steps
+        self.points = points  # in the order of time, (count, d)
         # Number of each point's unbroken stretch, (count,).
         self.stretches = np.zeros(len(points), dtype=np.int64) if stretches is None else stretches
         # Images are unknown where increments are NaN or missing at the end.
         self.positions = np.flatnonzero(np.isfinite(increments).all(axis=1))  # of points with a known image, (n,)
-        self.arguments = points[self.positions]  # points with a known image, (n, 2)
-        self.increments = increments[self.positions]  # image minus argument, (n, 2)
-        self.turn = turn  # one turn in these units; infinite for coordinates that are not angles, (2,)
+        self.arguments = points[self.positions]  # points with a known image, (n, d)
+        self.increments = increments[self.positions]  # image minus argument, (n, d)
+        self.turn = turn  # one turn in these units; infinite for coordinates that are not angles, (d,)
         self.winds = winds  # whether the increments of angles include whole turns
-        self.noise = noise  # standard deviation of the arguments, (2,)
+        self.noise = noise  # standard deviation of the arguments, (d,)
         self.angle = np.isfinite(turn)
-        self._tree = self.tree(self.arguments)
+        self.count = len(self.arguments) // steps  # of points of each phase
+        self._tree = self.tree(self.arguments, self.phases(self.positions))
 
     def followed(self, steps: int) -> np.ndarray:
         """Return the positions of the points whose stretch contains the point `steps` later."""
         return np.flatnonzero(self.stretches[steps:] == self.stretches[:-steps])
 
-    def tree(self, points: np.ndarray) -> cKDTree:
-        """Return a search tree of points, periodic in the angles."""
-        return cKDTree(self.wrap_points(points), boxsize=np.where(self.angle, self.turn, 0.0))
+    def phases(self, positions: np.ndarray) -> np.ndarray:
+        """Return the phases (n,) of the points at these positions (n,)."""
+        return positions % self.steps
+
+    def tree(self, points: np.ndarray, phases: np.ndarray) -> cKDTree:
+        """Return a search tree of points (n, d) at phases (n,), periodic in the angles."""
+        return cKDTree(self.places(points, phases), boxsize=np.append(np.where(self.angle, self.turn, 0.0), 0.0))
+
+    def places(self, points: np.ndarray, phases: np.ndarray) -> np.ndarray:
+        """Return points (n, d) at phases (n,) as they are in a search tree, (n, d + 1)."""
+        return np.column_stack([self.wrap_points(points), APART * phases])
 
     def wrap_points(self, points: np.ndarray) -> np.ndarray:
         """Return points with angles in [0, turn)."""
@@ -88,61 +120,71 @@ class ReturnMap:
         return np.where(self.angle, np.where(inside >= self.turn, 0.0, inside), points)
 
     def wrap(self, difference: np.ndarray) -> np.ndarray:
-        """Return differences (…, 2) with angles in half a turn either way."""
+        """Return differences (…, d) with angles in half a turn either way."""
         turn = np.where(self.angle, self.turn, 1.0)
         return np.where(self.angle, difference - turn * np.round(difference / turn), difference)
 
     def distance(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """Return the largest coordinate differences (n,) of points (n, 2)."""
+        """Return the largest coordinate differences (n,) of points (n, d)."""
         return np.abs(self.wrap(one - other)).max(axis=1)
 
-    def nearest(self, centres: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def nearest(self, centres: np.ndarray, phases: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return distances and positions of the nearest arguments, (m, count) each."""
-        distance, index = self._tree.query(self.wrap_points(centres), np.arange(1, count + 1))
+        distance, index = self._tree.query(self.places(centres, phases), np.arange(1, min(count, self.count) + 1))
         return np.asarray(distance), np.asarray(index)
 
-    def count_within(self, centres: np.ndarray, bandwidths: np.ndarray) -> np.ndarray:
-        """Return the number of neighbours (m,) of fits about the centres (m, 2) with the bandwidths (m,)."""
+    def count_within(self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray) -> np.ndarray:
+        """Return the number of neighbours (m,) of fits about the centres (m, d) with the bandwidths (m,)."""
         radii = KERNEL_REACH * bandwidths
-        return np.asarray(self._tree.query_ball_point(self.wrap_points(centres), radii, return_length=True))
+        return np.asarray(self._tree.query_ball_point(self.places(centres, phases), radii, return_length=True))
 
-    def fit(self, centres: np.ndarray, count: int, degree: int, *, influence: bool = True) -> LocalFit:
-        """Fit polynomials about the centres (m, 2) to their `count` nearest neighbours; faster without `influence`."""
-        parts, size = [], max(1, MOST_PRODUCTS // (count * TERMS[2 * degree]))
-        for block in (centres[k : k + size] for k in range(0, len(centres), size)):
-            distance, index = self.nearest(block, count)
-            parts.append(self._fit(block, distance[:, -1] / KERNEL_REACH, index, np.array([True]), degree, influence))
+    def fit(
+        self, centres: np.ndarray, phases: np.ndarray, count: int, degree: int, *, influence: bool = True,
+        shrunk: bool = False,
+    ) -> LocalFit:  # fmt: skip
+        """Fit polynomials about the centres (m, d) to their `count` nearest neighbours; faster without `influence`.
+
+        With more than two coordinates, `shrunk` reduces coefficients that the neighbours do not determine.
+        """
+        parts, size = [], max(1, MOST_PRODUCTS // (count * comb(len(self.turn) + 2 * degree, 2 * degree)))
+        for k in range(0, len(centres), size):
+            block = centres[k : k + size]
+            distance, index = self.nearest(block, phases[k : k + size], count)
+            bandwidths = distance[:, -1] / KERNEL_REACH
+            parts.append(self._fit(block, bandwidths, index, np.array([True]), degree, influence, shrunk))
         return LocalFit(*map(np.concatenate, zip(*parts, strict=True)))
 
     def fit_within(
-        self, centres: np.ndarray, bandwidths: np.ndarray, degree: int, *, influence: bool = True
+        self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray, degree: int, *, influence: bool = True
     ) -> LocalFit:
-        """Fit polynomials about the centres (m, 2) with the bandwidths (m,), or larger ones where points are few.
+        """Fit polynomials about the centres (m, d) with the bandwidths (m,), or larger ones where points are few.
 
         The neighbours are repeated to equal numbers, without influence.
         """
-        distance, nearest = self.nearest(centres, FEWEST_FITTED)
+        fewest = max(FEWEST_FITTED, comb(len(self.turn) + degree, degree) * 3 // 2)
+        distance, nearest = self.nearest(centres, phases, fewest)
         bandwidths = np.maximum(bandwidths, distance[:, -1] / KERNEL_REACH)
-        near = self._tree.query_ball_point(self.wrap_points(centres), KERNEL_REACH * bandwidths)
+        near = self._tree.query_ball_point(self.places(centres, phases), KERNEL_REACH * bandwidths)
         counts = np.array([len(members) for members in near])[:, None]
         position = np.arange(counts.max() + 1)
         # The nearest comes first, and again in its place.
         inside = (position > 0) & (position <= counts)
         index = np.repeat(nearest[:, :1], len(position), axis=1)
         index[inside] = np.concatenate(near)
-        return self._fit(centres, bandwidths, index, inside, degree, influence)
+        return self._fit(centres, bandwidths, index, inside, degree, influence, shrunk=True)
 
     @staticmethod
     def predict(fit: LocalFit, away: np.ndarray) -> np.ndarray:
-        """Return images (m, …, 2) at displacements (m, …, 2) from the centres."""
-        terms = fit.derivatives.shape[1]
-        monomials = np.stack([away[..., 0] ** a * away[..., 1] ** b for a, b in MONOMIAL_POWERS[1:terms]], axis=-1)
-        slopes = fit.derivatives[:, 1:] / FACTORIALS[1:terms, None]
-        shape = (len(away), *(1,) * (away.ndim - 2), 2)
-        return fit.value.reshape(shape) + np.einsum("m...t,mtc->m...c", monomials, slopes)
+        """Return images (m, …, d) at displacements (m, …, d) from the centres."""
+        _, terms, d = fit.derivatives.shape
+        powers = monomials(d, next(n for n in range(terms) if comb(d + n, n) == terms))[1:]
+        products = np.stack([np.prod(away**power, axis=-1) for power in powers], axis=-1)
+        slopes = fit.derivatives[:, 1:] / factorial(powers).prod(1)[:, None]
+        shape = (len(away), *(1,) * (away.ndim - 2), d)
+        return fit.value.reshape(shape) + np.einsum("m...t,mtc->m...c", products, slopes)
 
     def residual_variance(self, centres: np.ndarray, fit: LocalFit) -> np.ndarray:
-        """Return the weighted residual variances (m, 2) of the neighbours' images."""
+        """Return the weighted residual variances (m, d) of the neighbours' images."""
         away = self.wrap(self.arguments[fit.neighbours] - centres[:, None])
         residual = away + self.increments[fit.neighbours] + centres[:, None] - self.predict(fit, away)
         residual = residual if self.winds else self.wrap(residual)
@@ -150,9 +192,15 @@ class ReturnMap:
         free = np.maximum(fit.effective - fit.derivatives.shape[1], 1.0) / fit.effective
         return np.einsum("mn,mnc->mc", weight, residual**2) / weight.sum(1)[:, None] / free[:, None]
 
+    def fit_to(
+        self, centres: np.ndarray, bandwidths: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int
+    ) -> LocalFit:
+        """Fit polynomials about the centres (m, d) to those arguments of `index` (m, n) that are `inside` (m, n)."""
+        return self._fit(centres, bandwidths, index, inside, degree, False, shrunk=True)
+
     def _fit(
         self, centres: np.ndarray, bandwidth: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int,
-        wants_influence: bool,
+        wants_influence: bool, shrunk: bool = False,
     ) -> LocalFit:  # fmt: skip
         bandwidth = np.maximum(bandwidth, np.max(self.noise) / MOST_NOISE)
         away = self.wrap(self.arguments[index] - centres[:, None])
@@ -161,20 +209,34 @@ class ReturnMap:
         image = image - reference
         if not self.winds:
             image = self.wrap(image)
-        one, other = _deconvoluted(away / bandwidth[:, None, None], self.noise / bandwidth[:, None], 2 * degree)
-        one *= inside[:, None]
-        powers, weight = MONOMIAL_POWERS[: TERMS[degree]], one[:, 0]
-        regressors = one[:, powers[:, 0]] * other[:, powers[:, 1]]
+        by_coordinate = _deconvoluted(away / bandwidth[:, None, None], self.noise / bandwidth[:, None], 2 * degree)
+        by_coordinate[0] *= inside[:, None]
+        d, weight = len(by_coordinate), by_coordinate[0][:, 0]
+        powers, products = monomials(d, degree), monomials(d, 2 * degree)
+        regressors = _products(by_coordinate, powers)
+        # The sums of products by powers of the last coordinate: one matrix product.
+        others = monomials(d - 1, 2 * degree)
+        table = _products(by_coordinate[:-1], others) @ by_coordinate[-1].mT
         sums = powers[:, None] + powers
-        inverse = np.linalg.pinv((one @ other.mT)[:, sums[..., 0], sums[..., 1]], rcond=1e-10, hermitian=True)
-        solution = inverse @ (regressors @ image)
+        row = np.argmax(np.all(sums[..., None, :-1] == others, axis=-1), axis=-1)
+        normal, target = table[:, row, sums[..., -1]], regressors @ image
+        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+        solution = inverse @ target
         effective = weight.sum(1) ** 2 / (weight**2).sum(1)
-        scale = (FACTORIALS[: len(powers)] / bandwidth[:, None] ** powers.sum(1))[..., None]
-        influence = np.empty((len(centres), 0, len(powers), 2))
+        if d > 2 and shrunk:
+            rest = np.einsum("mn,mnc->mc", weight, image**2) - (solution * target).sum(1)
+            free = np.maximum(effective - len(powers), 1.0) / effective
+            variance = np.maximum(rest, 0.0).max(1) / weight.sum(1) / free
+            order = powers.sum(1)
+            prior = STEEPEST_SLOPE * bandwidth[:, None] * (bandwidth[:, None] / CURVATURE_LENGTH) ** (order - 1.0)
+            shrinkage = np.where(order > 0, variance[:, None] / prior**2, 0.0)
+            inverse = np.linalg.pinv(normal + shrinkage[:, :, None] * np.eye(len(powers)), rcond=1e-10, hermitian=True)
+            solution = inverse @ target
+        scale = (factorial(powers).prod(1) / bandwidth[:, None] ** powers.sum(1))[..., None]
+        influence = np.empty((len(centres), 0, len(powers), d))
         if wants_influence:
             # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
-            products = MONOMIAL_POWERS[: TERMS[2 * degree]]
-            functions = one[:, products[:, 0]] * other[:, products[:, 1]]
+            functions = _products(by_coordinate, products)
             belongs = np.all(sums[..., None, :] == products, axis=-1).astype(float)
             fitted = np.einsum("abf,mbc,mka->mkcf", belongs, solution, inverse, optimize=True)
             residual = (inverse @ regressors)[:, :, None] * image.mT[:, None]
@@ -195,7 +257,8 @@ def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.
     left = 1.0 - noise[:, None] ** 2
     kernel = np.exp(-0.5 * np.sum(away**2 / left, axis=-1)) / np.sqrt(left.prod(-1))
     moments = []
-    for k, factor in enumerate((kernel, np.ones_like(kernel))):
+    for k in range(away.shape[-1]):
+        factor = kernel if k == 0 else np.ones_like(kernel)
         mean, variance = away[..., k] / left[..., k], -(1.0 - left[..., k]) / left[..., k]
         rows = [factor, mean * factor]
         for order in range(2, highest + 1):
@@ -204,33 +267,43 @@ def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.
     return moments
 
 
+def _products(by_coordinate: list[np.ndarray], powers: np.ndarray) -> np.ndarray:
+    """Return products (m, terms, n) of the functions of each coordinate with the given powers (terms, d)."""
+    result = by_coordinate[0][:, powers[:, 0]]
+    for functions, power in zip(by_coordinate[1:], powers.T[1:], strict=True):
+        result *= functions[:, power]
+    return result
+
+
 class Atlas:
     """Quadratic polynomials of the return map about points of the section, from `count` neighbours each."""
 
     def __init__(self, maps: ReturnMap, count: int):
         self._maps, self._count = maps, count
-        self._centres = maps.arguments[:: -(-len(maps.arguments) * count // MOST_NEIGHBOURS)]
-        self._fit = maps.fit(self._centres, count, 2, influence=False)
+        every = -(-len(maps.arguments) * count // MOST_NEIGHBOURS)
+        kept = maps.positions // maps.steps % every == 0
+        self._centres, phases = maps.arguments[kept], maps.phases(maps.positions[kept])
+        self._fit = maps.fit(self._centres, phases, count, 2, influence=False, shrunk=True)
         self._hessian = self._fit.hessian
-        self._tree = maps.tree(self._centres)
+        self._tree = maps.tree(self._centres, phases)
 
-    def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return images (m, 2), derivatives (m, image, argument) and bandwidths (m,) at points (m, 2).
+    def at(self, points: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return images (m, d), derivatives (m, image, argument) and bandwidths (m,) at points (m, d).
 
         The bandwidth is infinite where a point is farther from the nearest centre than that.
         """
-        _, nearest = self._tree.query(self._maps.wrap_points(points))
+        _, nearest = self._tree.query(self._maps.places(points, phases))
         away = self._maps.wrap(points - self._centres[nearest])
         curved = np.einsum("mijk,mk->mij", self._hessian[nearest], away)
         jacobian = self._fit.jacobian[nearest]
         image = self._fit.value[nearest] + np.einsum("mij,mj->mi", jacobian + 0.5 * curved, away)
         bandwidth = self._fit.bandwidth[nearest]
-        outside = np.sqrt(np.sum(away**2, axis=-1)) > bandwidth
+        outside = np.sqrt(np.sum(away**2, axis=-1)) > FARTHEST_FROM_CENTRE[min(points.shape[1], 3)] * bandwidth
         return image, jacobian + curved, np.where(outside, np.inf, bandwidth)
 
-    def exactly(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def exactly(self, points: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the same from fits about the points themselves."""
-        fit = self._maps.fit(points, self._count, 2, influence=False)
+        fit = self._maps.fit(points, phases, self._count, 2, influence=False, shrunk=True)
         return fit.value, fit.jacobian, fit.bandwidth
 
 
@@ -240,7 +313,7 @@ SMALLEST_BANDWIDTH = 4.0
 
 
 def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
-    """Return the standard deviations (2,) of independent errors of the two coordinates.
+    """Return the standard deviations (d,) of independent errors of the coordinates, from maps of one step.
 
     Where the return map is quadratic, the residual variance of an image is the variance of its own error plus the
     propagated one of the argument's error. The densest neighbourhoods are used, where curvature matters least, and
@@ -249,12 +322,13 @@ def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
     from scipy.optimize import nnls
 
     centres = maps.arguments[:: max(1, len(maps.arguments) // NOISE_CENTRES)]
-    noise, count = np.zeros(2), int(2.25 * neighbours)
+    d = maps.points.shape[1]
+    noise, count = np.zeros(d), int(2.25 * neighbours)
     for _ in range(3):
-        width = maps.nearest(centres, count)[0][:, -1]
+        width = maps.nearest(centres, np.zeros(len(centres)), count)[0][:, -1]
         dense = centres[width <= np.median(width)]
-        fit = maps.fit(dense, count, 2, influence=False)
-        rows = (np.eye(2) + fit.jacobian**2).reshape(-1, 2)
+        fit = maps.fit(dense, np.zeros(len(dense)), count, 2, influence=False)
+        rows = (np.eye(d) + fit.jacobian**2).reshape(-1, d)
         target = maps.residual_variance(dense, fit).reshape(-1)
         weight = 1.0 / np.maximum(target, 1e-30)
         for _ in range(NOISE_ROUNDS):
@@ -271,7 +345,11 @@ def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
 
 LONGEST_PERIOD = 32
 # As fractions of the median distance between two random points: points that coincide, unpredictable images.
-SAME_POINT, UNPREDICTED = 0.05, 0.2
+SAME_POINT, UNPREDICTED = 0.05, 0.08
+# Neighbours of a prediction, as a multiple of the number of terms.
+PREDICTING = 1.5
+# Median of the absolute value of a standard normal number.
+NORMAL_MEDIAN = 0.6745
 # Neighbours that diverge by less than this factor in this many steps show no chaos.
 DIVERGED, DIVERGING_STEPS = 2.5, 6
 DIVERGING_PROBES = 400
@@ -280,8 +358,12 @@ NEIGHBOUR = 8
 FEWEST_FOLLOWED = 100
 
 
-def check_chaos(maps: ReturnMap) -> None:
-    """Raise a ValueError, which names the kind of motion, unless the points show a chaotic return map."""
+def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, float]:
+    """Raise a ValueError, which names the kind of motion, unless the points show a chaotic return map.
+
+    Returns the error of predictions by local maps and the part of noise in it, as fractions of the distance of random
+    points. `remedy` returns which coordinate to add where the points do not determine the next ones.
+    """
     section, generator = maps.points, np.random.default_rng(0)
     starts = maps.followed(DIVERGING_STEPS + 1)
     if starts.size < FEWEST_FOLLOWED:
@@ -304,12 +386,13 @@ def check_chaos(maps: ReturnMap) -> None:
     probes = min(DIVERGING_PROBES, len(section) // 4, starts.size)
     centre, neighbour = _neighbours(maps, starts[generator.choice(starts.size, probes, replace=False)])
     now = np.median(maps.distance(section[centre], section[neighbour]))
-    images = np.median(maps.distance(section[centre + 1], section[neighbour + 1]))
-    if images > UNPREDICTED * random:
+    error, from_noise = prediction_error(maps)
+    if error > UNPREDICTED:
         raise ValueError(
-            f"section: must show a return map, got images of neighbouring points {images / random:.0%} as far apart as "
-            "random points. Check for a wrong frequency, for noise as large as the motion, and for states that the two "
-            "coordinates do not determine."
+            f"section: must show a return map, got images that local maps of the {section.shape[1]} coordinates "
+            f"predict with errors of {error:.0%} of the distance of random points, {from_noise:.1%} from known noise. "
+            f"If the system has more states than coordinates, add one: {remedy()}. Otherwise check for a wrong "
+            "frequency, and for noise as large as the motion."
         )
     later = np.median(maps.distance(section[centre + DIVERGING_STEPS], section[neighbour + DIVERGING_STEPS]))
     if later < DIVERGED * now:
@@ -317,11 +400,37 @@ def check_chaos(maps: ReturnMap) -> None:
             "section: must be of a chaotic motion, got a quasi-periodic one, whose neighbouring points do not diverge. "
             "Record the system where it is chaotic."
         )
+    return error, from_noise
+
+
+def prediction_error(maps: ReturnMap) -> tuple[float, float]:
+    """Return the median error with which local maps predict images, and what known noise contributes to it.
+
+    Both as fractions of the median distance of random points. Maps are linear or quadratic, whichever predicts better,
+    from neighbours distant in time. Where the coordinates determine the next point, errors fall to the noise as
+    neighbours come closer; where they do not, they are as large as the effect of the unknown states.
+    """
+    generator, d = np.random.default_rng(0), maps.points.shape[1]
+    one, other = generator.integers(len(maps.arguments), size=(2, 4 * DIVERGING_PROBES))
+    random = np.median(maps.distance(maps.arguments[one], maps.arguments[other]))
+    some = generator.choice(len(maps.arguments), min(DIVERGING_PROBES, len(maps.arguments)), replace=False)
+    centres, positions, phases = maps.arguments[some], maps.positions[some], np.zeros(some.size)
+    results = []
+    for degree in (1, 2):
+        count = int(PREDICTING * comb(d + degree, degree)) + 2 * DIVERGING_STEPS + 1
+        distance, index = maps.nearest(centres, phases, count)
+        away = np.abs(maps.positions[index] - positions[:, None]) > DIVERGING_STEPS
+        fit = maps.fit_to(centres, distance[:, -1] / KERNEL_REACH, index, away, degree)
+        error = maps.distance(fit.value, centres + maps.increments[some])
+        variance = maps.noise**2 + np.einsum("mij,j->mi", fit.jacobian**2, maps.noise**2)
+        expected = NORMAL_MEDIAN * np.median(np.sqrt(variance.max(1)))
+        results.append((float(np.median(error) / random), float(expected / random)))
+    return min(results)
 
 
 def _neighbours(maps: ReturnMap, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return points and a neighbour of each that is distant in time and has later points, where there is one."""
-    _, index = maps.nearest(maps.points[centre], NEIGHBOUR + 2 * DIVERGING_STEPS)
+    _, index = maps.nearest(maps.points[centre], np.zeros(len(centre)), NEIGHBOUR + 2 * DIVERGING_STEPS)
     near = maps.positions[index]
     far = (np.abs(near - centre[:, None]) > DIVERGING_STEPS) & np.isin(near, maps.followed(DIVERGING_STEPS + 1))
     rank = np.cumsum(far, axis=1)

@@ -1,6 +1,6 @@
 """PoincareSection: points of a motion, once a forcing period or where it crosses a plane."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,18 +10,25 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.data.recording import Recording
+from bayesperiodic.orbits.coordinates import (
+    channel_and_delay,
+    channels_of,
+    columns_of,
+    coordinate_names,
+    coordinate_signals,
+    coordinate_values,
+    delays_of,
+    longest_window,
+    wrapped,
+)
 from bayesperiodic.orbits.stretches import (
     FEWEST_SAMPLES,
-    LONGEST_USUAL_STEP,
     SMALLEST_WINDOW,
     Stretches,
     joined,
     local_fit,
-    smoothed,
-    usual_step,
 )
 
-DEGREES = 180.0 / np.pi
 FEWEST_POINTS, CYCLE_SAMPLES = 200, 64
 # A signal must go so far below a level between two crossings, in standard deviations, so that noise adds none.
 CROSSING_BAND = 0.1
@@ -33,23 +40,24 @@ class PoincareSection(Result):
 
     Attributes
     ----------
-    points : array (count, 2)
-        Angles in (−π, π].
+    points : array (count, d)
+        In the d coordinates, two or more; angles in (−π, π].
     coordinates, angles : tuple of str
-        The two coordinates, and those of them that are angles, one at most.
+        The coordinates, and those of them that are angles, one at most. A delayed one is a channel and, in brackets,
+        the forcing periods after the phase of the section: ``"voltage[-0.25]"`` is the voltage a quarter period before.
     frequency : float
         Forcing frequency [Hz]; for crossings of a plane, returns per second.
-    increments : array (count − 1, 2)
+    increments : array (count − 1, d)
         Next point minus point, NaN across a break. Angles include whole turns; where `winds` is False they are in half
         a turn either way.
     winds : bool
         Whether the whole turns between the points are known.
-    noise : array (2,) or None
+    noise : array (d,) or None
         Standard deviation of the points' errors; None if it must be estimated from the points.
     instants : array (count,) or None
         Times of the points [s].
-    time, signals : array (samples,), array (samples, 2), or None
-        The recording, angles unwrapped; None for points alone.
+    time, signals : array (samples,), array (samples, channels), or None
+        The recording, one column a channel in the order of the coordinates, angles unwrapped; None for points alone.
     values : int
         Number of measured values.
     synthetic : bool
@@ -76,7 +84,7 @@ class PoincareSection(Result):
     """
 
     points: np.ndarray
-    coordinates: tuple[str, str]
+    coordinates: tuple[str, ...]
     angles: tuple[str, ...]
     frequency: float
     increments: np.ndarray
@@ -112,8 +120,11 @@ class PoincareSection(Result):
         ----------
         recording : Recording
             At least 8 samples a period; the steps may differ. For several, see `from_recordings`.
-        coordinates : sequence of two str
-            Outputs, such as ``("angle", "rate")``.
+        coordinates : sequence of str
+            Two or more outputs that determine the next point, as many as the system has states, or more, such as
+            ``("angle", "rate")``. What is not measured is replaced by delayed coordinates, such as
+            ``("velocity", "voltage", "voltage[-0.25]")`` with the voltage a quarter of the forcing period before; see
+            Notes.
         frequency : float
             Of the forcing [Hz].
         origin : float
@@ -128,7 +139,16 @@ class PoincareSection(Result):
         Raises
         ------
         ValueError
-            For an unknown coordinate, too few samples or periods, or an angle that does not seem to be in radians.
+            For an unknown coordinate, too few samples or periods, an angle that does not seem to be in radians, or
+            delays of one channel that are too close modulo a period.
+
+        Notes
+        -----
+        Errors of the coordinates are taken as independent, and those of a point and the next one too. For white noise
+        this holds for delayed coordinates as well, because no two values of a channel use the same samples: windows are
+        no longer than the time between them, and delays of one channel must not be closer, modulo a period (with
+        `steps` of `find_orbits`, modulo a step), than the 8 samples of the smallest window. For noise with a longer
+        memory, standard deviations are too small.
         """
         if not isinstance(recording, Recording):
             raise ValueError(
@@ -187,19 +207,22 @@ class PoincareSection(Result):
         given = _recordings(recordings)
         signals = []
         for recording in given:
-            names, angle_names, values = _signals(recording, coordinates, angles)
+            names, angle_names, values = coordinate_signals(recording, coordinates, angles)
             signals.append(values)
-        samples = _unwrapped(joined(given, signals, frequency), np.isin(names, angle_names))
+        samples = _unwrapped(joined(given, signals, frequency), np.isin(channels_of(names), angle_names))
         if samples.sampling_rate < FEWEST_SAMPLES * frequency:
             rate = f"{samples.sampling_rate / frequency:.3g}"
             raise ValueError(
                 f"recording: must have at least {FEWEST_SAMPLES} samples a period, got {rate}. For samples taken once "
                 "a period, use from_points."
             )
-        instants, stretch, left_out = samples.instants(frequency, origin)
+        delays = delays_of(names)
+        longest_window(names, samples.sampling_rate / frequency)
+        instants, stretch, left_out = samples.instants(frequency, origin, (delays.min(), delays.max()))
         synthetic = any(recording.synthetic for recording in given)
         section = cls._of(samples, names, angle_names, instants, stretch, left_out, synthetic, frequency)
-        if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * np.ptp(samples.signals, axis=0)):
+        extent = np.ptp(samples.signals, axis=0)[columns_of(names)]
+        if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * extent):
             raise ValueError(
                 "recording: must be chaotic, got a motion of period 1, whose section points coincide. Use "
                 "recording.fold instead."
@@ -222,7 +245,7 @@ class PoincareSection(Result):
         Parameters
         ----------
         recording, coordinates, angles
-            As for `from_recording`.
+            As for `from_recording`, without delayed coordinates.
         channel : str
             Output whose crossings define the section; not one of the coordinates.
         level : float
@@ -239,7 +262,12 @@ class PoincareSection(Result):
         ValueError
             For an unknown channel, too few crossings, and as for `from_recording`.
         """
-        names, angle_names, signals = _signals(recording, coordinates, angles)
+        names, angle_names, signals = coordinate_signals(recording, coordinates, angles)
+        if channels_of(names) != names:
+            raise ValueError(
+                f"coordinates: must be without delays for crossings, got {list(names)}. Delays are fractions of a "
+                "forcing period; use from_recording for a forced system."
+            )
         _checks.one_of("channel", channel, [name for name in recording.outputs if name not in names])
         level = _checks.finite_number("level", level)
         if direction not in (1, -1):
@@ -264,7 +292,7 @@ class PoincareSection(Result):
 
         Parameters
         ----------
-        points : array (count, 2), or sequence of such arrays
+        points : array (count, d), or sequence of such arrays
             All consecutive points in the order of time; angles [rad] with any number of turns. Several arrays are
             unbroken stretches: the first point of one does not follow the last point of another.
         coordinates, frequency, angles
@@ -280,12 +308,12 @@ class PoincareSection(Result):
             For too few points, another shape, NaN, or an angle that seems to be in degrees.
         """
         frequency = _checks.positive("frequency", frequency)
-        names, angle_names = _names(coordinates, angles)
+        names, angle_names = coordinate_names(coordinates, angles)
         several = isinstance(points, Sequence) and len(points) > 0 and all(np.ndim(part) == 2 for part in points)
         parts = [_checks.real_array("points", part) for part in (points if several else [points])]
         for part in parts:
-            if part.ndim != 2 or part.shape[1] != 2:
-                raise ValueError(f"points: must have the shape (count, 2), got {part.shape}.")
+            if part.ndim != 2 or part.shape[1] != len(names):
+                raise ValueError(f"points: must have the shape (count, {len(names)}), got {part.shape}.")
         values = np.concatenate(parts)
         turning = np.isin(names, angle_names)
         for k, name in enumerate(names):
@@ -306,7 +334,7 @@ class PoincareSection(Result):
 
     @classmethod
     def _of(
-        cls, samples: Stretches, names: tuple[str, str], angles: tuple[str, ...], instants: np.ndarray,
+        cls, samples: Stretches, names: tuple[str, ...], angles: tuple[str, ...], instants: np.ndarray,
         stretch: np.ndarray, left_out: int, synthetic: bool, frequency: float | None = None,
     ) -> "PoincareSection":  # fmt: skip
         """Return the section of signals at given instants; the frequency is by default that of the instants."""
@@ -315,8 +343,8 @@ class PoincareSection(Result):
             returns = np.diff(instants)[np.diff(stretch) == 0]
             frequency = float(returns.size / returns.sum())
         time = samples.time
-        at = np.clip(instants, time[samples.starts[stretch]], time[samples.stops[stretch] - 1])
-        values, noise = smoothed(samples, at, stretch)
+        usual = float(np.median(np.diff(instants)))
+        values, noise = coordinate_values(samples, names, instants, stretch, frequency, usual)
         points, increments = wrapped(values, np.isin(names, angles)), _within(np.diff(values, axis=0), stretch)
         breaks = (stretch, samples.starts, left_out) if samples.starts.size > 1 else (None, None, left_out)
         measured = (instants, time, samples.signals, samples.signals.size, synthetic)
@@ -324,6 +352,79 @@ class PoincareSection(Result):
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def delayed(self, coordinate: str) -> np.ndarray | None:
+        """Evaluate a channel of the section's coordinates at a delay.
+
+        Parameters
+        ----------
+        coordinate : str
+            Such as ``"voltage[-0.25]"``.
+
+        Returns
+        -------
+        array (count,), or None
+            At the section's points; of the nearest sample where the delay leads out of a stretch. None for points
+            alone.
+
+        Raises
+        ------
+        ValueError
+            For an unknown channel.
+        """
+        channel, delay = channel_and_delay(coordinate)
+        channels = channels_of(self.coordinates)
+        _checks.one_of("coordinate", channel, channels)
+        if self.instants is None or self.time is None or self.signals is None:
+            return None
+        starts = np.zeros(1, dtype=np.int64) if self.starts is None else self.starts
+        stretch = np.zeros(len(self), dtype=np.int64) if self.stretches is None else self.stretches
+        samples = Stretches(self.time, self.signals[:, [channels.index(channel)]], starts)
+        first, last = self.time[samples.starts[stretch]], self.time[samples.stops[stretch] - 1]
+        return local_fit(samples, np.clip(self.instants + delay / self.frequency, first, last), stretch)[0][:, 0]
+
+    def between(self, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Evaluate the recording at several phases a return.
+
+        Parameters
+        ----------
+        steps : int
+            Number of phases a return, equally spaced, the section's is the first.
+
+        Returns
+        -------
+        points : array (count·steps, d)
+            In the order of time, those of a return together; NaN from the last point of a stretch on.
+        increments : array (count·steps − 1, d)
+            Next point minus point, NaN across a break.
+        noise : array (d,)
+            Standard deviation of the errors.
+
+        Raises
+        ------
+        ValueError
+            For points alone, and for delays of a channel that are too close modulo a step.
+        """
+        steps = _checks.integer("steps", steps, 1)
+        if self.instants is None or self.time is None or self.signals is None:
+            raise ValueError(f"steps: must be 1 for points alone, got {steps}. Make the section of a recording.")
+        starts = np.zeros(1, dtype=np.int64) if self.starts is None else self.starts
+        stretch = np.zeros(len(self), dtype=np.int64) if self.stretches is None else self.stretches
+        samples = Stretches(self.time, self.signals, starts)
+        after = np.append(np.diff(self.instants), 0.0)
+        followed = np.append(np.diff(stretch) == 0, False)
+        instants = self.instants[:, None] + after[:, None] * np.arange(steps) / steps
+        present = followed[:, None] | (np.arange(steps) == 0)
+        usual = float(np.median(after)) / steps
+        each = np.broadcast_to(stretch[:, None], present.shape)[present]
+        names, frequency = self.coordinates, self.frequency
+        values, noise = coordinate_values(samples, names, instants[present], each, frequency, usual, steps)
+        if noise is None:
+            raise ValueError(f"steps: must be 1 for stretches too short to determine the noise, got {steps}.")
+        signals = np.full((present.size, len(names)), np.nan)
+        signals[present.ravel()] = values
+        increments = _within(np.diff(signals, axis=0), np.repeat(stretch, steps))
+        return wrapped(signals, np.isin(names, self.angles)), increments, noise
 
     def cycle(self, index: int, period: int, samples: int = CYCLE_SAMPLES) -> dict[str, np.ndarray] | None:
         """Interpolate the measured motion from one point over some returns.
@@ -336,7 +437,8 @@ class PoincareSection(Result):
         Returns
         -------
         dict of str to array (samples·period,), or None
-            By coordinate; angles start in (−π, π] and are continuous. None for a section of points alone.
+            By channel, over the time from the phase of the section to that phase; angles start in (−π, π] and are
+            continuous. None for a section of points alone.
 
         Raises
         ------
@@ -357,10 +459,10 @@ class PoincareSection(Result):
         knots = np.arange(period + 1)
         at = np.interp(np.arange(samples * period) / samples, knots, self.instants[index : index + period + 1])
         values = local_fit(recorded, at, stretch)[0]
-        shift = self.points[index] - values[0]
-        turns = np.where(np.isin(self.coordinates, self.angles), np.round(shift / (2.0 * np.pi)), 0.0)
-        values += 2.0 * np.pi * turns
-        return dict(zip(self.coordinates, values.T, strict=True))
+        channels = channels_of(self.coordinates)
+        turning = np.isin(channels, self.angles)
+        values += np.where(turning, wrapped(values[0]) - values[0], 0.0)
+        return dict(zip(channels, values.T, strict=True))
 
     def __repr__(self) -> str:
         source = "points alone" if self.signals is None else f"a recording of {len(self.signals)} samples"
@@ -369,11 +471,6 @@ class PoincareSection(Result):
         lost = f"; {self.left_out} points in gaps left out" if self.left_out else ""
         names = ", ".join(self.coordinates)
         return f"PoincareSection({len(self.points)} points of {names} at {self.frequency:.6g} Hz from {source}{lost})"
-
-
-def wrapped(values: np.ndarray, turning: np.ndarray | bool = True) -> np.ndarray:
-    """Return values (…, coordinates), with those that are turning angles in (−π, π]."""
-    return np.where(turning, np.pi - (np.pi - values) % (2.0 * np.pi), values)
 
 
 def _within(increments: np.ndarray, stretch: np.ndarray) -> np.ndarray:
@@ -400,85 +497,12 @@ def _unwrapped(samples: Stretches, turning: np.ndarray) -> Stretches:
     return samples._replace(signals=signals)
 
 
-def _names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple[tuple[str, str], tuple[str, ...]]:
-    names = _checks.identifiers("coordinates", [coordinates] if isinstance(coordinates, str) else coordinates)
-    if len(names) != 2:
-        raise ValueError(f"coordinates: must be two outputs, got {coordinates!r}.")
-    angle_names = (angles,) if isinstance(angles, str) else tuple(angles)
-    for name in angle_names:
-        _checks.one_of("angles", name, names)
-    if len(angle_names) > 1:
-        raise ValueError(f"angles: must name at most one coordinate, got {angle_names!r}.")
-    return (names[0], names[1]), angle_names
-
-
-def _signals(
-    recording: Recording, coordinates: Sequence[str], angles: Iterable[str]
-) -> tuple[tuple[str, str], tuple[str, ...], np.ndarray]:
-    """Return the names of the coordinates and of their angles, and their values (samples, 2), angles unwrapped."""
-    names, angle_names = _names(coordinates, angles)
-    for name in names:
-        _checks.one_of("coordinates", name, recording.outputs)
-    if isinstance(recording.time, Mapping):
-        raise ValueError(
-            f"recording: must have the same times for all channels, got {recording!r}; leave other channels out, or "
-            "record the coordinates together."
-        )
-    signals = np.stack([recording.outputs[name] for name in names], -1)
-    for name in angle_names:
-        k = names.index(name)
-        _check_angle(name, signals[:, k])
-        signals[:, k] = np.unwrap(signals[:, k])
-        _check_rate(name, names[1 - k], recording.time, signals[:, k], signals[:, 1 - k])
-    return names, angle_names, signals
-
-
 def _check_count(count: int) -> None:
     if count < FEWEST_POINTS:
         raise ValueError(
             f"section: must have at least {FEWEST_POINTS} points, got {count}; thousands are better. Record more "
             "forcing periods."
         )
-
-
-def _check_angle(name: str, values: np.ndarray) -> None:
-    """Raise a ValueError for an angle that jumps by other than 2π, or moves half a turn between samples."""
-    step = np.abs(np.diff(values))
-    smooth, largest, extent = float(np.quantile(step, 0.9)), float(step.max()), float(np.ptp(values))
-    jumps = largest > 0.75 * extent and largest > 4.0 * smooth
-    if jumps and abs(extent / 360.0 - 1.0) < 0.1:
-        raise ValueError(
-            f"outputs[{name!r}]: must be an angle in radians, got jumps of {largest:.4g}. It seems to be in degrees: "
-            "convert it with numpy.radians."
-        )
-    if jumps and largest > 1.0 and abs(extent / (2.0 * np.pi) - 1.0) > 0.1:
-        raise ValueError(
-            f"outputs[{name!r}]: must be an angle that is continuous or jumps by a turn (6.283 rad), got jumps of "
-            f"{largest:.4g}. Check the unit, and whether the angle covers half a turn only (arctan instead of arctan2)."
-        )
-    if np.quantile(np.abs(wrapped(np.diff(values))), 0.9) > 0.75 * np.pi or smooth > 2.0 * np.pi:
-        raise ValueError(
-            f"outputs[{name!r}]: must move by less than half a turn (3.14 rad) between samples, got steps of "
-            f"{smooth:.4g}. Convert degrees with numpy.radians, or sample faster."
-        )
-
-
-def _check_rate(name: str, other: str, time: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> None:
-    """Raise a ValueError if the other coordinate is the rate of the unwrapped angle in another unit."""
-    step = np.diff(time)
-    short = step <= LONGEST_USUAL_STEP * usual_step(time)
-    measured = np.diff(angle)[short]
-    expected = (0.5 * (rate[1:] + rate[:-1]) * step)[short]
-    scale, product = np.sqrt(np.sum(measured**2) * np.sum(expected**2)), np.sum(measured * expected)
-    if scale == 0.0 or product < 0.98 * scale:
-        return
-    ratio = product / np.sum(expected**2)
-    for factor, quantity in ((DEGREES, "angle"), (1.0 / DEGREES, "rate")):
-        if abs(ratio / factor - 1.0) < 0.1:
-            raise ValueError(
-                f"outputs[{name!r}]: must be the integral of {other!r}, got {ratio:.3g} times it; the {quantity} seems "
-                "to be in degrees. Use radians and radians per second."
-            )
 
 
 def _upward_crossings(time: np.ndarray, signal: np.ndarray, band: float) -> np.ndarray:

@@ -41,13 +41,16 @@ class Stretches(NamedTuple):
         lasting = np.sum(self.time[self.stops - 1] - self.time[self.starts])
         return float((self.time.size - self.starts.size) / lasting)
 
-    def instants(self, frequency: float, origin: float) -> tuple[np.ndarray, np.ndarray, int]:
+    def instants(
+        self, frequency: float, origin: float, reach: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[np.ndarray, np.ndarray, int]:
         """Return the times of whole tau, the stretch of each, and how many between first and last are in gaps.
 
+        The times from tau plus the first of `reach` to tau plus the second one, in periods, are in the same stretch.
         Stretches with fewer samples than the smallest window count as gaps.
         """
-        first = np.ceil((self.time[self.starts] - origin) * frequency - 1e-9).astype(np.int64)
-        last = np.floor((self.time[self.stops - 1] - origin) * frequency + 1e-9).astype(np.int64)
+        first = np.ceil((self.time[self.starts] - origin) * frequency - reach[0] - 1e-9).astype(np.int64)
+        last = np.floor((self.time[self.stops - 1] - origin) * frequency - reach[1] + 1e-9).astype(np.int64)
         # Of two stretches that touch at an instant, the first one has it.
         first[1:] = np.maximum(first[1:], last[:-1] + 1)
         counts = np.where(self.stops - self.starts >= 2 * SMALLEST_WINDOW, np.maximum(last + 1 - first, 0), 0)
@@ -96,8 +99,12 @@ def usual_step(time: np.ndarray) -> float:
     return float(np.quantile(np.diff(time), USUAL_STEP))
 
 
-def smoothed(samples: Stretches, at: np.ndarray, stretch: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def smoothed(
+    samples: Stretches, at: np.ndarray, stretch: np.ndarray, longest: float
+) -> tuple[np.ndarray, np.ndarray | float]:
     """Return signals (instants, channels) at given instants, and the standard deviation of their errors (channels,).
+
+    Windows are no longer than `longest`.
 
     Polynomials of degree 7 are fitted in windows of increasing width. For white noise the expected squared difference
     between a narrow and a wide estimate is known except for the squared bias of the wide one; the excess is tested for
@@ -105,13 +112,13 @@ def smoothed(samples: Stretches, at: np.ndarray, stretch: np.ndarray) -> tuple[n
     first significant one it is 40 times smaller, and negligible even in averages over hundreds of instants.
 
     Where a stretch ends within the window, the smallest one is used, beside the instant if necessary. The standard
-    deviation is None if there are too few other instants.
+    deviation is NaN if there are too few other instants.
     """
     narrow, narrow_gain, _ = local_fit(samples, at, stretch)
-    widest = max(SMALLEST_WINDOW, int(0.5 * samples.sampling_rate * np.median(np.diff(at))))
+    widest = max(SMALLEST_WINDOW, int(0.5 * samples.sampling_rate * longest))
     inner = samples.windows(at, stretch, max(widest, NOISE_SAMPLES // 2))[1]
     if np.count_nonzero(inner) < FEWEST_INSTANTS:
-        return narrow, None
+        return narrow, np.nan
     inside = at[inner], stretch[inner]
     # A higher degree on few samples: noise dominates the residual.
     variance = local_fit(samples, *inside, NOISE_SAMPLES // 2, NOISE_DEGREE)[2].mean(0)

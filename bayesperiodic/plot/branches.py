@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from bayesperiodic import _checks
 from bayesperiodic.diagnostics.branch_prediction import BranchPrediction
+from bayesperiodic.orbits.coordinates import channel_and_delay
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.section import PoincareSection
 from bayesperiodic.periodic.continuation import FOLD, PERIOD_DOUBLING, Branch
@@ -202,6 +203,8 @@ def section(
 ) -> Figure:
     """Draw a Poincaré section with the points of periodic orbits by period (de Kraker et al. 1997, fig. 5).
 
+    Of more than two coordinates the first two are drawn.
+
     Parameters
     ----------
     section : PoincareSection
@@ -223,7 +226,7 @@ def section(
     every = 1 + len(section.points) // MOST_POINTS_DRAWN
     shown = section.points[::every]
     name = "section" if every == 1 else f"section, one point in {every}"
-    ax.plot(*shown.T, ",", color="0.65", rasterized=True, zorder=1)
+    ax.plot(*shown[:, :2].T, ",", color="0.65", rasterized=True, zorder=1)
     handles = [plt.Line2D([], [], marker=".", ls="", color="0.65", label=f"{name} ({len(shown)})")]
     periods = sorted({orbit.period for orbit in orbits})
     for period, marker, colour in zip(periods, cycle(PERIOD_MARKERS), cycle(ENSEMBLES), strict=False):
@@ -232,7 +235,7 @@ def section(
         size = max(6.5 - period, 3.0)
         look: dict[str, Any] = {"marker": marker, "color": colour, "ls": "", "ms": size, "mec": "black", "mew": 0.4}
         # Longer orbits have many points, and cover none of the shorter ones.
-        ax.plot(*points.T, zorder=3 + 1 / period, **look)
+        ax.plot(*points[:, :2].T, zorder=3 + 1 / period, **look)
         noun = "orbit" if len(members) == 1 else "orbits"
         handles.append(plt.Line2D([], [], label=f"period {period}: {len(members)} {noun}", **look))
     across, up = _coordinate_labels(section, units)
@@ -246,6 +249,8 @@ def orbits(
     orbits: Orbits | Sequence[Orbit], *, units: Mapping[str, str] | None = None, figure: Figure | None = None
 ) -> Figure:
     """Draw the phase portrait of each orbit: measured cycle, polished orbit of the model, and section points.
+
+    Of more than two coordinates the first two are drawn.
 
     Parameters
     ----------
@@ -290,23 +295,34 @@ def orbits(
 
 def _portrait(ax: Axes, orbit: Orbit) -> None:
     for label, signals in _cycles(orbit).items():
-        x, y = (np.angle(np.exp(1j * signals[c])) if c in orbit.angles else signals[c] for c in orbit.coordinates)
+        x, y = (np.angle(np.exp(1j * signals[c])) if c in orbit.angles else signals[c] for c in orbit.coordinates[:2])
         # Angles jump at ±π.
         jump = np.flatnonzero(np.abs(np.diff(x)) > np.pi) + 1 if orbit.angles else np.empty(0, dtype=int)
         ax.plot(np.insert(x, jump, np.nan), np.insert(y, jump, np.nan), **CYCLE_STYLES[label])
-    ax.plot(*orbit.points.T, ms=4.5, zorder=4, **POINT_STYLE)
+    ax.plot(*orbit.points[:, :2].T, ms=4.5, zorder=4, **POINT_STYLE)
     turns = "" if orbit.winding is None else f", winding {orbit.winding}".replace("-", "−")
     ax.set_title(f"period {orbit.period}{turns}\n$\\mu$ = {_multiplier(orbit)}", fontsize="x-small")
     ax.tick_params(labelsize="x-small")
 
 
 def _cycles(orbit: Orbit) -> dict[str, Mapping[str, np.ndarray]]:
-    """Return the measured cycle and that of the model, closed, by their labels."""
-    cycles = {} if orbit.cycle is None else {CLOSEST_CYCLE: orbit.cycle}
+    """Return the measured cycle and that of the model, closed, in the first two coordinates, by their labels."""
+    cycles: dict[str, Mapping[str, np.ndarray]] = {}
+    if orbit.cycle is not None:
+        cycles[CLOSEST_CYCLE] = _delayed(orbit.cycle, orbit)
     if orbit.solution is not None:
-        outputs = orbit.solution.outputs.items()
-        cycles[MODEL_CYCLE] = {c: np.append(v, v[0]) for c, v in outputs if c in orbit.coordinates}
+        outputs = _delayed(orbit.solution.outputs, orbit).items()
+        cycles[MODEL_CYCLE] = {c: np.append(v, v[0]) for c, v in outputs}
     return cycles
+
+
+def _delayed(signals: Mapping[str, np.ndarray], orbit: Orbit) -> dict[str, np.ndarray]:
+    """Return the first two coordinates over the period, from the channels."""
+    result = {}
+    for coordinate in orbit.coordinates[:2]:
+        channel, delay = channel_and_delay(coordinate)
+        result[coordinate] = np.roll(signals[channel], -round(delay * len(signals[channel]) / orbit.period))
+    return result
 
 
 def _multiplier(orbit: Orbit) -> str:
@@ -318,4 +334,4 @@ def _multiplier(orbit: Orbit) -> str:
 
 def _coordinate_labels(plane: PoincareSection | Orbit, units: Mapping[str, str] | None) -> list[str]:
     known = dict.fromkeys(plane.angles, "rad") | dict(units or {})
-    return [axis_label(coordinate, known.get(coordinate, "")) for coordinate in plane.coordinates]
+    return [axis_label(coordinate, known.get(coordinate, "")) for coordinate in plane.coordinates[:2]]

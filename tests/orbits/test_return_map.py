@@ -27,7 +27,7 @@ def maps(count, noise, seed, width=None):
 
 
 def test_a_quadratic_map_is_recovered_exactly():
-    fit = maps(500, 0.0, 1).fit(np.array([[0.2, -0.1]]), 80, 2)
+    fit = maps(500, 0.0, 1).fit(np.array([[0.2, -0.1]]), np.zeros(1), 80, 2)
     np.testing.assert_allclose(fit.value[0], quadratic(np.array([[0.2, -0.1]]))[0], atol=1e-12)
     np.testing.assert_allclose(fit.jacobian[0], slopes(0.2, -0.1), atol=1e-11)
     np.testing.assert_allclose(fit.hessian[0], [[[1.4, 0.2], [0.2, 0.0]], [[0.0, 0.0], [0.0, 1.8]]], atol=1e-9)
@@ -39,9 +39,9 @@ def test_noise_in_the_arguments_does_not_attenuate_slopes():
     centre, errors, plain = np.array([[0.0, 0.2]]), [], []
     for seed in range(150):
         noisy = maps(2000, 0.02, seed, width=0.05)
-        errors.append(noisy.fit(centre, 300, 2, influence=False).jacobian[0] - slopes(0.0, 0.2))
+        errors.append(noisy.fit(centre, np.zeros(1), 300, 2, influence=False).jacobian[0] - slopes(0.0, 0.2))
         noisy.noise = np.zeros(2)
-        plain.append(noisy.fit(centre, 300, 2, influence=False).jacobian[0] - slopes(0.0, 0.2))
+        plain.append(noisy.fit(centre, np.zeros(1), 300, 2, influence=False).jacobian[0] - slopes(0.0, 0.2))
     assert np.all(np.abs(np.mean(errors, axis=0)) < 4.0 * np.std(errors, axis=0) / np.sqrt(150))
     assert np.mean(plain, axis=0)[0, 0] < -0.1
 
@@ -49,7 +49,7 @@ def test_noise_in_the_arguments_does_not_attenuate_slopes():
 def test_influences_give_the_variance_of_replicates():
     # The mean stated variance is that of 300 replicates within 25 %, three standard errors of a variance.
     centre = np.array([[0.1, 0.2]])
-    fits = [maps(1500, 0.02, seed).fit(centre, 150, 2) for seed in range(300)]
+    fits = [maps(1500, 0.02, seed).fit(centre, np.zeros(1), 150, 2) for seed in range(300)]
     actual = np.var([np.concatenate([fit.value, fit.derivatives[0, 1:3]]) for fit in fits], axis=0)
     stated = np.mean([(fit.influence[0, :, :3] ** 2).sum(axis=0) for fit in fits], axis=0)
     np.testing.assert_allclose(stated, actual, rtol=0.25)
@@ -57,8 +57,9 @@ def test_influences_give_the_variance_of_replicates():
 
 def test_fits_of_given_bandwidths_are_those_of_as_many_neighbours():
     noisy, centres = maps(1500, 0.02, 1), np.array([[0.1, 0.2], [-0.6, 0.5], [0.9, -0.9]])
-    alone = [noisy.fit(centre[None], count, 3) for centre, count in zip(centres, (80, 250, 120), strict=True)]
-    together = noisy.fit_within(centres, np.array([fit.bandwidth[0] for fit in alone]) * (1.0 + 1e-12), 3)
+    phases, counts = np.zeros(3), (80, 250, 120)
+    alone = [noisy.fit(centre[None], phases[:1], count, 3) for centre, count in zip(centres, counts, strict=True)]
+    together = noisy.fit_within(centres, phases, np.array([fit.bandwidth[0] for fit in alone]) * (1.0 + 1e-12), 3)
     for k, fit in enumerate(alone):
         np.testing.assert_allclose(together.value[k], fit.value[0], rtol=1e-9)
         np.testing.assert_allclose(together.derivatives[k], fit.derivatives[0], rtol=1e-6, atol=1e-9)
@@ -69,7 +70,7 @@ def test_fits_of_given_bandwidths_are_those_of_as_many_neighbours():
 
 
 def test_where_points_are_few_the_bandwidth_is_larger():
-    fit = maps(1500, 0.0, 1).fit_within(np.array([[0.1, 0.2], [3.0, 3.0]]), np.array([0.1, 0.1]), 2)
+    fit = maps(1500, 0.0, 1).fit_within(np.array([[0.1, 0.2], [3.0, 3.0]]), np.zeros(2), np.array([0.1, 0.1]), 2)
     assert fit.bandwidth[0] == 0.1 and fit.bandwidth[1] > 0.5
     np.testing.assert_allclose(fit.value, quadratic(np.array([[0.1, 0.2], [3.0, 3.0]])), atol=1e-6)
 
@@ -84,7 +85,7 @@ def test_a_neighbourhood_is_one_step_narrower_than_the_widest_that_agrees(bend, 
     for seed in range(20):
         noisy = maps(6000, 1e-3, seed)
         noisy.increments[:, 0] += bend * noisy.arguments[:, 0] ** 5
-        narrowest = noisy.nearest(point, 72)[0][0, -1] / KERNEL_REACH
+        narrowest = noisy.nearest(point, np.zeros(1), 72)[0][0, -1] / KERNEL_REACH
         found.append(_bandwidths(noisy, point, 32)[0] / narrowest)
     assert np.median(found) == pytest.approx(2.0 ** (0.5 * steps), rel=1e-9)
 
@@ -98,11 +99,11 @@ def test_increments_modulo_a_turn_give_the_same_map():
     folded = np.stack([(angle + 0.37) % 1.0 - 0.37, other], axis=1)
     run = image - arguments
     turn = np.array([1.0, np.inf])
-    known = ReturnMap(folded, run, turn, True, np.zeros(2)).fit(np.array([[0.5, 0.0]]), 60, 1)
+    known = ReturnMap(folded, run, turn, True, np.zeros(2)).fit(np.array([[0.5, 0.0]]), np.zeros(1), 60, 1)
     np.testing.assert_allclose(known.value[0] - [0.5, 0.0], [0.6, 0.0], atol=1e-12)
     modulo = run.copy()
     modulo[:, 0] -= np.round(modulo[:, 0])
-    alone = ReturnMap(folded, modulo, turn, False, np.zeros(2)).fit(np.array([[0.5, 0.0]]), 60, 1)
+    alone = ReturnMap(folded, modulo, turn, False, np.zeros(2)).fit(np.array([[0.5, 0.0]]), np.zeros(1), 60, 1)
     np.testing.assert_allclose(alone.jacobian, known.jacobian, atol=1e-12)
     np.testing.assert_allclose((alone.value - known.value) % 1.0 % 1.0, [[0.0, 0.0]], atol=1e-12)
 
@@ -114,7 +115,7 @@ def atlas():
 
 def test_an_atlas_reproduces_a_quadratic_map_between_the_centres(atlas):
     points = np.random.default_rng(2).uniform(-0.8, 0.8, (200, 2))
-    found, jacobian, bandwidth = atlas.at(points)
+    found, jacobian, bandwidth = atlas.at(points, np.zeros(len(points)))
     assert found == pytest.approx(quadratic(points), abs=1e-9)
     assert jacobian == pytest.approx(np.array([slopes(x, y) for x, y in points]), abs=1e-7)
     assert np.isfinite(bandwidth).all()
@@ -122,9 +123,11 @@ def test_an_atlas_reproduces_a_quadratic_map_between_the_centres(atlas):
 
 def test_fits_about_the_points_agree_with_the_atlas(atlas):
     points = np.random.default_rng(3).uniform(-0.8, 0.8, (50, 2))
-    for one, other in zip(atlas.at(points)[:2], atlas.exactly(points)[:2], strict=True):
+    for one, other in zip(
+        atlas.at(points, np.zeros(len(points)))[:2], atlas.exactly(points, np.zeros(len(points)))[:2], strict=True
+    ):
         assert one == pytest.approx(other, abs=1e-7)
 
 
 def test_an_atlas_is_undefined_far_from_the_data(atlas):
-    assert np.isinf(atlas.at(np.array([[3.0, 3.0]]))[2]).all()
+    assert np.isinf(atlas.at(np.array([[3.0, 3.0]]), np.zeros(1))[2]).all()

@@ -126,7 +126,7 @@ def test_invalid_recordings_raise():
         bp.PoincareSection.from_recording(recording, ("angle", "rat"), frequency=chaos.FREQUENCY)
     with pytest.raises(ValueError, match="angles: must be .*got 'phi'"):
         bp.PoincareSection.from_recording(recording, BOTH, frequency=chaos.FREQUENCY, angles=("phi",))
-    with pytest.raises(ValueError, match="coordinates: must be two outputs"):
+    with pytest.raises(ValueError, match="coordinates: must be two or more outputs"):
         bp.PoincareSection.from_recording(recording, ("angle",), **ANGLE)
     with pytest.raises(ValueError, match="section: must have at least 200 points, got 51"):
         bp.PoincareSection.from_recording(chaos.recording(50, 40), BOTH, **ANGLE)

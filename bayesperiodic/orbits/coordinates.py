@@ -1,0 +1,173 @@
+"""The coordinates of a section: their names, delays, checks, and values."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from bayesperiodic import _checks
+from bayesperiodic.data.recording import Recording
+from bayesperiodic.orbits.stretches import LONGEST_USUAL_STEP, SMALLEST_WINDOW, Stretches, smoothed, usual_step
+
+DEGREES = 180.0 / np.pi
+# A delayed coordinate: a channel, and in brackets forcing periods after the phase of the section.
+DELAYED = re.compile(r"(.*)\[([^\[\]]*)\]", re.DOTALL)
+
+
+def channel_and_delay(coordinate: str) -> tuple[str, float]:
+    """Return the channel of a coordinate and its delay in forcing periods after the phase of the section."""
+    match = DELAYED.fullmatch(coordinate)
+    return (match[1], float(match[2])) if match else (coordinate, 0.0)
+
+
+def channels_of(coordinates: Sequence[str]) -> tuple[str, ...]:
+    """Return the channels of coordinates, each once."""
+    return tuple(dict.fromkeys(channel_and_delay(name)[0] for name in coordinates))
+
+
+def columns_of(names: Sequence[str]) -> np.ndarray:
+    """Return the position of each coordinate's channel among the channels."""
+    channels = channels_of(names)
+    return np.array([channels.index(channel_and_delay(name)[0]) for name in names])
+
+
+def delays_of(names: Sequence[str]) -> np.ndarray:
+    """Return the delay of each coordinate in forcing periods."""
+    return np.array([channel_and_delay(name)[1] for name in names])
+
+
+def longest_window(names: Sequence[str], samples: float, steps: int = 1) -> float:
+    """Return the shortest distance of two values of a channel, at this step or others, as a fraction of a step.
+
+    `samples` is their number a period. Raises a ValueError if windows of the fewest samples overlap.
+    """
+    columns, delays = columns_of(names), delays_of(names)
+    places = [np.sort(steps * delays[columns == column] % 1.0) for column in np.unique(columns)]
+    shortest = min(float(np.diff(one, append=one[0] + 1.0).min()) for one in places)
+    if shortest * samples < 2 * SMALLEST_WINDOW * steps * (1.0 - 1e-9):
+        modulo = "a period" if steps == 1 else f"1/{steps} of a period"
+        raise ValueError(
+            f"coordinates: must have values of a channel at least {2 * SMALLEST_WINDOW} samples apart modulo {modulo}, "
+            f"got {shortest * samples / steps:.2g} for {list(names)}. Otherwise they share their noise: choose other "
+            "delays" + ", or another number of steps." * (steps > 1) + "." * (steps == 1)
+        )
+    return shortest
+
+
+def coordinate_values(
+    samples: Stretches, names: Sequence[str], instants: np.ndarray, stretch: np.ndarray, frequency: float,
+    usual: float, steps: int = 1,
+) -> tuple[np.ndarray, np.ndarray | None]:  # fmt: skip
+    """Return the coordinates (instants, d) at given instants, a usual time apart, and the sd (d,) of their errors."""
+    longest = usual * longest_window(names, samples.sampling_rate / frequency, steps)
+    values, noise = np.empty((instants.size, len(names))), np.empty(len(names))
+    delays, columns = delays_of(names), columns_of(names)
+    first, last = samples.time[samples.starts[stretch]], samples.time[samples.stops[stretch] - 1]
+    for delay in np.unique(delays):
+        here = delays == delay
+        part = samples._replace(signals=samples.signals[:, columns[here]])
+        at = np.clip(instants + delay / frequency, first, last)
+        values[:, here], noise[here] = smoothed(part, at, stretch, longest)
+    return values, None if np.isnan(noise).any() else noise
+
+
+def coordinate_names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of coordinates and of those that are angles; raise a ValueError unless they are valid."""
+    given = [coordinates] if isinstance(coordinates, str) else list(coordinates)
+    names, delayed = [], set()
+    for name in given:
+        match = DELAYED.fullmatch(name) if isinstance(name, str) else None
+        if match is None:
+            names.append(name)
+            continue
+        try:
+            _checks.finite_number("delay", float(match[2]))
+        except ValueError:
+            raise ValueError(
+                f"coordinates: must have a number in brackets, the delay in forcing periods, such as "
+                f"{match[1] + '[-0.25]'!r}, got {name!r}."
+            ) from None
+        names.append(match[1])
+        delayed.add(match[1])
+    _checks.identifiers("coordinates", dict.fromkeys(names))
+    if len(names) < 2:
+        raise ValueError(f"coordinates: must be two or more outputs, got {coordinates!r}.")
+    if len(set(given)) < len(given):
+        raise ValueError(f"coordinates: must differ, got {given!r}.")
+    angle_names = (angles,) if isinstance(angles, str) else tuple(angles)
+    for name in angle_names:
+        _checks.one_of("angles", name, given)
+    if len(angle_names) > 1:
+        raise ValueError(f"angles: must name at most one coordinate, got {angle_names!r}.")
+    if any(channel_and_delay(name)[0] in delayed for name in angle_names):
+        raise ValueError(f"coordinates: must have no delays of an angle, got {given!r}. Delay another channel.")
+    return tuple(given), angle_names
+
+
+def coordinate_signals(
+    recording: Recording, coordinates: Sequence[str], angles: Iterable[str]
+) -> tuple[tuple[str, ...], tuple[str, ...], np.ndarray]:
+    """Return the names of the coordinates and of their angles, and values (samples, channels), angles unwrapped."""
+    names, angle_names = coordinate_names(coordinates, angles)
+    channels = channels_of(names)
+    for name in channels:
+        _checks.one_of("coordinates", name, recording.outputs)
+    if isinstance(recording.time, Mapping):
+        raise ValueError(
+            f"recording: must have the same times for all channels, got {recording!r}; leave other channels out, or "
+            "record the coordinates together."
+        )
+    signals = np.stack([recording.outputs[name] for name in channels], -1)
+    for name in angle_names:
+        k = channels.index(name)
+        _check_angle(name, signals[:, k])
+        signals[:, k] = np.unwrap(signals[:, k])
+        for other in range(len(channels)):
+            if other != k:
+                _check_rate(name, channels[other], recording.time, signals[:, k], signals[:, other])
+    return names, angle_names, signals
+
+
+def _check_angle(name: str, values: np.ndarray) -> None:
+    """Raise a ValueError for an angle that jumps by other than 2π, or moves half a turn between samples."""
+    step = np.abs(np.diff(values))
+    smooth, largest, extent = float(np.quantile(step, 0.9)), float(step.max()), float(np.ptp(values))
+    jumps = largest > 0.75 * extent and largest > 4.0 * smooth
+    if jumps and abs(extent / 360.0 - 1.0) < 0.1:
+        raise ValueError(
+            f"outputs[{name!r}]: must be an angle in radians, got jumps of {largest:.4g}. It seems to be in degrees: "
+            "convert it with numpy.radians."
+        )
+    if jumps and largest > 1.0 and abs(extent / (2.0 * np.pi) - 1.0) > 0.1:
+        raise ValueError(
+            f"outputs[{name!r}]: must be an angle that is continuous or jumps by a turn (6.283 rad), got jumps of "
+            f"{largest:.4g}. Check the unit, and whether the angle covers half a turn only (arctan instead of arctan2)."
+        )
+    if np.quantile(np.abs(wrapped(np.diff(values))), 0.9) > 0.75 * np.pi or smooth > 2.0 * np.pi:
+        raise ValueError(
+            f"outputs[{name!r}]: must move by less than half a turn (3.14 rad) between samples, got steps of "
+            f"{smooth:.4g}. Convert degrees with numpy.radians, or sample faster."
+        )
+
+
+def _check_rate(name: str, other: str, time: np.ndarray, angle: np.ndarray, rate: np.ndarray) -> None:
+    """Raise a ValueError if the other coordinate is the rate of the unwrapped angle in another unit."""
+    step = np.diff(time)
+    short = step <= LONGEST_USUAL_STEP * usual_step(time)
+    measured = np.diff(angle)[short]
+    expected = (0.5 * (rate[1:] + rate[:-1]) * step)[short]
+    scale, product = np.sqrt(np.sum(measured**2) * np.sum(expected**2)), np.sum(measured * expected)
+    if scale == 0.0 or product < 0.98 * scale:
+        return
+    ratio = product / np.sum(expected**2)
+    for factor, quantity in ((DEGREES, "angle"), (1.0 / DEGREES, "rate")):
+        if abs(ratio / factor - 1.0) < 0.1:
+            raise ValueError(
+                f"outputs[{name!r}]: must be the integral of {other!r}, got {ratio:.3g} times it; the {quantity} seems "
+                "to be in degrees. Use radians and radians per second."
+            )
+
+
+def wrapped(values: np.ndarray, turning: np.ndarray | bool = True) -> np.ndarray:
+    """Return values (…, coordinates), with those that are turning angles in (−π, π]."""
+    return np.where(turning, np.pi - (np.pi - values) % (2.0 * np.pi), values)
