@@ -9,9 +9,8 @@ from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STALLED, Bat
 from bayesperiodic.periodic.condensed import (
     RESOLVED_SHARE,
     CondensedEquations,
-    Preconditioner,
-    ResponseMatrices,
 )
+from bayesperiodic.periodic.element_forces import Preconditioner, ResponseMatrices
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized
 from bayesperiodic.periodic.receptance import compiled, unresolved
 
@@ -113,13 +112,13 @@ class CondensedBatch:
         free = np.empty(d_f.shape[:-1], dtype=complex)
         for e, response in enumerate(responses):
             d_f[e], free[e] = response.d_f, _unforced(response.d_u, self._load[e])
-        turns, reversed_bits = self._transform
-        address = first.model.element_kernels.residual.address if first.count else 0
+        kernels, blocks = first.model.element_kernels, np.array(first.model.state_blocks, dtype=np.int64)
+        address = (kernels.residual_jacobian if blocks.size else kernels.residual).address if first.count else 0
 
         def part(block: tuple[int, int]) -> None:
             compiled().correct_many(
-                address, d_f, free, self._inverse, self._low, every, self._rates, float(first.grid.periods), turns,
-                reversed_bits, polish, *block, moved, d, f, lost, steps,
+                address, d_f, free, self._inverse, self._low, every, self._rates, float(first.grid.periods),
+                *self._transform, blocks, polish, *block, moved, d, f, lost, steps,
             )  # fmt: skip
 
         in_blocks(part, lost.size, FEWEST_CONDENSED_SOLVES, threads)
@@ -137,6 +136,10 @@ class CondensedBatch:
         ]
         outputs = np.stack([e.on_points(y) for e, y in zip(self._sets, every_y, strict=True)])
         shares = np.stack([unresolved(*of_set) for of_set in zip(self._largest, f, every_y, strict=True)])
+        if blocks.size:
+            for e, b in np.argwhere(status == CONVERGED):
+                given = d[e, b], f[e, b], every_y[e][b], every[e, b]
+                shares[e, b] = max(shares[e, b], self._sets[e].error_of_memory(*given))
         finer = {}
         for e, b in np.argwhere((status == CONVERGED) & ~(shares <= RESOLVED_SHARE)):
             equations, theta = self._sets[e], every[e, b]
