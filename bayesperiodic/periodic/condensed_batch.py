@@ -18,6 +18,8 @@ FEWEST_CONDENSED_SOLVES = 4
 # Parts of the way from an anchor in which a solution is followed, and largest correction in units of the predicted
 # change or, where a contact begins, of this part of the solution.
 LARGEST_PATH_PART, SMALLEST_PATH_PART, STRAIGHT_PATH, LEAST_PATH_CHANGE = 0.25, 1.0 / 256.0, 0.5, 0.01
+# Part of the points on which it is followed at first, and the fewest.
+PATH_POINTS_RATIO, FEWEST_PATH_POINTS = 8, 64
 
 
 class CondensedBatch:
@@ -156,18 +158,38 @@ class CondensedBatch:
         return BatchSolution(z, outputs, frequency, status, steps)
 
     def _follow(self, e: int, parameters: np.ndarray) -> tuple[np.ndarray, int, int]:
-        """Follow a solution from the anchor in steps; return it, the status, and Newton's steps."""
-        equations, anchor = self._sets[e], self._anchors[e]
+        """Follow a solution from the anchor in steps; return it, the status, and Newton's steps.
+
+        The steps are on fewer points at first, whose solution starts the one on all points, or where those do not
+        suffice, on all points.
+        """
+        equations, used = self._sets[e], 0
         if not self._known[e]:  # a guess, from which to solve
             solved = equations.solve(parameters, on_grid(self._d[e], self._points))
             return harmonics(solved.z), solved.code, len(solved.history)
+        fewer = max(self._points // PATH_POINTS_RATIO, FEWEST_PATH_POINTS)
+        if fewer < self._points:
+            d, code, used = self._stepped(e, parameters, fewer)
+            if code == CONVERGED:
+                start = resized(d, self._points)
+                solved = equations.solve(parameters, on_grid(start, self._points))
+                d, used = harmonics(solved.z), used + len(solved.history)
+                small = np.linalg.norm(d - start) <= LEAST_PATH_CHANGE * np.linalg.norm(d)
+                if solved.code == CONVERGED and small and np.all(solved.history[:, 2] == 1.0):
+                    return d, CONVERGED, used
+        d, code, more = self._stepped(e, parameters, self._points)
+        return d, code, used + more
+
+    def _stepped(self, e: int, parameters: np.ndarray, points: int) -> tuple[np.ndarray, int, int]:
+        """Follow a solution on a number of points; return it, the status, and Newton's steps."""
+        equations, anchor = self._sets[e], self._anchors[e]
         change = parameters - anchor.parameters
-        here, done, step, used = self._d[e], 0.0, LARGEST_PATH_PART, 0
-        ahead = np.tensordot(change, self._slopes[e], (0, 0))
+        here, done, step, used = resized(self._d[e], points), 0.0, LARGEST_PATH_PART, 0
+        ahead = resized(np.tensordot(change, self._slopes[e], (0, 0)), points)
         while done < 1.0:
             there = anchor.parameters + (done + step) * change
             predicted = here + step * ahead
-            solved = equations.solve(there, on_grid(predicted, self._points))
+            solved = equations.solve(there, on_grid(predicted, points))
             used, d = used + len(solved.history), harmonics(solved.z)
             size = max(float(np.linalg.norm(step * ahead)), LEAST_PATH_CHANGE * float(np.linalg.norm(d)))
             straight = np.linalg.norm(d - predicted) <= STRAIGHT_PATH * size and np.all(solved.history[:, 2] == 1.0)
