@@ -13,6 +13,8 @@ WEAK_COUPLING = 0.05
 # The same with internal states, by which a change at one moment lasts; corrections of Newton's step with such states,
 # and their last one relative to it.
 WEAK_COUPLING_OF_MEMORY, MOST_STEP_SWEEPS, LAST_STEP_SWEEP = 0.0125, 20, 1e-4
+# Points of the internal states per low harmonic in Newton's matrix.
+LEAST_PRECONDITIONER_POINTS = 8
 MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR = 200, 1e-13
 
 
@@ -131,9 +133,11 @@ def linearised(forces: Forces, rates: np.ndarray, moved: np.ndarray) -> np.ndarr
 def _of_units(memory: Memory, rates: np.ndarray, low: int) -> list[np.ndarray]:
     """Return changes of the forces by internal states for unit real and imaginary harmonics of d.
 
-    They are (elements, harmonics, harmonics), the latter those of d, of as many low harmonics.
+    They are (elements, harmonics, harmonics), the latter those of d, of as many low harmonics. Fewer points than those
+    of the forces suffice.
     """
-    points, result = len(memory.states), []
+    memory, result = memory.on_fewer(LEAST_PRECONDITIONER_POINTS * low), []
+    points = len(memory.states)
     for unit in (1.0, 1j):
         columns = np.zeros((2, points // 2, low), dtype=complex)
         numbers = np.arange(low)

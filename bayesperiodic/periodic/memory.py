@@ -61,6 +61,14 @@ class Memory(NamedTuple):
         """Derivatives of the forces by the internal states, (points, elements, internal states)."""
         return self.slopes[:, : self.elements, 0, self.elements :]
 
+    def on_fewer(self, points: int) -> "Memory":
+        """Return this on fewer of its points, but not fewer than the given ones."""
+        every = 1
+        while len(self.states) >= 2 * every * points:
+            every *= 2
+        states, columns = self.states[::every].copy(), self.columns[::every].copy()
+        return self._replace(states=states, columns=columns, step=every * self.step)
+
     def steepest(self, rates: np.ndarray) -> np.ndarray:
         """Return bounds of the change of the forces by that of the displacements (harmonics, elements).
 
