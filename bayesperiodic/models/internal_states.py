@@ -24,6 +24,17 @@ class ElementMotion(NamedTuple):
     blocks: tuple[int, ...]  # number of internal states that depend on each other, in their order
     owners: tuple[int, ...]  # the element of each
 
+    @property
+    def of_elements(self) -> tuple[sp.Symbol, ...]:
+        """Displacements of the elements, then their first and second derivatives."""
+        count, every = len(self.forces), len(self.forces) + len(self.rates)
+        return tuple(symbol for i, symbol in enumerate(self.symbols) if i % every < count)
+
+    @property
+    def states(self) -> tuple[sp.Symbol, ...]:
+        """The internal states."""
+        return self.symbols[len(self.forces) : len(self.forces) + len(self.rates)]
+
 
 def motion_of_elements(
     elements: Sequence[Element], inner: Sequence[str], parameters: Mapping[str, sp.Symbol]

@@ -478,6 +478,7 @@ class CondensedModel(Model):
         moving = motion_of_elements(structure.elements, inner, self.parameter_symbols)
         self.element_forces, self.element_rates = moving.forces, moving.rates
         self.element_symbols, self.state_blocks, self.state_owners = moving.symbols, moving.blocks, moving.owners
+        self.element_motion, self.internal_states = moving.of_elements, moving.states
         unknown = [n for n in self.parameters if n not in structure.parameters]
         self._warn_of_unused([*moving.forces, *moving.rates], unknown)
         self.element_names = tuple(element.name for element in structure.elements)
@@ -527,7 +528,7 @@ class CondensedModel(Model):
     def definition(self) -> str:
         """All that solutions depend on, as text; equal for equal models."""
         names = self.states, self.inputs, self.parameters, self.outputs, "condensed"
-        places = repr((self.state_owners, *self.element_symbols[: len(self.element_forces) + len(self.element_rates)]))
+        places = repr((self.state_owners, *self.element_motion[: len(self.element_forces)], *self.internal_states))
         expressions = map(sp.srepr, (*self.element_forces, *self.element_rates))
         return "\n".join([repr(names), self.structure.digest, places, *expressions])
 
@@ -564,12 +565,11 @@ class CondensedModel(Model):
     def latex(self) -> str:
         """Return the equation of motion, and the forces of the elements, as a LaTeX ``aligned`` environment."""
         written = {symbol: sp.latex(sp.Symbol(name)) for name, symbol in self.parameter_symbols.items()}
-        count, inner = len(self.element_forces), len(self.element_rates)
-        for number in range(count):
-            for order, mark in enumerate(("d", r"\dot{d}")):
-                written[self.element_symbols[order * (count + inner) + number]] = f"{mark}_{{{number + 1}}}"
-        for number in range(inner):
-            written[self.element_symbols[count + number]] = f"w_{{{number + 1}}}"
+        count = len(self.element_forces)
+        for order, mark in enumerate(("d", r"\dot{d}")):
+            for number in range(count):
+                written[self.element_motion[order * count + number]] = f"{mark}_{{{number + 1}}}"
+        written |= {symbol: f"w_{{{number}}}" for number, symbol in enumerate(self.internal_states, 1)}
         forces = [
             rf"{left}_{{{number + 1}}} &= {sp.latex(e, symbol_names=written)}"
             for left, given in (("f", self.element_forces), (r"\dot{w}", self.element_rates))

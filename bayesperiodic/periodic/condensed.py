@@ -423,6 +423,20 @@ class CondensedEquations(PeriodicEquations):
         """Return the outputs (points, channels) on the experiment's grid."""
         return self._outputs(harmonics(z), parameters)[0]
 
+    def linear_outputs(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the outputs (points, channels) if the forces of the elements were linear as at rest; NaN if none."""
+        points = self._fewest()
+        rest = np.zeros((points // 2, self.count), dtype=complex)
+        matrices, load = self.matrices(parameters, points)[0], self.input_harmonics(points)
+        forces = self.forces(rest, parameters)
+        f = harmonics(forces.values)
+        right = times(matrices.d_u, load) - times(matrices.d_f, f)
+        d = linear_solve(forces, self.rates(points), matrices.d_f, right[None])
+        if d is None:
+            return np.full((self.grid.points, len(self.model.outputs)), np.nan)
+        f = f + linearised(forces, self.rates(points), d)[0]
+        return self.on_points(times(matrices.y_u, load) - times(matrices.y_f, f))
+
     def sensitivities_along(
         self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
     ) -> Sensitivities | None:

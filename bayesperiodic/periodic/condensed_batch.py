@@ -18,8 +18,9 @@ FEWEST_CONDENSED_SOLVES = 4
 # Parts of the way from an anchor in which a solution is followed, and largest correction in units of the predicted
 # change or, where a contact begins, of this part of the solution.
 LARGEST_PATH_PART, SMALLEST_PATH_PART, STRAIGHT_PATH, LEAST_PATH_CHANGE = 0.25, 1.0 / 256.0, 0.5, 0.01
-# Part of the points on which it is followed at first, and the fewest.
-PATH_POINTS_RATIO, FEWEST_PATH_POINTS = 8, 64
+# Part of the points on which it is followed at first, and the fewest; the smallest part of the way on all points, where
+# that fails.
+PATH_POINTS_RATIO, FEWEST_PATH_POINTS, RETRIED_PATH_PART = 8, 64, 1.0 / 16.0
 
 
 class CondensedBatch:
@@ -177,10 +178,13 @@ class CondensedBatch:
                 small = np.linalg.norm(d - start) <= LEAST_PATH_CHANGE * np.linalg.norm(d)
                 if solved.code == CONVERGED and small and np.all(solved.history[:, 2] == 1.0):
                     return d, CONVERGED, used
-        d, code, more = self._stepped(e, parameters, self._points)
+        smallest = RETRIED_PATH_PART if fewer < self._points else SMALLEST_PATH_PART
+        d, code, more = self._stepped(e, parameters, self._points, smallest)
         return d, code, used + more
 
-    def _stepped(self, e: int, parameters: np.ndarray, points: int) -> tuple[np.ndarray, int, int]:
+    def _stepped(
+        self, e: int, parameters: np.ndarray, points: int, smallest: float = SMALLEST_PATH_PART
+    ) -> tuple[np.ndarray, int, int]:
         """Follow a solution on a number of points; return it, the status, and Newton's steps."""
         equations, anchor = self._sets[e], self._anchors[e]
         change = parameters - anchor.parameters
@@ -195,7 +199,7 @@ class CondensedBatch:
             straight = np.linalg.norm(d - predicted) <= STRAIGHT_PATH * size and np.all(solved.history[:, 2] == 1.0)
             if solved.code != CONVERGED or not straight:
                 step *= 0.5
-                if step < SMALLEST_PATH_PART:
+                if step < smallest:
                     return d, OTHER_ORBIT if solved.code == CONVERGED else solved.code, used
                 continue
             ahead, here, done = (d - here) / step, d, done + step

@@ -9,6 +9,7 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.diagnostics.candidates import Term, extended, of_elements
+from bayesperiodic.estimation.units import compared_with_data, unit_error
 from bayesperiodic.periodic.condensed import CondensedEquations
 
 Element = bp.elements.Element
@@ -34,10 +35,13 @@ def quadratic(v, drag):
     return drag * v * abs(v)
 
 
-def runs(model, values, error=0.003):
-    """Return synthetic experiments at four frequencies."""
+FORCES = (0.4, 6.0), (0.6, 3.0), (0.75, 6.0), (0.9, 3.0)
+
+
+def runs(model, values, error=0.003, forces=FORCES):
+    """Return synthetic experiments at frequencies [Hz] and forces."""
     result = []
-    for seed, (frequency, force) in enumerate([(0.4, 6.0), (0.6, 3.0), (0.75, 6.0), (0.9, 3.0)]):
+    for seed, (frequency, force) in enumerate(forces):
         inputs, random = {"force": force * WAVE}, np.random.default_rng(seed)
         truth = bp.solve_periodic(model, values, inputs, frequency=frequency, samples=SAMPLES).outputs
         outputs = {n: y + error * np.ptp(y) * random.standard_normal(SAMPLES) for n, y in truth.items()}
@@ -161,3 +165,39 @@ def test_report_shows_matrices_places_and_forces(found, tmp_path):
 def test_elements_of_the_same_name_are_refused():
     with pytest.raises(ValueError, match="elements: .*probe"):
         chain(True, *(Element("probe", lambda: 0, place) for place in (0, 1)))
+
+
+def test_wrong_unit_is_told_by_the_linear_response():
+    """Of condensed models as of symbolic ones, whose amplitudes are the same."""
+    data = [
+        bp.Experiment(e.name, e.frequency, {n: 1e3 * y for n, y in e.outputs.items()}, e.inputs, samples=SAMPLES)
+        for e in runs(chain(True, SPRING), VALUES)
+    ]
+    problem, symbolic = (bp.Problem(chain(kind, SPRING), data, priors=PRIORS) for kind in (True, False))
+    ours, theirs = (compared_with_data(p, p.median()) for p in (problem, symbolic))
+    assert ours and re.findall("amplitude[^,;.]*", ours) == re.findall("amplitude[^,;.]*", theirs)
+    assert "amplitude of 'x' is 1e+3 times that of the linearised model" in unit_error(problem)
+
+
+@cache
+def rubbing():
+    """Return a problem whose model has friction and lacks a cubic spring at another element, and its estimate."""
+    joint = Element("joint", bp.elements.jenkins, (1, 0), {"width": 0.1})
+    values = {"alpha": 0.05, "k_tip": 5.0, "joint_stiffness": 10.0, "joint_limit": 1.0}
+    priors = {name: bp.LogNormal(value, 0.3) for name, value in values.items()}
+    forces = (0.7, 4.0), (0.75, 6.0), (0.8, 8.0)
+    data = runs(chain(True, joint, SPRING), values | {"spring_k3": 10.0}, forces=forces)
+    problem = bp.Problem(chain(True, joint, Element("spring", lambda: 0, 2)), data, priors=priors)
+    return problem, bp.map_estimate(problem, progress=False)
+
+
+def test_missing_spring_is_found_beside_an_element_with_an_internal_state(tmp_path):
+    """The coefficient is within 4 standard deviations: by chance, one in 16000 runs with another seed is not."""
+    problem, fit = rubbing()
+    result = bp.missing_terms(problem, fit, max_terms=1)
+    (step,) = result.steps
+    assert (step.term, step.place) == ("spring**3", "force of spring")
+    assert abs(step.coefficient - 10.0) < 4 * step.sd
+    text = bp.report(problem, fit, None, tmp_path / "report.html", missing=result).read_text(encoding="utf-8")
+    plain = re.sub(r"<[^>]*>", "", text)
+    assert "f1=w1" in plain and "w˙1=" in plain and "f2=0" in plain
