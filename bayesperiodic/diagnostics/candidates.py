@@ -89,7 +89,7 @@ def _elements_variables(model: CondensedModel) -> list[dict[str, sp.Expr]]:
     """Return displacement and velocity of each element of a condensed model, by name."""
     count = len(model.element_names)
     return [
-        {DERIVATIVES[order] + name: model.element_symbols[order * count + k] for order in range(2)}
+        {DERIVATIVES[order] + name: model.element_motion[order * count + k] for order in range(2)}
         for k, name in enumerate(model.element_names)
     ]
 
@@ -99,7 +99,7 @@ def of_elements(model: CondensedModel) -> Model:
     check_derivative_names("elements", "s", model.element_names)
     names = [d + name for d in DERIVATIVES for name in model.element_names]
     other: Model = copy(model)
-    other.state_symbols, other.input_symbols = dict(zip(names, model.element_symbols, strict=True)), {}
+    other.state_symbols, other.input_symbols = dict(zip(names, model.element_motion, strict=True)), {}
     other.states, other.inputs, other.orders = model.element_names, (), dict.fromkeys(model.element_names, 1)
     return other
 

@@ -14,6 +14,8 @@ from bayesperiodic.problem.description import Description
 
 MAX_STEPS = 100
 MAX_STEP_HALVINGS = 30
+# Largest factor by which a step changes a parameter.
+LARGEST_FACTOR = 100.0
 SCALED_STEP = 1e-8
 CONVERGED_STEP, SMALL_GAIN = 1e-4, 1e-12
 # A step that gains less than the rounding errors of the objective, which are up to 1e-7 [standard deviations].
@@ -99,6 +101,15 @@ class Objective:
         with np.errstate(over="ignore"):
             result[logs] = theta[logs] * np.exp(step[logs] / theta[logs])
         return result
+
+    def longest(self, theta: np.ndarray, step: np.ndarray) -> float:
+        """Return the part of a step, at most 1, that changes parameters by no more than a factor `LARGEST_FACTOR`.
+
+        These are the parameters whose density is over the logarithm. Solves with absurd values cost most.
+        """
+        logs = self.density.logarithmic
+        change = np.max(np.abs(step[logs] / theta[logs]), initial=0.0)
+        return float(min(1.0, np.log(LARGEST_FACTOR) / change)) if change > 0.0 else 1.0
 
     def hessian_and_gradient(self, iterate: Iterate) -> tuple[np.ndarray, np.ndarray]:
         """Return H of eq. (8) and the gradient of the objective, the prior's part included in both."""
@@ -243,7 +254,7 @@ def _ascend(
         step, size = _step(_curved(objective, now, hessian), gradient, held)
         if size < SCALED_STEP:
             return now, "converged", history
-        damping, trial = 1.0, None
+        damping, trial = objective.longest(now.theta, step), None
         for _ in range(MAX_STEP_HALVINGS):
             trial = objective.at(objective.moved(now.theta, damping * step), now.here, now.noise)
             if trial is not None and trial.objective > now.objective:

@@ -6,9 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.likelihood.observation import Response
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
+from bayesperiodic.periodic.condensed import CondensedEquations
 from bayesperiodic.periodic.equations import FREQUENCY
 from bayesperiodic.periodic.floquet import first_order_matrix
 from bayesperiodic.periodic.isolation import MANY_CYCLES
@@ -30,12 +32,18 @@ class Scales(NamedTuple):
 def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
     """Return by experiment the measured and the modelled sizes at θ, where the linearised model has any.
 
-    The frequency of the model is that of the eigenvalue whose modulus is nearest to the measured frequency.
+    The frequency of the model is that of the eigenvalue whose modulus is nearest to the measured frequency; condensed
+    models have none here.
     """
     scales = {}
     for e in problem.experiments:
         equations, (parameters, sensors) = problem.equations[e.name], problem.parameter_maps[e.name].split(theta)
         measured, modelled = {FREQUENCY: e.frequency}, {}
+        if isinstance(equations, CondensedEquations):
+            response = Response(equations.linear_outputs(parameters), np.array(e.frequency), np.empty(0), sensors)
+            _add_amplitudes(measured, modelled, problem, e, response)
+            scales[e.name] = Scales(measured, _possible(modelled))
+            continue
         with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
             z = equations.static_guess(parameters)
             columns = equations.residual_jacobian(z, parameters)
@@ -47,11 +55,21 @@ def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
             if not problem.model.autonomous and e.condition is None:
                 z = z - equations.factors(columns).solve(np.ascontiguousarray(columns[:, : equations.count]))
                 response = Response(equations.outputs(z, parameters), np.array(e.frequency), np.empty(0), sensors)
-                for channel, values in problem.observations[e.name].predicted(response).items():
-                    measured[channel] = 0.5 * float(np.ptp(e.outputs[channel]))
-                    modelled[channel] = 0.5 * float(np.ptp(values))
-        scales[e.name] = Scales(measured, {name: size for name, size in modelled.items() if 0.0 < size < np.inf})
+                _add_amplitudes(measured, modelled, problem, e, response)
+        scales[e.name] = Scales(measured, _possible(modelled))
     return scales
+
+
+def _add_amplitudes(
+    measured: dict[str, float], modelled: dict[str, float], problem: Problem, e: Experiment, response: Response
+) -> None:
+    for channel, values in problem.observations[e.name].predicted(response).items():
+        measured[channel] = 0.5 * float(np.ptp(e.outputs[channel]))
+        modelled[channel] = 0.5 * float(np.ptp(values))
+
+
+def _possible(sizes: Mapping[str, float]) -> dict[str, float]:
+    return {name: size for name, size in sizes.items() if 0.0 < size < np.inf}
 
 
 def singular_start(problem: Problem, theta: np.ndarray, statuses: Mapping[str, str]) -> str:
@@ -59,6 +77,8 @@ def singular_start(problem: Problem, theta: np.ndarray, statuses: Mapping[str, s
     for e in problem.experiments:
         if statuses[e.name] == STATUSES[NOT_FINITE]:
             equations, parameters = problem.equations[e.name], problem.parameters(theta[None], e.name)[0]
+            if isinstance(equations, CondensedEquations):
+                return ""
             given = None if isinstance(e.guess, str) else e.guess
             start = as_guess(equations, given) if given else equations.static_guess(parameters)
             return singular_term(equations, start, parameters)

@@ -15,6 +15,7 @@ from bayesperiodic._compile.code_generation import Kernels, SymbolicModel, VjpKe
 from bayesperiodic._compile.grid_function import GridFunction
 from bayesperiodic._expressions import parse
 from bayesperiodic._printing import Printed
+from bayesperiodic.models.internal_states import motion_of_elements
 from bayesperiodic.models.matrices import definition, of_modes, structure
 from bayesperiodic.models.names import DERIVATIVES, RESERVED, Names, called, check_derivative_names, with_derivatives
 from bayesperiodic.models.structure import MatrixStructure
@@ -197,8 +198,7 @@ class Model(Printed):
         elements : sequence of elements.Element
             Nonlinear parts. Each parameter of an element is a parameter of the model, called element_parameter.
         condensed : bool, optional
-            By default True for more than ten degrees of freedom, if all elements are memoryless: their forces are
-            functions of displacement and velocity, without internal states.
+            By default True for more than ten degrees of freedom, if no element depends on the time.
 
         Returns
         -------
@@ -209,7 +209,7 @@ class Model(Printed):
         ValueError
             For matrices that are not square, of different sizes or not finite, a singular mass matrix, a place that
             does not exist, an output that may be absolute or relative, an absolute one that needs the integral of the
-            input, a condensed model without input or with an element that has internal states, and as for `Model`.
+            input, a condensed model without input or with an element that depends on the time, and as for `Model`.
 
         Examples
         --------
@@ -282,7 +282,7 @@ class Model(Printed):
     @classmethod
     def _of_structure(cls, name: str, given: MatrixStructure, condensed: bool | None) -> "Model":
         if condensed is None:
-            condensed = given.memoryless and bool(given.drives) and given.degrees > MOST_SYMBOLIC
+            condensed = given.of_motion and bool(given.drives) and given.degrees > MOST_SYMBOLIC
         return CondensedModel(name, given) if condensed else cls(name, **definition(given))
 
     def _expression(self, argument: str, given: Any) -> sp.Expr:
@@ -443,7 +443,8 @@ class Model(Printed):
 class CondensedModel(Model):
     """Model of matrices whose periodic solutions are found in the displacements of its elements alone.
 
-    `Model.from_matrices` makes it. It has no symbolic equations: what needs them raises a ValueError.
+    `Model.from_matrices` makes it. It has no symbolic equations: what needs them raises a ValueError. The internal
+    states of elements, such as `elements.jenkins`, are no states of the model.
 
     Parameters
     ----------
@@ -454,14 +455,15 @@ class CondensedModel(Model):
     Raises
     ------
     ValueError
-        Without a force, and for an element with internal states.
+        Without a force, for an element that depends on the time, and for internal states whose equations are not of
+        first order and linear in the derivatives.
     """
 
     def __init__(self, name: str, structure: MatrixStructure):
-        if not structure.memoryless:
+        if not structure.of_motion:
             raise ValueError(
-                "elements: must be functions of displacement and velocity in a condensed model, got one with internal "
-                "states or an argument s; take condensed=False, or a memoryless element."
+                "elements: must be functions of displacement, velocity and internal states in a condensed model, got "
+                "one with an argument s and no states; take condensed=False, or an element without s."
             )
         if not structure.drives:
             raise ValueError(
@@ -469,30 +471,20 @@ class CondensedModel(Model):
             )
         given = definition(structure)
         self._set_names(name, given["states"], given["inputs"], given["parameters"])
+        inner, self.states = self.states[structure.degrees :], self.states[: structure.degrees]
         self.outputs = _checks.identifiers("outputs", structure.measured, (*RESERVED, *self.inputs))
         if not self.outputs:
             raise ValueError("outputs: must have at least one output, got none.")
-        moving = with_derivatives("e", tuple(f"d{number}" for number in range(len(structure.elements))))
-        self.element_symbols = tuple(moving.values())
-        s, p, forces = Names("states", {}), Names("parameters", self.parameter_symbols), []
-        for element, d, v in zip(
-            structure.elements, self.element_symbols, self.element_symbols[len(structure.elements) :], strict=False
-        ):
-            forces.append(self._element_force(element.evaluate(d, v, s, p).force))
-        self.element_forces = tuple(forces)
-        self._warn_of_unused(forces, [n for n in self.parameters if n not in structure.parameters])
+        moving = motion_of_elements(structure.elements, inner, self.parameter_symbols)
+        self.element_forces, self.element_rates = moving.forces, moving.rates
+        self.element_symbols, self.state_blocks, self.state_owners = moving.symbols, moving.blocks, moving.owners
+        self.element_motion, self.internal_states = moving.of_elements, moving.states
+        unknown = [n for n in self.parameters if n not in structure.parameters]
+        self._warn_of_unused([*moving.forces, *moving.rates], unknown)
         self.element_names = tuple(element.name for element in structure.elements)
         # Functions cannot be pickled; what they returned is kept.
         self.structure = replace(structure, elements=())
         self.angles, self.units, self.orders = (), {}, dict.fromkeys(self.states, 2)
-
-    def _element_force(self, given: sp.Expr) -> sp.Expr:
-        known = {*self.element_symbols, *self.parameter_symbols.values()}
-        if given.has(sp.I, sp.zoo, sp.nan, sp.oo, -sp.oo):
-            raise ValueError(f"elements: must have real and finite forces, got {_checks.shortened(given)}.")
-        if unknown := sorted(map(str, given.free_symbols - known)):
-            raise ValueError(f"elements: must have forces of d, v and parameters, got {', '.join(unknown)}.")
-        return given
 
     def refusal(self) -> ValueError:
         """Return the error for what needs symbolic equations."""
@@ -524,7 +516,7 @@ class CondensedModel(Model):
 
     @cached_property
     def explicit_time(self) -> bool:
-        """False, since elements are functions of displacement and velocity."""
+        """False, since elements do not depend on the time."""
         return False
 
     @cached_property
@@ -536,18 +528,23 @@ class CondensedModel(Model):
     def definition(self) -> str:
         """All that solutions depend on, as text; equal for equal models."""
         names = self.states, self.inputs, self.parameters, self.outputs, "condensed"
-        return "\n".join([repr(names), self.structure.digest, *map(sp.srepr, self.element_forces)])
+        places = repr((self.state_owners, *self.element_motion[: len(self.element_forces)], *self.internal_states))
+        expressions = map(sp.srepr, (*self.element_forces, *self.element_rates))
+        return "\n".join([repr(names), self.structure.digest, places, *expressions])
 
     @cached_property
     def element_kernels(self) -> Kernels:
-        """The compiled forces of the elements, as equations of the elements' displacements; cached on disk."""
+        """The compiled forces of the elements, then the rates of internal states; cached on disk.
+
+        They are equations of the elements' displacements and of the internal states.
+        """
         return SymbolicModel(
             states=self.element_symbols,
             inputs=(),
             parameters=tuple(self.parameter_symbols.values()),
             tau=self.time_symbols["tau"],
             frequency=self.time_symbols["frequency"],
-            equations=self.element_forces or (sp.S.Zero,),
+            equations=(*self.element_forces, *self.element_rates) or (sp.S.Zero,),
             outputs=(sp.S.Zero,),
             transitions=(),
         ).kernels()
@@ -569,11 +566,14 @@ class CondensedModel(Model):
         """Return the equation of motion, and the forces of the elements, as a LaTeX ``aligned`` environment."""
         written = {symbol: sp.latex(sp.Symbol(name)) for name, symbol in self.parameter_symbols.items()}
         count = len(self.element_forces)
-        for number in range(count):
-            for order, mark in enumerate(("d", r"\dot{d}")):
-                written[self.element_symbols[order * count + number]] = f"{mark}_{{{number + 1}}}"
+        for order, mark in enumerate(("d", r"\dot{d}")):
+            for number in range(count):
+                written[self.element_motion[order * count + number]] = f"{mark}_{{{number + 1}}}"
+        written |= {symbol: f"w_{{{number}}}" for number, symbol in enumerate(self.internal_states, 1)}
         forces = [
-            f"f_{{{number + 1}}} &= {sp.latex(f, symbol_names=written)}" for number, f in enumerate(self.element_forces)
+            rf"{left}_{{{number + 1}}} &= {sp.latex(e, symbol_names=written)}"
+            for left, given in (("f", self.element_forces), (r"\dot{w}", self.element_rates))
+            for number, e in enumerate(given)
         ]
         motion = self.structure.latex(self.parameter_symbols, written)
         return (

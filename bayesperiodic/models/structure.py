@@ -131,9 +131,9 @@ class MatrixStructure:
         return self.weights.shape[1]
 
     @property
-    def memoryless(self) -> bool:
-        """Whether the elements' forces are functions of displacement and velocity, without internal states."""
-        return not any(e.states or "s" in signature(e.force).parameters for e in self.elements)
+    def of_motion(self) -> bool:
+        """Whether the elements' forces follow from their displacements, velocities and internal states alone."""
+        return all(e.states or "s" not in signature(e.force).parameters for e in self.elements)
 
     @property
     def digest(self) -> str:

@@ -15,21 +15,33 @@ References
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import scipy.linalg
 
 from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, SINGULAR, STALLED
+from bayesperiodic.periodic.element_forces import (
+    Forces,
+    Preconditioner,
+    ResponseMatrices,
+    linear_solve,
+    linearised,
+    newton_step,
+    residual_of,
+    times,
+)
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, sampled
+from bayesperiodic.periodic.memory import remembered
 from bayesperiodic.periodic.receptance import Receptance, unresolved
 from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
 # Points of the grid of the elements, and relative change of the outputs below which they are not doubled.
 FEWEST_ELEMENT_POINTS, MOST_ELEMENT_POINTS, RESOLVED_CHANGE = 32, 4096, 1e-6
+# The latter with internal states, whose formula is of order two at kinks: it leaves about a third of the change.
+RESOLVED_CHANGE_OF_MEMORY = 5e-5
 # Bound of the error of the outputs, see `unresolved`, above which points are doubled too.
 RESOLVED_SHARE = 1e-4
 # The largest change or bound of outputs that count as resolved by the most points; the smallest relative harmonic of an
@@ -37,92 +49,11 @@ RESOLVED_SHARE = 1e-4
 LARGEST_OUTPUT_CHANGE, LEAST_HARMONIC = 1e-2, 1e-12
 # Points up to which a solve that fails is repeated, and their ratio.
 MOST_STARTING_POINTS, STARTING_RATIO = 512, 4
-# Share of a step that is left by harmonics whose coupling by the elements is neglected in Newton's matrix.
-WEAK_COUPLING = 0.05
 MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40, 10, 1e-10, 1e-13
-MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR = 200, 1e-13
 # Steps of the load along the branch, in units of the load and of the linear response; corrections, their largest ratio,
 # the last one, and the smallest cosine between two tangents.
 FIRST_LOAD_STEP, SMALLEST_LOAD_STEP, LARGEST_LOAD_STEP = 0.05, 1e-6, 0.1
 MOST_LOAD_CORRECTIONS, LOAD_CONTRACTION, LOAD_ERROR, STRAIGHT_TANGENTS = 10, 0.6, 1e-7, 0.9
-
-
-class Forces(NamedTuple):
-    """Forces of the elements on a grid, (points, elements), and their derivatives by displacement and velocity."""
-
-    values: np.ndarray
-    stiffness: np.ndarray
-    damping: np.ndarray
-
-
-class ResponseMatrices(NamedTuple):
-    """Frequency response at harmonics, each (…, harmonics, rows, columns)."""
-
-    d_f: np.ndarray
-    d_u: np.ndarray
-    y_f: np.ndarray
-    y_u: np.ndarray
-
-    @property
-    def largest(self) -> np.ndarray:
-        """Largest modulus of y_f over the harmonics, (…, rows, columns)."""
-        return np.asarray(np.abs(self.y_f).max(axis=-3))
-
-
-class Preconditioner:
-    """Inverse of the derivative of the residual by the harmonics of d, exact for the low ones.
-
-    The higher ones, which the elements couple only weakly, are treated as uncoupled.
-    """
-
-    def __init__(self, forces: Forces, rates: np.ndarray, d_f: np.ndarray, low: int = 0):
-        points, self.elements = forces.values.shape
-        self.low = low = low or self.strongly_coupled(forces, rates, d_f)
-        numbers = np.arange(low)
-        stiffness, damping = (np.fft.fft(part, axis=0).T / points for part in forces[1:])
-        difference, total = (numbers[:, None] - numbers) % points, (numbers[:, None] + numbers) % points
-        turning = 1j * rates[:low]
-        same = stiffness[:, difference] + damping[:, difference] * turning
-        mirrored = stiffness[:, total] - damping[:, total] * turning
-        mirrored[:, :, 0] = 0.0
-        sums = [np.einsum("kab,bkl->kalb", d_f[:low], part) for part in (same + mirrored, 1j * (same - mirrored))]
-        unit = np.einsum("kl,ab->kalb", np.eye(low), np.eye(self.elements))
-        by_real, by_imaginary = (s + u for s, u in zip(sums, (unit, 1j * unit), strict=True))
-        blocks = [[by_real.real, by_imaginary.real], [by_real.imag, by_imaginary.imag]]
-        size = low * self.elements
-        matrix = np.block([[block.reshape(size, size) for block in row] for row in blocks])
-        # The imaginary parts of the means are zero.
-        zero = slice(size, size + self.elements)
-        matrix[zero], matrix[:, zero] = 0.0, 0.0
-        matrix[zero, zero] = np.eye(self.elements)
-        self.matrix = matrix
-        if not self.elements:
-            return
-        self._factors = scipy.linalg.lu_factor(matrix, check_finite=False)
-
-    @property
-    def inverse(self) -> np.ndarray:
-        """Inverse for the low harmonics, real parts of harmonics and elements before the imaginary ones."""
-        return np.linalg.inv(self.matrix)
-
-    @staticmethod
-    def strongly_coupled(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> int:
-        """Return the number of low harmonics beyond which all are coupled weakly."""
-        steepest = np.abs(forces.stiffness).max(axis=0) + rates[:, None] * np.abs(forces.damping).max(axis=0)
-        coupling = np.sqrt(np.sum(np.abs(d_f * steepest[:, None, :]) ** 2, axis=(1, 2)))
-        return min(len(rates), int(np.flatnonzero(~(coupling < WEAK_COUPLING)).max(initial=0)) + 1)
-
-    def __call__(self, right: np.ndarray) -> np.ndarray:
-        """Return the approximate solution (…, harmonics, elements) for a right-hand side of that shape."""
-        result, low = right.copy(), right[..., : self.low, :]
-        if not self.elements:
-            return result
-        flat = np.concatenate([part.reshape(*right.shape[:-2], -1) for part in (low.real, low.imag)], axis=-1)
-        columns = flat.reshape(-1, flat.shape[-1]).T
-        solved = scipy.linalg.lu_solve(self._factors, columns, check_finite=False).T.reshape(flat.shape)
-        real, imaginary = np.split(solved, 2, axis=-1)
-        result[..., : self.low, :] = (real + 1j * imaginary).reshape(low.shape)
-        return result
 
 
 @dataclass(frozen=True)
@@ -274,22 +205,50 @@ class CondensedEquations(PeriodicEquations):
         return self._receptance.recent(key, lambda: self._forces(d, parameters))
 
     def _forces(self, d: np.ndarray, parameters: np.ndarray) -> Forces:
-        values, given = self._evaluated("residual_jacobian", d, parameters), self.count
-        f, slopes = values[:, :given], values[:, given:].reshape(len(values), given, 3, given)
-        diagonal = np.arange(given)
-        return Forces(f, slopes[:, diagonal, 0, diagonal], slopes[:, diagonal, 1, diagonal])
+        states, given, memory = self._motion(d), self.count, None
+        if self.model.state_owners:
+            period = self.grid.periods / self.frequency
+            memory = remembered(self.model, states, parameters, self.frequency, period)
+            if memory is None:
+                unknown = np.full((len(states), given), np.nan)
+                return Forces(unknown, unknown, unknown)
+        values = self._evaluated("residual_jacobian", states, parameters) if memory is None else memory.columns
+        every, diagonal = given + len(self.model.state_owners), np.arange(given)
+        f, slopes = values[:, :given], values[:, every:].reshape(len(values), every, 3, every)
+        return Forces(f, slopes[:, diagonal, 0, diagonal], slopes[:, diagonal, 1, diagonal], memory)
 
     def forces_by_parameters(self, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return the derivatives of the forces by the parameters, (points, elements, parameters)."""
         if not self.count:
             return np.zeros((2 * len(d), 0, parameters.size))
-        values = self._evaluated("derivatives", d, parameters)[:, : self.count * parameters.size]
-        return values.reshape(len(values), self.count, -1)
+        memory = self.forces(d, parameters).memory
+        states = self._motion(d) if memory is None else memory.states
+        every = self.count + len(self.model.state_owners)
+        values = self._evaluated("derivatives", states, parameters)[:, : every * parameters.size]
+        slopes = values.reshape(len(values), every, -1)
+        of_forces = slopes[:, : self.count]
+        return of_forces if memory is None else of_forces + memory.change(slopes[:, self.count :])
 
-    def _evaluated(self, name: str, d: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        points, kernels = 2 * len(d), self.model.element_kernels
-        states = np.zeros((points, 3 * self.count))
-        states[:, : 2 * self.count] = on_grid(np.concatenate([d, 1j * self.rates(points)[:, None] * d], axis=1), points)
+    def _by_frequency(self, d: np.ndarray, forces: Forces) -> np.ndarray:
+        """Return the derivatives of the forces by the frequency, (points, elements), with harmonics d held."""
+        v = on_grid(1j * self.rates(2 * len(d))[:, None] * d, 2 * len(d)) / self.frequency
+        change, memory = forces.damping * v, forces.memory
+        if memory is None:
+            return np.asarray(change)
+        # In units of the period, the rates of the states are inversely proportional to the frequency.
+        added = memory.by_velocity * v[:, memory.owners] - memory.rates / self.frequency
+        return np.asarray(change + memory.change(added[..., None])[..., 0])
+
+    def _motion(self, d: np.ndarray) -> np.ndarray:
+        """Return displacements and velocities of the elements as states of their kernels (points, 3·variables)."""
+        points, every = 2 * len(d), self.count + len(self.model.state_owners)
+        states, both = np.zeros((points, 3 * every)), np.concatenate([d, 1j * self.rates(points)[:, None] * d], axis=1)
+        motion = on_grid(both, points)
+        states[:, : self.count], states[:, every : every + self.count] = np.split(motion, 2, axis=1)
+        return states
+
+    def _evaluated(self, name: str, states: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        kernels, points = self.model.element_kernels, len(states)
         return kernels.evaluate(name, states, np.empty((points, 0)), parameters, np.zeros(points), self.frequency)
 
     def solve(self, parameters: np.ndarray, guess: np.ndarray, *_: Any) -> Solved:
@@ -305,14 +264,14 @@ class CondensedEquations(PeriodicEquations):
         free = load * times(matrices.d_u, self.input_harmonics(points))
         rates = self.rates(points)
         history: list[tuple[float, float, float]] = []
-        forces = self.forces(d, parameters)
+        forces, known = self.forces(d, parameters), None
         residual, size = residual_of(d, forces, matrices, free)
         for _ in range(MOST_CONDENSED_STEPS):
             if not np.isfinite(residual).all():
                 return d, NOT_FINITE, np.array(history).reshape(-1, 3)
             before = float(np.linalg.norm(residual))
             try:
-                step = Preconditioner(forces, rates, matrices.d_f)(residual)
+                step, known = newton_step(forces, rates, matrices.d_f, residual, known)
             except np.linalg.LinAlgError:
                 return d, SINGULAR, np.array(history).reshape(-1, 3)
             share = 1.0
@@ -364,7 +323,8 @@ class CondensedEquations(PeriodicEquations):
         """Double the points of a solution until its outputs are resolved; return it, the code and Newton's history."""
         history, change = np.empty((0, 3)), np.nan
         before, share = self._outputs(d, parameters)
-        while not (change <= RESOLVED_CHANGE and share <= RESOLVED_SHARE):
+        enough = RESOLVED_CHANGE_OF_MEMORY if self.model.state_owners else RESOLVED_CHANGE
+        while not (change <= enough and share <= RESOLVED_SHARE):
             if 2 * len(d) >= MOST_ELEMENT_POINTS:
                 worst = np.fmax(change, share)
                 return d, CONVERGED if worst <= LARGEST_OUTPUT_CHANGE else NOT_RESOLVED, history
@@ -439,7 +399,21 @@ class CondensedEquations(PeriodicEquations):
     def _output_harmonics(self, d: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, float]:
         matrices, f = self.matrices(parameters, 2 * len(d))[0], harmonics(self.forces(d, parameters).values)
         y = times(matrices.y_u, self.input_harmonics(2 * len(d))) - times(matrices.y_f, f)
-        return y, float(unresolved(matrices.largest, f, y))
+        bound = float(unresolved(matrices.largest, f, y))
+        return y, max(bound, self.error_of_memory(d, f, y, parameters))
+
+    def error_of_memory(self, d: np.ndarray, f: np.ndarray, y: np.ndarray, parameters: np.ndarray) -> float:
+        """Return the relative error of the outputs by that of internal states, d being held; 0 without such states.
+
+        It is a third of their change if half of the points give the forces' harmonics f, since the formula is of order
+        two at kinks.
+        """
+        if not self.model.state_owners:
+            return 0.0
+        fewer = harmonics(self._forces(resized(d, len(d)), parameters).values)
+        change = np.linalg.norm(times(self.matrices(parameters, len(d))[0].y_f, fewer - f[: len(fewer)]), axis=0)
+        worst = np.max(change / np.maximum(np.linalg.norm(y, axis=0), np.finfo(float).tiny), initial=0.0)
+        return float(worst) / 3.0 if np.isfinite(worst) else np.inf
 
     def error_bound(self, z: np.ndarray, parameters: np.ndarray) -> float:
         """Return the bound of the relative error of the outputs by the number of points, see `unresolved`."""
@@ -448,6 +422,20 @@ class CondensedEquations(PeriodicEquations):
     def outputs(self, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return the outputs (points, channels) on the experiment's grid."""
         return self._outputs(harmonics(z), parameters)[0]
+
+    def linear_outputs(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the outputs (points, channels) if the forces of the elements were linear as at rest; NaN if none."""
+        points = self._fewest()
+        rest = np.zeros((points // 2, self.count), dtype=complex)
+        matrices, load = self.matrices(parameters, points)[0], self.input_harmonics(points)
+        forces = self.forces(rest, parameters)
+        f = harmonics(forces.values)
+        right = times(matrices.d_u, load) - times(matrices.d_f, f)
+        d = linear_solve(forces, self.rates(points), matrices.d_f, right[None])
+        if d is None:
+            return np.full((self.grid.points, len(self.model.outputs)), np.nan)
+        f = f + linearised(forces, self.rates(points), d)[0]
+        return self.on_points(times(matrices.y_u, load) - times(matrices.y_f, f))
 
     def sensitivities_along(
         self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
@@ -476,7 +464,7 @@ class CondensedEquations(PeriodicEquations):
         `directions` are indices of parameters, their number standing for the frequency; the latter are (directions,
         harmonics, elements) and (directions, harmonics, outputs).
         """
-        points, rates = 2 * len(d), self.rates(2 * len(d))
+        points = 2 * len(d)
         matrices, changes = self.matrices(parameters, points, directions)
         forces = self.forces(d, parameters)
         f, load = harmonics(forces.values), self.input_harmonics(points)
@@ -487,7 +475,7 @@ class CondensedEquations(PeriodicEquations):
                 ..., [directions[n] for n in of_elements]
             ]
         for index in (i for i, n in enumerate(directions) if n == size):
-            slopes[..., index] = forces.damping * on_grid(1j * rates[:, None] * d, points) / self.frequency
+            slopes[..., index] = self._by_frequency(d, forces)
         of_forces = harmonics(slopes.reshape(points, self.count * len(directions))).reshape(
             len(d), self.count, len(directions)
         )
@@ -527,10 +515,10 @@ class CondensedEquations(PeriodicEquations):
         """Return derivatives along what is added to d and the outputs, (directions, harmonics, …), with d held."""
         points = len(forces.values)
         rates = self.rates(points)
-        moved = _linear_solve(forces, rates, matrices.d_f, right)
+        moved = linear_solve(forces, rates, matrices.d_f, right)
         if moved is None:
             return None
-        outputs = explicit - times(matrices.y_f, _linearised(forces, rates, moved))
+        outputs = explicit - times(matrices.y_f, linearised(forces, rates, moved))
         return Sensitivities(on_grid(moved, points), self.on_points(outputs), np.zeros(len(right)))
 
 
@@ -554,44 +542,6 @@ def _stacked(amplitudes: np.ndarray, unit: float) -> np.ndarray:
 def _unstacked(vector: np.ndarray, unit: float, shape: tuple[int, ...]) -> np.ndarray:
     real, imaginary = np.split(vector * unit, 2)
     return (real + 1j * imaginary).reshape(shape)
-
-
-def times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return matrices (…, rows, columns) times vectors (…, columns)."""
-    return (matrices @ vectors[..., None])[..., 0]
-
-
-def residual_of(
-    d: np.ndarray, forces: Forces, matrices: ResponseMatrices, free: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Return the residual and the size of its terms."""
-    parts = d, times(matrices.d_f, harmonics(forces.values)), -free
-    return parts[0] + parts[1] + parts[2], max(*(float(np.linalg.norm(part)) for part in parts), np.finfo(float).tiny)
-
-
-def _linearised(forces: Forces, rates: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Return the change of the forces for a change of d, harmonics (…, harmonics, elements) both."""
-    points = len(forces.values)
-    change = forces.stiffness * on_grid(moved, points) + forces.damping * on_grid(1j * rates[:, None] * moved, points)
-    return harmonics(change)
-
-
-def _linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.ndarray) -> np.ndarray | None:
-    """Return x of the linearised equations (…, harmonics, elements); None if they are singular."""
-    try:
-        inverse = Preconditioner(forces, rates, d_f)
-    except np.linalg.LinAlgError:
-        return None
-    x = inverse(right)
-    for _ in range(MOST_LINEAR_SWEEPS):
-        step = inverse(right - x - times(d_f, _linearised(forces, rates, x)))
-        x = x + step
-        size = float(np.linalg.norm(x))
-        if not np.isfinite(size):
-            return None
-        if np.linalg.norm(step) <= LINEAR_SWEEP_ERROR * size:
-            return x
-    return None
 
 
 def equations_for(model: Model, inputs: Mapping[str, np.ndarray] | None, **settings: Any) -> PeriodicEquations:

@@ -9,9 +9,8 @@ from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STALLED, Bat
 from bayesperiodic.periodic.condensed import (
     RESOLVED_SHARE,
     CondensedEquations,
-    Preconditioner,
-    ResponseMatrices,
 )
+from bayesperiodic.periodic.element_forces import Preconditioner, ResponseMatrices
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized
 from bayesperiodic.periodic.receptance import compiled, unresolved
 
@@ -19,6 +18,9 @@ FEWEST_CONDENSED_SOLVES = 4
 # Parts of the way from an anchor in which a solution is followed, and largest correction in units of the predicted
 # change or, where a contact begins, of this part of the solution.
 LARGEST_PATH_PART, SMALLEST_PATH_PART, STRAIGHT_PATH, LEAST_PATH_CHANGE = 0.25, 1.0 / 256.0, 0.5, 0.01
+# Part of the points on which it is followed at first, and the fewest; the smallest part of the way on all points, where
+# that fails.
+PATH_POINTS_RATIO, FEWEST_PATH_POINTS, RETRIED_PATH_PART = 8, 64, 1.0 / 16.0
 
 
 class CondensedBatch:
@@ -113,13 +115,13 @@ class CondensedBatch:
         free = np.empty(d_f.shape[:-1], dtype=complex)
         for e, response in enumerate(responses):
             d_f[e], free[e] = response.d_f, _unforced(response.d_u, self._load[e])
-        turns, reversed_bits = self._transform
-        address = first.model.element_kernels.residual.address if first.count else 0
+        kernels, blocks = first.model.element_kernels, np.array(first.model.state_blocks, dtype=np.int64)
+        address = (kernels.residual_jacobian if blocks.size else kernels.residual).address if first.count else 0
 
         def part(block: tuple[int, int]) -> None:
             compiled().correct_many(
-                address, d_f, free, self._inverse, self._low, every, self._rates, float(first.grid.periods), turns,
-                reversed_bits, polish, *block, moved, d, f, lost, steps,
+                address, d_f, free, self._inverse, self._low, every, self._rates, float(first.grid.periods),
+                *self._transform, blocks, polish, *block, moved, d, f, lost, steps,
             )  # fmt: skip
 
         in_blocks(part, lost.size, FEWEST_CONDENSED_SOLVES, threads)
@@ -137,6 +139,10 @@ class CondensedBatch:
         ]
         outputs = np.stack([e.on_points(y) for e, y in zip(self._sets, every_y, strict=True)])
         shares = np.stack([unresolved(*of_set) for of_set in zip(self._largest, f, every_y, strict=True)])
+        if blocks.size:
+            for e, b in np.argwhere(status == CONVERGED):
+                given = d[e, b], f[e, b], every_y[e][b], every[e, b]
+                shares[e, b] = max(shares[e, b], self._sets[e].error_of_memory(*given))
         finer = {}
         for e, b in np.argwhere((status == CONVERGED) & ~(shares <= RESOLVED_SHARE)):
             equations, theta = self._sets[e], every[e, b]
@@ -153,24 +159,47 @@ class CondensedBatch:
         return BatchSolution(z, outputs, frequency, status, steps)
 
     def _follow(self, e: int, parameters: np.ndarray) -> tuple[np.ndarray, int, int]:
-        """Follow a solution from the anchor in steps; return it, the status, and Newton's steps."""
-        equations, anchor = self._sets[e], self._anchors[e]
+        """Follow a solution from the anchor in steps; return it, the status, and Newton's steps.
+
+        The steps are on fewer points at first, whose solution starts the one on all points, or where those do not
+        suffice, on all points.
+        """
+        equations, used = self._sets[e], 0
         if not self._known[e]:  # a guess, from which to solve
             solved = equations.solve(parameters, on_grid(self._d[e], self._points))
             return harmonics(solved.z), solved.code, len(solved.history)
+        fewer = max(self._points // PATH_POINTS_RATIO, FEWEST_PATH_POINTS)
+        if fewer < self._points:
+            d, code, used = self._stepped(e, parameters, fewer)
+            if code == CONVERGED:
+                start = resized(d, self._points)
+                solved = equations.solve(parameters, on_grid(start, self._points))
+                d, used = harmonics(solved.z), used + len(solved.history)
+                small = np.linalg.norm(d - start) <= LEAST_PATH_CHANGE * np.linalg.norm(d)
+                if solved.code == CONVERGED and small and np.all(solved.history[:, 2] == 1.0):
+                    return d, CONVERGED, used
+        smallest = RETRIED_PATH_PART if fewer < self._points else SMALLEST_PATH_PART
+        d, code, more = self._stepped(e, parameters, self._points, smallest)
+        return d, code, used + more
+
+    def _stepped(
+        self, e: int, parameters: np.ndarray, points: int, smallest: float = SMALLEST_PATH_PART
+    ) -> tuple[np.ndarray, int, int]:
+        """Follow a solution on a number of points; return it, the status, and Newton's steps."""
+        equations, anchor = self._sets[e], self._anchors[e]
         change = parameters - anchor.parameters
-        here, done, step, used = self._d[e], 0.0, LARGEST_PATH_PART, 0
-        ahead = np.tensordot(change, self._slopes[e], (0, 0))
+        here, done, step, used = resized(self._d[e], points), 0.0, LARGEST_PATH_PART, 0
+        ahead = resized(np.tensordot(change, self._slopes[e], (0, 0)), points)
         while done < 1.0:
             there = anchor.parameters + (done + step) * change
             predicted = here + step * ahead
-            solved = equations.solve(there, on_grid(predicted, self._points))
+            solved = equations.solve(there, on_grid(predicted, points))
             used, d = used + len(solved.history), harmonics(solved.z)
             size = max(float(np.linalg.norm(step * ahead)), LEAST_PATH_CHANGE * float(np.linalg.norm(d)))
             straight = np.linalg.norm(d - predicted) <= STRAIGHT_PATH * size and np.all(solved.history[:, 2] == 1.0)
             if solved.code != CONVERGED or not straight:
                 step *= 0.5
-                if step < SMALLEST_PATH_PART:
+                if step < smallest:
                     return d, OTHER_ORBIT if solved.code == CONVERGED else solved.code, used
                 continue
             ahead, here, done = (d - here) / step, d, done + step

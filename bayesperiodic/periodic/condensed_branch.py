@@ -14,12 +14,8 @@ from bayesperiodic.periodic.condensed import (
     MOST_ELEMENT_POINTS,
     RESOLVED_SHARE,
     CondensedEquations,
-    Forces,
-    Preconditioner,
-    ResponseMatrices,
-    residual_of,
-    times,
 )
+from bayesperiodic.periodic.element_forces import Forces, Preconditioner, ResponseMatrices, residual_of, times
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized
 

@@ -20,6 +20,8 @@ MOST_MODES, MODE_ERROR_STEPS = 16, 128
 # Steps in time, and relative change of the largest modulus by twice as many, below which these are enough; with many
 # steps, also that in units of the distance from the unit circle.
 FEWEST_MODAL_STEPS, MANY_MODAL_STEPS, MOST_MODAL_STEPS, MODAL_ERROR, CLEAR_OF_CIRCLE = 64, 1024, 4096, 1e-8, 1e-3
+# Points at which the linearised equations of internal states are evaluated, one after the other, and points a step.
+POINTS_OF_MEMORY, POINTS_A_STEP = (4096, 8192, 16384), 8
 LEAST_STEP_TURN = 1e-7  # of an undamped mode in a step, below which the formula of a critically damped one is taken
 
 
@@ -34,11 +36,12 @@ class CondensedSolution(PeriodicSolution):
     ----------
     linearisation, twice_the_points : array
         Empty.
-    of_modes : complex array (2·modes,)
+    of_modes : complex array (2·modes + internal states of elements,)
         The multipliers, those of the 16 lowest modes at most; the elements bend the other modes statically. Those below
         about 1e-12 are rounding errors. None unless converged.
     multiplier_error : float
-        Estimated error of the largest modulus: its change with half of the steps in time, and with half of the modes.
+        Estimated error of the largest modulus: its change with half of the steps in time (with internal states of
+        elements, the largest of two such changes), and with half of the modes.
     changes : dict of str to float
         See `error_estimate`.
     """
@@ -54,12 +57,12 @@ class CondensedSolution(PeriodicSolution):
 
     @property
     def multipliers(self) -> np.ndarray:
-        """Floquet multipliers over the response period, complex (2·modes,), largest modulus first."""
+        """Floquet multipliers over the response period, complex as `of_modes`, largest modulus first."""
         return self.of_modes
 
     @property
     def exponents(self) -> np.ndarray:
-        """Floquet exponents log(multiplier)/period [1/s], complex (2·modes,)."""
+        """Floquet exponents log(multiplier)/period [1/s], complex as `of_modes`."""
         return self._others / self.period
 
     @property
@@ -138,7 +141,7 @@ def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.nd
     """Return the Floquet multipliers in the lowest modes, largest first, and the error of the largest modulus.
 
     The maps over the period with steps h, h/2, h/4, … are extrapolated in even powers of h ([1]_) until the largest
-    modulus does not change any more.
+    modulus does not change any more. With internal states of elements, which have kinks, they are not extrapolated.
 
     References
     ----------
@@ -146,6 +149,16 @@ def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.nd
        Analysis 2 (1965) 384-403.
     """
     motion = _Linearised(equations, theta, harmonics(z), MOST_MODES)
+    values, error = _of_memory(motion) if equations.model.state_owners else _extrapolated(motion)
+    if len(motion.modes.stiffness) < len(equations.model.states):
+        fewer = _Linearised(equations, theta, harmonics(z), MOST_MODES // 2)
+        of_fewer, of_all = (np.abs(np.linalg.eigvals(m.monodromy(MODE_ERROR_STEPS))).max() for m in (fewer, motion))
+        error += abs(float(of_fewer - of_all))
+    return values[np.argsort(-np.abs(values), kind="stable")], error
+
+
+def _extrapolated(motion: _Linearised) -> tuple[np.ndarray, float]:
+    """Return the multipliers for steps that become small, and the error of the largest modulus."""
     steps, row, largest = FEWEST_MODAL_STEPS, [motion.monodromy(FEWEST_MODAL_STEPS)], []
     while True:
         values = np.linalg.eigvals(row[-1]).astype(complex)
@@ -153,16 +166,23 @@ def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.nd
         error = abs(largest[-1] - largest[-2]) if len(largest) > 1 else np.inf
         clear = CLEAR_OF_CIRCLE * abs(largest[-1] - 1.0) if steps >= MANY_MODAL_STEPS else 0.0
         if steps >= MOST_MODAL_STEPS or (len(row) > 2 and error <= max(clear, MODAL_ERROR * largest[-1])):
-            break
+            return values, error
         steps, before, row = 2 * steps, row, [motion.monodromy(2 * steps)]
         for order, coarse in enumerate(before, start=1):
             row.append(row[-1] + (row[-1] - coarse) / (4.0**order - 1.0))
-    values = values[np.argsort(-np.abs(values), kind="stable")]
-    if len(motion.modes.stiffness) < len(equations.model.states):
-        fewer = _Linearised(equations, theta, harmonics(z), MOST_MODES // 2)
-        of_fewer, of_all = (np.abs(np.linalg.eigvals(m.monodromy(MODE_ERROR_STEPS))).max() for m in (fewer, motion))
-        error += abs(float(of_fewer - of_all))
-    return values, error
+
+
+def _of_memory(motion: _Linearised) -> tuple[np.ndarray, float]:
+    """Return the multipliers with internal states, and the error of the largest modulus.
+
+    Elements begin to slide and reverse between two points: the error is of order one and irregular in their number,
+    and the larger of the last two changes estimates it.
+    """
+    largest = []
+    for points in POINTS_OF_MEMORY:
+        values = np.linalg.eigvals(motion.monodromy(points // POINTS_A_STEP, points)).astype(complex)
+        largest.append(float(np.abs(values).max()))
+    return values, float(np.abs(np.diff(largest)).max())
 
 
 class _Linearised:
@@ -177,16 +197,31 @@ class _Linearised:
         self._forcing = np.ascontiguousarray(np.concatenate([zero, modes.at], axis=1).T)
         self._diagonal = not any((a - np.diag(np.diag(a))).any() for a in (modes.stiffness, modes.damping))
         self._size, self._elements = size, elements
+        self._inner = len(equations.model.state_owners)
         self._known = self._couplings(max(2 * len(d), MODE_ERROR_STEPS))
 
-    def _couplings(self, points: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return springs and dampers of the elements in series with the other modes, (points, elements, elements)."""
+    def _couplings(self, points: int) -> tuple[np.ndarray, ...]:
+        """Return springs and dampers of the elements in series with the other modes, (points, elements, elements).
+
+        With internal states w, also the derivatives of the forces by w, and those of the rates of w by displacements,
+        velocities and w.
+        """
         unit, forces = np.eye(self._elements), self._equations.forces(resized(self._d, points), self._theta)
-        springs, dampers = (part[..., None] * unit for part in forces[1:])
-        if self.modes.compliance.any():
-            series = np.linalg.inv(unit + springs @ self.modes.compliance)
+        springs, dampers = (part[..., None] * unit for part in forces[1:3])
+        flexible, series = self.modes.compliance, np.broadcast_to(unit, springs.shape)
+        if flexible.any():
+            series = np.linalg.inv(unit + springs @ flexible)
             springs, dampers = series @ springs, series @ dampers @ series.transpose(0, 2, 1)
-        return springs, dampers
+        if forces.memory is None:
+            return springs, dampers
+        slopes, count = forces.memory.slopes, self._elements
+        of_states = series @ slopes[:, :count, 0, count:]
+        by_d, by_v = slopes[:, count:, 0, :count], slopes[:, count:, 1, :count]
+        # The other modes take part of displacements and velocities; changes of `series` in time are neglected.
+        left = unit - flexible @ springs
+        inside = slopes[:, count:, 0, count:] - by_d @ flexible @ of_states
+        relaxed = np.linalg.inv(np.eye(self._inner) + by_v @ flexible @ of_states)
+        return springs, dampers, of_states, relaxed @ by_d @ left, relaxed @ by_v @ left, relaxed @ inside
 
     def _free(self, length: float) -> np.ndarray:
         """Return the motion without elements over a time."""
@@ -205,8 +240,10 @@ class _Linearised:
         result[v, q], result[v, v] = -squares * odd, even - decay * odd
         return result
 
-    def monodromy(self, steps: int) -> np.ndarray:
-        """Return the map of (q, q̇) over the period in steps, of second order.
+    def monodromy(self, steps: int, points: int = 0) -> np.ndarray:
+        """Return the map of (q, q̇) and internal states over the period in steps, of second order.
+
+        The elements are evaluated at these points, by default at those of the solution, or the steps if more.
 
         Each step is the exact motion of the linear structure between two points, at which the elements act for half of
         the step ([1]_), with their mean over it.
@@ -216,21 +253,52 @@ class _Linearised:
         .. [1] G. Strang, On the construction and comparison of difference schemes, SIAM Journal on Numerical Analysis 5
            (1968) 506-517.
         """
-        if steps > len(self._known[0]):
-            self._known = self._couplings(steps)
-        length, unit = self._period / steps, np.eye(self._elements)
-        springs, dampers = (_means(part, steps) for part in self._known)
-        result = np.eye(2 * self._size)
+        points = points or max(steps, len(self._known[0]))
+        if points != len(self._known[0]):
+            self._known = self._couplings(points)
+        length, means = self._period / steps, [_means(part, steps) for part in self._known]
+        result = np.eye(2 * self._size + self._inner)
+        kicks = self._kicks_of_states(length, *means) if self._inner else self._kicks(length, *means)
+        free = self._free(length)
+        compiled().monodromy(free, self._diagonal, self._places, self._forcing, kicks, result)
+        return result
+
+    def _kicks(self, length: float, springs: np.ndarray, dampers: np.ndarray) -> np.ndarray:
+        """Return the impulses of the elements in steps, by their displacements and velocities."""
         # The middle rule of velocities; two halves of a step make the kick of a whole one.
         halves = 0.5 * length * np.concatenate([springs, dampers], axis=2)
         kicks = 2.0 * halves
         if dampers.any():
+            unit = np.eye(self._elements)
             halves = np.linalg.solve(unit + 0.25 * length * dampers @ (self.modes.at @ self.modes.at.T), halves)
             kicks = 2.0 * halves - halves @ (self._places @ self._forcing) @ halves
         kicks[0] = halves[0]
-        free = self._free(length)
-        compiled().monodromy(free, self._diagonal, self._places, self._forcing, kicks, result)
-        return result
+        return kicks
+
+    def _kicks_of_states(
+        self,
+        length: float,
+        springs: np.ndarray,
+        dampers: np.ndarray,
+        of_states: np.ndarray,
+        by_d: np.ndarray,
+        by_v: np.ndarray,
+        by_states: np.ndarray,
+    ) -> np.ndarray:
+        """Return impulses and internal states w after steps, by displacements, velocities and w; see `_couplings`."""
+        count, inner = self._elements, self._inner
+        forces = np.concatenate([springs, dampers, of_states], axis=2)
+        rates = np.concatenate([by_d, by_v, by_states], axis=2)
+        # Velocities and w change by the middle rule in half of a step, displacements being held.
+        change = np.concatenate([-(self.modes.at @ self.modes.at.T) @ forces, rates], axis=1)
+        unit, still = np.eye(2 * count + inner), np.zeros((len(forces), count, 2 * count + inner))
+        change = np.concatenate([still, change], axis=1)
+        middle = np.linalg.inv(unit - 0.25 * length * change)
+        half = middle @ (unit + 0.25 * length * change)
+        impulses = 0.5 * length * forces @ middle
+        kicks = np.concatenate([impulses + impulses @ half, (half @ half)[:, 2 * count :]], axis=1)
+        kicks[0] = np.concatenate([impulses[0], half[0, 2 * count :]])
+        return np.ascontiguousarray(kicks)
 
 
 def _means(values: np.ndarray, count: int) -> np.ndarray:

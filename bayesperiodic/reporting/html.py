@@ -182,8 +182,9 @@ def outputs(model: Model) -> list[Markup]:
 def _condensed_equations(model: CondensedModel) -> list[Markup]:
     count = len(model.element_forces)
     numbers = range(1, count + 1)
-    moving = zip(model.element_symbols, ((f"d_{k}", order) for order in range(3) for k in numbers), strict=True)
-    printer, terms, masses = _MathPrinter(_names(model) | dict(moving)), [], []
+    moving = dict(zip(model.element_motion, ((f"d_{k}", order) for order in range(3) for k in numbers), strict=True))
+    moving |= {symbol: (f"w_{k}", 0) for k, symbol in enumerate(model.internal_states, 1)}
+    printer, terms, masses = _MathPrinter(_names(model) | moving), [], []
     for factor, letter, number, order in model.structure.linear_terms(model.parameter_symbols):
         scale = printer.text(factor) if factor != 1 else ""
         scale = f"<mrow><mo>(</mo>{scale}<mo>)</mo></mrow>" if factor.is_Add else scale
@@ -202,6 +203,8 @@ def _condensed_equations(model: CondensedModel) -> list[Markup]:
     for k, at, force in each:
         rows.append(printer.displayed(printer.named(f"d_{k}"), _moved(model, printer, at, 0)))
         rows.append(printer.displayed(printer.named(f"f_{k}"), printer.text(force)))
+    for k, rate in enumerate(model.element_rates, 1):
+        rows.append(printer.displayed(printer.named(f"w_{k}", 1), printer.text(rate)))
     return rows
 
 

@@ -9,7 +9,9 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.diagnostics.candidates import Term, extended, of_elements
+from bayesperiodic.estimation.units import compared_with_data, unit_error
 from bayesperiodic.periodic.condensed import CondensedEquations
+from bayesperiodic.reporting.html import equations
 
 Element = bp.elements.Element
 SAMPLES = 64
@@ -78,31 +80,44 @@ def test_stored_identifiability_is_read_again(tmp_path):
     assert repr(bp.load(tmp_path / "identifiability.h5")) == repr(ours)
 
 
-def test_effects_of_forces_are_differences_of_solutions_of_the_model_with_the_term():
-    problem, _ = lacking()
-    model, step = problem.model, 1e-4
+RUBBING = {"joint_stiffness": 10.0, "joint_limit": 1.0}
+
+
+def rubbing():
+    """Return the chain with an internal state beside the spring and an element without force."""
+    joint = Element("joint", bp.elements.jenkins, (1, 0), {"width": 0.1})
+    return chain(True, joint, SPRING, Element("probe", lambda: 0, (1, 0)))
+
+
+@pytest.mark.parametrize(("model", "more"), [(lambda: lacking()[0].model, {}), (rubbing, RUBBING)])
+def test_effects_of_forces_are_differences_of_solutions_of_the_model_with_the_term(model, more):
+    """On the same points."""
+    model, values, step = model(), VALUES | more, 1e-3
     known = of_elements(model).state_symbols
     terms = {
         "c_0": Term("force of probe", "dprobe*probe**2", known["dprobe"] * known["probe"] ** 2),
         "c_1": Term("force of spring", "spring**2", known["spring"] ** 2),
     }
-    more = extended(model, terms)
+    extension = extended(model, terms)
     how = {"inputs": {"force": 6.0 * WAVE}, "frequency": 0.75, "samples": SAMPLES}
-    equations = CondensedEquations.build(model, **how)
-    theta = np.array([VALUES[name] for name in model.parameters])
-    z = equations.find(theta, None)[0].z
-    count, states = len(model.element_names), equations.states(z)
+    built = CondensedEquations.build(model, **how)
+    theta = np.array([values[name] for name in model.parameters])
+    z = built.find(theta, None)[0].z
+    count, states = len(model.element_names), built.states(z)
     d, v = states[:, :count], states[:, count : 2 * count]
     change = np.zeros((2, len(z), count))
-    change[0, :, 1], change[1, :, 0] = v[:, 1] * d[:, 1] ** 2, d[:, 0] ** 2
-    moved = equations.moved_by_forces(z, theta, change)
+    spring, probe = (model.element_names.index(name) for name in ("spring", "probe"))
+    change[0, :, probe], change[1, :, spring] = v[:, probe] * d[:, probe] ** 2, d[:, spring] ** 2
+    moved = built.moved_by_forces(z, theta, change)
+    extended_equations = CondensedEquations.build(extension, **how)
     for row, name in enumerate(terms):
-        ends = [
-            bp.solve_periodic(more, VALUES | dict.fromkeys(terms, 0.0) | {name: sign * step}, **how).outputs
-            for sign in (1, -1)
-        ]
-        for column, channel in enumerate(model.outputs):
-            difference = (ends[0][channel] - ends[1][channel]) / (2 * step)
+        ends = []
+        for sign in (1, -1):
+            given = values | dict.fromkeys(terms, 0.0) | {name: sign * step}
+            there = np.array([given[n] for n in extension.parameters])
+            ends.append(extended_equations.outputs(extended_equations.solve(there, z).z, there))
+        for column in range(len(model.outputs)):
+            difference = (ends[0][:, column] - ends[1][:, column]) / (2 * step)
             np.testing.assert_allclose(moved.outputs[row, :, column], difference, atol=1e-5 * np.abs(difference).max())
 
 
@@ -158,6 +173,23 @@ def test_report_shows_matrices_places_and_forces(found, tmp_path):
     assert "dprobe*abs(dprobe)" in plain
 
 
+def test_equations_of_internal_states_are_shown():
+    plain = re.sub(r"<[^>]*>|\u2062", "", "".join(equations(rubbing())))
+    assert "f1=jointlimitw1" in plain and "w˙1=" in plain and "f3=0" in plain
+
+
 def test_elements_of_the_same_name_are_refused():
     with pytest.raises(ValueError, match="elements: .*probe"):
         chain(True, *(Element("probe", lambda: 0, place) for place in (0, 1)))
+
+
+def test_wrong_unit_is_told_by_the_linear_response():
+    """Of condensed models as of symbolic ones, whose amplitudes are the same."""
+    data = [
+        bp.Experiment(e.name, e.frequency, {n: 1e3 * y for n, y in e.outputs.items()}, e.inputs, samples=SAMPLES)
+        for e in runs(chain(True, SPRING), VALUES)
+    ]
+    problem, symbolic = (bp.Problem(chain(kind, SPRING), data, priors=PRIORS) for kind in (True, False))
+    ours, theirs = (compared_with_data(p, p.median()) for p in (problem, symbolic))
+    assert ours and re.findall("amplitude[^,;.]*", ours) == re.findall("amplitude[^,;.]*", theirs)
+    assert "amplitude of 'x' is 1e+3 times that of the linearised model" in unit_error(problem)

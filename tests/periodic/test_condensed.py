@@ -275,7 +275,6 @@ def free_bar(**changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"elements": [Element("joint", bp.elements.jenkins, 0, {"width": 0.1})]}, "elements: must be functions of"),
         ({"elements": [Element("late", lambda s, k: k * s.tau, 0)]}, "elements: must be functions of"),
         ({"forces": {}}, "forces: must have at least one force or a base in a condensed model"),
     ],

@@ -1,0 +1,196 @@
+"""Forces of the elements of a condensed model, linearised, and the solves of its linearised equations in harmonics."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from bayesperiodic.periodic.harmonics import harmonics, on_grid
+from bayesperiodic.periodic.memory import Memory
+
+# Share of a step that is left by harmonics whose coupling by the elements is neglected in Newton's matrix.
+WEAK_COUPLING = 0.05
+# The same with internal states, by which a change at one moment lasts; corrections of Newton's step with such states,
+# and their last one relative to it.
+WEAK_COUPLING_OF_MEMORY, MOST_STEP_SWEEPS, LAST_STEP_SWEEP = 0.0125, 20, 1e-4
+# Points of the internal states per low harmonic in Newton's matrix.
+LEAST_PRECONDITIONER_POINTS = 8
+MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR = 200, 1e-13
+
+
+class Forces(NamedTuple):
+    """Forces of the elements on a grid, (points, elements), and their derivatives by displacement and velocity.
+
+    The latter are with the internal states held.
+    """
+
+    values: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+    memory: Memory | None = None  # by internal states
+
+
+class ResponseMatrices(NamedTuple):
+    """Frequency response at harmonics, each (…, harmonics, rows, columns)."""
+
+    d_f: np.ndarray
+    d_u: np.ndarray
+    y_f: np.ndarray
+    y_u: np.ndarray
+
+    @property
+    def largest(self) -> np.ndarray:
+        """Largest modulus of y_f over the harmonics, (…, rows, columns)."""
+        return np.asarray(np.abs(self.y_f).max(axis=-3))
+
+
+class Preconditioner:
+    """Inverse of the derivative of the residual by the harmonics of d, exact for the low ones.
+
+    The higher ones, which the elements couple only weakly, are treated as uncoupled.
+    """
+
+    def __init__(self, forces: Forces, rates: np.ndarray, d_f: np.ndarray, low: int = 0):
+        points, self.elements = forces.values.shape
+        self.low = low = low or self.strongly_coupled(forces, rates, d_f)
+        numbers = np.arange(low)
+        stiffness, damping = (np.fft.fft(part, axis=0).T / points for part in forces[1:3])
+        difference, total = (numbers[:, None] - numbers) % points, (numbers[:, None] + numbers) % points
+        turning = 1j * rates[:low]
+        same = stiffness[:, difference] + damping[:, difference] * turning
+        mirrored = stiffness[:, total] - damping[:, total] * turning
+        mirrored[:, :, 0] = 0.0
+        by_part = [same + mirrored, 1j * (same - mirrored)]
+        if forces.memory is not None:
+            by_part = [a + b for a, b in zip(by_part, _of_units(forces.memory, rates, low), strict=True)]
+        sums = [np.einsum("kab,bkl->kalb", d_f[:low], part) for part in by_part]
+        unit = np.einsum("kl,ab->kalb", np.eye(low), np.eye(self.elements))
+        by_real, by_imaginary = (s + u for s, u in zip(sums, (unit, 1j * unit), strict=True))
+        blocks = [[by_real.real, by_imaginary.real], [by_real.imag, by_imaginary.imag]]
+        size = low * self.elements
+        matrix = np.block([[block.reshape(size, size) for block in row] for row in blocks])
+        # The imaginary parts of the means are zero.
+        zero = slice(size, size + self.elements)
+        matrix[zero], matrix[:, zero] = 0.0, 0.0
+        matrix[zero, zero] = np.eye(self.elements)
+        self.matrix = matrix
+        if not self.elements:
+            return
+        self._factors = scipy.linalg.lu_factor(matrix, check_finite=False)
+
+    @property
+    def inverse(self) -> np.ndarray:
+        """Inverse for the low harmonics, real parts of harmonics and elements before the imaginary ones."""
+        return np.linalg.inv(self.matrix)
+
+    @staticmethod
+    def strongly_coupled(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> int:
+        """Return the number of low harmonics beyond which all are coupled weakly."""
+        steepest = np.abs(forces.stiffness).max(axis=0) + rates[:, None] * np.abs(forces.damping).max(axis=0)
+        weak = WEAK_COUPLING
+        if forces.memory is not None:
+            steepest, weak = steepest + forces.memory.steepest(rates), WEAK_COUPLING_OF_MEMORY
+        coupling = np.sqrt(np.sum(np.abs(d_f * steepest[:, None, :]) ** 2, axis=(1, 2)))
+        return min(len(rates), int(np.flatnonzero(~(coupling < weak)).max(initial=0)) + 1)
+
+    def __call__(self, right: np.ndarray) -> np.ndarray:
+        """Return the approximate solution (…, harmonics, elements) for a right-hand side of that shape."""
+        result, low = right.copy(), right[..., : self.low, :]
+        if not self.elements:
+            return result
+        flat = np.concatenate([part.reshape(*right.shape[:-2], -1) for part in (low.real, low.imag)], axis=-1)
+        columns = flat.reshape(-1, flat.shape[-1]).T
+        solved = scipy.linalg.lu_solve(self._factors, columns, check_finite=False).T.reshape(flat.shape)
+        real, imaginary = np.split(solved, 2, axis=-1)
+        result[..., : self.low, :] = (real + 1j * imaginary).reshape(low.shape)
+        return result
+
+
+def times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return matrices (…, rows, columns) times vectors (…, columns)."""
+    return (matrices @ vectors[..., None])[..., 0]
+
+
+def residual_of(
+    d: np.ndarray, forces: Forces, matrices: ResponseMatrices, free: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return the residual and the size of its terms."""
+    parts = d, times(matrices.d_f, harmonics(forces.values)), -free
+    return parts[0] + parts[1] + parts[2], max(*(float(np.linalg.norm(part)) for part in parts), np.finfo(float).tiny)
+
+
+def linearised(forces: Forces, rates: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Return the change of the forces for a change of d, harmonics (…, harmonics, elements) both."""
+    points = len(forces.values)
+    d, v = on_grid(moved, points), on_grid(1j * rates[:, None] * moved, points)
+    change = forces.stiffness * d + forces.damping * v
+    if forces.memory is not None:
+        columns = [np.moveaxis(part.reshape(-1, *d.shape[-2:]), 0, -1) for part in (d, v)]
+        change = change + np.moveaxis(forces.memory.along(*columns), -1, 0).reshape(change.shape)
+    return harmonics(change)
+
+
+def _of_units(memory: Memory, rates: np.ndarray, low: int) -> list[np.ndarray]:
+    """Return changes of the forces by internal states for unit real and imaginary harmonics of d.
+
+    They are (elements, harmonics, harmonics), the latter those of d, of as many low harmonics. Fewer points than those
+    of the forces suffice.
+    """
+    memory, result = memory.on_fewer(LEAST_PRECONDITIONER_POINTS * low), []
+    points = len(memory.states)
+    for unit in (1.0, 1j):
+        columns = np.zeros((2, points // 2, low), dtype=complex)
+        numbers = np.arange(low)
+        columns[0, numbers, numbers] = unit
+        columns[1, numbers, numbers] = 1j * rates[:low] * unit
+        d, v = (np.repeat(part[:, None], memory.elements, axis=1) for part in on_grid(columns, points))
+        change = memory.along(d, v)
+        by_harmonic = harmonics(change.reshape(points, -1))[:low].reshape(low, memory.elements, low)
+        result.append(by_harmonic.transpose(1, 0, 2))
+    return result
+
+
+def newton_step(
+    forces: Forces, rates: np.ndarray, d_f: np.ndarray, residual: np.ndarray, known: Preconditioner | None = None
+) -> tuple[np.ndarray, Preconditioner]:
+    """Return Newton's step, and its preconditioner; with internal states the step is corrected.
+
+    Then the higher harmonics count too, and one that is `known` from a step before serves if the corrections become
+    small with it.
+    """
+    if forces.memory is None:
+        inverse = Preconditioner(forces, rates, d_f)
+        return inverse(residual), inverse
+    if known is not None and known.low <= len(rates):
+        step = _swept(known, forces, rates, d_f, residual, MOST_STEP_SWEEPS, LAST_STEP_SWEEP)
+        if step is not None:
+            return step, known
+    inverse = Preconditioner(forces, rates, d_f)
+    step = _swept(inverse, forces, rates, d_f, residual, MOST_STEP_SWEEPS, LAST_STEP_SWEEP)
+    return (inverse(residual) if step is None else step), inverse
+
+
+def linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.ndarray) -> np.ndarray | None:
+    """Return x of the linearised equations (…, harmonics, elements); None if they are singular."""
+    try:
+        inverse = Preconditioner(forces, rates, d_f)
+    except np.linalg.LinAlgError:
+        return None
+    return _swept(inverse, forces, rates, d_f, right, MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR)
+
+
+def _swept(
+    inverse: Preconditioner, forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.ndarray, most: int,
+    last: float,
+) -> np.ndarray | None:  # fmt: skip
+    """Return x of the linearised equations, corrected until the last correction is small; None if it is not."""
+    x = inverse(right)
+    for _ in range(most):
+        step = inverse(right - x - times(d_f, linearised(forces, rates, x)))
+        x = x + step
+        size = float(np.linalg.norm(x))
+        if not np.isfinite(size):
+            return None
+        if np.linalg.norm(step) <= last * size:
+            return x
+    return None
