@@ -38,7 +38,8 @@ def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
     scales = {}
     for e in problem.experiments:
         equations, (parameters, sensors) = problem.equations[e.name], problem.parameter_maps[e.name].split(theta)
-        measured, modelled = {FREQUENCY: e.frequency}, {}
+        measured: dict[str, float] = {FREQUENCY: e.frequency}
+        modelled: dict[str, float] = {}
         if isinstance(equations, CondensedEquations):
             response = Response(equations.linear_outputs(parameters), np.array(e.frequency), np.empty(0), sensors)
             _add_amplitudes(measured, modelled, problem, e, response)
