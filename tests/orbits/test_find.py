@@ -143,7 +143,7 @@ def test_intervals_hold_where_the_density_of_returns_varies():
         section = bp.PoincareSection.from_recording(
             chaos.recording(12_000, 40, 0.001, seed), ("angle", "rate"), frequency=chaos.FREQUENCY, angles=("angle",)
         )
-        maps, size = find._scaled(section, 32)
+        maps, size, _ = find._scaled(section, 32)
         for sign in (1, -1):
             estimate = refine(maps, sign * np.array(known.section) / size, 32)
             error = np.log(abs(estimate.eigenvalues[0] / known.multipliers[0]))
