@@ -132,8 +132,8 @@ def compare_models(models: Mapping[str, tuple[Problem, Posterior]], *, held_out:
 
     Examples
     --------
-    >>> print(bp.compare_models(springs, held_out=False).conclusion.partition(" (")[0])
-    'cubic' is preferred by evidence and leave-one-out prediction
+    >>> bp.compare_models(springs, held_out=False).table["verdict"].to_dict()
+    {'cubic': 'preferred', 'linear': 'worse'}
     """
     models = _checked(models)
     notes: list[str] = []

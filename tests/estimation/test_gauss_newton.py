@@ -33,6 +33,10 @@ class Inexact:
         """Return θ after a step."""
         return theta + step
 
+    def longest(self, theta, step):
+        """Return the whole step."""
+        return 1.0
+
     def anchored(self, iterate):
         """Return the iterate itself."""
         return iterate
