@@ -25,8 +25,9 @@ from bayesperiodic.problem.fingerprint import check_results, fingerprint
 # Colours without another meaning, one for each channel; and that of the residual with the terms.
 CHANNELS, AFTER = ENSEMBLES[1:4], ENSEMBLES[2]
 HELD_OUT_STYLE: dict[str, Any] = {"color": "grey", "ls": ":", "marker": "s", "ms": 4, "mfc": "white"}
-# Part of the axis to the left of the points, for their values.
-ROOM_FOR_VALUES = 0.5
+# Values that are written above each other [decades], the distance of these lines [points], and the part of the axis to
+# the left of the points, for them.
+SIDE_BY_SIDE, LINE_HEIGHT, ROOM_FOR_VALUES = 0.5, 10, 0.5
 
 
 @styled
@@ -78,11 +79,16 @@ def _steps(axes: Axes, search: MissingTerms) -> None:
     if np.isfinite(held_out).any():
         axes.plot(held_out, rows, label="experiments left out", **HELD_OUT_STYLE)
     values = {name: np.array([step.unexplained[name] for step in models]) for name in search.before.unexplained}
+    written = np.empty((0, len(rows)))
     for number, (channel, left) in enumerate(values.items()):
-        axes.plot(left, rows, "o-", color=CHANNELS[number % len(CHANNELS)], lw=1.6, ms=5, label=axis_label(channel))
-        for row, value in zip(rows, left, strict=True):
-            text = f"{100.0 * value:.2g} %"
-            axes.annotate(text, (value, row), (-5, 1), textcoords="offset points", ha="right", va="bottom")
+        colour = CHANNELS[number % len(CHANNELS)]
+        axes.plot(left, rows, "o-", color=colour, lw=1.6, ms=5, label=axis_label(channel))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            below = np.sum(np.abs(np.log10(written / left)) < SIDE_BY_SIDE, axis=0)
+        written = np.vstack([written, left])
+        for row, value, lines in zip(rows, left, below, strict=True):
+            place, text = (-5, 1 + LINE_HEIGHT * lines), f"{100.0 * value:.2g} %"
+            axes.annotate(text, (value, row), place, textcoords="offset points", ha="right", va="bottom", color=colour)
     known = np.concatenate([held_out, *values.values()])
     known = known[np.isfinite(known) & (known > 0.0)]
     axes.set(xscale="log", xlabel="unexplained variance", ylim=(len(models) - 0.6, -0.6))
