@@ -141,6 +141,9 @@ def test_missing_term_is_drawn_over_the_motion_of_the_element(found):
     figure = bp.plot.missing_terms(problem, fit, found)
     labels = {axes.get_xlabel() for axes in figure.axes}
     assert "rate of probe [1/s]" in labels
+    figure.draw_without_rendering()
+    boxes = [text.get_window_extent() for axes in figure.axes for text in axes.texts]
+    assert len(boxes) == 4 and not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
     plt.close(figure)
 
 
