@@ -6,13 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.likelihood.observation import Response
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 from bayesperiodic.periodic.condensed import CondensedEquations
 from bayesperiodic.periodic.equations import FREQUENCY
-from bayesperiodic.periodic.floquet import first_order_matrix
 from bayesperiodic.periodic.isolation import MANY_CYCLES
 from bayesperiodic.periodic.singular_terms import singular_term
 from bayesperiodic.periodic.solution import as_guess
@@ -38,39 +36,20 @@ def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
     scales = {}
     for e in problem.experiments:
         equations, (parameters, sensors) = problem.equations[e.name], problem.parameter_maps[e.name].split(theta)
-        measured: dict[str, float] = {FREQUENCY: e.frequency}
-        modelled: dict[str, float] = {}
-        if isinstance(equations, CondensedEquations):
-            response = Response(equations.linear_outputs(parameters), np.array(e.frequency), np.empty(0), sensors)
-            _add_amplitudes(measured, modelled, problem, e, response)
-            scales[e.name] = Scales(measured, _possible(modelled))
-            continue
+        measured, modelled = {FREQUENCY: e.frequency}, {}
         with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
-            z = equations.static_guess(parameters)
-            columns = equations.residual_jacobian(z, parameters)
-            jacobian = columns[:1, equations.count :].reshape(1, equations.count, -1)
-            rates = np.linalg.eigvals(first_order_matrix(jacobian, tuple(problem.model.orders.values()))[0])
+            rates = equations.linear_rates(parameters)
             sizes = np.abs(rates[rates != 0.0]) / (2 * np.pi)
             if sizes.size:
                 modelled[FREQUENCY] = float(sizes[np.argmin(np.abs(np.log(sizes / e.frequency)))])
             if not problem.model.autonomous and e.condition is None:
-                z = z - equations.factors(columns).solve(np.ascontiguousarray(columns[:, : equations.count]))
-                response = Response(equations.outputs(z, parameters), np.array(e.frequency), np.empty(0), sensors)
-                _add_amplitudes(measured, modelled, problem, e, response)
-        scales[e.name] = Scales(measured, _possible(modelled))
+                outputs = equations.linear_outputs(parameters)
+                response = Response(outputs, np.array(e.frequency), np.empty(0), sensors)
+                for channel, values in problem.observations[e.name].predicted(response).items():
+                    measured[channel] = 0.5 * float(np.ptp(e.outputs[channel]))
+                    modelled[channel] = 0.5 * float(np.ptp(values))
+        scales[e.name] = Scales(measured, {name: size for name, size in modelled.items() if 0.0 < size < np.inf})
     return scales
-
-
-def _add_amplitudes(
-    measured: dict[str, float], modelled: dict[str, float], problem: Problem, e: Experiment, response: Response
-) -> None:
-    for channel, values in problem.observations[e.name].predicted(response).items():
-        measured[channel] = 0.5 * float(np.ptp(e.outputs[channel]))
-        modelled[channel] = 0.5 * float(np.ptp(values))
-
-
-def _possible(sizes: Mapping[str, float]) -> dict[str, float]:
-    return {name: size for name, size in sizes.items() if 0.0 < size < np.inf}
 
 
 def singular_start(problem: Problem, theta: np.ndarray, statuses: Mapping[str, str]) -> str:

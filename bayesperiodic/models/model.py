@@ -400,10 +400,13 @@ class Model(Printed):
         -------
         VjpKernels
         """
-        known = self.__dict__.setdefault("_vjp_kernels", {})
-        if moving not in known:
-            known[moving] = VjpKernels(*grid_functions(self.symbolic.vjp_source(moving), VJP_FUNCTIONS))
-        return known[moving]
+        if moving not in self._vjp_kernels:
+            self._vjp_kernels[moving] = VjpKernels(*grid_functions(self.symbolic.vjp_source(moving), VJP_FUNCTIONS))
+        return self._vjp_kernels[moving]
+
+    @cached_property
+    def _vjp_kernels(self) -> dict[tuple[int, ...], VjpKernels]:
+        return {}
 
     def input_derivatives(self) -> dict[str, int]:
         """Return the order of the highest time derivative of every input that the model uses."""
@@ -430,8 +433,10 @@ class Model(Printed):
         return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
 
     def __getstate__(self) -> dict[str, Any]:
-        compiled = ("kernels", "_vjp_kernels", "jacobian_change", "smooth_signs", "softened")
-        return {key: value for key, value in self.__dict__.items() if key not in compiled}
+        # Copies are changed before use; none keeps what was computed from the equations.
+        classes = type(self).__mro__
+        computed = {name for one in classes for name, value in vars(one).items() if isinstance(value, cached_property)}
+        return {key: value for key, value in self.__dict__.items() if key not in computed}
 
     def __repr__(self) -> str:
         return (
@@ -581,11 +586,6 @@ class CondensedModel(Model):
             + " \\\\\n".join([motion, *(["d &= W x"] if count else []), *forces])
             + "\n\\end{aligned}"
         )
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {
-            key: value for key, value in self.__dict__.items() if key not in ("element_kernels", "with_all_outputs")
-        }
 
 
 def _symbols(expressions: Iterable[sp.Expr]) -> set[sp.Symbol]:

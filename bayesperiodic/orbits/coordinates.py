@@ -45,11 +45,11 @@ def longest_window(names: Sequence[str], samples: float, steps: int = 1) -> floa
     places = [np.sort(steps * delays[columns == column] % 1.0) for column in np.unique(columns)]
     shortest = min(float(np.diff(one, append=one[0] + 1.0).min()) for one in places)
     if shortest * samples < 2 * SMALLEST_WINDOW * steps * (1.0 - 1e-9):
-        modulo = "a period" if steps == 1 else f"1/{steps} of a period"
+        modulo, more = ("a period", "") if steps == 1 else (f"1/{steps} of a period", ", or another number of steps")
         raise ValueError(
             f"coordinates: must have values of a channel at least {2 * SMALLEST_WINDOW} samples apart modulo {modulo}, "
             f"got {shortest * samples / steps:.2g} for {list(names)}. Otherwise they share their noise: choose other "
-            "delays" + ", or another number of steps." * (steps > 1) + "." * (steps == 1)
+            f"delays{more}."
         )
     return shortest
 

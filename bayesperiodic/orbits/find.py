@@ -155,20 +155,18 @@ def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.nd
 
 def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
     """Return which delayed coordinate would let local maps predict best, in the units of the maps."""
-    errors = {}
-    for channel in channels_of(section.coordinates):
-        for name in (f"{channel}[{delay}]" for delay in DELAYS_TRIED):
-            values = (
-                section.delayed(name) if channel not in section.angles and name not in section.coordinates else None
-            )
-            if values is not None:
-                values = values[:, None] / np.ptp(values)
-                increments = np.where(np.isfinite(section.increments[:, :1]), np.diff(values, axis=0), np.nan)
-                more = ReturnMap(
-                    np.hstack([maps.points, values]), np.hstack([section.increments / np.ptp(section.points, axis=0),
-                    increments]), np.append(maps.turn, np.inf), maps.winds, np.append(maps.noise, 0.0), maps.stretches,
-                )  # fmt: skip
-                errors[name] = prediction_error(more)[0]
+    errors, size = {}, np.ptp(section.points, axis=0)
+    channels = [name for name in channels_of(section.coordinates) if name not in section.angles]
+    for name in (f"{channel}[{delay}]" for channel in channels for delay in DELAYS_TRIED):
+        values = None if name in section.coordinates else section.delayed(name)
+        if values is None:
+            continue
+        column = values[:, None] / np.ptp(values[np.isfinite(values)])
+        # No increments across breaks, where those of the section are NaN.
+        increments = np.diff(column, axis=0) + 0.0 * section.increments[:, :1]
+        points, added = np.hstack([maps.points, column]), np.hstack([section.increments / size, increments])
+        turn, noise = np.append(maps.turn, np.inf), np.append(maps.noise, 0.0)
+        errors[name] = prediction_error(ReturnMap(points, added, turn, maps.winds, noise, maps.stretches))[0]
     if not errors:
         return "another output"
     best = min(errors, key=errors.__getitem__)

@@ -364,8 +364,7 @@ class PoincareSection(Result):
         Returns
         -------
         array (count,), or None
-            At the section's points; of the nearest sample where the delay leads out of a stretch. None for points
-            alone.
+            At the section's points; NaN where the delay leads out of a stretch. None for points alone.
 
         Raises
         ------
@@ -375,13 +374,23 @@ class PoincareSection(Result):
         channel, delay = channel_and_delay(coordinate)
         channels = channels_of(self.coordinates)
         _checks.one_of("coordinate", channel, channels)
+        measured = self._measured
+        if measured is None:
+            return None
+        samples, instants, stretch = measured
+        at, column = instants + delay / self.frequency, [channels.index(channel)]
+        first, last = samples.time[samples.starts[stretch]], samples.time[samples.stops[stretch] - 1]
+        values = local_fit(samples._replace(signals=samples.signals[:, column]), np.clip(at, first, last), stretch)[0]
+        return np.where((first <= at) & (at <= last), values[:, 0], np.nan)
+
+    @property
+    def _measured(self) -> tuple[Stretches, np.ndarray, np.ndarray] | None:
+        """The recording, the times of the points, and the stretch of each; None for points alone."""
         if self.instants is None or self.time is None or self.signals is None:
             return None
         starts = np.zeros(1, dtype=np.int64) if self.starts is None else self.starts
         stretch = np.zeros(len(self), dtype=np.int64) if self.stretches is None else self.stretches
-        samples = Stretches(self.time, self.signals[:, [channels.index(channel)]], starts)
-        first, last = self.time[samples.starts[stretch]], self.time[samples.stops[stretch] - 1]
-        return local_fit(samples, np.clip(self.instants + delay / self.frequency, first, last), stretch)[0][:, 0]
+        return Stretches(self.time, self.signals, starts), self.instants, stretch
 
     def between(self, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Evaluate the recording at several phases a return.
@@ -406,14 +415,13 @@ class PoincareSection(Result):
             For points alone, and for delays of a channel that are too close modulo a step.
         """
         steps = _checks.integer("steps", steps, 1)
-        if self.instants is None or self.time is None or self.signals is None:
+        measured = self._measured
+        if measured is None:
             raise ValueError(f"steps: must be 1 for points alone, got {steps}. Make the section of a recording.")
-        starts = np.zeros(1, dtype=np.int64) if self.starts is None else self.starts
-        stretch = np.zeros(len(self), dtype=np.int64) if self.stretches is None else self.stretches
-        samples = Stretches(self.time, self.signals, starts)
-        after = np.append(np.diff(self.instants), 0.0)
+        samples, returns, stretch = measured
+        after = np.append(np.diff(returns), 0.0)
         followed = np.append(np.diff(stretch) == 0, False)
-        instants = self.instants[:, None] + after[:, None] * np.arange(steps) / steps
+        instants = returns[:, None] + after[:, None] * np.arange(steps) / steps
         present = followed[:, None] | (np.arange(steps) == 0)
         usual = float(np.median(after)) / steps
         each = np.broadcast_to(stretch[:, None], present.shape)[present]
@@ -445,20 +453,19 @@ class PoincareSection(Result):
         ValueError
             If the returns are not in one unbroken stretch.
         """
-        if self.instants is None or self.time is None or self.signals is None:
+        measured = self._measured
+        if measured is None:
             return None
         inside = 0 <= index and index + period < len(self)
-        if not inside or (self.stretches is not None and self.stretches[index] != self.stretches[index + period]):
+        recorded, instants, stretch = measured
+        if not inside or stretch[index] != stretch[index + period]:
             raise ValueError(
                 f"index, period: must be a point and a number of returns in one unbroken stretch, got {index!r} and "
                 f"{period!r} in {self!r}."
             )
-        starts = np.zeros(1, dtype=np.int64) if self.starts is None else self.starts
-        recorded = Stretches(self.time, self.signals, starts)
-        stretch = np.full(samples * period, 0 if self.stretches is None else self.stretches[index])
         knots = np.arange(period + 1)
-        at = np.interp(np.arange(samples * period) / samples, knots, self.instants[index : index + period + 1])
-        values = local_fit(recorded, at, stretch)[0]
+        at = np.interp(np.arange(samples * period) / samples, knots, instants[index : index + period + 1])
+        values = local_fit(recorded, at, np.full(samples * period, stretch[index]))[0]
         channels = channels_of(self.coordinates)
         turning = np.isin(channels, self.angles)
         values += np.where(turning, wrapped(values[0]) - values[0], 0.0)
@@ -474,7 +481,7 @@ class PoincareSection(Result):
 
 
 def _within(increments: np.ndarray, stretch: np.ndarray) -> np.ndarray:
-    """Return increments (count − 1, 2) with NaN where the next point (count,) is in another stretch."""
+    """Return increments (count − 1, d) with NaN where the next point (count,) is in another stretch."""
     return np.where((np.diff(stretch) == 0)[:, None], increments, np.nan)
 
 

@@ -47,6 +47,8 @@ RESOLVED_SHARE = 1e-4
 # The largest change or bound of outputs that count as resolved by the most points; the smallest relative harmonic of an
 # input.
 LARGEST_OUTPUT_CHANGE, LEAST_HARMONIC = 1e-2, 1e-12
+# Modes whose frequencies are compared with data.
+LINEAR_MODES = 16
 # Points up to which a solve that fails is repeated, and their ratio.
 MOST_STARTING_POINTS, STARTING_RATIO = 512, 4
 MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40, 10, 1e-10, 1e-13
@@ -423,12 +425,19 @@ class CondensedEquations(PeriodicEquations):
         """Return the outputs (points, channels) on the experiment's grid."""
         return self._outputs(harmonics(z), parameters)[0]
 
+    def linear_rates(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the lowest angular frequencies [1/s] without damping, elements linear as at rest, states held."""
+        modes = self._receptance.lowest(parameters, LINEAR_MODES, self.model.structure.weights)
+        springs = self._at_rest(parameters).stiffness[0]
+        return np.sqrt(np.linalg.eigvals(modes.stiffness + (modes.at.T * springs) @ modes.at).astype(complex))
+
+    def _at_rest(self, parameters: np.ndarray) -> Forces:
+        return self.forces(np.zeros((self._fewest() // 2, self.count), dtype=complex), parameters)
+
     def linear_outputs(self, parameters: np.ndarray) -> np.ndarray:
         """Return the outputs (points, channels) if the forces of the elements were linear as at rest; NaN if none."""
-        points = self._fewest()
-        rest = np.zeros((points // 2, self.count), dtype=complex)
+        points, forces = self._fewest(), self._at_rest(parameters)
         matrices, load = self.matrices(parameters, points)[0], self.input_harmonics(points)
-        forces = self.forces(rest, parameters)
         f = harmonics(forces.values)
         right = times(matrices.d_u, load) - times(matrices.d_f, f)
         d = linear_solve(forces, self.rates(points), matrices.d_f, right[None])

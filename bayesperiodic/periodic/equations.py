@@ -26,6 +26,7 @@ from bayesperiodic.periodic.compiled import (
     Workspace,
     kernels,
 )
+from bayesperiodic.periodic.floquet import first_order_matrix
 from bayesperiodic.periodic.schemes import CyclicGrid, Scheme, default_scheme, find_scheme
 
 # Values of all states from which an equilibrium is sought if the equations are singular at zero, in SI units, and the
@@ -233,6 +234,19 @@ class PeriodicEquations:
                 solution = other
                 break
         return np.tile(solution, (self.grid.points, 1))
+
+    def linear_rates(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the eigenvalues [1/s] of the equations linearised about the equilibrium under the mean inputs."""
+        columns = self.residual_jacobian(self.static_guess(parameters), parameters)
+        jacobian = columns[:1, self.count :].reshape(1, self.count, -1)
+        return np.asarray(np.linalg.eigvals(first_order_matrix(jacobian, tuple(self.model.orders.values()))[0]))
+
+    def linear_outputs(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the outputs (points, channels) of the equations linearised about that equilibrium."""
+        z = self.static_guess(parameters)
+        columns = self.residual_jacobian(z, parameters)
+        change = self.factors(columns).solve(np.ascontiguousarray(columns[:, : self.count]))
+        return self.outputs(z - change, parameters)
 
     def _equilibrium(self, parameters: np.ndarray, start: float) -> tuple[np.ndarray, bool, bool]:
         """Return where Newton's iteration ends, if that is an equilibrium, and if the equations are finite at a start.

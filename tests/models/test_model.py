@@ -6,6 +6,7 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
+from bayesperiodic.diagnostics.candidates import Term, extended, of_elements
 
 
 def spring(**changes):
@@ -34,6 +35,20 @@ def test_autonomous_means_neither_inputs_nor_time():
     assert spring(inputs=[], equations=lambda s, p, u: [p.m * s.ddx + p.k * s.x]).autonomous
     assert not spring().autonomous
     assert not spring(inputs=[], equations=lambda s, p, u: [p.m * s.ddx + p.k * s.x * sp.cos(s.tau)]).autonomous
+
+
+@pytest.mark.parametrize("condensed", [False, True])
+def test_copies_keep_nothing_that_was_computed_from_the_equations(condensed):
+    """A model with a further term is another one, also if the definition of the first was computed before."""
+    model = bp.Model.from_matrices(
+        "spring", mass=np.eye(1), stiffness=np.eye(1), forces={"force": 0}, outputs={"x": (0, "displacement")},
+        elements=[bp.elements.Element("stop", bp.elements.cubic, 0)], condensed=condensed,
+    )  # fmt: skip
+    before, symbols = model.definition, (of_elements(model) if condensed else model).state_symbols
+    place, name = ("force of stop", "stop") if condensed else ("equation of x0", "x0")
+    other = extended(model, {"c": Term(place, f"{name}**2", symbols[name] ** 2)})
+    assert other.definition != before == model.definition
+    assert pickle.loads(pickle.dumps(other)).definition == other.definition
 
 
 def test_latex_writes_dots_and_greek():

@@ -13,7 +13,7 @@ from bayesperiodic.periodic.batch import Anchor
 from bayesperiodic.periodic.condensed import CondensedEquations, Preconditioner
 from bayesperiodic.periodic.condensed_batch import CondensedBatch
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized
-from bayesperiodic.periodic.receptance import Receptance
+from tests.periodic.test_condensed import errors_with_flexibility_and_without
 
 Element = bp.elements.Element
 FREQUENCY, SAMPLES = 0.06, 64
@@ -312,18 +312,11 @@ def test_multipliers_have_an_error_as_stated():
 
 def test_modes_left_out_bend_statically(monkeypatch):
     """In 4 of 12 modes, the largest multiplier with a viscoelastic element is nearer with their flexibility."""
-    monkeypatch.setattr(condensed_solution, "MOST_MODES", 4)
-    exact, errors, lowest = viscoelastic_multipliers(), [], Receptance.lowest
-    for scale in (1, 0):
-        monkeypatch.setattr(
-            Receptance,
-            "lowest",
-            lambda *given, scale=scale: (m := lowest(*given))._replace(compliance=scale * m.compliance),
-        )
-        solution = bp.solve_periodic(
-            viscoelastic(), VISCOELASTIC, {"force": force()}, frequency=FREQUENCY, samples=SAMPLES
-        )
-        errors.append(np.abs(solution.multipliers[0] - exact).min())
+    how = {"inputs": {"force": force()}, "frequency": FREQUENCY, "samples": SAMPLES}
+    errors = errors_with_flexibility_and_without(
+        monkeypatch, 4, lambda: bp.solve_periodic(viscoelastic(), VISCOELASTIC, **how).multipliers[0],
+        viscoelastic_multipliers(),
+    )  # fmt: skip
     assert errors[0] < 0.2 * errors[1]
 
 
