@@ -1,8 +1,6 @@
 """Sections of more than two coordinates, delayed ones among them."""
 
-import os
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +10,8 @@ from scipy.stats import binom
 import bayesperiodic as bp
 from bayesperiodic.orbits.cycles import eigenvalues, newton_step
 from bayesperiodic.orbits.return_map import ReturnMap
-from tests.orbits import wells
+from tests.orbits import harvester, wells
 
-HARVESTER = Path(os.environ.get("BAYESPERIODIC_DATA", "data")) / "harvester" / "harvester_pieces.npz"
 STATES = ("x", "y", "v")
 
 
@@ -87,6 +84,13 @@ def test_points_whose_delays_leave_a_stretch_are_left_out():
     between = np.arange(np.ceil(first - 0.4 + 1e-9), np.ceil(second + 1.6 - 1e-9))
     assert section.left_out == between.size
     assert np.isnan(section.increments).any(axis=1).sum() == 1
+
+
+def test_values_at_a_delay_are_missing_where_it_leads_out_of_a_stretch():
+    section = bp.PoincareSection.from_recording(recorded(np.arange(9000) / 25.7), ("x", "y"), frequency=1.0)
+    values = section.delayed("y[-2.5]")
+    assert section.instants[0] == 0.0 and np.isnan(values[:3]).all()
+    np.testing.assert_allclose(values[3:], lines(section.instants[3:] - 2.5)[1], atol=2e-5)
 
 
 def test_errors_of_delayed_coordinates_are_independent_and_of_the_stated_size():
@@ -328,28 +332,22 @@ def test_orbits_of_three_states_in_120_pieces(names, noise, fraction):
     assert np.sum(np.abs(logarithms) < 1.645) >= binom.ppf(0.005, logarithms.size, 0.9)
 
 
-@cache
-def harvester():
-    with np.load(HARVESTER) as file:
-        channels = {"velocity": file["velocity"], "voltage": file["voltage_V"]}
-        time = float(file["interval_s"][0]) * np.arange(channels["velocity"].size).reshape(120, -1)
-    return [bp.Recording(time[k], {n: v[k].astype(float) for n, v in channels.items()}, {}) for k in range(120)]
-
-
-@pytest.mark.skipif(not HARVESTER.exists(), reason="needs the recording of the harvester")
+@harvester.needed
 def test_two_coordinates_of_the_harvester_are_refused_and_a_third_delayed_one_passes():
     """The beam has three states, of which velocity and voltage are measured."""
-    section = bp.PoincareSection.from_recordings(harvester(), ("velocity", "voltage"), frequency=6.5, origin=0.25 / 6.5)
+    section = bp.PoincareSection.from_recordings(
+        harvester.pieces(), ("velocity", "voltage"), frequency=6.5, origin=0.25 / 6.5
+    )
     with pytest.raises(ValueError, match=r"return map, .* with '(velocity|voltage)\[-0\.(25|5)\]' errors are [12]\."):
         bp.find_orbits(section, periods=[1])
     section = bp.PoincareSection.from_recordings(
-        harvester(), ("velocity", "voltage", "voltage[-0.25]"), frequency=6.5, origin=0.25 / 6.5
+        harvester.pieces(), ("velocity", "voltage", "voltage[-0.25]"), frequency=6.5, origin=0.25 / 6.5
     )
     assert bp.find_orbits(section, periods=[1]).prediction_error[0] < 0.04
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not HARVESTER.exists(), reason="needs the recording of the harvester")
+@harvester.needed
 def test_an_orbit_of_the_harvester_is_the_same_half_a_period_later():
     """The orbit of period 3 with the most returns, from independent local maps; false-alarm rate 0.3 %.
 
@@ -358,7 +356,7 @@ def test_an_orbit_of_the_harvester_is_the_same_half_a_period_later():
     names = ("voltage", "voltage[-0.25]", "voltage[-0.5]", "voltage[-0.75]")
     logarithms, variances = [], []
     for origin in (0.25, 0.75):
-        section = bp.PoincareSection.from_recordings(harvester(), names, frequency=6.5, origin=origin / 6.5)
+        section = bp.PoincareSection.from_recordings(harvester.pieces(), names, frequency=6.5, origin=origin / 6.5)
         orbit = max(bp.find_orbits(section, periods=[3], steps=5), key=lambda one: one.returns)
         assert orbit.returns >= 15
         logarithms.append(np.log(orbit.eigenvalues[0].real))

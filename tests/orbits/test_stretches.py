@@ -1,8 +1,5 @@
 """Sections of recordings with gaps, and of several recordings."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -12,14 +9,13 @@ from bayesperiodic import _io
 from bayesperiodic.orbits import find
 from bayesperiodic.orbits.cycles import refine
 from bayesperiodic.orbits.return_map import ReturnMap
-from tests.orbits import chaos
+from tests.orbits import chaos, harvester
 from tests.orbits.test_find import coupled, henon, map_orbit, map_section
 
 BOTH = ("angle", "rate")
 ANGLE = {"frequency": chaos.FREQUENCY, "angles": ("angle",)}
 SIZE = np.array([chaos.SIZE["angle"], chaos.SIZE["rate"]])
 PERIOD = 1.0 / chaos.FREQUENCY
-HARVESTER = Path(os.environ.get("BAYESPERIODIC_DATA", "data")) / "harvester" / "harvester_pieces.npz"
 
 
 def part(recording, first, last):
@@ -300,32 +296,24 @@ def test_invalid_sets_of_recordings_raise():
         section_of(parts[0], bp.Recording(parts[1].time, {"angle": parts[1].outputs["angle"]}, {}))
 
 
-@pytest.mark.skipif(not HARVESTER.exists(), reason="needs the recording of the harvester")
+@harvester.needed
 def test_points_of_a_measured_recording_in_pieces_are_those_of_an_interpolation_within_each():
     """Cubic splines through all samples of a piece, an independent estimate without smoothing.
 
     The voltage's noise is 2e-6 V, that of the velocity 0.01 to 0.03 with dropouts in 1.3 % of the samples, so that nine
     of ten points are compared within 0.1.
     """
-    with np.load(HARVESTER) as file:
-        velocity, voltage, number = (file[name] for name in ("velocity", "voltage_V", "number"))
-        interval = float(file["interval_s"][0])
     kept = np.flatnonzero(np.arange(120) % 5 != 2)
-    count = velocity.shape[1]
-    times = {k: interval * (count * (number[k] - 1) + np.arange(count)) for k in kept}
-    recordings = [
-        bp.Recording(times[k], {"velocity": velocity[k].astype(float), "voltage": voltage[k].astype(float)}, {})
-        for k in np.random.default_rng(0).permutation(kept)
-    ]
+    given = harvester.pieces()
+    recordings = [given[k] for k in np.random.default_rng(0).permutation(kept)]
     # At this phase some points are beside the ends of pieces.
     section = bp.PoincareSection.from_recordings(recordings, ("velocity", "voltage"), frequency=6.5, origin=0.07)
     instants, expected = [], []
-    for k in kept:
+    for one in (given[k] for k in kept):
         whole = 0.07 + np.arange(4000) / 6.5
-        inside = whole[(whole >= times[k][0]) & (whole <= times[k][-1])]
+        inside = whole[(whole >= one.time[0]) & (whole <= one.time[-1])]
         instants.append(inside)
-        channels = np.stack([velocity[k], voltage[k]], axis=1).astype(float)
-        expected.append(CubicSpline(times[k], channels)(inside))
+        expected.append(CubicSpline(one.time, np.stack([*one.outputs.values()], axis=1))(inside))
     np.testing.assert_allclose(section.instants, np.concatenate(instants))
     away = np.abs(section.points - np.concatenate(expected))
     assert away[:, 1].max() < 2e-5
