@@ -78,6 +78,7 @@ UNSOUND = with_tone("recording not sound", CAUTION)
 MEASURED_SPECTRUM, ASSUMED_SPECTRUM = "measured", "assumed"
 ALL = "all"
 SEARCH = "bp.missing_terms(problem, fit) looks for the term that is missing"
+ONE_START = "one start was tried, and others may lead to a better fit: give starts=8"
 
 
 def adequacy(
@@ -181,12 +182,15 @@ def misfit(problem: Problem, fit: MapEstimate) -> str:
         guesses = {name: solution.states for name, solution in fit.solutions.items()}
         here = problem.anchored(theta, guesses).density().linearise(theta)
         noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
-        reason = misfit_at(problem, Iterate(theta, here, noise, np.nan))
+        reason = misfit_at(problem, Iterate(theta, here, noise, np.nan), len(fit.starts))
     return reason and f"{reason}; the verdicts take the model for right"
 
 
-def misfit_at(problem: Problem, estimate: Iterate) -> str:
-    """Return why the model is misspecified at an estimate, in words; "" if no test rejects it, or if there is none."""
+def misfit_at(problem: Problem, estimate: Iterate, starts: int) -> str:
+    """Return why the model is misspecified at an estimate, in words; "" if no test rejects it, or if there is none.
+
+    The best of few starts can be a local optimum of a right model.
+    """
     if not estimate.here.converged:
         return ""
     table = adequacy(problem, estimate.here, estimate.noise[None], {})
@@ -194,7 +198,7 @@ def misfit_at(problem: Problem, estimate: Iterate) -> str:
         return ""
     reasons = "; ".join(f"{label}: {text}" for label, text in rejected.items())
     subject, remedy = ("model or the noise model", "") if concerns_noise(table) else ("model", f"; {SEARCH}")
-    return f"The {subject} is misspecified ({reasons}){remedy}"
+    return f"The {subject} is misspecified ({reasons}){remedy}{f'; {ONE_START}' if starts == 1 else ''}"
 
 
 def concerns_noise(table: pd.DataFrame) -> bool:

@@ -86,7 +86,7 @@ def check(problem: Problem, fit: MapEstimate) -> FitCheck:
     objective, peak = at_estimate(problem, fit)
     estimate = replace(peak, noise=np.array([fit.noise[name] for name in problem.noise_names]))
     uncertain = uncertainty(problem, estimate, objective.log_variance_factor)
-    checks = checked(objective, estimate, uncertain, fit.solutions)
+    checks = checked(objective, estimate, uncertain, fit)
     for text in check_warnings(problem, replace(fit, checks=checks)):
         warnings.warn(text, UserWarning, stacklevel=3)
     return checks
@@ -119,13 +119,12 @@ def with_joint(problem: Problem, fit: MapEstimate) -> MapEstimate:
     return replace(fit, joint=joint_laplace(sampled, peak))
 
 
-def checked(
-    objective: Objective, estimate: Iterate, uncertain: Uncertainty, solutions: Mapping[str, PeriodicSolution]
-) -> FitCheck:
+def checked(objective: Objective, estimate: Iterate, uncertain: Uncertainty, fit: MapEstimate) -> FitCheck:
     """Return the checks of an estimate."""
     import pandas as pd
 
     problem: Any = objective.density.problem
+    solutions = fit.solutions
     names, lost, inverse, covariance = list(problem.names), uncertain.lost, uncertain.inverse, uncertain.covariance
     shift = doubling_shift(problem, estimate, solutions, covariance)
     shift[lost] = np.nan
@@ -150,7 +149,7 @@ def checked(
         undetermined=undetermined(uncertain.information, estimate.theta, names, problem.logarithmic, change),
         robust_covariance=robust_table,
         # The prior must not count as misfit of the model, which is tested where the data alone are fitted best.
-        misfit=misfit_at(problem, alone if conflict.text else estimate),
+        misfit=misfit_at(problem, alone if conflict.text else estimate, len(fit.starts)),
     )
 
 

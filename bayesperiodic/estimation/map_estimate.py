@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -124,7 +125,8 @@ def map_estimate(
     starts : int, optional
         Number of starts; those after the first are draws from the priors, solved from the orbits of the first. By
         default one if `start` is given, and otherwise up to eight, with at most 16 000 unknowns of all periodic solves
-        together: eight for 2000 (states × points × experiments) or fewer, one for more than 8000.
+        together: eight for 2000 (states × points × experiments) or fewer, one for more than 8000; three for condensed
+        models, whose draws are solved from rest where they are not reached.
     seed : int
         Of these draws.
     checks : bool
@@ -328,12 +330,16 @@ def _in_wide_tables(problem: Problem, theta: np.ndarray, draws: np.ndarray, prog
 def _from_draw(objective: Objective, ends: Sequence[End], theta: np.ndarray, progress: bool) -> End | None:
     """Return the end of the iteration from a draw of the prior; None if there is no orbit or no finite density.
 
-    It is solved from the orbits of the first end, and is one of the ends where it comes close to that.
+    It is solved from the orbits of the first end, a condensed model also from rest where that fails, and is one of the
+    ends where it comes close to that.
     """
     first = ends[0].iterate
+    problem: Any = objective.density.problem
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
-        other = objective.at(theta, first.here, objective.density.problem.likelihood.guess())
+        other = objective.at(theta, first.here, problem.likelihood.guess())
+        if other is None and isinstance(problem.model, CondensedModel):
+            other = objective.iterate(problem.density().linearise(theta), problem.likelihood.guess())
         return None if other is None else _climb(objective, objective.anchored(other), progress, ends=ends)
 
 
@@ -461,7 +467,7 @@ def _describe(
         tied=_tied_slopes(problem, best.theta),
         fingerprint=fingerprint(problem),
     )
-    return replace(fit, checks=checked(objective, best, uncertain, fit.solutions)) if checks else fit
+    return replace(fit, checks=checked(objective, best, uncertain, fit)) if checks else fit
 
 
 def _by_name(problem: Problem, values: np.ndarray) -> dict[str, float]:

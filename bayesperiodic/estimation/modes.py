@@ -14,6 +14,7 @@ from bayesperiodic._io import Storable
 from bayesperiodic._linalg import hessian_eigh
 from bayesperiodic.estimation.gauss_newton import NO_CURVATURE, End, Iterate, Objective, preference, prior_only
 from bayesperiodic.estimation.laplace import JointLaplace
+from bayesperiodic.models.model import CondensedModel
 from bayesperiodic.periodic.schemes import FourierScheme, find_scheme
 from bayesperiodic.problem.description import Description
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 # Default number of starts: at most 8, and at most this number of unknowns of all starts and experiments. A dense
 # scheme counts as many times more as its grid is longer than 50 points.
-MOST_STARTS, MOST_UNKNOWNS, DENSE = 8, 16_000, 50
+MOST_STARTS, MOST_UNKNOWNS, DENSE, CONDENSED_STARTS = 8, 16_000, 50, 3
 # Ends of the iteration are separate optima if their distance exceeds one standard deviation of the Laplace
 # approximation at one of them. Optima whose objective is lower than the best one's by more than 30 are left out.
 SEPARATE_SDS, LOWEST_OBJECTIVE, MOST_MODES = 1.0, 30.0, 16
@@ -64,7 +65,12 @@ class Mode(Storable):
 
 
 def default_starts(problem: Description) -> int:
-    """Return the number of starts whose iterations are cheap, 1 to 8, from the number of unknowns of the solves."""
+    """Return the number of starts whose iterations are cheap, 1 to 8, from the number of unknowns of the solves.
+
+    Of condensed models it is the same for all, since friction and contact have local optima.
+    """
+    if isinstance(problem.model, CondensedModel):
+        return CONDENSED_STARTS
     points = [e.samples * e.periods for e in problem.experiments]
     dense = isinstance(find_scheme(problem.scheme), FourierScheme)
     unknowns = len(problem.model.states) * sum(p * (max(1.0, p / DENSE) if dense else 1.0) for p in points)
