@@ -362,7 +362,7 @@ def _refitted(
     density, start = problem.anchored(peak, guesses).density(), dict(zip(problem.names, peak.tolist(), strict=True))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of the fit with all experiments, which has been made before
-        fit = map_estimate(rest, start=start, starts=default_starts(rest), checks=False, progress=False)
+        fit = map_estimate(rest, start=start, starts=default_starts(rest)[0], checks=False, progress=False)
         draws = sample(rest, fit, seed=posterior.seed, progress=False)
     terms = log_likelihood_terms(density, draws.tree["posterior"].to_dataset())["data"]
     other = _joint(problem, terms).to_numpy()[..., index].ravel()

@@ -1,7 +1,7 @@
 """Checks of an estimate that take time: noise model, prior, grid, noise of inputs, undetermined parameters."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -34,7 +34,7 @@ from bayesperiodic.estimation.unexplained import Unexplained, testable, used
 from bayesperiodic.estimation.units import unit_error
 from bayesperiodic.likelihood.input_noise import EXACT, FEWEST_CYCLES, ROUGH
 from bayesperiodic.periodic.isolation import MANY_CYCLES
-from bayesperiodic.periodic.solution import PeriodicSolution, equations_of, resolution_warning
+from bayesperiodic.periodic.solution import equations_of, resolution_warning
 from bayesperiodic.periodic.solve import is_one_of_many
 from bayesperiodic.problem.fingerprint import check_results
 

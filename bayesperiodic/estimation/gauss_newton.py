@@ -178,7 +178,7 @@ def corrected(objective: Objective, end: End, report: Report = None) -> tuple[Ob
     return objective, end
 
 
-def resumed(objective: Objective, end: End, report: Report = None) -> End | None:
+def resumed(objective: Objective, end: End, report: Report = None, most: int = MAX_STEPS) -> End | None:
     """Climb on from the end of a climb with another objective; None if that is not finite there.
 
     Earlier values in the history are shifted so that it goes on where the objective changes.
@@ -186,26 +186,26 @@ def resumed(objective: Objective, end: End, report: Report = None) -> End | None
     start = objective.iterate(end.iterate.here, end.iterate.noise)
     if start is None:
         return None
-    now, status, more = climb(objective, start, report=report)
+    now, status, more = climb(objective, start, report=report, most=most)
     return End(now, status, np.concatenate([end.history + (start.objective - end.history[-1]), more[1:]]))
 
 
 def climb(
     objective: Objective, start: Iterate, held: np.ndarray | None = None, report: Report = None,
-    most: int = MAX_STEPS,
+    most: int = MAX_STEPS, halvings: int = MAX_STEP_HALVINGS,
 ) -> End:  # fmt: skip
     """Increase the objective from an anchored start until the steps are small, at most so many steps in a row.
 
     Where H is not positive definite (convex log-priors that outweigh the data) steps take its negative curvature with
     the opposite sign; directions without curvature are left out. Each solve starts from the previous iterate and is
     checked to lie on the same branch, so that a step cannot change to another periodic solution. A step whose solve
-    fails is halved. A parameter at the end of its prior's support is fixed while the gradient points outwards.
-    Parameters `held` (names,) are fixed.
+    fails is halved, `halvings` times at most. A parameter at the end of its prior's support is fixed while the gradient
+    points outwards. Parameters `held` (names,) are fixed.
     """
     always = np.zeros(start.theta.size, dtype=bool) if held is None else held
     now, resting, history = start, always, [start.objective]
     for _ in range(MAX_ROUNDS):
-        now, status, objectives = _ascend(objective, now, resting, report, most)
+        now, status, objectives = _ascend(objective, now, resting, report, most, halvings)
         history += objectives
         if status == CLIMB_ENDED:
             break
@@ -242,7 +242,7 @@ def at_ends(objective: Objective, iterate: Iterate) -> np.ndarray:
 
 
 def _ascend(
-    objective: Objective, start: Iterate, held: np.ndarray, report: Report, most: int
+    objective: Objective, start: Iterate, held: np.ndarray, report: Report, most: int, halvings: int
 ) -> tuple[Iterate, str, list[float]]:
     """Climb with the same parameters fixed; return the end, the status, and the objectives of all steps."""
     now = start
@@ -255,7 +255,7 @@ def _ascend(
         if size < SCALED_STEP:
             return now, "converged", history
         damping, trial = objective.longest(now.theta, step), None
-        for _ in range(MAX_STEP_HALVINGS):
+        for _ in range(halvings):
             trial = objective.at(objective.moved(now.theta, damping * step), now.here, now.noise)
             if trial is not None and trial.objective > now.objective:
                 break

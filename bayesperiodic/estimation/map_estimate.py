@@ -4,22 +4,29 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.measurements import Amplitude, Measurement
-from bayesperiodic.density.initial_orbits import InitialEstimate, measured_orbits, simultaneous_fit
-from bayesperiodic.density.log_posterior import NATURAL, RIDGE_COORDINATES, Linearisation, LogPosterior
-from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
+from bayesperiodic.density.initial_orbits import simultaneous_fit
+from bayesperiodic.density.log_posterior import RIDGE_COORDINATES, LogPosterior
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.density.responses import ResponseSolver
-from bayesperiodic.density.sweeps import tables
 from bayesperiodic.estimation.check import check_warnings, checked
+from bayesperiodic.estimation.climbs import (
+    climbed,
+    first_iterate,
+    fractions_left,
+    from_draws,
+    in_wide_tables,
+    linearised,
+    objective_near,
+    on_best_sheets,
+    on_measured_orbits,
+    pooled,
+)
 from bayesperiodic.estimation.covariance import (
     degrees_of_freedom,
     estimated_inputs,
@@ -40,10 +47,9 @@ from bayesperiodic.estimation.gauss_newton import (
 )
 from bayesperiodic.estimation.laplace import joint_laplace
 from bayesperiodic.estimation.modes import (
-    SEPARATE_SDS,
+    LOWEST_OBJECTIVE,
     default_starts,
     notable,
-    optimum_of,
     weighed,
     with_images,
 )
@@ -52,9 +58,7 @@ from bayesperiodic.estimation.second_order import second_order_warnings
 from bayesperiodic.estimation.shape import shape_warnings
 from bayesperiodic.estimation.table_orbits import table_warnings
 from bayesperiodic.estimation.units import compared_with_data, not_isolated, singular_start, unit_error
-from bayesperiodic.estimation.wide_tables import widened
 from bayesperiodic.likelihood.noise import Relative
-from bayesperiodic.models.model import CondensedModel
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.problem.model_inputs import model_inputs
@@ -62,16 +66,10 @@ from bayesperiodic.problem.model_inputs import model_inputs
 MOST_SHOWN_MODES = 3
 # Standard deviations from which on an amplitude of a noisy harmonic is nearly normal.
 LEAST_NORMAL = 4.0
-# Standard deviation of a phase of which nothing is known [rad].
-RANDOM_PHASE = np.pi / np.sqrt(3.0)
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
 # Most linearisations of errors of the inputs, the steps between two, and the change [sds] that ends them.
 MOST_LINEARISATIONS, STEPS_BETWEEN, SETTLED_INPUTS = 40, 5, 1e-5
-# Seconds after which the progress bar is shown.
-SHOWN_AFTER = 2.0
-# Choices of the sheets of tables' branches that are tried after the first.
-MOST_SHEET_CHANGES = 5
 
 
 @in_one_thread
@@ -125,8 +123,8 @@ def map_estimate(
     starts : int, optional
         Number of starts; those after the first are draws from the priors, solved from the orbits of the first. By
         default one if `start` is given, and otherwise up to eight, with at most 16 000 unknowns of all periodic solves
-        together: eight for 2000 (states × points × experiments) or fewer, one for more than 8000; three for condensed
-        models, whose draws are solved from rest where they are not reached.
+        together: eight for 2000 (states × points × experiments) or fewer, one for more than 8000; of condensed models
+        up to eight while the tests of `predict` reject the model at the best end. Their draws are solved from rest.
     seed : int
         Of these draws.
     checks : bool
@@ -170,34 +168,31 @@ def map_estimate(
         start = problem.completed(start)
         _checks.same_names("start", start, problem.names)
     theta = problem.median() if start is None else problem.vector(start)
-    if starts is None:
-        starts = default_starts(problem) if start is None else 1
-    _checks.integer("starts", starts, 1)
+    if starts is not None:
+        fewest = most = _checks.integer("starts", starts, 1)
+    else:
+        fewest, most = (1, 1) if start is not None else default_starts(problem)
     _checks.instance("checks", checks, bool)
-    draws = problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0)))
-    near = _in_wide_tables(problem, theta, draws, progress) if start is None else []
-    first = _first_iterate(problem, near[0]) if near else None
-    first = first or _first_iterate(problem, theta)
+    draws = problem.joint_prior.sample(most - 1, np.random.default_rng(_checks.integer("seed", seed, 0)))
+    near = in_wide_tables(problem, theta, draws, progress) if start is None else []
+    first = first_iterate(problem, near[0]) if near else None
+    first = first or first_iterate(problem, theta)
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
-    objective = _objective(problem, first.here)
-    end = _on_best_sheets(problem, _climb(objective, first, progress), progress)
-    end = _on_measured_orbits(problem, theta, end, progress)
-    ends: list[End | None] = [end]
-    for draw in near[1:] or draws:
-        if near and draw is near[0]:
-            ends.append(end)
-        else:
-            ends.append(_from_draw(objective, [one for one in ends if one], draw, progress))
+    objective = objective_near(problem, first.here)
+    end = on_best_sheets(problem, climbed(objective, first, progress), progress)
+    end = on_measured_orbits(problem, theta, end, progress)
+    ends = from_draws(objective, (near or [theta])[0], end, near[1:] or [*draws], fewest, progress)
     best = max((end for end in ends if end), key=preference)
     noisy, moved = _with_noisy_inputs(problem, best, progress)
     if noisy is not problem:
-        objective = _objective(noisy, moved.iterate.here)
+        objective = objective_near(noisy, moved.iterate.here)
         ends, problem = [moved if end is best else _moved(noisy, end) for end in ends], noisy
         best = moved
     objective, settled = corrected(objective, best)
-    ends = [settled if end is best else end and resumed(objective, end) for end in ends]
-    modes = with_images(objective, [end for end in ends if end], partial(_climb, objective, progress=progress))
+    least = best.iterate.objective - LOWEST_OBJECTIVE
+    ends = [settled if end is best else end and _restated(objective, end, least) for end in ends]
+    modes = with_images(objective, [end for end in ends if end], partial(climbed, objective, progress=progress))
     lost = {"objective": -np.inf} | dict.fromkeys(problem.names, np.nan)
     outcomes = [
         {"objective": end.iterate.objective} | _by_name(problem, end.iterate.theta) if end else lost for end in ends
@@ -219,7 +214,7 @@ def nearest_optimum(
     None if there is no orbit or no finite density.
     """
     near = LogPosterior(problem, ResponseSolver.start(problem, theta, guesses)).linearise(theta)
-    objective = _objective(problem, near)
+    objective = objective_near(problem, near)
     first = objective.iterate(near, problem.likelihood.guess())
     return None if first is None else (objective, climb(objective, first))
 
@@ -234,7 +229,7 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
         objective, first = _of_problem(problem, now)
         if first is None:
             break
-        end = _climb(objective, first, progress, STEPS_BETWEEN)
+        end = climbed(objective, first, progress, STEPS_BETWEEN)
         step = end.iterate.theta - now.theta
         moved = [one.expected - (before[n].expected if n in before else np.inf) for n, one in errors.items()]
         still = all(np.abs(change).max(initial=0.0) < SETTLED_INPUTS for change in moved)
@@ -262,161 +257,19 @@ def _moved(problem: Problem, end: End | None) -> End | None:
     return End(iterate, end.status, end.history) if end and iterate else None
 
 
+def _restated(objective: Objective, end: End, least: float) -> End | None:
+    """Return an end with another objective, climbed on to where it is not below the least and may be a mode."""
+    return resumed(objective, end, most=MAX_STEPS if end.iterate.objective >= least else 0)
+
+
 def _of_problem(problem: Problem, iterate: Iterate) -> tuple[Objective, Iterate | None]:
     """Return objective and iterate, solved from the same orbits, of a problem with other errors of the inputs."""
     if iterate.here.solver.problem is problem:
-        return _objective(problem, iterate.here), iterate
+        return objective_near(problem, iterate.here), iterate
     guesses = {name: solution.states for name, solution in iterate.here.solver.solutions(iterate.theta).items()}
     near = LogPosterior(problem, ResponseSolver.start(problem, iterate.theta, guesses)).linearise(iterate.theta)
-    objective = _objective(problem, near)
+    objective = objective_near(problem, near)
     return objective, objective.iterate(near, iterate.noise)
-
-
-def _objective(problem: Problem, near: Linearisation) -> Objective:
-    return Objective(LogPosterior(problem, near.solver, coordinates=NATURAL), of_total=True)
-
-
-def _first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:
-    """Return the anchored iterate at a start; None if the log-posterior is not finite there."""
-    if not np.isfinite(problem.joint_prior.log_prob(theta)):
-        return None
-    initial = simultaneous_fit(problem, theta)
-    if initial is not None and initial.states:
-        near = _linearised(problem, theta, initial)
-        iterate = _objective(problem, near).iterate(near, problem.likelihood.guess())
-        if iterate is not None:
-            return iterate
-    if initial is not None and not any(o.whole for o in problem.observations.values()):
-        return None
-    near = _linearised(problem, theta, None)
-    return _objective(problem, near).iterate(near, problem.likelihood.guess())
-
-
-def _linearised(problem: Problem, theta: np.ndarray, initial: InitialEstimate | None) -> Linearisation:
-    """Return residuals and Jacobian where orbits and parameters fit together, or else at θ."""
-    if initial is None or not initial.states:
-        return _on_sheets(problem, problem.density().linearise(theta))
-    return LogPosterior(problem, ResponseSolver.start(problem, initial.theta, initial.states)).linearise(initial.theta)
-
-
-def _on_sheets(problem: Problem, here: Linearisation) -> Linearisation:
-    """Return the same with the points of tables on the sheets of their branches that fit the data best at this θ.
-
-    Orbits that are followed from another θ, at which the branch has other folds, may be on others.
-    """
-    if not tables(problem):
-        return here
-    return LogPosterior(problem, here.solver.on_best_sheets(here.theta)).linearise(here.theta)
-
-
-def _in_wide_tables(problem: Problem, theta: np.ndarray, draws: np.ndarray, progress: bool) -> list[np.ndarray]:
-    """Return where climbs in tables with larger errors end, the best first, of each start; nothing without tables."""
-    wide = widened(problem)
-    first = wide and _first_iterate(wide, theta)
-    if not (wide and first):
-        return []
-    objective = _objective(wide, first.here)
-    ends: list[End] = [_on_best_sheets(wide, _climb(objective, first, progress), progress)]
-    lost = []
-    for draw in draws:
-        end = _from_draw(objective, ends, draw, progress)
-        if end:
-            ends.append(end)
-        else:
-            lost.append(draw)
-    return [*(end.iterate.theta for end in sorted(ends, key=preference, reverse=True)), *lost]
-
-
-def _from_draw(objective: Objective, ends: Sequence[End], theta: np.ndarray, progress: bool) -> End | None:
-    """Return the end of the iteration from a draw of the prior; None if there is no orbit or no finite density.
-
-    It is solved from the orbits of the first end, a condensed model also from rest where that fails, and is one of the
-    ends where it comes close to that.
-    """
-    first = ends[0].iterate
-    problem: Any = objective.density.problem
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
-        other = objective.at(theta, first.here, problem.likelihood.guess())
-        if other is None and isinstance(problem.model, CondensedModel):
-            other = objective.iterate(problem.density().linearise(theta), problem.likelihood.guess())
-        return None if other is None else _climb(objective, objective.anchored(other), progress, ends=ends)
-
-
-def _climb(
-    objective: Objective, first: Iterate, progress: bool, most: int = MAX_STEPS, ends: Sequence[End] = ()
-) -> End:
-    """Climb with a progress bar; where an iterate comes close to one of the ends, that is returned."""
-    reached: list[End] = []
-    with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress, delay=SHOWN_AFTER) as bar:
-
-        def report(iterate: Iterate, size: float) -> bool:
-            bar.set_postfix_str(f"objective {iterate.objective:.6g}, step {size:.2g} sd", refresh=False)
-            bar.update()
-            known = optimum_of(objective, iterate, ends) if size < SEPARATE_SDS else None
-            reached.extend([known] if known else [])
-            return known is not None
-
-        end = climb(objective, first, report=report, most=most)
-    return reached[0] if reached else end
-
-
-def _on_best_sheets(problem: Problem, end: End, progress: bool) -> End:
-    """Return the end of a climb; where tables fit better on other sheets of their branches, the best from there."""
-    for _ in range(MOST_SHEET_CHANGES if tables(problem) else 0):
-        theta = end.iterate.theta
-        solver = end.iterate.here.solver.on_best_sheets(theta)
-        if end.iterate.here.solver.on_same_orbits(solver):
-            break
-        near = LogPosterior(problem, solver).linearise(theta)
-        objective = _objective(problem, near)
-        first = objective.iterate(near, problem.likelihood.guess())
-        if first is None:
-            break
-        other = _climb(objective, first, progress)
-        if preference(other) <= preference(end):
-            break
-        end = other
-    return end
-
-
-def _on_measured_orbits(problem: Problem, start: np.ndarray, end: End, progress: bool) -> End:
-    """Return the end of a climb; if its orbits are not the measured ones, the best of those from the measured orbits.
-
-    They are not if they differ in kind, or leave most of the variance of a channel unexplained.
-    """
-    if not _doubtful(problem, end):
-        return end
-    for near in _near_measured_orbits(problem, end.iterate, start):
-        objective = _objective(problem, near)
-        first = objective.iterate(near, problem.likelihood.guess())
-        if first is not None:
-            end = max(end, _climb(objective, first, progress), key=preference)
-        if not _doubtful(problem, end):
-            break
-    return end
-
-
-def _doubtful(problem: Problem, end: End) -> bool:
-    here = end.iterate.here
-    left = _fractions_left(problem, here.compared()).values()
-    return bool(here.other_orbits) or max(left, default=0.0) > MOST_UNEXPLAINED
-
-
-def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> Iterator[Linearisation]:
-    """Yield where to start again: near orbits that give the measured outputs, and where simultaneous fits of them end.
-
-    Orbits and parameters are looked for from the start and from the estimate.
-    """
-    unable = problem.model.autonomous or isinstance(problem.model, CondensedModel)
-    if unable or not all(e.outputs for e in problem.experiments):
-        return
-    solutions = {name: solution.states for name, solution in end.here.solver.solutions(end.theta).items()}
-    for theta in (start, end.theta):
-        measured = measured_orbits(problem, theta, solutions)
-        for initial in (measured, simultaneous_fit(problem, measured.theta, measured.states)):
-            if initial is not None and initial.states:
-                yield _linearised(problem, initial.theta, initial)
 
 
 def _describe(
@@ -448,8 +301,8 @@ def _describe(
         ),
         solutions=solutions,
         residuals=residuals,
-        rms={c: _pooled(problem, c, residuals) for c in (*problem.channels, *problem.quantities)},
-        fvu=_fractions_left(problem, residuals),
+        rms={c: pooled(problem, c, residuals) for c in (*problem.channels, *problem.quantities)},
+        fvu=fractions_left(problem, residuals),
         true_inputs=TrueInputs(
             {e.name: model_inputs(problem, e, best.theta) for e in problem.experiments},
             estimated_inputs(problem, best).sd,
@@ -530,31 +383,8 @@ def _tied_slopes(problem: Problem, theta: np.ndarray) -> dict[str, dict[str, flo
     return {name: dict(zip(problem.names, slopes[name], strict=True)) for name in problem.tied}
 
 
-def _fractions_left(problem: Problem, residuals: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, float]:
-    """Return the fraction of each channel's variance that is left in residuals, of quantities of their mean square."""
-    measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} | _scales(e) for e in problem.experiments}
-    compared = (*problem.channels, *problem.quantities)
-    power = {c: max(_pooled(problem, c, measured) ** 2, np.finfo(float).tiny) for c in compared}
-    return {c: _pooled(problem, c, residuals) ** 2 / whole for c, whole in power.items()}
-
-
 def _is_unknown_amplitude(one: Measurement) -> bool:
     return isinstance(one, Amplitude) and one.sd is None
-
-
-def _scales(experiment: Experiment) -> dict[str, np.ndarray]:
-    """Return what errors of measured quantities are compared with, by label: their values; of phases, any phase."""
-    result: dict[str, list[float]] = {}
-    for one in experiment.measurements:
-        result.setdefault(one.label, []).append(RANDOM_PHASE if one.signed else one.value)
-    return {label: np.array(values) for label, values in result.items()}
-
-
-def _pooled(problem: Problem, channel: str, signals: Mapping[str, Mapping[str, np.ndarray]]) -> float:
-    """Return the root mean square of a channel over the measured points of all experiments, or of a quantity."""
-    having = [(e, signals[e.name][channel]) for e in problem.experiments if channel in signals[e.name]]
-    values = [part[e.measured_points] if channel in e.outputs else part for e, part in having]
-    return float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
 
 
 def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
@@ -576,7 +406,7 @@ def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
             f"be followed from its guess to parameters at which {where}. Leave it out if it may be no orbit, or give "
             "start={…} nearer to the truth."
         )
-    near = _linearised(problem, theta, initial)
+    near = linearised(problem, theta, initial)
     if text := not_isolated(problem, theta, near.statuses):
         return text
     failed = ", ".join(f"{name!r} ({status})" for name, status in near.statuses.items() if status != "converged")

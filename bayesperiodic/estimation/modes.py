@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 # Default number of starts: at most 8, and at most this number of unknowns of all starts and experiments. A dense
 # scheme counts as many times more as its grid is longer than 50 points.
-MOST_STARTS, MOST_UNKNOWNS, DENSE, CONDENSED_STARTS = 8, 16_000, 50, 3
+MOST_STARTS, MOST_UNKNOWNS, DENSE = 8, 16_000, 50
 # Ends of the iteration are separate optima if their distance exceeds one standard deviation of the Laplace
 # approximation at one of them. Optima whose objective is lower than the best one's by more than 30 are left out.
 SEPARATE_SDS, LOWEST_OBJECTIVE, MOST_MODES = 1.0, 30.0, 16
@@ -64,17 +64,17 @@ class Mode(Storable):
         return bool(abs(self.theta[name] - value) > SEPARATE_SDS * min(widths, default=np.inf))
 
 
-def default_starts(problem: Description) -> int:
-    """Return the number of starts whose iterations are cheap, 1 to 8, from the number of unknowns of the solves.
+def default_starts(problem: Description) -> tuple[int, int]:
+    """Return the number of starts whose iterations are cheap, 1 to 8, from the number of unknowns, and the most.
 
-    Of condensed models it is the same for all, since friction and contact have local optima.
+    The most are for models that tests reject. They are more for condensed models only: friction and contact have local
+    optima, and their solves have few unknowns.
     """
-    if isinstance(problem.model, CondensedModel):
-        return CONDENSED_STARTS
     points = [e.samples * e.periods for e in problem.experiments]
     dense = isinstance(find_scheme(problem.scheme), FourierScheme)
     unknowns = len(problem.model.states) * sum(p * (max(1.0, p / DENSE) if dense else 1.0) for p in points)
-    return int(np.clip(MOST_UNKNOWNS / unknowns, 1, MOST_STARTS))
+    cheap = int(np.clip(MOST_UNKNOWNS / unknowns, 1, MOST_STARTS))
+    return cheap, MOST_STARTS if isinstance(problem.model, CondensedModel) else cheap
 
 
 def with_images(objective: Objective, ends: Sequence[End], climbed: Callable[[Iterate], End]) -> list[End]:

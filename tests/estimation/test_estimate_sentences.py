@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from bayesperiodic.estimation import check, map_estimate, profile
+from bayesperiodic.estimation.climbs import pooled
 from bayesperiodic.estimation.modes import Mode
 from bayesperiodic.estimation.result import FitCheck, MapEstimate, NoiseSplit
 from bayesperiodic.estimation.unexplained import of_periodogram
@@ -145,7 +146,7 @@ def test_root_mean_square_is_pooled_over_the_measured_points():
         SimpleNamespace(name="three", outputs={}),
     ]
     signals = {"one": {"y": np.array([1.0, 2.0, 3.0])}, "two": {"y": np.array([4.0, 50.0])}, "three": {}}
-    found = map_estimate._pooled(SimpleNamespace(experiments=experiments), "y", signals)
+    found = pooled(SimpleNamespace(experiments=experiments), "y", signals)
     assert found == pytest.approx(np.sqrt((1 + 4 + 9 + 16) / 4))
 
 

@@ -28,7 +28,7 @@ def test_known_variance_gives_the_closed_form():
 
 
 def test_progress_is_shown_unless_disabled(capsys, monkeypatch):
-    monkeypatch.setattr("bayesperiodic.estimation.map_estimate.SHOWN_AFTER", 0.0)
+    monkeypatch.setattr("bayesperiodic.estimation.climbs.SHOWN_AFTER", 0.0)
     problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS)
     bp.map_estimate(problem, progress=False)
     assert capsys.readouterr().err == ""

@@ -107,11 +107,11 @@ def test_starts_without_an_orbit_are_silent():
 def test_number_of_starts_follows_from_the_number_of_unknowns():
     """200 points are cheap, 8 runs of 200 as well; 100 runs, or 1600 points of a dense scheme, are not."""
     runs = [duffing_run(f"run {i}", seed=i) for i in range(8)]
-    assert default_starts(duffing(runs[0])) == default_starts(duffing(*runs)) == 8
-    assert default_starts(duffing(*runs, *(duffing_run(f"more {i}") for i in range(8)))) == 5
-    assert default_starts(duffing(*runs[:2], scheme="fourier")) == 8
-    assert default_starts(duffing(*runs, scheme="fourier")) == 2
-    assert default_starts(duffing(*(duffing_run(f"run {i}") for i in range(50)))) == 1
+    assert default_starts(duffing(runs[0])) == default_starts(duffing(*runs)) == (8, 8)
+    assert default_starts(duffing(*runs, *(duffing_run(f"more {i}") for i in range(8)))) == (5, 5)
+    assert default_starts(duffing(*runs[:2], scheme="fourier")) == (8, 8)
+    assert default_starts(duffing(*runs, scheme="fourier")) == (2, 2)
+    assert default_starts(duffing(*(duffing_run(f"run {i}") for i in range(50)))) == (1, 1)
 
 
 def test_a_given_start_is_the_only_one():

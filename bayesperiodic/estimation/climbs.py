@@ -1,0 +1,230 @@
+"""Climbs to the optimum: from a start, from the measured orbits, and from draws of the priors."""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.initial_orbits import InitialEstimate, measured_orbits, simultaneous_fit
+from bayesperiodic.density.log_posterior import NATURAL, Linearisation, LogPosterior
+from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
+from bayesperiodic.density.problem import Problem
+from bayesperiodic.density.responses import ResponseSolver
+from bayesperiodic.density.sweeps import tables
+from bayesperiodic.estimation.adequacy import misfit_at
+from bayesperiodic.estimation.gauss_newton import (
+    MAX_STEP_HALVINGS,
+    MAX_STEPS,
+    End,
+    Iterate,
+    Objective,
+    climb,
+    preference,
+)
+from bayesperiodic.estimation.modes import SEPARATE_SDS, optimum_of
+from bayesperiodic.estimation.wide_tables import widened
+from bayesperiodic.models.model import CondensedModel
+
+# Seconds after which the progress bar is shown.
+SHOWN_AFTER = 2.0
+# Choices of the sheets of tables' branches that are tried after the first.
+MOST_SHEET_CHANGES = 5
+# Halvings of a step from a draw of a condensed model; solves that fail cost most.
+HALVINGS_FROM_DRAWS = 3
+# Standard deviation of a phase of which nothing is known [rad].
+RANDOM_PHASE = np.pi / np.sqrt(3.0)
+
+
+def objective_near(problem: Problem, near: Linearisation) -> Objective:
+    """Return the objective whose solves start from a linearisation."""
+    return Objective(LogPosterior(problem, near.solver, coordinates=NATURAL), of_total=True)
+
+
+def first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:
+    """Return the anchored iterate at a start; None if the log-posterior is not finite there."""
+    if not np.isfinite(problem.joint_prior.log_prob(theta)):
+        return None
+    initial = simultaneous_fit(problem, theta)
+    if initial is not None and initial.states:
+        near = linearised(problem, theta, initial)
+        iterate = objective_near(problem, near).iterate(near, problem.likelihood.guess())
+        if iterate is not None:
+            return iterate
+    if initial is not None and not any(o.whole for o in problem.observations.values()):
+        return None
+    near = linearised(problem, theta, None)
+    return objective_near(problem, near).iterate(near, problem.likelihood.guess())
+
+
+def linearised(problem: Problem, theta: np.ndarray, initial: InitialEstimate | None) -> Linearisation:
+    """Return residuals and Jacobian where orbits and parameters fit together, or else at θ."""
+    if initial is None or not initial.states:
+        return _on_sheets(problem, problem.density().linearise(theta))
+    return LogPosterior(problem, ResponseSolver.start(problem, initial.theta, initial.states)).linearise(initial.theta)
+
+
+def _on_sheets(problem: Problem, here: Linearisation) -> Linearisation:
+    """Return the same with the points of tables on the sheets of their branches that fit the data best at this θ.
+
+    Orbits that are followed from another θ, at which the branch has other folds, may be on others.
+    """
+    if not tables(problem):
+        return here
+    return LogPosterior(problem, here.solver.on_best_sheets(here.theta)).linearise(here.theta)
+
+
+def in_wide_tables(problem: Problem, theta: np.ndarray, draws: np.ndarray, progress: bool) -> list[np.ndarray]:
+    """Return where climbs in tables with larger errors end, the best first, of each start; nothing without tables."""
+    wide = widened(problem)
+    first = wide and first_iterate(wide, theta)
+    if not (wide and first):
+        return []
+    objective = objective_near(wide, first.here)
+    ends: list[End] = [on_best_sheets(wide, climbed(objective, first, progress), progress)]
+    lost = []
+    for draw in draws:
+        end = _from_draw(objective, ends, draw, progress)
+        if end:
+            ends.append(end)
+        else:
+            lost.append(draw)
+    return [*(end.iterate.theta for end in sorted(ends, key=preference, reverse=True)), *lost]
+
+
+def from_draws(
+    objective: Objective, start: np.ndarray, end: End, draws: Sequence[np.ndarray], fewest: int, progress: bool
+) -> list[End | None]:
+    """Return the ends of the iterations from a start and from draws of the prior; that of the start is given.
+
+    After `fewest` starts, the others follow only as long as tests reject the model at the best end.
+    """
+    ends: list[End | None] = [end]
+    problem: Any = objective.density.problem
+    for draw in draws:
+        reached = [one for one in ends if one]
+        if len(ends) >= fewest and not misfit_at(problem, max(reached, key=preference).iterate, len(ends)):
+            break
+        ends.append(end if draw is start else _from_draw(objective, reached, draw, progress))
+    return ends
+
+
+def _from_draw(objective: Objective, ends: Sequence[End], theta: np.ndarray, progress: bool) -> End | None:
+    """Return the end of the iteration from a draw of the prior; None if there is no orbit or no finite density.
+
+    It is solved from the orbits of the first end, condensed models from rest, and is one of the ends where it comes
+    close to that.
+    """
+    first, halvings = ends[0].iterate, MAX_STEP_HALVINGS
+    problem: Any = objective.density.problem
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        if isinstance(problem.model, CondensedModel):
+            halvings = HALVINGS_FROM_DRAWS
+            other = objective.iterate(problem.density().linearise(theta), problem.likelihood.guess())
+        else:
+            other = objective.at(theta, first.here, problem.likelihood.guess())
+            other = other and objective.anchored(other)
+        return None if other is None else climbed(objective, other, progress, ends=ends, halvings=halvings)
+
+
+def climbed(
+    objective: Objective, first: Iterate, progress: bool, most: int = MAX_STEPS, ends: Sequence[End] = (),
+    halvings: int = MAX_STEP_HALVINGS,
+) -> End:  # fmt: skip
+    """Climb with a progress bar; where an iterate comes close to one of the ends, that is returned."""
+    reached: list[End] = []
+    with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress, delay=SHOWN_AFTER) as bar:
+
+        def report(iterate: Iterate, size: float) -> bool:
+            bar.set_postfix_str(f"objective {iterate.objective:.6g}, step {size:.2g} sd", refresh=False)
+            bar.update()
+            known = optimum_of(objective, iterate, ends) if size < SEPARATE_SDS else None
+            reached.extend([known] if known else [])
+            return known is not None
+
+        end = climb(objective, first, report=report, most=most, halvings=halvings)
+    return reached[0] if reached else end
+
+
+def on_best_sheets(problem: Problem, end: End, progress: bool) -> End:
+    """Return the end of a climb; where tables fit better on other sheets of their branches, the best from there."""
+    for _ in range(MOST_SHEET_CHANGES if tables(problem) else 0):
+        theta = end.iterate.theta
+        solver = end.iterate.here.solver.on_best_sheets(theta)
+        if end.iterate.here.solver.on_same_orbits(solver):
+            break
+        near = LogPosterior(problem, solver).linearise(theta)
+        objective = objective_near(problem, near)
+        first = objective.iterate(near, problem.likelihood.guess())
+        if first is None:
+            break
+        other = climbed(objective, first, progress)
+        if preference(other) <= preference(end):
+            break
+        end = other
+    return end
+
+
+def on_measured_orbits(problem: Problem, start: np.ndarray, end: End, progress: bool) -> End:
+    """Return the end of a climb; if its orbits are not the measured ones, the best of those from the measured orbits.
+
+    They are not if they differ in kind, or leave most of the variance of a channel unexplained.
+    """
+    if not _doubtful(problem, end):
+        return end
+    for near in _near_measured_orbits(problem, end.iterate, start):
+        objective = objective_near(problem, near)
+        first = objective.iterate(near, problem.likelihood.guess())
+        if first is not None:
+            end = max(end, climbed(objective, first, progress), key=preference)
+        if not _doubtful(problem, end):
+            break
+    return end
+
+
+def _doubtful(problem: Problem, end: End) -> bool:
+    here = end.iterate.here
+    left = fractions_left(problem, here.compared()).values()
+    return bool(here.other_orbits) or max(left, default=0.0) > MOST_UNEXPLAINED
+
+
+def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> Iterator[Linearisation]:
+    """Yield where to start again: near orbits that give the measured outputs, and where simultaneous fits of them end.
+
+    Orbits and parameters are looked for from the start and from the estimate.
+    """
+    unable = problem.model.autonomous or isinstance(problem.model, CondensedModel)
+    if unable or not all(e.outputs for e in problem.experiments):
+        return
+    solutions = {name: solution.states for name, solution in end.here.solver.solutions(end.theta).items()}
+    for theta in (start, end.theta):
+        measured = measured_orbits(problem, theta, solutions)
+        for initial in (measured, simultaneous_fit(problem, measured.theta, measured.states)):
+            if initial is not None and initial.states:
+                yield linearised(problem, initial.theta, initial)
+
+
+def fractions_left(problem: Problem, residuals: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, float]:
+    """Return the fraction of each channel's variance that is left in residuals, of quantities of their mean square."""
+    measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} | _scales(e) for e in problem.experiments}
+    compared = (*problem.channels, *problem.quantities)
+    power = {c: max(pooled(problem, c, measured) ** 2, np.finfo(float).tiny) for c in compared}
+    return {c: pooled(problem, c, residuals) ** 2 / whole for c, whole in power.items()}
+
+
+def _scales(experiment: Experiment) -> dict[str, np.ndarray]:
+    """Return what errors of measured quantities are compared with, by label: their values; of phases, any phase."""
+    result: dict[str, list[float]] = {}
+    for one in experiment.measurements:
+        result.setdefault(one.label, []).append(RANDOM_PHASE if one.signed else one.value)
+    return {label: np.array(values) for label, values in result.items()}
+
+
+def pooled(problem: Problem, channel: str, signals: Mapping[str, Mapping[str, np.ndarray]]) -> float:
+    """Return the root mean square of a channel over the measured points of all experiments, or of a quantity."""
+    having = [(e, signals[e.name][channel]) for e in problem.experiments if channel in signals[e.name]]
+    values = [part[e.measured_points] if channel in e.outputs else part for e, part in having]
+    return float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
