@@ -337,8 +337,8 @@ class ResponseSolver:
             result[i] = np.abs(orbit_multipliers(equations, parameters[i], z, 1)).max(initial=0.0)
         return result
 
-    def solutions(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
-        """Return the periodic solution of every experiment at one θ (names,), with its sensitivities.
+    def solutions(self, theta: np.ndarray, *, sensitivities: bool = True) -> dict[str, PeriodicSolution]:
+        """Return the periodic solution of every experiment at one θ (names,), with its sensitivities or without.
 
         Inputs and outputs are those of the model, without the sensors.
         """
@@ -346,7 +346,7 @@ class ResponseSolver:
         for e in self.problem.experiments:
             (here, z), code = self._solved(simulation, e.name), int(simulation.statuses(e.name)[0])
             here, parameters = without_sensors(self.problem, here, self._at_scale(e, simulation), theta)
-            solutions[e.name] = described(here, parameters, Solved(z, code, NO_HISTORY))
+            solutions[e.name] = described(here, parameters, Solved(z, code, NO_HISTORY), sensitivities=sensitivities)
         return solutions
 
     def _at_scale(self, experiment: Experiment, simulation: Simulation) -> Experiment:

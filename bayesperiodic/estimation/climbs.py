@@ -199,7 +199,8 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
     unable = problem.model.autonomous or isinstance(problem.model, CondensedModel)
     if unable or not all(e.outputs for e in problem.experiments):
         return
-    solutions = {name: solution.states for name, solution in end.here.solver.solutions(end.theta).items()}
+    orbits = end.here.solver.solutions(end.theta, sensitivities=False)
+    solutions = {name: solution.states for name, solution in orbits.items()}
     for theta in (start, end.theta):
         measured = measured_orbits(problem, theta, solutions)
         for initial in (measured, simultaneous_fit(problem, measured.theta, measured.states)):

@@ -223,7 +223,8 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
     """Return problem and end of the climb with errors of inputs and frequencies, linearised about the estimate."""
     for _ in range(MOST_LINEARISATIONS if problem.noisy_inputs or problem.frequency_errors else 0):
         now, before = end.iterate, problem.input_errors
-        loadings = input_loadings(problem, now.theta, now.here.solver.solutions(now.theta), problem.input_noise)
+        orbits = now.here.solver.solutions(now.theta, sensitivities=False)
+        loadings = input_loadings(problem, now.theta, orbits, problem.input_noise)
         errors = estimated_inputs(problem, now, loadings).errors
         problem = problem.with_input_errors(errors)
         objective, first = _of_problem(problem, now)
@@ -266,7 +267,8 @@ def _of_problem(problem: Problem, iterate: Iterate) -> tuple[Objective, Iterate 
     """Return objective and iterate, solved from the same orbits, of a problem with other errors of the inputs."""
     if iterate.here.solver.problem is problem:
         return objective_near(problem, iterate.here), iterate
-    guesses = {name: solution.states for name, solution in iterate.here.solver.solutions(iterate.theta).items()}
+    orbits = iterate.here.solver.solutions(iterate.theta, sensitivities=False)
+    guesses = {name: solution.states for name, solution in orbits.items()}
     near = LogPosterior(problem, ResponseSolver.start(problem, iterate.theta, guesses)).linearise(iterate.theta)
     objective = objective_near(problem, near)
     return objective, objective.iterate(near, iterate.noise)

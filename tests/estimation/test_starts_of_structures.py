@@ -11,7 +11,7 @@ TRUTH = {"alpha": 0.05, "stop_k": 0.5, "stop_clearance": 0.5}
 
 @pytest.fixture(scope="module")
 def problem() -> bp.Problem:
-    """A chain with a stop at its end that the motion of 1.4 m would not touch at the medians of the priors."""
+    """Return a chain with a stop at its end that the motion of 1.4 m would not touch at the medians of the priors."""
     springs = 2.0 * np.eye(COUNT) - np.eye(COUNT, k=1) - np.eye(COUNT, k=-1) + 0.05 * np.eye(COUNT)
     model = bp.Model.from_matrices(
         "chain", mass=np.eye(COUNT), stiffness=springs, damping={"alpha": np.eye(COUNT)},
