@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from tests.periodic import beam
+from studies.structure import beam
 
 EVERY = 16
 
