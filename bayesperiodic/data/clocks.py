@@ -277,7 +277,7 @@ def _relative(step: PhaseStep, rates: dict[str, float], frequency: float) -> str
 
 
 def drift_findings(
-    listed: list[Drift], channels: Sequence[str], phases: Phases, span: tuple[float, float], cycles: int, total: int
+    listed: list[Drift], channels: Sequence[str], span: tuple[float, float], cycles: int, total: int
 ) -> Iterator[Finding]:
     """Return the findings of drifts of phases."""
     for drift in listed:

@@ -19,9 +19,8 @@ LARGE_BEAT, HARMLESS_PHASE = 0.05, 1.0 / 180.0
 HARMLESS_DRIFT, HARMLESS_STEP = 0.015, 0.005
 # Effect of a drift or step on the mean, in standard errors, from which it is serious: slow noise has smaller ones.
 SERIOUS_CHANGE = 2.0
-# Change between neighbouring cycles that is a step, in standard deviations of the other changes, and cycles needed;
-# the standard deviation is uncertain if there are fewer cycles than this.
-STEP_FROM_CYCLE, FEWEST_FOR_STEPS, ENOUGH_FOR_STEPS = 8.0, 10, 20
+# Change between neighbouring cycles that is a step, in standard deviations of the other changes.
+STEP_FROM_CYCLE = 8.0
 # Amplitude of a beat relative to the mean one, its false-alarm rate, and the cycles needed.
 HARMLESS_BEAT, BEAT_FALSE_ALARM, FEWEST_FOR_BEATS = 0.01, 1e-4, 24
 # Beats of the whole recording: turns with one line beside the harmonic or two, step of the number of turns, share of
@@ -63,7 +62,7 @@ def cycle_findings(
         if (b - a) * frequency < 1.0:
             continue
         count = int((b - a) * frequency)
-        stepping = [*_outer_steps(channels, time, every, steady, frequency, a < start, used)] if kind == "ramp" else []
+        stepping = [*_outer_steps(time, every, steady, frequency, a < start, used)] if kind == "ramp" else []
         yield from stepping
         if not stepping and not (slow and kind == "ramp"):
             place = b if what.endswith("until") else a
@@ -113,13 +112,7 @@ def _beat(line: np.ndarray) -> tuple[float, float]:
 
 
 def _outer_steps(
-    channels: Sequence[str],
-    time: np.ndarray,
-    every: Windows,
-    steady: Steady,
-    frequency: float,
-    before: bool,
-    used: str,
+    time: np.ndarray, every: Windows, steady: Steady, frequency: float, before: bool, used: str
 ) -> Iterator[Finding]:
     """Return a step of the phase of all channels at an end of the part used, if the amplitudes are the same outside."""
     outside = every.last <= steady.level[0] if before else every.first >= steady.level[1]

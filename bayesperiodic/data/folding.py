@@ -158,7 +158,7 @@ def _noises(
     for group, part, one, inflation in zip(seen.groups, parts, fit.each, seen.inflation, strict=True):
         sampling = Sampling.of(part.time, fit.frequency, one.amplitudes.shape[1] - 1, cycles)
         for i, channel in enumerate(part.channels):
-            one_cycle[channel], of_mean = _noise(part, one, i, cycles, sampling)
+            one_cycle[channel], of_mean = _noise(part, one, i, sampling)
             squares = seen.steady.squares[row] if seen.steady else np.zeros(0)
             order = min(squares.size, of_mean.variance.size)
             of_mean.variance[:] *= inflation
@@ -347,9 +347,7 @@ class AmplitudeNoise:
     beside: np.ndarray
 
 
-def _noise(
-    signals: Signals, fit: HarmonicFit, row: int, cycles: int, sampling: Sampling
-) -> tuple[np.ndarray, AmplitudeNoise]:
+def _noise(signals: Signals, fit: HarmonicFit, row: int, sampling: Sampling) -> tuple[np.ndarray, AmplitudeNoise]:
     """Return the variances of one cycle's complex amplitudes, (harmonics + 1,), and the noise of the mean's.
 
     The spectrum of the K cycles has lines at multiples of 1/K of the fundamental, and those between the harmonics

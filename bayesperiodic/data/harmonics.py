@@ -20,6 +20,7 @@ TRACKED, FEWEST_TRACKED, FEWEST_REFINED = 48, 384, 12
 NEGLIGIBLE_PHASE, PHASE_FALSE_ALARM = 1.0 / 360.0, 1e-4
 # Gauss-Newton steps towards a wandering phase.
 PHASE_ITERATIONS = 4
+MOST_FREQUENCY_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -78,14 +79,14 @@ class Pace:
 
 
 def refine_frequency(
-    time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int, iterations: int = 20
+    time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int
 ) -> tuple[HarmonicFit, Pace]:
     """Return the fit at the least-squares frequency, and the uncertainty of that frequency.
 
     Gauss-Newton iteration for the fundamental, with the amplitudes projected out and every channel weighted by its
     residual variance. It ends where a step is small compared with the standard error.
     """
-    refined = _refined(time, channels, frequency, harmonics, iterations)
+    refined = _refined(time, channels, frequency, harmonics)
     return refined[0], _pace(time, *refined)
 
 
@@ -97,10 +98,10 @@ def nearby_fit(time: np.ndarray, channels: np.ndarray, frequency: float, harmoni
 
 
 def _refined(
-    time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int, iterations: int = 20
+    time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int
 ) -> tuple[HarmonicFit, np.ndarray, np.ndarray, float]:
     """Return the fit at the least-squares frequency, its clear harmonics, the weights, and the information."""
-    for _ in range(iterations):
+    for _ in range(MOST_FREQUENCY_STEPS):
         fit, clear, weights, gradient, information = normal_equation(time, channels, frequency, harmonics)
         step = next_step(gradient, information, frequency, float(np.ptp(time)))
         if not step:

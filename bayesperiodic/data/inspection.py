@@ -225,7 +225,7 @@ def _clock_findings(
     if not varies:
         cycles = round((stop - start) * frequency)
         drifts = clocks.clock_drifts(phases, inside, places)
-        listed += clocks.drift_findings(drifts, channels, phases, (start, stop), cycles, total)
+        listed += clocks.drift_findings(drifts, channels, (start, stop), cycles, total)
     return listed, drifts
 
 

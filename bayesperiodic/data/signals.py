@@ -230,14 +230,14 @@ def explains_more(fit: Fit, other: Fit) -> bool:
 
 def parts(time: np.ndarray, signal: np.ndarray) -> list[slice]:
     """Return the parts of at least three cycles between gaps of time and steps of the signal's frequency."""
-    rising = _rising(time, signal)
+    rising = _rising(signal)
     if rising.size < 2:
         return [slice(0, time.size)]
     period = float(np.median(np.diff(time[rising])))
     edges = np.concatenate([[0], gaps(time, period) + 1, [time.size]])
     pieces = []
     for first, last in zip(edges[:-1], edges[1:], strict=True):
-        inside = first + _rising(time[first:last], signal[first:last])
+        inside = first + _rising(signal[first:last])
         steps = inside[_steps(time, signal, inside)]
         bounds = [first, *steps.tolist(), last]
         pieces += [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
@@ -245,7 +245,7 @@ def parts(time: np.ndarray, signal: np.ndarray) -> list[slice]:
     return [part for part, count in zip(pieces, cycles, strict=True) if count > MINIMUM_CYCLES]
 
 
-def _rising(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
+def _rising(signal: np.ndarray) -> np.ndarray:
     """Return the samples at which the signal rises above its mean, which it must have left by the hysteresis."""
     centred = signal - signal.mean()
     level = HYSTERESIS * centred.std()

@@ -249,14 +249,15 @@ class LogPosterior(SamplingCoordinates):
             return self._nothing(status)
         if count < good.size:
             simulation, noise = simulation.at(good), noise[good]
-        residuals, moments = self.comparisons.residuals(simulation, threads), np.empty((count, 0))
+        residuals, likelihood = self.comparisons.residuals(simulation, threads), self.problem.likelihood
         if self.collapsed:
-            by_name = self.problem.likelihood.moments(residuals)
+            by_name = likelihood.moments(residuals)
             moments = np.stack([by_name[name] for name in self.collapsed], axis=-1)
             # Of these blocks the integral contains all that depends on the residuals; what is left is ln|S|.
-            residuals = residuals.without(self._integrated)
-        values = self.problem.likelihood(residuals, noise) + np.sum(self._integrals(moments), axis=-1)
-        values = np.where(np.isfinite(values), values, -np.inf)
+            values = likelihood(residuals.without(self._integrated), noise) + np.sum(self._integrals(moments), axis=-1)
+            values = np.where(np.isfinite(values), values, -np.inf)
+        else:
+            values, moments = likelihood(residuals, noise), np.empty((count, 0))
         return Evaluation(_placed(values, good, -np.inf), _placed(moments, good, np.nan), status)
 
     def _nothing(self, status: np.ndarray) -> Evaluation:
@@ -272,8 +273,8 @@ class LogPosterior(SamplingCoordinates):
         if count < inside.size:
             theta, noise, prior = theta[inside], noise[inside], prior[inside]
         likelihood, moments, status = self.log_likelihood(theta, noise, threads)
-        parts = (prior + likelihood, -np.inf), (moments, np.nan), (status, CONVERGED)
-        return Evaluation(*(_placed(part, inside, outside) for part, outside in parts))
+        log_prob, moments = _placed(prior + likelihood, inside, -np.inf), _placed(moments, inside, np.nan)
+        return Evaluation(log_prob, moments, _placed(status, inside, CONVERGED))
 
     def evaluate(self, points: np.ndarray, threads: int | None = 1) -> Evaluation:
         """Return the log-density at points (points, dimension), by default in one thread."""

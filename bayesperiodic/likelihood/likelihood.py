@@ -62,9 +62,8 @@ class Residuals(Sequence[np.ndarray]):
 
     @cached_property
     def squares(self) -> np.ndarray:
-        """The sum of the squares of each block, (…, blocks)."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            sums = [np.einsum("...i,...i->...", stack, stack) for stack in self.stacks]
+        """The sum of the squares of each block, (…, blocks); callers ignore overflows."""
+        sums = [np.einsum("...i,...i->...", stack, stack) for stack in self.stacks]
         result = np.empty((*sums[0].shape[1:], len(self._places)))
         for block, (stack, member) in enumerate(self._places):
             result[..., block] = sums[stack][member]
@@ -198,13 +197,14 @@ class Likelihood:
         """
         units = np.array([self.fixed.get(name, 1.0) for name in self.names])
         units[[self.names.index(names[0]) for names in self._parameters if names]] = 1.0
-        squares, spectra = np.array(Residuals.of(residuals).squares), self._spectra(units)
-        for b, g in self._group_of.items():
-            variances = spectra[g][0]
-            if variances.size == 1:
-                squares[..., b] /= variances[0]
-            else:
-                with np.errstate(over="ignore", invalid="ignore"):
+        spectra = self._spectra(units)
+        with np.errstate(over="ignore", invalid="ignore"):
+            squares = np.array(Residuals.of(residuals).squares)
+            for b, g in self._group_of.items():
+                variances = spectra[g][0]
+                if variances.size == 1:
+                    squares[..., b] /= variances[0]
+                else:
                     squares[..., b] = np.add.reduce(residuals[b] ** 2 / variances, axis=-1)
         return self._summed(block.weight * squares[..., b] for b, block in enumerate(self.blocks))
 

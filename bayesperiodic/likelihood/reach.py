@@ -23,7 +23,6 @@ REACH_OF_BRANCH = "reach of the branch"
 class Reach(LinearBlock):
     """Distance of the measured frequency beyond the fold of the model's branch, in units of its resolution."""
 
-    measured_frequency: float = 1.0  # [Hz]
     resolution: float = 1.0  # [Hz]
 
     words: ClassVar[str] = REACH_OF_BRANCH
@@ -35,9 +34,8 @@ class Reach(LinearBlock):
         """Return one block of every point of a table."""
         if experiment.sweep is None or model.autonomous:
             return []
-        f = experiment.frequency
         given = common(experiment, REACH_OF_BRANCH, count=0.0, size=1)
-        return [cls(measured_frequency=f, resolution=experiment.sweep.resolution * f, **given)]
+        return [cls(resolution=experiment.sweep.resolution * experiment.frequency, **given)]
 
     @property
     def alike_in(self) -> tuple[Hashable, ...]:

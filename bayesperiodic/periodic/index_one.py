@@ -58,7 +58,7 @@ def orbit_floquet(
     values = np.linalg.svd(mass, compute_uv=False)
     rank = np.sum(values > 2 * np.pi / (TOO_FAST * (MOST_PARTS * len(mass)) ** 2), axis=1)
     if rank.min() < sizes.size and not np.ptp(rank):
-        return _reduced(mass, rest, int(rank[0]), period)
+        return _reduced(mass, rest, int(rank[0]))
     if values[:, -1].min() <= SINGULAR_VALUE:
         return CHANGING_RANK
     return floquet(first_order_matrix(linearisation, orders) * (sizes / sizes[:, None]), period)
@@ -84,7 +84,7 @@ def _scaled(
     return mass / largest, rest / largest
 
 
-def _reduced(mass: np.ndarray, rest: np.ndarray, rank: int, period: float) -> Floquet | str:
+def _reduced(mass: np.ndarray, rest: np.ndarray, rank: int) -> Floquet | str:
     left, values, right = np.linalg.svd(mass)
     null, fast = left[:, :, rank:], values[:, rank:]
     algebraic = np.swapaxes(null, 1, 2) @ rest @ np.swapaxes(right[:, rank:], 1, 2)

@@ -72,7 +72,6 @@ class _LinearPoint(NamedTuple):
     equations: PeriodicEquations
     columns: np.ndarray
     derivatives: Derivatives
-    g_values: np.ndarray  # (unknowns, points, states)
     f_values: np.ndarray  # (unknowns, points, channels)
     factors: BorderedFactors
 
@@ -158,7 +157,7 @@ class SpecialEquations:
             else:
                 corner = np.tensordot(self.rows, f, ((1, 2), (1, 2)))
                 factors = here.bordered(columns, g, _pulled_back(here, d, self.rows), corner)
-        return _LinearPoint(here, columns, d, g, f, factors)
+        return _LinearPoint(here, columns, d, f, factors)
 
     def _slopes(
         self, name: str, here: PeriodicEquations, z: np.ndarray, columns: np.ndarray, d: Derivatives

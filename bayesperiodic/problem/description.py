@@ -219,7 +219,7 @@ class Description(Printed):
             delayed, errors = self.parameter_maps[e.name].delayed, self.input_errors.get(e.name)
             caused = None if errors is None else errors.parts([block.size for block in blocks_of(e, self.model)])
             result[e.name] = Observation(e, self.model, self.sensors.parameters(delayed), caused)
-        return result
+        return _checks.read_only(result)
 
     @cached_property
     def likelihood(self) -> Likelihood:
@@ -489,14 +489,12 @@ class Description(Printed):
         every = {e.name: noisy_inputs(e, self.input_noise) for e in self.experiments}
         return {name: inputs for name, inputs in every.items() if inputs}
 
-    def true_inputs(self, experiment: Experiment, errors: InputErrors | None = None) -> dict[str, np.ndarray]:
+    def true_inputs(self, experiment: Experiment) -> dict[str, np.ndarray]:
         """Return the inputs of the model in an experiment: the measured ones less their errors, by known sensors.
 
         Parameters
         ----------
         experiment : Experiment
-        errors : InputErrors, optional
-            By default those of the problem.
 
         Returns
         -------
@@ -505,19 +503,23 @@ class Description(Printed):
         """
         return self.drive(experiment, self.input_errors.get(experiment.name))[0]
 
-    def drive(self, experiment: Experiment, errors: InputErrors | None) -> tuple[dict[str, np.ndarray], float]:
+    def drive(
+        self, experiment: Experiment, errors: InputErrors | None, sensors: Mapping[str, float] | None = None
+    ) -> tuple[dict[str, np.ndarray], float]:
         """Return inputs (points,) and frequency [Hz] of an experiment, the measured ones less expected errors.
 
         Parameters
         ----------
         experiment : Experiment
         errors : InputErrors, optional
+        sensors : mapping of str to float, optional
+            Values of unknown parameters of sensors; the inputs are corrected by these, too.
 
         Returns
         -------
         (dict of str to array (points,), float)
         """
-        inputs = self.sensors.corrected(experiment, true_inputs(experiment, self.input_noise, errors))
+        inputs = self.sensors.corrected(experiment, true_inputs(experiment, self.input_noise, errors), sensors)
         of_frequency = self.frequency_errors.get(experiment.name)
         if of_frequency is None or errors is None:
             return inputs, experiment.frequency
@@ -532,7 +534,7 @@ class Description(Printed):
             inputs, frequency = self.drive(e, self.input_errors.get(e.name))
             how = {"samples": e.samples, "scheme": self.scheme, "periods": e.periods, "winding": e.winding}
             result[e.name] = equations_for(self.model, inputs, frequency=frequency, **how)
-        return result
+        return _checks.read_only(result)
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled functions cannot be pickled; they are loaded again where they are needed.

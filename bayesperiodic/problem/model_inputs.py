@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.likelihood.input_noise import true_inputs
 from bayesperiodic.models.sensed import DELAY
 from bayesperiodic.periodic.condensed import equations_for
 from bayesperiodic.periodic.equations import PeriodicEquations
@@ -25,8 +24,8 @@ def sensor_values(problem: Description, experiment: Experiment, theta: np.ndarra
 
 def model_inputs(problem: Description, experiment: Experiment, theta: np.ndarray) -> dict[str, np.ndarray]:
     """Return the measured inputs (points,) less their expected errors, corrected by their sensors at one θ (names,)."""
-    measured = true_inputs(experiment, problem.input_noise, problem.input_errors.get(experiment.name))
-    return problem.sensors.corrected(experiment, measured, sensor_values(problem, experiment, theta))
+    errors = problem.input_errors.get(experiment.name)
+    return problem.drive(experiment, errors, sensor_values(problem, experiment, theta))[0]
 
 
 def without_sensors(

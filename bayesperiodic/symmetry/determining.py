@@ -16,6 +16,7 @@ from sympy.polys.matrices import DomainMatrix
 from bayesperiodic.models.model import Model
 
 PRIME = 2_147_483_629
+MOST_TRIALS = 200
 PARAMETER_WEIGHT = 100
 
 
@@ -168,7 +169,7 @@ def nullspace(matrix: np.ndarray, modulus: int = PRIME) -> np.ndarray:
     return vectors
 
 
-def _circuits(vectors: np.ndarray, weights: np.ndarray, tries: int = 200) -> list[tuple[int, ...]]:
+def _circuits(vectors: np.ndarray, weights: np.ndarray) -> list[tuple[int, ...]]:
     """Return supports of combinations of the vectors that contain no smaller support, the lightest first.
 
     The rows of reduced echelon forms are such combinations; the orders of the columns are random, with a fixed seed.
@@ -176,7 +177,7 @@ def _circuits(vectors: np.ndarray, weights: np.ndarray, tries: int = 200) -> lis
     random = np.random.default_rng(0)
     supports: set[tuple[int, ...]] = set()
     columns = vectors.shape[1]
-    for trial in range(tries if len(vectors) > 1 else 1):
+    for trial in range(MOST_TRIALS if len(vectors) > 1 else 1):
         # Heavy columns are the first pivots, so that each appears in one row only.
         order = np.lexsort((random.permutation(columns), -weights)) if trial % 2 else random.permutation(columns)
         for row in _reduced(vectors[:, order], PRIME)[0]:

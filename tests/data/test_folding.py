@@ -123,7 +123,7 @@ def test_variance_of_the_mean_is_right_within_half_under_noise_of_any_spectrum(n
     for _ in range(2000):
         signals = folding.Signals("slow", time, ("y",), noise(time, generator)[None], 0)
         fit = fit_harmonics(time, signals.values, 1.0, 3)
-        stated += folding._noise(signals, fit, 0, 20, Sampling.of(time, 1.0, 3, 20))[1].variance[:3]
+        stated += folding._noise(signals, fit, 0, Sampling.of(time, 1.0, 3, 20))[1].variance[:3]
         actual += np.abs(fit.amplitudes[0, :3]) ** 2
     assert np.all(stated < 1.5 * actual)
     assert np.all(stated > actual / 1.5)

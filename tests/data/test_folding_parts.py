@@ -30,7 +30,7 @@ def test_noise_of_a_harmonic_is_the_mean_power_of_the_lines_beside_it(row):
     values = np.cos(2 * np.pi * 0.3 * time) + 0.1 * np.random.default_rng(1).standard_normal((2, time.size))
     values[1] *= 3.0
     fit = harmonics.fit_harmonics(time, values, 0.3, 3)
-    one_cycle, noise = folding._noise(signals(time, *values), fit, row, cycles, lines.Sampling.of(time, 0.3, 3, cycles))
+    one_cycle, noise = folding._noise(signals(time, *values), fit, row, lines.Sampling.of(time, 0.3, 3, cycles))
     basis = design(0.3 * time, 3)
     residual = values[row] - basis @ np.linalg.lstsq(basis, values[row], rcond=None)[0]
     power = np.abs(np.fft.fft(residual) / time.size) ** 2
@@ -114,7 +114,7 @@ def test_exact_data_have_no_noise_and_the_degrees_of_freedom_of_the_lines():
     time = np.arange(64) / 8.0
     fit = harmonics.HarmonicFit(1.0, np.array([[0.5, 1.0, 0.0]], dtype=complex), np.zeros((1, 64)))
     one_cycle, noise = folding._noise(
-        signals(time, np.round(np.cos(2 * np.pi * time), 9)), fit, 0, 8, lines.Sampling.of(time, 1.0, 2, 8)
+        signals(time, np.round(np.cos(2 * np.pi * time), 9)), fit, 0, lines.Sampling.of(time, 1.0, 2, 8)
     )
     assert one_cycle.tolist() == noise.variance.tolist() == [0.0, 0.0, 0.0]
     assert noise.freedom.tolist() == noise.lines.tolist() == [16.0, 16.0, 16.0]
@@ -129,7 +129,7 @@ def test_repeated_quantisation_errors_count_with_three_degrees_of_freedom():
     clean = 3.0 * np.cos(2 * np.pi * time) + np.sin(4 * np.pi * time)
     values = 0.25 * np.round((clean + 0.013) / 0.25)
     fit = harmonics.fit_harmonics(time, values[None], 1.0, 3)
-    _, noise = folding._noise(signals(time, values), fit, 0, 20, lines.Sampling.of(time, 1.0, 3, 20))
+    _, noise = folding._noise(signals(time, values), fit, 0, lines.Sampling.of(time, 1.0, 3, 20))
     repeated = 0.25**2 / 12 / 16
     assert noise.variance == pytest.approx(repeated * np.array([1.0, 4.0, 4.0, 4.0]), rel=1e-3)
     assert noise.freedom == pytest.approx(np.full(4, 3.0))

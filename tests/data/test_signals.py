@@ -44,7 +44,7 @@ def test_a_signal_rises_only_after_it_was_below_the_mean_by_a_quarter_of_its_sd(
         elif value > level:
             rising += [i] if below else []
             below = False
-    assert signals._rising(np.arange(signal.size), signal + 5.0).tolist() == rising == [1, 7, 12]
+    assert signals._rising(signal + 5.0).tolist() == rising == [1, 7, 12]
 
 
 @pytest.mark.parametrize(("change", "found"), [(0.0067, []), (0.0080, [6])])

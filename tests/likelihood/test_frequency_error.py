@@ -250,3 +250,23 @@ def test_an_error_of_the_frequency_alone_stands_beside_measured_noise_of_inputs(
     fit = bp.map_estimate(problem, start=TRUTH, checks=False, **QUIET)
     assert fit.converged and fit.input_errors["exact"].loadings.any() and fit.input_errors["noisy"].loadings.any()
     assert all(abs(fit.theta[n] - TRUTH[n]) < 4 * fit.sd[n] and fit.degrees_of_freedom[n] > 1.0 for n in TRUTH)
+
+
+@pytest.mark.parametrize("sensors", [{}, {"F": bp.Sensor(gain=bp.Normal(1.0, 0.1))}])
+def test_stored_inputs_are_those_of_the_stored_orbits(sensors):
+    """Where time is explicit, an error of the frequency turns the inputs: outputs follow from them by the equations."""
+    run = folded(recorded(BOTH, 2, 1)[0], FREQUENCY * (1 + 2e-4), 2, 3.0)
+    noise = np.random.default_rng(3)
+    outputs = {c: y + 1e-3 * noise.standard_normal(y.size) for c, y in run.outputs.items()}
+    run = replace(run, outputs=outputs, frequency_se=1e-4)
+    priors = {name: bp.LogNormal(value, 0.5) for name, value in TRUTH.items()}
+    problem = bp.Problem(BOTH, [run], priors=priors, scheme="fourier", sensors=sensors)
+    fit = bp.map_estimate(problem, checks=False, **QUIET)
+    (solution,) = fit.solutions.values()
+    assert abs(fit.frequencies.loc["run", "estimate"] - run.frequency) > 0.5 * run.frequency_se
+    again = bp.solve_periodic(
+        BOTH, {name: fit.theta[name] for name in TRUTH}, solution.inputs, frequency=solution.frequency, samples=32,
+        periods=2, scheme="fourier", guess=solution.states,
+    )  # fmt: skip
+    assert again.outputs["q"] == pytest.approx(solution.outputs["q"], abs=1e-8)
+    np.testing.assert_allclose(fit.inputs["run"]["F"], solution.inputs["F"], atol=1e-12)

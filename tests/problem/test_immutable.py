@@ -102,7 +102,8 @@ def test_settings_build_the_problem_again(problem):
 def test_mappings_refuse_changes(problem, copied: Callable):
     other = copied(problem)
     run = other.experiments[0]
-    for mapping in (run.outputs, run.independent, other.fixed, other.priors, other.settings["priors"]):
+    made = run.outputs, run.independent, other.fixed, other.priors, other.settings["priors"]
+    for mapping in (*made, other.observations, other.equations):
         for change in ("__setitem__", "x", 0.0), ("__delitem__", "x"), ("update", {"x": 0.0}), ("pop", "x"), ("clear",):
             with pytest.raises(TypeError, match="read-only"):
                 getattr(mapping, change[0])(*change[1:])

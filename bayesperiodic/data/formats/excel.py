@@ -51,7 +51,7 @@ def contents(file: Path, wanted: list[Key], *, header: int | None = None, date_f
     with _opened(file) as book:
         sheets = {sheet.title: _rows(sheet) for sheet in book.worksheets}
     for sheet, rows in sheets.items():
-        table = _table(rows, line, sheet) if rows else None
+        table = _table(rows, line) if rows else None
         if table is None:
             remarks.append(f"sheet {sheet!r} has no table of numbers")
             continue
@@ -126,7 +126,7 @@ def _is_empty(cell: Any) -> bool:
     return cell is None or (isinstance(cell, str) and cell.strip() in NO_VALUE)
 
 
-def _table(rows: list[tuple[Any, ...]], line: int | None, sheet: str) -> _Sheet | None:
+def _table(rows: list[tuple[Any, ...]], line: int | None) -> _Sheet | None:
     """Return the table of a sheet: its columns of values, and the names and units above them."""
     start = line or 0
     width = max(map(len, rows))

@@ -200,7 +200,7 @@ def _converted(
 ) -> tuple[np.ndarray, str, str]:
     """Return a column of texts as numbers, dates or durations if all of its cells are, with a remark and a refusal."""
     cells = [cell.strip(" \t") for cell in values if isinstance(cell, str)]
-    if sure or not any("," in cell for cell in cells) or not text_cells.refusal(cells, decimal, sure):
+    if sure or not any("," in cell for cell in cells) or not text_cells.refusal(cells, sure):
         if (read := text_cells.numbers(values, decimal, notation.thousands)) is not None:
             return read, "numbers with signs between thousands, or exponents of Fortran", ""
     dates, remark, refusal = text_cells.times(values, notation.date_format)
@@ -218,7 +218,7 @@ def _converted(
             )
     if decimal == "," and (bad := text_cells.other_than_numbers(values)):
         return values, "", bad
-    return values, "", text_cells.refusal(cells, decimal, sure)
+    return values, "", text_cells.refusal(cells, sure)
 
 
 def _suggested_time(channels: list[StoredChannel], read: Read) -> str:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from bayesperiodic.data.formats.header_units import MISSING
 from bayesperiodic.data.formats.text_header import DATE, EXPONENT, GROUPS, NUMBER_CELL, TIME_OF_DAY
 
 GROUPED, PLAIN_COMMA = re.compile(rf"[+-]?{GROUPS}"), re.compile(rf"[+-]?[0-9]*,[0-9]+{EXPONENT}")
@@ -54,7 +53,7 @@ class CellEvidence:
         return signs.pop() if len(signs) == 1 else ""
 
 
-def refusal(cells: list[str], decimal: str, sure: bool) -> str:
+def refusal(cells: list[str], sure: bool) -> str:
     """Return why numbers with commas cannot be read, if they are not dates or texts."""
     numbers = [cell for cell in cells if NUMBER_CELL.fullmatch(cell)]
     if len(numbers) < len(cells) or not numbers:
@@ -237,8 +236,3 @@ def _dates(texts: Any, parts: re.Match[str]) -> tuple[np.ndarray | None, str, st
     for order, values in read.items():
         return values, f"dates read as {order}", ""
     return None, "", ""
-
-
-def is_missing(cell: str) -> bool:
-    """Return whether a cell is empty or a text of a missing value."""
-    return cell in MISSING

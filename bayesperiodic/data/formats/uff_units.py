@@ -20,7 +20,7 @@ CODES = {
 }  # fmt: skip
 # Relative difference of factors of one unit: they have few digits in some files.
 SAME_FACTOR = 1e-4
-GENERAL, SCALAR, ROTATIONS = 1, 0, (4, 5, 6)
+SCALAR, ROTATIONS = 0, (4, 5, 6)
 # Units by specific data type, for translations and rotations; L is the length, F the force.
 TRANSLATION = {
     2: "F/L**2", 3: "", 8: "L", 9: "F", 11: "L/s", 12: "L/s**2", 13: "F", 15: "F/L**2", 17: "s", 18: "Hz", 19: "rpm",

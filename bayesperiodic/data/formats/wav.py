@@ -21,7 +21,6 @@ UNKNOWN_SIZE = 2**32 - 1
 class _Form:
     """Format of the samples: `valid` of the `bits` of an integer are used, the upper ones."""
 
-    tag: int
     channels: int
     rate: int
     bits: int
@@ -118,5 +117,5 @@ def _form(content: BinaryIO, order: str, size: int) -> _Form:
     if whole not in allowed or not whole - 8 < bits <= whole or not 0 < valid <= bits:
         raise ValueError(f"its samples have {valid} of {bits} bits in {whole // 8} bytes, which has several meanings")
     if tag == PCM and whole == 8:
-        return _Form(tag, channels, rate, whole, whole)
-    return _Form(tag, channels, rate, whole, valid if tag == PCM else whole)
+        return _Form(channels, rate, whole, whole)
+    return _Form(channels, rate, whole, valid if tag == PCM else whole)
