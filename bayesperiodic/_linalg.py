@@ -18,6 +18,8 @@ from threadpoolctl import ThreadpoolController
 Arguments = ParamSpec("Arguments")
 Value = TypeVar("Value")
 
+# What overflows or is not defined in an iteration is not finite, and ends it.
+unwarned = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 TINY = np.finfo(float).tiny
 RANK = 1e-6
 

@@ -109,6 +109,7 @@ def results_of(run, problem):
             "recording check": run.check(),
             "experiment": experiment,
             "model": problem.model,
+            "element": bp.elements.Element(problem.names[-1], bp.elements.cubic, 0),
             "problem": problem,
             "estimate": fit,
             "estimate's checks": fit.checks,
@@ -140,7 +141,9 @@ def test_results_with_any_names_can_be_printed_where_the_encoding_lacks_their_ch
     """Python's own print raises a UnicodeEncodeError then, after hours of sampling; names stay as they are in UTF-8."""
     results, _ = greek
     lacking = [name for name, result in results.items() if missing_in_cp1252(repr(result))]
-    assert {"estimate", "posterior", "problem", "experiment", "model", "structure", "comparison"} <= set(lacking)
+    assert {"estimate", "posterior", "problem", "experiment", "model", "element", "structure", "comparison"} <= set(
+        lacking
+    )
     for encoding in (CP1252, "ascii", "utf-8"):
         console = io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="strict")
         monkeypatch.setattr(sys, "stdout", console)

@@ -35,6 +35,10 @@ class LeftOut(Storable):
     variance: np.ndarray  # of the complex amplitude
     freedom: np.ndarray  # degrees of freedom of the variance
 
+    def __post_init__(self) -> None:
+        for member in fields(self):
+            object.__setattr__(self, member.name, _checks.read_only(getattr(self, member.name)))
+
 
 @dataclass(frozen=True)
 class Experiment(Result):

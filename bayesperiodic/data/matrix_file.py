@@ -12,12 +12,14 @@ import scipy.sparse
 
 from bayesperiodic import _checks, _hdf5
 from bayesperiodic.data import units
-from bayesperiodic.data.formats import recognise
+from bayesperiodic.data.formats import npz, recognise
 from bayesperiodic.data.formats.contents import LARGEST_ARRAY, Contents, StoredChannel, existing
 
 MATRIX_MARKET, ONE_ARRAY = b"%%MatrixMarket", b"\x93NUMPY"
 # Arrays of a sparse matrix of SciPy in an NPZ file.
 SCIPY_SPARSE = {"format", "shape", "data"}
+# Those that contain numbers of rows, columns and diagonals.
+SPARSE_PLACES = frozenset({"row", "col", "indices", "offsets"})
 FORMATS_OF_MATRICES = "a MatrixMarket, NPZ, NPY, MAT or HDF5 file"
 
 
@@ -89,7 +91,7 @@ def _contents(file: Path, head: bytes) -> Contents:
     if head == MATRIX_MARKET:
         return _of_one(file, "a MatrixMarket file (.mtx)", _market_values)
     if head.startswith(ONE_ARRAY):
-        return _of_one(file, "a file of one array (.npy)", partial(np.load, allow_pickle=False))
+        return _of_one(file, "a file of one array (.npy)", _array_values)
     form = recognise.recognised(file)
     if form == "hdf5":
         with recognise.one_error("an HDF5 file", file):
@@ -134,6 +136,12 @@ def _hdf5_contents(file: Path) -> Contents:
     )
 
 
+def _array_values(file: Path) -> np.ndarray:
+    """Return the array of an NPY file."""
+    with file.open("rb") as content:
+        return npz.array_of(file.stem, content, file.stat().st_size)
+
+
 def _market_values(file: Path) -> np.ndarray:
     """Return the matrix of a MatrixMarket file."""
     rows, columns, entries, layout, field, symmetry = scipy.io.mminfo(str(file))
@@ -159,6 +167,14 @@ def _scipy_values(file: Path, whole: Contents) -> np.ndarray:
     shape = [int(n) for n in np.ravel(arrays["shape"])]
     if len(shape) != 2 or min(shape) < 0 or 8 * shape[0] * shape[1] > LARGEST_ARRAY:
         raise ValueError(f"it has the shape {shape}")
+    # SciPy does not compare all of them with the shape.
+    for name in SPARSE_PLACES.intersection(arrays):
+        places = arrays[name]
+        if places.dtype.kind not in "iu" or np.any((places > max(shape)) | (places < -max(shape))):
+            raise ValueError(f"its {name!r} do not fit its shape {shape}")
+    pointers = np.ravel(arrays.get("indptr", 0))
+    if pointers.dtype.kind not in "iu" or np.any(pointers[1:] < pointers[:-1]):
+        raise ValueError("its 'indptr' decrease")
     matrix: Any = scipy.sparse.load_npz(file)
     if matrix.format in ("csr", "csc", "bsr"):
         matrix.check_format(full_check=True)

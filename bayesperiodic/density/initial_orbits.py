@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesperiodic._linalg import hessian_eigh, in_one_thread, scaled
+from bayesperiodic._linalg import hessian_eigh, in_one_thread, scaled, unwarned
 from bayesperiodic.data.experiment import DATA
 from bayesperiodic.likelihood.likelihood import Likelihood
 from bayesperiodic.likelihood.noise_estimate import estimate_noise
@@ -38,8 +38,6 @@ SEEN, EQUATIONS, SEEN_ROUNDS, TURNS, FEW_TURNS = 8, 0.03, 5, 100, 5
 # Means of a state that are tried, in standard deviations from the one found.
 MEANS = (1.0, -1.0, 2.0, -2.0)
 Guesses = Mapping[str, Mapping[str, np.ndarray]]
-# What overflows or is not defined in an iteration is not finite, and ends it.
-unwarned = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 @dataclass(frozen=True)

@@ -24,12 +24,10 @@ from bayesperiodic.estimation.gauss_newton import (
     climb,
     preference,
 )
-from bayesperiodic.estimation.modes import SEPARATE_SDS, optimum_of
+from bayesperiodic.estimation.modes import SEPARATE_SDS, SHOWN_AFTER, optimum_of
 from bayesperiodic.estimation.wide_tables import widened
 from bayesperiodic.models.model import CondensedModel
 
-# Seconds after which the progress bar is shown.
-SHOWN_AFTER = 2.0
 # Choices of the sheets of tables' branches that are tried after the first.
 MOST_SHEET_CHANGES = 5
 # Halvings of a step from a draw of a condensed model; solves that fail cost most.

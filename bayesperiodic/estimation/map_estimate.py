@@ -132,7 +132,7 @@ def map_estimate(
         a good start. Without them ``fit.checks`` is None, and ``fit.joint`` unless there are several optima; for
         repeated fits.
     progress : bool
-        Show the iterations, with the objective and the step in standard deviations.
+        Show the iterations, with the objective and the step in standard deviations, and the images that are solved.
 
     Returns
     -------
@@ -192,7 +192,9 @@ def map_estimate(
     objective, settled = corrected(objective, best)
     least = best.iterate.objective - LOWEST_OBJECTIVE
     ends = [settled if end is best else end and _restated(objective, end, least) for end in ends]
-    modes = with_images(objective, [end for end in ends if end], partial(climbed, objective, progress=progress))
+    modes = with_images(
+        objective, [end for end in ends if end], partial(climbed, objective, progress=progress), progress
+    )
     lost = {"objective": -np.inf} | dict.fromkeys(problem.names, np.nan)
     outcomes = [
         {"objective": end.iterate.objective} | _by_name(problem, end.iterate.theta) if end else lost for end in ends

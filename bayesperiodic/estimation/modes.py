@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import softmax
+from tqdm import tqdm
 
 from bayesperiodic._io import Storable
 from bayesperiodic._linalg import hessian_eigh
@@ -33,6 +34,8 @@ NEAR_SDS = 0.3
 EQUAL_OBJECTIVES = 1e-3
 # Smallest density of an image, relative to the optimum's, and largest number of signs changed in all combinations.
 CREDIBLE, MOST_SIGNS = 1e-3, 4
+# Images that are solved between two updates of the progress bar, and seconds after which bars are shown.
+IMAGES_AT_ONCE, SHOWN_AFTER = 16, 2.0
 # Mass of another optimum above which the estimate alone does not describe the posterior.
 NOTABLE = 0.01
 # Share of the prior from which the iteration ends at an optimum, for the statement on what the starts can miss.
@@ -77,12 +80,14 @@ def default_starts(problem: Description) -> tuple[int, int]:
     return cheap, MOST_STARTS if isinstance(problem.model, CondensedModel) else cheap
 
 
-def with_images(objective: Objective, ends: Sequence[End], climbed: Callable[[Iterate], End]) -> list[End]:
+def with_images(
+    objective: Objective, ends: Sequence[End], climbed: Callable[[Iterate], End], progress: bool = False
+) -> list[End]:
     """Return the separate optima among the ends and among their images, the best first.
 
     Images differ from an optimum by signs, or by the exchange of two parameters. Where their density is at least a
-    thousandth of the optimum's, the iteration starts there as well. Ends are left out if more of their orbits are not
-    the measured ones than of the best end's.
+    thousandth of the optimum's, the iteration starts there as well; those of an optimum that is itself left out are not
+    solved. Ends are left out if more of their orbits are not the measured ones than of the best end's.
     """
     ends = sorted(ends, key=preference, reverse=True)
     fewest = len(ends[0].iterate.here.other_orbits)
@@ -96,7 +101,9 @@ def with_images(objective: Objective, ends: Sequence[End], climbed: Callable[[It
     waiting = list(optima)
     while waiting and len(optima) < MOST_MODES:
         here = waiting.pop(0).iterate
-        for image in _credible_images(objective, here):
+        if here.objective < max(end.iterate.objective for end in optima) - LOWEST_OBJECTIVE:
+            continue
+        for image in _credible_images(objective, here, progress):
             start = objective.at(image, here.here, here.noise) if _is_separate(objective, image, optima) else None
             if start is None:
                 continue
@@ -147,17 +154,24 @@ def _distance(objective: Objective, theta: np.ndarray, mode: Iterate) -> float:
     return float(np.sqrt(np.sum(np.abs(values[curved]) * along[curved] ** 2)))
 
 
-def _credible_images(objective: Objective, mode: Iterate) -> np.ndarray:
+def _credible_images(objective: Objective, mode: Iterate, progress: bool) -> np.ndarray:
     """Return images of an optimum, (images, names), whose density is at least a thousandth of the optimum's.
 
-    Images with a negligible prior are not solved.
+    Images with a negligible prior are not solved. Of thirty parameters there are hundreds, which may take minutes.
     """
     problem = objective.density.problem
     points = np.concatenate([mode.theta[None], images(problem, mode.theta)])
     prior = problem.joint_prior.log_prob(points)
     points = points[prior > prior[0] + np.log(CREDIBLE)]
+    if len(points) == 1:
+        return points[1:]
     density = objective.density.with_settings(solver=mode.here.solver)
-    values = density.at(points, np.tile(mode.noise, (len(points), 1))).log_prob
+    values = np.empty(len(points))
+    with tqdm(total=len(points), desc="MAP", unit="image", leave=False, disable=not progress, delay=SHOWN_AFTER) as bar:
+        for start in range(0, len(points), IMAGES_AT_ONCE):
+            block = points[start : start + IMAGES_AT_ONCE]
+            values[start : start + len(block)] = density.at(block, np.tile(mode.noise, (len(block), 1))).log_prob
+            bar.update(len(block))
     return points[1:][values[1:] > values[0] + np.log(CREDIBLE)]
 
 

@@ -11,6 +11,7 @@ import sympy as sp
 
 from bayesperiodic import _checks
 from bayesperiodic._expressions import parse_any
+from bayesperiodic._printing import Printed
 from bayesperiodic.models.hysteresis import Hysteretic
 from bayesperiodic.models.names import DERIVATIVES, Names
 from bayesperiodic.models.structure import CONSTANT_PART, POWERS, Base, Matrices, MatrixStructure
@@ -25,7 +26,7 @@ OF_THE_MOTION = ("d", "v", "s", "name", "names")
 
 
 @dataclass(frozen=True)
-class Element:
+class Element(Printed):
     """A nonlinear part between two degrees of freedom of `Model.from_matrices`, or of one and the ground.
 
     Attributes

@@ -20,6 +20,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from bayesperiodic._linalg import unwarned
 from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, SINGULAR, STALLED
 from bayesperiodic.periodic.element_forces import (
@@ -253,6 +254,7 @@ class CondensedEquations(PeriodicEquations):
         kernels, points = self.model.element_kernels, len(states)
         return kernels.evaluate(name, states, np.empty((points, 0)), parameters, np.zeros(points), self.frequency)
 
+    @unwarned
     def solve(self, parameters: np.ndarray, guess: np.ndarray, *_: Any) -> Solved:
         """Run Newton's iteration from a guess (points, elements) on its grid."""
         d, code, history = self._newton(parameters, harmonics(guess), 1.0, None)
@@ -295,6 +297,7 @@ class CondensedEquations(PeriodicEquations):
                 return d, CONVERGED, np.array(history)
         return d, STALLED, np.array(history)
 
+    @unwarned
     def find(self, parameters: np.ndarray, guess: np.ndarray | None) -> tuple[Solved, str]:
         """Solve from a guess (points, elements), or from rest, and double the points until the outputs are resolved."""
         points = self._fewest()
@@ -321,6 +324,7 @@ class CondensedEquations(PeriodicEquations):
                 return *self._newton(parameters, raised, 1.0, None), "input amplitude"
         return d, code, history, "newton"
 
+    @unwarned
     def doubled(self, parameters: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
         """Double the points of a solution until its outputs are resolved; return it, the code and Newton's history."""
         history, change = np.empty((0, 3)), np.nan
@@ -465,6 +469,7 @@ class CondensedEquations(PeriodicEquations):
         result = self._sensitivities(z, parameters, of_frequency, directions[..., : len(self.model.inputs)])
         return result and result._replace(frequency=frequency)
 
+    @unwarned
     def slopes(
         self, d: np.ndarray, parameters: np.ndarray, directions: list[int]
     ) -> tuple[Forces, ResponseMatrices, np.ndarray, np.ndarray]:
@@ -493,6 +498,7 @@ class CondensedEquations(PeriodicEquations):
         of_y = times(changes.y_u, load) - times(changes.y_f, f) - times(matrices.y_f, direct)
         return forces, matrices, of_d, of_y
 
+    @unwarned
     def _sensitivities(
         self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray, inputs: np.ndarray | None = None
     ) -> Sensitivities | None:
@@ -509,6 +515,7 @@ class CondensedEquations(PeriodicEquations):
             right, explicit = right + times(matrices.d_u, more), explicit + times(matrices.y_u, more)
         return self._moved(forces, matrices, right, explicit)
 
+    @unwarned
     def moved_by_forces(self, z: np.ndarray, parameters: np.ndarray, change: np.ndarray) -> Sensitivities | None:
         """Return derivatives along changes of the elements' forces (directions, points, elements); None if singular."""
         if not change.size:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bayesperiodic._linalg import unwarned
 from bayesperiodic.periodic.batch import Anchor, in_blocks
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STALLED, BatchSolution
 from bayesperiodic.periodic.condensed import (
@@ -26,6 +27,7 @@ PATH_POINTS_RATIO, FEWEST_PATH_POINTS, RETRIED_PATH_PART = 8, 64, 1.0 / 16.0
 class CondensedBatch:
     """Input sets of one condensed model on one grid with an anchor each, solved for many parameter vectors."""
 
+    @unwarned
     def __init__(self, sets: Sequence[CondensedEquations], anchors: Sequence[Anchor]):
         first = sets[0]
         self._sets, self._anchors = list(sets), list(anchors)
@@ -82,6 +84,7 @@ class CondensedBatch:
                 result.append(equations.many_matrices(parameters[e], self._points))
         return result
 
+    @unwarned
     def solve(
         self,
         parameters: np.ndarray,
@@ -158,6 +161,7 @@ class CondensedBatch:
         frequency = np.repeat([[e.frequency] for e in self._sets], solves, axis=1)
         return BatchSolution(z, outputs, frequency, status, steps)
 
+    @unwarned
     def _follow(self, e: int, parameters: np.ndarray) -> tuple[np.ndarray, int, int]:
         """Follow a solution from the anchor in steps; return it, the status, and Newton's steps.
 
@@ -182,6 +186,7 @@ class CondensedBatch:
         d, code, more = self._stepped(e, parameters, self._points, smallest)
         return d, code, used + more
 
+    @unwarned
     def _stepped(
         self, e: int, parameters: np.ndarray, points: int, smallest: float = SMALLEST_PATH_PART
     ) -> tuple[np.ndarray, int, int]:
@@ -206,6 +211,7 @@ class CondensedBatch:
             step = min(2.0 * step, LARGEST_PATH_PART, 1.0 - done)
         return here, CONVERGED, used
 
+    @unwarned
     def vjp(self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, moving: tuple[int, ...]) -> np.ndarray:
         """Return Σ weights · ∂ŷ/∂θ (sets, moving) at one solution of every input set; see `batch.Batch.vjp`."""
         result = np.full((len(self._sets), len(moving)), np.nan)

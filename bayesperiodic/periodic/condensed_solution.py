@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg
 
+from bayesperiodic._linalg import unwarned
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
 from bayesperiodic.periodic.condensed import CondensedEquations, receptance
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
@@ -87,6 +88,7 @@ class CondensedSolution(PeriodicSolution):
         return dict(self.changes)
 
 
+@unwarned
 def described(
     equations: PeriodicEquations, theta: np.ndarray, solved: Solved, found_by: str = NEWTON, sensitivities: bool = True
 ) -> PeriodicSolution:
@@ -142,6 +144,7 @@ def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.nd
 
     The maps over the period with steps h, h/2, h/4, … are extrapolated in even powers of h ([1]_) until the largest
     modulus does not change any more. With internal states of elements, which have kinks, they are not extrapolated.
+    They are NaN, with an infinite error, where the map overflows.
 
     References
     ----------
@@ -149,7 +152,10 @@ def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.nd
        Analysis 2 (1965) 384-403.
     """
     motion = _Linearised(equations, theta, harmonics(z), MOST_MODES)
-    values, error = _of_memory(motion) if equations.model.state_owners else _extrapolated(motion)
+    try:
+        values, error = _of_memory(motion) if equations.model.state_owners else _extrapolated(motion)
+    except np.linalg.LinAlgError:  # of a map that overflows
+        return np.full(2 * len(motion.modes.stiffness), np.nan, dtype=complex), np.inf
     if len(motion.modes.stiffness) < len(equations.model.states):
         fewer = _Linearised(equations, theta, harmonics(z), MOST_MODES // 2)
         of_fewer, of_all = (np.abs(np.linalg.eigvals(m.monodromy(MODE_ERROR_STEPS))).max() for m in (fewer, motion))

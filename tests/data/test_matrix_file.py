@@ -1,6 +1,8 @@
 """Matrices of files that other programs have written, or of texts by hand after the formats' descriptions."""
 
+import io
 import pickle
+import zipfile
 
 import h5py
 import numpy as np
@@ -9,6 +11,7 @@ import scipy.io
 import scipy.sparse
 
 import bayesperiodic as bp
+from bayesperiodic.data.formats import npz
 
 # Not symmetric and not square, so that no exchange of rows and columns is overlooked.
 WIDE = np.array([[1.0, 0.0, -2.5], [0.0, 4.0, 3.0]])
@@ -173,6 +176,46 @@ def test_sparse_matrix_whose_places_are_wrong_is_refused(tmp_path):
     np.savez(tmp_path / "K.npz", **arrays)
     with pytest.raises(ValueError, match="it has the shape"):
         bp.read_matrix(tmp_path / "K.npz")
+
+
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [("coo", "row"), ("coo", "col"), ("csr", "indices"), ("csr", "indptr"), ("bsr", "indptr"), ("dia", "offsets")],
+)
+def test_places_outside_of_a_sparse_matrix_are_refused_before_scipy_uses_them(form, name, tmp_path, monkeypatch):
+    scipy.sparse.save_npz(tmp_path / "K.npz", scipy.sparse.coo_array(np.eye(2)).asformat(form), compressed=False)
+    assert np.array_equal(bp.read_matrix(tmp_path / "K.npz"), np.eye(2))
+    with np.load(tmp_path / "K.npz") as stored:
+        arrays = dict(stored)
+    arrays[name][-1] = -1 if name == "indptr" else 3
+    np.savez(tmp_path / "K.npz", **arrays)
+    monkeypatch.setattr(scipy.sparse, "load_npz", None)
+    with pytest.raises(ValueError, match=f"its '{name}' "):
+        bp.read_matrix(tmp_path / "K.npz")
+
+
+@pytest.mark.parametrize("shape", [(20_000, 10_000), (200_000, 200_000), (2, 2), (2, 4)])
+def test_size_of_an_array_is_that_of_its_header_before_memory_is_allocated(shape, tmp_path, monkeypatch):
+    """Files with 6 numbers whose headers state up to 320 GB."""
+    content = io.BytesIO()
+    np.lib.format.write_array_header_1_0(content, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    content.write(np.zeros(6).tobytes())
+    (tmp_path / "K.npy").write_bytes(content.getvalue())
+    with zipfile.ZipFile(tmp_path / "K.npz", "w") as archive:
+        archive.writestr("K.npy", content.getvalue())
+    monkeypatch.setattr(np.lib.format, "read_array", None)
+    for name in ("K.npy", "K.npz"):
+        with pytest.raises(ValueError, match="its array 'K' has another size than its header says"):
+            bp.read_matrix(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["K.npy", "K.npz"])
+def test_array_above_the_limit_is_refused(name, tmp_path, monkeypatch):
+    (np.save if name == "K.npy" else np.savez)(tmp_path / name, **{"arr" if name == "K.npy" else "K": np.eye(20)})
+    assert np.array_equal(bp.read_matrix(tmp_path / name), np.eye(20))
+    monkeypatch.setattr(npz, "LARGEST_ARRAY", 3200)
+    with pytest.raises(ValueError, match="its array 'K' has more than"):
+        bp.read_matrix(tmp_path / name)
 
 
 @pytest.mark.parametrize("form", ["mtx", "npz", "sparse.npz", "npy", "mat", "7.3.mat", "h5"])

@@ -115,3 +115,40 @@ def test_priors_are_silent_everywhere(prior):
 def test_median_of_a_log_uniform_over_all_numbers_is_the_geometric_mean():
     assert float(bp.LogUniform(1e-300, 1e300).quantile(0.5)) == pytest.approx(1.0, rel=1e-12)
     assert float(bp.LogUniform(1e-200, 1e280).quantile(0.75)) == pytest.approx(1e160, rel=1e-10)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("force", [bp.elements.cubic, bp.elements.jenkins], ids=["cubic", "jenkins"])
+@pytest.mark.parametrize("factor", (1e-300, 1e150, 1e300))
+def test_densities_and_solves_of_condensed_models_are_silent(force, factor):
+    """Each parameter at an extreme value, and all of them."""
+    problem, theta = condensed(force)
+    noise = np.full(len(problem.noise_names), 1e-4)
+    for name in [*theta, None]:
+        there = {key: value * factor if name in (key, None) else value for key, value in theta.items()}
+        values = [there[key] for key in problem.names]
+        value, gradient = problem.value_and_gradient(values, noise)
+        assert value == -np.inf or (np.isfinite(value) and np.isfinite(gradient).all())
+        assert not np.isnan(problem.log_posterior(values, noise))
+        (solution,) = problem.solve(there).values()
+        known = solution.converged and np.isfinite(solution.multipliers).all()
+        assert repr(solution) and (known or solution.stable is None)
+
+
+@cache
+def condensed(force):
+    """Return the problem of three masses with an element between two of them, and its parameters."""
+    stiffness, u = np.array([[2.0, -1, 0], [-1, 2, -1], [0, -1, 1]]), np.cos(2 * np.pi * np.arange(32) / 32)
+    constants = {"width": 0.1} if force is bp.elements.jenkins else {}
+    model = bp.Model.from_matrices(
+        "three", mass={"m": np.eye(3)}, damping={"a": np.eye(3), "b": stiffness}, stiffness={"k": stiffness},
+        forces={"f": 2}, outputs={"x": (2, "displacement"), "y": (1, "acceleration")}, condensed=True,
+        elements=[bp.elements.Element("e", force, (1, 0), constants)],
+    )  # fmt: skip
+    theta = dict.fromkeys(model.parameters, 1.0) | {"a": 0.1, "b": 0.01}
+    clean = bp.solve_periodic(model, theta, {"f": u}, frequency=0.1, samples=32).outputs
+    random = np.random.default_rng(0)
+    noisy = {name: y + 0.01 * random.standard_normal(32) for name, y in clean.items()}
+    priors = {name: bp.LogNormal(value, 2.0) for name, value in theta.items()}
+    run = bp.Experiment("run", 0.1, noisy, {"f": u}, samples=32)
+    return bp.Problem(model, [run], priors=priors), theta

@@ -290,7 +290,7 @@ def end(theta, objective, status="converged", others=()):
 
 
 def test_optima_are_more_than_one_sd_apart_converged_and_on_the_measured_orbits(monkeypatch):
-    monkeypatch.setattr(modes, "_credible_images", lambda objective, here: np.empty((0, 1)))
+    monkeypatch.setattr(modes, "_credible_images", lambda *_: np.empty((0, 1)))
     monkeypatch.setattr(modes, "prior_only", lambda problem, theta, hessian: np.zeros(1, dtype=bool))
     density = SimpleNamespace(problem=None)
     curved = SimpleNamespace(hessian_and_gradient=lambda iterate: (np.array([[4.0]]), None), density=density)
@@ -307,7 +307,7 @@ def test_optima_are_more_than_one_sd_apart_converged_and_on_the_measured_orbits(
     # An image is climbed from where it is separate, and followed by its own images.
     images_of = {3.0: [3.1, -3.0], -3.0: [5.0], -8.0: [20.0]}
     monkeypatch.setattr(
-        modes, "_credible_images", lambda _, here: np.array(images_of.get(float(here.theta[0]), []))[:, None]
+        modes, "_credible_images", lambda _, here, __: np.array(images_of.get(float(here.theta[0]), []))[:, None]
     )
     started = []
     moving = SimpleNamespace(
@@ -321,6 +321,35 @@ def test_optima_are_more_than_one_sd_apart_converged_and_on_the_measured_orbits(
     climbed = lambda start: with_noise(end(float(start.theta[0]), -2.0))  # noqa: E731
     assert [float(one.iterate.theta[0]) for one in modes.with_images(moving, [first], climbed)] == [3.0, -3.0, 5.0]
     assert started == [-3.0, 5.0]
+    # Images of optima that are left out, 30 below the best one, are not climbed from.
+    far, started[:] = with_noise(end(-8.0, -40.0)), []
+    assert [float(one.iterate.theta[0]) for one in modes.with_images(moving, [first, far], climbed)] == [3.0, -3.0, 5.0]
+    assert started == [-3.0, 5.0]
+
+
+@pytest.mark.parametrize("progress", [True, False])
+def test_images_are_solved_block_by_block_and_counted(progress, monkeypatch, capsys):
+    """Those of seven parameters, 21 exchanges, whose density is negligible unless the first one is 1 or 2."""
+    monkeypatch.setattr(modes, "SHOWN_AFTER", 0.0)
+    supports, sizes = dict.fromkeys("abcdefg", (0.0, np.inf)), []
+
+    def at(points, noise):
+        sizes.append(len(points))
+        assert noise.shape == (len(points), 1)
+        return SimpleNamespace(log_prob=np.where(points[:, 0] <= 2.0, 0.0, -7.0))
+
+    problem = named(**supports)
+    problem.joint_prior.log_prob = lambda points: np.zeros(len(points))
+    density = SimpleNamespace(problem=problem, with_settings=lambda solver: SimpleNamespace(at=at))
+    mode = SimpleNamespace(theta=np.arange(1.0, 8.0), noise=np.ones(1), here=SimpleNamespace(solver=None))
+    found = modes._credible_images(SimpleNamespace(density=density), mode, progress)
+    expected = images(problem, mode.theta)
+    assert np.array_equal(found, expected[expected[:, 0] <= 2.0]) and len(found) == 16
+    assert sum(sizes) == 22 and max(sizes) == modes.IMAGES_AT_ONCE
+    assert ("0/22" in capsys.readouterr().err) == progress
+    problem.joint_prior.log_prob = lambda points: np.where((points == mode.theta).all(axis=1), 0.0, -7.0)
+    sizes.clear()
+    assert modes._credible_images(SimpleNamespace(density=density), mode, progress).shape == (0, 7) and not sizes
 
 
 def with_noise(one):

@@ -2,7 +2,8 @@
 
 import copy
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic.likelihood.input_noise import InputErrors
 from tests.known import LINEAR, linear_experiment
-from tests.problems import DUFFING_PRIORS, duffing, duffing_run
+from tests.problems import DUFFING, DUFFING_PRIORS, duffing, duffing_run
 
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.4), "coulomb": bp.Uniform(0.0, 50.0)}
 AT = {"k": 870.0, "c": 37.0, "coulomb": 22.0}, {"force": 7.0}
@@ -134,6 +135,64 @@ def test_arrays_and_mappings_that_the_user_changes_do_not_change_the_problem():
             array[:] = 0
     assert float(problem.log_posterior(*at)) == before
     assert float(problem.replace().log_posterior(*at)) == before
+
+
+def arrays_of(value):
+    """Yield all arrays in the fields, mappings and sequences of an object."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, Mapping):
+        yield from (array for item in value.values() for array in arrays_of(item))
+    elif isinstance(value, list | tuple):
+        yield from (array for item in value for array in arrays_of(item))
+    elif is_dataclass(value):
+        yield from (array for member in fields(value) for array in arrays_of(getattr(value, member.name)))
+
+
+def table_of_amplitudes():
+    rows = {"f": np.array([0.1, 0.12]), "x": np.array([0.6, 0.8]), "phase": np.array([-10.0, -20.0])}
+    return bp.response_table(
+        rows, outputs={"displacement": "x"}, inputs={"force": 0.5}, frequency="f", phases={"displacement": "phase"}
+    )
+
+
+@pytest.mark.parametrize(
+    ("made", "least"),
+    [(lambda: [duffing_run()], 2), (lambda: [folded_run()], 9), (table_of_amplitudes, 2)],
+    ids=["arrays", "folded", "table"],
+)
+def test_every_array_of_an_experiment_is_read_only(made, least):
+    arrays = list(arrays_of(made()))
+    assert len(arrays) >= least and not any(array.flags.writeable for array in arrays if array.size)
+
+
+def folded_run():
+    force = {"force": 0.5 * np.cos(2 * np.pi * np.arange(32) / 32)}
+    run = bp.simulate(
+        bp.models.duffing, DUFFING, force, frequency=0.1, duration=200, sampling_rate=8, noise={"displacement": 0.01},
+        seed=1,
+    )  # fmt: skip
+    return run.between(100, 200).fold(32, frequency=0.1, harmonics=5)
+
+
+@pytest.mark.parametrize("condensed", [False, True])
+def test_matrices_and_weights_that_the_user_changes_do_not_change_the_model(condensed):
+    stiffness, weights = np.array([[2.0, -1.0], [-1.0, 1.0]]), np.array([0.6, 0.8])
+    mass, damping, wave = np.eye(2), 0.1 * np.eye(2), {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    model = bp.Model.from_matrices(
+        "two", mass={"m": mass}, damping=damping, stiffness={"k": stiffness}, forces={"force": weights},
+        outputs={"x": (weights, "displacement")}, condensed=condensed,
+        elements=[bp.elements.Element("stop", bp.elements.cubic, weights)],
+    )  # fmt: skip
+
+    def response():
+        theta = {"m": 1.0, "k": 1.1, "stop_k3": 0.2}
+        return bp.solve_periodic(model, theta, wave, frequency=0.1, samples=32).outputs["x"]
+
+    before = response()
+    for array in (mass, damping, stiffness, weights):
+        array *= 3.0
+    assert np.array_equal(response(), before)
 
 
 def test_anchors_and_errors_of_inputs_leave_the_problem_as_it_is():
