@@ -93,19 +93,19 @@ def in_wide_tables(problem: Problem, theta: np.ndarray, draws: np.ndarray, progr
 
 
 def from_draws(
-    objective: Objective, start: np.ndarray, end: End, draws: Sequence[np.ndarray], fewest: int, progress: bool
+    objective: Objective, starting: Sequence[np.ndarray], end: End, fewest: int, progress: bool
 ) -> list[End | None]:
-    """Return the ends of the iterations from a start and from draws of the prior; that of the start is given.
+    """Return the ends of the iterations from θ in turn, draws of the prior behind the first; the first end is given.
 
     After `fewest` starts, the others follow only as long as tests reject the model at the best end.
     """
     ends: list[End | None] = [end]
     problem: Any = objective.density.problem
-    for draw in draws:
+    for draw in starting[1:]:
         reached = [one for one in ends if one]
         if len(ends) >= fewest and not misfit_at(problem, max(reached, key=preference).iterate, len(ends)):
             break
-        ends.append(end if draw is start else _from_draw(objective, reached, draw, progress))
+        ends.append(end if draw is starting[0] else _from_draw(objective, reached, draw, progress))
     return ends
 
 
@@ -121,7 +121,7 @@ def _from_draw(objective: Objective, ends: Sequence[End], theta: np.ndarray, pro
         warnings.simplefilter("ignore")
         if isinstance(problem.model, CondensedModel):
             halvings = HALVINGS_FROM_DRAWS
-            other = objective.iterate(problem.density().linearise(theta), problem.likelihood.guess())
+            other = objective.iterate(linearised(problem, theta, None), problem.likelihood.guess())
         else:
             other = objective.at(theta, first.here, problem.likelihood.guess())
             other = other and objective.anchored(other)

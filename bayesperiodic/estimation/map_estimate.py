@@ -174,7 +174,7 @@ def map_estimate(
         fewest, most = (1, 1) if start is not None else default_starts(problem)
     _checks.instance("checks", checks, bool)
     draws = problem.joint_prior.sample(most - 1, np.random.default_rng(_checks.integer("seed", seed, 0)))
-    near = in_wide_tables(problem, theta, draws, progress) if start is None else []
+    near = in_wide_tables(problem, theta, draws[: fewest - 1], progress) if start is None else []
     first = first_iterate(problem, near[0]) if near else None
     first = first or first_iterate(problem, theta)
     if first is None:
@@ -182,7 +182,8 @@ def map_estimate(
     objective = objective_near(problem, first.here)
     end = on_best_sheets(problem, climbed(objective, first, progress), progress)
     end = on_measured_orbits(problem, theta, end, progress)
-    ends = from_draws(objective, (near or [theta])[0], end, near[1:] or [*draws], fewest, progress)
+    starting = [*(near or [theta, *draws[: fewest - 1]]), *draws[fewest - 1 :]]
+    ends = from_draws(objective, starting, end, fewest, progress)
     best = max((end for end in ends if end), key=preference)
     noisy, moved = _with_noisy_inputs(problem, best, progress)
     if noisy is not problem:
