@@ -13,6 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from scipy.linalg import orth
+from scipy.linalg.lapack import dgetrf
 from threadpoolctl import ThreadpoolController
 
 Arguments = ParamSpec("Arguments")
@@ -50,6 +51,14 @@ def covariance_cholesky(covariance: np.ndarray) -> np.ndarray:
     """Return the lower Cholesky factor of a covariance; raise a LinAlgError unless it is positive definite."""
     sd = _standard_deviations(covariance)
     return sd[:, None] * np.linalg.cholesky(covariance / np.outer(sd, sd))
+
+
+def factors(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return LU factors and pivots of a matrix for `scipy.linalg.lu_solve`; raise a LinAlgError if it is singular."""
+    lu, pivots, zero = dgetrf(matrix)
+    if zero:
+        raise np.linalg.LinAlgError("the matrix is singular")
+    return lu, pivots
 
 
 def column_space(jacobian: np.ndarray) -> np.ndarray:

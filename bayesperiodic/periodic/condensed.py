@@ -34,9 +34,9 @@ from bayesperiodic.periodic.element_forces import (
     times,
 )
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved
-from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, sampled
-from bayesperiodic.periodic.memory import remembered
-from bayesperiodic.periodic.receptance import Receptance, unresolved
+from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, sampled, transform_tables
+from bayesperiodic.periodic.memory import error_of_fewer, remembered
+from bayesperiodic.periodic.receptance import Receptance, compiled, unresolved
 from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
 # Points of the grid of the elements, and relative change of the outputs below which they are not doubled.
@@ -375,7 +375,10 @@ class CondensedEquations(PeriodicEquations):
                     return d, load, np.append(by_load, 1.0), True
             return d, load, along, False
 
-        _, _, before, good = corrected(d, load, np.append(np.zeros(2 * d.size), 1.0))
+        try:
+            _, _, before, good = corrected(d, load, np.append(np.zeros(2 * d.size), 1.0))
+        except np.linalg.LinAlgError:
+            return None
         before /= np.linalg.norm(before)
         while good or step >= SMALLEST_LOAD_STEP:
             try:
@@ -416,10 +419,14 @@ class CondensedEquations(PeriodicEquations):
         """
         if not self.model.state_owners:
             return 0.0
-        fewer = harmonics(self._forces(resized(d, len(d)), parameters).values)
-        change = np.linalg.norm(times(self.matrices(parameters, len(d))[0].y_f, fewer - f[: len(fewer)]), axis=0)
-        worst = np.max(change / np.maximum(np.linalg.norm(y, axis=0), np.finfo(float).tiny), initial=0.0)
-        return float(worst) / 3.0 if np.isfinite(worst) else np.inf
+        memory, fewer = self.forces(d, parameters).memory, np.empty((len(d) // 2, self.count), dtype=complex)
+        if memory is None:
+            return np.inf
+        compiled().forces_on_fewer(
+            self.model.element_kernels.residual_jacobian.address, parameters, 2.0 * np.pi * self.frequency,
+            float(self.grid.periods), *transform_tables(2 * len(d)), memory.blocks, memory.states, fewer,
+        )  # fmt: skip
+        return float(error_of_fewer(self.matrices(parameters, 2 * len(d))[0].y_f, fewer - f[: len(fewer)], y))
 
     def error_bound(self, z: np.ndarray, parameters: np.ndarray) -> float:
         """Return the bound of the relative error of the outputs by the number of points, see `unresolved`."""

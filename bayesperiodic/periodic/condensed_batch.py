@@ -11,8 +11,9 @@ from bayesperiodic.periodic.condensed import (
     RESOLVED_SHARE,
     CondensedEquations,
 )
-from bayesperiodic.periodic.element_forces import Preconditioner, ResponseMatrices
-from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized
+from bayesperiodic.periodic.element_forces import Forces, Preconditioner, ResponseMatrices
+from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, transform_tables
+from bayesperiodic.periodic.memory import error_of_fewer
 from bayesperiodic.periodic.receptance import compiled, unresolved
 
 FEWEST_CONDENSED_SOLVES = 4
@@ -47,17 +48,19 @@ class CondensedBatch:
         self._load = np.stack([e.input_harmonics(points) for e in sets])
         self._rates = np.array([2 * np.pi * e.frequency for e in sets])
         self._known = np.array([a.sensitivities is not None for a in anchors])
-        self._inverse, self._low = self._preconditioners()
-        turns = np.exp(-2j * np.pi * np.arange(points // 2) / points)
-        bits = points.bit_length() - 1
-        place = np.array([int(f"{i:0{bits}b}"[::-1], 2) for i in range(points)])
-        self._transform = turns, place
+        at_anchors = [e.forces(d, a.parameters) for e, d, a in zip(sets, self._d, anchors, strict=True)]
+        self._inverse, self._low = self._preconditioners(at_anchors)
+        self._transform, self._blocks = transform_tables(points), np.array(first.model.state_blocks, dtype=np.int64)
+        self._states = np.zeros((len(sets), points, 3 * (first.count + self._blocks.sum())))
+        for states, forces in zip(self._states, at_anchors, strict=True):
+            if forces.memory is not None:
+                states[:] = forces.memory.states
 
-    def _preconditioners(self) -> tuple[np.ndarray, int]:
+    def _preconditioners(self, at_anchors: Sequence[Forces]) -> tuple[np.ndarray, int]:
         """Return the transposed inverses of the sets, all of the largest number of low harmonics, and that number."""
         given = []
-        for e, anchor, d, matrices in zip(self._sets, self._anchors, self._d, self._matrices, strict=True):
-            given.append((e.forces(d, anchor.parameters), e.rates(self._points), matrices.d_f))
+        for e, forces, matrices in zip(self._sets, at_anchors, self._matrices, strict=True):
+            given.append((forces, e.rates(self._points), matrices.d_f))
         low, inverses = 1, []
         for known, part in zip(self._known, given, strict=True):
             if known:
@@ -108,6 +111,7 @@ class CondensedBatch:
         ahead = np.einsum("ebp,epkm->ebkm", change, self._slopes)
         d = self._d[:, None] + ahead
         moved, f = np.sqrt(np.sum(np.abs(ahead) ** 2, axis=(2, 3))), np.empty_like(d)
+        fewer = np.empty((count, solves, self._points // 4 if self._blocks.size else 0, first.count), dtype=complex)
         lost, steps = np.zeros((2, count, solves), dtype=np.int64)
         lost[~self._known] = 1
         if without is not None:
@@ -118,13 +122,13 @@ class CondensedBatch:
         free = np.empty(d_f.shape[:-1], dtype=complex)
         for e, response in enumerate(responses):
             d_f[e], free[e] = response.d_f, _unforced(response.d_u, self._load[e])
-        kernels, blocks = first.model.element_kernels, np.array(first.model.state_blocks, dtype=np.int64)
+        kernels, blocks = first.model.element_kernels, self._blocks
         address = (kernels.residual_jacobian if blocks.size else kernels.residual).address if first.count else 0
 
         def part(block: tuple[int, int]) -> None:
             compiled().correct_many(
                 address, d_f, free, self._inverse, self._low, every, self._rates, float(first.grid.periods),
-                *self._transform, blocks, polish, *block, moved, d, f, lost, steps,
+                *self._transform, blocks, polish, *block, moved, d, f, lost, steps, self._states, fewer,
             )  # fmt: skip
 
         in_blocks(part, lost.size, FEWEST_CONDENSED_SOLVES, threads)
@@ -143,9 +147,13 @@ class CondensedBatch:
         outputs = np.stack([e.on_points(y) for e, y in zip(self._sets, every_y, strict=True)])
         shares = np.stack([unresolved(*of_set) for of_set in zip(self._largest, f, every_y, strict=True)])
         if blocks.size:
-            for e, b in np.argwhere(status == CONVERGED):
-                given = d[e, b], f[e, b], every_y[e][b], every[e, b]
-                shares[e, b] = max(shares[e, b], self._sets[e].error_of_memory(*given))
+            change = fewer - f[:, :, : fewer.shape[2]]
+            for e, (r, y) in enumerate(zip(responses, every_y, strict=True)):
+                by_memory = error_of_fewer(r.y_f, change[e], y)
+                for b in np.flatnonzero(lost[e]):
+                    if status[e, b] == CONVERGED:
+                        by_memory[b] = self._sets[e].error_of_memory(d[e, b], f[e, b], y[b], every[e, b])
+                shares[e] = np.maximum(shares[e], by_memory)
         finer = {}
         for e, b in np.argwhere((status == CONVERGED) & ~(shares <= RESOLVED_SHARE)):
             equations, theta = self._sets[e], every[e, b]

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
+from bayesperiodic._linalg import factors
 from bayesperiodic.periodic.arclength import INPUTS, Change, ParametrisedEquations
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, SINGULAR, STALLED
 from bayesperiodic.periodic.condensed import (
@@ -51,7 +52,7 @@ class _Bordered:
         matrix[:size, :size] = inverse.matrix
         matrix[:size, size], matrix[size, :size] = _flat(slope[: self._low]), _flat(self._row[: self._low])
         matrix[size, size] = corner - self._high(slope)
-        self._factors = scipy.linalg.lu_factor(matrix, check_finite=False)
+        self._factors = factors(matrix)
 
     def _high(self, amplitudes: np.ndarray) -> float:
         return float(np.vdot(self._row[self._low :], amplitudes[self._low :]).real)

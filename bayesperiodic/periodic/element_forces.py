@@ -1,10 +1,12 @@
 """Forces of the elements of a condensed model, linearised, and the solves of its linearised equations in harmonics."""
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 
+from bayesperiodic._linalg import factors
 from bayesperiodic.periodic.harmonics import harmonics, on_grid
 from bayesperiodic.periodic.memory import Memory
 
@@ -47,7 +49,8 @@ class ResponseMatrices(NamedTuple):
 class Preconditioner:
     """Inverse of the derivative of the residual by the harmonics of d, exact for the low ones.
 
-    The higher ones, which the elements couple only weakly, are treated as uncoupled.
+    The higher ones, which the elements couple only weakly, are treated as uncoupled. Solves raise a LinAlgError where
+    the derivative is singular.
     """
 
     def __init__(self, forces: Forces, rates: np.ndarray, d_f: np.ndarray, low: int = 0):
@@ -74,9 +77,10 @@ class Preconditioner:
         matrix[zero], matrix[:, zero] = 0.0, 0.0
         matrix[zero, zero] = np.eye(self.elements)
         self.matrix = matrix
-        if not self.elements:
-            return
-        self._factors = scipy.linalg.lu_factor(matrix, check_finite=False)
+
+    @cached_property
+    def _factors(self) -> tuple[np.ndarray, np.ndarray]:
+        return factors(self.matrix)
 
     @property
     def inverse(self) -> np.ndarray:
@@ -172,11 +176,11 @@ def newton_step(
 
 def linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.ndarray) -> np.ndarray | None:
     """Return x of the linearised equations (…, harmonics, elements); None if they are singular."""
+    inverse = Preconditioner(forces, rates, d_f)
     try:
-        inverse = Preconditioner(forces, rates, d_f)
+        return _swept(inverse, forces, rates, d_f, right, MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR)
     except np.linalg.LinAlgError:
         return None
-    return _swept(inverse, forces, rates, d_f, right, MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR)
 
 
 def _swept(

@@ -22,6 +22,13 @@ def resized(amplitudes: np.ndarray, points: int) -> np.ndarray:
     return result
 
 
+def transform_tables(points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return exp(−2πi k/points) for half of the points, a power of two, and all bit-reversed numbers."""
+    bits = points.bit_length() - 1
+    place = np.array([int(f"{i:0{bits}b}"[::-1], 2) for i in range(points)])
+    return np.exp(-2j * np.pi * np.arange(points // 2) / points), place
+
+
 def sampled(amplitudes: np.ndarray, points: int) -> np.ndarray:
     """Return the values of a series of harmonics at any number of points, however few."""
     count = amplitudes.shape[-2]

@@ -96,6 +96,18 @@ class Memory(NamedTuple):
         return self.change(by_d * d[:, self.owners] + by_v * v[:, self.owners])
 
 
+def error_of_fewer(y_f: np.ndarray, change: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the relative error of outputs y by the formula of the internal states; infinite where it is not known.
+
+    `change` (…, harmonics, elements) is that of the forces where half of the points give them, of which at kinks, where
+    the formula is of order two, a third is left. `y_f` (…, harmonics, outputs, elements) and y (…, harmonics, outputs)
+    may have more harmonics.
+    """
+    moved = np.linalg.norm((y_f[..., : change.shape[-2], :, :] @ change[..., None])[..., 0], axis=-2)
+    worst = np.max(moved / np.maximum(np.linalg.norm(y, axis=-2), np.finfo(float).tiny), axis=-1, initial=0.0)
+    return np.where(np.isfinite(worst), worst / 3.0, np.inf)
+
+
 def remembered(
     model: CondensedModel, states: np.ndarray, parameters: np.ndarray, frequency: float, period: float
 ) -> Memory | None:

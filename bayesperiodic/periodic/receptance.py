@@ -301,4 +301,8 @@ def unresolved(largest: np.ndarray, f: np.ndarray, y: np.ndarray) -> np.ndarray:
 @cache
 def compiled() -> ModuleType:
     """Return the compiled functions of condensed equations."""
-    return load(Path(__file__).with_name("_kernels").joinpath("condensed.py").read_text(encoding="utf-8"))
+    memory, condensed = (
+        Path(__file__).with_name("_kernels").joinpath(f"{name}.py").read_text(encoding="utf-8")
+        for name in ("memory", "condensed")
+    )
+    return load(condensed, shared=load(memory))
