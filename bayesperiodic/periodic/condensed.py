@@ -35,7 +35,7 @@ from bayesperiodic.periodic.element_forces import (
 )
 from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, sampled, transform_tables
-from bayesperiodic.periodic.memory import error_of_fewer, remembered
+from bayesperiodic.periodic.memory import Memory, error_of_fewer, remembered
 from bayesperiodic.periodic.receptance import Receptance, compiled, unresolved
 from bayesperiodic.periodic.schemes import Scheme, find_scheme, fourier
 
@@ -199,19 +199,19 @@ class CondensedEquations(PeriodicEquations):
         """Return values (…, points, columns) on the experiment's grid from harmonics (…, harmonics, columns)."""
         return sampled(harmonics, self.grid.points)
 
-    def forces(self, d: np.ndarray, parameters: np.ndarray) -> Forces:
-        """Return the forces at harmonics d (harmonics, elements)."""
+    def forces(self, d: np.ndarray, parameters: np.ndarray, near: Forces | None = None) -> Forces:
+        """Return the forces at harmonics d (harmonics, elements); internal states are followed from those of `near`."""
         if not self.count:
             none = np.zeros((2 * len(d), 0))
             return Forces(none, none, none)
         key = ("forces", parameters.tobytes(), self.frequency, self.grid.periods, d.tobytes())
-        return self._receptance.recent(key, lambda: self._forces(d, parameters))
+        return self._receptance.recent(key, lambda: self._forces(d, parameters, near and near.memory))
 
-    def _forces(self, d: np.ndarray, parameters: np.ndarray) -> Forces:
+    def _forces(self, d: np.ndarray, parameters: np.ndarray, near: Memory | None) -> Forces:
         states, given, memory = self._motion(d), self.count, None
         if self.model.state_owners:
             period = self.grid.periods / self.frequency
-            memory = remembered(self.model, states, parameters, self.frequency, period)
+            memory = remembered(self.model, states, parameters, self.frequency, period, near)
             if memory is None:
                 unknown = np.full((len(states), given), np.nan)
                 return Forces(unknown, unknown, unknown)
@@ -281,7 +281,7 @@ class CondensedEquations(PeriodicEquations):
             share = 1.0
             for _ in range(MOST_STEP_HALVINGS):
                 there = d - share * step
-                new_forces = self.forces(there, parameters)
+                new_forces = self.forces(there, parameters, forces)
                 residual, size = residual_of(there, new_forces, matrices, free)
                 after = float(np.linalg.norm(residual))
                 if after < before or after <= NEWTON_ROUNDING * size:

@@ -24,8 +24,9 @@ def resized(amplitudes: np.ndarray, points: int) -> np.ndarray:
 
 def transform_tables(points: int) -> tuple[np.ndarray, np.ndarray]:
     """Return exp(−2πi k/points) for half of the points, a power of two, and all bit-reversed numbers."""
-    bits = points.bit_length() - 1
-    place = np.array([int(f"{i:0{bits}b}"[::-1], 2) for i in range(points)])
+    place = np.zeros(1, dtype=np.int64)
+    while len(place) < points:
+        place = np.concatenate([2 * place, 2 * place + 1])
     return np.exp(-2j * np.pi * np.arange(points // 2) / points), place
 
 

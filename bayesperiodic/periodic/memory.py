@@ -109,15 +109,27 @@ def error_of_fewer(y_f: np.ndarray, change: np.ndarray, y: np.ndarray) -> np.nda
 
 
 def remembered(
-    model: CondensedModel, states: np.ndarray, parameters: np.ndarray, frequency: float, period: float
-) -> Memory | None:
+    model: CondensedModel, states: np.ndarray, parameters: np.ndarray, frequency: float, period: float,
+    near: Memory | None = None,
+) -> Memory | None:  # fmt: skip
     """Return the periodic internal states for displacements and velocities in `states`; None if they are not found.
 
-    `states` (points, 3·variables) are filled.
+    `states` (points, 3·variables) are filled, starting from the internal states of a motion that is near, if any.
     """
     kernels, given = model.element_kernels, states.shape[1] // 3
     columns, step = np.empty((len(states), given * (1 + 3 * given))), 2 * period / len(states)
     blocks, owners = (np.array(given, dtype=np.int64) for given in (model.state_blocks, model.state_owners))
-    if not compiled().march(kernels.residual_jacobian.address, states, columns, parameters, frequency, step, blocks):
-        return None
+    call = kernels.residual_jacobian.address, states, columns, parameters, frequency, step, blocks
+    if near is None:
+        if not compiled().march(*call):
+            return None
+    else:
+        inner = slice(near.elements, given)
+        states[:, inner] = near.states[:, inner]
+        if not compiled().follow_states(*call):
+            return None
+        # The derivatives at the last states.
+        columns = kernels.evaluate(
+            "residual_jacobian", states, np.empty((len(states), 0)), parameters, np.zeros(len(states)), frequency
+        )
     return Memory(states, columns, step, blocks, owners)

@@ -189,9 +189,12 @@ class Receptance:
 
         `directions` are indices of parameters, the number of parameters standing for the frequency.
         """
+        self._check_regular(parameters)
+        if self._modes is not None and not len(directions):
+            values = self.many(parameters[None], frequency, harmonics)[0]
+            return LinearResponse(values, np.zeros((0, *values.shape)))
         rates = 2 * np.pi * frequency * harmonics
         factors = self.coefficients(parameters, rates)
-        self._check_regular(parameters)
         slopes = [self._slope(d, parameters, rates, factors, frequency) for d in directions]
         if self._modes is not None:
             diagonals, rows, columns = self._modes

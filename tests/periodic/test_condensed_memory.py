@@ -160,6 +160,26 @@ def test_linear_element_of_two_states_has_its_response_its_derivatives_and_its_m
         assert np.abs(solution.multipliers - value).min() < 5e-6
 
 
+def test_forces_of_a_linear_element_are_those_of_its_frequency_response_whatever_the_motion():
+    """From rest, and from the states of another motion; the second state begins at 0 with rate 0."""
+    given = viscoelastic()
+    equations = CondensedEquations.build(given, {"force": force()}, frequency=FREQUENCY, samples=SAMPLES)
+    theta, random = np.array([VISCOELASTIC[name] for name in given.parameters]), np.random.default_rng(1)
+    inner = np.array([[-VISCOELASTIC["soft_a"], 0.3], [1.0, -0.5]])
+    turning = 1j * equations.rates(512)[:5]
+    response = [VISCOELASTIC["soft_k"] * np.linalg.solve(r * np.eye(2) - inner, [r, 0])[0] for r in turning]
+    before = None
+    for _ in range(40):
+        d = np.zeros((256, 1), dtype=complex)
+        d[:5, 0] = random.standard_normal(5) + 1j * np.append(0.0, random.standard_normal(4))
+        exact = d[:5, 0] * response
+        forces = equations.forces(d, theta)
+        for near in (forces, before and equations.forces(d * (1 + 1e-15), theta, before)):
+            if near is not None:
+                assert np.abs(harmonics(near.values)[:5, 0] - exact).max() < 1e-6 * np.abs(exact).max()
+        before = forces
+
+
 @pytest.mark.parametrize("kind", [*VALUES])
 def test_derivatives_are_those_of_the_formula(kind):
     """By d, parameters and frequency on 64 points: finite differences of the harmonics, and Newton's matrix."""

@@ -143,7 +143,9 @@ def march(address, states, out, theta, rate, step, sizes):
                         for row in range(2):
                             change = a[row * size + r, 2 * size]
                             near[row, first + r] -= share * change
-                            if not abs(change) <= LAST_STATE_STEP * scale[first + r - offset]:
+                            # A state that begins at 0 with rate 0 has no scale yet.
+                            size_here = max(scale[first + r - offset], abs(near[row, first + r]))
+                            if not abs(change) <= LAST_STATE_STEP * size_here:
                                 settled = False
                             if not abs(change) < np.inf:
                                 return False
