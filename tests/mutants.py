@@ -16,15 +16,21 @@ from resource import RUSAGE_CHILDREN, getrusage
 BUDGET = 40.0
 STATISTICS = Path("mutants/mutmut-stats.json")
 KILLED = ("killed", "timeout")
+NOT_RUN = 255  # of an error before the tests, which mutmut calls a timeout
 
 
 def chosen_tests(mutant: str, statistics: dict) -> tuple[list[str], float]:
-    """Return the tests of a mutant, and how long they take [s]."""
+    """Return the tests of a mutant, each with all its parameters, and how long they take [s]."""
     folder, function = f"tests/{mutant.split('.')[1]}/", mutant.rpartition("__mutmut_")[0]
-    calling = statistics["tests_by_mangled_function_name"].get(function, [])
+    # pytest does not find some parameters again by their text, and then runs no test at all.
+    calling = {test.partition("[")[0] for test in statistics["tests_by_mangled_function_name"].get(function, [])}
     # A result that several tests share is computed in the first of them only, so the others in its file follow.
     files = {test.partition("::")[0] for test in calling if test.startswith(folder)}
-    seconds = {test: time for test, time in statistics["duration_by_test"].items() if test.partition("::")[0] in files}
+    seconds: dict[str, float] = {}
+    for test, time in statistics["duration_by_test"].items():
+        if test.partition("::")[0] in files:
+            name = test.partition("[")[0]
+            seconds[name] = seconds.get(name, 0.0) + time
     chosen, total = [], 0.0
     for test in sorted(seconds, key=lambda test: (test not in calling, seconds[test])):
         if chosen and total + seconds[test] > BUDGET:
@@ -50,7 +56,8 @@ def run(names: list[str]) -> dict[str, str]:
         if tests:
             # The limits are wide, so that no mutant is killed because the machine is busy.
             runner.submit(name, tests, int(8 * seconds + 240), seconds)
-            statuses[name] = status_by_exit_code[runner.wait_for_result().exit_code]
+            code = runner.wait_for_result().exit_code
+            statuses[name] = "not run" if code == NOT_RUN else status_by_exit_code[code]
         print(f"{number} {statuses[name]}: {name}", flush=True)
     runner.signal_work_complete()
     runner.shutdown()

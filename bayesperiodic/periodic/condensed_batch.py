@@ -17,6 +17,8 @@ from bayesperiodic.periodic.memory import error_of_fewer
 from bayesperiodic.periodic.receptance import compiled, unresolved
 
 FEWEST_CONDENSED_SOLVES = 4
+# Numbers in the frequency response between the elements for which parameter vectors are solved together.
+MOST_RESPONSE_NUMBERS = 2**20
 # Parts of the way from an anchor in which a solution is followed, and largest correction in units of the predicted
 # change or, where a contact begins, of this part of the solution.
 LARGEST_PATH_PART, SMALLEST_PATH_PART, STRAIGHT_PATH, LEAST_PATH_CHANGE = 0.25, 1.0 / 256.0, 0.5, 0.01
@@ -103,14 +105,30 @@ class CondensedBatch:
         of the anchor with the most points. Where that grid does not resolve the outputs, the points are doubled; if the
         most points do not resolve them, the status is "not resolved". z has the grid of the most points.
         """
-        first, count = self._sets[0], len(self._sets)
-        every = np.empty((count, *parameters.shape[-2:]))
+        every = np.empty((len(self._sets), *parameters.shape[-2:]))
         every[:] = parameters
-        solves = every.shape[1]
+        together = max(1, MOST_RESPONSE_NUMBERS // (self._d.size * max(1, self._d.shape[-1])))
+        solved = []
+        for first in range(0, max(1, every.shape[1]), together):
+            part = slice(first, first + together)
+            left_out = None if without is None else without[:, part]
+            solved.append(self._solve(np.ascontiguousarray(every[:, part]), threads, keep, polish, left_out))
+        if len(solved) == 1:
+            return solved[0]
+        points = max(one.z.shape[2] for one in solved)
+        z = [one.z if one.z.shape[2] == points else on_grid(harmonics(one.z), points) for one in solved]
+        others = [*zip(*solved, strict=True)][1:]
+        return BatchSolution(*(np.concatenate(values, axis=1) for values in (z, *others)))
+
+    def _solve(
+        self, every: np.ndarray, threads: int | None, keep: bool, polish: bool, without: np.ndarray | None
+    ) -> BatchSolution:
+        """Solve every input set for some parameter vectors (sets, solves, parameters), see `solve`."""
+        first, count, solves = self._sets[0], len(self._sets), every.shape[1]
         change = every - np.stack([a.parameters for a in self._anchors])[:, None]
         ahead = np.einsum("ebp,epkm->ebkm", change, self._slopes)
         d = self._d[:, None] + ahead
-        moved, f = np.sqrt(np.sum(np.abs(ahead) ** 2, axis=(2, 3))), np.empty_like(d)
+        moved, f = np.sqrt(np.sum(np.abs(ahead) ** 2, axis=(2, 3))), np.full_like(d, np.nan)
         fewer = np.empty((count, solves, self._points // 4 if self._blocks.size else 0, first.count), dtype=complex)
         lost, steps = np.zeros((2, count, solves), dtype=np.int64)
         lost[~self._known] = 1

@@ -35,5 +35,9 @@ def sampled(amplitudes: np.ndarray, points: int) -> np.ndarray:
     count = amplitudes.shape[-2]
     if points >= 2 * count:
         return on_grid(amplitudes, points)
-    every = -(-2 * count // points)
-    return on_grid(amplitudes, every * points)[..., ::every, :]
+    # Harmonics whose numbers differ by the number of points are the same there.
+    same = np.zeros((*amplitudes.shape[:-2], -(-count // points) * points, amplitudes.shape[-1]), dtype=complex)
+    same[..., :count, :] = 2.0 * amplitudes
+    same[..., 0, :] = amplitudes[..., 0, :]
+    sums = same.reshape(*amplitudes.shape[:-2], -1, points, amplitudes.shape[-1]).sum(axis=-3)
+    return np.fft.ifft(sums, axis=-2).real * points

@@ -1,5 +1,6 @@
 """Condensed models with internal states: closed forms, symbolic models, and harmonic balance with exact friction."""
 
+import tracemalloc
 from functools import cache
 
 import numpy as np
@@ -8,7 +9,7 @@ import scipy.optimize
 
 import bayesperiodic as bp
 from bayesperiodic.models.hysteresis import MICROSLIP, Hysteretic
-from bayesperiodic.periodic import condensed, condensed_solution
+from bayesperiodic.periodic import condensed, condensed_batch, condensed_solution
 from bayesperiodic.periodic.batch import Anchor
 from bayesperiodic.periodic.condensed import CondensedEquations, Preconditioner
 from bayesperiodic.periodic.condensed_batch import CondensedBatch
@@ -359,6 +360,30 @@ def test_batch_has_the_solutions_of_single_solves(kind):
     gradient = batch.vjp(every[:1], result.z[:, 0], weights, tuple(moving))[0]
     slopes = equations.sensitivities_along(result.z[0, 0], every[0], np.eye(theta.size)).outputs
     np.testing.assert_allclose(gradient, np.einsum("dnc,nc->d", slopes, weights[0]))
+
+
+def test_memory_of_a_batch_does_not_grow_with_its_vectors(monkeypatch):
+    """They are solved in parts, with the values of one part; only outputs and states of all are kept."""
+    equations, theta = equations_of(12, "jenkins")
+    z = equations.find(theta, None)[0].z
+    anchor = Anchor.of(
+        equations, theta, z, equations.sensitivities_along(z, theta, np.eye(theta.size)), np.arange(theta.size)
+    )
+    batch = CondensedBatch([equations], [anchor])
+    every = theta * np.exp(0.01 * np.random.default_rng(0).standard_normal((60, theta.size)))
+    left_out = np.arange(60)[None] == 31
+    whole = batch.solve(every, keep=True, without=left_out)
+    monkeypatch.setattr(condensed_batch, "MOST_RESPONSE_NUMBERS", 8 * len(z))
+    parts = batch.solve(every, keep=True, without=left_out)
+    for one, other in zip(whole, parts, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+    peaks = []
+    for count in (60, 600):
+        tracemalloc.start()
+        outputs = batch.solve(np.tile(every, (count // 60, 1))).outputs
+        peaks.append(tracemalloc.get_traced_memory()[1] - 3 * outputs.nbytes)
+        tracemalloc.stop()
+    assert peaks[1] < 1.5 * peaks[0]
 
 
 def test_branch_over_a_resonance_passes_the_solutions_of_the_symbolic_model():
