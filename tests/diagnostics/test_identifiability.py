@@ -1,11 +1,14 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import sympy as sp
 from scipy import integrate, stats
 
 import bayesperiodic as bp
+from bayesperiodic.diagnostics import identifiability
 from bayesperiodic.diagnostics.design import FurtherExperiment, Information, _added, rank_candidates
-from bayesperiodic.diagnostics.identifiability import cumulative_jensen_shannon, structure_of
+from bayesperiodic.diagnostics.identifiability import cumulative_jensen_shannon, power_scaling, structure_of
 from tests.known import GEAR, LINEAR, grid, linear_experiment, linear_regressors
 from tests.pendulum import PENDULUM
 from tests.problems import cycle_run, pendulum_run
@@ -283,6 +286,30 @@ def test_power_scaling_distinguishes_prior_from_likelihood(linear):
     problem, fit = one(lambda p: p.a, 1.0, 0.05, a=WIDE)
     table = bp.identifiability(problem, fit, bp.sample(problem, fit, **SHORT), profile=False).table
     assert table.loc["a", "likelihood_sensitivity"] > 0.05 > table.loc["a", "prior_sensitivity"]
+
+
+def test_power_scaling_weights_each_draw_by_its_own_likelihood():
+    """The density that is sampled contains the prior and, of a logarithmic coordinate, its change of variable."""
+    problem, fit = one(lambda p: p.a, 1.0, 0.5, a=bp.LogNormal(1.0, 0.7))
+    posterior = bp.sample(problem, fit, **SHORT)
+    draws = posterior.draws("a")[:, None]
+    likelihood = problem.log_likelihood(draws, {})
+    expected = []
+    for power in (0.8, 1.25):
+        weights = np.exp((power - 1.0) * (likelihood - likelihood.max()))
+        expected.append(cumulative_jensen_shannon(draws[:, 0], weights / weights.sum()) / np.log2(1.25))
+    (_, found) = power_scaling(problem, posterior)["a"]
+    assert found == pytest.approx(np.mean(expected), rel=1e-6)
+
+
+def test_probability_of_a_sign_has_an_error_even_if_all_draws_have_it():
+    """Of n independent draws, all negative, the rate is taken as that of one more of each kind."""
+    problem, fit = one(lambda p: p.a, -1.0, 0.01, a=WIDE)
+    draws = SimpleNamespace(draws=lambda _: np.full(100, -1.0), ess={"a": 98.0})
+    share, error = identifiability._negative(problem, fit, draws, "a")
+    assert share == 1.0 and error == pytest.approx(np.sqrt(0.99 * 0.01 / 98.0))
+    draws.draws = lambda _: np.full(100, 1.0)
+    assert identifiability._negative(problem, fit, draws, "a") == (0.0, pytest.approx(np.sqrt(0.99 * 0.01 / 98.0)))
 
 
 def test_weak_motion_at_one_frequency_determines_stiffness_and_mass_only_in_combination():

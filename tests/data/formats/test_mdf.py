@@ -278,6 +278,12 @@ def test_file_that_is_not_finalized_is_refused(tmp_path, flags):
     assert [one.name for one in tmp_path.iterdir()] == ["run.mf4"]
 
 
+def test_file_without_a_header_block_is_refused(tmp_path):
+    content = simple()
+    assert content[64:68] == b"##HD"
+    refused(tmp_path, content[:64] + b"##TX" + content[68:], "must be an MDF file .* is cut off or damaged")
+
+
 @pytest.mark.parametrize("cycles", [199, 201, 2**40])
 def test_number_of_samples_other_than_stored_is_refused(tmp_path, cycles):
     refused(tmp_path, simple(cycles=cycles), "must be an MDF file .* is cut off or damaged")

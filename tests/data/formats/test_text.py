@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.data.formats import encodings, text
+from bayesperiodic.data.formats import encodings, text, text_cells
 from tests.data.test_damaged_files import damaged
 
 X = {"outputs": {"x": "x"}}
@@ -528,3 +528,19 @@ def test_empty_field_at_the_end_of_one_row_is_none(write, row):
     rows[row] += "7"
     with pytest.raises(ValueError, match=r"2 fields in each row|has rows of|has 2 fields for 3"):
         read(write("t,x\n" + "\n".join(rows)))
+
+
+def test_commas_that_are_no_thousands_are_not_called_so():
+    """Of 1,23 and 1,234 only the second has a comma that may stand between thousands."""
+    assert "may be the decimal sign" in text_cells.refusal(["1,234", "2,345"], False)
+    assert "do not all have one decimal sign" in text_cells.refusal(["1,23", "1,234"], False)
+    assert text_cells.refusal(["1,23", "later"], False) == ""
+
+
+def test_units_above_names_may_stand_behind_a_mark_of_comments(tmp_path):
+    file = tmp_path / "run.csv"
+    rows = [f"{0.001 * k:.3f},{np.sin(0.1 * k):.6f}" for k in range(50)]
+    file.write_text("\n".join(["#,ms,mm", "time,x", *rows]))
+    run = bp.Recording.from_csv(file, time="time", outputs={"x": "x"})
+    np.testing.assert_allclose(run.time[:3], [0.0, 1e-6, 2e-6], atol=1e-12)
+    assert np.abs(run.outputs["x"]).max() < 1.01e-3
