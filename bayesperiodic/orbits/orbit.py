@@ -13,6 +13,7 @@ from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.orbits.coordinates import channel_and_delay
+from bayesperiodic.orbits.waveform import Waveform
 from bayesperiodic.periodic.solution import PeriodicSolution
 
 if TYPE_CHECKING:
@@ -61,6 +62,9 @@ class Orbit(Result):
         Position of the orbit with all signs changed among the orbits; its own if it is symmetric.
     cycle : mapping of str to array (samples·period,) or None
         The closest measured cycle by channel, angles continuous; None for a section of points alone.
+    waveform : Waveform or None
+        All channels over the period with errors, by local regression of the motion that follows the points; None for a
+        section of points alone, and for the method "boxes".
     solution : PeriodicSolution or None
         The model's orbit, from `polish_orbits`.
     equilibrium : bool
@@ -97,6 +101,7 @@ class Orbit(Result):
     quality: float
     partner: int | None = None
     cycle: Mapping[str, np.ndarray] | None = None
+    waveform: Waveform | None = None
     solution: PeriodicSolution | None = None
     equilibrium: bool = False
     synthetic: bool = False

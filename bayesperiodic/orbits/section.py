@@ -383,7 +383,7 @@ class PoincareSection(Result):
         channel, delay = channel_and_delay(coordinate)
         channels = channels_of(self.coordinates)
         _checks.one_of("coordinate", channel, channels)
-        measured = self._measured
+        measured = self.measured
         if measured is None:
             return None
         samples, instants, stretch = measured
@@ -393,8 +393,13 @@ class PoincareSection(Result):
         return np.where((first <= at) & (at <= last), values[:, 0], np.nan)
 
     @property
-    def _measured(self) -> tuple[Stretches, np.ndarray, np.ndarray] | None:
-        """The recording, the times of the points, and the stretch of each; None for points alone."""
+    def channels(self) -> tuple[str, ...]:
+        """The channels of the recording, in the order of `signals`."""
+        return (*channels_of(self.coordinates), *self.others)
+
+    @property
+    def measured(self) -> tuple[Stretches, np.ndarray, np.ndarray] | None:
+        """The recording, the times of the points (count,), and the stretch of each (count,); None for points alone."""
         if self.instants is None or self.time is None or self.signals is None:
             return None
         starts = np.zeros(1, dtype=np.int64) if self.starts is None else self.starts
@@ -424,7 +429,7 @@ class PoincareSection(Result):
             For points alone, and for delays of a channel that are too close modulo a step.
         """
         steps = _checks.integer("steps", steps, 1)
-        measured = self._measured
+        measured = self.measured
         if measured is None:
             raise ValueError(f"steps: must be 1 for points alone, got {steps}. Make the section of a recording.")
         samples, returns, stretch = measured
@@ -462,7 +467,7 @@ class PoincareSection(Result):
         ValueError
             If the returns are not in one unbroken stretch.
         """
-        measured = self._measured
+        measured = self.measured
         if measured is None:
             return None
         inside = 0 <= index and index + period < len(self)

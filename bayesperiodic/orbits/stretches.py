@@ -110,23 +110,34 @@ def smoothed(
     Where a stretch ends within the window, the smallest one is used, beside the instant if necessary. The standard
     deviation is NaN if there are too few other instants.
     """
-    narrow, narrow_gain, _ = local_fit(samples, at, stretch)
     widest = max(SMALLEST_WINDOW, int(0.5 * samples.sampling_rate * longest))
     inner = samples.windows(at, stretch, max(widest, NOISE_SAMPLES // 2))[1]
     if np.count_nonzero(inner) < FEWEST_INSTANTS:
-        return narrow, np.nan
+        return local_fit(samples, at, stretch)[0], np.nan
     inside = at[inner], stretch[inner]
     variance = noise_variance(samples, *inside)
     halves = unbiased_windows(samples, *inside, widest, variance)
-    values, sd = narrow.copy(), np.sqrt(variance * narrow_gain.mean())
+    values, gains = windowed(samples, at, stretch, halves)
+    return values, np.sqrt(variance * gains.mean(axis=0))
+
+
+def windowed(
+    samples: Stretches, at: np.ndarray, stretch: np.ndarray, halves: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return signals at given instants, and their variances for unit noise, (instants, channels) each.
+
+    Each channel has its window, of which `halves` are half the numbers of samples; where a stretch ends within the
+    window, the smallest one is used.
+    """
+    values, gain, _ = local_fit(samples, at, stretch)
+    gains = np.repeat(gain[:, None], values.shape[1], axis=1)
     for channel, half in enumerate(halves):
         if half > SMALLEST_WINDOW:
             fits = samples.windows(at, stretch, half)[1]
             one = samples._replace(signals=samples.signals[:, [channel]])
-            fitted, gain, _ = local_fit(one, at[fits], stretch[fits], half)
-            values[fits, channel] = fitted[:, 0]
-            sd[channel] = np.sqrt(variance[channel] * (gain.sum() + narrow_gain[~fits].sum()) / at.size)
-    return values, sd
+            fitted, wide, _ = local_fit(one, at[fits], stretch[fits], half)
+            values[fits, channel], gains[fits, channel] = fitted[:, 0], wide
+    return values, gains
 
 
 def noise_variance(samples: Stretches, at: np.ndarray, stretch: np.ndarray) -> np.ndarray:

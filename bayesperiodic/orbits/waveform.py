@@ -1,0 +1,201 @@
+"""Waveforms of orbits: all channels over the period, by local regression of the motion that follows the points.
+
+A closed point has neighbours in the section, and the motion of each until the next point is measured. The polynomial of
+the return map's own fit, with its neighbours, weights and correction for noise, is fitted to this motion at many phases;
+its value at the closed point is the orbit's waveform from there to its next point.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesperiodic import _checks
+from bayesperiodic._io import Storable
+from bayesperiodic.orbits.coordinates import columns_of
+from bayesperiodic.orbits.cycles import REFINING_DEGREE, VALUE_GROWTH, WIDENED, Estimate, errors_by_run
+from bayesperiodic.orbits.return_map import ReturnMap
+from bayesperiodic.orbits.section import CYCLE_SAMPLES, PoincareSection
+from bayesperiodic.orbits.stretches import (
+    FEWEST_INSTANTS,
+    NOISE_SAMPLES,
+    SMALLEST_WINDOW,
+    noise_variance,
+    unbiased_windows,
+    windowed,
+)
+
+# Values a return whose windows do not overlap, so that the noise of their samples is independent.
+INDEPENDENT = 16
+# Instants from which windows are determined.
+WINDOW_INSTANTS = 2000
+TURN = 2.0 * np.pi
+# Fractional part of the golden ratio, which spreads instants evenly over the phases.
+SPREADING = 0.6180339887
+
+
+@dataclass(frozen=True)
+class Waveform(Storable):
+    """Waveform of an orbit over its period, with errors.
+
+    Attributes
+    ----------
+    values : mapping of str to array (samples·period,)
+        All channels of the section's recordings, inputs included, by name, from the section's phase on, the end
+        excluded; angles are continuous.
+    inputs : tuple of str
+        The channels that are inputs.
+    errors : array (errors, channels, samples·period)
+        Errors that the channels and phases have in common, each one standard deviation, independent of each other: of
+        the closed points, propagated by the slopes of the regression, and of the regression; the last one is the
+        estimated bias.
+    noise : array (channels,)
+        Standard deviation of further errors, of which 16 a forcing period are independent.
+    """
+
+    values: Mapping[str, np.ndarray]
+    inputs: tuple[str, ...]
+    errors: np.ndarray
+    noise: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("values", "errors", "noise"):
+            object.__setattr__(self, name, _checks.read_only(getattr(self, name)))
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The channels that are outputs."""
+        return tuple(name for name in self.values if name not in self.inputs)
+
+    @property
+    def sd(self) -> dict[str, np.ndarray]:
+        """Standard error of each value, by channel, (samples·period,)."""
+        total = np.sqrt(np.sum(self.errors**2, axis=0) + self.noise[:, None] ** 2)
+        return dict(zip(self.values, total, strict=True))
+
+    def covariance(self, channels: tuple[str, ...], every: int) -> np.ndarray:
+        """Compute the covariance of some channels at every so many phases.
+
+        Parameters
+        ----------
+        channels : tuple of str
+        every : int
+            Distance of the phases, in samples.
+
+        Returns
+        -------
+        array (values, values)
+            Phase by phase, and in the order of the channels within a phase.
+        """
+        columns = [list(self.values).index(name) for name in channels]
+        errors = self.errors[:, columns, ::every]
+        flat = errors.transpose(0, 2, 1).reshape(len(errors), -1)
+        return flat.T @ flat + np.diag(np.tile(self.noise[columns] ** 2, errors.shape[2]))
+
+    def reduced(self, times: int, angles: tuple[str, ...]) -> "Waveform":
+        """Return the mean of the repeats of a waveform that repeats itself so many times."""
+        values = {}
+        for name, whole in self.values.items():
+            repeats = whole.reshape(times, -1)
+            turns = np.round((repeats[:, :1] - repeats[:1, :1]) / TURN) if name in angles else 0.0
+            values[name] = np.mean(repeats - TURN * turns, axis=0)
+        errors = self.errors.reshape(*self.errors.shape[:2], times, -1).mean(axis=2)
+        return Waveform(values, self.inputs, errors, self.noise / np.sqrt(times))
+
+
+class Following:
+    """The measured motion from each argument of a return map to its image."""
+
+    def __init__(self, section: PoincareSection, maps: ReturnMap, size: np.ndarray):
+        measured = section.measured
+        assert measured is not None
+        self._samples, instants, stretch = measured
+        self._size, self.channels, self.inputs = size, section.channels, section.inputs
+        returns, step = np.divmod(maps.positions, maps.steps)
+        self._length = (instants[returns + 1] - instants[returns]) / maps.steps
+        self._start, self._stretch = instants[returns] + step * self._length, stretch[returns]
+        self.count = -(-CYCLE_SAMPLES // maps.steps)  # samples from a point to the next one
+        self._angles = [
+            (k, column)
+            for k, (name, column) in enumerate(zip(section.coordinates, columns_of(section.coordinates), strict=True))
+            if name in section.angles
+        ]
+        self._halves = self._windows(maps.steps)
+
+    def _windows(self, steps: int) -> list[int]:
+        """Return half the number of samples in each channel's window, at most 1/INDEPENDENT of a return."""
+        some = np.arange(0, self._start.size, -(-self._start.size // WINDOW_INSTANTS))
+        at, stretch = self._start[some] + self._length[some] * (SPREADING * some % 1.0), self._stretch[some]
+        longest = float(np.median(self._length)) * steps / INDEPENDENT
+        widest = max(SMALLEST_WINDOW, int(0.5 * self._samples.sampling_rate * longest))
+        inner = self._samples.windows(at, stretch, max(widest, NOISE_SAMPLES // 2))[1]
+        if np.count_nonzero(inner) < FEWEST_INSTANTS:
+            return [SMALLEST_WINDOW] * len(self.channels)
+        inside = at[inner], stretch[inner]
+        return unbiased_windows(self._samples, *inside, widest, noise_variance(self._samples, *inside))
+
+    def signals(self, index: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """Return all channels (n, samples·channels) after arguments (n,), whose angles are as in the points (n, d)."""
+        phases = np.arange(self.count) / self.count
+        at = self._start[index, None] + self._length[index, None] * phases
+        values, _ = windowed(self._samples, at.ravel(), np.repeat(self._stretch[index], self.count), self._halves)
+        values = values.reshape(len(index), self.count, -1)
+        for k, column in self._angles:
+            away = near[:, k] * self._size[k] - values[:, 0, column]
+            values[:, :, column] += TURN * np.round(away / TURN)[:, None]
+        return values.reshape(len(index), -1)
+
+
+def waveform_of(following: Following, maps: ReturnMap, estimate: Estimate, shift: int) -> Waveform:
+    """Return the waveform of a refined cycle from its point `shift` returns after the first one on."""
+    fits = estimate.fits
+    assert fits is not None
+    phases = maps.phases(np.arange(len(estimate.points)))
+    narrow = maps.regress(estimate.points, phases, fits.bandwidths, REFINING_DEGREE, following.signals)
+    wide = maps.regress(fits.wide_points, phases, WIDENED * fits.bandwidths, REFINING_DEGREE, following.signals)
+    pairs, runs, by_run = errors_by_run(maps, fits.narrow)
+    d = estimate.points.shape[1]
+    values, errors = [], []
+    for j, (fit, other) in enumerate(zip(narrow, wide, strict=True)):
+        closed = by_run[:, d * j : d * (j + 1)] @ fit.derivatives[0, 1 : 1 + d]
+        np.add.at(closed, runs[np.searchsorted(pairs, maps.positions[fit.neighbours[0]])], fit.influence[0, :, 0])
+        bias = _without_turns(other.value[0] - fit.value[0], following) / VALUE_GROWTH
+        values.append(fit.value[0].reshape(following.count, -1))
+        errors.append(np.vstack([closed, bias]).reshape(len(closed) + 1, following.count, -1))
+    order = (np.arange(len(values)) + maps.steps * shift) % len(values)
+    motion = _continuous([values[j] for j in order], following)
+    whole = np.concatenate([errors[j] for j in order], axis=1).transpose(0, 2, 1)
+    common, noise = _common(whole, np.std(motion, axis=0), 2 * estimate.points.size)
+    return Waveform(dict(zip(following.channels, motion.T, strict=True)), following.inputs, common, noise)
+
+
+def _without_turns(difference: np.ndarray, following: Following) -> np.ndarray:
+    """Return the difference of two motions (samples·channels,) without whole turns of angles."""
+    result = difference.reshape(following.count, -1)
+    for _, column in following._angles:
+        result[:, column] -= TURN * np.round(result[0, column] / TURN)
+    return result.ravel()
+
+
+def _continuous(parts: list[np.ndarray], following: Following) -> np.ndarray:
+    """Return parts (samples, channels) of a motion as one, angles continuous from (−π, π] on."""
+    motion = np.concatenate(parts)
+    for _, column in following._angles:
+        motion[:, column] = np.unwrap(motion[:, column])
+        motion[:, column] -= TURN * np.ceil((motion[0, column] - np.pi) / TURN)
+    return motion
+
+
+def _common(errors: np.ndarray, size: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest principal components of errors (n, channels, samples), and the sd (channels,) of the rest.
+
+    The errors of the closed points and those of the neighbours' points are propagated by the slopes of the regression:
+    they have as many components each as there are coordinates of all points. The rest is noise of single samples. The
+    last error, the bias, is kept.
+    """
+    scale = np.where(size > 0.0, size, 1.0)[:, None]
+    random = (errors[:-1] / scale).reshape(len(errors) - 1, -1)
+    _, values, axes = np.linalg.svd(random, full_matrices=False)
+    kept = (values[:most, None] * axes[:most]).reshape(-1, *errors.shape[1:]) * scale
+    rest = np.sum(errors[:-1] ** 2, axis=0) - np.sum(kept**2, axis=0)
+    return np.concatenate([kept, errors[-1:]]), np.sqrt(np.maximum(rest, 0.0).mean(axis=1))
