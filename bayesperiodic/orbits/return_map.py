@@ -67,6 +67,16 @@ class LocalFit(NamedTuple):
         return np.ascontiguousarray(self.derivatives[:, place].transpose(0, 3, 1, 2))
 
 
+class Regression(NamedTuple):
+    """Values that follow a point, fitted to what follows its n neighbours, in d coordinates."""
+
+    value: np.ndarray  # (values,)
+    slopes: np.ndarray  # by the coordinates, (d, values)
+    neighbours: np.ndarray  # positions among the arguments, (n,)
+    influence: np.ndarray  # contribution of each neighbour to the error of `value`, (n, values)
+    gain: float  # variance of `value` for independent errors of unit variance
+
+
 class ReturnMap:
     """The return map of a section, fitted locally on request.
 
@@ -224,30 +234,29 @@ class ReturnMap:
 
     def regress(
         self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray, degree: int, signals: Signals
-    ) -> list[LocalFit]:
+    ) -> list["Regression"]:
         """Fit what follows the neighbours, as `fit_within` fits their images: the same neighbours and weights.
 
-        `signals` returns it, (n, values), for a position among the arguments and points (n, d) near a centre. The
-        fits, one a centre, have values (1, values) and derivatives (1, terms, values); angles are continuous.
+        `signals` returns it, (n, values), for positions (n,) among the arguments and these points (n, d) near a centre.
         """
-        fits = []
+        results = []
         for centre, phase, width in zip(centres[:, None], phases[:, None], bandwidths[:, None], strict=True):
             index, inside, bandwidth = self._within(centre, phase, width, degree)
             index, inside = index[:, inside[0]], inside[:, inside[0]]
-            image = self._images(centre, index)[0]
-            system = self._system(centre, bandwidth, index, inside, degree, image)
-            near = centre + self.wrap(self.arguments[index[0]] - centre)
-            target = signals(index[0], near)
-            reference = target[:1]
-            solution = system.solve((target - reference)[None])
-            influence = system.influence((target - reference)[None], solution)
-            derivatives = solution * system.scale
-            value = reference + derivatives[:, 0]
-            fits.append(LocalFit(value, derivatives, bandwidth, index, influence, system.effective))
-        return fits
+            system = self._system(centre, bandwidth, index, inside, degree, self._images(centre, index)[0])
+            target = signals(index[0], centre + self.wrap(self.arguments[index[0]] - centre))
+            reference, target = target[:1], (target - target[:1])[None]
+            solution = system.solve(target)
+            derivatives = (solution * system.scale)[0]
+            weights = (system.inverse @ system.regressors)[0, 0]
+            slopes, influence = derivatives[1 : 1 + len(self.turn)], system.influence(target, solution)[0, :, 0]
+            results.append(
+                Regression(reference[0] + derivatives[0], slopes, index[0], influence, float(np.sum(weights**2)))
+            )
+        return results
 
     def _images(self, centres: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return images of arguments (m, n, d) relative to one of them, and that one's (m, d) relative to the centre."""
+        """Return images of arguments (m, n, d) relative to one of them, and that one (m, d) relative to the centre."""
         image = self.wrap(self.arguments[index] - centres[:, None]) + self.increments[index]
         reference = image[:, :1]
         image = image - reference
@@ -309,9 +318,7 @@ class _NormalEquations(NamedTuple):
         fitted = np.einsum("abf,mbc,mka->mkcf", belongs, solution, self.inverse, optimize=True)
         residual = (self.inverse @ self.regressors)[:, :, None] * target.mT[:, None]
         residual -= (fitted.reshape(len(target), -1, len(products)) @ functions).reshape(residual.shape)
-        leverage = np.clip(
-            np.einsum("mab,abf->mf", self.inverse, belongs)[:, None] @ functions, 0.0, MOST_LEVERAGE
-        )
+        leverage = np.clip(np.einsum("mab,abf->mf", self.inverse, belongs)[:, None] @ functions, 0.0, MOST_LEVERAGE)
         return (residual * self.scale[..., None] / (1.0 - leverage)[:, None]).transpose(0, 3, 1, 2)
 
 

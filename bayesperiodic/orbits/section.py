@@ -226,7 +226,9 @@ class PoincareSection(Result):
         longest_window(names, samples.sampling_rate / frequency)
         instants, stretch, left_out = samples.instants(frequency, origin, (delays.min(), delays.max()))
         synthetic = any(recording.synthetic for recording in given)
-        section = cls._of(samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency)
+        section = cls._of(
+            samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency
+        )
         extent = np.ptp(samples.signals, axis=0)[columns_of(names)]
         if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * extent):
             raise ValueError(
@@ -355,9 +357,12 @@ class PoincareSection(Result):
         usual = float(np.median(np.diff(instants)))
         values, noise = coordinate_values(samples, names, instants, stretch, frequency, usual)
         points, increments = wrapped(values, np.isin(names, angles)), _within(np.diff(values, axis=0), stretch)
-        breaks = (stretch, samples.starts, left_out) if samples.starts.size > 1 else (None, None, left_out)
-        measured = (instants, time, samples.signals, time.size * len(channels_of(names)), synthetic)
-        return cls(points, names, angles, frequency, increments, True, noise, *measured, *breaks, others, inputs)
+        broken = samples.starts.size > 1
+        return cls(
+            points, names, angles, frequency, increments, True, noise, instants, time, samples.signals,
+            time.size * len(channels_of(names)), synthetic, stretch if broken else None,
+            samples.starts if broken else None, left_out, others, inputs,
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.points)

@@ -1,8 +1,8 @@
 """Waveforms of orbits: all channels over the period, by local regression of the motion that follows the points.
 
-A closed point has neighbours in the section, and the motion of each until the next point is measured. The polynomial of
-the return map's own fit, with its neighbours, weights and correction for noise, is fitted to this motion at many phases;
-its value at the closed point is the orbit's waveform from there to its next point.
+A closed point has neighbours in the section, and the motion of each until the next point is measured. A polynomial like
+that of the return map, with the same neighbours, weights and correction for noise, is fitted to this motion at many
+phases; its value at the closed point is the orbit's waveform from there to its next point.
 """
 
 from collections.abc import Mapping
@@ -49,8 +49,8 @@ class Waveform(Storable):
         Errors that the channels and phases have in common, each one standard deviation, independent of each other: of
         the closed points, propagated by the slopes of the regression, and of the regression; the last one is the
         estimated bias.
-    noise : array (channels,)
-        Standard deviation of further errors, of which 16 a forcing period are independent.
+    noise : array (channels, samples·period)
+        Standard deviation of further errors, which are independent at 16 phases a forcing period.
     """
 
     values: Mapping[str, np.ndarray]
@@ -70,7 +70,7 @@ class Waveform(Storable):
     @property
     def sd(self) -> dict[str, np.ndarray]:
         """Standard error of each value, by channel, (samples·period,)."""
-        total = np.sqrt(np.sum(self.errors**2, axis=0) + self.noise[:, None] ** 2)
+        total = np.sqrt(np.sum(self.errors**2, axis=0) + self.noise**2)
         return dict(zip(self.values, total, strict=True))
 
     def covariance(self, channels: tuple[str, ...], every: int) -> np.ndarray:
@@ -90,7 +90,7 @@ class Waveform(Storable):
         columns = [list(self.values).index(name) for name in channels]
         errors = self.errors[:, columns, ::every]
         flat = errors.transpose(0, 2, 1).reshape(len(errors), -1)
-        return flat.T @ flat + np.diag(np.tile(self.noise[columns] ** 2, errors.shape[2]))
+        return flat.T @ flat + np.diag(self.noise[columns, ::every].T.ravel() ** 2)
 
     def reduced(self, times: int, angles: tuple[str, ...]) -> "Waveform":
         """Return the mean of the repeats of a waveform that repeats itself so many times."""
@@ -100,7 +100,8 @@ class Waveform(Storable):
             turns = np.round((repeats[:, :1] - repeats[:1, :1]) / TURN) if name in angles else 0.0
             values[name] = np.mean(repeats - TURN * turns, axis=0)
         errors = self.errors.reshape(*self.errors.shape[:2], times, -1).mean(axis=2)
-        return Waveform(values, self.inputs, errors, self.noise / np.sqrt(times))
+        noise = np.sqrt(np.mean(self.noise.reshape(len(self.noise), times, -1) ** 2, axis=1) / times)
+        return Waveform(values, self.inputs, errors, noise)
 
 
 class Following:
@@ -120,19 +121,26 @@ class Following:
             for k, (name, column) in enumerate(zip(section.coordinates, columns_of(section.coordinates), strict=True))
             if name in section.angles
         ]
-        self._halves = self._windows(maps.steps)
+        self._halves, self.variance = self._windows(maps.steps)
 
-    def _windows(self, steps: int) -> list[int]:
-        """Return half the number of samples in each channel's window, at most 1/INDEPENDENT of a return."""
+    def _windows(self, steps: int) -> tuple[list[int], np.ndarray]:
+        """Return half the number of samples in each channel's window, and the variance of the values' noise.
+
+        Windows are at most 1/INDEPENDENT of a return.
+        """
         some = np.arange(0, self._start.size, -(-self._start.size // WINDOW_INSTANTS))
         at, stretch = self._start[some] + self._length[some] * (SPREADING * some % 1.0), self._stretch[some]
         longest = float(np.median(self._length)) * steps / INDEPENDENT
         widest = max(SMALLEST_WINDOW, int(0.5 * self._samples.sampling_rate * longest))
         inner = self._samples.windows(at, stretch, max(widest, NOISE_SAMPLES // 2))[1]
-        if np.count_nonzero(inner) < FEWEST_INSTANTS:
-            return [SMALLEST_WINDOW] * len(self.channels)
-        inside = at[inner], stretch[inner]
-        return unbiased_windows(self._samples, *inside, widest, noise_variance(self._samples, *inside))
+        enough = np.count_nonzero(inner) >= FEWEST_INSTANTS
+        if enough:
+            at, stretch = at[inner], stretch[inner]
+        variance = noise_variance(self._samples, at, stretch)
+        halves = [SMALLEST_WINDOW] * variance.size
+        if enough:
+            halves = unbiased_windows(self._samples, at, stretch, widest, variance)
+        return halves, variance * windowed(self._samples, at, stretch, halves)[1].mean(axis=0)
 
     def signals(self, index: np.ndarray, near: np.ndarray) -> np.ndarray:
         """Return all channels (n, samples·channels) after arguments (n,), whose angles are as in the points (n, d)."""
@@ -157,15 +165,17 @@ def waveform_of(following: Following, maps: ReturnMap, estimate: Estimate, shift
     d = estimate.points.shape[1]
     values, errors = [], []
     for j, (fit, other) in enumerate(zip(narrow, wide, strict=True)):
-        closed = by_run[:, d * j : d * (j + 1)] @ fit.derivatives[0, 1 : 1 + d]
-        np.add.at(closed, runs[np.searchsorted(pairs, maps.positions[fit.neighbours[0]])], fit.influence[0, :, 0])
-        bias = _without_turns(other.value[0] - fit.value[0], following) / VALUE_GROWTH
-        values.append(fit.value[0].reshape(following.count, -1))
+        closed = by_run[:, d * j : d * (j + 1)] @ fit.slopes
+        np.add.at(closed, runs[np.searchsorted(pairs, maps.positions[fit.neighbours])], fit.influence)
+        bias = _without_turns(other.value - fit.value, following) / VALUE_GROWTH
+        values.append(fit.value.reshape(following.count, -1))
         errors.append(np.vstack([closed, bias]).reshape(len(closed) + 1, following.count, -1))
     order = (np.arange(len(values)) + maps.steps * shift) % len(values)
     motion = _continuous([values[j] for j in order], following)
     whole = np.concatenate([errors[j] for j in order], axis=1).transpose(0, 2, 1)
-    common, noise = _common(whole, np.std(motion, axis=0), 2 * estimate.points.size)
+    common, rest = _common(whole, np.std(motion, axis=0), 2 * estimate.points.size)
+    gains = np.repeat([narrow[j].gain for j in order], following.count)
+    noise = np.sqrt(np.maximum(rest[:, None], following.variance[:, None] * gains))
     return Waveform(dict(zip(following.channels, motion.T, strict=True)), following.inputs, common, noise)
 
 
@@ -187,7 +197,7 @@ def _continuous(parts: list[np.ndarray], following: Following) -> np.ndarray:
 
 
 def _common(errors: np.ndarray, size: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest principal components of errors (n, channels, samples), and the sd (channels,) of the rest.
+    """Return the largest principal components of errors (n, channels, samples), and the others' variance (channels,).
 
     The errors of the closed points and those of the neighbours' points are propagated by the slopes of the regression:
     they have as many components each as there are coordinates of all points. The rest is noise of single samples. The
@@ -198,4 +208,4 @@ def _common(errors: np.ndarray, size: np.ndarray, most: int) -> tuple[np.ndarray
     _, values, axes = np.linalg.svd(random, full_matrices=False)
     kept = (values[:most, None] * axes[:most]).reshape(-1, *errors.shape[1:]) * scale
     rest = np.sum(errors[:-1] ** 2, axis=0) - np.sum(kept**2, axis=0)
-    return np.concatenate([kept, errors[-1:]]), np.sqrt(np.maximum(rest, 0.0).mean(axis=1))
+    return np.concatenate([kept, errors[-1:]]), np.maximum(rest, 0.0).mean(axis=1)
