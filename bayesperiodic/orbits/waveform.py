@@ -169,14 +169,17 @@ def waveform_of(following: Following, maps: ReturnMap, estimate: Estimate, shift
         np.add.at(closed, runs[np.searchsorted(pairs, maps.positions[fit.neighbours])], fit.influence)
         bias = _without_turns(other.value - fit.value, following) / VALUE_GROWTH
         values.append(fit.value.reshape(following.count, -1))
-        errors.append(np.vstack([closed, bias]).reshape(len(closed) + 1, following.count, -1))
+        biases = np.zeros((len(narrow), bias.size))
+        biases[j] = bias
+        errors.append(np.vstack([closed, biases]).reshape(len(closed) + len(narrow), following.count, -1))
     order = (np.arange(len(values)) + maps.steps * shift) % len(values)
     motion = _continuous([values[j] for j in order], following)
     whole = np.concatenate([errors[j] for j in order], axis=1).transpose(0, 2, 1)
-    common, rest = _common(whole, np.std(motion, axis=0), 2 * estimate.points.size)
+    random, biases = np.split(whole, [-len(narrow)])
+    common, rest = _common(random, np.std(motion, axis=0), 2 * estimate.points.size)
     gains = np.repeat([narrow[j].gain for j in order], following.count)
     noise = np.sqrt(np.maximum(rest[:, None], following.variance[:, None] * gains))
-    return Waveform(dict(zip(following.channels, motion.T, strict=True)), following.inputs, common, noise)
+    return Waveform(dict(zip(following.channels, motion.T, strict=True)), following.inputs, np.concatenate([common, biases]), noise)
 
 
 def _without_turns(difference: np.ndarray, following: Following) -> np.ndarray:
@@ -200,12 +203,10 @@ def _common(errors: np.ndarray, size: np.ndarray, most: int) -> tuple[np.ndarray
     """Return the largest principal components of errors (n, channels, samples), and the others' variance (channels,).
 
     The errors of the closed points and those of the neighbours' points are propagated by the slopes of the regression:
-    they have as many components each as there are coordinates of all points. The rest is noise of single samples. The
-    last error, the bias, is kept.
+    they have as many components each as there are coordinates of all points. The rest is noise of single samples.
     """
     scale = np.where(size > 0.0, size, 1.0)[:, None]
-    random = (errors[:-1] / scale).reshape(len(errors) - 1, -1)
-    _, values, axes = np.linalg.svd(random, full_matrices=False)
+    _, values, axes = np.linalg.svd((errors / scale).reshape(len(errors), -1), full_matrices=False)
     kept = (values[:most, None] * axes[:most]).reshape(-1, *errors.shape[1:]) * scale
-    rest = np.sum(errors[:-1] ** 2, axis=0) - np.sum(kept**2, axis=0)
-    return np.concatenate([kept, errors[-1:]]), np.maximum(rest, 0.0).mean(axis=1)
+    rest = np.sum(errors**2, axis=0) - np.sum(kept**2, axis=0)
+    return kept, np.maximum(rest, 0.0).mean(axis=1)
