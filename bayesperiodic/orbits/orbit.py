@@ -141,37 +141,34 @@ class Orbit(Result):
         self,
         *,
         samples: int = 800,
-        phases: int = 1,
         multipliers: bool = False,
         whole: bool = False,
         states: Mapping[str, str] | None = None,
     ) -> Experiment:
         """Return the orbit as an experiment: its section points at tau = 0, 1, …, as in de Kraker et al. (1997).
 
-        With more `phases`, the waveforms of all outputs are compared, at that many phases a forcing period. Their
-        covariance is known up to one factor, the noise parameter "scale", common to all orbits of a problem. The inputs
-        are those of the waveform, taken as exact. Delayed coordinates are left out, because all outputs of an
+        Their covariance is known up to one factor, the noise parameter "scale", common to all orbits of a problem. The
+        inputs are those of the waveform, taken as exact. Delayed coordinates are left out, because all outputs of an
         experiment are compared at the same tau.
 
         Parameters
         ----------
         samples : int
             Grid points per forcing period.
-        phases : int
-            1 for the section points alone, 2, 4, 8 or 16 for the waveform; 16 contain nearly all information.
         multipliers : bool
             Compare the unstable eigenvalues too, as log|μ| with fixed sign and with their covariance with the points.
             One that is complex, not estimated, or whose bias exceeds half its standard deviation is left out, and so
             are all smaller ones.
         whole : bool
-            Compare the whole waveform instead, with an unknown variance per channel, so that the errors of a wrong
-            model need not be like those of the waveform. Its own errors are stated as variances of the harmonics, for
-            ``noise="measured"``; their correlation is not. Without a waveform, the samples of the measured cycle, a
-            close return that does not close exactly; the gap counts as noise.
+            Compare the waveforms of all outputs instead, at 16 phases a forcing period and with their covariance,
+            which contain nearly all information. Where the errors of the model exceed those of the waveform,
+            ``dataclasses.replace(experiment, covariance=None)`` has a variance per channel in its place. Without a
+            waveform, all samples of the measured cycle are compared, with a variance per channel: it is a close return
+            and does not close exactly; the gap counts as noise.
         states : mapping of str to str, optional
             The output that measures each state of the model, such as ``{"phi": "angle"}``: the first solve then starts
-            from the waveform, or from the measured cycle. By default it starts from the polished solution, else, with
-            more phases or `whole`, from states found from the waveform and the equations (guess "data" of
+            from the waveform, or from the measured cycle. By default it starts from the polished solution; without one,
+            the whole waveform starts it from states that are found from the waveform and the equations (guess "data" of
             `Experiment`), as hidden states need.
 
         Returns
@@ -182,9 +179,8 @@ class Orbit(Result):
         ------
         ValueError
             If all coordinates are delayed, if the orbit is not polished and `states` or the winding are not known, if
-            `whole` or `states` are given and there is neither waveform nor measured cycle, if there is no waveform for
-            more `phases`, for these together with `multipliers` or `whole`, or if `samples` is not a multiple of
-            `phases`, or of the cycle's number.
+            `whole` or `states` are given and there is neither waveform nor measured cycle, for the whole waveform
+            together with `multipliers`, or if `samples` is not a multiple of the phases compared.
 
         Warns
         -----
@@ -196,7 +192,7 @@ class Orbit(Result):
         if winding is None:
             raise ValueError(f"winding: must be known, got None for {self.name!r}. Use polish_orbits first.")
         turns = winding if self.solution is None else self.solution.winding
-        data = _compared(self, samples, phases, multipliers, whole, winding)
+        compared = _compared(self, samples, multipliers, whole)
         if self.solution is not None:
             inputs = {name: _on_grid(values, samples * self.period) for name, values in self.solution.inputs.items()}
         else:
@@ -204,14 +200,14 @@ class Orbit(Result):
         experiment = Experiment(
             self.name,
             self.frequency,
-            data.pop("outputs"),
+            compared.pop("outputs"),
             inputs,
             samples=samples,
             periods=self.period,
             winding=turns,
-            guess=_guess(self, samples, winding, states, hidden=phases > 1 or whole),
+            guess=_guess(self, samples, winding, states, hidden=whole),
             synthetic=self.synthetic,
-            **data,
+            **compared,
         )
         return _with_multipliers(self, experiment) if multipliers else experiment
 
@@ -307,23 +303,18 @@ def _resampled(orbit: Orbit, winding: int, samples: int, channels: Iterable[str]
 
     The gap between its end and its start is distributed over the period.
     """
+    motion = orbit.cycle if orbit.waveform is None else orbit.waveform.values
     tau, result = np.arange(samples * orbit.period) / samples, {}
     for name in channels:
+        assert motion is not None
+        values = np.asarray(motion[name], dtype=float)
         turns = TURN * winding if name in orbit.angles else 0.0
-        result[name] = _fourier.on_grid(_amplitudes(orbit, name, turns), tau.size) + turns * tau / orbit.period
+        gap = _end(values) - values[0] - turns
+        amplitudes = _fourier.coefficients(values - (turns + gap) * (np.arange(values.size) / values.size) + 0.5 * gap)
+        floor = NOISE_FLOOR * np.median(np.abs(amplitudes[amplitudes.size // 2 :]))
+        kept = np.flatnonzero(np.abs(amplitudes) > floor).max(initial=1)
+        result[name] = _fourier.on_grid(amplitudes[: kept + 1], tau.size) + turns * tau / orbit.period
     return result
-
-
-def _amplitudes(orbit: Orbit, name: str, turns: float) -> np.ndarray:
-    """Return the significant Fourier amplitudes (harmonics + 1,) of a channel of the waveform, else of the cycle."""
-    motion = orbit.cycle if orbit.waveform is None else orbit.waveform.values
-    assert motion is not None
-    values = np.asarray(motion[name], dtype=float)
-    gap = _end(values) - values[0] - turns
-    amplitudes = _fourier.coefficients(values - (turns + gap) * (np.arange(values.size) / values.size) + 0.5 * gap)
-    floor = NOISE_FLOOR * np.median(np.abs(amplitudes[amplitudes.size // 2 :]))
-    kept = np.flatnonzero(np.abs(amplitudes) > floor).max(initial=1)
-    return np.asarray(amplitudes[: kept + 1])
 
 
 def _end(values: np.ndarray) -> float:
@@ -335,25 +326,20 @@ def _on_grid(values: np.ndarray, points: int) -> np.ndarray:
     return values if values.size == points else _fourier.on_grid(_fourier.coefficients(values), points)
 
 
-def _compared(orbit: Orbit, samples: int, phases: int, multipliers: bool, whole: bool, winding: int) -> dict[str, Any]:
+def _compared(orbit: Orbit, samples: int, multipliers: bool, whole: bool) -> dict[str, Any]:
     """Return the arguments of the experiment that say what is compared, with which errors."""
-    phases, waveform = _checks.integer("phases", phases, 1), orbit.waveform
-    if whole and phases > 1:
-        raise ValueError(f"phases: must be 1 with whole=True, got {phases}.")
-    if whole and waveform is not None:
-        return _whole_waveform(orbit, waveform, samples, winding)
-    points = samples * orbit.period
     measured: Mapping[str, np.ndarray]
     covariance: np.ndarray | None
-    if whole:
+    if whole and orbit.waveform is not None:
+        measured, covariance = _of_waveform(orbit, orbit.waveform, samples, multipliers)
+    elif whole:
         measured, covariance = _measured_cycle(orbit, samples), None
-    elif phases > 1:
-        measured, covariance = _at_phases(orbit, samples, phases, multipliers)
     else:
         used, present = orbit._undelayed
         measured = dict(zip(used, orbit.points[:, present].T, strict=True))
         rows = np.flatnonzero(np.tile(present, orbit.period))
         covariance = orbit.joint_covariance[np.ix_(rows, rows)]
+    points = samples * orbit.period
     mask = np.arange(points) % (points // len(next(iter(measured.values())))) == 0
     outputs = {name: np.zeros(points) for name in measured}
     for name, values in measured.items():
@@ -361,45 +347,17 @@ def _compared(orbit: Orbit, samples: int, phases: int, multipliers: bool, whole:
     return {"outputs": outputs, "mask": mask, "covariance": covariance}
 
 
-def _at_phases(orbit: Orbit, samples: int, phases: int, multipliers: bool) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return the outputs of the waveform at some phases a forcing period, (phases·period,) each, and the covariance."""
-    if orbit.waveform is None:
-        raise ValueError(
-            f"phases: must be 1, got {phases}; {orbit.name!r} has no waveform. Make the section of recordings."
-        )
+def _of_waveform(
+    orbit: Orbit, waveform: Waveform, samples: int, multipliers: bool
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return the outputs of the waveform where their noise is independent, (values,) each, and their covariance."""
     if multipliers:
-        raise ValueError(f"phases: must be 1 with multipliers, got {phases}.")
-    waveform = orbit.waveform
-    count = waveform.errors.shape[2] // orbit.period
-    if phases > INDEPENDENT or count % phases or samples % phases:
-        allowed = [n for n in range(1, INDEPENDENT + 1) if count % n == 0]
-        raise ValueError(f"phases: must be one of {allowed} that divides samples ({samples}), got {phases}.")
-    every = count // phases
+        raise ValueError(f"multipliers: must be False with the whole waveform of {orbit.name!r}, got True.")
+    if samples % INDEPENDENT:
+        raise ValueError(f"samples: must be a multiple of {INDEPENDENT} for the whole waveform, got {samples}.")
+    every = waveform.noise.shape[1] // (INDEPENDENT * orbit.period)
     values = {name: np.array(waveform.values[name][::every]) for name in waveform.outputs}
     return values, waveform.covariance(waveform.outputs, every)
-
-
-def _whole_waveform(orbit: Orbit, waveform: Waveform, samples: int, winding: int) -> dict[str, Any]:
-    """Return the outputs over the period, the harmonics kept, and the variances of their amplitudes."""
-    outputs = _resampled(orbit, winding, samples, waveform.outputs)
-    harmonics, variances = {}, {}
-    independent = INDEPENDENT * orbit.period
-    for column, name in enumerate(waveform.values):
-        if name in waveform.inputs:
-            continue
-        harmonics[name] = _amplitudes(orbit, name, TURN * winding if name in orbit.angles else 0.0).size - 1
-        common = np.abs(_fourier.coefficients(waveform.errors[:, column], harmonics[name])) ** 2
-        noise = (
-            np.mean(waveform.noise[column] ** 2) / independent * np.where(np.arange(harmonics[name] + 1) > 0, 4.0, 1.0)
-        )
-        variances[name] = common.sum(axis=0) + noise
-    return {
-        "outputs": outputs,
-        "harmonics": harmonics,
-        "amplitude_variance": variances,
-        "amplitude_freedom": {name: np.full(one.size, np.inf) for name, one in variances.items()},
-        "scatter": {name: float(np.sqrt(one[0] + 0.5 * one[1:].sum())) for name, one in variances.items()},
-    }
 
 
 def _measured_cycle(orbit: Orbit, samples: int) -> Mapping[str, np.ndarray]:
@@ -430,7 +388,7 @@ def _guess(
     if orbit.solution is None:
         raise ValueError(
             f"states: must name the coordinate that measures each state, such as {{'phi': 'angle'}}, got None; "
-            f"{orbit.name!r} is not polished. If states are hidden, give phases=16."
+            f"{orbit.name!r} is not polished. If states are hidden, give whole=True."
         )
     tau = np.arange(samples * orbit.period) / samples
     guess = {}

@@ -248,6 +248,7 @@ class _Polisher:
             eigenvalues=np.sign(orbit.eigenvalues) * moduli if signed else moduli,
             eigenvalue_bias=orbit.eigenvalue_bias / times,
             cycle=orbit.cycle and {name: values[: len(values) // times] for name, values in orbit.cycle.items()},
+            waveform=orbit.waveform and orbit.waveform.reduced(times, orbit.angles),
         )
 
     def _mismatch(self, orbit: Orbit) -> str:
