@@ -2,12 +2,14 @@
 
 A closed point has neighbours in the section, and the motion of each until the next point is measured. A polynomial like
 that of the return map, with the same neighbours, weights and correction for noise, is fitted to this motion at many
-phases; its value at the closed point is the orbit's waveform from there to its next point.
+phases, a linear one for inputs; its value at the closed point is the orbit's waveform from there to its next point.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from math import lcm
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +30,9 @@ from bayesperiodic.orbits.stretches import (
 
 # Values a return whose windows do not overlap, so that the noise of their samples is independent.
 INDEPENDENT = 16
+# Inputs depend little on the motion, and are taken as exact in fits: linear polynomials have less noise. The bias of
+# their values is proportional to the second power of the bandwidth.
+INPUT_DEGREE, INPUT_GROWTH = 1, WIDENED**2 - 1.0
 # Instants from which windows are determined.
 WINDOW_INSTANTS = 2000
 # Degree of polynomials of errors of the size of the bias, over a part of the period.
@@ -142,13 +147,15 @@ class Following:
         assert measured is not None
         self._samples, instants, stretch = measured
         self._size, self.channels, self.inputs = size, section.channels, section.inputs
+        first_input = len(self.channels) - len(self.inputs)
+        self.outputs, self.driven = slice(0, first_input), slice(first_input, None)
         returns, step = np.divmod(maps.positions, maps.steps)
         self._length = (instants[returns + 1] - instants[returns]) / maps.steps
         self._start, self._stretch = instants[returns] + step * self._length, stretch[returns]
         # Samples from a point to the next one; INDEPENDENT of a return are equally spaced.
         spaced = lcm(INDEPENDENT, maps.steps)
         self.count = spaced * -(-CYCLE_SAMPLES // spaced) // maps.steps
-        self._angles = [
+        self.angles = [
             (k, column)
             for k, (name, column) in enumerate(zip(section.coordinates, columns_of(section.coordinates), strict=True))
             if name in section.angles
@@ -174,57 +181,85 @@ class Following:
             halves = unbiased_windows(self._samples, at, stretch, widest, variance)
         return halves, variance * windowed(self._samples, at, stretch, halves)[1].mean(axis=0)
 
-    def signals(self, index: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """Return all channels (n, samples·channels) after arguments (n,), whose angles are as in the points (n, d)."""
+    def signals(self, index: np.ndarray, near: np.ndarray, columns: slice) -> np.ndarray:
+        """Return channels (n, samples·channels) after arguments (n,), whose angles are as in the points (n, d)."""
         phases = np.arange(self.count) / self.count
         at = self._start[index, None] + self._length[index, None] * phases
         values, _ = windowed(self._samples, at.ravel(), np.repeat(self._stretch[index], self.count), self._halves)
         values = values.reshape(len(index), self.count, -1)
-        for k, column in self._angles:
+        for k, column in self.angles:
             away = near[:, k] * self._size[k] - values[:, 0, column]
             values[:, :, column] += TURN * np.round(away / TURN)[:, None]
-        return values.reshape(len(index), -1)
+        return values[:, :, columns].reshape(len(index), -1)
+
+
+class _Part(NamedTuple):
+    """Motion from a point of a cycle to the next one."""
+
+    values: np.ndarray  # (samples, channels)
+    errors: np.ndarray  # of each run of neighbours, (runs, samples, channels)
+    bias: np.ndarray  # rms over the samples, (channels,)
+    gain: np.ndarray  # variance of the values for independent errors of unit variance, (channels,)
 
 
 def waveform_of(following: Following, maps: ReturnMap, estimate: Estimate, shift: int) -> Waveform:
     """Return the waveform of a refined cycle from its point `shift` returns after the first one on."""
-    fits = estimate.fits
-    assert fits is not None
-    phases = maps.phases(np.arange(len(estimate.points)))
-    narrow = maps.regress(estimate.points, phases, fits.bandwidths, REFINING_DEGREE, following.signals)
-    wide = maps.regress(fits.wide_points, phases, WIDENED * fits.bandwidths, REFINING_DEGREE, following.signals)
-    pairs, runs, by_run = errors_by_run(maps, fits.narrow)
-    d = estimate.points.shape[1]
-    values, errors, biases = [], [], []
-    for j, (fit, other) in enumerate(zip(narrow, wide, strict=True)):
-        closed = by_run[:, d * j : d * (j + 1)] @ fit.slopes
-        np.add.at(closed, runs[np.searchsorted(pairs, maps.positions[fit.neighbours])], fit.influence)
-        bias = _without_turns(other.value - fit.value, following) / VALUE_GROWTH
-        values.append(fit.value.reshape(following.count, -1))
-        errors.append(closed.reshape(len(closed), following.count, -1))
-        biases.append(np.sqrt(np.mean(bias.reshape(following.count, -1) ** 2, axis=0)))
-    order = (np.arange(len(values)) + maps.steps * shift) % len(values)
-    motion = _continuous([values[j] for j in order], following)
-    whole = np.concatenate([errors[j] for j in order], axis=1).transpose(0, 2, 1)
-    common, rest = _common(whole, np.std(motion, axis=0), 2 * estimate.points.size)
-    gains = np.repeat([narrow[j].gain for j in order], following.count)
+    parts = _parts(following, maps, estimate, following.outputs, REFINING_DEGREE, VALUE_GROWTH)
+    if following.inputs:
+        inputs = _parts(following, maps, estimate, following.driven, INPUT_DEGREE, INPUT_GROWTH)
+        parts = [
+            _Part(*(np.concatenate(two, axis=-1) for two in zip(*both, strict=True)))
+            for both in zip(parts, inputs, strict=True)
+        ]
+    parts = [parts[j] for j in (np.arange(len(parts)) + maps.steps * shift) % len(parts)]
+    motion = _continuous([part.values for part in parts], following)
+    errors = np.concatenate([part.errors for part in parts], axis=1).transpose(0, 2, 1)
+    common, rest = _common(errors, np.std(motion, axis=0), 2 * estimate.points.size)
+    gains = np.repeat(np.stack([part.gain for part in parts], axis=1), following.count, axis=1)
     noise = np.sqrt(np.maximum(rest[:, None], following.variance[:, None] * gains))
-    bias = np.stack([biases[j] for j in order], axis=1)
+    bias = np.stack([part.bias for part in parts], axis=1)
     return Waveform(dict(zip(following.channels, motion.T, strict=True)), following.inputs, common, bias, noise)
 
 
+def _parts(
+    following: Following, maps: ReturnMap, estimate: Estimate, columns: slice, degree: int, growth: float
+) -> list[_Part]:
+    """Return the motion of some channels after each point, by polynomials of some degree.
+
+    The bias is the difference to wider neighbourhoods over `growth`.
+    """
+    fits = estimate.fits
+    assert fits is not None
+    signals = partial(following.signals, columns=columns)
+    phases = maps.phases(np.arange(len(estimate.points)))
+    narrow = maps.regress(estimate.points, phases, fits.bandwidths, degree, signals)
+    wide = maps.regress(fits.wide_points, phases, WIDENED * fits.bandwidths, degree, signals)
+    pairs, runs, by_run = errors_by_run(maps, fits.narrow)
+    d, parts = estimate.points.shape[1], []
+    for j, (fit, other) in enumerate(zip(narrow, wide, strict=True)):
+        errors = by_run[:, d * j : d * (j + 1)] @ fit.slopes
+        np.add.at(errors, runs[np.searchsorted(pairs, maps.positions[fit.neighbours])], fit.influence)
+        away = (other.value - fit.value).reshape(following.count, -1)
+        if columns == following.outputs:
+            away = _without_turns(away, following)
+        bias = np.sqrt(np.mean(away**2, axis=0)) / growth
+        values, errors = fit.value.reshape(away.shape), errors.reshape(len(errors), *away.shape)
+        parts.append(_Part(values, errors, bias, np.full(bias.size, fit.gain)))
+    return parts
+
+
 def _without_turns(difference: np.ndarray, following: Following) -> np.ndarray:
-    """Return the difference of two motions (samples·channels,) without whole turns of angles."""
-    result = difference.reshape(following.count, -1)
-    for _, column in following._angles:
+    """Return the difference of two motions (samples, channels) without whole turns of angles."""
+    result = np.array(difference)
+    for _, column in following.angles:
         result[:, column] -= TURN * np.round(result[0, column] / TURN)
-    return result.ravel()
+    return result
 
 
 def _continuous(parts: list[np.ndarray], following: Following) -> np.ndarray:
     """Return parts (samples, channels) of a motion as one, angles continuous from (−π, π] on."""
     motion = np.concatenate(parts)
-    for _, column in following._angles:
+    for _, column in following.angles:
         motion[:, column] = np.unwrap(motion[:, column])
         motion[:, column] -= TURN * np.ceil((motion[0, column] - np.pi) / TURN)
     return motion
