@@ -193,7 +193,7 @@ class Following:
         return values[:, :, columns].reshape(len(index), -1)
 
 
-class _Part(NamedTuple):
+class _MotionPart(NamedTuple):
     """Motion from a point of a cycle to the next one."""
 
     values: np.ndarray  # (samples, channels)
@@ -208,7 +208,7 @@ def waveform_of(following: Following, maps: ReturnMap, estimate: Estimate, shift
     if following.inputs:
         inputs = _parts(following, maps, estimate, following.driven, INPUT_DEGREE, INPUT_GROWTH)
         parts = [
-            _Part(*(np.concatenate(two, axis=-1) for two in zip(*both, strict=True)))
+            _MotionPart(*(np.concatenate(two, axis=-1) for two in zip(*both, strict=True)))
             for both in zip(parts, inputs, strict=True)
         ]
     parts = [parts[j] for j in (np.arange(len(parts)) + maps.steps * shift) % len(parts)]
@@ -223,7 +223,7 @@ def waveform_of(following: Following, maps: ReturnMap, estimate: Estimate, shift
 
 def _parts(
     following: Following, maps: ReturnMap, estimate: Estimate, columns: slice, degree: int, growth: float
-) -> list[_Part]:
+) -> list[_MotionPart]:
     """Return the motion of some channels after each point, by polynomials of some degree.
 
     The bias is the difference to wider neighbourhoods over `growth`.
@@ -244,7 +244,7 @@ def _parts(
             away = _without_turns(away, following)
         bias = np.sqrt(np.mean(away**2, axis=0)) / growth
         values, errors = fit.value.reshape(away.shape), errors.reshape(len(errors), *away.shape)
-        parts.append(_Part(values, errors, bias, np.full(bias.size, fit.gain)))
+        parts.append(_MotionPart(values, errors, bias, np.full(bias.size, fit.gain)))
     return parts
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ from scipy.stats import chi2
 
 import bayesperiodic as bp
 from bayesperiodic.orbits import find
-from bayesperiodic.orbits.return_map import ReturnMap
-from bayesperiodic.orbits.waveform import INDEPENDENT, Following
+from bayesperiodic.orbits.cycles import REFINING_DEGREE, errors_by_run
+from bayesperiodic.orbits.return_map import Atlas, ReturnMap
+from bayesperiodic.orbits.waveform import INDEPENDENT, Following, _parts
 from tests.orbits import chaos, wells
+from tests.orbits.test_find import coupled, map_section
 
 OMEGA = 0.8
 PERIOD = 2.0 * np.pi / OMEGA
@@ -171,6 +174,26 @@ def test_the_regression_of_the_images_is_the_fit_of_the_return_map(coordinates):
         np.testing.assert_allclose(one.value, fit.value[k], atol=1e-12)
         np.testing.assert_allclose(one.slopes.T, fit.jacobian[k], atol=1e-10)
         np.testing.assert_allclose(one.influence.T @ one.influence, fit.influence[k, :, 0].T @ fit.influence[k, :, 0])
+
+
+def test_errors_of_the_motion_until_the_next_point_are_the_errors_of_that_point():
+    """The motion is the image: its error is that of the regression and of the closed point, times the slopes."""
+    maps, _, _ = find._scaled(map_section(coupled, 4000, 0.001), 32)
+    increments = maps.increments
+    images = SimpleNamespace(
+        signals=lambda index, near, columns: near + increments[index], count=1, angles=[], outputs=slice(None)
+    )
+    checked = 0
+    for _, estimate in find._chained(maps, Atlas(maps, find._search_count(maps, 32)), 2, 32):
+        _, _, errors = errors_by_run(maps, estimate.fits.narrow)
+        parts = _parts(images, maps, estimate, images.outputs, REFINING_DEGREE, 1.0)
+        for k, part in enumerate(parts):
+            following = errors[:, 2 * ((k + 1) % 2) :][:, :2]
+            scale = np.abs(following).max()
+            np.testing.assert_allclose(part.errors[:, 0], following, atol=1e-2 * scale)
+            assert np.abs(part.values[0] - estimate.points[(k + 1) % 2]).max() < 1e-5
+            checked += 1
+    assert checked >= 2
 
 
 def test_the_angle_of_a_waveform_is_the_integral_of_its_rate():
