@@ -5,7 +5,7 @@ that of the return map, with the same neighbours, weights and correction for noi
 phases, a linear one for inputs; its value at the closed point is the orbit's waveform from there to its next point.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from math import lcm
@@ -68,7 +68,7 @@ class Waveform(Storable):
 
     Examples
     --------
-    The rate of the chaotic pendulum over an orbit, and its standard error in per cent of the rate's:
+    An orbit of the chaotic pendulum:
 
     >>> orbit = pendulum_orbits[0]
     >>> waveform = orbit.waveform
@@ -81,10 +81,6 @@ class Waveform(Storable):
     errors: np.ndarray
     bias: np.ndarray
     noise: np.ndarray
-
-    def __post_init__(self) -> None:
-        for name in ("values", "errors", "bias", "noise"):
-            object.__setattr__(self, name, _checks.read_only(getattr(self, name)))
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -120,23 +116,31 @@ class Waveform(Storable):
         -------
         array (values, values)
             Phase by phase, and in the order of the channels within a phase.
+
+        Raises
+        ------
+        ValueError
+            For an unknown channel.
         """
+        for name in channels:
+            _checks.one_of("channels", name, self.values)
         columns = [list(self.values).index(name) for name in channels]
         errors = self._common_errors[:, columns, ::every]
         flat = errors.transpose(0, 2, 1).reshape(len(errors), -1)
         return flat.T @ flat + np.diag(self.noise[columns, ::every].T.ravel() ** 2)
 
-    def reduced(self, times: int, angles: tuple[str, ...]) -> "Waveform":
-        """Return the mean of the repeats of a waveform that repeats itself so many times."""
-        values = {}
-        for name, whole in self.values.items():
-            repeats = whole.reshape(times, -1)
-            turns = np.round((repeats[:, :1] - repeats[:1, :1]) / TURN) if name in angles else 0.0
-            values[name] = np.mean(repeats - TURN * turns, axis=0)
-        errors = self.errors.reshape(*self.errors.shape[:2], times, -1).mean(axis=2)
-        noise = np.sqrt(np.mean(self.noise.reshape(len(self.noise), times, -1) ** 2, axis=1) / times)
-        bias = self.bias.reshape(len(self.bias), times, -1).mean(axis=1)
-        return Waveform(values, self.inputs, errors, bias, noise)
+
+def mean_of_repeats(waveform: Waveform, times: int, angles: Iterable[str]) -> Waveform:
+    """Return the mean of the repeats of a waveform that repeats itself so many times."""
+    values = {}
+    for name, whole in waveform.values.items():
+        repeats = whole.reshape(times, -1)
+        turns = np.round((repeats[:, :1] - repeats[:1, :1]) / TURN) if name in angles else 0.0
+        values[name] = np.mean(repeats - TURN * turns, axis=0)
+    errors = waveform.errors.reshape(*waveform.errors.shape[:2], times, -1).mean(axis=2)
+    noise = np.sqrt(np.mean(waveform.noise.reshape(len(waveform.noise), times, -1) ** 2, axis=1) / times)
+    bias = waveform.bias.reshape(len(waveform.bias), times, -1).mean(axis=1)
+    return Waveform(values, waveform.inputs, errors, bias, noise)
 
 
 class Following:

@@ -13,7 +13,7 @@ import bayesperiodic as bp
 from bayesperiodic.orbits import find
 from bayesperiodic.orbits.cycles import REFINING_DEGREE, errors_by_run
 from bayesperiodic.orbits.return_map import Atlas, ReturnMap
-from bayesperiodic.orbits.waveform import INDEPENDENT, Following, _parts
+from bayesperiodic.orbits.waveform import INDEPENDENT, Following, _parts, mean_of_repeats
 from tests.orbits import chaos, wells
 from tests.orbits.test_find import coupled, map_section
 
@@ -286,7 +286,7 @@ def test_repeats_of_a_waveform_are_averaged():
         bias=np.concatenate([wave.bias, wave.bias], axis=1),
         noise=np.concatenate([wave.noise, wave.noise], axis=1),
     )
-    once = twice.reduced(2, ("x",))
+    once = mean_of_repeats(twice, 2, ("x",))
     for name, values in wave.values.items():
         np.testing.assert_allclose(once.values[name], values + 0.01, atol=1e-12)
     np.testing.assert_allclose(once.errors, wave.errors)
@@ -299,6 +299,8 @@ def test_what_the_whole_waveform_cannot_do_raises():
         orbits[0].experiment(samples=100, whole=True)
     with pytest.raises(ValueError, match="multipliers: must be False with the whole waveform of .*, got True"):
         orbits[0].experiment(whole=True, multipliers=True)
+    with pytest.raises(ValueError, match="channels: must be one of 'x', 'y', 'u', got 'z'"):
+        orbits[0].waveform.covariance(("z",), 4)
     with pytest.raises(ValueError, match="states: must be one of 'x', 'y', got 'u'"):
         orbits[0].experiment(states={"x": "u"})
     alone = bp.PoincareSection.from_points(chaos.points(3000), ("angle", "rate"), frequency=1.0, angles=("angle",))
