@@ -55,6 +55,7 @@ from .orbits.orbit import Orbits as Orbits
 from .orbits.polish import polish_orbits as polish_orbits
 from .orbits.polish import select_orbits as select_orbits
 from .orbits.section import PoincareSection as PoincareSection
+from .orbits.waveform import Waveform as Waveform
 from .periodic.continuation import Branch as Branch
 from .periodic.continuation import continue_periodic as continue_periodic
 from .periodic.continuation import double_period as double_period

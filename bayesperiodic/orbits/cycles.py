@@ -60,6 +60,15 @@ class Estimate(NamedTuple):
     covariance: np.ndarray  # of the points and of log|eigenvalue|, (d·p + d, d·p + d)
     bias: np.ndarray  # estimated, (d·p + d,)
     turns: float  # of the angle, from the fits
+    fits: "CycleFits | None" = None  # those at the points; None for "boxes"
+
+
+class CycleFits(NamedTuple):
+    """The local fits that close a refined cycle, and the cycle that wider ones close."""
+
+    bandwidths: np.ndarray  # (p,)
+    narrow: LocalFit
+    wide_points: np.ndarray  # of the cycle of fits WIDENED times as wide, (p, d)
 
 
 def newton_step(defect: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
@@ -234,7 +243,9 @@ def refine(maps: ReturnMap, points: np.ndarray, neighbours: int) -> Estimate | N
     slope_bias = (np.log(np.abs(wide_values)) - np.log(np.abs(values))) / SLOPE_GROWTH
     point_bias = maps.wrap(wide[0] - cycle).ravel() / VALUE_GROWTH
     turns = _turns(maps, np.sum(fit.value - cycle, axis=0))
-    return Estimate(maps.wrap(cycle), values, _joint_covariance(maps, fit), np.append(point_bias, slope_bias), turns)
+    covariance = _joint_covariance(maps, fit)
+    fits = CycleFits(bandwidths, fit, wide[0])
+    return Estimate(maps.wrap(cycle), values, covariance, np.append(point_bias, slope_bias), turns, fits)
 
 
 def _turns(maps: ReturnMap, run: np.ndarray) -> float:
@@ -301,9 +312,16 @@ def _eigenvectors(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _joint_covariance(maps: ReturnMap, fit: LocalFit) -> np.ndarray:
-    """Return the joint covariance of the points of a cycle and of log|eigenvalue|, by the delta method.
+    """Return the joint covariance of the points of a cycle and of log|eigenvalue|, by the delta method."""
+    errors = errors_by_run(maps, fit)[2]
+    return errors.T @ errors
 
-    Consecutive pairs of points share the noise of a point, so errors are summed over runs of consecutive pairs.
+
+def errors_by_run(maps: ReturnMap, fit: LocalFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pairs of points in the fits of a cycle, the run of each, and errors of runs (runs, d·p + d).
+
+    The errors are those of the cycle's points and of log|eigenvalue|. Consecutive pairs share the noise of a point, so
+    errors are summed over runs of consecutive pairs, and are independent between runs.
     """
     jacobian, (p, d) = fit.jacobian, fit.value.shape
     by_value = -np.linalg.inv(_closing_matrix(jacobian[None])[0])
@@ -320,7 +338,7 @@ def _joint_covariance(maps: ReturnMap, fit: LocalFit) -> np.ndarray:
     runs = np.concatenate([[0], np.cumsum(np.diff(pairs) > 1)])
     errors = np.zeros((runs[-1] + 1, d * (p + 1)))
     np.add.at(errors, runs[owner], np.concatenate(rows))
-    return errors.T @ errors
+    return pairs, runs, errors
 
 
 def box_orbits(maps: ReturnMap, period: int, neighbours: int, box: float) -> list[tuple[MapCycle, Estimate]]:

@@ -23,6 +23,7 @@ from bayesperiodic.orbits.return_map import (
     prediction_error,
 )
 from bayesperiodic.orbits.section import PoincareSection
+from bayesperiodic.orbits.waveform import Following, waveform_of
 
 SEARCHES = ("chained", "boxes")
 QUALITY_DEGREE, FEWEST_NEIGHBOURS = 3, 32
@@ -113,7 +114,8 @@ def find_orbits(
         atlas = Atlas(maps, _search_count(maps, neighbours))
         pairs = [pair for p in wanted for pair in _chained(maps, atlas, p, neighbours)]
     quality_count = _search_count(maps, FEWEST_NEIGHBOURS)
-    orbits = [_orbit(section, maps, size, *pair, _quality(maps, *pair, quality_count)) for pair in pairs]
+    following = Following(section, maps, size) if pairs and section.measured is not None else None
+    orbits = [_orbit(section, maps, size, *pair, _quality(maps, *pair, quality_count), following) for pair in pairs]
     finished = _finished(orbits, maps, size)
     return Orbits(finished, values=section.values, method=method, prediction_error=prediction)
 
@@ -215,8 +217,9 @@ def _largest_sd(estimate: Estimate) -> float:
 
 
 def _orbit(
-    section: PoincareSection, maps: ReturnMap, size: np.ndarray, candidate: MapCycle, estimate: Estimate, quality: float
-) -> Orbit:
+    section: PoincareSection, maps: ReturnMap, size: np.ndarray, candidate: MapCycle, estimate: Estimate,
+    quality: float, following: Following | None,
+) -> Orbit:  # fmt: skip
     count, d = estimate.points.shape
     period = count // maps.steps
     # The orbit starts at the point that belongs to the start of the measured cycle.
@@ -239,15 +242,18 @@ def _orbit(
             values = cycle[section.coordinates[column]]
             values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
         # It moves no more than by noise and its distance to the orbit.
-        extent = np.ptp(section.signals, axis=0)
+        extent = np.ptp(section.signals[:, : len(cycle)], axis=0)
         extent = np.where(np.isin(list(cycle), section.angles), np.minimum(extent, 2.0 * np.pi), extent)
         limit = (STILL_RANGE + STILL_NOISE * maps.noise.max()) * extent
         still = bool(np.all(np.ptp(np.stack(list(cycle.values())), axis=1) < limit))
+    waveform = None
+    if following is not None and estimate.fits is not None:
+        waveform = waveform_of(following, maps, estimate, candidate.shift)
     return Orbit(
         name="", coordinates=section.coordinates, angles=section.angles, frequency=section.frequency, period=period,
         winding=round(estimate.turns) if section.winds else None, points=points, joint_covariance=covariance,
         eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[-d:], returns=candidate.returns, quality=quality,
-        cycle=cycle, equilibrium=still, synthetic=section.synthetic, remark=remark,
+        cycle=cycle, waveform=waveform, equilibrium=still, synthetic=section.synthetic, remark=remark,
     )  # fmt: skip
 
 

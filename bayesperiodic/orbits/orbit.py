@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +11,9 @@ import numpy as np
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
-from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.orbits.coordinates import channel_and_delay
+from bayesperiodic.data.experiment import DATA, Experiment
+from bayesperiodic.orbits.coordinates import channel_and_delay, channels_of
+from bayesperiodic.orbits.waveform import INDEPENDENT, Waveform
 from bayesperiodic.periodic.solution import PeriodicSolution
 
 if TYPE_CHECKING:
@@ -61,6 +62,9 @@ class Orbit(Result):
         Position of the orbit with all signs changed among the orbits; its own if it is symmetric.
     cycle : mapping of str to array (samples·period,) or None
         The closest measured cycle by channel, angles continuous; None for a section of points alone.
+    waveform : Waveform or None
+        All channels over the period with errors, by local regression of the motion that follows the points; None for a
+        section of points alone, and for the method "boxes".
     solution : PeriodicSolution or None
         The model's orbit, from `polish_orbits`.
     equilibrium : bool
@@ -97,6 +101,7 @@ class Orbit(Result):
     quality: float
     partner: int | None = None
     cycle: Mapping[str, np.ndarray] | None = None
+    waveform: Waveform | None = None
     solution: PeriodicSolution | None = None
     equilibrium: bool = False
     synthetic: bool = False
@@ -142,8 +147,9 @@ class Orbit(Result):
     ) -> Experiment:
         """Return the orbit as an experiment: its section points at tau = 0, 1, …, as in de Kraker et al. (1997).
 
-        Their covariance is known up to one factor, the noise parameter "scale", common to all orbits of a problem.
-        Delayed coordinates are left out, because all outputs of an experiment are compared at the same tau.
+        Their covariance is known up to one factor, the noise parameter "scale", common to all orbits of a problem. The
+        inputs are those of the waveform, taken as exact. Delayed coordinates are left out, because all outputs of an
+        experiment are compared at the same tau.
 
         Parameters
         ----------
@@ -154,11 +160,16 @@ class Orbit(Result):
             One that is complex, not estimated, or whose bias exceeds half its standard deviation is left out, and so
             are all smaller ones.
         whole : bool
-            Compare all samples of the measured cycle instead, with a variance per channel. The measured cycle is a
-            close return and does not close exactly; the gap counts as noise.
+            Compare the waveforms of all outputs instead, at 16 phases a forcing period and with their covariance,
+            which contain nearly all information. Where the errors of the model exceed those of the waveform,
+            ``dataclasses.replace(experiment, covariance=None)`` has a variance per channel in its place. Without a
+            waveform, all samples of the measured cycle are compared, with a variance per channel: it is a close return
+            and does not close exactly; the gap counts as noise.
         states : mapping of str to str, optional
-            The coordinate that measures each state of the model, such as ``{"phi": "angle"}``: the first solve then
-            starts from the measured cycle. By default it starts from the polished solution.
+            The output that measures each state of the model, such as ``{"phi": "angle"}``: the first solve then starts
+            from the waveform, or from the measured cycle. By default it starts from the polished solution; without one,
+            the whole waveform starts it from states that are found from the waveform and the equations (guess "data" of
+            `Experiment`), as hidden states need.
 
         Returns
         -------
@@ -168,8 +179,8 @@ class Orbit(Result):
         ------
         ValueError
             If all coordinates are delayed, if the orbit is not polished and `states` or the winding are not known, if
-            `whole` or `states` are given and
-            there is no measured cycle, or if `samples` is not a multiple of the cycle's.
+            `whole` or `states` are given and there is neither waveform nor measured cycle, for the whole waveform
+            together with `multipliers`, or if `samples` is not a multiple of the phases compared.
 
         Warns
         -----
@@ -180,28 +191,23 @@ class Orbit(Result):
         winding = counted_turns(self) if self.solution is None else sum(self.solution.winding.values())
         if winding is None:
             raise ValueError(f"winding: must be known, got None for {self.name!r}. Use polish_orbits first.")
-        points = samples * self.period
-        used, present = self._undelayed
-        here = dict(zip(used, self.points[:, present].T, strict=True))
-        measured = _measured_cycle(self, samples) if whole else here
-        mask = np.arange(points) % (points // len(next(iter(measured.values())))) == 0
-        rows = np.flatnonzero(np.tile(present, self.period))
-        outputs = {name: np.zeros(points) for name in measured}
-        for name, values in measured.items():
-            outputs[name][mask] = values
-        inputs = {} if self.solution is None else self.solution.inputs
+        turns = winding if self.solution is None else self.solution.winding
+        compared = _compared(self, samples, multipliers, whole)
+        if self.solution is not None:
+            inputs = {name: _on_grid(values, samples * self.period) for name, values in self.solution.inputs.items()}
+        else:
+            inputs = _resampled(self, winding, samples, () if self.waveform is None else self.waveform.inputs)
         experiment = Experiment(
             self.name,
             self.frequency,
-            outputs,
-            {name: _on_grid(values, points) for name, values in inputs.items()},
+            compared.pop("outputs"),
+            inputs,
             samples=samples,
             periods=self.period,
-            winding=winding if self.solution is None else self.solution.winding,
-            mask=mask,
-            covariance=None if whole else self.joint_covariance[np.ix_(rows, rows)],
-            guess=_guess(self, samples, winding, states),
+            winding=turns,
+            guess=_guess(self, samples, winding, states, hidden=whole),
             synthetic=self.synthetic,
+            **compared,
         )
         return _with_multipliers(self, experiment) if multipliers else experiment
 
@@ -288,21 +294,27 @@ def counted_turns(orbit: Orbit) -> int | None:
 
 
 def resampled_cycle(orbit: Orbit, winding: int, samples: int) -> np.ndarray:
-    """Return the measured cycle (samples·period, channels) on another grid, closed, with significant harmonics only.
+    """Return the motion (samples·period, channels) of the coordinates on another grid, see `_resampled`."""
+    return np.stack(list(_resampled(orbit, winding, samples, channels_of(orbit.coordinates)).values()), axis=-1)
 
-    The gap between its end and its start is distributed over the cycle.
+
+def _resampled(orbit: Orbit, winding: int, samples: int, channels: Iterable[str]) -> dict[str, np.ndarray]:
+    """Return channels of the waveform, else of the cycle, on another grid, closed, with significant harmonics only.
+
+    The gap between its end and its start is distributed over the period.
     """
-    assert orbit.cycle is not None
-    tau, columns = np.arange(samples * orbit.period) / samples, []
-    for name in orbit.cycle:
-        values = np.asarray(orbit.cycle[name], dtype=float)
+    motion = orbit.cycle if orbit.waveform is None else orbit.waveform.values
+    tau, result = np.arange(samples * orbit.period) / samples, {}
+    for name in channels:
+        assert motion is not None
+        values = np.asarray(motion[name], dtype=float)
         turns = TURN * winding if name in orbit.angles else 0.0
         gap = _end(values) - values[0] - turns
         amplitudes = _fourier.coefficients(values - (turns + gap) * (np.arange(values.size) / values.size) + 0.5 * gap)
         floor = NOISE_FLOOR * np.median(np.abs(amplitudes[amplitudes.size // 2 :]))
         kept = np.flatnonzero(np.abs(amplitudes) > floor).max(initial=1)
-        columns.append(_fourier.on_grid(amplitudes[: kept + 1], tau.size) + turns * tau / orbit.period)
-    return np.stack(columns, axis=-1)
+        result[name] = _fourier.on_grid(amplitudes[: kept + 1], tau.size) + turns * tau / orbit.period
+    return result
 
 
 def _end(values: np.ndarray) -> float:
@@ -314,6 +326,40 @@ def _on_grid(values: np.ndarray, points: int) -> np.ndarray:
     return values if values.size == points else _fourier.on_grid(_fourier.coefficients(values), points)
 
 
+def _compared(orbit: Orbit, samples: int, multipliers: bool, whole: bool) -> dict[str, Any]:
+    """Return the arguments of the experiment that say what is compared, with which errors."""
+    measured: Mapping[str, np.ndarray]
+    covariance: np.ndarray | None
+    if whole and orbit.waveform is not None:
+        measured, covariance = _of_waveform(orbit, orbit.waveform, samples, multipliers)
+    elif whole:
+        measured, covariance = _measured_cycle(orbit, samples), None
+    else:
+        used, present = orbit._undelayed
+        measured = dict(zip(used, orbit.points[:, present].T, strict=True))
+        rows = np.flatnonzero(np.tile(present, orbit.period))
+        covariance = orbit.joint_covariance[np.ix_(rows, rows)]
+    points = samples * orbit.period
+    mask = np.arange(points) % (points // len(next(iter(measured.values())))) == 0
+    outputs = {name: np.zeros(points) for name in measured}
+    for name, values in measured.items():
+        outputs[name][mask] = values
+    return {"outputs": outputs, "mask": mask, "covariance": covariance}
+
+
+def _of_waveform(
+    orbit: Orbit, waveform: Waveform, samples: int, multipliers: bool
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Return the outputs of the waveform where their noise is independent, (values,) each, and their covariance."""
+    if multipliers:
+        raise ValueError(f"multipliers: must be False with the whole waveform of {orbit.name!r}, got True.")
+    if samples % INDEPENDENT:
+        raise ValueError(f"samples: must be a multiple of {INDEPENDENT} for the whole waveform, got {samples}.")
+    every = waveform.noise.shape[1] // (INDEPENDENT * orbit.period)
+    values = {name: np.array(waveform.values[name][::every]) for name in waveform.outputs}
+    return values, waveform.covariance(waveform.outputs, every)
+
+
 def _measured_cycle(orbit: Orbit, samples: int) -> Mapping[str, np.ndarray]:
     if orbit.cycle is None:
         raise ValueError(f"whole: must be False, got True; {orbit.name!r} has no measured cycle.")
@@ -323,22 +369,26 @@ def _measured_cycle(orbit: Orbit, samples: int) -> Mapping[str, np.ndarray]:
     return orbit.cycle
 
 
-def _guess(orbit: Orbit, samples: int, winding: int, states: Mapping[str, str] | None) -> dict[str, np.ndarray]:
-    """Return the states from which the first solve starts: coordinates of the cycle, or those of the solution."""
+def _guess(
+    orbit: Orbit, samples: int, winding: int, states: Mapping[str, str] | None, hidden: bool
+) -> str | dict[str, np.ndarray]:
+    """Return the states from which the first solve starts: of outputs, of the solution, or found from the waveform."""
     if states is not None:
-        if orbit.cycle is None:
+        if orbit.cycle is None and orbit.waveform is None:
             raise ValueError(
                 f"states: must be None, got {states!r}; {orbit.name!r} has no measured cycle. Use polish_orbits first."
             )
-        cycle = resampled_cycle(orbit, winding, samples)
+        measured = orbit.waveform.outputs if orbit.waveform is not None else tuple(orbit.cycle or ())
         for name in states.values():
-            _checks.one_of("states", name, orbit.cycle)
-        channels = list(orbit.cycle)
-        return {state: cycle[:, channels.index(name)] for state, name in states.items()}
+            _checks.one_of("states", name, measured)
+        motion = _resampled(orbit, winding, samples, states.values())
+        return {state: motion[name] for state, name in states.items()}
+    if orbit.solution is None and orbit.waveform is not None and hidden:
+        return DATA
     if orbit.solution is None:
         raise ValueError(
             f"states: must name the coordinate that measures each state, such as {{'phi': 'angle'}}, got None; "
-            f"{orbit.name!r} is not polished."
+            f"{orbit.name!r} is not polished. If states are hidden, give whole=True."
         )
     tau = np.arange(samples * orbit.period) / samples
     guess = {}

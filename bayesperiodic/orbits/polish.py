@@ -12,6 +12,7 @@ from bayesperiodic.models.model import Model
 from bayesperiodic.orbits.coordinates import channel_and_delay, wrapped
 from bayesperiodic.orbits.cycles import shift_between
 from bayesperiodic.orbits.orbit import TURN, Orbit, Orbits, counted_turns, resampled_cycle
+from bayesperiodic.orbits.waveform import mean_of_repeats
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme
@@ -248,6 +249,7 @@ class _Polisher:
             eigenvalues=np.sign(orbit.eigenvalues) * moduli if signed else moduli,
             eigenvalue_bias=orbit.eigenvalue_bias / times,
             cycle=orbit.cycle and {name: values[: len(values) // times] for name, values in orbit.cycle.items()},
+            waveform=orbit.waveform and mean_of_repeats(orbit.waveform, times, orbit.angles),
         )
 
     def _mismatch(self, orbit: Orbit) -> str:

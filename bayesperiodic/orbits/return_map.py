@@ -27,6 +27,8 @@ STEEPEST_SLOPE, CURVATURE_LENGTH = 10.0, 0.1
 FARTHEST_FROM_CENTRE = {2: 1.0, 3: 2.0}
 # Distance of two phases in a search tree, in units of the attractor's size.
 APART = 1e3
+# What follows neighbours (n, values): of their positions (n,) among the arguments and the points (n, d) themselves.
+Signals = Callable[[np.ndarray, np.ndarray], np.ndarray]
 # Limits of memory: products of regressors in one call, neighbours of all fits of an atlas.
 MOST_PRODUCTS, MOST_NEIGHBOURS = 4_000_000, 6_000_000
 
@@ -63,6 +65,16 @@ class LocalFit(NamedTuple):
         place = np.empty((d, d), dtype=int)
         place[one, other] = place[other, one] = 1 + d + np.arange(one.size)
         return np.ascontiguousarray(self.derivatives[:, place].transpose(0, 3, 1, 2))
+
+
+class Regression(NamedTuple):
+    """Values that follow a point, fitted to what follows its n neighbours, in d coordinates."""
+
+    value: np.ndarray  # (values,)
+    slopes: np.ndarray  # by the coordinates, (d, values)
+    neighbours: np.ndarray  # positions among the arguments, (n,)
+    influence: np.ndarray  # contribution of each neighbour to the error of `value`, (n, values)
+    gain: float  # variance of `value` for independent errors of unit variance
 
 
 class ReturnMap:
@@ -161,6 +173,13 @@ class ReturnMap:
 
         The neighbours are repeated to equal numbers, without influence.
         """
+        index, inside, bandwidths = self._within(centres, phases, bandwidths, degree)
+        return self._fit(centres, bandwidths, index, inside, degree, influence, shrunk=True)
+
+    def _within(
+        self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray, degree: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the neighbours (m, n) of fits of given bandwidths, which are used, and the bandwidths (m,)."""
         fewest = max(FEWEST_FITTED, comb(len(self.turn) + degree, degree) * 3 // 2)
         distance, nearest = self.nearest(centres, phases, fewest)
         bandwidths = np.maximum(bandwidths, distance[:, -1] / KERNEL_REACH)
@@ -171,7 +190,7 @@ class ReturnMap:
         inside = (position > 0) & (position <= counts)
         index = np.repeat(nearest[:, :1], len(position), axis=1)
         index[inside] = np.concatenate(near)
-        return self._fit(centres, bandwidths, index, inside, degree, influence, shrunk=True)
+        return index, inside, np.maximum(bandwidths, np.max(self.noise) / MOST_NOISE)
 
     @staticmethod
     def predict(fit: LocalFit, away: np.ndarray) -> np.ndarray:
@@ -203,49 +222,104 @@ class ReturnMap:
         wants_influence: bool, shrunk: bool = False,
     ) -> LocalFit:  # fmt: skip
         bandwidth = np.maximum(bandwidth, np.max(self.noise) / MOST_NOISE)
-        away = self.wrap(self.arguments[index] - centres[:, None])
-        image = away + self.increments[index]
+        image, reference = self._images(centres, index)
+        system = self._system(centres, bandwidth, index, inside, degree, image if shrunk else None)
+        solution = system.solve(image)
+        influence = np.empty((len(centres), 0, *solution.shape[1:]))
+        if wants_influence:
+            influence = system.influence(image, solution)
+        derivatives = solution * system.scale
+        value = centres + reference + derivatives[:, 0]
+        return LocalFit(value, derivatives, bandwidth, index, influence, system.effective)
+
+    def regress(
+        self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray, degree: int, signals: Signals
+    ) -> list["Regression"]:
+        """Fit what follows the neighbours, as `fit_within` fits their images: the same neighbours and weights.
+
+        `signals` returns it, (n, values), for positions (n,) among the arguments and these points (n, d) near a centre.
+        """
+        results = []
+        for centre, phase, width in zip(centres[:, None], phases[:, None], bandwidths[:, None], strict=True):
+            index, inside, bandwidth = self._within(centre, phase, width, degree)
+            index, inside = index[:, inside[0]], inside[:, inside[0]]
+            system = self._system(centre, bandwidth, index, inside, degree, self._images(centre, index)[0])
+            target = signals(index[0], centre + self.wrap(self.arguments[index[0]] - centre))
+            reference, target = target[:1], (target - target[:1])[None]
+            solution = system.solve(target)
+            derivatives = (solution * system.scale)[0]
+            weights = (system.inverse @ system.regressors)[0, 0]
+            slopes, influence = derivatives[1 : 1 + len(self.turn)], system.influence(target, solution)[0, :, 0]
+            results.append(
+                Regression(reference[0] + derivatives[0], slopes, index[0], influence, float(np.sum(weights**2)))
+            )
+        return results
+
+    def _images(self, centres: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return images of arguments (m, n, d) relative to one of them, and that one (m, d) relative to the centre."""
+        image = self.wrap(self.arguments[index] - centres[:, None]) + self.increments[index]
         reference = image[:, :1]
         image = image - reference
-        if not self.winds:
-            image = self.wrap(image)
+        return image if self.winds else self.wrap(image), reference[:, 0]
+
+    def _system(
+        self, centres: np.ndarray, bandwidth: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int,
+        shrinking: np.ndarray | None,
+    ) -> "_NormalEquations":  # fmt: skip
+        """Return the normal equations of fits; the residuals of the images `shrinking` determine their shrinkage."""
+        away = self.wrap(self.arguments[index] - centres[:, None])
         by_coordinate = _deconvoluted(away / bandwidth[:, None, None], self.noise / bandwidth[:, None], 2 * degree)
         by_coordinate[0] *= inside[:, None]
         d, weight = len(by_coordinate), by_coordinate[0][:, 0]
-        powers, products = monomials(d, degree), monomials(d, 2 * degree)
+        powers = monomials(d, degree)
         regressors = _products(by_coordinate, powers)
         # The sums of products by powers of the last coordinate: one matrix product.
         others = monomials(d - 1, 2 * degree)
         table = _products(by_coordinate[:-1], others) @ by_coordinate[-1].mT
         sums = powers[:, None] + powers
         row = np.argmax(np.all(sums[..., None, :-1] == others, axis=-1), axis=-1)
-        normal, target = table[:, row, sums[..., -1]], regressors @ image
+        normal = table[:, row, sums[..., -1]]
         inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
-        solution = inverse @ target
         effective = weight.sum(1) ** 2 / (weight**2).sum(1)
-        if d > 2 and shrunk:
-            rest = np.einsum("mn,mnc->mc", weight, image**2) - (solution * target).sum(1)
+        order = powers.sum(1)
+        if d > 2 and shrinking is not None:
+            target = regressors @ shrinking
+            rest = np.einsum("mn,mnc->mc", weight, shrinking**2) - (inverse @ target * target).sum(1)
             free = np.maximum(effective - len(powers), 1.0) / effective
             variance = np.maximum(rest, 0.0).max(1) / weight.sum(1) / free
-            order = powers.sum(1)
             prior = STEEPEST_SLOPE * bandwidth[:, None] * (bandwidth[:, None] / CURVATURE_LENGTH) ** (order - 1.0)
             shrinkage = np.where(order > 0, variance[:, None] / prior**2, 0.0)
             inverse = np.linalg.pinv(normal + shrinkage[:, :, None] * np.eye(len(powers)), rcond=1e-10, hermitian=True)
-            solution = inverse @ target
-        scale = (factorial(powers).prod(1) / bandwidth[:, None] ** powers.sum(1))[..., None]
-        influence = np.empty((len(centres), 0, len(powers), d))
-        if wants_influence:
-            # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
-            functions = _products(by_coordinate, products)
-            belongs = np.all(sums[..., None, :] == products, axis=-1).astype(float)
-            fitted = np.einsum("abf,mbc,mka->mkcf", belongs, solution, inverse, optimize=True)
-            residual = (inverse @ regressors)[:, :, None] * image.mT[:, None]
-            residual -= (fitted.reshape(len(centres), -1, len(products)) @ functions).reshape(residual.shape)
-            leverage = np.clip(np.einsum("mab,abf->mf", inverse, belongs)[:, None] @ functions, 0.0, MOST_LEVERAGE)
-            influence = (residual * scale[..., None] / (1.0 - leverage)[:, None]).transpose(0, 3, 1, 2)
-        derivatives = solution * scale
-        value = centres + reference[:, 0] + derivatives[:, 0]
-        return LocalFit(value, derivatives, bandwidth, index, influence, effective)
+        scale = (factorial(powers).prod(1) / bandwidth[:, None] ** order)[..., None]
+        return _NormalEquations(by_coordinate, degree, regressors, inverse, scale, effective)
+
+
+class _NormalEquations(NamedTuple):
+    """Normal equations of local polynomials about m centres, with n neighbours each."""
+
+    by_coordinate: list[np.ndarray]  # see `_deconvoluted`
+    degree: int
+    regressors: np.ndarray  # (m, terms, n)
+    inverse: np.ndarray  # (m, terms, terms)
+    scale: np.ndarray  # derivatives over coefficients, (m, terms, 1)
+    effective: np.ndarray  # effective number of neighbours, (m,)
+
+    def solve(self, target: np.ndarray) -> np.ndarray:
+        """Return the coefficients (m, terms, values) of polynomials through targets (m, n, values)."""
+        return self.inverse @ (self.regressors @ target)
+
+    def influence(self, target: np.ndarray, solution: np.ndarray) -> np.ndarray:
+        """Return the contribution (m, n, terms, values) of each neighbour to the error of the derivatives."""
+        # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
+        d = len(self.by_coordinate)
+        powers, products = monomials(d, self.degree), monomials(d, 2 * self.degree)
+        functions = _products(self.by_coordinate, products)
+        belongs = np.all((powers[:, None] + powers)[..., None, :] == products, axis=-1).astype(float)
+        fitted = np.einsum("abf,mbc,mka->mkcf", belongs, solution, self.inverse, optimize=True)
+        residual = (self.inverse @ self.regressors)[:, :, None] * target.mT[:, None]
+        residual -= (fitted.reshape(len(target), -1, len(products)) @ functions).reshape(residual.shape)
+        leverage = np.clip(np.einsum("mab,abf->mf", self.inverse, belongs)[:, None] @ functions, 0.0, MOST_LEVERAGE)
+        return (residual * self.scale[..., None] / (1.0 - leverage)[:, None]).transpose(0, 3, 1, 2)
 
 
 def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.ndarray]:

@@ -57,9 +57,10 @@ class PoincareSection(Result):
     instants : array (count,) or None
         Times of the points [s].
     time, signals : array (samples,), array (samples, channels), or None
-        The recording, one column a channel in the order of the coordinates, angles unwrapped; None for points alone.
+        The recording, angles unwrapped, one column a channel: those of the coordinates in their order, then `others`;
+        None for points alone.
     values : int
-        Number of measured values.
+        Number of measured values of the coordinates.
     synthetic : bool
         True if the data were simulated.
     stretches : array (count,) of int, or None
@@ -69,6 +70,9 @@ class PoincareSection(Result):
         First sample of each stretch, by its number; None for points alone, or if there is no break.
     left_out : int
         Number of returns between the first and the last point of which the points are in gaps; 0 for crossings.
+    others, inputs : tuple of str
+        Further channels of the recording (of all recordings), outputs and then inputs, and those of them that are
+        inputs.
 
     Examples
     --------
@@ -98,6 +102,8 @@ class PoincareSection(Result):
     stretches: np.ndarray | None = None
     starts: np.ndarray | None = None
     left_out: int = 0
+    others: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
 
     @classmethod
     def from_recording(
@@ -205,11 +211,11 @@ class PoincareSection(Result):
         frequency = _checks.positive("frequency", frequency)
         origin = _checks.finite_number("origin", origin)
         given = _recordings(recordings)
-        signals = []
-        for recording in given:
-            names, angle_names, values = coordinate_signals(recording, coordinates, angles)
-            signals.append(values)
-        samples = _unwrapped(joined(given, signals, frequency), np.isin(channels_of(names), angle_names))
+        parts = [coordinate_signals(recording, coordinates, angles) for recording in given]
+        names, angle_names = parts[0][:2]
+        others, inputs = _other_channels(given, names)
+        signals = [_with_others(one, values, others) for one, (*_, values) in zip(given, parts, strict=True)]
+        samples = _unwrapped(joined(given, signals, frequency), np.isin((*channels_of(names), *others), angle_names))
         if samples.sampling_rate < FEWEST_SAMPLES * frequency:
             rate = f"{samples.sampling_rate / frequency:.3g}"
             raise ValueError(
@@ -220,7 +226,9 @@ class PoincareSection(Result):
         longest_window(names, samples.sampling_rate / frequency)
         instants, stretch, left_out = samples.instants(frequency, origin, (delays.min(), delays.max()))
         synthetic = any(recording.synthetic for recording in given)
-        section = cls._of(samples, names, angle_names, instants, stretch, left_out, synthetic, frequency)
+        section = cls._of(
+            samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency
+        )
         extent = np.ptp(samples.signals, axis=0)[columns_of(names)]
         if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * extent):
             raise ValueError(
@@ -272,7 +280,9 @@ class PoincareSection(Result):
         level = _checks.finite_number("level", level)
         if direction not in (1, -1):
             raise ValueError(f"direction: must be 1 (upwards) or -1 (downwards), got {direction!r}.")
-        samples = _unwrapped(joined([recording], [signals], None), np.isin(names, angle_names))
+        others, inputs = _other_channels([recording], names)
+        signals = _with_others(recording, signals, others)
+        samples = _unwrapped(joined([recording], [signals], None), np.isin((*names, *others), angle_names))
         height = direction * (recording.outputs[channel] - level)
         band, crossings = CROSSING_BAND * height.std(), []
         for start, stop in zip(samples.starts, samples.stops, strict=True):
@@ -282,7 +292,7 @@ class PoincareSection(Result):
             )
         stretch = np.repeat(np.arange(len(crossings)), [one.size for one in crossings])
         instants = np.concatenate(crossings)
-        return cls._of(samples, names, angle_names, instants, stretch, 0, recording.synthetic)
+        return cls._of(samples, names, angle_names, instants, stretch, 0, recording.synthetic, others, inputs)
 
     @classmethod
     def from_points(
@@ -335,7 +345,8 @@ class PoincareSection(Result):
     @classmethod
     def _of(
         cls, samples: Stretches, names: tuple[str, ...], angles: tuple[str, ...], instants: np.ndarray,
-        stretch: np.ndarray, left_out: int, synthetic: bool, frequency: float | None = None,
+        stretch: np.ndarray, left_out: int, synthetic: bool, others: tuple[str, ...], inputs: tuple[str, ...],
+        frequency: float | None = None,
     ) -> "PoincareSection":  # fmt: skip
         """Return the section of signals at given instants; the frequency is by default that of the instants."""
         _check_count(instants.size)
@@ -346,9 +357,12 @@ class PoincareSection(Result):
         usual = float(np.median(np.diff(instants)))
         values, noise = coordinate_values(samples, names, instants, stretch, frequency, usual)
         points, increments = wrapped(values, np.isin(names, angles)), _within(np.diff(values, axis=0), stretch)
-        breaks = (stretch, samples.starts, left_out) if samples.starts.size > 1 else (None, None, left_out)
-        measured = (instants, time, samples.signals, samples.signals.size, synthetic)
-        return cls(points, names, angles, frequency, increments, True, noise, *measured, *breaks)
+        broken = samples.starts.size > 1
+        return cls(
+            points, names, angles, frequency, increments, True, noise, instants, time, samples.signals,
+            time.size * len(channels_of(names)), synthetic, stretch if broken else None,
+            samples.starts if broken else None, left_out, others, inputs,
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.points)
@@ -374,7 +388,7 @@ class PoincareSection(Result):
         channel, delay = channel_and_delay(coordinate)
         channels = channels_of(self.coordinates)
         _checks.one_of("coordinate", channel, channels)
-        measured = self._measured
+        measured = self.measured
         if measured is None:
             return None
         samples, instants, stretch = measured
@@ -384,8 +398,13 @@ class PoincareSection(Result):
         return np.where((first <= at) & (at <= last), values[:, 0], np.nan)
 
     @property
-    def _measured(self) -> tuple[Stretches, np.ndarray, np.ndarray] | None:
-        """The recording, the times of the points, and the stretch of each; None for points alone."""
+    def channels(self) -> tuple[str, ...]:
+        """The channels of the recording, in the order of `signals`."""
+        return (*channels_of(self.coordinates), *self.others)
+
+    @property
+    def measured(self) -> tuple[Stretches, np.ndarray, np.ndarray] | None:
+        """The recording, the times of the points (count,), and the stretch of each (count,); None for points alone."""
         if self.instants is None or self.time is None or self.signals is None:
             return None
         starts = np.zeros(1, dtype=np.int64) if self.starts is None else self.starts
@@ -415,7 +434,7 @@ class PoincareSection(Result):
             For points alone, and for delays of a channel that are too close modulo a step.
         """
         steps = _checks.integer("steps", steps, 1)
-        measured = self._measured
+        measured = self.measured
         if measured is None:
             raise ValueError(f"steps: must be 1 for points alone, got {steps}. Make the section of a recording.")
         samples, returns, stretch = measured
@@ -453,7 +472,7 @@ class PoincareSection(Result):
         ValueError
             If the returns are not in one unbroken stretch.
         """
-        measured = self._measured
+        measured = self.measured
         if measured is None:
             return None
         inside = 0 <= index and index + period < len(self)
@@ -468,6 +487,7 @@ class PoincareSection(Result):
         values = local_fit(recorded, at, np.full(samples * period, stretch[index]))[0]
         channels = channels_of(self.coordinates)
         turning = np.isin(channels, self.angles)
+        values = values[:, : len(channels)]
         values += np.where(turning, wrapped(values[0]) - values[0], 0.0)
         return dict(zip(channels, values.T, strict=True))
 
@@ -496,6 +516,23 @@ def _recordings(recordings: Iterable[Recording]) -> list[Recording]:
     for k, recording in enumerate(given):
         _checks.instance(f"recordings[{k}]", recording, Recording)
     return given
+
+
+def _other_channels(
+    recordings: Sequence[Recording], coordinates: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the channels of all recordings that are none of the coordinates, inputs last, and the inputs."""
+    outputs, inputs = (
+        tuple(c for c in getattr(recordings[0], kind) if all(c in getattr(one, kind) for one in recordings))
+        for kind in ("outputs", "inputs")
+    )
+    return tuple(c for c in (*outputs, *inputs) if c not in channels_of(coordinates)), inputs
+
+
+def _with_others(recording: Recording, signals: np.ndarray, others: Sequence[str]) -> np.ndarray:
+    """Return signals (samples, channels) with those of other channels in further columns."""
+    every = {**recording.outputs, **recording.inputs}
+    return np.column_stack([signals, *(every[name] for name in others)])
 
 
 def _unwrapped(samples: Stretches, turning: np.ndarray) -> Stretches:

@@ -106,42 +106,70 @@ def smoothed(
 
     Windows are no longer than `longest`.
 
-    Polynomials of degree 7 are fitted in windows of increasing width. For white noise the expected squared difference
-    between a narrow and a wide estimate is known except for the squared bias of the wide one; the excess is tested for
-    significance. Bias is proportional to the eighth power of the width, so in a window 1.6 times narrower than the
-    first significant one it is 40 times smaller, and negligible even in averages over hundreds of instants.
-
+    Each channel has its widest window without bias, see `unbiased_windows`.
     Where a stretch ends within the window, the smallest one is used, beside the instant if necessary. The standard
     deviation is NaN if there are too few other instants.
     """
-    narrow, narrow_gain, _ = local_fit(samples, at, stretch)
     widest = max(SMALLEST_WINDOW, int(0.5 * samples.sampling_rate * longest))
     inner = samples.windows(at, stretch, max(widest, NOISE_SAMPLES // 2))[1]
     if np.count_nonzero(inner) < FEWEST_INSTANTS:
-        return narrow, np.nan
+        return local_fit(samples, at, stretch)[0], np.nan
     inside = at[inner], stretch[inner]
-    # A higher degree on few samples: noise dominates the residual.
-    variance = local_fit(samples, *inside, NOISE_SAMPLES // 2, NOISE_DEGREE)[2].mean(0)
-    count = narrow.shape[1]
-    halves, unbiased = [SMALLEST_WINDOW], np.ones(count, dtype=bool)
-    first_biased = np.full(count, widest)
-    while (half := halves[-1] + max(1, halves[-1] // 5)) <= widest and unbiased.any():
-        wide, gain, _ = local_fit(samples, *inside, half)
-        squared = (wide - narrow[inner]) ** 2
-        bias = squared.mean(0) - variance * (narrow_gain[inner].mean() - gain.mean())
-        biased = unbiased & (bias > 2.0 * squared.std(0) / np.sqrt(len(wide)))
-        first_biased[biased], unbiased[biased] = half, False
-        halves.append(half)
-    values, sd = narrow.copy(), np.sqrt(variance * narrow_gain.mean())
-    for channel in range(count):
-        half = max(h for h in halves if h == SMALLEST_WINDOW or h * WINDOW_MARGIN <= first_biased[channel])
+    variance = noise_variance(samples, *inside)
+    halves = unbiased_windows(samples, *inside, widest, variance)
+    values, gains = windowed(samples, at, stretch, halves)
+    return values, np.sqrt(variance * gains.mean(axis=0))
+
+
+def windowed(
+    samples: Stretches, at: np.ndarray, stretch: np.ndarray, halves: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return signals at given instants, and their variances for unit noise, (instants, channels) each.
+
+    Each channel has its window, of which `halves` are half the numbers of samples; where a stretch ends within the
+    window, the smallest one is used.
+    """
+    values, gain, _ = local_fit(samples, at, stretch)
+    gains = np.repeat(gain[:, None], values.shape[1], axis=1)
+    for channel, half in enumerate(halves):
         if half > SMALLEST_WINDOW:
             fits = samples.windows(at, stretch, half)[1]
             one = samples._replace(signals=samples.signals[:, [channel]])
-            fitted, gain, _ = local_fit(one, at[fits], stretch[fits], half)
-            values[fits, channel] = fitted[:, 0]
-            sd[channel] = np.sqrt(variance[channel] * (gain.sum() + narrow_gain[~fits].sum()) / at.size)
-    return values, sd
+            fitted, wide, _ = local_fit(one, at[fits], stretch[fits], half)
+            values[fits, channel], gains[fits, channel] = fitted[:, 0], wide
+    return values, gains
+
+
+def noise_variance(samples: Stretches, at: np.ndarray, stretch: np.ndarray) -> np.ndarray:
+    """Return the variance (channels,) of white noise of the samples, from those about given instants."""
+    # A higher degree on few samples: noise dominates the residual.
+    return local_fit(samples, at, stretch, NOISE_SAMPLES // 2, NOISE_DEGREE)[2].mean(0)
+
+
+def unbiased_windows(
+    samples: Stretches, at: np.ndarray, stretch: np.ndarray, widest: int, variance: np.ndarray
+) -> list[int]:
+    """Return half the number of samples in the widest window without bias, for each channel.
+
+    Polynomials of degree 7 are fitted in windows of increasing width about given instants, up to twice `widest`
+    samples. For white noise of a variance (channels,) the expected squared difference between a narrow and a wide
+    estimate is known except for the squared bias of the wide one; the excess is tested for significance. Bias is
+    proportional to the eighth power of the width, so in a window 1.6 times narrower than the first significant one it
+    is 40 times smaller, and negligible even in averages over hundreds of instants.
+    """
+    narrow, narrow_gain, _ = local_fit(samples, at, stretch)
+    halves, unbiased = [SMALLEST_WINDOW], np.ones(variance.size, dtype=bool)
+    first_biased = np.full(variance.size, widest)
+    while (half := halves[-1] + max(1, halves[-1] // 5)) <= widest and unbiased.any():
+        wide, gain, _ = local_fit(samples, at, stretch, half)
+        squared = (wide - narrow) ** 2
+        bias = squared.mean(0) - variance * (narrow_gain.mean() - gain.mean())
+        biased = unbiased & (bias > 2.0 * squared.std(0) / np.sqrt(len(wide)))
+        first_biased[biased], unbiased[biased] = half, False
+        halves.append(half)
+    return [
+        max(h for h in halves if h == SMALLEST_WINDOW or h * WINDOW_MARGIN <= first) for first in first_biased.tolist()
+    ]
 
 
 def local_fit(

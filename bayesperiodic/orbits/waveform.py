@@ -1,0 +1,282 @@
+"""Waveforms of orbits: all channels over the period, by local regression of the motion that follows the points.
+
+A closed point has neighbours in the section, and the motion of each until the next point is measured. A polynomial like
+that of the return map, with the same neighbours, weights and correction for noise, is fitted to this motion at many
+phases, a linear one for inputs; its value at the closed point is the orbit's waveform from there to its next point.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from math import lcm
+from typing import NamedTuple
+
+import numpy as np
+
+from bayesperiodic import _checks
+from bayesperiodic._io import Storable
+from bayesperiodic.orbits.coordinates import columns_of
+from bayesperiodic.orbits.cycles import REFINING_DEGREE, VALUE_GROWTH, WIDENED, Estimate, errors_by_run
+from bayesperiodic.orbits.return_map import ReturnMap
+from bayesperiodic.orbits.section import CYCLE_SAMPLES, PoincareSection
+from bayesperiodic.orbits.stretches import (
+    FEWEST_INSTANTS,
+    NOISE_SAMPLES,
+    SMALLEST_WINDOW,
+    noise_variance,
+    unbiased_windows,
+    windowed,
+)
+
+# Values a return whose windows do not overlap, so that the noise of their samples is independent.
+INDEPENDENT = 16
+# Inputs depend little on the motion, and are taken as exact in fits: linear polynomials have less noise. The bias of
+# their values is proportional to the second power of the bandwidth.
+INPUT_DEGREE, INPUT_GROWTH = 1, WIDENED**2 - 1.0
+# Instants from which windows are determined.
+WINDOW_INSTANTS = 2000
+# Degree of polynomials of errors of the size of the bias, over a part of the period.
+BIAS_DEGREE = 2
+TURN = 2.0 * np.pi
+# Fractional part of the golden ratio, which spreads instants evenly over the phases.
+SPREADING = 0.6180339887
+
+
+@dataclass(frozen=True)
+class Waveform(Storable):
+    """Waveform of an orbit over its period, with errors.
+
+    Attributes
+    ----------
+    values : mapping of str to array (samples·period,)
+        All channels of the section's recordings, inputs included, by name, from the section's phase on, the end
+        excluded; angles are continuous.
+    inputs : tuple of str
+        The channels that are inputs.
+    errors : array (errors, channels, samples·period)
+        Errors that the channels and phases have in common, each one standard deviation, independent of each other: of
+        the closed points, propagated by the slopes of the regression, and of the regression.
+    bias : array (channels, parts)
+        Root mean square of the estimated bias after each point: a part is a forcing period, or a step of `find_orbits`.
+    noise : array (channels, samples·period)
+        Standard deviation of further errors, which are independent at 16 phases a forcing period.
+
+    Notes
+    -----
+    The bias is estimated from the difference to wider neighbourhoods. It is not subtracted, and its course over the
+    phases is not used: errors of its size in each channel, after each point, may be any polynomial of degree two.
+
+    Examples
+    --------
+    An orbit of the chaotic pendulum:
+
+    >>> orbit = pendulum_orbits[0]
+    >>> waveform = orbit.waveform
+    >>> waveform.outputs, waveform.values["rate"].shape == (64 * orbit.period,)
+    (('angle', 'rate'), True)
+    """
+
+    values: Mapping[str, np.ndarray]
+    inputs: tuple[str, ...]
+    errors: np.ndarray
+    bias: np.ndarray
+    noise: np.ndarray
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The channels that are outputs."""
+        return tuple(name for name in self.values if name not in self.inputs)
+
+    @property
+    def sd(self) -> dict[str, np.ndarray]:
+        """Standard error of each value, by channel, (samples·period,)."""
+        total = np.sqrt(np.sum(self._common_errors**2, axis=0) + self.noise**2)
+        return dict(zip(self.values, total, strict=True))
+
+    @property
+    def _common_errors(self) -> np.ndarray:
+        """The errors, and smooth ones of the size of the bias, (n, channels, samples·period)."""
+        channels, parts = self.bias.shape
+        count = self.noise.shape[1] // parts
+        courses = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, count), BIAS_DEGREE).T
+        courses /= np.sqrt(np.mean(courses**2, axis=1, keepdims=True) * len(courses))
+        smooth = np.einsum("kt,cp,cd,pq->kcpdqt", courses, self.bias, np.eye(channels), np.eye(parts))
+        return np.concatenate([self.errors, smooth.reshape(-1, channels, parts * count)])
+
+    def covariance(self, channels: tuple[str, ...], every: int) -> np.ndarray:
+        """Compute the covariance of some channels at every so many phases.
+
+        Parameters
+        ----------
+        channels : tuple of str
+        every : int
+            Distance of the phases, in samples.
+
+        Returns
+        -------
+        array (values, values)
+            Phase by phase, and in the order of the channels within a phase.
+
+        Raises
+        ------
+        ValueError
+            For an unknown channel.
+        """
+        for name in channels:
+            _checks.one_of("channels", name, self.values)
+        columns = [list(self.values).index(name) for name in channels]
+        errors = self._common_errors[:, columns, ::every]
+        flat = errors.transpose(0, 2, 1).reshape(len(errors), -1)
+        return flat.T @ flat + np.diag(self.noise[columns, ::every].T.ravel() ** 2)
+
+
+def mean_of_repeats(waveform: Waveform, times: int, angles: Iterable[str]) -> Waveform:
+    """Return the mean of the repeats of a waveform that repeats itself so many times."""
+    values = {}
+    for name, whole in waveform.values.items():
+        repeats = whole.reshape(times, -1)
+        turns = np.round((repeats[:, :1] - repeats[:1, :1]) / TURN) if name in angles else 0.0
+        values[name] = np.mean(repeats - TURN * turns, axis=0)
+    errors = waveform.errors.reshape(*waveform.errors.shape[:2], times, -1).mean(axis=2)
+    noise = np.sqrt(np.mean(waveform.noise.reshape(len(waveform.noise), times, -1) ** 2, axis=1) / times)
+    bias = waveform.bias.reshape(len(waveform.bias), times, -1).mean(axis=1)
+    return Waveform(values, waveform.inputs, errors, bias, noise)
+
+
+class Following:
+    """The measured motion from each argument of a return map to its image."""
+
+    def __init__(self, section: PoincareSection, maps: ReturnMap, size: np.ndarray):
+        measured = section.measured
+        assert measured is not None
+        self._samples, instants, stretch = measured
+        self._size, self.channels, self.inputs = size, section.channels, section.inputs
+        first_input = len(self.channels) - len(self.inputs)
+        self.outputs, self.driven = slice(0, first_input), slice(first_input, None)
+        returns, step = np.divmod(maps.positions, maps.steps)
+        self._length = (instants[returns + 1] - instants[returns]) / maps.steps
+        self._start, self._stretch = instants[returns] + step * self._length, stretch[returns]
+        # Samples from a point to the next one; INDEPENDENT of a return are equally spaced.
+        spaced = lcm(INDEPENDENT, maps.steps)
+        self.count = spaced * -(-CYCLE_SAMPLES // spaced) // maps.steps
+        self.angles = [
+            (k, column)
+            for k, (name, column) in enumerate(zip(section.coordinates, columns_of(section.coordinates), strict=True))
+            if name in section.angles
+        ]
+        self._halves, self.variance = self._windows(maps.steps)
+
+    def _windows(self, steps: int) -> tuple[list[int], np.ndarray]:
+        """Return half the number of samples in each channel's window, and the variance of the values' noise.
+
+        Windows are at most 1/INDEPENDENT of a return.
+        """
+        some = np.arange(0, self._start.size, -(-self._start.size // WINDOW_INSTANTS))
+        at, stretch = self._start[some] + self._length[some] * (SPREADING * some % 1.0), self._stretch[some]
+        longest = float(np.median(self._length)) * steps / INDEPENDENT
+        widest = max(SMALLEST_WINDOW, int(0.5 * self._samples.sampling_rate * longest))
+        inner = self._samples.windows(at, stretch, max(widest, NOISE_SAMPLES // 2))[1]
+        enough = np.count_nonzero(inner) >= FEWEST_INSTANTS
+        if enough:
+            at, stretch = at[inner], stretch[inner]
+        variance = noise_variance(self._samples, at, stretch)
+        halves = [SMALLEST_WINDOW] * variance.size
+        if enough:
+            halves = unbiased_windows(self._samples, at, stretch, widest, variance)
+        return halves, variance * windowed(self._samples, at, stretch, halves)[1].mean(axis=0)
+
+    def signals(self, index: np.ndarray, near: np.ndarray, columns: slice) -> np.ndarray:
+        """Return channels (n, samples·channels) after arguments (n,), whose angles are as in the points (n, d)."""
+        phases = np.arange(self.count) / self.count
+        at = self._start[index, None] + self._length[index, None] * phases
+        values, _ = windowed(self._samples, at.ravel(), np.repeat(self._stretch[index], self.count), self._halves)
+        values = values.reshape(len(index), self.count, -1)
+        for k, column in self.angles:
+            away = near[:, k] * self._size[k] - values[:, 0, column]
+            values[:, :, column] += TURN * np.round(away / TURN)[:, None]
+        return values[:, :, columns].reshape(len(index), -1)
+
+
+class _MotionPart(NamedTuple):
+    """Motion from a point of a cycle to the next one."""
+
+    values: np.ndarray  # (samples, channels)
+    errors: np.ndarray  # of each run of neighbours, (runs, samples, channels)
+    bias: np.ndarray  # rms over the samples, (channels,)
+    gain: np.ndarray  # variance of the values for independent errors of unit variance, (channels,)
+
+
+def waveform_of(following: Following, maps: ReturnMap, estimate: Estimate, shift: int) -> Waveform:
+    """Return the waveform of a refined cycle from its point `shift` returns after the first one on."""
+    parts = _parts(following, maps, estimate, following.outputs, REFINING_DEGREE, VALUE_GROWTH)
+    if following.inputs:
+        inputs = _parts(following, maps, estimate, following.driven, INPUT_DEGREE, INPUT_GROWTH)
+        parts = [
+            _MotionPart(*(np.concatenate(two, axis=-1) for two in zip(*both, strict=True)))
+            for both in zip(parts, inputs, strict=True)
+        ]
+    parts = [parts[j] for j in (np.arange(len(parts)) + maps.steps * shift) % len(parts)]
+    motion = _continuous([part.values for part in parts], following)
+    errors = np.concatenate([part.errors for part in parts], axis=1).transpose(0, 2, 1)
+    common, rest = _common(errors, np.std(motion, axis=0), 2 * estimate.points.size)
+    gains = np.repeat(np.stack([part.gain for part in parts], axis=1), following.count, axis=1)
+    noise = np.sqrt(np.maximum(rest[:, None], following.variance[:, None] * gains))
+    bias = np.stack([part.bias for part in parts], axis=1)
+    return Waveform(dict(zip(following.channels, motion.T, strict=True)), following.inputs, common, bias, noise)
+
+
+def _parts(
+    following: Following, maps: ReturnMap, estimate: Estimate, columns: slice, degree: int, growth: float
+) -> list[_MotionPart]:
+    """Return the motion of some channels after each point, by polynomials of some degree.
+
+    The bias is the difference to wider neighbourhoods over `growth`.
+    """
+    fits = estimate.fits
+    assert fits is not None
+    signals = partial(following.signals, columns=columns)
+    phases = maps.phases(np.arange(len(estimate.points)))
+    narrow = maps.regress(estimate.points, phases, fits.bandwidths, degree, signals)
+    wide = maps.regress(fits.wide_points, phases, WIDENED * fits.bandwidths, degree, signals)
+    pairs, runs, by_run = errors_by_run(maps, fits.narrow)
+    d, parts = estimate.points.shape[1], []
+    for j, (fit, other) in enumerate(zip(narrow, wide, strict=True)):
+        errors = by_run[:, d * j : d * (j + 1)] @ fit.slopes
+        np.add.at(errors, runs[np.searchsorted(pairs, maps.positions[fit.neighbours])], fit.influence)
+        away = (other.value - fit.value).reshape(following.count, -1)
+        if columns == following.outputs:
+            away = _without_turns(away, following)
+        bias = np.sqrt(np.mean(away**2, axis=0)) / growth
+        values, errors = fit.value.reshape(away.shape), errors.reshape(len(errors), *away.shape)
+        parts.append(_MotionPart(values, errors, bias, np.full(bias.size, fit.gain)))
+    return parts
+
+
+def _without_turns(difference: np.ndarray, following: Following) -> np.ndarray:
+    """Return the difference of two motions (samples, channels) without whole turns of angles."""
+    result = np.array(difference)
+    for _, column in following.angles:
+        result[:, column] -= TURN * np.round(result[0, column] / TURN)
+    return result
+
+
+def _continuous(parts: list[np.ndarray], following: Following) -> np.ndarray:
+    """Return parts (samples, channels) of a motion as one, angles continuous from (−π, π] on."""
+    motion = np.concatenate(parts)
+    for _, column in following.angles:
+        motion[:, column] = np.unwrap(motion[:, column])
+        motion[:, column] -= TURN * np.ceil((motion[0, column] - np.pi) / TURN)
+    return motion
+
+
+def _common(errors: np.ndarray, size: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest principal components of errors (n, channels, samples), and the others' variance (channels,).
+
+    The errors of the closed points and those of the neighbours' points are propagated by the slopes of the regression:
+    they have as many components each as there are coordinates of all points. The rest is noise of single samples.
+    """
+    scale = np.where(size > 0.0, size, 1.0)[:, None]
+    _, values, axes = np.linalg.svd((errors / scale).reshape(len(errors), -1), full_matrices=False)
+    kept = (values[:most, None] * axes[:most]).reshape(-1, *errors.shape[1:]) * scale
+    rest = np.sum(errors**2, axis=0) - np.sum(kept**2, axis=0)
+    return kept, np.maximum(rest, 0.0).mean(axis=1)
