@@ -249,4 +249,11 @@ WITHOUT_RESULTS = {
         ),
         ELSEWHERE: ("Oscillations, 1979",),
     },
+    "docs/studies/structure.md": {
+        SETTING: (
+            "of 50 finite elements", "at 0.4 of its length", "noise of 0.02 N and 0.1 m/s²", "of 10 to 300 degrees",
+            "1.5 to 2 times off", "90 % interval |", "up to 4096 points", "within 0.05 of its limit",
+            "the stop within 20 µm",
+        ),
+    },
 }  # fmt: skip

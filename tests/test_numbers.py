@@ -888,6 +888,23 @@ def rounded_slider():
     )
 
 
+@on("docs/studies/structure.md")
+def beam_with_joint_and_stop():
+    given = results("structure")
+    rows = {
+        "alpha": ("damping α [1/s]", 1.0, 4), "joint_stiffness": ("stiffness of the joint [N/m]", 1.0, 0),
+        "joint_limit": ("limit of the joint [N]", 1.0, 4), "stop_k": ("stiffness of the stop [N/m]", 1.0, 1),
+        "stop_clearance": ("clearance of the stop [mm]", 1e3, 4),
+    }  # fmt: skip
+    for name, (label, unit, digits) in rows.items():
+        low, _, high = (unit * value for value in given["intervals"][name])
+        yield f"| {label} | {unit * given['truth'][name]:g} | {low:.{digits}f} to {high:.{digits}f} |"
+    yield (
+        f"Estimate and posterior take {given['processor_seconds']:.0f} s of processor time, and the study "
+        f"{given['memory_GB']:.1f} GB of memory."
+    )
+
+
 @on("docs/reference/files.md")
 def formats():
     """Yield the number of damaged files, and each row of the table, whose tests must exist."""

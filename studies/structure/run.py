@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import scipy.io
 import scipy.sparse
+from matplotlib.figure import Figure
 
 import bayesperiodic as bp
 from studies import common
@@ -29,6 +30,15 @@ PRIORS = {
     "joint_limit": bp.LogNormal(0.5, 1.0),
     "stop_k": bp.LogNormal(2000.0, 1.0),
     "stop_clearance": bp.LogNormal(3e-3, 0.5),
+}
+UNITS = {
+    "alpha": "1/s",
+    "joint_stiffness": "N/m",
+    "joint_limit": "N",
+    "stop_k": "N/m",
+    "stop_clearance": "m",
+    "variance[middle]": "(m/s²)²",
+    "variance[outer]": "(m/s²)²",
 }
 FRICTION_WIDTH, STOP_WIDTH = 0.05, 2e-5  # of the limit; m
 
@@ -103,9 +113,8 @@ def run(options: argparse.Namespace) -> None:
     print(posterior)
     processor = time.process_time() - processor
     with watch.part("report", "report"):
-        bp.report(problem, fit, posterior, options.out / "report.html")
-        corner = bp.plot.corner(posterior, laplace=fit, problem=problem, truths={n: beam.TRUTH[n] for n in PRIORS})
-        figures = {"corner": common.titled(corner, "Beam with joint and stop (synthetic data)")}
+        bp.report(problem, fit, posterior, folder / "report.html")
+        figures = {"corner": corner(problem, fit, posterior)}
     results: dict[str, Any] = {
         "seed": options.seed,
         "degrees_of_freedom": 2 * beam.ELEMENTS,
@@ -122,3 +131,13 @@ def run(options: argparse.Namespace) -> None:
 def intervals(posterior: bp.Posterior) -> dict[str, list[float]]:
     """Return the 5, 50 and 95 % quantiles of the parameters."""
     return {n: np.quantile(posterior.draws(n), [0.05, 0.5, 0.95]).tolist() for n in PRIORS}
+
+
+def corner(problem: bp.Problem, fit: bp.MapEstimate, posterior: bp.Posterior) -> Figure:
+    """Return the joint posterior with the true values."""
+    figure = bp.plot.corner(posterior, laplace=fit, problem=problem, truths={n: beam.TRUTH[n] for n in PRIORS})
+    for axes in figure.axes:
+        for set_label, name in ((axes.set_xlabel, axes.get_xlabel()), (axes.set_ylabel, axes.get_ylabel())):
+            if name:
+                set_label(f"{name}\n[{UNITS[name]}]")
+    return common.titled(figure, "Beam with joint and stop (synthetic data)")
