@@ -113,7 +113,8 @@ def find_orbits(
         atlas = Atlas(maps, _search_count(maps, neighbours))
         pairs = [pair for p in wanted for pair in _chained(maps, atlas, p, neighbours)]
     quality_count = _search_count(maps, FEWEST_NEIGHBOURS)
-    orbits = [_orbit(section, maps, size, *pair, _quality(maps, *pair, quality_count)) for pair in pairs]
+    extent = _extent(section)
+    orbits = [_orbit(section, maps, size, extent, *pair, _quality(maps, *pair, quality_count)) for pair in pairs]
     finished = _finished(orbits, maps, size)
     return Orbits(finished, values=section.values, method=method, prediction_error=prediction)
 
@@ -214,9 +215,18 @@ def _largest_sd(estimate: Estimate) -> float:
     return float(np.sqrt(np.diag(estimate.covariance)[: estimate.points.size].max()))
 
 
+def _extent(section: PoincareSection) -> np.ndarray | None:
+    """Return the ranges (channels,) of the recorded signals, of angles at most a turn; None without a recording."""
+    if section.signals is None:
+        return None
+    extent = np.array([np.ptp(signal) for signal in section.signals.T])
+    return np.where(np.isin(channels_of(section.coordinates), section.angles), np.minimum(extent, 2.0 * np.pi), extent)
+
+
 def _orbit(
-    section: PoincareSection, maps: ReturnMap, size: np.ndarray, candidate: MapCycle, estimate: Estimate, quality: float
-) -> Orbit:
+    section: PoincareSection, maps: ReturnMap, size: np.ndarray, extent: np.ndarray | None, candidate: MapCycle,
+    estimate: Estimate, quality: float,
+) -> Orbit:  # fmt: skip
     count, d = estimate.points.shape
     period = count // maps.steps
     # The orbit starts at the point that belongs to the start of the measured cycle.
@@ -234,13 +244,11 @@ def _orbit(
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
     still = False
-    if cycle is not None and section.signals is not None:
+    if cycle is not None and extent is not None:
         for column in np.flatnonzero(maps.angle):
             values = cycle[section.coordinates[column]]
             values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
         # It moves no more than by noise and its distance to the orbit.
-        extent = np.ptp(section.signals, axis=0)
-        extent = np.where(np.isin(list(cycle), section.angles), np.minimum(extent, 2.0 * np.pi), extent)
         limit = (STILL_RANGE + STILL_NOISE * maps.noise.max()) * extent
         still = bool(np.all(np.ptp(np.stack(list(cycle.values())), axis=1) < limit))
     return Orbit(
