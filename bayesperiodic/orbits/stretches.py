@@ -164,9 +164,12 @@ def local_fit(
         local = signals[index]
         reference = local[:, half]
         local = local - reference[:, None]
-        weights = basis @ np.linalg.solve(normal, np.broadcast_to(centre[:, None], (len(index), degree + 1, 1)))
+        projected = basis.transpose(0, 2, 1) @ local
+        centres = np.broadcast_to(centre[:, None], (len(index), degree + 1, 1))
+        solved = np.linalg.solve(normal, np.concatenate([centres, projected], axis=2))
+        weights = basis @ solved[..., :1]
         values.append(reference + (weights.transpose(0, 2, 1) @ local)[:, 0])
         gains.append((weights[..., 0] ** 2).sum(1))
-        residual = local - basis @ np.linalg.solve(normal, basis.transpose(0, 2, 1) @ local)
+        residual = local - basis @ solved[..., 1:]
         residuals.append((residual**2).sum(1) / free)
     return np.concatenate(values), np.concatenate(gains), np.concatenate(residuals)
