@@ -195,19 +195,19 @@ def _search_count(maps: ReturnMap, neighbours: int) -> int:
 
 def _chained(maps: ReturnMap, atlas: Atlas, period: int, neighbours: int) -> list[tuple[MapCycle, Estimate]]:
     pairs: list[tuple[MapCycle, Estimate]] = []
-
-    def same(one: Estimate, other: Estimate) -> bool:
-        distance, _ = cycles.shift_between(one.points[:: maps.steps], other.points[:: maps.steps], maps.wrap)
-        return distance < max(1e-3, 2.0 * max(_largest_sd(one), _largest_sd(other)))
-
+    before: list[np.ndarray] = []
+    sds: list[float] = []
     for candidate in cycles.candidates(maps, atlas, period):
         estimate = cycles.refine(maps, candidate.points, neighbours)
         if estimate is None or not (sd := _largest_sd(estimate)) < LARGEST_SD:
             continue
         returns = estimate.points[:: maps.steps]
         repeats = cycles.has_shorter_period(returns, maps.wrap, max(2e-3, 3.0 * sd))
-        if not repeats and not any(same(estimate, other) for _, other in pairs):
+        distances, _ = cycles.shifts_between(returns, before, maps.wrap)
+        if not repeats and np.all(distances >= np.maximum(1e-3, 2.0 * np.maximum(sd, sds))):
             pairs.append((candidate, estimate))
+            before.append(returns)
+            sds.append(sd)
     return pairs
 
 
@@ -274,15 +274,18 @@ def _quality(maps: ReturnMap, candidate: MapCycle, estimate: Estimate, neighbour
     steps = np.arange(len(estimate.points) + 1)
     points = np.roll(estimate.points, -maps.steps * candidate.shift, axis=0)
     away = maps.wrap(maps.points[maps.steps * candidate.closest + steps] - points[steps % len(points)])
+    here, there, phases = away[:-1], away[1:], maps.phases(steps[:-1])
+    counts, growing, reach = np.full(len(points), neighbours), np.arange(len(points)), 1.5 * np.abs(here).max(1)
+    while growing.size and 4 * (count := counts[growing[0]]) < maps.count:
+        farthest = maps.nearest(points[growing], phases[growing], count)[0][:, -1]
+        growing = growing[farthest < reach[growing]]
+        counts[growing] *= 2
     statistic = 0.0
-    for phase, point, here, there in zip(maps.phases(steps[:-1])[:, None], points, away[:-1], away[1:], strict=True):
-        count = neighbours
-        reach = 1.5 * np.abs(here).max()
-        while maps.nearest(point[None], phase, count)[0][0, -1] < reach and 4 * count < maps.count:
-            count *= 2
-        fit = maps.fit(point[None], phase, count, QUALITY_DEGREE, influence=False)
-        residual = maps.wrap(there - (maps.predict(fit, here[None])[0] - fit.value[0]))
-        statistic += float(np.sum(residual**2 / maps.residual_variance(point[None], fit)[0]))
+    for count in np.unique(counts):
+        some = np.flatnonzero(counts == count)
+        fit = maps.fit(points[some], phases[some], count, QUALITY_DEGREE, influence=False)
+        residual = maps.wrap(there[some] - (maps.predict(fit, here[some]) - fit.value))
+        statistic += float(np.sum(residual**2 / maps.residual_variance(points[some], fit)))
     return float(chdtrc(estimate.points.size, statistic))
 
 
@@ -293,11 +296,9 @@ def _finished(orbits: list[Orbit], maps: ReturnMap, size: np.ndarray) -> tuple[O
     points = [orbit.points / size for orbit in orbits]
     sds = [np.sqrt(np.diag(o.covariance).reshape(o.points.shape).max(0) / size**2).max() for o in orbits]
     for number, orbit in enumerate(orbits):
-        away = {
-            k: cycles.shift_between(points[number], -points[k], maps.wrap)[0]
-            for k, other in enumerate(orbits)
-            if other.period == orbit.period
-        }
+        alike = [k for k, other in enumerate(orbits) if other.period == orbit.period]
+        distances, _ = cycles.shifts_between(points[number], [-points[k] for k in alike], maps.wrap)
+        away = dict(zip(alike, distances.tolist(), strict=True))
         near = [k for k, distance in away.items() if distance < max(2e-3, 4.0 * sds[number], 4.0 * sds[k])]
         partner = min(near, key=away.__getitem__, default=None)
         # Without a measured cycle, a symmetric fixed point is taken for a state of rest.

@@ -115,6 +115,7 @@ class ReturnMap:
         self.winds = winds  # whether the increments of angles include whole turns
         self.noise = noise  # standard deviation of the arguments, (d,)
         self.angle = np.isfinite(turn)
+        self._angles = np.flatnonzero(self.angle).tolist()
         self.count = len(self.arguments) // steps  # of points of each phase
         self._tree = self.tree(self.arguments, self.phases(self.positions))
 
@@ -143,7 +144,7 @@ class ReturnMap:
     def wrap(self, difference: np.ndarray) -> np.ndarray:
         """Return differences (…, d) with angles in half a turn either way."""
         result = np.array(difference)
-        for k in np.flatnonzero(self.angle):
+        for k in self._angles:
             column = result[..., k]
             column -= self.turn[k] * np.round(column / self.turn[k])
         return result
@@ -260,9 +261,10 @@ class ReturnMap:
         if wants_influence:
             # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
             first = inverse[:, : 1 + d]
-            fitted = np.einsum("abf,mbc,mka->mkcf", terms.belongs, solution, first, optimize=True)
+            weights = np.einsum("mka,mbc->mkcab", first, solution).reshape(len(centres), (1 + d) * d, -1)
+            fitted = weights @ terms.belongs.reshape(-1, len(terms.products))
             residual = (first @ regressors)[:, :, None] * image.mT[:, None]
-            residual -= (fitted.reshape(len(centres), -1, len(terms.products)) @ functions).reshape(residual.shape)
+            residual -= (fitted @ functions).reshape(residual.shape)
             leverages = np.einsum("mab,abf->mf", inverse, terms.belongs)[:, None] @ functions
             leverage = np.clip(leverages, 0.0, MOST_LEVERAGE)
             influence = (residual * scale[:, : 1 + d, None] / (1.0 - leverage)[:, None]).transpose(0, 3, 1, 2)
