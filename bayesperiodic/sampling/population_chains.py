@@ -94,7 +94,7 @@ def sample_chains(density: PopulationDensity, seed: int, *, progress: bool) -> C
 
     Where nearly all proposals are independent of the walkers, tau needs no further check.
     """
-    with tqdm(unit="step", desc="population", disable=not progress) as bar:
+    with progress_bar(unit="step", desc="population", disable=not progress) as bar:
         coordinates = Decoupled(density)
         run = _Run(coordinates, seed, bar)
         run.adapt()
