@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from bayesperiodic._parallel import Terminated
+from bayesperiodic._printing import progress_bar
 from bayesperiodic.density.log_posterior import SAMPLED, LogPosterior
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.problem.parameters import CHAIN, DRAW

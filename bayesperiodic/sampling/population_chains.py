@@ -5,8 +5,8 @@ from typing import Any
 
 import emcee
 import numpy as np
-from tqdm import tqdm
 
+from bayesperiodic._printing import progress_bar
 from bayesperiodic.sampling.convergence import PASSES, autocorrelation_time, unmet_criteria
 from bayesperiodic.sampling.moves import MixtureMove, moves
 from bayesperiodic.sampling.population_coordinates import Decoupled

@@ -25,6 +25,7 @@ from bayesperiodic._parallel import (
     ended_by_termination,
     interrupts_deferred,
 )
+from bayesperiodic._printing import progress_bar
 from bayesperiodic.density.log_posterior import (
     COLLAPSED,
     NATURAL,
