@@ -4,6 +4,11 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from tqdm import tqdm
+
+# Seconds between two states of a progress bar in a terminal, and in a file, where each adds to the text.
+OFTEN, SELDOM = 0.1, 5.0
+
 
 def printable(text: str) -> str:
     r"""Return a text that the standard output can show; characters that its encoding lacks are escaped, as ``\u03b8``.
@@ -35,3 +40,8 @@ def as_text(rows: Mapping[str, Any], columns: list[str] | None = None) -> str:
 def written(theta: Mapping[str, float]) -> str:
     """Return the names and values of parameters, as in messages."""
     return ", ".join(f"{name} = {value:.6g}" for name, value in theta.items())
+
+
+def progress_bar(**options: Any) -> tqdm:
+    """Return a bar of tqdm, written to a standard error that is no terminal every few seconds only."""
+    return tqdm(mininterval=OFTEN if sys.stderr.isatty() else SELDOM, **options)

@@ -1,7 +1,8 @@
 """Periodic orbits by multiple shooting, independent of the package.
 
-Everything rests on `scipy.integrate.solve_ivp` (DOP853) with the variational equations integrated along. The reference
-orbits are read from ``reference_orbits.json``; `python -m tests.reference_orbits` computes all of them again.
+Everything rests on `scipy.integrate` (DOP853, for many orbits of the pendulum LSODA) with the variational equations
+integrated along. The reference orbits are read from ``reference_orbits.json``; `python -m tests.reference_orbits`
+computes all of them again.
 """
 
 from __future__ import annotations
@@ -14,11 +15,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.integrate import solve_ivp
+from scipy.integrate import odeint, solve_ivp
 
 TURN = 2.0 * np.pi
 
 Field = Callable[[float, np.ndarray], np.ndarray]
+# From start, end and state to the state at the end of a segment and its derivative by the state at the start.
+Flow = Callable[[float, float, np.ndarray], tuple[np.ndarray, np.ndarray]]
+MOST_STEPS = 100_000
 
 # φ'' + c1 tanh(φ'/width) + c2 φ' + c3 φ'|φ'| + (g + lift ω² cos ωt)/length · sin φ = 0, SI units.
 PENDULUM = {"c1": 0.02, "c2": 0.05, "c3": 0.05, "width": 0.05, "g": 9.81, "lift": 0.11, "length": 0.30}
@@ -70,6 +74,32 @@ def pendulum(omega: float, **changes: float) -> tuple[Field, Field, float]:
     return slope, jacobian, TURN / omega
 
 
+def pendulum_flow(omega: float, tolerance: float, **changes: float) -> Flow:
+    """Return the flow of the driven pendulum, by LSODA and with floats in place of arrays: eight times faster."""
+    p = PENDULUM | changes
+    c1, c2, c3, width = p["c1"], p["c2"], p["c3"], p["width"]
+    constant, swing = p["g"] / p["length"], p["lift"] * omega**2 / p["length"]
+
+    def extended(t: float, z: np.ndarray) -> list[float]:
+        angle, rate, a, b, c, d = z.tolist()
+        bend, pull, speed = math.tanh(rate / width), constant + swing * math.cos(omega * t), abs(rate)
+        stiffness, damping = pull * math.cos(angle), c1 / width * (1.0 - bend**2) + c2 + 2.0 * c3 * speed
+        acceleration = -c1 * bend - (c2 + c3 * speed) * rate - pull * math.sin(angle)
+        return [rate, acceleration, c, d, -stiffness * a - damping * c, -stiffness * b - damping * d]
+
+    def advance(start: float, end: float, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        first = np.concatenate([state, np.eye(2).ravel()])
+        values, report = odeint(
+            extended, first, [start, end], tfirst=True, full_output=True, mxstep=MOST_STEPS, rtol=tolerance,
+            atol=tolerance,
+        )  # fmt: skip
+        if report["message"] != "Integration successful.":
+            raise RuntimeError(report["message"])
+        return values[-1, :2], values[-1, 2:].reshape(2, 2)
+
+    return advance
+
+
 def flow(
     slope: Field, jacobian: Field, start: float, end: float, state: np.ndarray, tolerance: float = 3e-14,
     method: Any = "DOP853",
@@ -110,19 +140,33 @@ def shoot(
     slope: Field, jacobian: Field, times: ArrayLike, states: ArrayLike, jump: ArrayLike, pin: int | None = None,
     tolerance: float = 3e-14, method: Any = "DOP853", accuracy: float = 1e-12,
 ) -> Orbit:  # fmt: skip
+    """Return the periodic orbit near the given states, see `closed`, integrated by `scipy.integrate.solve_ivp`.
+
+    `slope`, `jacobian`: y' and its derivative by y, as functions of (t, y). `tolerance`, `method`: Of `solve_ivp`.
+    """
+
+    def advance(start: float, end: float, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return flow(slope, jacobian, start, end, state, tolerance, method)
+
+    return closed(advance, times, states, jump, pin, accuracy)
+
+
+def closed(
+    advance: Flow, times: ArrayLike, states: ArrayLike, jump: ArrayLike, pin: int | None = None,
+    accuracy: float = 1e-12,
+) -> Orbit:  # fmt: skip
     """Return the periodic orbit near the given states by one damped Newton iteration over all segments.
 
-    `slope`, `jacobian`: y' and its derivative by y, as functions of (t, y). `times`: Starts of the segments and the end
-    of the last one. `states`: Guess, one row per segment. `jump`: State at the end minus state at the start, such as
-    (2π·winding, 0). `pin`: State that keeps its value at the first start; the last state is then an unknown constant,
-    and the multipliers are those of the other states. `tolerance`, `method`: Of `scipy.integrate.solve_ivp`.
-    `accuracy`: Largest component of the last Newton step, relative to the largest state if that exceeds 1.
+    `times`: Starts of the segments and the end of the last one. `states`: Guess, one row per segment. `jump`: State at
+    the end minus state at the start, such as (2π·winding, 0). `pin`: State that keeps its value at the first start; the
+    last state is then an unknown constant, and the multipliers are those of the other states. `accuracy`: Largest
+    component of the last Newton step, relative to the largest state if that exceeds 1.
     """
     times, x = np.asarray(times, dtype=float), np.array(states, dtype=float)
     segments, count = x.shape
 
     def defects(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        pairs = [flow(slope, jacobian, times[k], times[k + 1], x[k], tolerance, method) for k in range(segments)]
+        pairs = [advance(times[k], times[k + 1], x[k]) for k in range(segments)]
         g = np.array([end for end, _ in pairs]) - np.vstack([x[1:], x[:1] + jump])
         if pin is not None:
             g[-1, -1] = 0.0

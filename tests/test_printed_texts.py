@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic._printing import printable
+from bayesperiodic._printing import SELDOM, printable, progress_bar
 from tests import layout
 from tests.problems import DUFFING, duffing_run
 
@@ -177,3 +177,13 @@ def test_command_line_prints_in_cp1252(arguments):
     )
     assert b"UnicodeEncodeError" not in done.stderr
     assert (done.returncode, bool(done.stdout)) == ((2, False) if "no-such-study" in arguments else (0, True))
+
+
+def test_a_progress_bar_in_a_file_is_written_every_few_seconds_only(capsys, monkeypatch):
+    clock = iter(np.arange(0.0, 1000.0, 0.1))
+    monkeypatch.setattr("tqdm.std.time", lambda: next(clock))
+    with progress_bar(total=1000) as bar:
+        for _ in range(1000):
+            bar.update()
+    states = capsys.readouterr().err.split("\r")
+    assert "1000/1000" in states[-1] and len(states) < 1000 * 0.2 / SELDOM + 5

@@ -266,6 +266,7 @@ class ResponseSolver:
                 solved = batch.solve(parameters, threads, keep=keep or multipliers, whole=whole)
             else:
                 given: dict[str, Any] = {"keep": keep or multipliers, "polish": polish or multipliers}
+                given |= {"whole": whole} if isinstance(batch, Batch) else {}
                 solved = batch.solve(parameters, threads, **given, without=left_out)
             status, logarithms = solved.status, [np.empty((len(theta), 0))] * len(experiments)
             if multipliers:

@@ -41,7 +41,7 @@ class Unexplained:
         """
         components, jacobian, harmonic = _without_matched_mean(components, jacobian, harmonic)
         first = cls(components, jacobian, harmonic)
-        square, freedom = first.explained(np.eye(first.harmonics.size, dtype=bool))
+        square, freedom = explained(*first.sums)
         free = np.maximum(freedom, 1)
         p = np.maximum(fdtrc(free, behind[first.harmonics], square / free), np.finfo(float).tiny)
         known = np.where((freedom > 0) & (square > 0.0), chdtri(free, p), square)
@@ -49,31 +49,21 @@ class Unexplained:
         return cls(components * factor, jacobian * factor, harmonic)
 
     @cached_property
-    def _sums(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def sums(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Sums over each harmonic: b bᵀ of the basis, b·e, e² of the residual e, and the number of components."""
-        b, e = self._basis, self._rest
-        each = np.eye(self.harmonics.size)[:, self._group]
-        gram = np.einsum("hs,si,sj->hij", each, b, b, optimize=True)
-        return gram, each @ (b * e[:, None]), each @ e**2, each.sum(axis=1)
-
-    def explained(self, sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the sums of squares (sets,) explained by sets (sets, harmonics) of harmonics, and their sizes."""
-        gram, along, square, size = (np.tensordot(sets.astype(float), part, 1) for part in self._sums)
-        values, vectors = np.linalg.eigh(gram)
-        left = 1.0 - values
-        # Combinations of the components of a set that the parameters can produce have no information.
-        absorbed = left < ABSORBED
-        turned = np.einsum("srj,sr->sj", vectors, along) ** 2
-        ratio = np.where(absorbed, -1.0 / np.maximum(values, 0.5), 1.0 / np.maximum(left, ABSORBED))
-        return square + np.sum(turned * ratio, axis=1), np.rint(size - absorbed.sum(axis=1)).astype(int)
+        order = np.argsort(self._group, kind="stable")
+        b, e = self._basis[order], self._rest[order, None]
+        starts = np.searchsorted(self._group[order], np.arange(self.harmonics.size))
+        parts = (b[:, :, None] * b[:, None], b * e, e**2, np.ones_like(e))
+        gram, along, square, size = (np.add.reduceat(part, starts, axis=0) for part in parts)
+        return gram, along, square[:, 0], size[:, 0]
 
     def whiteness(self) -> Whiteness:
         """Return Bartlett's test of the cumulative power of the harmonics, the highest first.
 
         Harmonics of which the parameters take up a component or more have no power of two values, and are left out.
         """
-        tails = np.tri(self.harmonics.size, dtype=bool)[:, ::-1]
-        square, freedom = self.explained(tails)
+        square, freedom = explained(*(np.cumsum(part[::-1], axis=0) for part in self.sums))
         pairs = np.diff(freedom, prepend=0) == 2
         power = np.diff(square, prepend=0.0)[pairs][::-1]
         return of_periodogram(np.maximum(power, 0.0))
@@ -81,9 +71,8 @@ class Unexplained:
     def harmonic_content(self) -> tuple[float, float]:
         """Return p of excess power in one harmonic or in the lowest 2ᵏ + 1 (Bonferroni), and the strongest harmonic."""
         count = self.harmonics.size
-        lowest = np.array([np.arange(count) <= 2**k for k in range(count.bit_length()) if 2**k < count - 1], dtype=bool)
-        sets = np.concatenate([np.eye(count, dtype=bool), lowest.reshape(-1, count)])
-        square, freedom = self.explained(sets)
+        last = [2**k for k in range(count.bit_length()) if 2**k < count - 1]
+        square, freedom = explained(*(np.concatenate([p, np.cumsum(p, axis=0)[last]]) for p in self.sums))
         rest = self.freedom - freedom
         tested = (freedom > 0) & (rest > 0)
         if not tested.any():
@@ -91,8 +80,21 @@ class Unexplained:
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = square / freedom / (np.maximum(self.square - square, 0.0) / rest)
         p = np.where(tested, fdtrc(freedom, rest, np.maximum(np.nan_to_num(ratio, nan=0.0, posinf=np.inf), 0.0)), 1.0)
-        _, _, power, size = self._sums
+        _, _, power, size = self.sums
         return min(1.0, float(p.min() * tested.sum())), float(self.harmonics[np.argmax(power / size)])
+
+
+def explained(
+    gram: np.ndarray, along: np.ndarray, square: np.ndarray, size: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sums of squares (sets,) explained by sets of harmonics, and their sizes, from sums over each set."""
+    values, vectors = np.linalg.eigh(gram)
+    left = 1.0 - values
+    # Combinations of the components of a set that the parameters can produce have no information.
+    absorbed = left < ABSORBED
+    turned = np.einsum("srj,sr->sj", vectors, along) ** 2
+    ratio = np.where(absorbed, -1.0 / np.maximum(values, 0.5), 1.0 / np.maximum(left, ABSORBED))
+    return square + np.sum(turned * ratio, axis=1), np.rint(size - absorbed.sum(axis=1)).astype(int)
 
 
 def _without_matched_mean(

@@ -4,7 +4,7 @@ All coordinates are in units of the attractor's size. A chain is the consecutive
 the return map; Newton's method moves all of them together until the maps along the chain close it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
 from itertools import combinations
 from typing import NamedTuple
@@ -112,10 +112,17 @@ def eigenvalues(jacobian: np.ndarray) -> np.ndarray:
 
 def shift_between(one: np.ndarray, other: np.ndarray, wrap: Wrap) -> tuple[float, int]:
     """Return the smallest distance of two cycles (p, d) under cyclic shifts of the other, and that shift."""
+    (distance,), (shift,) = shifts_between(one, [other], wrap)
+    return float(distance), int(shift)
+
+
+def shifts_between(one: np.ndarray, others: Sequence[np.ndarray], wrap: Wrap) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same of one cycle (p, d) and each of several others, (others,) each."""
     steps = np.arange(len(one))
-    distances = np.abs(wrap(other[(steps[:, None] + steps) % len(one)] - one)).max((1, 2))
-    best = int(np.argmin(distances))
-    return float(distances[best]), best
+    shifted = np.reshape(others, (len(others), *one.shape))[:, (steps[:, None] + steps) % len(one)]
+    distances = np.abs(wrap(shifted - one)).max((2, 3))
+    best = np.argmin(distances, axis=1)
+    return distances[np.arange(len(best)), best], best
 
 
 def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool:
@@ -211,10 +218,11 @@ def _distinct(maps: ReturnMap, chains: np.ndarray, step: np.ndarray, members: li
         returns = chains[k, :: maps.steps]
         if has_shorter_period(returns, maps.wrap, tolerance):
             continue
-        shifts = ((group, *shift_between(returns, cycle[:: maps.steps], maps.wrap)) for cycle, group in groups)
-        group, shift = next(((group, shift) for group, distance, shift in shifts if distance < tolerance), ([], 0))
-        if not group:
-            groups.append((maps.wrap(chains[k]), group))
+        distances, shifts = shifts_between(returns, [cycle[:: maps.steps] for cycle, _ in groups], maps.wrap)
+        near = np.flatnonzero(distances < tolerance)
+        if not near.size:
+            groups.append((maps.wrap(chains[k]), []))
+        group, shift = (groups[near[0]][1], shifts[near[0]]) if near.size else (groups[-1][1], 0)
         group.append(np.stack([members[k], np.full(len(members[k]), shift)]))
     result = []
     for cycle, group in groups:

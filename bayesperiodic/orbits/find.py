@@ -115,7 +115,10 @@ def find_orbits(
         pairs = [pair for p in wanted for pair in _chained(maps, atlas, p, neighbours)]
     quality_count = _search_count(maps, FEWEST_NEIGHBOURS)
     following = Following(section, maps, size) if pairs and section.measured is not None else None
-    orbits = [_orbit(section, maps, size, *pair, _quality(maps, *pair, quality_count), following) for pair in pairs]
+    extent = _extent(section)
+    orbits = [
+        _orbit(section, maps, size, extent, *pair, _quality(maps, *pair, quality_count), following) for pair in pairs
+    ]
     finished = _finished(orbits, maps, size)
     return Orbits(finished, values=section.values, method=method, prediction_error=prediction)
 
@@ -196,19 +199,19 @@ def _search_count(maps: ReturnMap, neighbours: int) -> int:
 
 def _chained(maps: ReturnMap, atlas: Atlas, period: int, neighbours: int) -> list[tuple[MapCycle, Estimate]]:
     pairs: list[tuple[MapCycle, Estimate]] = []
-
-    def same(one: Estimate, other: Estimate) -> bool:
-        distance, _ = cycles.shift_between(one.points[:: maps.steps], other.points[:: maps.steps], maps.wrap)
-        return distance < max(1e-3, 2.0 * max(_largest_sd(one), _largest_sd(other)))
-
+    before: list[np.ndarray] = []
+    sds: list[float] = []
     for candidate in cycles.candidates(maps, atlas, period):
         estimate = cycles.refine(maps, candidate.points, neighbours)
         if estimate is None or not (sd := _largest_sd(estimate)) < LARGEST_SD:
             continue
         returns = estimate.points[:: maps.steps]
         repeats = cycles.has_shorter_period(returns, maps.wrap, max(2e-3, 3.0 * sd))
-        if not repeats and not any(same(estimate, other) for _, other in pairs):
+        distances, _ = cycles.shifts_between(returns, before, maps.wrap)
+        if not repeats and np.all(distances >= np.maximum(1e-3, 2.0 * np.maximum(sd, sds))):
             pairs.append((candidate, estimate))
+            before.append(returns)
+            sds.append(sd)
     return pairs
 
 
@@ -216,9 +219,17 @@ def _largest_sd(estimate: Estimate) -> float:
     return float(np.sqrt(np.diag(estimate.covariance)[: estimate.points.size].max()))
 
 
+def _extent(section: PoincareSection) -> np.ndarray | None:
+    """Return the ranges (channels,) of the recorded signals, of angles at most a turn; None without a recording."""
+    if section.signals is None:
+        return None
+    extent = np.array([np.ptp(signal) for signal in section.signals.T[: len(channels_of(section.coordinates))]])
+    return np.where(np.isin(channels_of(section.coordinates), section.angles), np.minimum(extent, 2.0 * np.pi), extent)
+
+
 def _orbit(
-    section: PoincareSection, maps: ReturnMap, size: np.ndarray, candidate: MapCycle, estimate: Estimate,
-    quality: float, following: Following | None,
+    section: PoincareSection, maps: ReturnMap, size: np.ndarray, extent: np.ndarray | None, candidate: MapCycle,
+    estimate: Estimate, quality: float, following: Following | None,
 ) -> Orbit:  # fmt: skip
     count, d = estimate.points.shape
     period = count // maps.steps
@@ -237,13 +248,11 @@ def _orbit(
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
     still = False
-    if cycle is not None and section.signals is not None:
+    if cycle is not None and extent is not None:
         for column in np.flatnonzero(maps.angle):
             values = cycle[section.coordinates[column]]
             values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
         # It moves no more than by noise and its distance to the orbit.
-        extent = np.ptp(section.signals[:, : len(cycle)], axis=0)
-        extent = np.where(np.isin(list(cycle), section.angles), np.minimum(extent, 2.0 * np.pi), extent)
         limit = (STILL_RANGE + STILL_NOISE * maps.noise.max()) * extent
         still = bool(np.all(np.ptp(np.stack(list(cycle.values())), axis=1) < limit))
     waveform = None
@@ -272,15 +281,18 @@ def _quality(maps: ReturnMap, candidate: MapCycle, estimate: Estimate, neighbour
     steps = np.arange(len(estimate.points) + 1)
     points = np.roll(estimate.points, -maps.steps * candidate.shift, axis=0)
     away = maps.wrap(maps.points[maps.steps * candidate.closest + steps] - points[steps % len(points)])
+    here, there, phases = away[:-1], away[1:], maps.phases(steps[:-1])
+    counts, growing, reach = np.full(len(points), neighbours), np.arange(len(points)), 1.5 * np.abs(here).max(1)
+    while growing.size and 4 * (count := counts[growing[0]]) < maps.count:
+        farthest = maps.nearest(points[growing], phases[growing], count)[0][:, -1]
+        growing = growing[farthest < reach[growing]]
+        counts[growing] *= 2
     statistic = 0.0
-    for phase, point, here, there in zip(maps.phases(steps[:-1])[:, None], points, away[:-1], away[1:], strict=True):
-        count = neighbours
-        reach = 1.5 * np.abs(here).max()
-        while maps.nearest(point[None], phase, count)[0][0, -1] < reach and 4 * count < maps.count:
-            count *= 2
-        fit = maps.fit(point[None], phase, count, QUALITY_DEGREE, influence=False)
-        residual = maps.wrap(there - (maps.predict(fit, here[None])[0] - fit.value[0]))
-        statistic += float(np.sum(residual**2 / maps.residual_variance(point[None], fit)[0]))
+    for count in np.unique(counts):
+        some = np.flatnonzero(counts == count)
+        fit = maps.fit(points[some], phases[some], count, QUALITY_DEGREE, influence=False)
+        residual = maps.wrap(there[some] - (maps.predict(fit, here[some]) - fit.value))
+        statistic += float(np.sum(residual**2 / maps.residual_variance(points[some], fit)))
     return float(chdtrc(estimate.points.size, statistic))
 
 
@@ -291,11 +303,9 @@ def _finished(orbits: list[Orbit], maps: ReturnMap, size: np.ndarray) -> tuple[O
     points = [orbit.points / size for orbit in orbits]
     sds = [np.sqrt(np.diag(o.covariance).reshape(o.points.shape).max(0) / size**2).max() for o in orbits]
     for number, orbit in enumerate(orbits):
-        away = {
-            k: cycles.shift_between(points[number], -points[k], maps.wrap)[0]
-            for k, other in enumerate(orbits)
-            if other.period == orbit.period
-        }
+        alike = [k for k, other in enumerate(orbits) if other.period == orbit.period]
+        distances, _ = cycles.shifts_between(points[number], [-points[k] for k in alike], maps.wrap)
+        away = dict(zip(alike, distances.tolist(), strict=True))
         near = [k for k, distance in away.items() if distance < max(2e-3, 4.0 * sds[number], 4.0 * sds[k])]
         partner = min(near, key=away.__getitem__, default=None)
         # Without a measured cycle, a symmetric fixed point is taken for a state of rest.

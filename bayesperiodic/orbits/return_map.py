@@ -40,6 +40,27 @@ def monomials(coordinates: int, degree: int) -> np.ndarray:
     return np.array([np.bincount(np.array(one, dtype=int), minlength=coordinates) for one in factors])
 
 
+class _Terms(NamedTuple):
+    """Terms of polynomials of one degree, their products, and where these are in sums by the last coordinate."""
+
+    powers: np.ndarray  # (terms, d)
+    factorials: np.ndarray  # products of the factorials of the powers, (terms,)
+    products: np.ndarray  # powers of the products of two terms, (products, d); the terms themselves come first
+    belongs: np.ndarray  # which product two terms have, as zeros and ones, (terms, terms, products)
+    others: np.ndarray  # powers of all coordinates but the last, (rows, d - 1)
+    row: np.ndarray  # among those, of the product of two terms, (terms, terms)
+    column: np.ndarray  # power of the last coordinate in it, (terms, terms)
+
+
+@cache
+def _terms(coordinates: int, degree: int) -> _Terms:
+    powers, products = monomials(coordinates, degree), monomials(coordinates, 2 * degree)
+    others, sums = monomials(coordinates - 1, 2 * degree), powers[:, None] + powers
+    belongs = np.all(sums[..., None, :] == products, axis=-1).astype(float)
+    row = np.argmax(np.all(sums[..., None, :-1] == others, axis=-1), axis=-1)
+    return _Terms(powers, factorial(powers).prod(1), products, belongs, others, row, sums[..., -1])
+
+
 class LocalFit(NamedTuple):
     """Polynomials of the return map about m centres, in d coordinates."""
 
@@ -47,7 +68,7 @@ class LocalFit(NamedTuple):
     derivatives: np.ndarray  # of the image by the argument: order 0 (relative), u, v, …, uu, uv, …, (m, terms, d)
     bandwidth: np.ndarray  # (m,)
     neighbours: np.ndarray  # positions among the arguments, (m, n)
-    influence: np.ndarray  # contribution of each neighbour to the error of `derivatives`, (m, n, terms, d)
+    influence: np.ndarray  # contribution of each neighbour to the error of the value and slopes, (m, n, 1 + d, d)
     effective: np.ndarray  # effective number of neighbours, (m,)
 
     @property
@@ -106,6 +127,7 @@ class ReturnMap:
         self.winds = winds  # whether the increments of angles include whole turns
         self.noise = noise  # standard deviation of the arguments, (d,)
         self.angle = np.isfinite(turn)
+        self._angles = np.flatnonzero(self.angle).tolist()
         self.count = len(self.arguments) // steps  # of points of each phase
         self._tree = self.tree(self.arguments, self.phases(self.positions))
 
@@ -133,8 +155,11 @@ class ReturnMap:
 
     def wrap(self, difference: np.ndarray) -> np.ndarray:
         """Return differences (…, d) with angles in half a turn either way."""
-        turn = np.where(self.angle, self.turn, 1.0)
-        return np.where(self.angle, difference - turn * np.round(difference / turn), difference)
+        result = np.array(difference)
+        for k in self._angles:
+            column = result[..., k]
+            column -= self.turn[k] * np.round(column / self.turn[k])
+        return result
 
     def distance(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
         """Return the largest coordinate differences (n,) of points (n, d)."""
@@ -196,9 +221,9 @@ class ReturnMap:
     def predict(fit: LocalFit, away: np.ndarray) -> np.ndarray:
         """Return images (m, …, d) at displacements (m, …, d) from the centres."""
         _, terms, d = fit.derivatives.shape
-        powers = monomials(d, next(n for n in range(terms) if comb(d + n, n) == terms))[1:]
-        products = np.stack([np.prod(away**power, axis=-1) for power in powers], axis=-1)
-        slopes = fit.derivatives[:, 1:] / factorial(powers).prod(1)[:, None]
+        polynomials = _terms(d, next(n for n in range(terms) if comb(d + n, n) == terms))
+        products = np.stack([np.prod(away**power, axis=-1) for power in polynomials.powers[1:]], axis=-1)
+        slopes = fit.derivatives[:, 1:] / polynomials.factorials[1:, None]
         shape = (len(away), *(1,) * (away.ndim - 2), d)
         return fit.value.reshape(shape) + np.einsum("m...t,mtc->m...c", products, slopes)
 
@@ -222,10 +247,11 @@ class ReturnMap:
         wants_influence: bool, shrunk: bool = False,
     ) -> LocalFit:  # fmt: skip
         bandwidth = np.maximum(bandwidth, np.max(self.noise) / MOST_NOISE)
-        image, reference = self._images(centres, index)
-        system = self._system(centres, bandwidth, index, inside, degree, image if shrunk else None)
+        away = self._away(centres, index)
+        image, reference = self._images(away, index)
+        system = self._system(away, bandwidth, inside, degree, image if shrunk else None, wants_influence)
         solution = system.solve(image)
-        influence = np.empty((len(centres), 0, *solution.shape[1:]))
+        influence = np.empty((len(centres), 0, 1 + away.shape[2], away.shape[2]))
         if wants_influence:
             influence = system.influence(image, solution)
         derivatives = solution * system.scale
@@ -243,8 +269,9 @@ class ReturnMap:
         for centre, phase, width in zip(centres[:, None], phases[:, None], bandwidths[:, None], strict=True):
             index, inside, bandwidth = self._within(centre, phase, width, degree)
             index, inside = index[:, inside[0]], inside[:, inside[0]]
-            system = self._system(centre, bandwidth, index, inside, degree, self._images(centre, index)[0])
-            target = signals(index[0], centre + self.wrap(self.arguments[index[0]] - centre))
+            away = self._away(centre, index)
+            system = self._system(away, bandwidth, inside, degree, self._images(away, index)[0], True)
+            target = signals(index[0], centre + away[0])
             reference, target = target[:1], (target - target[:1])[None]
             solution = system.solve(target)
             derivatives = (solution * system.scale)[0]
@@ -255,71 +282,78 @@ class ReturnMap:
             )
         return results
 
-    def _images(self, centres: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _away(self, centres: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Return the displacements of arguments (m, n, d) from the centres (m, d)."""
+        return self.wrap(self.arguments.take(index, axis=0) - centres[:, None])
+
+    def _images(self, away: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return images of arguments (m, n, d) relative to one of them, and that one (m, d) relative to the centre."""
-        image = self.wrap(self.arguments[index] - centres[:, None]) + self.increments[index]
-        reference = image[:, :1]
-        image = image - reference
+        image = self.increments.take(index, axis=0)
+        image += away
+        reference = image[:, :1].copy()
+        image -= reference
         return image if self.winds else self.wrap(image), reference[:, 0]
 
     def _system(
-        self, centres: np.ndarray, bandwidth: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int,
-        shrinking: np.ndarray | None,
+        self, away: np.ndarray, bandwidth: np.ndarray, inside: np.ndarray, degree: int,
+        shrinking: np.ndarray | None, wants_influence: bool,
     ) -> "_NormalEquations":  # fmt: skip
         """Return the normal equations of fits; the residuals of the images `shrinking` determine their shrinkage."""
-        away = self.wrap(self.arguments[index] - centres[:, None])
         by_coordinate = _deconvoluted(away / bandwidth[:, None, None], self.noise / bandwidth[:, None], 2 * degree)
         by_coordinate[0] *= inside[:, None]
         d, weight = len(by_coordinate), by_coordinate[0][:, 0]
-        powers = monomials(d, degree)
-        regressors = _products(by_coordinate, powers)
+        terms = _terms(d, degree)
+        orders = terms.powers.sum(1)
+        functions = _products(by_coordinate, terms.products if wants_influence else terms.powers)
         # The sums of products by powers of the last coordinate: one matrix product.
-        others = monomials(d - 1, 2 * degree)
-        table = _products(by_coordinate[:-1], others) @ by_coordinate[-1].mT
-        sums = powers[:, None] + powers
-        row = np.argmax(np.all(sums[..., None, :-1] == others, axis=-1), axis=-1)
-        normal = table[:, row, sums[..., -1]]
+        table = _products(by_coordinate[:-1], terms.others) @ by_coordinate[-1].mT
+        normal = table[:, terms.row, terms.column]
         inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
         effective = weight.sum(1) ** 2 / (weight**2).sum(1)
-        order = powers.sum(1)
         if d > 2 and shrinking is not None:
-            target = regressors @ shrinking
+            target = functions[:, : len(orders)] @ shrinking
             rest = np.einsum("mn,mnc->mc", weight, shrinking**2) - (inverse @ target * target).sum(1)
-            free = np.maximum(effective - len(powers), 1.0) / effective
+            free = np.maximum(effective - len(orders), 1.0) / effective
             variance = np.maximum(rest, 0.0).max(1) / weight.sum(1) / free
-            prior = STEEPEST_SLOPE * bandwidth[:, None] * (bandwidth[:, None] / CURVATURE_LENGTH) ** (order - 1.0)
-            shrinkage = np.where(order > 0, variance[:, None] / prior**2, 0.0)
-            inverse = np.linalg.pinv(normal + shrinkage[:, :, None] * np.eye(len(powers)), rcond=1e-10, hermitian=True)
-        scale = (factorial(powers).prod(1) / bandwidth[:, None] ** order)[..., None]
-        return _NormalEquations(by_coordinate, degree, regressors, inverse, scale, effective)
+            prior = STEEPEST_SLOPE * bandwidth[:, None] * (bandwidth[:, None] / CURVATURE_LENGTH) ** (orders - 1.0)
+            shrinkage = np.where(orders > 0, variance[:, None] / prior**2, 0.0)
+            inverse = np.linalg.pinv(normal + shrinkage[:, :, None] * np.eye(len(orders)), rcond=1e-10, hermitian=True)
+        scale = (terms.factorials / bandwidth[:, None] ** orders)[..., None]
+        return _NormalEquations(functions, terms, inverse, scale, effective)
 
 
 class _NormalEquations(NamedTuple):
     """Normal equations of local polynomials about m centres, with n neighbours each."""
 
-    by_coordinate: list[np.ndarray]  # see `_deconvoluted`
-    degree: int
-    regressors: np.ndarray  # (m, terms, n)
+    functions: np.ndarray  # the terms, and for `influence` also their other products, (m, terms or products, n)
+    terms: _Terms
     inverse: np.ndarray  # (m, terms, terms)
     scale: np.ndarray  # derivatives over coefficients, (m, terms, 1)
     effective: np.ndarray  # effective number of neighbours, (m,)
+
+    @property
+    def regressors(self) -> np.ndarray:
+        """The terms, (m, terms, n)."""
+        return self.functions[:, : len(self.terms.powers)]
 
     def solve(self, target: np.ndarray) -> np.ndarray:
         """Return the coefficients (m, terms, values) of polynomials through targets (m, n, values)."""
         return self.inverse @ (self.regressors @ target)
 
     def influence(self, target: np.ndarray, solution: np.ndarray) -> np.ndarray:
-        """Return the contribution (m, n, terms, values) of each neighbour to the error of the derivatives."""
+        """Return the contribution (m, n, 1 + d, values) of each neighbour to the error of the value and slopes."""
         # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
-        d = len(self.by_coordinate)
-        powers, products = monomials(d, self.degree), monomials(d, 2 * self.degree)
-        functions = _products(self.by_coordinate, products)
-        belongs = np.all((powers[:, None] + powers)[..., None, :] == products, axis=-1).astype(float)
-        fitted = np.einsum("abf,mbc,mka->mkcf", belongs, solution, self.inverse, optimize=True)
-        residual = (self.inverse @ self.regressors)[:, :, None] * target.mT[:, None]
-        residual -= (fitted.reshape(len(target), -1, len(products)) @ functions).reshape(residual.shape)
-        leverage = np.clip(np.einsum("mab,abf->mf", self.inverse, belongs)[:, None] @ functions, 0.0, MOST_LEVERAGE)
-        return (residual * self.scale[..., None] / (1.0 - leverage)[:, None]).transpose(0, 3, 1, 2)
+        terms, first = self.terms, self.inverse[:, : 1 + self.terms.powers.shape[1]]
+        weights = np.einsum("mka,mbc->mkcab", first, solution)
+        fitted = weights.reshape(len(target), -1, len(terms.powers) ** 2) @ terms.belongs.reshape(
+            -1, len(terms.products)
+        )
+        residual = (first @ self.regressors)[:, :, None] * target.mT[:, None]
+        residual -= (fitted @ self.functions).reshape(residual.shape)
+        leverages = np.einsum("mab,abf->mf", self.inverse, terms.belongs)[:, None] @ self.functions
+        leverage = np.clip(leverages, 0.0, MOST_LEVERAGE)
+        scale = self.scale[:, : first.shape[1], None]
+        return (residual * scale / (1.0 - leverage)[:, None]).transpose(0, 3, 1, 2)
 
 
 def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.ndarray]:
@@ -328,16 +362,18 @@ def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.
     x^a exp(−x²/2) is the expectation, over noise of variance s², of the Gaussian of variance 1 − s² times the a-th
     moment of a normal distribution with mean x/(1 − s²) and the negative variance −s²/(1 − s²).
     """
-    left = 1.0 - noise[:, None] ** 2
-    kernel = np.exp(-0.5 * np.sum(away**2 / left, axis=-1)) / np.sqrt(left.prod(-1))
-    moments = []
-    for k in range(away.shape[-1]):
-        factor = kernel if k == 0 else np.ones_like(kernel)
-        mean, variance = away[..., k] / left[..., k], -(1.0 - left[..., k]) / left[..., k]
-        rows = [factor, mean * factor]
+    left, moments = 1.0 - noise**2, []
+    exponent, divisor = np.zeros(away.shape[:2]), np.sqrt(left.prod(1))
+    for k, rest in enumerate(left.T[..., None]):
+        mean, variance = away[..., k] / rest, (rest - 1.0) / rest
+        exponent -= 0.5 * rest * mean**2
+        rows = np.empty((len(away), highest + 1, away.shape[1]))
+        rows[:, 0], rows[:, 1] = 1.0, mean
         for order in range(2, highest + 1):
-            rows.append(mean * rows[-1] + (order - 1) * variance * rows[-2])
-        moments.append(np.stack(rows, axis=1))
+            np.multiply(mean, rows[:, order - 1], out=rows[:, order])
+            rows[:, order] += (order - 1) * variance * rows[:, order - 2]
+        moments.append(rows)
+    moments[0] *= (np.exp(exponent) / divisor[:, None])[:, None]
     return moments
 
 

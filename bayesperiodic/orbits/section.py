@@ -229,7 +229,7 @@ class PoincareSection(Result):
         section = cls._of(
             samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency
         )
-        extent = np.ptp(samples.signals, axis=0)[columns_of(names)]
+        extent = np.array([np.ptp(signal) for signal in samples.signals.T])[columns_of(names)]
         if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * extent):
             raise ValueError(
                 "recording: must be chaotic, got a motion of period 1, whose section points coincide. Use "
@@ -537,7 +537,9 @@ def _with_others(recording: Recording, signals: np.ndarray, others: Sequence[str
 
 def _unwrapped(samples: Stretches, turning: np.ndarray) -> Stretches:
     """Return signals whose angles are continuous where recordings are joined."""
-    signals = np.where(turning, np.unwrap(samples.signals, axis=0), samples.signals)
+    signals = samples.signals.copy()
+    for channel in np.flatnonzero(turning):
+        signals[:, channel] = np.unwrap(signals[:, channel])
     return samples._replace(signals=signals)
 
 

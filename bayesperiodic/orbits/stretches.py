@@ -1,6 +1,6 @@
 """Signals over time in unbroken stretches, and their values between the samples by local polynomials."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -129,13 +129,13 @@ def windowed(
     Each channel has its window, of which `halves` are half the numbers of samples; where a stretch ends within the
     window, the smallest one is used.
     """
-    values, gain, _ = local_fit(samples, at, stretch)
+    values, gain = local_fit(samples, at, stretch)
     gains = np.repeat(gain[:, None], values.shape[1], axis=1)
     for channel, half in enumerate(halves):
         if half > SMALLEST_WINDOW:
             fits = samples.windows(at, stretch, half)[1]
             one = samples._replace(signals=samples.signals[:, [channel]])
-            fitted, wide, _ = local_fit(one, at[fits], stretch[fits], half)
+            fitted, wide = local_fit(one, at[fits], stretch[fits], half)
             values[fits, channel], gains[fits, channel] = fitted[:, 0], wide
     return values, gains
 
@@ -143,7 +143,7 @@ def windowed(
 def noise_variance(samples: Stretches, at: np.ndarray, stretch: np.ndarray) -> np.ndarray:
     """Return the variance (channels,) of white noise of the samples, from those about given instants."""
     # A higher degree on few samples: noise dominates the residual.
-    return local_fit(samples, at, stretch, NOISE_SAMPLES // 2, NOISE_DEGREE)[2].mean(0)
+    return _residual_variance(samples, at, stretch, NOISE_SAMPLES // 2, NOISE_DEGREE)
 
 
 def unbiased_windows(
@@ -157,11 +157,11 @@ def unbiased_windows(
     proportional to the eighth power of the width, so in a window 1.6 times narrower than the first significant one it
     is 40 times smaller, and negligible even in averages over hundreds of instants.
     """
-    narrow, narrow_gain, _ = local_fit(samples, at, stretch)
+    narrow, narrow_gain = local_fit(samples, at, stretch)
     halves, unbiased = [SMALLEST_WINDOW], np.ones(variance.size, dtype=bool)
     first_biased = np.full(variance.size, widest)
     while (half := halves[-1] + max(1, halves[-1] // 5)) <= widest and unbiased.any():
-        wide, gain, _ = local_fit(samples, at, stretch, half)
+        wide, gain = local_fit(samples, at, stretch, half)
         squared = (wide - narrow) ** 2
         bias = squared.mean(0) - variance * (narrow_gain.mean() - gain.mean())
         biased = unbiased & (bias > 2.0 * squared.std(0) / np.sqrt(len(wide)))
@@ -174,27 +174,37 @@ def unbiased_windows(
 
 def local_fit(
     samples: Stretches, at: np.ndarray, stretch: np.ndarray, half: int = SMALLEST_WINDOW, degree: int = VALUE_DEGREE
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return values, their variance for unit noise, and the residual variance of polynomials on 2·half samples each."""
-    count = 2 * half
-    first = samples.windows(at, stretch, half)[0]
-    time, signals = samples.time, samples.signals
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return values of polynomials on 2·half samples each, and their variance for unit noise."""
     centre = np.polynomial.legendre.legvander(np.zeros(1), degree)[0]
-    free = max(count - degree - 1, 1)
-    values, gains, residuals = [], [], []
-    for k in range(0, len(at), CROSSINGS_EACH):
-        index = first[k : k + CROSSINGS_EACH, None] + np.arange(count)
-        width = 0.5 * (time[index[:, -1]] - time[index[:, 0]])
-        basis = np.polynomial.legendre.legvander(
-            (time[index] - at[k : k + CROSSINGS_EACH, None]) / width[:, None], degree
-        )
+    values, gains = [], []
+    for basis, reference, local in _local_bases(samples, at, stretch, half, degree):
         normal = basis.transpose(0, 2, 1) @ basis
-        local = signals[index]
-        reference = local[:, half]
-        local = local - reference[:, None]
-        weights = basis @ np.linalg.solve(normal, np.broadcast_to(centre[:, None], (len(index), degree + 1, 1)))
+        weights = basis @ np.linalg.solve(normal, np.broadcast_to(centre[:, None], (len(basis), degree + 1, 1)))
         values.append(reference + (weights.transpose(0, 2, 1) @ local)[:, 0])
         gains.append((weights[..., 0] ** 2).sum(1))
-        residual = local - basis @ np.linalg.solve(normal, basis.transpose(0, 2, 1) @ local)
-        residuals.append((residual**2).sum(1) / free)
-    return np.concatenate(values), np.concatenate(gains), np.concatenate(residuals)
+    return np.concatenate(values), np.concatenate(gains)
+
+
+def _residual_variance(samples: Stretches, at: np.ndarray, stretch: np.ndarray, half: int, degree: int) -> np.ndarray:
+    """Return the residual variance (channels,) of polynomials on 2·half samples each, the mean over the instants."""
+    total = np.zeros(samples.signals.shape[1])
+    for basis, _, local in _local_bases(samples, at, stretch, half, degree):
+        across = basis.transpose(0, 2, 1)
+        residual = local - basis @ np.linalg.solve(across @ basis, across @ local)
+        total += (residual**2).sum((0, 1))
+    return total / max(2 * half - degree - 1, 1) / len(at)
+
+
+def _local_bases(
+    samples: Stretches, at: np.ndarray, stretch: np.ndarray, half: int, degree: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield Legendre polynomials in the window of each instant, and one of its samples and all minus that one."""
+    first, time = samples.windows(at, stretch, half)[0], samples.time
+    for k in range(0, len(at), CROSSINGS_EACH):
+        index = first[k : k + CROSSINGS_EACH, None] + np.arange(2 * half)
+        width = 0.5 * (time[index[:, -1]] - time[index[:, 0]])
+        places = (time[index] - at[k : k + CROSSINGS_EACH, None]) / width[:, None]
+        local = samples.signals[index]
+        reference = local[:, half]
+        yield np.polynomial.legendre.legvander(places, degree), reference, local - reference[:, None]

@@ -118,6 +118,7 @@ class Batch:
         keep: bool = False,
         polish: bool = False,
         without: np.ndarray | None = None,
+        whole: bool = False,
     ) -> BatchSolution:
         """Solve every input set for every parameter vector; the result does not depend on the number of threads.
 
@@ -132,6 +133,9 @@ class Batch:
             Take further chord steps, so that z and what is derived from it are as accurate as possible.
         without : bool array (sets, solves), optional
             Solves to be left out, whose status is "stalled".
+        whole : bool
+            A parameter vector needs a solution for every input set: where the first set has none, the others get its
+            status. Unless it is the only one, it is not solved for them. Ignored with `without`.
         """
         first, grid = self._first, self._first.grid
         every, solution = _unsolved(first, self._size, parameters, keep)
@@ -141,9 +145,18 @@ class Batch:
         compiled, functions = self._compiled
         before = functions, grid.packed, grid.periods, self._sets, self._anchors, every
         after = polish, first.model.kernels.output_rates, solution
-        in_blocks(
-            lambda block: compiled.solve_many(*before, *block, *after), solution.status.size, SMALLEST_BLOCK, threads
-        )
+        status = solution.status
+        whole = whole and without is None and len(status) > 1
+        # A failed solve takes as long as hundreds that converge; without one, another call takes longer.
+        ends = [0, status.shape[1], status.size] if whole and status.shape[1] > 1 else [0, status.size]
+        for start, stop in pairwise(ends):
+            in_blocks(
+                lambda block, start=start: compiled.solve_many(*before, start + block[0], start + block[1], *after),  # type: ignore[misc]
+                stop - start, SMALLEST_BLOCK, threads,
+            )  # fmt: skip
+            if whole:
+                lost = status[0] != CONVERGED
+                status[1:, lost] = status[0, lost]
         return solution
 
     def sensitivities(self, parameters: np.ndarray, z: np.ndarray, moving: np.ndarray) -> list[Sensitivities | None]:

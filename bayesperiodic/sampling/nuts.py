@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from bayesperiodic._parallel import Terminated
+from bayesperiodic._printing import progress_bar
 from bayesperiodic.density.log_posterior import SAMPLED, LogPosterior
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.problem.parameters import CHAIN, DRAW
@@ -164,12 +165,12 @@ class _Chains:
 
     def _judge(self, max_steps: int, progress: bool) -> None:
         passes, tau = 0, np.empty(0)
-        with tqdm(total=max_steps, unit="draw", desc="sampling", disable=not progress) as bar:
+        with progress_bar(total=max_steps, unit="draw", desc="sampling", disable=not progress) as bar:
             for steps in (*range(DRAWS_BETWEEN_CHECKS, max_steps, DRAWS_BETWEEN_CHECKS), max_steps):
                 self._wait(steps, bar)
                 self.steps, kept = steps, self.kept(steps)
                 tau, missing = stop_rule(kept, mode_of(self.density, self.fit, kept), tau, self.density.labels)
-                bar.set_postfix_str(f"tau {tau.max():.1f}, length {steps / tau.max():.0f} tau")
+                bar.set_postfix_str(f"tau {tau.max():.1f}, length {steps / tau.max():.0f} tau", refresh=False)
                 passes = 0 if missing else passes + 1
                 if passes >= PASSES:
                     self.converged = True

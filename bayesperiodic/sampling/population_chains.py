@@ -5,8 +5,8 @@ from typing import Any
 
 import emcee
 import numpy as np
-from tqdm import tqdm
 
+from bayesperiodic._printing import progress_bar
 from bayesperiodic.sampling.convergence import PASSES, autocorrelation_time, unmet_criteria
 from bayesperiodic.sampling.moves import MixtureMove, moves
 from bayesperiodic.sampling.population_coordinates import Decoupled
@@ -94,7 +94,7 @@ def sample_chains(density: PopulationDensity, seed: int, *, progress: bool) -> C
 
     Where nearly all proposals are independent of the walkers, tau needs no further check.
     """
-    with tqdm(unit="step", desc="population", disable=not progress) as bar:
+    with progress_bar(unit="step", desc="population", disable=not progress) as bar:
         coordinates = Decoupled(density)
         run = _Run(coordinates, seed, bar)
         run.adapt()

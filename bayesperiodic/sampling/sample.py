@@ -25,6 +25,7 @@ from bayesperiodic._parallel import (
     ended_by_termination,
     interrupts_deferred,
 )
+from bayesperiodic._printing import progress_bar
 from bayesperiodic.density.log_posterior import (
     COLLAPSED,
     NATURAL,
@@ -341,14 +342,14 @@ class _EnsembleRun:
     def _sample(self, max_steps: int, store: Checkpoint | None, evaluate: Evaluate, progress: bool) -> None:
         """Advance from check to check; before the last round of adaptation a check fits the mixture."""
         state = self.state
-        with tqdm(total=max_steps, unit="step", desc="sampling", disable=not progress) as bar:
+        with progress_bar(total=max_steps, unit="step", desc="sampling", disable=not progress) as bar:
             while state["steps"] < max_steps:
                 until = min(state["next"], max_steps)
                 self._advance(until, evaluate, bar)
                 state |= {"steps": until}
                 if until == state["next"]:
                     if state["burnt"] and not self._outdated():
-                        bar.set_postfix_str(self._judge())
+                        bar.set_postfix_str(self._judge(), refresh=False)
                     else:
                         self._adapt()
                 self._save(store, now=state["converged"] or until == max_steps)

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.integrate import solve_ivp
 from scipy.stats import binom
 from tqdm import tqdm
 
@@ -18,8 +17,8 @@ from studies import shooting
 from studies.pendulum.recording import COORDINATES, OMEGA, TRUTH
 from studies.shooting import TURN
 
-# Tolerances of the integration, and of that which counts the turns; accuracy of the orbit.
-TOLERANCE, ROUGH, ACCURACY = 1e-10, 1e-6, 1e-9
+# Tolerance of the integration, accuracy of the orbit.
+TOLERANCE, ACCURACY = 1e-11, 1e-9
 
 
 class Shot(NamedTuple):
@@ -41,16 +40,14 @@ def shoot(parameters: Mapping[str, float], omega: float, points: np.ndarray) -> 
     inertia = p["m"] * p["l"] ** 2
     changes = {"width": p["v0"], "g": p["g"], "lift": p["a"], "length": p["l"]}
     changes |= {f"c{i}": p[f"k{i}"] / inertia for i in (1, 2, 3)}
-    slope, jacobian, period = shooting.pendulum(omega, **changes)
-    times = period * np.arange(len(states) + 1)
-    ends = [solve_ivp(slope, (0.0, period), state, "DOP853", rtol=ROUGH, atol=ROUGH).y[0, -1] for state in states]
+    advance = shooting.pendulum_flow(omega, TOLERANCE, **changes)
+    times = TURN / omega * np.arange(len(states) + 1)
+    ends = [advance(times[0], times[1], state)[0][0] for state in states]
     turns = np.round((np.array(ends) - np.roll(states[:, 0], -1)) / TURN)
     states[1:, 0] += TURN * np.cumsum(turns)[:-1]
     winding = int(turns.sum())
     try:
-        orbit = shooting.shoot(
-            slope, jacobian, times, states, [TURN * winding, 0.0], tolerance=TOLERANCE, accuracy=ACCURACY
-        )
+        orbit = shooting.closed(advance, times, states, [TURN * winding, 0.0], accuracy=ACCURACY)
     except (RuntimeError, np.linalg.LinAlgError):
         return Shot(states, winding, np.full(2, np.nan), 0, False)
     wrapped = orbit.states.copy()

@@ -190,6 +190,17 @@ def test_failed_solve_does_not_affect_the_other_points(batch):
     assert np.isfinite(outputs[[0, 1, 3, 4]]).all()
 
 
+def test_a_failure_in_the_first_set_rejects_the_others_only_with_whole(equations):
+    together, parameters = Batch([equations] * 2, [anchored(equations)] * 2), spread(3)
+    parameters[1, 3] *= -1e4
+    apart, whole = together.solve(parameters), together.solve(parameters, whole=True)
+    assert apart.status[:, 1].all() and apart.iterations[1, 1] > 0 == whole.iterations[1, 1]
+    alone = together.solve(parameters[1:2], whole=True)
+    assert np.all(whole.status[:, 1] == apart.status[0, 1]) and np.array_equal(alone.status[:, 0], whole.status[:, 1])
+    for part, other in zip(apart, whole, strict=True):
+        assert np.array_equal(part[:, [0, 2]], other[:, [0, 2]])
+
+
 def test_solves_stay_on_the_branch_of_the_anchor():
     """On the bistable Duffing curve, results either continue the anchor's upper branch or say "other orbit"."""
     tau = grid(200)
