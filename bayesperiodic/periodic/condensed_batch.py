@@ -166,12 +166,10 @@ class CondensedBatch:
         shares = np.stack([unresolved(*of_set) for of_set in zip(self._largest, f, every_y, strict=True)])
         if blocks.size:
             change = fewer - f[:, :, : fewer.shape[2]]
-            for e, (r, y) in enumerate(zip(responses, every_y, strict=True)):
-                by_memory = error_of_fewer(r.y_f, change[e], y)
-                for b in np.flatnonzero(lost[e]):
-                    if status[e, b] == CONVERGED:
-                        by_memory[b] = self._sets[e].error_of_memory(d[e, b], f[e, b], y[b], every[e, b])
-                shares[e] = np.maximum(shares[e], by_memory)
+            by_memory = [error_of_fewer(r.y_f, c, y) for r, c, y in zip(responses, change, every_y, strict=True)]
+            for e, b in np.argwhere((lost != 0) & (status == CONVERGED)):
+                by_memory[e][b] = self._sets[e].error_of_memory(d[e, b], f[e, b], every_y[e][b], every[e, b])
+            shares = np.maximum(shares, by_memory)
         finer = {}
         for e, b in np.argwhere((status == CONVERGED) & ~(shares <= RESOLVED_SHARE)):
             equations, theta = self._sets[e], every[e, b]

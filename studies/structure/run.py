@@ -140,4 +140,5 @@ def corner(problem: bp.Problem, fit: bp.MapEstimate, posterior: bp.Posterior) ->
         for set_label, name in ((axes.set_xlabel, axes.get_xlabel()), (axes.set_ylabel, axes.get_ylabel())):
             if name:
                 set_label(f"{name}\n[{UNITS[name]}]")
+    figure.subplots_adjust(left=figure.subplotpars.left + 0.02)
     return common.titled(figure, "Beam with joint and stop (synthetic data)")
