@@ -57,7 +57,7 @@ class PoincareSection(Result):
     instants : array (count,) or None
         Times of the points [s].
     time, signals : array (samples,), array (samples, channels), or None
-        The recording, angles unwrapped, one column a channel: those of the coordinates in their order, then `others`;
+        The recording, angles unwrapped, one column a channel: those of the coordinates in their order, then ``others``;
         None for points alone.
     values : int
         Number of measured values of the coordinates.
@@ -399,7 +399,7 @@ class PoincareSection(Result):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The channels of the recording, in the order of `signals`."""
+        """The channels of the recording, in the order of the columns of signals."""
         return (*channels_of(self.coordinates), *self.others)
 
     @property
