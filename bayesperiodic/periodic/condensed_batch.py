@@ -107,7 +107,7 @@ class CondensedBatch:
         """
         every = np.empty((len(self._sets), *parameters.shape[-2:]))
         every[:] = parameters
-        together = max(1, MOST_RESPONSE_NUMBERS // (self._d.size * max(1, self._d.shape[-1])))
+        together = max(1, MOST_RESPONSE_NUMBERS // max(1, self._d.size * self._d.shape[-1]))
         solved = []
         for first in range(0, max(1, every.shape[1]), together):
             part = slice(first, first + together)

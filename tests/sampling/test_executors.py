@@ -18,6 +18,7 @@ from scipy import stats
 from tqdm import tqdm
 
 import bayesperiodic as bp
+from bayesperiodic import _printing
 from bayesperiodic.likelihood import observation
 from bayesperiodic.periodic import batch
 from bayesperiodic.sampling import sample
@@ -125,7 +126,7 @@ def hooked(monkeypatch: pytest.MonkeyPatch, steps: int, act) -> None:
                 Bar.done = True
                 act()
 
-    monkeypatch.setattr(sample, "tqdm", Bar)
+    monkeypatch.setattr(_printing, "tqdm", Bar)
 
 
 def killed(pool: ProcessPoolExecutor) -> None:
