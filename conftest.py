@@ -42,7 +42,7 @@ def pendulum_orbits() -> bp.Orbits:
     section = bp.PoincareSection.from_recording(
         pendulum_recording(), ("angle", "rate"), frequency=1.4467, angles=["angle"]
     )
-    return bp.find_orbits(section, periods=[1])
+    return bp.find_orbits(section, periods=[1], waveforms=True)
 
 
 @cache

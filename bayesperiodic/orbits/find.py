@@ -50,6 +50,7 @@ def find_orbits(
     neighbours: int = 32,
     box: float = 0.01,
     steps: int = 1,
+    waveforms: bool = False,
 ) -> Orbits:
     """Find the unstable periodic orbits in a section of a chaotic motion, without a model.
 
@@ -77,6 +78,9 @@ def find_orbits(
         Local maps a return for "chained", from one phase of the forcing to the next, if the section is of a recording.
         A map over a part of the period stretches less and is closer to a polynomial: more orbits are found where one
         return stretches much, but each map needs the noise of its points to be small against its bandwidth.
+    waveforms : bool
+        Find also `Orbit.waveform` of each orbit, which takes longer than the search, for "chained" and a section of a
+        recording.
 
     Returns
     -------
@@ -114,7 +118,7 @@ def find_orbits(
         atlas = Atlas(maps, _search_count(maps, neighbours))
         pairs = [pair for p in wanted for pair in _chained(maps, atlas, p, neighbours)]
     quality_count = _search_count(maps, FEWEST_NEIGHBOURS)
-    following = Following(section, maps, size) if pairs and section.measured is not None else None
+    following = Following(section, maps, size) if waveforms and pairs and section.measured is not None else None
     extent = _extent(section)
     orbits = [
         _orbit(section, maps, size, extent, *pair, _quality(maps, *pair, quality_count), following) for pair in pairs

@@ -63,8 +63,8 @@ class Orbit(Result):
     cycle : mapping of str to array (samples·period,) or None
         The closest measured cycle by channel, angles continuous; None for a section of points alone.
     waveform : Waveform or None
-        All channels over the period with errors, by local regression of the motion that follows the points; None for a
-        section of points alone, and for the method "boxes".
+        All channels over the period with errors, by local regression of the motion that follows the points, from
+        `find_orbits` with ``waveforms=True``; None for a section of points alone, and for the method "boxes".
     solution : PeriodicSolution or None
         The model's orbit, from `polish_orbits`.
     equilibrium : bool

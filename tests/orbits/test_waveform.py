@@ -55,7 +55,7 @@ def double_well_orbits(seed=0, steps=1):
         outputs = {"y": noisy["y"], "x": noisy["x"]}
         pieces.append(bp.Recording(times + k * (PIECE + 1) * PERIOD, outputs, {"u": noisy["u"]}))
     section = bp.PoincareSection.from_recordings(pieces, ("x", "y"), frequency=1.0 / PERIOD)
-    return section, bp.find_orbits(section, periods=[1, 2, 3], steps=steps)
+    return section, bp.find_orbits(section, periods=[1, 2, 3], steps=steps, waveforms=True)
 
 
 def images(points):
@@ -202,7 +202,7 @@ def test_the_angle_of_a_waveform_is_the_integral_of_its_rate():
         recording, ("angle", "rate"), frequency=chaos.FREQUENCY, angles=("angle",)
     )
     turning = 0
-    for orbit in bp.find_orbits(section, periods=[1, 2]):
+    for orbit in bp.find_orbits(section, periods=[1, 2], waveforms=True):
         if abs(orbit.eigenvalues[0]) > 50 or orbit.equilibrium:
             continue
         angle, rate = orbit.waveform.values["angle"], orbit.waveform.values["rate"]
@@ -230,7 +230,11 @@ def beam_orbits(seed):
         for one in wells.recordings(2600, (5e-4,) * 3, seed=seed)
     ]
     section = bp.PoincareSection.from_recordings(pieces, ("y", "v", "v[-0.25]"), frequency=1.0 / wells.PERIOD)
-    return [orbit for orbit in bp.find_orbits(section, periods=[1, 2], steps=2) if abs(orbit.eigenvalues[0]) < 15]
+    return [
+        orbit
+        for orbit in bp.find_orbits(section, periods=[1, 2], steps=2, waveforms=True)
+        if abs(orbit.eigenvalues[0]) < 15
+    ]
 
 
 def beam():
@@ -304,5 +308,7 @@ def test_what_the_whole_waveform_cannot_do_raises():
     with pytest.raises(ValueError, match="states: must be one of 'x', 'y', got 'u'"):
         orbits[0].experiment(states={"x": "u"})
     alone = bp.PoincareSection.from_points(chaos.points(3000), ("angle", "rate"), frequency=1.0, angles=("angle",))
-    assert all(orbit.waveform is None for orbit in bp.find_orbits(alone, periods=[1]))
-    assert all(orbit.waveform is None for orbit in bp.find_orbits(section, periods=[1, 2], method="boxes"))
+    assert all(orbit.waveform is None for orbit in bp.find_orbits(alone, periods=[1], waveforms=True))
+    boxes = bp.find_orbits(section, periods=[1, 2], method="boxes", waveforms=True)
+    assert all(orbit.waveform is None for orbit in boxes)
+    assert all(orbit.waveform is None for orbit in bp.find_orbits(section, periods=[1]))
