@@ -79,8 +79,8 @@ def find_orbits(
         A map over a part of the period stretches less and is closer to a polynomial: more orbits are found where one
         return stretches much, but each map needs the noise of its points to be small against its bandwidth.
     waveforms : bool
-        Find also the attribute ``waveform`` of each orbit, which takes longer than the search, for "chained" and a section of a
-        recording.
+        Find also the attribute ``waveform`` of each orbit, which takes longer than the search, for "chained" and a
+        section of a recording.
 
     Returns
     -------
