@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -149,11 +149,12 @@ class Batch:
         whole = whole and without is None and len(status) > 1
         # A failed solve takes as long as hundreds that converge; without one, another call takes longer.
         ends = [0, status.shape[1], status.size] if whole and status.shape[1] > 1 else [0, status.size]
+
+        def part(start: int, block: tuple[int, int]) -> None:
+            compiled.solve_many(*before, start + block[0], start + block[1], *after)
+
         for start, stop in pairwise(ends):
-            in_blocks(
-                lambda block, start=start: compiled.solve_many(*before, start + block[0], start + block[1], *after),  # type: ignore[misc]
-                stop - start, SMALLEST_BLOCK, threads,
-            )  # fmt: skip
+            in_blocks(partial(part, start), stop - start, SMALLEST_BLOCK, threads)
             if whole:
                 lost = status[0] != CONVERGED
                 status[1:, lost] = status[0, lost]

@@ -144,8 +144,8 @@ def march(address, states, out, theta, rate, step, sizes):
                             change = a[row * size + r, 2 * size]
                             near[row, first + r] -= share * change
                             # A state that begins at 0 with rate 0 has no scale yet.
-                            size_here = max(scale[first + r - offset], abs(near[row, first + r]))
-                            if not abs(change) <= LAST_STATE_STEP * size_here:
+                            level = max(scale[first + r - offset], abs(near[row, first + r]))
+                            if not abs(change) <= LAST_STATE_STEP * level:
                                 settled = False
                             if not abs(change) < np.inf:
                                 return False

@@ -537,15 +537,6 @@ def test_commas_that_are_no_thousands_are_not_called_so():
     assert text_cells.refusal(["1,23", "later"], False) == ""
 
 
-def test_units_above_names_may_stand_behind_a_mark_of_comments(tmp_path):
-    file = tmp_path / "run.csv"
-    rows = [f"{0.001 * k:.3f},{np.sin(0.1 * k):.6f}" for k in range(50)]
-    file.write_text("\n".join(["#,ms,mm", "time,x", *rows]))
-    run = bp.Recording.from_csv(file, time="time", outputs={"x": "x"})
-    np.testing.assert_allclose(run.time[:3], [0.0, 1e-6, 2e-6], atol=1e-12)
-    assert np.abs(run.outputs["x"]).max() < 1.01e-3
-
-
 def test_characters_that_decide_an_encoding_are_shown(tmp_path):
     file = tmp_path / "run.csv"
     rows = [f"{0.001 * k:.3f},{np.sin(0.1 * k):.6f}" for k in range(50)]
