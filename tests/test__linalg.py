@@ -7,7 +7,7 @@ import scipy.linalg
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import bayesperiodic as bp
-from bayesperiodic._linalg import covariance_cholesky, covariance_eigh, hessian_eigh, in_one_thread, one_thread
+from bayesperiodic._linalg import covariance_cholesky, covariance_eigh, factors, hessian_eigh, in_one_thread, one_thread
 from bayesperiodic.data import recording
 from tests.known import LINEAR
 
@@ -159,3 +159,12 @@ def test_a_forked_process_does_not_inherit_the_limit_of_other_threads(two_thread
     assert os.waitpid(child, 0)[1] == 0
     leave.set()
     other.join()
+
+
+def test_factors_solve_and_a_singular_matrix_has_none():
+    matrix = np.random.default_rng(0).standard_normal((5, 5))
+    given, right = matrix.copy(), np.arange(5.0)
+    np.testing.assert_allclose(scipy.linalg.lu_solve(factors(matrix), right), np.linalg.solve(given, right))
+    assert np.array_equal(matrix, given)
+    with pytest.raises(np.linalg.LinAlgError, match="singular"):
+        factors(np.ones((3, 3)))
