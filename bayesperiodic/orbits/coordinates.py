@@ -10,12 +10,15 @@ from bayesperiodic.data.recording import Recording
 from bayesperiodic.orbits.stretches import LONGEST_USUAL_STEP, SMALLEST_WINDOW, Stretches, smoothed, usual_step
 
 DEGREES = 180.0 / np.pi
-# A delayed coordinate: a channel, and in brackets forcing periods after the phase of the section.
-DELAYED = re.compile(r"(.*)\[([^\[\]]*)\]", re.DOTALL)
+# Fraction of the returns that are shorter than the one with which windows and delays are compared.
+SHORT_RETURN = 0.01
+# A delayed coordinate: a channel, and in brackets the time after the instant of the section, in forcing periods or, for
+# crossings, in seconds, with the unit s.
+DELAYED = re.compile(r"(.*)\[([^\[\]]*?)( ?s)?\]", re.DOTALL)
 
 
 def channel_and_delay(coordinate: str) -> tuple[str, float]:
-    """Return the channel of a coordinate and its delay in forcing periods after the phase of the section."""
+    """Return the channel of a coordinate and its delay, in forcing periods or in seconds, as its section has it."""
     match = DELAYED.fullmatch(coordinate)
     return (match[1], float(match[2])) if match else (coordinate, 0.0)
 
@@ -32,7 +35,7 @@ def columns_of(names: Sequence[str]) -> np.ndarray:
 
 
 def delays_of(names: Sequence[str]) -> np.ndarray:
-    """Return the delay of each coordinate in forcing periods."""
+    """Return the delay of each coordinate in forcing periods or in seconds."""
     return np.array([channel_and_delay(name)[1] for name in names])
 
 
@@ -54,25 +57,51 @@ def longest_window(names: Sequence[str], samples: float, steps: int = 1) -> floa
     return shortest
 
 
+def longest_window_of_crossings(names: Sequence[str], channel: str | None, rate: float, returns: np.ndarray) -> float:
+    """Return the shortest time [s] between two values of a channel, at this crossing and the next one.
+
+    The coordinates have the names, the crossing channel is None at steps between the crossings, the rate is that of the
+    samples, and the times between the crossings are `returns` [s]. Raises a ValueError if windows of the fewest samples overlap.
+    """
+    every = tuple(names) if channel is None else (channel, *names)
+    columns, delays = columns_of(every), delays_of(every)
+    until_next, least = float(np.quantile(returns, SHORT_RETURN)), 2 * SMALLEST_WINDOW / rate * (1.0 - 1e-9)
+    for column in np.unique(columns):
+        places = np.sort(delays[columns == column])
+        apart, span = np.diff(places).min(initial=np.inf), places[-1] - places[0]
+        if min(apart, until_next - span) < least:
+            raise ValueError(
+                f"coordinates: must have values of a channel at least {least:.3g} s ({2 * SMALLEST_WINDOW} samples) "
+                f"apart, and no longer before the next crossing, {until_next:.3g} s later, got {list(every)}. "
+                "Otherwise they share their noise: choose other delays."
+            )
+        until_next = min(apart, until_next - span)
+    return until_next
+
+
 def coordinate_values(
-    samples: Stretches, names: Sequence[str], instants: np.ndarray, stretch: np.ndarray, frequency: float,
-    usual: float, steps: int = 1,
-) -> tuple[np.ndarray, np.ndarray | None]:  # fmt: skip
-    """Return the coordinates (instants, d) at given instants, a usual time apart, and the sd (d,) of their errors."""
-    longest = usual * longest_window(names, samples.sampling_rate / frequency, steps)
+    samples: Stretches, names: Sequence[str], instants: np.ndarray, stretch: np.ndarray, unit: float, longest: float
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the coordinates (instants, d) at given instants, and the standard deviation (d,) of their errors.
+
+    The unit of delays and the longest window are in seconds.
+    """
     values, noise = np.empty((instants.size, len(names))), np.empty(len(names))
     delays, columns = delays_of(names), columns_of(names)
     first, last = samples.time[samples.starts[stretch]], samples.time[samples.stops[stretch] - 1]
     for delay in np.unique(delays):
         here = delays == delay
         part = samples._replace(signals=samples.signals[:, columns[here]])
-        at = np.clip(instants + delay / frequency, first, last)
+        at = np.clip(instants + delay * unit, first, last)
         values[:, here], noise[here] = smoothed(part, at, stretch, longest)
     return values, None if np.isnan(noise).any() else noise
 
 
-def coordinate_names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def coordinate_names(
+    coordinates: Sequence[str], angles: Iterable[str], *, forced: bool = True
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of coordinates and of those that are angles; raise a ValueError unless they are valid."""
+    unit, example = ("forcing periods", "-0.25") if forced else ("seconds with the unit", "-0.25 s")
     given = [coordinates] if isinstance(coordinates, str) else list(coordinates)
     names, delayed = [], set()
     for name in given:
@@ -81,11 +110,11 @@ def coordinate_names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple
             names.append(name)
             continue
         try:
-            _checks.finite_number("delay", float(match[2]))
+            _checks.finite_number("delay", float(match[2] if (match[3] is None) == forced else ""))
         except ValueError:
             raise ValueError(
-                f"coordinates: must have a number in brackets, the delay in forcing periods, such as "
-                f"{match[1] + '[-0.25]'!r}, got {name!r}."
+                f"coordinates: must have a number in brackets, the delay in {unit}, such as "
+                f"{match[1] + f'[{example}]'!r}, got {name!r}."
             ) from None
         names.append(match[1])
         delayed.add(match[1])
@@ -105,10 +134,10 @@ def coordinate_names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple
 
 
 def coordinate_signals(
-    recording: Recording, coordinates: Sequence[str], angles: Iterable[str]
+    recording: Recording, coordinates: Sequence[str], angles: Iterable[str], *, forced: bool = True
 ) -> tuple[tuple[str, ...], tuple[str, ...], np.ndarray]:
     """Return the names of the coordinates and of their angles, and values (samples, channels), angles unwrapped."""
-    names, angle_names = coordinate_names(coordinates, angles)
+    names, angle_names = coordinate_names(coordinates, angles, forced=forced)
     channels = channels_of(names)
     for name in channels:
         _checks.one_of("coordinates", name, recording.outputs)

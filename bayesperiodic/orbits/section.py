@@ -1,7 +1,7 @@
 """PoincareSection: points of a motion, once a forcing period or where it crosses a plane."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,19 +19,18 @@ from bayesperiodic.orbits.coordinates import (
     coordinate_values,
     delays_of,
     longest_window,
+    longest_window_of_crossings,
     wrapped,
 )
+from bayesperiodic.orbits.crossings import Crossings, refined, upward_crossings
 from bayesperiodic.orbits.stretches import (
     FEWEST_SAMPLES,
-    SMALLEST_WINDOW,
     Stretches,
     joined,
     local_fit,
 )
 
 FEWEST_POINTS, CYCLE_SAMPLES = 200, 64
-# A signal must go so far below a level between two crossings, in standard deviations, so that noise adds none.
-CROSSING_BAND = 0.1
 
 
 @dataclass(frozen=True)
@@ -45,6 +44,7 @@ class PoincareSection(Result):
     coordinates, angles : tuple of str
         The coordinates, and those of them that are angles, one at most. A delayed one is a channel and, in brackets,
         the forcing periods after the phase of the section: ``"voltage[-0.25]"`` is the voltage a quarter period before.
+        For crossings the delay is in seconds: ``"voltage[-0.1 s]"``.
     frequency : float
         Forcing frequency [Hz]; for crossings of a plane, returns per second.
     increments : array (count − 1, d)
@@ -73,6 +73,8 @@ class PoincareSection(Result):
     others, inputs : tuple of str
         Further channels of the recording (of all recordings), outputs and then inputs, and those of them that are
         inputs.
+    crossed : str or None
+        Channel whose crossings define the section; None if the phase of a forcing does.
 
     Examples
     --------
@@ -104,6 +106,7 @@ class PoincareSection(Result):
     left_out: int = 0
     others: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
+    crossed: str | None = None
 
     @classmethod
     def from_recording(
@@ -223,12 +226,13 @@ class PoincareSection(Result):
                 "a period, use from_points."
             )
         delays = delays_of(names)
-        longest_window(names, samples.sampling_rate / frequency)
+        longest = longest_window(names, samples.sampling_rate / frequency)
         instants, stretch, left_out = samples.instants(frequency, origin, (delays.min(), delays.max()))
         synthetic = any(recording.synthetic for recording in given)
         section = cls._of(
-            samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency
-        )
+            samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency,
+            longest * _usual(instants),
+        )  # fmt: skip
         extent = np.array([np.ptp(signal) for signal in samples.signals.T])[columns_of(names)]
         if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * extent):
             raise ValueError(
@@ -238,61 +242,90 @@ class PoincareSection(Result):
         return section
 
     @classmethod
+    @in_one_thread
     def from_crossings(
         cls,
-        recording: Recording,
+        recordings: Recording | Iterable[Recording],
         coordinates: Sequence[str],
         *,
         channel: str,
-        level: float = 0.0,
+        level: float | None = None,
         direction: int = 1,
         angles: Iterable[str] = (),
     ) -> "PoincareSection":
-        """Evaluate a recording where a channel crosses a level, as for autonomous systems.
+        """Evaluate recordings where a channel crosses a level, as for autonomous systems.
+
+        The crossings are those of the smoothed channel, which must go below the level and above it by more than a band,
+        a tenth of the channel's standard deviation and at least five of the smoothed channel's errors: noise and small
+        ripple add none.
 
         Parameters
         ----------
-        recording, coordinates, angles
-            As for `from_recording`, without delayed coordinates.
+        recordings : Recording or sequence of them
+            At least 8 samples between two crossings; pieces, gaps and joined recordings as for `from_recordings`.
+        coordinates : sequence of str
+            Two or more outputs that determine the next crossing, one fewer than the system has states, or more. What is
+            not measured is replaced by delayed coordinates, the delay in seconds with the unit:
+            ``("current[-0.1 s]", "current[-0.2 s]")`` are the values of the only channel 0.1 s and 0.2 s before it
+            crosses the level. They lie within the shortest time between two crossings.
         channel : str
-            Output whose crossings define the section; not one of the coordinates.
-        level : float
+            Output whose crossings define the section; among the coordinates only with delays.
+        level : float, optional
+            By default the median of the channel, which every motion crosses. It should be where the channel is steep,
+            and be crossed once an oscillation; all orbits must cross it.
         direction : {1, -1}
             Upwards or downwards.
+        angles
+            As for `from_recording`.
 
         Returns
         -------
         PoincareSection
-            `frequency` is the mean number of returns per second; the times between them follow from ``instants``.
+            `frequency` is the mean number of returns per second. The times between the crossings are data too: an orbit
+            has its own period with an error (`Orbit.duration`).
 
         Raises
         ------
         ValueError
-            For an unknown channel, too few crossings, and as for `from_recording`.
+            For an unknown channel, too few crossings or samples, delays of one channel that are too close or too long,
+            and as for `from_recordings`.
+
+        Notes
+        -----
+        The error of a crossing's instant moves all coordinates along the flow; the standard deviations `noise` contain
+        it.
+
+        Examples
+        --------
+        One channel of the Roessler system with two delays, where the channel crosses its median upwards:
+
+        >>> section = bp.PoincareSection.from_crossings(roessler, ("x[-0.7 s]", "x[-1.4 s]"), channel="x")
+        >>> section
         """
-        names, angle_names, signals = coordinate_signals(recording, coordinates, angles)
-        if channels_of(names) != names:
-            raise ValueError(
-                f"coordinates: must be without delays for crossings, got {list(names)}. Delays are fractions of a "
-                "forcing period; use from_recording for a forced system."
-            )
-        _checks.one_of("channel", channel, [name for name in recording.outputs if name not in names])
-        level = _checks.finite_number("level", level)
+        given = _recordings([recordings] if isinstance(recordings, Recording) else recordings)
+        parts = [coordinate_signals(recording, coordinates, angles, forced=False) for recording in given]
+        names, angle_names = parts[0][:2]
+        others, inputs = _other_channels(given, names)
+        every = (*channels_of(names), *others)
+        _checks.one_of("channel", channel, [c for c in every if c not in names and c not in inputs])
         if direction not in (1, -1):
             raise ValueError(f"direction: must be 1 (upwards) or -1 (downwards), got {direction!r}.")
-        others, inputs = _other_channels([recording], names)
-        signals = _with_others(recording, signals, others)
-        samples = _unwrapped(joined([recording], [signals], None), np.isin((*names, *others), angle_names))
-        height = direction * (recording.outputs[channel] - level)
-        band, crossings = CROSSING_BAND * height.std(), []
-        for start, stop in zip(samples.starts, samples.stops, strict=True):
-            long = stop - start >= 2 * SMALLEST_WINDOW
-            crossings.append(
-                _upward_crossings(recording.time[start:stop], height[start:stop], band) if long else np.empty(0)
-            )
-        stretch = np.repeat(np.arange(len(crossings)), [one.size for one in crossings])
-        instants = np.concatenate(crossings)
-        return cls._of(samples, names, angle_names, instants, stretch, 0, recording.synthetic, others, inputs)
+        signals = [_with_others(one, values, others) for one, (*_, values) in zip(given, parts, strict=True)]
+        samples = _unwrapped(joined(given, signals, None), np.isin(every, angle_names))
+        values = samples.signals[:, [every.index(channel)]]
+        level = float(np.median(values)) if level is None else _checks.finite_number("level", level)
+        height = samples._replace(signals=direction * (values - level))
+        delays = delays_of(names)
+        crossings = upward_crossings(height, height.time.size // (2 * FEWEST_POINTS)).within(samples, delays.min(), delays.max())
+        _check_count(crossings.instants.size)
+        longest = longest_window_of_crossings(names, channel, samples.sampling_rate, crossings.returns)
+        crossings, error = refined(height, crossings, longest)
+        synthetic = any(recording.synthetic for recording in given)
+        section = cls._of(
+            samples, names, angle_names, crossings.instants, crossings.stretch, 0, synthetic, others, inputs,
+            1.0 / float(crossings.returns.mean()), longest, channel,
+        )  # fmt: skip
+        return section if section.noise is None else replace(section, noise=section._with_errors_of(crossings, error))
 
     @classmethod
     def from_points(
@@ -346,23 +379,32 @@ class PoincareSection(Result):
     def _of(
         cls, samples: Stretches, names: tuple[str, ...], angles: tuple[str, ...], instants: np.ndarray,
         stretch: np.ndarray, left_out: int, synthetic: bool, others: tuple[str, ...], inputs: tuple[str, ...],
-        frequency: float | None = None,
+        frequency: float, longest: float, crossed: str | None = None,
     ) -> "PoincareSection":  # fmt: skip
-        """Return the section of signals at given instants; the frequency is by default that of the instants."""
+        """Return the section of signals at given instants, in windows no longer than `longest`."""
         _check_count(instants.size)
-        if frequency is None:
-            returns = np.diff(instants)[np.diff(stretch) == 0]
-            frequency = float(returns.size / returns.sum())
-        time = samples.time
-        usual = float(np.median(np.diff(instants)))
-        values, noise = coordinate_values(samples, names, instants, stretch, frequency, usual)
+        time, unit = samples.time, 1.0 if crossed else 1.0 / frequency
+        values, noise = coordinate_values(samples, names, instants, stretch, unit, longest)
         points, increments = wrapped(values, np.isin(names, angles)), _within(np.diff(values, axis=0), stretch)
         broken = samples.starts.size > 1
         return cls(
             points, names, angles, frequency, increments, True, noise, instants, time, samples.signals,
             time.size * len(channels_of(names)), synthetic, stretch if broken else None,
-            samples.starts if broken else None, left_out, others, inputs,
+            samples.starts if broken else None, left_out, others, inputs, crossed,
         )  # fmt: skip
+
+    def _with_errors_of(self, crossings: Crossings, error: float) -> np.ndarray:
+        """Return the noise (d,) of the points, with that of crossings of a signal with errors of this sd."""
+        measured = self.measured
+        assert measured is not None and self.noise is not None
+        samples, instants, stretch = measured
+        apart = float(np.median(crossings.band / crossings.slopes))
+        before, later = (
+            coordinate_values(samples, self.coordinates, instants + away, stretch, 1.0, 2.0 * apart)[0]
+            for away in (-apart, apart)
+        )
+        rates = (later - before) / (2.0 * apart)
+        return np.hypot(self.noise, error * np.sqrt(np.mean((rates / crossings.slopes[:, None])**2, axis=0)))
 
     def __len__(self) -> int:
         return len(self.points)
@@ -386,16 +428,21 @@ class PoincareSection(Result):
             For an unknown channel.
         """
         channel, delay = channel_and_delay(coordinate)
-        channels = channels_of(self.coordinates)
+        channels = self.channels if self.crossed else channels_of(self.coordinates)
         _checks.one_of("coordinate", channel, channels)
         measured = self.measured
         if measured is None:
             return None
         samples, instants, stretch = measured
-        at, column = instants + delay / self.frequency, [channels.index(channel)]
+        at, column = instants + delay * self.unit, [channels.index(channel)]
         first, last = samples.time[samples.starts[stretch]], samples.time[samples.stops[stretch] - 1]
         values = local_fit(samples._replace(signals=samples.signals[:, column]), np.clip(at, first, last), stretch)[0]
         return np.where((first <= at) & (at <= last), values[:, 0], np.nan)
+
+    @property
+    def unit(self) -> float:
+        """The unit of delays [s]."""
+        return 1.0 if self.crossed else 1.0 / self.frequency
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -442,10 +489,13 @@ class PoincareSection(Result):
         followed = np.append(np.diff(stretch) == 0, False)
         instants = returns[:, None] + after[:, None] * np.arange(steps) / steps
         present = followed[:, None] | (np.arange(steps) == 0)
-        usual = float(np.median(after)) / steps
         each = np.broadcast_to(stretch[:, None], present.shape)[present]
-        names, frequency = self.coordinates, self.frequency
-        values, noise = coordinate_values(samples, names, instants[present], each, frequency, usual, steps)
+        names, rate = self.coordinates, samples.sampling_rate
+        if self.crossed:
+            longest = longest_window_of_crossings(names, None, rate, after[followed] / steps)
+        else:
+            longest = longest_window(names, rate / self.frequency, steps) * _usual(returns) / steps
+        values, noise = coordinate_values(samples, names, instants[present], each, self.unit, longest)
         if noise is None:
             raise ValueError(f"steps: must be 1 for stretches too short to determine the noise, got {steps}.")
         signals = np.full((present.size, len(names)), np.nan)
@@ -500,6 +550,10 @@ class PoincareSection(Result):
         return f"PoincareSection({len(self.points)} points of {names} at {self.frequency:.6g} Hz from {source}{lost})"
 
 
+def _usual(instants: np.ndarray) -> float:
+    return float(np.median(np.diff(instants)))
+
+
 def _within(increments: np.ndarray, stretch: np.ndarray) -> np.ndarray:
     """Return increments (count − 1, d) with NaN where the next point (count,) is in another stretch."""
     return np.where((np.diff(stretch) == 0)[:, None], increments, np.nan)
@@ -546,22 +600,5 @@ def _unwrapped(samples: Stretches, turning: np.ndarray) -> Stretches:
 def _check_count(count: int) -> None:
     if count < FEWEST_POINTS:
         raise ValueError(
-            f"section: must have at least {FEWEST_POINTS} points, got {count}; thousands are better. Record more "
-            "forcing periods."
+            f"section: must have at least {FEWEST_POINTS} points, got {count}; thousands are better. Record longer."
         )
-
-
-def _upward_crossings(time: np.ndarray, signal: np.ndarray, band: float) -> np.ndarray:
-    """Return the times at which a signal crosses zero upwards; between two of them it must go below minus the band."""
-    marks = np.flatnonzero(np.abs(signal) > band)
-    up = np.flatnonzero((signal[marks[:-1]] < 0.0) & (signal[marks[1:]] > 0.0))
-    crossings = []
-    for low, high in zip(marks[up], marks[up + 1], strict=True):
-        span = slice(max(low - 2, 0), high + 3)
-        centre = 0.5 * (time[low] + time[high])
-        roots = np.polynomial.Polynomial.fit(time[span] - centre, signal[span], 3).roots()
-        real = roots[np.abs(roots.imag) < 1e-9].real + centre
-        inside = real[(real >= time[low]) & (real <= time[high])]
-        if inside.size:
-            crossings.append(inside[np.argmin(np.abs(inside - centre))])
-    return np.array(crossings)

@@ -20,6 +20,8 @@ SMALLEST_WINDOW = (VALUE_DEGREE + 1) // 2
 WINDOW_MARGIN = 1.6
 # Fewest instants from which the window and the noise are determined.
 FEWEST_INSTANTS = 50
+# Instants from which the windows of a whole recording are determined.
+WINDOW_INSTANTS = 2000
 CROSSINGS_EACH = 20_000
 
 
@@ -119,6 +121,21 @@ def smoothed(
     halves = unbiased_windows(samples, *inside, widest, variance)
     values, gains = windowed(samples, at, stretch, halves)
     return values, np.sqrt(variance * gains.mean(axis=0))
+
+
+def window_of(samples: Stretches, widest: int) -> tuple[int, float]:
+    """Return half the number of samples in the widest window of the only signal without bias, and the noise's variance.
+
+    Both are those of the whole recording.
+    """
+    count = samples.time.size
+    places = np.unique(np.linspace(0, count - 1, WINDOW_INSTANTS).astype(int))
+    at, stretch = samples.time[places], np.searchsorted(samples.starts, places, side="right") - 1
+    inner = samples.windows(at, stretch, max(widest, NOISE_SAMPLES // 2))[1]
+    if np.count_nonzero(inner) < FEWEST_INSTANTS:
+        return SMALLEST_WINDOW, 0.0
+    variance = noise_variance(samples, at[inner], stretch[inner])
+    return unbiased_windows(samples, at[inner], stretch[inner], widest, variance)[0], float(variance[0])
 
 
 def windowed(

@@ -23,6 +23,7 @@ from bayesperiodic.orbits.stretches import (
     FEWEST_INSTANTS,
     NOISE_SAMPLES,
     SMALLEST_WINDOW,
+    WINDOW_INSTANTS,
     noise_variance,
     unbiased_windows,
     windowed,
@@ -33,8 +34,6 @@ INDEPENDENT = 16
 # Inputs depend little on the motion, and are taken as exact in fits: linear polynomials have less noise. The bias of
 # their values is proportional to the second power of the bandwidth.
 INPUT_DEGREE, INPUT_GROWTH = 1, WIDENED**2 - 1.0
-# Instants from which windows are determined.
-WINDOW_INSTANTS = 2000
 # Degree of polynomials of errors of the size of the bias, over a part of the period.
 BIAS_DEGREE = 2
 TURN = 2.0 * np.pi
