@@ -1,0 +1,72 @@
+"""Instants at which a measured channel crosses a level, found in the smoothed channel."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bayesperiodic.orbits.stretches import SMALLEST_WINDOW, Stretches, smoothed, window_of, windowed
+
+# A channel must go so far below the level and above it for a crossing, in standard deviations of the channel and in
+# standard deviations of the smoothed channel's errors, so that noise adds none.
+CROSSING_BAND, CROSSING_NOISE = 0.1, 5.0
+# Smoothed values are taken this often in half a window.
+VALUES_EACH_HALF = 4
+# Newton steps from linear interpolation; the slope is the mean one across the band.
+CROSSING_STEPS = 8
+
+
+class Crossings(NamedTuple):
+    """Upward crossings of zero, in the order of time."""
+
+    instants: np.ndarray  # (count,) [s]
+    stretch: np.ndarray  # of each, (count,)
+    slopes: np.ndarray  # of the signal, means across the band, (count,)
+    band: float  # the signal goes so far below zero and above it
+
+    @property
+    def returns(self) -> np.ndarray:
+        """Times between consecutive crossings of a stretch, (returns,) [s]."""
+        return np.diff(self.instants)[np.diff(self.stretch) == 0]
+
+    def within(self, samples: Stretches, earliest: float, latest: float) -> "Crossings":
+        """Return those from which the delays [s] from the earliest to the latest one are in the same stretch."""
+        first, last = samples.time[samples.starts], samples.time[samples.stops - 1]
+        kept = (self.instants + earliest >= first[self.stretch]) & (self.instants + latest <= last[self.stretch])
+        return self._replace(instants=self.instants[kept], stretch=self.stretch[kept], slopes=self.slopes[kept])
+
+
+def upward_crossings(samples: Stretches, widest: int) -> Crossings:
+    """Return where the only signal crosses zero upwards, by linear interpolation of smoothed values.
+
+    Between two crossings the signal goes below minus the band and above the band, and no crossing is between stretches.
+    Windows have at most 2·`widest` samples.
+    """
+    half, variance = window_of(samples, widest)
+    long = np.flatnonzero(samples.stops - samples.starts >= 2 * SMALLEST_WINDOW)
+    spans = zip(samples.starts[long], samples.stops[long], strict=True)
+    places = [np.arange(start, stop, max(1, half // VALUES_EACH_HALF)) for start, stop in spans]
+    stretch = np.repeat(long, [one.size for one in places])
+    time = samples.time[np.concatenate([*places, np.empty(0, dtype=int)])]
+    smooth, gains = windowed(samples, time, stretch, [half])
+    signal, error = smooth[:, 0], np.sqrt(variance * np.median(gains))
+    band = max(CROSSING_BAND * float(samples.signals.std()), CROSSING_NOISE * float(error))
+    marks = np.flatnonzero(np.abs(signal) > band)
+    low, high = marks[:-1], marks[1:]
+    up = (signal[low] < 0.0) & (signal[high] > 0.0) & (stretch[low] == stretch[high])
+    low, high = low[up], high[up]
+    negative = np.flatnonzero(signal < 0.0)
+    before = negative[np.searchsorted(negative, high) - 1]
+    step = (time[before + 1] - time[before]) / (signal[before + 1] - signal[before])
+    slopes = (signal[high] - signal[low]) / (time[high] - time[low])
+    return Crossings(time[before] - signal[before] * step, stretch[before], slopes, band)
+
+
+def refined(samples: Stretches, crossings: Crossings, longest: float) -> tuple[Crossings, float]:
+    """Return the crossings of the signal in windows no longer than `longest`, and the sd of its errors there."""
+    at, error = crossings.instants, np.nan
+    reach = crossings.band / crossings.slopes
+    for _ in range(CROSSING_STEPS):
+        values, sd = smoothed(samples, at, crossings.stretch, longest)
+        at = np.clip(at - values[:, 0] / crossings.slopes, crossings.instants - reach, crossings.instants + reach)
+        error = float(np.max(sd))
+    return crossings._replace(instants=at), error
