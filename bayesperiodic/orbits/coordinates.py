@@ -119,8 +119,8 @@ def coordinate_names(
         names.append(match[1])
         delayed.add(match[1])
     _checks.identifiers("coordinates", dict.fromkeys(names))
-    if len(names) < 2:
-        raise ValueError(f"coordinates: must be two or more outputs, got {coordinates!r}.")
+    if len(names) < (2 if forced else 1):
+        raise ValueError(f"coordinates: must be {'two' if forced else 'one'} or more outputs, got {coordinates!r}.")
     if len(set(given)) < len(given):
         raise ValueError(f"coordinates: must differ, got {given!r}.")
     angle_names = (angles,) if isinstance(angles, str) else tuple(angles)

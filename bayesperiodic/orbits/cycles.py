@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import label
 
-from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, LocalFit, ReturnMap
+from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, LocalFit, ReturnMap, for_coordinates
 
 # Search: a return this close starts a chain; chains in one cell are searched once.
 CLOSE, CELL = 0.08, 0.01
 LONGEST_CORRECTION, CORRECTIONS = 0.03, 14
-# With two coordinates and with more, where points are fewer: largest last step, largest bandwidth of a map.
+# With up to two coordinates and with more, where points are fewer: largest last step, largest bandwidth of a map.
 CONVERGED_CORRECTION, WIDEST_BANDWIDTH = {2: 2e-4, 3: 1e-3}, {2: 0.06, 3: 0.1}
 # Chains closer than this are merged.
 MERGED = 2e-3
@@ -146,16 +146,11 @@ def candidates(maps: ReturnMap, atlas: Atlas, period: int) -> list[MapCycle]:
     return _distinct(maps, chains, step, members)
 
 
-def _for(values: dict[int, float], maps: ReturnMap) -> float:
-    """Return the value for the number of coordinates."""
-    return values[min(len(maps.turn), 3)]
-
-
 def _converge(
     maps: ReturnMap, images: Images, chains: np.ndarray, steps: int, longest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Move chains (m, period, 2); return their last steps and the chains into which they were merged."""
-    noise, heir, converged = float(maps.noise.max()), np.arange(len(chains)), _for(CONVERGED_CORRECTION, maps)
+    noise, heir, converged = float(maps.noise.max()), np.arange(len(chains)), for_coordinates(CONVERGED_CORRECTION, len(maps.turn))
     step, active = np.full(len(chains), np.inf), heir
     for _ in range(steps):
         if active.size == 0:
@@ -166,7 +161,7 @@ def _converge(
         slopes = jacobian.reshape(*moved.shape, moved.shape[2])
         chains[active], size = _moved(maps, moved, image.reshape(moved.shape), slopes)
         widest = bandwidth.reshape(moved.shape[:2]).max(1)
-        lost = (widest > max(_for(WIDEST_BANDWIDTH, maps), 2.0 * noise)) | ~(size < longest)
+        lost = (widest > max(for_coordinates(WIDEST_BANDWIDTH, len(maps.turn)), 2.0 * noise)) | ~(size < longest)
         step[active] = np.where(lost, np.inf, size)
         active = active[(size > max(0.01 * converged, 0.05 * noise)) & ~lost]
         cells = _cells(maps, chains[active], max(MERGED, noise))
@@ -213,7 +208,7 @@ def _distinct(maps: ReturnMap, chains: np.ndarray, step: np.ndarray, members: li
     # Each cycle with the first points and the shift of each of its close returns, (returns, 2).
     groups: list[tuple[np.ndarray, list[np.ndarray]]] = []
     for k in np.argsort(step, kind="stable"):
-        if step[k] > max(_for(CONVERGED_CORRECTION, maps), 0.1 * noise):
+        if step[k] > max(for_coordinates(CONVERGED_CORRECTION, len(maps.turn)), 0.1 * noise):
             break
         returns = chains[k, :: maps.steps]
         if has_shorter_period(returns, maps.wrap, tolerance):

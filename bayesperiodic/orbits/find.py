@@ -22,6 +22,7 @@ from bayesperiodic.orbits.return_map import (
     estimate_noise,
     prediction_error,
 )
+from bayesperiodic.orbits.return_times import return_times_of
 from bayesperiodic.orbits.section import PoincareSection
 from bayesperiodic.orbits.waveform import Following, waveform_of
 
@@ -110,6 +111,8 @@ def find_orbits(
     steps, box = _checks.integer("steps", steps, 1), _checks.positive("box", box)
     neighbours = _checks.integer("neighbours", neighbours, 16)
     maps, size, prediction = _scaled(section, neighbours)
+    if len(size) == 1:  # As wide a neighbourhood as in two coordinates.
+        neighbours = max(neighbours, int(np.sqrt(neighbours * maps.count)))
     if method == "boxes":
         pairs = [pair for p in wanted for pair in cycles.box_orbits(maps, p, neighbours, box)]
     else:
@@ -262,16 +265,21 @@ def _orbit(
     waveform = None
     if following is not None and estimate.fits is not None:
         waveform = waveform_of(following, maps, estimate, candidate.shift)
+    times = return_times_of(section, maps, estimate, candidate.closest, candidate.shift)
     return Orbit(
-        name="", coordinates=section.coordinates, angles=section.angles, frequency=section.frequency, period=period,
+        name="", coordinates=section.coordinates, angles=section.angles,
+        frequency=section.frequency if times is None else period / float(times.times.sum()), period=period,
         winding=round(estimate.turns) if section.winds else None, points=points, joint_covariance=covariance,
         eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[-d:], returns=candidate.returns, quality=quality,
         cycle=cycle, waveform=waveform, equilibrium=still, synthetic=section.synthetic, remark=remark,
+        return_times=None if times is None else times.times, duration_sd=0.0 if times is None else times.sd,
     )  # fmt: skip
 
 
 def _remark(eigenvalues: np.ndarray, covariance: np.ndarray) -> str:
     """Return what is impossible about the determinant of a flow's map, given the covariance of log|eigenvalue|."""
+    if len(eigenvalues) == 1:  # The map along a thin attractor, not that of the flow.
+        return ""
     determinant, sd = float(np.prod(eigenvalues).real), float(np.sqrt(covariance.sum()))
     if determinant < 0.0 and IMPOSSIBLE * sd < 1.0:
         return f"determinant {determinant:.3g} ± {-determinant * sd:.2g}, negative in no flow"

@@ -25,7 +25,7 @@ NOISE_FLOOR = 5.0
 MOST_BIAS = 0.5
 TURN = 2.0 * np.pi
 _COLUMNS = (
-    "name", "period", "winding", "returns", "quality", "multiplier", "multiplier_sd", "contraction", "contraction_sd",
+    "name", "period", "duration", "duration_sd", "winding", "returns", "quality", "multiplier", "multiplier_sd", "contraction", "contraction_sd",
     "estimated", "modulus", "partner", "equilibrium", "remark", "rejected",
 )  # fmt: skip
 
@@ -42,9 +42,9 @@ class Orbit(Result):
         The section's d coordinates, and those of them that are angles. Their channels are outputs of the model;
         delayed ones are written as in `PoincareSection`.
     frequency : float
-        Of the forcing [Hz].
+        Of the forcing [Hz]; for a section by crossings the orbit's own returns per second.
     period : int
-        Prime period in forcing periods.
+        Prime period in forcing periods, or in returns.
     winding : int or None
         Turns of the angle per response period, 0 without an angle; None if the section does not determine it.
     points : array (period, d)
@@ -76,6 +76,11 @@ class Orbit(Result):
         return map: that of a flow is positive, with damping everywhere it is below one. Another one means that the
         coordinates do not determine the next point, or that there is no such orbit. Empty otherwise, also where the
         error is too large to tell, as is frequent for strong contraction.
+    return_times : array (period,) or None
+        For a section by crossings, the times from each point to the next one [s]; None with a forcing.
+    duration_sd : float
+        Standard error of the orbit's `duration` [s], with the estimated bias; zero with a forcing, NaN for the method
+        "boxes".
 
     Examples
     --------
@@ -106,6 +111,8 @@ class Orbit(Result):
     equilibrium: bool = False
     synthetic: bool = False
     remark: str = ""
+    return_times: np.ndarray | None = None
+    duration_sd: float = 0.0
 
     def __repr__(self) -> str:
         kind = ", at rest" if self.equilibrium else ""
@@ -114,13 +121,19 @@ class Orbit(Result):
         sd = self.eigenvalue_sd[0]
         error = f"sd {sd:.2g}" if np.isfinite(sd) else "sd not estimated"
         remark = f"; {self.remark}" if self.remark else ""
-        return f"Orbit({self.name!r}{kind}: eigenvalue {shown} ({error}), {self.returns} returns{remark})"
+        lasting = "" if self.return_times is None else f"duration {self.duration:.6g} s (sd {self.duration_sd:.2g} s), "
+        return f"Orbit({self.name!r}{kind}: {lasting}eigenvalue {shown} ({error}), {self.returns} returns{remark})"
 
     @property
     def covariance(self) -> np.ndarray:
         """Covariance of the points, (d·period, d·period), point by point."""
         size = self.points.size
         return self.joint_covariance[:size, :size]
+
+    @property
+    def duration(self) -> float:
+        """Prime period in seconds."""
+        return self.period / self.frequency
 
     @property
     def eigenvalue_sd(self) -> np.ndarray:
@@ -425,11 +438,13 @@ def _with_multipliers(orbit: Orbit, experiment: Experiment) -> Experiment:
 
 def _row(orbit: Orbit, names: list[str], reason: str) -> tuple[Any, ...]:
     sds = np.sqrt(np.diag(orbit.covariance)).reshape(orbit.points.shape).max(axis=0)
-    multiplier, contraction = (value.real if np.isreal(value) else value for value in orbit.eigenvalues[:2])
+    multiplier, contraction = (
+        value.real if np.isreal(value) else value for value in np.append(orbit.eigenvalues, np.nan)[:2]
+    )
     partner = "" if orbit.partner is None or orbit.partner >= len(names) else names[orbit.partner]
-    multiplier_sd, contraction_sd = orbit.eigenvalue_sd[:2]
+    multiplier_sd, contraction_sd = np.append(orbit.eigenvalue_sd, np.nan)[:2]
     return (
-        orbit.name, orbit.period, orbit.winding, orbit.returns, orbit.quality, multiplier, multiplier_sd, contraction,
+        orbit.name, orbit.period, orbit.duration, orbit.duration_sd, orbit.winding, orbit.returns, orbit.quality, multiplier, multiplier_sd, contraction,
         contraction_sd, bool(np.isfinite(multiplier_sd)), float(abs(orbit.eigenvalues[0])), partner,
         orbit.equilibrium, orbit.remark, reason, *sds,
     )  # fmt: skip

@@ -23,7 +23,7 @@ MOST_LEVERAGE = 0.9
 # Prior standard deviation of slopes, and the distance over which a slope changes by it, in more than two coordinates:
 # there the attractor is thin in some directions, and does not determine all coefficients.
 STEEPEST_SLOPE, CURVATURE_LENGTH = 10.0, 0.1
-# Largest distance from the nearest centre of an atlas, in bandwidths, with two coordinates and with more.
+# Largest distance from the nearest centre of an atlas, in bandwidths, with up to two coordinates and with more.
 FARTHEST_FROM_CENTRE = {2: 1.0, 3: 2.0}
 # Distance of two phases in a search tree, in units of the attractor's size.
 APART = 1e3
@@ -31,6 +31,11 @@ APART = 1e3
 Signals = Callable[[np.ndarray, np.ndarray], np.ndarray]
 # Limits of memory: products of regressors in one call, neighbours of all fits of an atlas.
 MOST_PRODUCTS, MOST_NEIGHBOURS = 4_000_000, 6_000_000
+
+
+def for_coordinates(values: dict[int, float], coordinates: int) -> float:
+    """Return the value for the number of coordinates."""
+    return values[min(max(coordinates, 2), 3)]
 
 
 @cache
@@ -306,7 +311,8 @@ class ReturnMap:
         orders = terms.powers.sum(1)
         functions = _products(by_coordinate, terms.products if wants_influence else terms.powers)
         # The sums of products by powers of the last coordinate: one matrix product.
-        table = _products(by_coordinate[:-1], terms.others) @ by_coordinate[-1].mT
+        rows = _products(by_coordinate[:-1], terms.others) if d > 1 else np.ones((1, 1, weight.shape[1]))
+        table = rows @ by_coordinate[-1].mT
         normal = table[:, terms.row, terms.column]
         inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
         effective = weight.sum(1) ** 2 / (weight**2).sum(1)
@@ -408,7 +414,7 @@ class Atlas:
         jacobian = self._fit.jacobian[nearest]
         image = self._fit.value[nearest] + np.einsum("mij,mj->mi", jacobian + 0.5 * curved, away)
         bandwidth = self._fit.bandwidth[nearest]
-        outside = np.sqrt(np.sum(away**2, axis=-1)) > FARTHEST_FROM_CENTRE[min(points.shape[1], 3)] * bandwidth
+        outside = np.sqrt(np.sum(away**2, axis=-1)) > for_coordinates(FARTHEST_FROM_CENTRE, points.shape[1]) * bandwidth
         return image, jacobian + curved, np.where(outside, np.inf, bandwidth)
 
     def exactly(self, points: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
