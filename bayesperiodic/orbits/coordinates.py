@@ -57,13 +57,13 @@ def longest_window(names: Sequence[str], samples: float, steps: int = 1) -> floa
     return shortest
 
 
-def longest_window_of_crossings(names: Sequence[str], channel: str | None, rate: float, returns: np.ndarray) -> float:
+def longest_window_of_crossings(names: Sequence[str], channel: str, rate: float, returns: np.ndarray) -> float:
     """Return the shortest time [s] between two values of a channel, at this crossing and the next one.
 
-    The coordinates have the names, the crossing channel is None at steps between the crossings, the rate is that of the
-    samples, and the times between the crossings are `returns` [s]. Raises a ValueError if windows of the fewest samples overlap.
+    The names are those of the coordinates, the rate is that of the samples, and the times between the crossings of the
+    channel are `returns` [s]. Raises a ValueError if windows of the fewest samples overlap.
     """
-    every = tuple(names) if channel is None else (channel, *names)
+    every = (channel, *names)
     columns, delays = columns_of(every), delays_of(every)
     until_next, least = float(np.quantile(returns, SHORT_RETURN)), 2 * SMALLEST_WINDOW / rate * (1.0 - 1e-9)
     for column in np.unique(columns):

@@ -30,11 +30,13 @@ SEARCHES = ("chained", "boxes")
 QUALITY_DEGREE, FEWEST_NEIGHBOURS = 3, 32
 # Bandwidth of the local fits of the search, in standard deviations of the noise.
 SEARCH_WIDTH = 4.0
+# Bandwidth with one coordinate, in standard deviations of the noise.
+WIDTH_OF_ONE = 20.0
 # Largest standard deviation of a point, in units of the attractor's size.
 LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
-# Delays tried for a coordinate to add, in forcing periods.
+# Delays tried for a coordinate to add, in forcing periods, or in mean returns.
 DELAYS_TRIED = (-0.25, -0.5)
 # Standard deviations from which a determinant is impossible.
 IMPOSSIBLE = 3.0
@@ -111,8 +113,7 @@ def find_orbits(
     steps, box = _checks.integer("steps", steps, 1), _checks.positive("box", box)
     neighbours = _checks.integer("neighbours", neighbours, 16)
     maps, size, prediction = _scaled(section, neighbours)
-    if len(size) == 1:  # As wide a neighbourhood as in two coordinates.
-        neighbours = max(neighbours, int(np.sqrt(neighbours * maps.count)))
+    neighbours = _wide_enough(maps, neighbours)
     if method == "boxes":
         pairs = [pair for p in wanted for pair in cycles.box_orbits(maps, p, neighbours, box)]
     else:
@@ -168,8 +169,9 @@ def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.nd
 def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
     """Return which delayed coordinate would let local maps predict best, in the units of the maps."""
     errors, size = {}, np.ptp(section.points, axis=0)
-    channels = [name for name in channels_of(section.coordinates) if name not in section.angles]
-    for name in (f"{channel}[{delay}]" for channel in channels for delay in DELAYS_TRIED):
+    channels = dict.fromkeys([*channels_of(section.coordinates), *([section.crossed] if section.crossed else [])])
+    delays = [f"{d / section.frequency:.2g} s" for d in DELAYS_TRIED] if section.crossed else DELAYS_TRIED
+    for name in (f"{channel}[{d}]" for channel in channels if channel not in section.angles for d in delays):
         values = None if name in section.coordinates else section.delayed(name)
         if values is None:
             continue
@@ -190,6 +192,16 @@ def _with_steps(section: PoincareSection, maps: ReturnMap, size: np.ndarray, ste
     points, increments, noise = section.between(steps)
     stretches = np.repeat(maps.stretches, steps)
     return ReturnMap(points / size, increments / size, maps.turn, maps.winds, noise / size, stretches, steps)
+
+
+def _wide_enough(maps: ReturnMap, neighbours: int) -> int:
+    """Return the neighbours for which fits in one coordinate are as wide as in two, or as the noise needs."""
+    if len(maps.turn) > 1:
+        return neighbours
+    most = int(np.sqrt(neighbours * maps.count))
+    centres = maps.arguments[:: max(1, len(maps.arguments) // 500)]
+    width = np.median(maps.nearest(centres, np.zeros(len(centres)), most)[0][:, -1]) / KERNEL_REACH
+    return int(np.clip(most * WIDTH_OF_ONE * maps.noise.max() / width, neighbours, max(most, neighbours)))
 
 
 def _search_count(maps: ReturnMap, neighbours: int) -> int:
@@ -262,17 +274,17 @@ def _orbit(
         # It moves no more than by noise and its distance to the orbit.
         limit = (STILL_RANGE + STILL_NOISE * maps.noise.max()) * extent
         still = bool(np.all(np.ptp(np.stack(list(cycle.values())), axis=1) < limit))
-    waveform = None
+    times, waveform = return_times_of(section, maps, estimate, candidate.closest), None
     if following is not None and estimate.fits is not None:
-        waveform = waveform_of(following, maps, estimate, candidate.shift)
-    times = return_times_of(section, maps, estimate, candidate.closest, candidate.shift)
+        waveform = waveform_of(following, maps, estimate, candidate.shift, times)
     return Orbit(
         name="", coordinates=section.coordinates, angles=section.angles,
-        frequency=section.frequency if times is None else period / float(times.times.sum()), period=period,
+        frequency=section.frequency if times is None else period / float(times.each.sum()), period=period,
         winding=round(estimate.turns) if section.winds else None, points=points, joint_covariance=covariance,
         eigenvalues=estimate.eigenvalues, eigenvalue_bias=bias[-d:], returns=candidate.returns, quality=quality,
         cycle=cycle, waveform=waveform, equilibrium=still, synthetic=section.synthetic, remark=remark,
-        return_times=None if times is None else times.times, duration_sd=0.0 if times is None else times.sd,
+        return_times=None if times is None else np.roll(times.each, -candidate.shift),
+        duration_sd=0.0 if times is None else times.sd,
     )  # fmt: skip
 
 

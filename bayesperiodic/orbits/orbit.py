@@ -160,6 +160,8 @@ class Orbit(Result):
     ) -> Experiment:
         """Return the orbit as an experiment: its section points at tau = 0, 1, …, as in de Kraker et al. (1997).
 
+        For a section by crossings give ``whole=True``: the experiment, for an autonomous model, is the waveform over the
+        orbit's own period, of which the frequency 1/`duration` with its standard error is data.
         Their covariance is known up to one factor, the noise parameter "scale", common to all orbits of a problem. The
         inputs are those of the waveform, taken as exact. Delayed coordinates are left out, because all outputs of an
         experiment are compared at the same tau.
@@ -201,6 +203,11 @@ class Orbit(Result):
             If an unstable eigenvalue is left out.
         """
         _checks.integer("samples", samples, 4)
+        if self.return_times is not None and not (whole and self.waveform is not None):
+            raise ValueError(
+                f"whole: must be True for {self.name!r} of a section by crossings, of which the points are not at equal "
+                "distances in time, with the waveform of find_orbits(..., waveforms=True)."
+            )
         winding = counted_turns(self) if self.solution is None else sum(self.solution.winding.values())
         if winding is None:
             raise ValueError(f"winding: must be known, got None for {self.name!r}. Use polish_orbits first.")
@@ -210,13 +217,15 @@ class Orbit(Result):
             inputs = {name: _on_grid(values, samples * self.period) for name, values in self.solution.inputs.items()}
         else:
             inputs = _resampled(self, winding, samples, () if self.waveform is None else self.waveform.inputs)
+        free = self.return_times is not None
         experiment = Experiment(
             self.name,
-            self.frequency,
+            1.0 / self.duration if free else self.frequency,
             compared.pop("outputs"),
             inputs,
-            samples=samples,
-            periods=self.period,
+            samples=samples * self.period if free else samples,
+            periods=1 if free else self.period,
+            frequency_se=self.duration_sd / self.duration**2,
             winding=turns,
             guess=_guess(self, samples, winding, states, hidden=whole),
             synthetic=self.synthetic,
@@ -396,12 +405,12 @@ def _guess(
             _checks.one_of("states", name, measured)
         motion = _resampled(orbit, winding, samples, states.values())
         return {state: motion[name] for state, name in states.items()}
-    if orbit.solution is None and orbit.waveform is not None and hidden:
+    if orbit.solution is None and orbit.waveform is not None and hidden and orbit.return_times is None:
         return DATA
     if orbit.solution is None:
         raise ValueError(
             f"states: must name the coordinate that measures each state, such as {{'phi': 'angle'}}, got None; "
-            f"{orbit.name!r} is not polished. If states are hidden, give whole=True."
+            f"{orbit.name!r} is not polished. If states of a forced model are hidden, give whole=True."
         )
     tau = np.arange(samples * orbit.period) / samples
     guess = {}

@@ -478,12 +478,17 @@ class PoincareSection(Result):
         Raises
         ------
         ValueError
-            For points alone, and for delays of a channel that are too close modulo a step.
+            For points alone or crossings, and for delays of a channel that are too close modulo a step.
         """
         steps = _checks.integer("steps", steps, 1)
         measured = self.measured
         if measured is None:
             raise ValueError(f"steps: must be 1 for points alone, got {steps}. Make the section of a recording.")
+        if self.crossed:
+            raise ValueError(
+                f"steps: must be 1 for crossings, got {steps}. Coordinates that determine the next crossing need not "
+                "determine it from between the crossings."
+            )
         samples, returns, stretch = measured
         after = np.append(np.diff(returns), 0.0)
         followed = np.append(np.diff(stretch) == 0, False)
@@ -491,10 +496,7 @@ class PoincareSection(Result):
         present = followed[:, None] | (np.arange(steps) == 0)
         each = np.broadcast_to(stretch[:, None], present.shape)[present]
         names, rate = self.coordinates, samples.sampling_rate
-        if self.crossed:
-            longest = longest_window_of_crossings(names, None, rate, after[followed] / steps)
-        else:
-            longest = longest_window(names, rate / self.frequency, steps) * _usual(returns) / steps
+        longest = longest_window(names, rate / self.frequency, steps) * _usual(returns) / steps
         values, noise = coordinate_values(samples, names, instants[present], each, self.unit, longest)
         if noise is None:
             raise ValueError(f"steps: must be 1 for stretches too short to determine the noise, got {steps}.")

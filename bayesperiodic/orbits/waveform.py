@@ -15,9 +15,10 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Storable
-from bayesperiodic.orbits.coordinates import columns_of
+from bayesperiodic.orbits.coordinates import SHORT_RETURN, columns_of
 from bayesperiodic.orbits.cycles import REFINING_DEGREE, VALUE_GROWTH, WIDENED, Estimate, errors_by_run
 from bayesperiodic.orbits.return_map import ReturnMap
+from bayesperiodic.orbits.return_times import ReturnTimes
 from bayesperiodic.orbits.section import CYCLE_SAMPLES, PoincareSection
 from bayesperiodic.orbits.stretches import (
     FEWEST_INSTANTS,
@@ -155,6 +156,8 @@ class Following:
         returns, step = np.divmod(maps.positions, maps.steps)
         self._length = (instants[returns + 1] - instants[returns]) / maps.steps
         self._start, self._stretch = instants[returns] + step * self._length, stretch[returns]
+        # The returns of crossings differ.
+        self._usual = 0.5 if section.crossed is None else SHORT_RETURN
         # Samples from a point to the next one; INDEPENDENT of a return are equally spaced.
         spaced = lcm(INDEPENDENT, maps.steps)
         self.count = spaced * -(-CYCLE_SAMPLES // spaced) // maps.steps
@@ -172,7 +175,7 @@ class Following:
         """
         some = np.arange(0, self._start.size, -(-self._start.size // WINDOW_INSTANTS))
         at, stretch = self._start[some] + self._length[some] * (SPREADING * some % 1.0), self._stretch[some]
-        longest = float(np.median(self._length)) * steps / INDEPENDENT
+        longest = float(np.quantile(self._length, self._usual)) * steps / INDEPENDENT
         widest = max(SMALLEST_WINDOW, int(0.5 * self._samples.sampling_rate * longest))
         inner = self._samples.windows(at, stretch, max(widest, NOISE_SAMPLES // 2))[1]
         enough = np.count_nonzero(inner) >= FEWEST_INSTANTS
@@ -184,16 +187,31 @@ class Following:
             halves = unbiased_windows(self._samples, at, stretch, widest, variance)
         return halves, variance * windowed(self._samples, at, stretch, halves)[1].mean(axis=0)
 
-    def signals(self, index: np.ndarray, near: np.ndarray, columns: slice) -> np.ndarray:
-        """Return channels (n, samples·channels) after arguments (n,), whose angles are as in the points (n, d)."""
-        phases = np.arange(self.count) / self.count
-        at = self._start[index, None] + self._length[index, None] * phases
-        values, _ = windowed(self._samples, at.ravel(), np.repeat(self._stretch[index], self.count), self._halves)
-        values = values.reshape(len(index), self.count, -1)
+    def phases(self, times: ReturnTimes | None, order: np.ndarray) -> list[np.ndarray]:
+        """Return the phases between each point of a cycle and the next one at which its waveform is sampled.
+
+        They are equally spaced in time over the period, which starts at the first point of `order`.
+        """
+        if times is None:
+            return [np.arange(self.count) / self.count for _ in order]
+        lengths, samples = times.each[order], self.count * order.size
+        ends = np.cumsum(lengths)
+        at = ends[-1] * np.arange(samples) / samples
+        owner, result = np.searchsorted(ends, at, side="right"), [np.empty(0)] * order.size
+        for j, point in enumerate(order):
+            result[point] = 1.0 + (at[owner == j] - ends[j]) / lengths[j]
+        return result
+
+    def signals(self, index: np.ndarray, near: np.ndarray, columns: slice, phases: np.ndarray) -> np.ndarray:
+        """Return channels (n, phases·channels) after arguments (n,), whose angles are as in the points (n, d)."""
+        every = np.append(0.0, phases)
+        at = self._start[index, None] + self._length[index, None] * every
+        values, _ = windowed(self._samples, at.ravel(), np.repeat(self._stretch[index], every.size), self._halves)
+        values = values.reshape(len(index), every.size, -1)
         for k, column in self.angles:
             away = near[:, k] * self._size[k] - values[:, 0, column]
             values[:, :, column] += TURN * np.round(away / TURN)[:, None]
-        return values[:, :, columns].reshape(len(index), -1)
+        return values[:, 1:, columns].reshape(len(index), -1)
 
 
 class _MotionPart(NamedTuple):
@@ -201,53 +219,74 @@ class _MotionPart(NamedTuple):
 
     values: np.ndarray  # (samples, channels)
     errors: np.ndarray  # of each run of neighbours, (runs, samples, channels)
-    bias: np.ndarray  # rms over the samples, (channels,)
+    bias: np.ndarray  # modulus, (samples, channels)
     gain: np.ndarray  # variance of the values for independent errors of unit variance, (channels,)
 
 
-def waveform_of(following: Following, maps: ReturnMap, estimate: Estimate, shift: int) -> Waveform:
-    """Return the waveform of a refined cycle from its point `shift` returns after the first one on."""
-    parts = _parts(following, maps, estimate, following.outputs, REFINING_DEGREE, VALUE_GROWTH)
+def waveform_of(
+    following: Following, maps: ReturnMap, estimate: Estimate, shift: int, times: ReturnTimes | None
+) -> Waveform:
+    """Return the waveform of a refined cycle from its point `shift` returns after the first one on.
+
+    Samples are equally spaced in time, also where the `times` between the points differ.
+    """
+    order = (np.arange(len(estimate.points)) + maps.steps * shift) % len(estimate.points)
+    phases = following.phases(times, order)
+    parts = _parts(following, maps, estimate, phases, following.outputs, REFINING_DEGREE, VALUE_GROWTH)
     if following.inputs:
-        inputs = _parts(following, maps, estimate, following.driven, INPUT_DEGREE, INPUT_GROWTH)
+        inputs = _parts(following, maps, estimate, phases, following.driven, INPUT_DEGREE, INPUT_GROWTH)
         parts = [
             _MotionPart(*(np.concatenate(two, axis=-1) for two in zip(*both, strict=True)))
             for both in zip(parts, inputs, strict=True)
         ]
-    parts = [parts[j] for j in (np.arange(len(parts)) + maps.steps * shift) % len(parts)]
+    parts = [parts[j] for j in order]
     motion = _continuous([part.values for part in parts], following)
-    errors = np.concatenate([part.errors for part in parts], axis=1).transpose(0, 2, 1)
-    common, rest = _common(errors, np.std(motion, axis=0), 2 * estimate.points.size)
-    gains = np.repeat(np.stack([part.gain for part in parts], axis=1), following.count, axis=1)
+    errors = np.concatenate([part.errors for part in parts], axis=1)
+    if times is not None:
+        errors += _moved(motion, times, order, [phases[j] for j in order])
+    common, rest = _common(errors.transpose(0, 2, 1), np.std(motion, axis=0), 2 * estimate.points.size)
+    gains = np.concatenate([np.tile(part.gain[:, None], len(part.values)) for part in parts], axis=1)
     noise = np.sqrt(np.maximum(rest[:, None], following.variance[:, None] * gains))
-    bias = np.stack([part.bias for part in parts], axis=1)
+    squares = np.concatenate([part.bias**2 for part in parts]).reshape(order.size, following.count, -1)
+    bias = np.sqrt(squares.mean(axis=1)).T
     return Waveform(dict(zip(following.channels, motion.T, strict=True)), following.inputs, common, bias, noise)
 
 
+def _moved(motion: np.ndarray, times: ReturnTimes, order: np.ndarray, phases: list[np.ndarray]) -> np.ndarray:
+    """Return the errors (runs, samples, channels) of a motion at equal parts of the period, due to those of times."""
+    samples, errors = len(motion), times.errors[:, order]
+    owner = np.repeat(np.arange(order.size), [part.size for part in phases])
+    until = np.cumsum(errors, axis=1) - errors
+    early = errors.sum(axis=1)[:, None] * (np.arange(samples) / samples)
+    early -= until[:, owner] + np.concatenate(phases) * errors[:, owner]
+    rates = np.gradient(motion, float(times.each.sum()) / samples, axis=0)
+    return early[:, :, None] * rates
+
+
 def _parts(
-    following: Following, maps: ReturnMap, estimate: Estimate, columns: slice, degree: int, growth: float
-) -> list[_MotionPart]:
-    """Return the motion of some channels after each point, by polynomials of some degree.
+    following: Following, maps: ReturnMap, estimate: Estimate, at: list[np.ndarray], columns: slice, degree: int,
+    growth: float,
+) -> list[_MotionPart]:  # fmt: skip
+    """Return the motion of some channels at phases after each point, by polynomials of some degree.
 
     The bias is the difference to wider neighbourhoods over `growth`.
     """
     fits = estimate.fits
     assert fits is not None
-    signals = partial(following.signals, columns=columns)
     phases = maps.phases(np.arange(len(estimate.points)))
-    narrow = maps.regress(estimate.points, phases, fits.bandwidths, degree, signals)
-    wide = maps.regress(fits.wide_points, phases, WIDENED * fits.bandwidths, degree, signals)
     pairs, runs, by_run = errors_by_run(maps, fits.narrow)
     d, parts = estimate.points.shape[1], []
-    for j, (fit, other) in enumerate(zip(narrow, wide, strict=True)):
+    for j, places in enumerate(at):
+        signals, one = partial(following.signals, columns=columns, phases=places), slice(j, j + 1)
+        (fit,) = maps.regress(estimate.points[one], phases[one], fits.bandwidths[one], degree, signals)
+        (other,) = maps.regress(fits.wide_points[one], phases[one], WIDENED * fits.bandwidths[one], degree, signals)
         errors = by_run[:, d * j : d * (j + 1)] @ fit.slopes
         np.add.at(errors, runs[np.searchsorted(pairs, maps.positions[fit.neighbours])], fit.influence)
-        away = (other.value - fit.value).reshape(following.count, -1)
+        away = (other.value - fit.value).reshape(places.size, -1)
         if columns == following.outputs:
             away = _without_turns(away, following)
-        bias = np.sqrt(np.mean(away**2, axis=0)) / growth
         values, errors = fit.value.reshape(away.shape), errors.reshape(len(errors), *away.shape)
-        parts.append(_MotionPart(values, errors, bias, np.full(bias.size, fit.gain)))
+        parts.append(_MotionPart(values, errors, np.abs(away) / growth, np.full(away.shape[1], fit.gain)))
     return parts
 
 

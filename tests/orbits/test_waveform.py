@@ -151,8 +151,8 @@ def test_nothing_is_taken_from_the_other_side_of_a_break():
         maps, size, _ = find._scaled(section, 32)
         maps = maps if steps == 1 else find._with_steps(section, maps, size, steps)
         following = Following(section, maps, size)
-        index = np.arange(len(maps.arguments))
-        values = following.signals(index, maps.arguments, slice(None)).reshape(index.size, following.count, -1)
+        index, phases = np.arange(len(maps.arguments)), np.arange(following.count) / following.count
+        values = following.signals(index, maps.arguments, slice(None), phases).reshape(index.size, following.count, -1)
         column = section.channels.index("piece")
         np.testing.assert_allclose(np.ptp(values[..., column], axis=1), 0.0, atol=1e-9)
         np.testing.assert_allclose(values[:, 0, column], section.stretches[maps.positions // steps], atol=1e-9)
