@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesperiodic.orbits.stretches import SMALLEST_WINDOW, Stretches, smoothed, window_of, windowed
+from bayesperiodic.orbits.stretches import SMALLEST_WINDOW, WINDOW_INSTANTS, Stretches, chosen_windows, windowed
 
 # A channel must go so far below the level and above it for a crossing, in standard deviations of the channel and in
 # standard deviations of the smoothed channel's errors, so that noise adds none.
@@ -41,15 +41,17 @@ def upward_crossings(samples: Stretches, widest: int) -> Crossings:
     Between two crossings the signal goes below minus the band and above the band, and no crossing is between stretches.
     Windows have at most 2·`widest` samples.
     """
-    half, variance = window_of(samples, widest)
+    some = np.unique(np.linspace(0, samples.time.size - 1, WINDOW_INSTANTS).astype(int))
+    piece = np.searchsorted(samples.starts, some, side="right") - 1
+    (half,), variance = chosen_windows(samples, samples.time[some], piece, widest)
     long = np.flatnonzero(samples.stops - samples.starts >= 2 * SMALLEST_WINDOW)
     spans = zip(samples.starts[long], samples.stops[long], strict=True)
     places = [np.arange(start, stop, max(1, half // VALUES_EACH_HALF)) for start, stop in spans]
     stretch = np.repeat(long, [one.size for one in places])
     time = samples.time[np.concatenate([*places, np.empty(0, dtype=int)])]
     smooth, gains = windowed(samples, time, stretch, [half])
-    signal, error = smooth[:, 0], np.sqrt(variance * np.median(gains))
-    band = max(CROSSING_BAND * float(samples.signals.std()), CROSSING_NOISE * float(error))
+    signal, error = smooth[:, 0], float(np.sqrt(np.nan_to_num(variance[0]) * np.median(gains)))
+    band = max(CROSSING_BAND * float(samples.signals.std()), CROSSING_NOISE * error)
     marks = np.flatnonzero(np.abs(signal) > band)
     low, high = marks[:-1], marks[1:]
     up = (signal[low] < 0.0) & (signal[high] > 0.0) & (stretch[low] == stretch[high])
@@ -63,10 +65,10 @@ def upward_crossings(samples: Stretches, widest: int) -> Crossings:
 
 def refined(samples: Stretches, crossings: Crossings, longest: float) -> tuple[Crossings, float]:
     """Return the crossings of the signal in windows no longer than `longest`, and the sd of its errors there."""
-    at, error = crossings.instants, np.nan
-    reach = crossings.band / crossings.slopes
+    at, stretch, slopes = crossings.instants, crossings.stretch, crossings.slopes
+    halves, variance = chosen_windows(samples, at, stretch, int(0.5 * samples.sampling_rate * longest))
+    reach = crossings.band / slopes
     for _ in range(CROSSING_STEPS):
-        values, sd = smoothed(samples, at, crossings.stretch, longest)
-        at = np.clip(at - values[:, 0] / crossings.slopes, crossings.instants - reach, crossings.instants + reach)
-        error = float(np.max(sd))
-    return crossings._replace(instants=at), error
+        values, gains = windowed(samples, at, stretch, halves)
+        at = np.clip(at - values[:, 0] / slopes, crossings.instants - reach, crossings.instants + reach)
+    return crossings._replace(instants=at), float(np.sqrt(variance[0] * gains.mean()))

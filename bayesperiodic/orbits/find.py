@@ -196,12 +196,12 @@ def _with_steps(section: PoincareSection, maps: ReturnMap, size: np.ndarray, ste
 
 def _wide_enough(maps: ReturnMap, neighbours: int) -> int:
     """Return the neighbours for which fits in one coordinate are as wide as in two, or as the noise needs."""
-    if len(maps.turn) > 1:
+    most = maps.as_wide_as_two(neighbours)
+    if most == neighbours:
         return neighbours
-    most = int(np.sqrt(neighbours * maps.count))
     centres = maps.arguments[:: max(1, len(maps.arguments) // 500)]
     width = np.median(maps.nearest(centres, np.zeros(len(centres)), most)[0][:, -1]) / KERNEL_REACH
-    return int(np.clip(most * WIDTH_OF_ONE * maps.noise.max() / width, neighbours, max(most, neighbours)))
+    return int(np.clip(most * WIDTH_OF_ONE * maps.noise.max() / width, neighbours, most))
 
 
 def _search_count(maps: ReturnMap, neighbours: int) -> int:

@@ -175,6 +175,10 @@ class ReturnMap:
         distance, index = self._tree.query(self.places(centres, phases), np.arange(1, min(count, self.count) + 1))
         return np.asarray(distance), np.asarray(index)
 
+    def as_wide_as_two(self, count: int) -> int:
+        """Return how many neighbours have about the width that `count` neighbours have in two coordinates or more."""
+        return count if len(self.turn) > 1 else max(count, int(np.sqrt(count * self.count)))
+
     def count_within(self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray) -> np.ndarray:
         """Return the number of neighbours (m,) of fits about the centres (m, d) with the bandwidths (m,)."""
         radii = KERNEL_REACH * bandwidths
@@ -533,7 +537,7 @@ def prediction_error(maps: ReturnMap) -> tuple[float, float]:
     centres, positions, phases = maps.arguments[some], maps.positions[some], np.zeros(some.size)
     results = []
     for degree in (1, 2):
-        count = int(PREDICTING * comb(d + degree, degree)) + 2 * DIVERGING_STEPS + 1
+        count = maps.as_wide_as_two(int(PREDICTING * comb(d + degree, degree)) + 2 * DIVERGING_STEPS + 1)
         distance, index = maps.nearest(centres, phases, count)
         away = np.abs(maps.positions[index] - positions[:, None]) > DIVERGING_STEPS
         fit = maps.fit_to(centres, distance[:, -1] / KERNEL_REACH, index, away, degree)

@@ -20,7 +20,7 @@ SMALLEST_WINDOW = (VALUE_DEGREE + 1) // 2
 WINDOW_MARGIN = 1.6
 # Fewest instants from which the window and the noise are determined.
 FEWEST_INSTANTS = 50
-# Instants from which the windows of a whole recording are determined.
+# Instants from which windows are determined that serve everywhere in a recording.
 WINDOW_INSTANTS = 2000
 CROSSINGS_EACH = 20_000
 
@@ -103,7 +103,7 @@ def usual_step(time: np.ndarray) -> float:
 
 def smoothed(
     samples: Stretches, at: np.ndarray, stretch: np.ndarray, longest: float
-) -> tuple[np.ndarray, np.ndarray | float]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Return signals (instants, channels) at given instants, and the standard deviation of their errors (channels,).
 
     Windows are no longer than `longest`.
@@ -112,30 +112,24 @@ def smoothed(
     Where a stretch ends within the window, the smallest one is used, beside the instant if necessary. The standard
     deviation is NaN if there are too few other instants.
     """
-    widest = max(SMALLEST_WINDOW, int(0.5 * samples.sampling_rate * longest))
-    inner = samples.windows(at, stretch, max(widest, NOISE_SAMPLES // 2))[1]
-    if np.count_nonzero(inner) < FEWEST_INSTANTS:
-        return local_fit(samples, at, stretch)[0], np.nan
-    inside = at[inner], stretch[inner]
-    variance = noise_variance(samples, *inside)
-    halves = unbiased_windows(samples, *inside, widest, variance)
+    halves, variance = chosen_windows(samples, at, stretch, int(0.5 * samples.sampling_rate * longest))
     values, gains = windowed(samples, at, stretch, halves)
     return values, np.sqrt(variance * gains.mean(axis=0))
 
 
-def window_of(samples: Stretches, widest: int) -> tuple[int, float]:
-    """Return half the number of samples in the widest window of the only signal without bias, and the noise's variance.
+def chosen_windows(
+    samples: Stretches, at: np.ndarray, stretch: np.ndarray, widest: int
+) -> tuple[list[int], np.ndarray]:
+    """Return half the number of samples in each channel's window, up to `widest`, and its noise's variance (channels,).
 
-    Both are those of the whole recording.
+    Smallest windows, and NaN, where too few instants are away from the ends of their stretches.
     """
-    count = samples.time.size
-    places = np.unique(np.linspace(0, count - 1, WINDOW_INSTANTS).astype(int))
-    at, stretch = samples.time[places], np.searchsorted(samples.starts, places, side="right") - 1
+    widest = max(SMALLEST_WINDOW, widest)
     inner = samples.windows(at, stretch, max(widest, NOISE_SAMPLES // 2))[1]
     if np.count_nonzero(inner) < FEWEST_INSTANTS:
-        return SMALLEST_WINDOW, 0.0
+        return [SMALLEST_WINDOW] * samples.signals.shape[1], np.full(samples.signals.shape[1], np.nan)
     variance = noise_variance(samples, at[inner], stretch[inner])
-    return unbiased_windows(samples, at[inner], stretch[inner], widest, variance)[0], float(variance[0])
+    return unbiased_windows(samples, at[inner], stretch[inner], widest, variance), variance
 
 
 def windowed(
