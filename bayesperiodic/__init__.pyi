@@ -39,6 +39,8 @@ from .diagnostics.predictive import prior_predictive as prior_predictive
 from .diagnostics.split import SplitCheck as SplitCheck
 from .diagnostics.split import split_check as split_check
 from .estimation.check import check as check
+from .estimation.many_orbits import OrbitsEstimate as OrbitsEstimate
+from .estimation.many_orbits import estimate_orbits as estimate_orbits
 from .estimation.map_estimate import map_estimate as map_estimate
 from .estimation.profile import Profile as Profile
 from .estimation.profile import profile as profile

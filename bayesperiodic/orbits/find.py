@@ -1,7 +1,7 @@
 """find_orbits: unstable periodic orbits of a chaotic section, without a model."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from bayesperiodic.orbits import cycles
 from bayesperiodic.orbits.coordinates import channels_of, wrapped
 from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
+from bayesperiodic.orbits.phases import merged, phases_of, with_late_partners
 from bayesperiodic.orbits.return_map import (
     FEWEST_FOLLOWED,
     KERNEL_REACH,
@@ -46,7 +47,7 @@ STILL_RANGE, STILL_NOISE = 0.02, 20.0
 
 @in_one_thread
 def find_orbits(
-    section: PoincareSection,
+    section: PoincareSection | Sequence[PoincareSection],
     *,
     periods: Iterable[int],
     method: str = "chained",
@@ -69,7 +70,10 @@ def find_orbits(
 
     Parameters
     ----------
-    section : PoincareSection
+    section : PoincareSection or sequence of PoincareSection
+        Several are of the same recordings, coordinates and frequency, with origins that differ by sixteenths of the
+        forcing period: which orbits are found depends on the phase. Each orbit, as its waveform shows, is then
+        returned once, at the phase of the first section, from the one where its errors are smallest.
     periods : iterable of int
         Prime periods in returns.
     method : {"chained", "boxes"}
@@ -83,21 +87,22 @@ def find_orbits(
         return stretches much, but each map needs the noise of its points to be small against its bandwidth.
     waveforms : bool
         Find also the attribute ``waveform`` of each orbit, which takes longer than the search, for "chained" and a
-        section of a recording.
+        section of a recording. With several sections they are always found.
 
     Returns
     -------
     Orbits
-        Ordered by period. States of rest are found like other orbits and marked `equilibrium`. The covariance of
-        log|eigenvalue| is NaN ("not estimated") where the estimated bias exceeds the standard deviation, or the
-        standard deviation exceeds 0.5.
+        Ordered by period, those of several sections also by the modulus of the largest eigenvalue. States of rest are
+        found like other orbits and marked `equilibrium`. The covariance of log|eigenvalue| is NaN ("not estimated")
+        where the estimated bias exceeds the standard deviation, or the standard deviation exceeds 0.5. Errors of points
+        and of eigenvalues are taken as independent where an orbit is not of the first of several sections.
 
     Raises
     ------
     ValueError
         For a section that is periodic, quasi-periodic or shows no return map, because of unknown states (the message
-        names which, and a delayed coordinate to add), for an unknown method, and for periods that are not whole
-        numbers.
+        names which, and a delayed coordinate to add), for an unknown method, for periods that are not whole numbers,
+        and for several sections that differ in more than their phase.
 
     Examples
     --------
@@ -107,7 +112,26 @@ def find_orbits(
     >>> [orbit.period for orbit in bp.find_orbits(henon_section, periods=[1, 2, 3])]
     [1, 2]
     """
-    _checks.instance("section", section, PoincareSection)
+    if isinstance(section, PoincareSection):
+        return _of_section(section, periods, method, neighbours, box, steps, waveforms)
+    _checks.instance("section", section, (list, tuple))
+    for one in section:
+        _checks.instance("section", one, PoincareSection)
+    if not section or method == "boxes":
+        raise ValueError("section: must be at least one section, for the method 'chained', where there are several.")
+    late, wanted = phases_of(section), list(periods)
+    each = [_of_section(one, wanted, method, neighbours, box, steps, waveforms=True) for one in section]
+    maps, size, _ = _scaled(section[0], neighbours)
+    orbits = with_late_partners(_finished(merged([one.orbits for one in each], late), maps, size))
+    worst = max((one.prediction_error for one in each), key=lambda error: error[0])
+    return Orbits(orbits, values=section[0].values, method=method, prediction_error=worst)
+
+
+def _of_section(
+    section: PoincareSection, periods: Iterable[int], method: str, neighbours: int, box: float, steps: int,
+    waveforms: bool,
+) -> Orbits:  # fmt: skip
+    """Return the orbits of one section."""
     wanted = _periods(periods, section)
     _checks.one_of("method", method, SEARCHES)
     steps, box = _checks.integer("steps", steps, 1), _checks.positive("box", box)
@@ -127,7 +151,7 @@ def find_orbits(
     orbits = [
         _orbit(section, maps, size, extent, *pair, _quality(maps, *pair, quality_count), following) for pair in pairs
     ]
-    finished = _finished(orbits, maps, size)
+    finished = with_late_partners(_finished(orbits, maps, size))
     return Orbits(finished, values=section.values, method=method, prediction_error=prediction)
 
 

@@ -60,8 +60,14 @@ class Orbit(Result):
         P-value of the closest return under the orbit and its linearised map; small where there is no orbit.
     partner : int or None
         Position of the orbit with all signs changed among the orbits; its own if it is symmetric.
+    partner_delay : float
+        Forcing periods by which the partner is later: 0, or 0.5 where the forcing changes its sign in half a period,
+        which is looked for in waveforms.
+    sections : int
+        Number of sections in which it was found, where `find_orbits` had several.
     cycle : mapping of str to array (samples·period,) or None
-        The closest measured cycle by channel, angles continuous; None for a section of points alone.
+        The closest measured cycle by channel, angles continuous; None for a section of points alone. The waveform's
+        coordinates for an orbit of another section than the first.
     waveform : Waveform or None
         All channels over the period with errors, by local regression of the motion that follows the points, from
         `find_orbits` with ``waveforms=True``; None for a section of points alone, and for the method "boxes".
@@ -113,6 +119,8 @@ class Orbit(Result):
     remark: str = ""
     return_times: np.ndarray | None = None
     duration_sd: float = 0.0
+    partner_delay: float = 0.0
+    sections: int = 1
 
     def __repr__(self) -> str:
         kind = ", at rest" if self.equilibrium else ""

@@ -90,11 +90,11 @@ class Waveform(Storable):
     @property
     def sd(self) -> dict[str, np.ndarray]:
         """Standard error of each value, by channel, (samples·period,)."""
-        total = np.sqrt(np.sum(self._common_errors**2, axis=0) + self.noise**2)
+        total = np.sqrt(np.sum(self.common_errors**2, axis=0) + self.noise**2)
         return dict(zip(self.values, total, strict=True))
 
     @property
-    def _common_errors(self) -> np.ndarray:
+    def common_errors(self) -> np.ndarray:
         """The errors, and smooth ones of the size of the bias, (n, channels, samples·period)."""
         channels, parts = self.bias.shape
         count = self.noise.shape[1] // parts
@@ -125,7 +125,7 @@ class Waveform(Storable):
         for name in channels:
             _checks.one_of("channels", name, self.values)
         columns = [list(self.values).index(name) for name in channels]
-        errors = self._common_errors[:, columns, ::every]
+        errors = self.common_errors[:, columns, ::every]
         flat = errors.transpose(0, 2, 1).reshape(len(errors), -1)
         return flat.T @ flat + np.diag(self.noise[columns, ::every].T.ravel() ** 2)
 

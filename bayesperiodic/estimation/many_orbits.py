@@ -1,0 +1,174 @@
+"""estimate_orbits: an estimate from many orbits of a chaotic motion, taken in one after the other."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bayesperiodic import _checks
+from bayesperiodic._linalg import in_one_thread
+from bayesperiodic._printing import Printed, progress_bar
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.problem import Problem
+from bayesperiodic.estimation.map_estimate import NoFiniteDensity, map_estimate
+from bayesperiodic.estimation.result import MapEstimate
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, repr=False)
+class OrbitsEstimate(Printed):
+    """Estimate from those of many orbits that the model has near the measured ones.
+
+    Attributes
+    ----------
+    problem : Problem
+        With the experiments included, the first solve of each at its solution.
+    fit : MapEstimate
+        Of this problem.
+    dropped : dict of str to str
+        Experiments left out, and why.
+
+    Examples
+    --------
+    See `estimate_orbits`.
+    """
+
+    problem: Problem
+    fit: MapEstimate
+    dropped: dict[str, str]
+
+    @property
+    def table(self) -> "pd.DataFrame":
+        """One row per experiment included: periods, largest multiplier of the model's orbit as text, rms of residuals."""
+        import pandas as pd
+
+        rows = {}
+        for one in self.problem.experiments:
+            solution, residuals = self.fit.solutions[one.name], self.fit.residuals[one.name]
+            large = complex(solution.multipliers[0])
+            shown = f"{large.real:.5g}" if large.imag == 0.0 else f"{large:.4g}"
+            rows[one.name] = {"periods": one.periods, "multiplier": shown} | {
+                f"rms[{channel}]": float(np.sqrt(np.mean(values**2))) for channel, values in residuals.items()
+            }
+        return pd.DataFrame.from_dict(rows, orient="index")
+
+    def __repr__(self) -> str:
+        lines = [f"OrbitsEstimate from {len(self.problem.experiments)} orbits", self.table.to_string()]
+        lines += [f"Dropped {name!r}: {reason}." for name, reason in self.dropped.items()]
+        return "\n".join([*lines, repr(self.fit)])
+
+
+@in_one_thread
+def estimate_orbits(
+    problem: Problem, *, start: Mapping[str, float] | None = None, progress: bool = True
+) -> OrbitsEstimate:
+    """Estimate parameters from many orbits, which are included one after the other.
+
+    Strongly unstable orbits exist only near the parameters at which they were measured: from a distant start, one of
+    many turns into another orbit or is lost, and with it the estimate. With one orbit more at a time, each is solved at
+    parameters that the others have determined. One with which the estimate does not converge, or with which an orbit
+    turns into another one, is dropped and tried once more at the end.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its experiments are the orbits, the most reliable first: those of short periods and small multipliers, such as
+        ``sorted(orbits, key=lambda orbit: (orbit.period, abs(orbit.eigenvalues[0])))``, from `Orbit.experiment`.
+    start : mapping of str to float, optional
+        Parameters; by default the priors' medians.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    OrbitsEstimate
+        Sample the posterior of its ``problem``. Intervals of its ``fit`` are those of the robust standard deviations
+        where the model is misspecified.
+
+    Raises
+    ------
+    ValueError
+        As `map_estimate`, and if no orbit can be included.
+
+    Warns
+    -----
+    UserWarning
+        As `map_estimate` for the final estimate.
+
+    See Also
+    --------
+    map_estimate : Includes all experiments at once.
+
+    Examples
+    --------
+    `pendulum_orbits` as in `polish_orbits`:
+
+    >>> orbits = [orbit for orbit in pendulum_orbits if abs(orbit.eigenvalues[0]) < 50]
+    >>> known = {name: value for name, value in pendulum_parameters.items() if name != "l"}
+    >>> runs = [orbit.experiment(states={"phi": "angle"}) for orbit in orbits]
+    >>> wide = bp.Problem(bp.models.pendulum, runs, priors={"l": bp.LogNormal(0.09, 0.3)}, fixed=known)
+    >>> estimate = bp.estimate_orbits(wide, progress=False)
+    >>> estimate.dropped, abs(estimate.fit.theta["l"] - pendulum_parameters["l"]) < 3 * estimate.fit.sd["l"]
+    ({}, True)
+    """
+    _checks.instance("problem", problem, Problem)
+    _checks.instance("progress", progress, bool)
+    theta: Mapping[str, float] | None = start
+    included: list[Experiment] = []
+    dropped: dict[str, str] = {}
+    again = list(problem.experiments)
+    with progress_bar(total=len(again), desc="orbits", disable=not progress) as bar:
+        for last in (False, True):
+            waiting, again = again, []
+            for one in waiting:
+                fit = _with_one_more(problem, [*included, one], theta)
+                if isinstance(fit, str):
+                    dropped[one.name] = fit
+                    again.append(one)
+                else:
+                    dropped.pop(one.name, None)
+                    theta, included = fit.theta, _at_solutions([*included, one], fit)
+                if last or one.name not in dropped:
+                    bar.update()
+    if not included:
+        reasons = "; ".join(f"{name!r}: {reason}" for name, reason in dropped.items())
+        raise ValueError(
+            f"problem: must have an orbit that the model has near the start, got none: {reasons}. Give start={{…}} "
+            "nearer to the truth."
+        )
+    used = problem.with_experiments(included)
+    assert theta is not None
+    fit = map_estimate(used, start=_of(used, theta), progress=False)
+    return OrbitsEstimate(used, fit, dropped)
+
+
+def _with_one_more(
+    problem: Problem, experiments: list[Experiment], theta: Mapping[str, float] | None
+) -> MapEstimate | str:
+    """Return the estimate from these experiments, or why there is none with the last one."""
+    used = problem.with_experiments(experiments)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            start = None if theta is None else _of(used, theta)
+            fit = map_estimate(used, start=start, checks=False, progress=False)
+        except NoFiniteDensity:
+            return "the model has no such orbit near the estimate from the others"
+    if fit.other_orbits:
+        name, reason = next(iter(fit.other_orbits.items()))
+        return f"{name!r} turns into another orbit ({reason})"
+    return fit if fit.converged else f"the estimate with it ends {fit.status!r}"
+
+
+def _of(problem: Problem, theta: Mapping[str, float]) -> dict[str, float]:
+    """Return the parameters of a problem, at the priors' medians where they are not known yet."""
+    return {**dict(zip(problem.names, problem.median().tolist(), strict=True)), **theta}
+
+
+def _at_solutions(experiments: list[Experiment], fit: MapEstimate) -> list[Experiment]:
+    """Return experiments whose first solve starts from their solutions."""
+    return [replace(one, guess=dict(fit.solutions[one.name].states)) for one in experiments]
