@@ -18,6 +18,9 @@ from bayesperiodic.estimation.result import MapEstimate
 if TYPE_CHECKING:
     import pandas as pd
 
+# Multipliers are printed as real up to this relative imaginary part.
+REAL = 1e-6
+
 
 @dataclass(frozen=True, repr=False)
 class OrbitsEstimate(Printed):
@@ -43,14 +46,14 @@ class OrbitsEstimate(Printed):
 
     @property
     def table(self) -> "pd.DataFrame":
-        """One row per experiment included: periods, largest multiplier of the model's orbit as text, rms of residuals."""
+        """One row per orbit included: periods, largest multiplier by the model as text, rms of each residual."""
         import pandas as pd
 
         rows = {}
         for one in self.problem.experiments:
             solution, residuals = self.fit.solutions[one.name], self.fit.residuals[one.name]
             large = complex(solution.multipliers[0])
-            shown = f"{large.real:.5g}" if large.imag == 0.0 else f"{large:.4g}"
+            shown = f"{large.real:.5g}" if abs(large.imag) < REAL * abs(large) else f"{large:.4g}"
             rows[one.name] = {"periods": one.periods, "multiplier": shown} | {
                 f"rms[{channel}]": float(np.sqrt(np.mean(values**2))) for channel, values in residuals.items()
             }

@@ -24,6 +24,8 @@ NOISE_FLOOR = 5.0
 # Largest bias of an eigenvalue that is used as data, in standard deviations.
 MOST_BIAS = 0.5
 TURN = 2.0 * np.pi
+# Harmonics of the forcing that are compared of a waveform with independent values at 16 phases.
+COMPARED_HARMONICS = INDEPENDENT // 2 - 1
 _COLUMNS = (
     "name", "period", "duration", "duration_sd", "winding", "returns", "quality", "multiplier", "multiplier_sd", "contraction", "contraction_sd",
     "estimated", "modulus", "partner", "equilibrium", "remark", "rejected",
@@ -164,6 +166,7 @@ class Orbit(Result):
         samples: int = 800,
         multipliers: bool = False,
         whole: bool = False,
+        model_error: bool = False,
         states: Mapping[str, str] | None = None,
     ) -> Experiment:
         """Return the orbit as an experiment: its section points at tau = 0, 1, …, as in de Kraker et al. (1997).
@@ -184,10 +187,13 @@ class Orbit(Result):
             are all smaller ones.
         whole : bool
             Compare the waveforms of all outputs instead, at 16 phases a forcing period and with their covariance,
-            which contain nearly all information. Where the errors of the model exceed those of the waveform,
-            ``dataclasses.replace(experiment, covariance=None)`` has a variance per channel in its place. Without a
+            which contain nearly all information. Without a
             waveform, all samples of the measured cycle are compared, with a variance per channel: it is a close return
             and does not close exactly; the gap counts as noise.
+        model_error : bool
+            With the whole waveform, compare its Fourier components, to seven times the forcing frequency, with an
+            unknown variance per channel in place of the covariance: for models whose errors exceed those of the
+            waveform. Residuals are then tested, and robust standard deviations take into account what they contain.
         states : mapping of str to str, optional
             The output that measures each state of the model, such as ``{"phi": "angle"}``: the first solve then starts
             from the waveform, or from the measured cycle. By default it starts from the polished solution; without one,
@@ -220,7 +226,7 @@ class Orbit(Result):
         if winding is None:
             raise ValueError(f"winding: must be known, got None for {self.name!r}. Use polish_orbits first.")
         turns = winding if self.solution is None else self.solution.winding
-        compared = _compared(self, samples, multipliers, whole)
+        compared = _compared(self, winding, samples, multipliers, whole, model_error)
         if self.solution is not None:
             inputs = {name: _on_grid(values, samples * self.period) for name, values in self.solution.inputs.items()}
         else:
@@ -356,8 +362,12 @@ def _on_grid(values: np.ndarray, points: int) -> np.ndarray:
     return values if values.size == points else _fourier.on_grid(_fourier.coefficients(values), points)
 
 
-def _compared(orbit: Orbit, samples: int, multipliers: bool, whole: bool) -> dict[str, Any]:
+def _compared(
+    orbit: Orbit, winding: int, samples: int, multipliers: bool, whole: bool, model_error: bool
+) -> dict[str, Any]:
     """Return the arguments of the experiment that say what is compared, with which errors."""
+    if model_error:
+        return _components(orbit, winding, samples, multipliers, whole)
     measured: Mapping[str, np.ndarray]
     covariance: np.ndarray | None
     if whole and orbit.waveform is not None:
@@ -375,6 +385,22 @@ def _compared(orbit: Orbit, samples: int, multipliers: bool, whole: bool) -> dic
     for name, values in measured.items():
         outputs[name][mask] = values
     return {"outputs": outputs, "mask": mask, "covariance": covariance}
+
+
+def _components(orbit: Orbit, winding: int, samples: int, multipliers: bool, whole: bool) -> dict[str, Any]:
+    """Return the arguments that compare the Fourier components of the waveform."""
+    if multipliers or not whole or orbit.waveform is None:
+        raise ValueError(
+            f"model_error: must be False without the whole waveform of {orbit.name!r}, or with multipliers, got True. Give "
+            "whole=True, with find_orbits(..., waveforms=True)."
+        )
+    names, highest = orbit.waveform.outputs, COMPARED_HARMONICS * orbit.period
+    sd = orbit.waveform.sd
+    return {
+        "outputs": _resampled(orbit, winding, samples, names),
+        "harmonics": dict.fromkeys(names, highest),
+        "scatter": {name: float(np.sqrt(np.mean(sd[name] ** 2))) for name in names},
+    }
 
 
 def _of_waveform(

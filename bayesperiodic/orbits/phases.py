@@ -108,7 +108,7 @@ def _outputs(orbit: Orbit, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     every = orbit.waveform.noise.shape[1] // (INDEPENDENT * orbit.period)
     return tuple(
         np.stack([by_name[name][::every] for name in names]) / size[:, None] for by_name in (orbit.waveform.values, sd)
-    )  # type: ignore[return-value]
+    )
 
 
 def _error(orbit: Orbit, size: np.ndarray) -> float:
