@@ -183,7 +183,10 @@ def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.nd
         )
     turn = np.array([2.0 * np.pi if name in section.angles else np.inf for name in section.coordinates]) / size
     noise = np.zeros(size.size) if section.noise is None else section.noise / size
-    maps = ReturnMap(section.points / size, section.increments / size, turn, section.winds, noise, section.stretches)
+    maps = ReturnMap(
+        section.points / size, section.increments / size, turn, section.winds, noise, section.stretches,
+        noises=None if section.noises is None else section.noises / size,
+    )  # fmt: skip
     prediction = check_chaos(maps, lambda: _remedy(section, maps))
     if section.noise is None:
         maps.noise = estimate_noise(maps, neighbours)

@@ -118,7 +118,7 @@ class ReturnMap:
 
     def __init__(
         self, points: np.ndarray, increments: np.ndarray, turn: np.ndarray, winds: bool, noise: np.ndarray,
-        stretches: np.ndarray | None = None, steps: int = 1,
+        stretches: np.ndarray | None = None, steps: int = 1, noises: np.ndarray | None = None,
     ):  # fmt: skip
         self.steps = steps
         self.points = points  # in the order of time, (count, d)
@@ -131,6 +131,7 @@ class ReturnMap:
         self.turn = turn  # one turn in these units; infinite for coordinates that are not angles, (d,)
         self.winds = winds  # whether the increments of angles include whole turns
         self.noise = noise  # standard deviation of the arguments, (d,)
+        self._noises = None if noises is None else noises[self.positions]  # of each, where they differ, (n, d)
         self.angle = np.isfinite(turn)
         self._angles = np.flatnonzero(self.angle).tolist()
         self.count = len(self.arguments) // steps  # of points of each phase
@@ -258,7 +259,7 @@ class ReturnMap:
         bandwidth = np.maximum(bandwidth, np.max(self.noise) / MOST_NOISE)
         away = self._away(centres, index)
         image, reference = self._images(away, index)
-        system = self._system(away, bandwidth, inside, degree, image if shrunk else None, wants_influence)
+        system = self._system(away, bandwidth, index, inside, degree, image if shrunk else None, wants_influence)
         solution = system.solve(image)
         influence = np.empty((len(centres), 0, 1 + away.shape[2], away.shape[2]))
         if wants_influence:
@@ -279,7 +280,7 @@ class ReturnMap:
             index, inside, bandwidth = self._within(centre, phase, width, degree)
             index, inside = index[:, inside[0]], inside[:, inside[0]]
             away = self._away(centre, index)
-            system = self._system(away, bandwidth, inside, degree, self._images(away, index)[0], True)
+            system = self._system(away, bandwidth, index, inside, degree, self._images(away, index)[0], True)
             target = signals(index[0], centre + away[0])
             reference, target = target[:1], (target - target[:1])[None]
             solution = system.solve(target)
@@ -304,11 +305,13 @@ class ReturnMap:
         return image if self.winds else self.wrap(image), reference[:, 0]
 
     def _system(
-        self, away: np.ndarray, bandwidth: np.ndarray, inside: np.ndarray, degree: int,
+        self, away: np.ndarray, bandwidth: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int,
         shrinking: np.ndarray | None, wants_influence: bool,
     ) -> "_NormalEquations":  # fmt: skip
         """Return the normal equations of fits; the residuals of the images `shrinking` determine their shrinkage."""
-        by_coordinate = _deconvoluted(away / bandwidth[:, None, None], self.noise / bandwidth[:, None], 2 * degree)
+        width = bandwidth[:, None, None]
+        noise = self.noise if self._noises is None else np.minimum(self._noises[index], MOST_NOISE * width)
+        by_coordinate = _deconvoluted(away / width, noise / width, 2 * degree)
         by_coordinate[0] *= inside[:, None]
         d, weight = len(by_coordinate), by_coordinate[0][:, 0]
         terms = _terms(d, degree)
@@ -369,12 +372,14 @@ class _NormalEquations(NamedTuple):
 def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.ndarray]:
     """Return, by coordinate, functions (m, power, n) whose expectations are the powers, the first times the kernel.
 
+    The noise is that of each neighbour (m, n, d), or of all (m, 1, d).
+
     x^a exp(−x²/2) is the expectation, over noise of variance s², of the Gaussian of variance 1 − s² times the a-th
     moment of a normal distribution with mean x/(1 − s²) and the negative variance −s²/(1 − s²).
     """
     left, moments = 1.0 - noise**2, []
-    exponent, divisor = np.zeros(away.shape[:2]), np.sqrt(left.prod(1))
-    for k, rest in enumerate(left.T[..., None]):
+    exponent, divisor = np.zeros(away.shape[:2]), np.sqrt(left.prod(axis=-1))
+    for k, rest in enumerate(np.moveaxis(left, -1, 0)):
         mean, variance = away[..., k] / rest, (rest - 1.0) / rest
         exponent -= 0.5 * rest * mean**2
         rows = np.empty((len(away), highest + 1, away.shape[1]))
@@ -383,7 +388,7 @@ def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.
             np.multiply(mean, rows[:, order - 1], out=rows[:, order])
             rows[:, order] += (order - 1) * variance * rows[:, order - 2]
         moments.append(rows)
-    moments[0] *= (np.exp(exponent) / divisor[:, None])[:, None]
+    moments[0] *= (np.exp(exponent) / divisor)[:, None]
     return moments
 
 

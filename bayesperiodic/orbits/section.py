@@ -75,6 +75,9 @@ class PoincareSection(Result):
         inputs.
     crossed : str or None
         Channel whose crossings define the section; None if the phase of a forcing does.
+    noises : array (count, d) or None
+        Standard deviation of each point's errors, for crossings, of which the instants have errors; `noise` is their
+        root mean square.
 
     Examples
     --------
@@ -107,6 +110,7 @@ class PoincareSection(Result):
     others: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
     crossed: str | None = None
+    noises: np.ndarray | None = None
 
     @classmethod
     def from_recording(
@@ -325,7 +329,7 @@ class PoincareSection(Result):
             samples, names, angle_names, crossings.instants, crossings.stretch, 0, synthetic, others, inputs,
             1.0 / float(crossings.returns.mean()), longest, channel,
         )  # fmt: skip
-        return section if section.noise is None else replace(section, noise=section._with_errors_of(crossings, error))
+        return section if section.noise is None else section._with_errors_of(crossings, error)
 
     @classmethod
     def from_points(
@@ -393,18 +397,17 @@ class PoincareSection(Result):
             samples.starts if broken else None, left_out, others, inputs, crossed,
         )  # fmt: skip
 
-    def _with_errors_of(self, crossings: Crossings, error: float) -> np.ndarray:
-        """Return the noise (d,) of the points, with that of crossings of a signal with errors of this sd."""
-        measured = self.measured
-        assert measured is not None and self.noise is not None
-        samples, instants, stretch = measured
+    def _with_errors_of(self, crossings: Crossings, error: float) -> "PoincareSection":
+        """Return the section with the errors due to those of the crossings, of a signal with errors of this sd."""
+        assert self.noise is not None and self.measured is not None
+        samples, instants, stretch = self.measured
         apart = float(np.median(crossings.band / crossings.slopes))
         before, later = (
-            coordinate_values(samples, self.coordinates, instants + away, stretch, 1.0, 2.0 * apart)[0]
+            coordinate_values(samples, self.coordinates, instants + away, stretch, self.unit, 2.0 * apart)[0]
             for away in (-apart, apart)
         )
-        rates = (later - before) / (2.0 * apart)
-        return np.hypot(self.noise, error * np.sqrt(np.mean((rates / crossings.slopes[:, None])**2, axis=0)))
+        noises = np.hypot(self.noise, error * (later - before) / (2.0 * apart * crossings.slopes[:, None]))
+        return replace(self, noise=np.sqrt(np.mean(noises**2, axis=0)), noises=noises)
 
     def __len__(self) -> int:
         return len(self.points)
