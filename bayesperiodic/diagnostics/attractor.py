@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest, hypergeom, norm
+from scipy.special import ndtr, ndtri
 from tqdm import tqdm
 
 from bayesperiodic import _checks
@@ -188,8 +188,6 @@ def predict_attractor(
 
     A recording of one set-up cannot show that the model is right, only that these statistics do not contradict it.
     """
-    import pandas as pd
-
     _checks.instance("problem", problem, Problem)
     _checks.instance("posterior", posterior, (Posterior, MapEstimate))
     _checks.instance("section", section, PoincareSection)
@@ -209,8 +207,8 @@ def predict_attractor(
         coordinates=section.coordinates,
         units={name: u for name in section.coordinates if (u := _unit(problem, name))},
         orbits={}, runs=runs, unfitted=runs - len(moved.points), left=int(moved.left.sum()),
-        settled=int(statistics.settled.sum()), pieces=len(pieces), periods=periods, misfit=float(np.median(moved.misfit)),
-        synthetic=section.synthetic,
+        settled=int(statistics.settled.sum()), pieces=len(pieces), periods=periods,
+        misfit=float(np.median(moved.misfit)), synthetic=section.synthetic,
     )  # fmt: skip
 
 
@@ -334,8 +332,8 @@ def _runs(
     if len(points) < FEWEST_PIECES:
         raise RuntimeError(
             f"posterior: must explain the measured outputs over single periods, got {len(points)} of {len(thetas)} "
-            f"starts with a misfit below {LARGEST_MISFIT:.0%} of their standard deviations. Check the model, the units, "
-            "and the phase of the section against that of the forcing."
+            f"starts with a misfit below {LARGEST_MISFIT:.0%} of their standard deviations. Check the model, the "
+            "units, and the phase of the section against that of the forcing."
         )
     return _Runs(np.array(points), np.array(growth), np.array(left), np.array(misfits))
 
@@ -406,8 +404,8 @@ class _Statistics:
         rows[LEFT] = self._share(self.runs.left, self.measured_left)
         rows[SETTLED] = self._share(self.settled, self.measured_settled)
         one, other = exponents["local_maps"]
-        spread = norm.ppf(0.5 + 0.5 * PROBABILITY) * difference.sd
-        p = 2.0 * norm.sf(abs(difference.mean) / difference.sd)
+        spread = ndtri(0.5 + 0.5 * PROBABILITY) * difference.sd
+        p = 2.0 * ndtr(-abs(difference.mean) / difference.sd)
         rows[EXPONENT] = (one, other, other - spread, other + spread, float(p))
         table = pd.DataFrame.from_dict(rows, "index", columns=["model", "recording", "low", "high", "p"])
         adjusted = holm(table["p"].to_numpy())
@@ -421,9 +419,12 @@ class _Statistics:
 
     def _share(self, ours: np.ndarray, theirs: np.ndarray) -> tuple[float, ...]:
         """Return fractions of runs and pieces, the 90 % interval of the latter, and p of Fisher's one-sided test."""
-        chance = hypergeom(ours.size + theirs.size, int(ours.sum() + theirs.sum()), ours.size)
-        low, high = binomtest(int(theirs.sum()), theirs.size).proportion_ci(PROBABILITY)
-        return float(ours.mean()), float(theirs.mean()), float(low), float(high), float(chance.sf(ours.sum() - 1))
+        from scipy.stats import binomtest, fisher_exact
+
+        counts = [[int(one.sum()), int((~one).sum())] for one in (ours, theirs)]
+        interval = binomtest(counts[1][0], theirs.size).proportion_ci(PROBABILITY)
+        p = fisher_exact(counts, alternative="greater")[1]
+        return float(ours.mean()), float(theirs.mean()), float(interval.low), float(interval.high), float(p)
 
     def _density(self) -> tuple[float, ...]:
         """Return the distance of the densities, that of the recording from itself, its range, and p."""
@@ -445,7 +446,7 @@ class _Statistics:
         return float(distance), float(np.median(chance)), *map(float, np.quantile(chance, [0.05, 0.95])), float(p)
 
     def _counts(self, series: np.ndarray, runs: int) -> np.ndarray:
-        """Return the counts (series, bins) of the points of some series (series, points, d), the first those of runs."""
+        """Return the counts (series, bins) of the points of series (series, points, d), the first those of runs."""
         low = np.where(self.turning, -np.pi, self.measured.min(axis=(0, 1)))
         width = np.where(self.turning, 2.0 * np.pi, np.ptp(self.measured, axis=(0, 1)))
         best = np.zeros((len(series), 1))

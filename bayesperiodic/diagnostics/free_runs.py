@@ -16,7 +16,7 @@ from bayesperiodic.orbits.stretches import local_fit
 
 # Phases of the first period at which the measured outputs are compared with those of a run.
 START_PHASES = 16
-# Steps of the integration in a period: the fewest and the most; largest error of a period, in units of the states' size.
+# Steps of the integration in a period, fewest and most; largest error of a period, in units of the states' size.
 FEWEST_STEPS, MOST_STEPS, STEP_ERROR = 128, 4096, 1e-3
 # Fit of a start: candidates, iterations, halvings; relative step of derivatives, smallest relative singular value, and
 # the decrease of the misfit that is none.
@@ -107,7 +107,7 @@ class Recorded:
 
 
 class Library(NamedTuple):
-    """States of the model on its motion, from which starts are taken, and their outputs over the period that follows."""
+    """States of the model on its motion, from which starts are taken, and outputs over the period that follows."""
 
     states: np.ndarray  # (count, size)
     outputs: np.ndarray  # (count, START_PHASES + 1, channels)
@@ -144,8 +144,10 @@ def enough_steps(recorded: Recorded, theta: np.ndarray, library: Library, start:
     some = library.states[:: max(1, len(library.states) // 20)]
     while steps <= MOST_STEPS:
         coarse, fine = (Runner(recorded.model, recorded.frequency, n) for n in (steps, 2 * steps))
-        ends = [[r.path(theta, y, recorded.table(start, r.steps))[-1] for y in some] for r in (coarse, fine)]
-        error = np.abs(np.subtract(*ends)) / library.size
+        one, other = (
+            np.array([r.path(theta, y, recorded.table(start, r.steps))[-1] for y in some]) for r in (coarse, fine)
+        )
+        error = np.abs(one - other) / library.size
         if np.nanmax(error, initial=0.0) < STEP_ERROR and np.isfinite(error).mean() > 0.5:
             return coarse
         steps *= 2
