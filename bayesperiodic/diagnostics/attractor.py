@@ -184,7 +184,7 @@ def predict_attractor(
 
     *Lyapunov exponent.* The recording's is that of local maps of its section. Their systematic error cancels in the
     comparison with the same maps of as many points of the runs, with the same noise; it is measured by the exponent of
-    two neighbouring runs of the model.
+    two neighbouring runs of the model. Local maps are not fitted to runs that settle.
 
     A recording of one set-up cannot show that the model is right, only that these statistics do not contradict it.
     """
@@ -200,7 +200,7 @@ def predict_attractor(
     thetas = problem.parameters(_parameters(problem, posterior, runs, generator), experiment)
     moved = _runs(recorded, thetas, _seeds(problem, posterior), generator, progress)
     pieces = _pieces(section, moved.points.shape[1])
-    statistics = _Statistics(recorded, moved, pieces, generator)
+    statistics = Statistics(recorded, moved, pieces, generator)
     table, exponents = statistics.table()
     return AttractorPrediction(
         table=table, exponents=exponents, section=section.points, model_section=moved.points[statistics.stays],
@@ -360,7 +360,7 @@ def _unit(problem: Problem, coordinate: str) -> str:
     return problem.model.units.get(channels_of([coordinate])[0], "")
 
 
-class _Statistics:
+class Statistics:
     """Statistics of runs and of the pieces of a recording, and their tests."""
 
     def __init__(self, recorded: Recorded, runs: _Runs, pieces: np.ndarray, generator: np.random.Generator):
@@ -401,8 +401,8 @@ class _Statistics:
 
         exponents, difference = self._exponents()
         rows = {DENSITY: self._density()}
-        rows[LEFT] = self._share(self.runs.left, self.measured_left)
-        rows[SETTLED] = self._share(self.settled, self.measured_settled)
+        rows[LEFT] = self.share(self.runs.left, self.measured_left)
+        rows[SETTLED] = self.share(self.settled, self.measured_settled)
         one, other = exponents["local_maps"]
         spread = ndtri(0.5 + 0.5 * PROBABILITY) * difference.sd
         p = 2.0 * ndtr(-abs(difference.mean) / difference.sd)
@@ -417,12 +417,13 @@ class _Statistics:
         ]  # fmt: skip
         return table, exponents
 
-    def _share(self, ours: np.ndarray, theirs: np.ndarray) -> tuple[float, ...]:
+    @staticmethod
+    def share(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, ...]:
         """Return fractions of runs and pieces, the 90 % interval of the latter, and p of Fisher's one-sided test."""
         from scipy.stats import binomtest, fisher_exact
 
-        counts = [[int(one.sum()), int((~one).sum())] for one in (ours, theirs)]
-        interval = binomtest(counts[1][0], theirs.size).proportion_ci(PROBABILITY)
+        counts = np.array([[one.sum(), (~one).sum()] for one in (ours, theirs)], dtype=int)
+        interval = binomtest(int(counts[1, 0]), theirs.size).proportion_ci(PROBABILITY)
         p = fisher_exact(counts, alternative="greater")[1]
         return float(ours.mean()), float(theirs.mean()), float(interval.low), float(interval.high), float(p)
 
@@ -466,7 +467,7 @@ class _Statistics:
         import pandas as pd
 
         some, frequency = np.flatnonzero(self.stays & ~self.settled), self.recorded.frequency
-        growth = self.runs.growth[some]
+        growth, chaotic = self.runs.growth[self.stays], self.runs.growth[some]
         number = min(some.size, len(self.measured))
         columns = ["exponent", "sd", "local_maps", "local_maps_sd"]
         table = pd.DataFrame(np.nan, index=["model", "recording"], columns=columns)
@@ -478,8 +479,8 @@ class _Statistics:
             growth_of_pieces(points / self.size, self.noise / self.size, turn)
             for points in (self.points[chosen[0]], self.measured[chosen[1]])
         )
-        mean, sd = growth.mean(), growth.std(ddof=1) / np.sqrt(some.size)
+        mean, sd, bias = growth.mean(), growth.std(ddof=1) / np.sqrt(growth.size), ours.mean - chaotic.mean()
         difference = float(np.hypot(ours.sd, theirs.sd))
         table.loc["model"] = [mean, sd, ours.mean, ours.sd]
-        table.loc["recording"] = [theirs.mean, np.hypot(theirs.sd, ours.mean - mean), theirs.mean, theirs.sd]
+        table.loc["recording"] = [theirs.mean, np.hypot(theirs.sd, bias), theirs.mean, theirs.sd]
         return frequency * table, Growth(frequency * (ours.mean - theirs.mean), frequency * difference)

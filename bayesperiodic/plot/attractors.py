@@ -57,9 +57,11 @@ def attractor(prediction: AttractorPrediction, *, figure: Figure | None = None) 
     for column, label in enumerate((across, up)):
         ax = figure.add_subplot(grid[1, column])
         values = [prediction.section[:, column], model[:, column]]
-        edges = np.linspace(min(map(np.min, values)), max(map(np.max, values)), MARGINAL_BINS + 1).tolist()
+        every = np.concatenate(values)
+        edges = np.linspace(every.min(), every.max(), MARGINAL_BINS + 1).tolist()
         ax.hist(values[0], edges, density=True, label="measured", **MEASURED_POINTS)
-        ax.hist(values[1], edges, density=True, histtype="step", lw=1.4, label="model", **MODEL_POINTS)
+        if values[1].size:
+            ax.hist(values[1], edges, density=True, histtype="step", lw=1.4, label="model", **MODEL_POINTS)
         ax.set(xlabel=label, yticks=[])
         if column == 0:
             ax.set_ylabel("density")
