@@ -20,6 +20,8 @@ from .data.special_points import Fold as Fold
 from .data.special_points import PhaseLag as PhaseLag
 from .data.sweep import Sweep as Sweep
 from .density.problem import Problem as Problem
+from .diagnostics.attractor import AttractorPrediction as AttractorPrediction
+from .diagnostics.attractor import predict_attractor as predict_attractor
 from .diagnostics.branch_prediction import BranchPrediction as BranchPrediction
 from .diagnostics.branch_prediction import predict_branch as predict_branch
 from .diagnostics.calibration import Calibration as Calibration

@@ -8,7 +8,7 @@ from scipy.integrate import DOP853, solve_ivp
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.recording import Recording
-from bayesperiodic.models.integration import integration_kernels
+from bayesperiodic.models.integration import complete_states, integration_kernels
 from bayesperiodic.models.model import Model, parameter_vector
 
 RELATIVE_TOLERANCE = 1e-10
@@ -106,7 +106,6 @@ class _FirstOrder:
         self.signals = [_with_derivatives(name, inputs[name], frequency) for name in model.inputs]
         self.orders = np.array([model.orders[state] for state in model.states])
         self.second = np.flatnonzero(self.orders == 2)
-        self.highest = self.orders * self.count + np.arange(self.count)
 
     def start(self, given: Mapping[str, float]) -> np.ndarray:
         """Return y from the given states and rates; the others are zero."""
@@ -125,23 +124,16 @@ class _FirstOrder:
         present = (size > 1e-15 * size.max(axis=0, initial=0.0)).any(axis=1)
         return table[: 1 + np.flatnonzero(present).max(initial=0)]
 
-    def _evaluate(self, function: str, states: np.ndarray, time: np.ndarray) -> np.ndarray:
+    def _inputs(self, time: np.ndarray) -> np.ndarray:
         signals = np.empty((len(self.signals), 3, time.size))
         for i, signal in enumerate(self.signals):
             signals[i] = signal(time)
-        inputs = np.ascontiguousarray(np.swapaxes(signals, 0, 1).reshape(-1, time.size).T)
-        tau = time * self.frequency
-        return self.model.kernels.evaluate(function, states, inputs, self.theta, tau, self.frequency)
+        return np.ascontiguousarray(np.swapaxes(signals, 0, 1).reshape(-1, time.size).T)
 
     def states(self, time: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return q, q̇, q̈, (points, 3·states), with the highest derivatives solved from the equations."""
-        states = np.zeros((time.size, 3 * self.count))
-        states[:, : self.count] = y[:, : self.count]
-        states[:, self.count + self.second] = y[:, self.count :]
-        columns = self._evaluate("residual_jacobian", states, time)
-        jacobian = columns[:, self.count :].reshape(-1, self.count, 3 * self.count)[:, :, self.highest]
-        states[:, self.highest] = -np.linalg.solve(jacobian, columns[:, : self.count, None])[..., 0]
-        return states
+        given = self._inputs(time), self.theta, time * self.frequency, self.frequency
+        return complete_states(self.model, y, *given)
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         """Return ẏ."""
@@ -150,7 +142,9 @@ class _FirstOrder:
 
     def outputs(self, time: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
         """Return the outputs by name, (points,) each."""
-        return dict(zip(self.model.outputs, self._evaluate("outputs", self.states(time, y), time).T, strict=True))
+        given = self._inputs(time), self.theta, time * self.frequency, self.frequency
+        columns = self.model.kernels.evaluate("outputs", self.states(time, y), *given)
+        return dict(zip(self.model.outputs, columns.T, strict=True))
 
 
 def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:

@@ -1,8 +1,9 @@
-"""Figures of data, estimates, posteriors, branches and orbits.
+"""Figures of data, estimates, posteriors, branches, orbits and attractors.
 
 Every function returns the matplotlib Figure; an empty one to draw into can be given as `figure`.
 """
 
+from bayesperiodic.plot.attractors import attractor
 from bayesperiodic.plot.branches import branch, orbits, section
 from bayesperiodic.plot.diagnostics import comparison, models, profile, ranks
 from bayesperiodic.plot.elements import elements
@@ -16,6 +17,6 @@ from bayesperiodic.plot.tables import response
 from bayesperiodic.plot.terms import missing_terms
 
 __all__ = [
-    "COLOURS", "branch", "comparison", "corner", "elements", "fit", "loops", "marginals", "missing_terms", "models",
-    "orbits", "population", "profile", "ranks", "recording", "response", "section", "summary", "traces",
+    "COLOURS", "attractor", "branch", "comparison", "corner", "elements", "fit", "loops", "marginals", "missing_terms",
+    "models", "orbits", "population", "profile", "ranks", "recording", "response", "section", "summary", "traces",
 ]  # fmt: skip

@@ -1,0 +1,486 @@
+"""Posterior prediction of a chaotic attractor: free runs of the model against the section of a recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+from tqdm import tqdm
+
+from bayesperiodic import _checks
+from bayesperiodic._io import Result
+from bayesperiodic._linalg import in_one_thread
+from bayesperiodic._verdicts import BAD, GOOD, with_tone
+from bayesperiodic.density.problem import Problem
+from bayesperiodic.diagnostics import free_runs
+from bayesperiodic.diagnostics.free_runs import Recorded, Runner
+from bayesperiodic.diagnostics.predictive import PROBABILITY, draws_of
+from bayesperiodic.estimation.adequacy import ADEQUACY_LEVEL, ALL, UNTESTED, holm
+from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.orbits.coordinates import channels_of, wrapped
+from bayesperiodic.orbits.lyapunov import Growth, growth_of_pieces
+from bayesperiodic.orbits.section import PoincareSection
+from bayesperiodic.periodic.solution import PeriodicSolution
+from bayesperiodic.problem.fingerprint import check_results
+from bayesperiodic.sampling.draws import Posterior
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+CONSISTENT, DIFFERENT = with_tone("consistent", GOOD), with_tone("different", BAD)
+DENSITY, LEFT, SETTLED, EXPONENT = "density", "runs that leave", "runs that settle", "Lyapunov exponent"
+# Returns at the start of a run that are left out; fewest returns and runs, and pieces of the recording.
+DISCARDED, FEWEST_RETURNS, FEWEST_RUNS, FEWEST_PIECES = 5, 20, 20, 10
+# A start is not fitted if the misfit of its first period exceeds this fraction of the outputs' standard deviation.
+LARGEST_MISFIT = 0.5
+# The region of the recording: its quantiles from this one on, and the margin as a fraction of their distance.
+OUTERMOST, MARGIN = 1e-3, 0.25
+# A run has settled if its last points repeat within this fraction of the section's size, after at most so many returns.
+REPEATING, REPEATS_WITHIN, LONGEST_CYCLE = 10, 0.02, 4
+# Mean number of the runs' points in a bin, bins along a coordinate, and random divisions of the recording.
+POINTS_EACH, FEWEST_BINS, MOST_BINS, DIVISIONS = 20, 3, 64, 999
+# Runs of the library from which starts are taken, and attempts to draw parameters within the support of the prior.
+LIBRARY_RUNS, DRAWING_ATTEMPTS = 40, 100
+
+
+@dataclass(frozen=True)
+class AttractorPrediction(Result):
+    """Free runs of a model from draws of its parameters, against the recording of a chaotic motion.
+
+    Attributes
+    ----------
+    table : DataFrame
+        Rows "density", "runs that leave", "runs that settle", "Lyapunov exponent" and "all". Columns: ``model`` and
+        ``recording``, the values that are compared; ``low`` and ``high``, the central 90 % of the values of ``model``
+        that chance gives; ``p``; and ``verdict``, "different" where p, adjusted by Holm's method for the four tests, is
+        below 1 %, "consistent", or "not tested". Density: half the sum of the absolute differences of the fractions of
+        points in the bins, 0 to 1. Runs: their fraction, and that of the pieces of the recording of the same length,
+        with its interval. Exponent [1/s]: that of local maps of as many points of both.
+    exponents : DataFrame
+        Rows "model" and "recording": the largest Lyapunov ``exponent`` [1/s] and its standard error ``sd``, and those
+        of local maps of their sections, ``local_maps`` and ``local_maps_sd``. The model's exponent is that of two
+        neighbouring runs, the recording's that of local maps, whose ``sd`` includes their error in the model's runs.
+    section, model_section : array (count, d), array (runs, returns, d)
+        Points of the recording, and of the runs that stay in its region, without the first five returns.
+    coordinates : tuple of str
+    units : dict of str to str
+        Of the coordinates, if known.
+    orbits : dict of str to array (period, d)
+        Points of the orbits given.
+    runs, unfitted, left, settled : int
+        Number of runs, of those whose start could not be fitted, and, of the others, of those that leave the region of
+        the recording or become periodic.
+    pieces, periods : int
+        Number of pieces of the recording, and forcing periods of a run.
+    misfit : float
+        Median of the rms misfit of the first period, in units of the standard deviations of the outputs.
+    synthetic : bool
+        True if the recording was simulated.
+    """
+
+    table: pd.DataFrame
+    exponents: pd.DataFrame
+    section: np.ndarray
+    model_section: np.ndarray
+    coordinates: tuple[str, ...]
+    units: dict[str, str]
+    orbits: dict[str, np.ndarray]
+    runs: int
+    unfitted: int
+    left: int
+    settled: int
+    pieces: int
+    periods: int
+    misfit: float
+    synthetic: bool
+
+    @property
+    def verdict(self) -> str:
+        """Verdict of all tests."""
+        return str(self.table.loc[ALL, "verdict"])
+
+    def __repr__(self) -> str:
+        different = [str(row) for row in self.table.index[self.table["verdict"] == DIFFERENT] if row != ALL]
+        untested = [str(row) for row in self.table.index[self.table["verdict"] == UNTESTED] if row != ALL]
+        verdict = {
+            DIFFERENT: f"The model does not predict the measured attractor: {', '.join(different)}",
+            CONSISTENT: "No test distinguishes the model's attractor from the measured one",
+        }.get(self.verdict, "The attractor is not tested")
+        one, other = (f"{row.exponent:.3g} ± {row.sd:.2g} 1/s" for row in self.exponents.itertuples())
+        lines = [
+            f"Free runs over {self.periods} forcing periods from {self.runs} draws, {self.unfitted} without a fit of "
+            f"their start (rms misfit of the first period {self.misfit:.1%})",
+            self.table.to_string(float_format="{:.3g}".format, na_rep="-"),
+            f"{verdict} (overall false alarm rate {ADEQUACY_LEVEL:.0%}).",
+            f"Not tested: {', '.join(untested)}." if untested and self.verdict != UNTESTED else "",
+            f"Largest Lyapunov exponent of the model {one}, of the recording {other} (standard errors)."
+            if self.exponents.notna().all(axis=None)
+            else "",
+        ]
+        return "\n".join(filter(None, lines))
+
+
+@in_one_thread
+def predict_attractor(
+    problem: Problem,
+    posterior: Posterior | MapEstimate,
+    section: PoincareSection,
+    *,
+    runs: int = 100,
+    periods: int = 30,
+    seed: int = 0,
+    progress: bool = True,
+) -> AttractorPrediction:
+    """Predict a chaotic attractor by free runs of the model, and test it against the section of a recording.
+
+    Each run has the parameters of a draw and the measured inputs of a part of the recording, and starts from the state
+    that explains the measured outputs of the first period best, hidden states included. After several periods a chaotic
+    run has forgotten its start, so that only statistics are compared: the density of the section, the fractions of runs
+    that leave the region of the recording or become periodic, and the largest Lyapunov exponent.
+
+    Parameters
+    ----------
+    problem : Problem
+        All experiments must have the same parameters of the model. Sensors are not supported.
+    posterior : Posterior or MapEstimate
+        Of the problem. Of a misspecified model the robust draws are used, and of an estimate normal draws with
+        `covariance` or, if the model is misspecified, `robust_covariance`, within the supports of the priors.
+    section : PoincareSection
+        Of a recording of the forced system, which need not be part of the problem. Its coordinates must be outputs of
+        the model, delayed or not, and the model's inputs must be recorded.
+    runs, periods : int
+        Number of runs, at least 20, and their length in forcing periods, at least 20. The recording must contain at
+        least 10 pieces of that length.
+    seed : int
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    AttractorPrediction
+        `plot.attractor` draws it.
+
+    Raises
+    ------
+    ValueError
+        For too few runs or periods, a section of points alone or of crossings, one that is too short, coordinates or
+        inputs that do not belong to the model, and draws of another problem.
+    RuntimeError
+        If the model has no motion from which runs could start, or fewer than 10 starts can be fitted.
+
+    Notes
+    -----
+    *Density.* The bins are boxes of all coordinates, as small as 20 points of the runs in each allow. The distance is
+    compared with that of a random half of the recording from the other half, or of pieces as numerous as the runs from
+    the rest, in pieces as long as the runs, which contain the dependence of consecutive points; it is scaled to the
+    number of points. The density of the model is the mean over the draws: wide posteriors widen it.
+
+    *Runs that leave* have an output beyond the range of the recording (without 0.1 % of the samples at each end) by
+    more than 25 % of the range. *Runs that settle* repeat their points after up to 4 returns, within 2 % of the
+    section's size over the last 10. Both are compared with the pieces of the recording by Fisher's exact test, and runs
+    that leave are not part of the other tests.
+
+    *Lyapunov exponent.* The recording's is that of local maps of its section. Their systematic error cancels in the
+    comparison with the same maps of as many points of the runs, with the same noise; it is measured by the exponent of
+    two neighbouring runs of the model. Local maps are not fitted to runs that settle.
+
+    A recording of one set-up cannot show that the model is right, only that these statistics do not contradict it.
+    """
+    _checks.instance("problem", problem, Problem)
+    _checks.instance("posterior", posterior, (Posterior, MapEstimate))
+    _checks.instance("section", section, PoincareSection)
+    runs, periods = _checks.integer("runs", runs, FEWEST_RUNS), _checks.integer("periods", periods, FEWEST_RETURNS)
+    generator = np.random.default_rng(_checks.integer("seed", seed, 0))
+    of = {"fit" if isinstance(posterior, MapEstimate) else "posterior": posterior}
+    problem = check_results(problem, **of)
+    experiment = _experiment_of(problem)
+    recorded = _recorded(problem, section, periods)
+    thetas = problem.parameters(_parameters(problem, posterior, runs, generator), experiment)
+    moved = _runs(recorded, thetas, _seeds(problem, posterior), generator, progress)
+    pieces = _pieces(section, moved.points.shape[1])
+    statistics = Statistics(recorded, moved, pieces, generator)
+    table, exponents = statistics.table()
+    return AttractorPrediction(
+        table=table, exponents=exponents, section=section.points, model_section=moved.points[statistics.stays],
+        coordinates=section.coordinates,
+        units={name: u for name in section.coordinates if (u := _unit(problem, name))},
+        orbits={}, runs=runs, unfitted=runs - len(moved.points), left=int(moved.left.sum()),
+        settled=int(statistics.settled.sum()), pieces=len(pieces), periods=periods,
+        misfit=float(np.median(moved.misfit)), synthetic=section.synthetic,
+    )  # fmt: skip
+
+
+def _experiment_of(problem: Problem) -> str:
+    """Return an experiment with the parameters of all; raise a ValueError if they differ."""
+    maps = problem.parameter_maps
+    for parameter in problem.model.parameters:
+        if len({(m.columns.get(parameter), m.fixed.get(parameter)) for m in maps.values()}) > 1:
+            raise ValueError(
+                f"problem: must have the same parameters of the model in all experiments, got several {parameter!r}."
+            )
+    return problem.experiments[0].name
+
+
+def _recorded(problem: Problem, section: PoincareSection, periods: int) -> Recorded:
+    """Return the recording of a section; raise a ValueError unless runs of the model can be compared with it."""
+    model = problem.model
+    if problem.sensors.given:
+        raise ValueError(
+            f"problem: must have no sensors, got those of {', '.join(problem.sensors.given)}. Make their gains and "
+            "offsets parameters of the model's outputs."
+        )
+    if section.measured is None:
+        raise ValueError("section: must be of a recording, got points alone, which have neither starts nor inputs.")
+    returns = np.diff(section.measured[1]) * section.frequency
+    if np.abs(returns - np.round(returns)).max() > 1e-6:
+        raise ValueError("section: must be of a forced system, once a forcing period, got crossings of a plane.")
+    for name in channels_of(section.coordinates):
+        _checks.one_of("section: coordinates", name, model.outputs)
+    for name in model.inputs:
+        _checks.one_of("section: inputs of the model", name, section.inputs)
+    recorded = Recorded(section, model, periods)
+    if recorded.starts.size < FEWEST_PIECES * periods:
+        raise ValueError(
+            f"section: must have at least {FEWEST_PIECES * periods} points with {periods} later ones in their unbroken "
+            f"stretch, got {recorded.starts.size}. Record more periods, or give fewer periods a run."
+        )
+    return recorded
+
+
+def _parameters(
+    problem: Problem, posterior: Posterior | MapEstimate, runs: int, generator: np.random.Generator
+) -> np.ndarray:
+    """Return draws θ (runs, names)."""
+    if isinstance(posterior, Posterior):
+        shown = posterior.headline
+        size = shown.draws(problem.names[0]).size
+        return draws_of(problem, shown, generator.choice(size, runs, replace=size < runs))[0]
+    covariance = (posterior.robust_covariance if posterior.misspecified else posterior.covariance).to_numpy()
+    if not np.isfinite(covariance).all():
+        raise ValueError("posterior: must have a finite covariance, got parameters that the data do not determine.")
+    mean, ends = np.array([*posterior.theta.values()]), np.array([*problem.joint_prior.supports.values()]).T
+    result = np.empty((0, mean.size))
+    for _ in range(DRAWING_ATTEMPTS):
+        draws = generator.multivariate_normal(mean, covariance, runs)
+        result = np.vstack([result, draws[np.all((ends[0] < draws) & (draws < ends[1]), axis=1)]])
+        if len(result) >= runs:
+            return result[:runs]
+    raise ValueError(
+        "posterior: must have an estimate well within the prior, got one at its end. Use draws of `sample`."
+    )
+
+
+def _seeds(problem: Problem, posterior: Posterior | MapEstimate) -> list[np.ndarray]:
+    """Return states and rates (size,) on the periodic solutions of the experiments, at tau = 0."""
+    if isinstance(posterior, MapEstimate):
+        solutions = posterior.solutions
+    else:
+        theta = np.array([np.median(posterior.draws(name)) for name in problem.names])
+        guesses = posterior.guesses([*problem.observations], problem.model.states)
+        solutions = problem.anchored(theta, guesses).density().solver.solutions(theta)
+    return [_start(problem, one) for one in solutions.values() if one.converged]
+
+
+def _start(problem: Problem, solution: PeriodicSolution) -> np.ndarray:
+    """Return the states and the rates of the second-order ones at tau = 0, the latter by differences."""
+    orders, step = problem.model.orders, 1.0 / (solution.samples * solution.frequency)
+    rates = [(z[1] - z[0]) / step for name, z in solution.states.items() if orders[name] == 2]
+    return np.array([*(z[0] for z in solution.states.values()), *rates])
+
+
+class _Runs(NamedTuple):
+    """Runs whose start was fitted."""
+
+    points: np.ndarray  # in the section, NaN after an overflow, (runs, returns, d)
+    growth: np.ndarray  # mean logarithm of growth in a period after the first ones, (runs,)
+    left: np.ndarray  # whether they leave the region of the recording, (runs,)
+    misfit: np.ndarray  # of the first period, also of starts that were not fitted
+
+
+def _runs(
+    recorded: Recorded, thetas: np.ndarray, seeds: list[np.ndarray], generator: np.random.Generator, progress: bool
+) -> _Runs:
+    """Return one run for each draw of the model's parameters (runs, parameters)."""
+    middle, model = np.ascontiguousarray(np.median(thetas, axis=0)), recorded.model
+    coarse = Runner(model, recorded.frequency, free_runs.FEWEST_STEPS)
+    some = generator.choice(recorded.starts, LIBRARY_RUNS)
+    library = free_runs.library_of(recorded, coarse, middle, seeds, some) if seeds else None
+    runner = free_runs.enough_steps(recorded, middle, library, some[0]) if library and len(library.states) else None
+    if library is None or runner is None:
+        raise RuntimeError(
+            "posterior: its parameters must give a bounded motion of the model with the measured inputs, got none that "
+            f"at most {free_runs.MOST_STEPS} steps a period integrate. Check units and the phase of the forcing."
+        )
+    low, high = _region(recorded)
+    points, growth, left, misfits = [], [], [], []
+    starts = generator.choice(recorded.starts, len(thetas), replace=recorded.starts.size < len(thetas))
+    for theta, start in zip(
+        tqdm(np.ascontiguousarray(thetas), desc="free runs", unit="run", disable=not progress), starts, strict=True
+    ):
+        table = recorded.table(start, runner.steps)
+        y, misfit = free_runs.fitted_start(recorded, runner, theta, library, start, table)
+        misfits.append(misfit)
+        if not misfit < LARGEST_MISFIT:
+            continue
+        run = free_runs.free_run(runner, theta, y, table, recorded.periods, library.size)
+        shown = run.outputs[:, recorded.places]
+        left.append(not np.all((low <= shown) & (shown <= high) | recorded.turning))
+        points.append(free_runs.section_points(recorded.section, model, run.outputs, runner.steps, DISCARDED))
+        growth.append(float(run.growth[DISCARDED:].mean()))
+    if len(points) < FEWEST_PIECES:
+        raise RuntimeError(
+            f"posterior: must explain the measured outputs over single periods, got {len(points)} of {len(thetas)} "
+            f"starts with a misfit below {LARGEST_MISFIT:.0%} of their standard deviations. Check the model, the "
+            "units, and the phase of the section against that of the forcing."
+        )
+    return _Runs(np.array(points), np.array(growth), np.array(left), np.array(misfits))
+
+
+def _region(recorded: Recorded) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of the region of the recording in each of its outputs, (channels,)."""
+    signals = recorded.samples.signals[:, recorded.columns]
+    low, high = np.quantile(signals, [OUTERMOST, 1.0 - OUTERMOST], axis=0)
+    return low - MARGIN * (high - low), high + MARGIN * (high - low)
+
+
+def _pieces(section: PoincareSection, length: int) -> np.ndarray:
+    """Return the positions (pieces, length) of consecutive points of unbroken stretches."""
+    measured = section.measured
+    assert measured is not None
+    ends = np.append(np.flatnonzero(np.diff(measured[2])) + 1, len(section))
+    begins = np.append(0, ends[:-1])
+    firsts = [np.arange(b, e - length + 1, length) for b, e in zip(begins, ends, strict=True)]
+    return np.concatenate(firsts)[:, None] + np.arange(length)
+
+
+def _unit(problem: Problem, coordinate: str) -> str:
+    """Return the unit of a coordinate, "" if it is unknown."""
+    return problem.model.units.get(channels_of([coordinate])[0], "")
+
+
+class Statistics:
+    """Statistics of runs and of the pieces of a recording, and their tests."""
+
+    def __init__(self, recorded: Recorded, runs: _Runs, pieces: np.ndarray, generator: np.random.Generator):
+        section = recorded.section
+        self.recorded, self.runs, self.generator = recorded, runs, generator
+        self.turning = np.isin(section.coordinates, section.angles)
+        self.size = np.where(self.turning, 2.0 * np.pi, np.ptp(section.points, axis=0))
+        self.noise = section.noise
+        self.measured = section.points[pieces]
+        sd = 0.0 if self.noise is None else self.noise
+        self.points = wrapped(runs.points + sd * generator.standard_normal(runs.points.shape), self.turning)
+        self.stays = ~runs.left
+        self.settled = self._settles(runs.points) & self.stays
+        self.measured_settled = self._settles(self.measured)
+        self.measured_left = self._measured_left(pieces)
+
+    def _settles(self, points: np.ndarray) -> np.ndarray:
+        """Return which of some series (series, points, d) repeat themselves at their ends."""
+        repeats = []
+        for period in range(1, LONGEST_CYCLE + 1):
+            away = wrapped(points[:, period:] - points[:, :-period], self.turning) / self.size
+            repeats.append(np.abs(away[:, -REPEATING:]).max(axis=(1, 2)) < REPEATS_WITHIN)
+        return np.any(repeats, axis=0)
+
+    def _measured_left(self, pieces: np.ndarray) -> np.ndarray:
+        """Return which pieces of the recording leave its region."""
+        low, high = _region(self.recorded)
+        signals = self.recorded.samples.signals[:, self.recorded.columns]
+        outside = ~np.all((low <= signals) & (signals <= high) | self.recorded.turning, axis=1)
+        counts = np.append(0, np.cumsum(outside))
+        ends = self.recorded.instants[pieces[:, [0, -1]]]
+        first, last = np.searchsorted(self.recorded.samples.time, ends).T
+        return counts[last] > counts[first]
+
+    def table(self) -> tuple[pd.DataFrame, pd.DataFrame]:
+        """Return the tests, and the exponents."""
+        import pandas as pd
+
+        exponents, difference = self._exponents()
+        rows = {DENSITY: self._density()}
+        rows[LEFT] = self.share(self.runs.left, self.measured_left)
+        rows[SETTLED] = self.share(self.settled, self.measured_settled)
+        one, other = exponents["local_maps"]
+        spread = ndtri(0.5 + 0.5 * PROBABILITY) * difference.sd
+        p = 2.0 * ndtr(-abs(difference.mean) / difference.sd)
+        rows[EXPONENT] = (one, other, other - spread, other + spread, float(p))
+        table = pd.DataFrame.from_dict(rows, "index", columns=["model", "recording", "low", "high", "p"])
+        adjusted = holm(table["p"].to_numpy())
+        tested = table["p"].notna().to_numpy()
+        table["verdict"] = np.select([~tested, adjusted < ADEQUACY_LEVEL], [UNTESTED, DIFFERENT], CONSISTENT)
+        whole = CONSISTENT if tested.any() else UNTESTED
+        table.loc[ALL] = [np.nan] * 4 + [
+            float(np.nanmin(adjusted)), DIFFERENT if (table["verdict"] == DIFFERENT).any() else whole
+        ]  # fmt: skip
+        return table, exponents
+
+    @staticmethod
+    def share(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, ...]:
+        """Return fractions of runs and pieces, the 90 % interval of the latter, and p of Fisher's one-sided test."""
+        from scipy.stats import binomtest, fisher_exact
+
+        counts = np.array([[one.sum(), (~one).sum()] for one in (ours, theirs)], dtype=int)
+        interval = binomtest(int(counts[1, 0]), theirs.size).proportion_ci(PROBABILITY)
+        p = fisher_exact(counts, alternative="greater")[1]
+        return float(ours.mean()), float(theirs.mean()), float(interval.low), float(interval.high), float(p)
+
+    def _density(self) -> tuple[float, ...]:
+        """Return the distance of the densities, that of the recording from itself, its range, and p."""
+        model = self.points[self.stays]
+        if len(model) < FEWEST_PIECES:
+            return (np.nan,) * 5
+        counts = self._counts(np.concatenate([model, self.measured]), len(model))
+        ours, theirs = counts[: len(model)], counts[len(model) :]
+        distance = 0.5 * np.abs(ours.sum(0) / ours.sum() - theirs.sum(0) / theirs.sum()).sum()
+        every, part = len(theirs), min(len(model), len(theirs) // 2)
+        scale = np.sqrt((1 / len(model) + 1 / every) / (1 / part + 1 / (every - part)))
+        chance = np.empty(DIVISIONS)
+        for k in range(DIVISIONS):
+            some = self.generator.permutation(every)[:part]
+            one = theirs[some].sum(0)
+            rest = theirs.sum(0) - one
+            chance[k] = scale * 0.5 * np.abs(one / one.sum() - rest / rest.sum()).sum()
+        p = (1 + np.sum(chance >= distance)) / (DIVISIONS + 1)
+        return float(distance), float(np.median(chance)), *map(float, np.quantile(chance, [0.05, 0.95])), float(p)
+
+    def _counts(self, series: np.ndarray, runs: int) -> np.ndarray:
+        """Return the counts (series, bins) of the points of series (series, points, d), the first those of runs."""
+        low = np.where(self.turning, -np.pi, self.measured.min(axis=(0, 1)))
+        width = np.where(self.turning, 2.0 * np.pi, np.ptp(self.measured, axis=(0, 1)))
+        best = np.zeros((len(series), 1))
+        for number in range(FEWEST_BINS, MOST_BINS + 1):
+            boxes = np.floor((series - low) / width * number).astype(np.int64)
+            _, which = np.unique(boxes.reshape(-1, boxes.shape[-1]), axis=0, return_inverse=True)
+            which = which.reshape(boxes.shape[:2])
+            occupied = np.unique(which[runs:]).size
+            if number > FEWEST_BINS and occupied * POINTS_EACH > min(runs, len(series) - runs) * series.shape[1]:
+                break
+            best = np.zeros((len(series), which.max() + 1))
+            np.add.at(best, (np.arange(len(series))[:, None], which), 1.0)
+        return best
+
+    def _exponents(self) -> tuple[pd.DataFrame, Growth]:
+        """Return the exponents of model and recording, and the difference of those by local maps, all in 1/s."""
+        import pandas as pd
+
+        some, frequency = np.flatnonzero(self.stays & ~self.settled), self.recorded.frequency
+        growth, chaotic = self.runs.growth[self.stays], self.runs.growth[some]
+        number = min(some.size, len(self.measured))
+        columns = ["exponent", "sd", "local_maps", "local_maps_sd"]
+        table = pd.DataFrame(np.nan, index=["model", "recording"], columns=columns)
+        if number < FEWEST_PIECES or self.noise is None:
+            return table, Growth(np.nan, np.nan)
+        turn = np.where(self.turning, 2.0 * np.pi, np.inf) / self.size
+        chosen = self.generator.permutation(some)[:number], self.generator.permutation(len(self.measured))[:number]
+        ours, theirs = (
+            growth_of_pieces(points / self.size, self.noise / self.size, turn)
+            for points in (self.points[chosen[0]], self.measured[chosen[1]])
+        )
+        mean, sd, bias = growth.mean(), growth.std(ddof=1) / np.sqrt(growth.size), ours.mean - chaotic.mean()
+        difference = float(np.hypot(ours.sd, theirs.sd))
+        table.loc["model"] = [mean, sd, ours.mean, ours.sd]
+        table.loc["recording"] = [theirs.mean, np.hypot(theirs.sd, bias), theirs.mean, theirs.sd]
+        return frequency * table, Growth(frequency * (ours.mean - theirs.mean), frequency * difference)
