@@ -1,0 +1,183 @@
+"""Equations of the beam, its experiments, and starting values by regression of the equations on waveforms."""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+import bayesperiodic as bp
+
+# Parameters of both equations but those of the polynomials, and their units; the velocity is in units of the laser.
+OTHERS = {
+    "damping": "1/s", "back": "1/s**2", "drive_gain": "", "decay": "1/s", "laser_gain": "", "offset": "V",
+}  # fmt: skip
+# Of the simulated recording.
+SYNTHETIC = {
+    "f1": 2000.0, "f2": 0.0, "f3": -7.6e4, "f4": 0.0, "f5": -1e5, "s0": -0.7, "damping": 1.2, "back": 80.0,
+    "drive_gain": 14.5, "decay": 6.3, "laser_gain": 18.0, "offset": 0.0,
+}  # fmt: skip
+# Harmonics of the forcing in derivatives of waveforms, and phases a period.
+HIGHEST, PHASES = 16, 64
+# Grid points a period, relative spread of priors, and random starts of the regression.
+SAMPLES, SPREAD, STARTS = 128, 0.5, 6
+POSITIVE = ("damping", "back", "drive_gain", "decay", "laser_gain")
+SMALLEST = 0.1  # of priors' standard deviations, as a fraction of the term's size
+
+
+def polynomials(degree: int, coupling: int) -> tuple[list[str], list[str]]:
+    """Return the names of the coefficients of restoring force and coupling."""
+    return [f"f{k}" for k in range(1, degree + 1)], [f"s{k}" for k in range(coupling + 1)]
+
+
+def parameters(degree: int, coupling: int) -> list[str]:
+    """Return the names of all parameters."""
+    force, piezo = polynomials(degree, coupling)
+    return [*force, *piezo, *OTHERS]
+
+
+def model(degree: int, coupling: int) -> bp.Model:
+    """Return a beam with polynomials of these degrees: x relative to the base, from the unstable equilibrium, and v.
+
+    The laser sees the velocity of the base too; `drive_gain` contains the unit of the laser.
+    """
+    force, piezo = polynomials(degree, coupling)
+    spring = " + ".join(f"{name}*x**{k}" for k, name in enumerate(force, start=1))
+    element = " + ".join(f"{name}*x**{k}" if k else name for k, name in enumerate(piezo))
+    return bp.Model(
+        "harvester",
+        states=["x", "v"],
+        inputs=["drive", "base"],
+        parameters=parameters(degree, coupling),
+        equations=[
+            f"ddx + damping*dx - ({spring}) + back*v + drive_gain*drive",
+            f"dv + decay*v + ({element})*dx",
+        ],
+        outputs={"velocity": "dx + laser_gain*base", "voltage": "v + offset"},
+    )
+
+
+class Start(NamedTuple):
+    """Starting values, and what they leave of the two equations, as fractions of rms acceleration and rate of v."""
+
+    values: dict[str, float]
+    velocity_delay: float  # s
+    voltage_delay: float  # s
+    left: tuple[float, float]
+    reach: float  # largest displacement, in units of the laser times s
+
+
+class _Waves(NamedTuple):
+    """Channels (phases·period,) of an orbit."""
+
+    period: int
+    frequency: float
+    velocity: np.ndarray
+    voltage: np.ndarray
+    drive: np.ndarray
+
+    def changed(self, values: np.ndarray, order: int, late: float = 0.0) -> np.ndarray:
+        """Return a derivative, or the integral of mean zero for order −1, with a delay removed."""
+        rate = 2j * np.pi * self.frequency / self.period * np.arange(values.size // 2 + 1)
+        amplitudes = np.fft.rfft(values) * np.exp(rate * late)
+        if order < 0:
+            amplitudes[0], rate[0] = 0.0, 1.0
+        amplitudes *= rate**order
+        amplitudes[HIGHEST * self.period + 1 :] = 0.0
+        return np.fft.irfft(amplitudes, values.size)
+
+
+def _waves(orbit: bp.Orbit) -> _Waves:
+    run = orbit.experiment(samples=PHASES, whole=True, model_error=True)
+    return _Waves(orbit.period, orbit.frequency, run.outputs["velocity"], run.outputs["voltage"], run.inputs["drive"])
+
+
+def start_from(orbits: list[bp.Orbit], degree: int, coupling: int, *, delays: bool, seed: int) -> Start:
+    """Return starting values by least squares of both equations on the waveforms.
+
+    Both are linear in the parameters, but for the gain of the laser, the mean displacement of each orbit, which is not
+    measured, and, with `delays`, those of velocity and voltage against the drive.
+    """
+    waves, generator = [_waves(orbit) for orbit in orbits], np.random.default_rng(seed)
+    size = np.std(np.concatenate([w.velocity for w in waves])) / (2.0 * np.pi * orbits[0].frequency)
+    gain = np.std(np.concatenate([w.velocity for w in waves])) / np.std(
+        np.concatenate([w.changed(w.drive, -1) for w in waves])
+    )
+    ends, scale = [], (size, gain)
+    for attempt in range(STARTS):
+        means = generator.normal(0.0, size, len(waves)) if attempt else np.zeros(len(waves))
+        first = np.concatenate([means / size, [0.5], [0.0, 0.0] if delays else []])
+        ends.append(least_squares(lambda z: np.concatenate(_equations(z, waves, degree, coupling, scale)[2]), first))
+    best = min(ends, key=lambda end: float(end.cost))
+    return _as_start(best.x, waves, degree, coupling, scale)
+
+
+def _equations(
+    z: np.ndarray, waves: list[_Waves], degree: int, coupling: int, scale: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]:
+    """Return the coefficients of both equations, the relative residuals, and the displacements."""
+    count = len(waves)
+    means, gain = scale[0] * (z[:count] - z[:count].mean()), scale[1] * z[count]
+    late, later = 1e-3 * z[count + 1 :] if z.size > count + 1 else (0.0, 0.0)
+    blocks = []
+    for mean, w in zip(means, waves, strict=True):
+        seen, base = w.changed(w.velocity, 0, late), w.changed(w.drive, -1)
+        rate = seen - gain * base
+        rate -= rate.mean()
+        x, v = w.changed(rate, -1) + mean, w.changed(w.voltage, 0, later)
+        left = np.column_stack([x[:, None] ** np.arange(degree + 1), rate, v, w.drive])
+        right = np.column_stack([v, np.ones(v.size), rate[:, None] * x[:, None] ** np.arange(coupling + 1)])
+        blocks.append((left, w.changed(rate, 1), right, w.changed(w.voltage, 1, later), x))
+    left, acceleration, right, change, x = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    force, piezo = (np.linalg.lstsq(m, t, rcond=None)[0] for m, t in ((left, acceleration), (right, change)))
+    residuals = [(t - m @ c) / t.std() for m, c, t in ((left, force, acceleration), (right, piezo, change))]
+    return force, piezo, residuals, x
+
+
+def _as_start(z: np.ndarray, waves: list[_Waves], degree: int, coupling: int, scale: tuple[float, float]) -> Start:
+    """Return the coefficients as parameters of the model, with x from the unstable equilibrium."""
+    force, piezo, residuals, x = _equations(z, waves, degree, coupling, scale)
+    spring, element = np.polynomial.Polynomial(force[: degree + 1]), np.polynomial.Polynomial(-piezo[2:])
+    roots = [r.real for r in spring.roots() if abs(r.imag) < 1e-9 and spring.deriv()(r.real) > 0.0]
+    shift = np.polynomial.Polynomial([min(roots, key=abs, default=0.0), 1.0])
+    spring, element = spring(shift), element(shift)
+    names, couplings = polynomials(degree, coupling)
+    values = dict(zip(names, spring.coef[1:].tolist(), strict=True))
+    values |= dict(zip(couplings, element.coef.tolist(), strict=True))
+    values |= {
+        "damping": max(-force[degree + 1], 0.5), "back": -force[degree + 2], "drive_gain": -force[degree + 3],
+        "decay": -piezo[0], "laser_gain": scale[1] * z[len(waves)], "offset": 0.0,
+    }  # fmt: skip
+    late = 1e-3 * z[len(waves) + 1 :] if z.size > len(waves) + 1 else (0.0, 0.0)
+    rms = tuple(float(np.std(r)) for r in residuals)
+    return Start(values, float(late[0]), float(late[1]), (rms[0], rms[1]), float(np.abs(x).max()))
+
+
+def priors_about(start: Start) -> dict[str, Any]:
+    """Return priors about starting values: a factor of 1.6 for positive ones, half the size for others."""
+    priors: dict[str, Any] = {}
+    for name, value in start.values.items():
+        if name in POSITIVE:
+            priors[name] = bp.LogNormal(abs(value), SPREAD)
+        elif name == "offset":
+            priors[name] = bp.Normal(0.0, 0.01)
+        else:
+            power = int(name[1:])
+            first = start.values["f1"] * start.reach if name[0] == "f" else start.values["s0"]
+            priors[name] = bp.Normal(value, max(SPREAD * abs(value), SMALLEST * abs(first) / start.reach**power))
+    return priors
+
+
+def experiment(orbit: bp.Orbit) -> bp.Experiment:
+    """Return the orbit as an experiment, by the Fourier components of its waveform."""
+    return orbit.experiment(samples=SAMPLES, whole=True, model_error=True)
+
+
+def shifted(run: bp.Experiment, velocity: float, voltage: float) -> bp.Experiment:
+    """Return the experiment of an orbit with the delays [s] of velocity and voltage against the drive removed."""
+    rate = 2j * np.pi * run.frequency / run.periods
+    outputs = {}
+    for name, late in (("velocity", velocity), ("voltage", voltage)):
+        amplitudes = np.fft.rfft(run.outputs[name])
+        outputs[name] = np.fft.irfft(amplitudes * np.exp(rate * np.arange(amplitudes.size) * late), run.time.size)
+    return replace(run, outputs=outputs)
