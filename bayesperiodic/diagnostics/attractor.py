@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,12 +16,14 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic._verdicts import BAD, GOOD, with_tone
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics import free_runs
+from bayesperiodic.diagnostics.attractor_orbits import orbit_table
 from bayesperiodic.diagnostics.free_runs import Recorded, Runner
 from bayesperiodic.diagnostics.predictive import PROBABILITY, draws_of
 from bayesperiodic.estimation.adequacy import ADEQUACY_LEVEL, ALL, UNTESTED, holm
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.orbits.coordinates import channels_of, wrapped
 from bayesperiodic.orbits.lyapunov import Growth, growth_of_pieces
+from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.section import PoincareSection
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.problem.fingerprint import check_results
@@ -43,6 +46,10 @@ REPEATING, REPEATS_WITHIN, LONGEST_CYCLE = 10, 0.02, 4
 POINTS_EACH, FEWEST_BINS, MOST_BINS, DIVISIONS = 20, 3, 64, 999
 # Runs of the library from which starts are taken, and attempts to draw parameters within the support of the prior.
 LIBRARY_RUNS, DRAWING_ATTEMPTS = 40, 100
+# Draws at which orbits are sought; largest fraction of starts without a fit that does not prevent a verdict.
+ORBIT_DRAWS, MOST_UNFITTED = 20, 0.1
+# Standard errors from which on an orbit is named.
+FAR = 4.0
 
 
 @dataclass(frozen=True)
@@ -55,7 +62,8 @@ class AttractorPrediction(Result):
         Rows "density", "runs that leave", "runs that settle", "Lyapunov exponent" and "all". Columns: ``model`` and
         ``recording``, the values that are compared; ``low`` and ``high``, the central 90 % of the values of ``model``
         that chance gives; ``p``; and ``verdict``, "different" where p, adjusted by Holm's method for the four tests, is
-        below 1 %, "consistent", or "not tested". Density: half the sum of the absolute differences of the fractions of
+        below 1 %, "consistent", or "not tested"; where more than 10 % of the starts could not be fitted, "all" is not
+        "consistent" but "not tested". Density: half the sum of the absolute differences of the fractions of
         points in the bins, 0 to 1. Runs: their fraction, and that of the pieces of the recording of the same length,
         with its interval. Exponent [1/s]: that of local maps of as many points of both.
     exponents : DataFrame
@@ -69,6 +77,13 @@ class AttractorPrediction(Result):
         Of the coordinates, if known.
     orbits : dict of str to array (period, d)
         Points of the orbits given.
+    orbit_table : DataFrame
+        A row for each of them: ``period``; ``draws``, at how many of up to 20 draws the model has an orbit whose points
+        are within five standard errors, which include 1 % of the section's size; the largest multiplier, ``measured``
+        and ``predicted`` (median of these draws), with their standard deviations ``measured_sd`` and ``predicted_sd``;
+        ``z_multiplier``, the difference of log|multiplier| in standard deviations, and ``z_points``, the largest
+        difference of a coordinate of the points, from measurement and draws together. NaN where the model has none, or
+        the measured multiplier has no error.
     runs, unfitted, left, settled : int
         Number of runs, of those whose start could not be fitted, and, of the others, of those that leave the region of
         the recording or become periodic.
@@ -78,6 +93,17 @@ class AttractorPrediction(Result):
         Median of the rms misfit of the first period, in units of the standard deviations of the outputs.
     synthetic : bool
         True if the recording was simulated.
+
+    Examples
+    --------
+    `attractor_prediction`: a pendulum whose mass and length were fitted to two unstable orbits of period 1.
+
+    >>> attractor_prediction.verdict, attractor_prediction.left, attractor_prediction.settled
+    ('consistent', 0, 0)
+    >>> attractor_prediction.table.index.tolist()
+    ['density', 'runs that leave', 'runs that settle', 'Lyapunov exponent', 'all']
+    >>> attractor_prediction.missing_orbits
+    []
     """
 
     table: pd.DataFrame
@@ -87,6 +113,7 @@ class AttractorPrediction(Result):
     coordinates: tuple[str, ...]
     units: dict[str, str]
     orbits: dict[str, np.ndarray]
+    orbit_table: pd.DataFrame
     runs: int
     unfitted: int
     left: int
@@ -101,25 +128,50 @@ class AttractorPrediction(Result):
         """Verdict of all tests."""
         return str(self.table.loc[ALL, "verdict"])
 
+    @property
+    def orbit_draws(self) -> int:
+        """Number of draws at which the orbits were sought."""
+        return min(self.runs, ORBIT_DRAWS)
+
     def __repr__(self) -> str:
         different = [str(row) for row in self.table.index[self.table["verdict"] == DIFFERENT] if row != ALL]
         untested = [str(row) for row in self.table.index[self.table["verdict"] == UNTESTED] if row != ALL]
         verdict = {
             DIFFERENT: f"The model does not predict the measured attractor: {', '.join(different)}",
             CONSISTENT: "No test distinguishes the model's attractor from the measured one",
-        }.get(self.verdict, "The attractor is not tested")
-        one, other = (f"{row.exponent:.3g} ± {row.sd:.2g} 1/s" for row in self.exponents.itertuples())
+        }.get(self.verdict, "The tests have no verdict, because too few runs have a start or stay in the region")
+        one, other = (
+            f"{value:.3g} ± {sd:.2g} 1/s" if np.isfinite(value) else "unknown"
+            for value, sd in self.exponents[["exponent", "sd"]].to_numpy()
+        )
         lines = [
             f"Free runs over {self.periods} forcing periods from {self.runs} draws, {self.unfitted} without a fit of "
             f"their start (rms misfit of the first period {self.misfit:.1%})",
             self.table.to_string(float_format="{:.3g}".format, na_rep="-"),
             f"{verdict} (overall false alarm rate {ADEQUACY_LEVEL:.0%}).",
             f"Not tested: {', '.join(untested)}." if untested and self.verdict != UNTESTED else "",
-            f"Largest Lyapunov exponent of the model {one}, of the recording {other} (standard errors)."
-            if self.exponents.notna().all(axis=None)
-            else "",
+            f"Largest Lyapunov exponent of the model {one}, of the recording {other} (standard errors).",
+            self._on_orbits(),
         ]
         return "\n".join(filter(None, lines))
+
+    @property
+    def missing_orbits(self) -> list[str]:
+        """Names of the orbits given that the model does not have at half of the draws or more."""
+        return [] if self.orbit_table.empty else [
+            str(name) for name, count in self.orbit_table["draws"].items() if 2 * count <= self.orbit_draws
+        ]  # fmt: skip
+
+    def _on_orbits(self) -> str:
+        """Return how many orbits the model has, which it does not have, and which differ significantly."""
+        if self.orbit_table.empty:
+            return ""
+        missing, count = self.missing_orbits, len(self.orbit_table)
+        scores = self.orbit_table[["z_multiplier", "z_points"]].drop(missing).abs().max(axis=1)
+        apart = [str(name) for name in scores.index[scores > FAR]]
+        names = f", not {'; '.join(missing)}" if missing else ""
+        far = f" More than {FAR:g} standard errors away: {'; '.join(apart)}." if apart else ""
+        return f"Of {count} measured orbits the model has {count - len(missing)} near the measured points{names}.{far}"
 
 
 @in_one_thread
@@ -130,6 +182,7 @@ def predict_attractor(
     *,
     runs: int = 100,
     periods: int = 30,
+    orbits: Orbits | Sequence[Orbit] = (),
     seed: int = 0,
     progress: bool = True,
 ) -> AttractorPrediction:
@@ -153,6 +206,8 @@ def predict_attractor(
     runs, periods : int
         Number of runs, at least 20, and their length in forcing periods, at least 20. The recording must contain at
         least 10 pieces of that length.
+    orbits : Orbits or sequence of Orbit
+        Of the section, from `find_orbits`, such as those that are not part of the problem.
     seed : int
     progress : bool
         Show a progress bar.
@@ -186,7 +241,17 @@ def predict_attractor(
     comparison with the same maps of as many points of the runs, with the same noise; it is measured by the exponent of
     two neighbouring runs of the model. Local maps are not fitted to runs that settle.
 
+    *Orbits* are solved by multiple shooting with the mean inputs of a forcing period, at the first 20 draws.
+
     A recording of one set-up cannot show that the model is right, only that these statistics do not contradict it.
+
+    Examples
+    --------
+    The same pendulum with a shorter arm:
+
+    >>> wrong = dataclasses.replace(pendulum_fit, theta=pendulum_fit.theta | {"l": 0.29})
+    >>> bp.predict_attractor(pendulum_problem, wrong, pendulum_section, runs=40, progress=False).verdict
+    'different'
     """
     _checks.instance("problem", problem, Problem)
     _checks.instance("posterior", posterior, (Posterior, MapEstimate))
@@ -196,9 +261,12 @@ def predict_attractor(
     of = {"fit" if isinstance(posterior, MapEstimate) else "posterior": posterior}
     problem = check_results(problem, **of)
     experiment = _experiment_of(problem)
-    recorded = _recorded(problem, section, periods)
-    thetas = problem.parameters(_parameters(problem, posterior, runs, generator), experiment)
-    moved = _runs(recorded, thetas, _seeds(problem, posterior), generator, progress)
+    recorded, given = _recorded(problem, section, periods), _orbits(section, orbits)
+    thetas = np.ascontiguousarray(problem.parameters(_parameters(problem, posterior, runs, generator), experiment))
+    middle = np.ascontiguousarray(np.median(thetas, axis=0))
+    runner, library = _prepared(recorded, middle, _seeds(problem, posterior), generator)
+    moved = _runs(recorded, runner, library, thetas, generator, progress)
+    solved = orbit_table(recorded, runner, thetas[:ORBIT_DRAWS], library, given)
     pieces = _pieces(section, moved.points.shape[1])
     statistics = Statistics(recorded, moved, pieces, generator)
     table, exponents = statistics.table()
@@ -206,9 +274,9 @@ def predict_attractor(
         table=table, exponents=exponents, section=section.points, model_section=moved.points[statistics.stays],
         coordinates=section.coordinates,
         units={name: u for name in section.coordinates if (u := _unit(problem, name))},
-        orbits={}, runs=runs, unfitted=runs - len(moved.points), left=int(moved.left.sum()),
-        settled=int(statistics.settled.sum()), pieces=len(pieces), periods=periods,
-        misfit=float(np.median(moved.misfit)), synthetic=section.synthetic,
+        orbits={orbit.name: orbit.points for orbit in given}, orbit_table=solved, runs=runs,
+        unfitted=runs - len(moved.points), left=int(moved.left.sum()), settled=int(statistics.settled.sum()),
+        pieces=len(pieces), periods=periods, misfit=float(np.median(moved.misfit)), synthetic=section.synthetic,
     )  # fmt: skip
 
 
@@ -247,6 +315,20 @@ def _recorded(problem: Problem, section: PoincareSection, periods: int) -> Recor
             f"stretch, got {recorded.starts.size}. Record more periods, or give fewer periods a run."
         )
     return recorded
+
+
+def _orbits(section: PoincareSection, orbits: Orbits | Sequence[Orbit]) -> list[Orbit]:
+    """Return orbits; raise a ValueError unless they belong to a recorded section with these coordinates."""
+    _checks.instance("orbits", orbits, (Orbits, list, tuple))
+    given = list(orbits)
+    for k, orbit in enumerate(given):
+        _checks.instance(f"orbits[{k}]", orbit, Orbit)
+        if (orbit.coordinates, orbit.angles) != (section.coordinates, section.angles) or orbit.cycle is None:
+            raise ValueError(
+                f"orbits[{k}]: must be of a section of a recording with the coordinates {section.coordinates}, got "
+                f"{orbit.name!r} with {orbit.coordinates}."
+            )
+    return given
 
 
 def _parameters(
@@ -299,12 +381,11 @@ class _Runs(NamedTuple):
     misfit: np.ndarray  # of the first period, also of starts that were not fitted
 
 
-def _runs(
-    recorded: Recorded, thetas: np.ndarray, seeds: list[np.ndarray], generator: np.random.Generator, progress: bool
-) -> _Runs:
-    """Return one run for each draw of the model's parameters (runs, parameters)."""
-    middle, model = np.ascontiguousarray(np.median(thetas, axis=0)), recorded.model
-    coarse = Runner(model, recorded.frequency, free_runs.FEWEST_STEPS)
+def _prepared(
+    recorded: Recorded, middle: np.ndarray, seeds: list[np.ndarray], generator: np.random.Generator
+) -> tuple[Runner, free_runs.Library]:
+    """Return what integrates the model accurately, and states on its motion at one θ; RuntimeError without motion."""
+    coarse = Runner(recorded.model, recorded.frequency, free_runs.FEWEST_STEPS)
     some = generator.choice(recorded.starts, LIBRARY_RUNS)
     library = free_runs.library_of(recorded, coarse, middle, seeds, some) if seeds else None
     runner = free_runs.enough_steps(recorded, middle, library, some[0]) if library and len(library.states) else None
@@ -313,21 +394,28 @@ def _runs(
             "posterior: its parameters must give a bounded motion of the model with the measured inputs, got none that "
             f"at most {free_runs.MOST_STEPS} steps a period integrate. Check units and the phase of the forcing."
         )
+    return runner, library
+
+
+def _runs(
+    recorded: Recorded, runner: Runner, library: free_runs.Library, thetas: np.ndarray,
+    generator: np.random.Generator, progress: bool,
+) -> _Runs:  # fmt: skip
+    """Return one run for each draw of the model's parameters (runs, parameters)."""
     low, high = _region(recorded)
     points, growth, left, misfits = [], [], [], []
     starts = generator.choice(recorded.starts, len(thetas), replace=recorded.starts.size < len(thetas))
-    for theta, start in zip(
-        tqdm(np.ascontiguousarray(thetas), desc="free runs", unit="run", disable=not progress), starts, strict=True
-    ):
+    bar = tqdm(thetas, desc="free runs", unit="run", disable=not progress)
+    for theta, start in zip(bar, starts, strict=True):
         table = recorded.table(start, runner.steps)
-        y, misfit = free_runs.fitted_start(recorded, runner, theta, library, start, table)
+        y, misfit = free_runs.explained_state(recorded, runner, theta, library, recorded.first_period(start), table)
         misfits.append(misfit)
         if not misfit < LARGEST_MISFIT:
             continue
         run = free_runs.free_run(runner, theta, y, table, recorded.periods, library.size)
         shown = run.outputs[:, recorded.places]
         left.append(not np.all((low <= shown) & (shown <= high) | recorded.turning))
-        points.append(free_runs.section_points(recorded.section, model, run.outputs, runner.steps, DISCARDED))
+        points.append(free_runs.section_points(recorded.section, runner.model, run.outputs, runner.steps, DISCARDED))
         growth.append(float(run.growth[DISCARDED:].mean()))
     if len(points) < FEWEST_PIECES:
         raise RuntimeError(
@@ -411,7 +499,8 @@ class Statistics:
         adjusted = holm(table["p"].to_numpy())
         tested = table["p"].notna().to_numpy()
         table["verdict"] = np.select([~tested, adjusted < ADEQUACY_LEVEL], [UNTESTED, DIFFERENT], CONSISTENT)
-        whole = CONSISTENT if tested.any() else UNTESTED
+        few = len(self.runs.points) < (1.0 - MOST_UNFITTED) * len(self.runs.misfit)
+        whole = UNTESTED if few or not tested.any() else CONSISTENT
         table.loc[ALL] = [np.nan] * 4 + [
             float(np.nanmin(adjusted)), DIFFERENT if (table["verdict"] == DIFFERENT).any() else whole
         ]  # fmt: skip
@@ -471,16 +560,17 @@ class Statistics:
         number = min(some.size, len(self.measured))
         columns = ["exponent", "sd", "local_maps", "local_maps_sd"]
         table = pd.DataFrame(np.nan, index=["model", "recording"], columns=columns)
+        if growth.size > 1:
+            table.loc["model", ["exponent", "sd"]] = growth.mean(), growth.std(ddof=1) / np.sqrt(growth.size)
         if number < FEWEST_PIECES or self.noise is None:
-            return table, Growth(np.nan, np.nan)
+            return frequency * table, Growth(np.nan, np.nan)
         turn = np.where(self.turning, 2.0 * np.pi, np.inf) / self.size
         chosen = self.generator.permutation(some)[:number], self.generator.permutation(len(self.measured))[:number]
         ours, theirs = (
             growth_of_pieces(points / self.size, self.noise / self.size, turn)
             for points in (self.points[chosen[0]], self.measured[chosen[1]])
         )
-        mean, sd, bias = growth.mean(), growth.std(ddof=1) / np.sqrt(growth.size), ours.mean - chaotic.mean()
-        difference = float(np.hypot(ours.sd, theirs.sd))
-        table.loc["model"] = [mean, sd, ours.mean, ours.sd]
+        bias, difference = ours.mean - chaotic.mean(), float(np.hypot(ours.sd, theirs.sd))
+        table.loc["model", ["local_maps", "local_maps_sd"]] = ours.mean, ours.sd
         table.loc["recording"] = [theirs.mean, np.hypot(theirs.sd, bias), theirs.mean, theirs.sd]
         return frequency * table, Growth(frequency * (ours.mean - theirs.mean), frequency * difference)
