@@ -4,6 +4,7 @@ An example gets every object below whose name it contains and does not assign. E
 for the test run.
 """
 
+import dataclasses
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -37,12 +38,40 @@ def pendulum_recording() -> bp.Recording:
 
 
 @cache
-def pendulum_orbits() -> bp.Orbits:
-    """Return the orbits of period 1 in that recording."""
-    section = bp.PoincareSection.from_recording(
+def pendulum_section() -> bp.PoincareSection:
+    """Return the section of that recording."""
+    return bp.PoincareSection.from_recording(
         pendulum_recording(), ("angle", "rate"), frequency=1.4467, angles=["angle"]
     )
-    return bp.find_orbits(section, periods=[1], waveforms=True)
+
+
+@cache
+def pendulum_orbits() -> bp.Orbits:
+    """Return the orbits of period 1 in that recording."""
+    return bp.find_orbits(pendulum_section(), periods=[1], waveforms=True)
+
+
+@cache
+def pendulum_problem() -> bp.Problem:
+    """Return the problem of mass and length of the pendulum from two of these orbits."""
+    runs = [orbit.experiment(states={"phi": "angle"}) for orbit in list(pendulum_orbits())[:2]]
+    priors = {name: bp.LogNormal(PENDULUM[name], 0.1) for name in ("m", "l")}
+    fixed = {name: value for name, value in PENDULUM.items() if name not in priors}
+    return bp.Problem(bp.models.pendulum, runs, priors=priors, fixed=fixed)
+
+
+@cache
+def pendulum_fit() -> bp.MapEstimate:
+    """Return the estimate of this problem."""
+    return bp.map_estimate(pendulum_problem(), checks=False, progress=False)
+
+
+@cache
+def attractor_prediction() -> bp.AttractorPrediction:
+    """Return the prediction of the recording by this estimate."""
+    return bp.predict_attractor(
+        pendulum_problem(), pendulum_fit(), pendulum_section(), runs=40, orbits=pendulum_orbits(), progress=False
+    )
 
 
 @cache
@@ -123,6 +152,7 @@ def duffing_springs() -> dict[str, tuple[bp.Problem, bp.Posterior]]:
 EXAMPLES: dict[str, Callable[[], Any]] = {
     "np": lambda: np,
     "bp": lambda: bp,
+    "dataclasses": lambda: dataclasses,
     "force": lambda: FORCE,
     "solution": duffing_solution,
     "branch": duffing_branch,
@@ -136,7 +166,11 @@ EXAMPLES: dict[str, Callable[[], Any]] = {
     "henon_section": henon_section,
     "pendulum_parameters": lambda: PENDULUM,
     "pendulum_recording": pendulum_recording,
+    "pendulum_section": pendulum_section,
     "pendulum_orbits": pendulum_orbits,
+    "pendulum_problem": pendulum_problem,
+    "pendulum_fit": pendulum_fit,
+    "attractor_prediction": attractor_prediction,
 }
 
 

@@ -2,47 +2,52 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import ndtr, ndtri
 from tqdm import tqdm
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic._verdicts import BAD, GOOD, with_tone
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics import free_runs
+from bayesperiodic.diagnostics.attractor_orbits import orbit_table
+from bayesperiodic.diagnostics.attractor_statistics import (
+    CONSISTENT,
+    DIFFERENT,
+    FEWEST_PIECES,
+    Runs,
+    Statistics,
+    region,
+)
 from bayesperiodic.diagnostics.free_runs import Recorded, Runner
-from bayesperiodic.diagnostics.predictive import PROBABILITY, draws_of
-from bayesperiodic.estimation.adequacy import ADEQUACY_LEVEL, ALL, UNTESTED, holm
+from bayesperiodic.diagnostics.predictive import draws_of
+from bayesperiodic.estimation.adequacy import ADEQUACY_LEVEL, ALL, UNTESTED
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.orbits.coordinates import channels_of, wrapped
-from bayesperiodic.orbits.lyapunov import Growth, growth_of_pieces
+from bayesperiodic.orbits.coordinates import channels_of
+from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.section import PoincareSection
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.problem.fingerprint import check_results
+from bayesperiodic.problem.parameters import SHIFT
 from bayesperiodic.sampling.draws import Posterior
 
 if TYPE_CHECKING:
     import pandas as pd
 
-CONSISTENT, DIFFERENT = with_tone("consistent", GOOD), with_tone("different", BAD)
-DENSITY, LEFT, SETTLED, EXPONENT = "density", "runs that leave", "runs that settle", "Lyapunov exponent"
-# Returns at the start of a run that are left out; fewest returns and runs, and pieces of the recording.
-DISCARDED, FEWEST_RETURNS, FEWEST_RUNS, FEWEST_PIECES = 5, 20, 20, 10
+# Returns at the start of a run that are left out; fewest returns and runs.
+DISCARDED, FEWEST_RETURNS, FEWEST_RUNS = 5, 20, 20
 # A start is not fitted if the misfit of its first period exceeds this fraction of the outputs' standard deviation.
 LARGEST_MISFIT = 0.5
-# The region of the recording: its quantiles from this one on, and the margin as a fraction of their distance.
-OUTERMOST, MARGIN = 1e-3, 0.25
-# A run has settled if its last points repeat within this fraction of the section's size, after at most so many returns.
-REPEATING, REPEATS_WITHIN, LONGEST_CYCLE = 10, 0.02, 4
-# Mean number of the runs' points in a bin, bins along a coordinate, and random divisions of the recording.
-POINTS_EACH, FEWEST_BINS, MOST_BINS, DIVISIONS = 20, 3, 64, 999
 # Runs of the library from which starts are taken, and attempts to draw parameters within the support of the prior.
 LIBRARY_RUNS, DRAWING_ATTEMPTS = 40, 100
+# Draws at which orbits are sought.
+ORBIT_DRAWS = 20
+# Standard errors from which on an orbit is named.
+FAR = 4.0
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,8 @@ class AttractorPrediction(Result):
         Rows "density", "runs that leave", "runs that settle", "Lyapunov exponent" and "all". Columns: ``model`` and
         ``recording``, the values that are compared; ``low`` and ``high``, the central 90 % of the values of ``model``
         that chance gives; ``p``; and ``verdict``, "different" where p, adjusted by Holm's method for the four tests, is
-        below 1 %, "consistent", or "not tested". Density: half the sum of the absolute differences of the fractions of
+        below 1 %, "consistent", or "not tested"; where more than 10 % of the starts could not be fitted, "all" is not
+        "consistent" but "not tested". Density: half the sum of the absolute differences of the fractions of
         points in the bins, 0 to 1. Runs: their fraction, and that of the pieces of the recording of the same length,
         with its interval. Exponent [1/s]: that of local maps of as many points of both.
     exponents : DataFrame
@@ -69,6 +75,13 @@ class AttractorPrediction(Result):
         Of the coordinates, if known.
     orbits : dict of str to array (period, d)
         Points of the orbits given.
+    orbit_table : DataFrame
+        A row for each of them: ``period``; ``draws``, at how many of up to 20 draws the model has an orbit whose points
+        are within five standard errors, which include 1 % of the section's size; the largest multiplier, ``measured``
+        and ``predicted`` (median of these draws), with their standard deviations ``measured_sd`` and ``predicted_sd``;
+        ``z_multiplier``, the difference of log|multiplier| in standard deviations, and ``z_points``, the largest
+        difference of a coordinate of the points, from measurement and draws together. NaN where the model has none, or
+        the measured multiplier has no error.
     runs, unfitted, left, settled : int
         Number of runs, of those whose start could not be fitted, and, of the others, of those that leave the region of
         the recording or become periodic.
@@ -78,6 +91,17 @@ class AttractorPrediction(Result):
         Median of the rms misfit of the first period, in units of the standard deviations of the outputs.
     synthetic : bool
         True if the recording was simulated.
+
+    Examples
+    --------
+    `attractor_prediction`: a pendulum whose mass and length were fitted to two unstable orbits of period 1.
+
+    >>> attractor_prediction.verdict, attractor_prediction.left, attractor_prediction.settled
+    ('consistent', 0, 0)
+    >>> attractor_prediction.table.index.tolist()
+    ['density', 'runs that leave', 'runs that settle', 'Lyapunov exponent', 'all']
+    >>> attractor_prediction.missing_orbits
+    []
     """
 
     table: pd.DataFrame
@@ -87,6 +111,7 @@ class AttractorPrediction(Result):
     coordinates: tuple[str, ...]
     units: dict[str, str]
     orbits: dict[str, np.ndarray]
+    orbit_table: pd.DataFrame
     runs: int
     unfitted: int
     left: int
@@ -101,25 +126,50 @@ class AttractorPrediction(Result):
         """Verdict of all tests."""
         return str(self.table.loc[ALL, "verdict"])
 
+    @property
+    def orbit_draws(self) -> int:
+        """Number of draws at which the orbits were sought."""
+        return min(self.runs, ORBIT_DRAWS)
+
     def __repr__(self) -> str:
         different = [str(row) for row in self.table.index[self.table["verdict"] == DIFFERENT] if row != ALL]
         untested = [str(row) for row in self.table.index[self.table["verdict"] == UNTESTED] if row != ALL]
         verdict = {
             DIFFERENT: f"The model does not predict the measured attractor: {', '.join(different)}",
             CONSISTENT: "No test distinguishes the model's attractor from the measured one",
-        }.get(self.verdict, "The attractor is not tested")
-        one, other = (f"{row.exponent:.3g} ± {row.sd:.2g} 1/s" for row in self.exponents.itertuples())
+        }.get(self.verdict, "The tests have no verdict, because too few runs have a start or stay in the region")
+        one, other = (
+            f"{value:.3g} ± {sd:.2g} 1/s" if np.isfinite(value) else "unknown"
+            for value, sd in self.exponents[["exponent", "sd"]].to_numpy()
+        )
         lines = [
             f"Free runs over {self.periods} forcing periods from {self.runs} draws, {self.unfitted} without a fit of "
             f"their start (rms misfit of the first period {self.misfit:.1%})",
             self.table.to_string(float_format="{:.3g}".format, na_rep="-"),
             f"{verdict} (overall false alarm rate {ADEQUACY_LEVEL:.0%}).",
             f"Not tested: {', '.join(untested)}." if untested and self.verdict != UNTESTED else "",
-            f"Largest Lyapunov exponent of the model {one}, of the recording {other} (standard errors)."
-            if self.exponents.notna().all(axis=None)
-            else "",
+            f"Largest Lyapunov exponent of the model {one}, of the recording {other} (standard errors).",
+            self._on_orbits(),
         ]
         return "\n".join(filter(None, lines))
+
+    @property
+    def missing_orbits(self) -> list[str]:
+        """Names of the orbits given that the model does not have at half of the draws or more."""
+        return [] if self.orbit_table.empty else [
+            str(name) for name, count in self.orbit_table["draws"].items() if 2 * count <= self.orbit_draws
+        ]  # fmt: skip
+
+    def _on_orbits(self) -> str:
+        """Return how many orbits the model has, which it does not have, and which differ significantly."""
+        if self.orbit_table.empty:
+            return ""
+        missing, count = self.missing_orbits, len(self.orbit_table)
+        scores = self.orbit_table[["z_multiplier", "z_points"]].drop(missing).abs().max(axis=1)
+        apart = [str(name) for name in scores.index[scores > FAR]]
+        names = f", not {'; '.join(missing)}" if missing else ""
+        far = f" More than {FAR:g} standard errors away: {'; '.join(apart)}." if apart else ""
+        return f"Of {count} measured orbits the model has {count - len(missing)} near the measured points{names}.{far}"
 
 
 @in_one_thread
@@ -130,6 +180,7 @@ def predict_attractor(
     *,
     runs: int = 100,
     periods: int = 30,
+    orbits: Orbits | Sequence[Orbit] = (),
     seed: int = 0,
     progress: bool = True,
 ) -> AttractorPrediction:
@@ -153,6 +204,8 @@ def predict_attractor(
     runs, periods : int
         Number of runs, at least 20, and their length in forcing periods, at least 20. The recording must contain at
         least 10 pieces of that length.
+    orbits : Orbits or sequence of Orbit
+        Of the section, from `find_orbits`, such as those that are not part of the problem.
     seed : int
     progress : bool
         Show a progress bar.
@@ -172,6 +225,8 @@ def predict_attractor(
 
     Notes
     -----
+    Inputs are interpolated by splines of degree 5, with their noise.
+
     *Density.* The bins are boxes of all coordinates, as small as 20 points of the runs in each allow. The distance is
     compared with that of a random half of the recording from the other half, or of pieces as numerous as the runs from
     the rest, in pieces as long as the runs, which contain the dependence of consecutive points; it is scaled to the
@@ -186,7 +241,17 @@ def predict_attractor(
     comparison with the same maps of as many points of the runs, with the same noise; it is measured by the exponent of
     two neighbouring runs of the model. Local maps are not fitted to runs that settle.
 
+    *Orbits* are solved by multiple shooting with the mean inputs of a forcing period, at the first 20 draws.
+
     A recording of one set-up cannot show that the model is right, only that these statistics do not contradict it.
+
+    Examples
+    --------
+    The same pendulum with a shorter arm:
+
+    >>> wrong = dataclasses.replace(pendulum_fit, theta=pendulum_fit.theta | {"l": 0.29})
+    >>> bp.predict_attractor(pendulum_problem, wrong, pendulum_section, runs=40, progress=False).verdict
+    'different'
     """
     _checks.instance("problem", problem, Problem)
     _checks.instance("posterior", posterior, (Posterior, MapEstimate))
@@ -196,9 +261,12 @@ def predict_attractor(
     of = {"fit" if isinstance(posterior, MapEstimate) else "posterior": posterior}
     problem = check_results(problem, **of)
     experiment = _experiment_of(problem)
-    recorded = _recorded(problem, section, periods)
-    thetas = problem.parameters(_parameters(problem, posterior, runs, generator), experiment)
-    moved = _runs(recorded, thetas, _seeds(problem, posterior), generator, progress)
+    recorded, given = _recorded(problem, section, periods), _orbits(section, orbits)
+    thetas = np.ascontiguousarray(problem.parameters(_parameters(problem, posterior, runs, generator), experiment))
+    middle = np.ascontiguousarray(np.median(thetas, axis=0))
+    runner, library = _prepared(recorded, middle, _seeds(problem, posterior), generator)
+    moved = _runs(recorded, runner, library, thetas, generator, progress)
+    solved = orbit_table(recorded, runner, thetas[:ORBIT_DRAWS], library, given)
     pieces = _pieces(section, moved.points.shape[1])
     statistics = Statistics(recorded, moved, pieces, generator)
     table, exponents = statistics.table()
@@ -206,9 +274,9 @@ def predict_attractor(
         table=table, exponents=exponents, section=section.points, model_section=moved.points[statistics.stays],
         coordinates=section.coordinates,
         units={name: u for name in section.coordinates if (u := _unit(problem, name))},
-        orbits={}, runs=runs, unfitted=runs - len(moved.points), left=int(moved.left.sum()),
-        settled=int(statistics.settled.sum()), pieces=len(pieces), periods=periods,
-        misfit=float(np.median(moved.misfit)), synthetic=section.synthetic,
+        orbits={orbit.name: orbit.points for orbit in given}, orbit_table=solved, runs=runs,
+        unfitted=runs - len(moved.points), left=int(moved.left.sum()), settled=int(statistics.settled.sum()),
+        pieces=len(pieces), periods=periods, misfit=float(np.median(moved.misfit)), synthetic=section.synthetic,
     )  # fmt: skip
 
 
@@ -226,10 +294,11 @@ def _experiment_of(problem: Problem) -> str:
 def _recorded(problem: Problem, section: PoincareSection, periods: int) -> Recorded:
     """Return the recording of a section; raise a ValueError unless runs of the model can be compared with it."""
     model = problem.model
-    if problem.sensors.given:
+    sensed = [*problem.sensors.given, *(name for name in problem.names if name.split("[")[0] == SHIFT)]
+    if sensed:
         raise ValueError(
-            f"problem: must have no sensors, got those of {', '.join(problem.sensors.given)}. Make their gains and "
-            "offsets parameters of the model's outputs."
+            f"problem: must have no sensors and delays, got {', '.join(sensed)}. Make gains and offsets parameters of "
+            "the model's outputs."
         )
     if section.measured is None:
         raise ValueError("section: must be of a recording, got points alone, which have neither starts nor inputs.")
@@ -247,6 +316,20 @@ def _recorded(problem: Problem, section: PoincareSection, periods: int) -> Recor
             f"stretch, got {recorded.starts.size}. Record more periods, or give fewer periods a run."
         )
     return recorded
+
+
+def _orbits(section: PoincareSection, orbits: Orbits | Sequence[Orbit]) -> list[Orbit]:
+    """Return orbits; raise a ValueError unless they belong to a recorded section with these coordinates."""
+    _checks.instance("orbits", orbits, (Orbits, list, tuple))
+    given = list(orbits)
+    for k, orbit in enumerate(given):
+        _checks.instance(f"orbits[{k}]", orbit, Orbit)
+        if (orbit.coordinates, orbit.angles) != (section.coordinates, section.angles) or orbit.cycle is None:
+            raise ValueError(
+                f"orbits[{k}]: must be of a section of a recording with the coordinates {section.coordinates}, got "
+                f"{orbit.name!r} with {orbit.coordinates}."
+            )
+    return given
 
 
 def _parameters(
@@ -290,21 +373,11 @@ def _start(problem: Problem, solution: PeriodicSolution) -> np.ndarray:
     return np.array([*(z[0] for z in solution.states.values()), *rates])
 
 
-class _Runs(NamedTuple):
-    """Runs whose start was fitted."""
-
-    points: np.ndarray  # in the section, NaN after an overflow, (runs, returns, d)
-    growth: np.ndarray  # mean logarithm of growth in a period after the first ones, (runs,)
-    left: np.ndarray  # whether they leave the region of the recording, (runs,)
-    misfit: np.ndarray  # of the first period, also of starts that were not fitted
-
-
-def _runs(
-    recorded: Recorded, thetas: np.ndarray, seeds: list[np.ndarray], generator: np.random.Generator, progress: bool
-) -> _Runs:
-    """Return one run for each draw of the model's parameters (runs, parameters)."""
-    middle, model = np.ascontiguousarray(np.median(thetas, axis=0)), recorded.model
-    coarse = Runner(model, recorded.frequency, free_runs.FEWEST_STEPS)
+def _prepared(
+    recorded: Recorded, middle: np.ndarray, seeds: list[np.ndarray], generator: np.random.Generator
+) -> tuple[Runner, free_runs.Library]:
+    """Return what integrates the model accurately, and states on its motion at one θ; RuntimeError without motion."""
+    coarse = Runner(recorded.model, recorded.frequency, free_runs.FEWEST_STEPS)
     some = generator.choice(recorded.starts, LIBRARY_RUNS)
     library = free_runs.library_of(recorded, coarse, middle, seeds, some) if seeds else None
     runner = free_runs.enough_steps(recorded, middle, library, some[0]) if library and len(library.states) else None
@@ -313,21 +386,28 @@ def _runs(
             "posterior: its parameters must give a bounded motion of the model with the measured inputs, got none that "
             f"at most {free_runs.MOST_STEPS} steps a period integrate. Check units and the phase of the forcing."
         )
-    low, high = _region(recorded)
+    return runner, library
+
+
+def _runs(
+    recorded: Recorded, runner: Runner, library: free_runs.Library, thetas: np.ndarray,
+    generator: np.random.Generator, progress: bool,
+) -> Runs:  # fmt: skip
+    """Return one run for each draw of the model's parameters (runs, parameters)."""
+    low, high = region(recorded)
     points, growth, left, misfits = [], [], [], []
     starts = generator.choice(recorded.starts, len(thetas), replace=recorded.starts.size < len(thetas))
-    for theta, start in zip(
-        tqdm(np.ascontiguousarray(thetas), desc="free runs", unit="run", disable=not progress), starts, strict=True
-    ):
+    bar = tqdm(thetas, desc="free runs", unit="run", disable=not progress)
+    for theta, start in zip(bar, starts, strict=True):
         table = recorded.table(start, runner.steps)
-        y, misfit = free_runs.fitted_start(recorded, runner, theta, library, start, table)
+        y, misfit = free_runs.explained_state(recorded, runner, theta, library, recorded.first_period(start), table)
         misfits.append(misfit)
         if not misfit < LARGEST_MISFIT:
             continue
         run = free_runs.free_run(runner, theta, y, table, recorded.periods, library.size)
         shown = run.outputs[:, recorded.places]
         left.append(not np.all((low <= shown) & (shown <= high) | recorded.turning))
-        points.append(free_runs.section_points(recorded.section, model, run.outputs, runner.steps, DISCARDED))
+        points.append(free_runs.section_points(recorded.section, runner.model, run.outputs, runner.steps, DISCARDED))
         growth.append(float(run.growth[DISCARDED:].mean()))
     if len(points) < FEWEST_PIECES:
         raise RuntimeError(
@@ -335,14 +415,7 @@ def _runs(
             f"starts with a misfit below {LARGEST_MISFIT:.0%} of their standard deviations. Check the model, the "
             "units, and the phase of the section against that of the forcing."
         )
-    return _Runs(np.array(points), np.array(growth), np.array(left), np.array(misfits))
-
-
-def _region(recorded: Recorded) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends of the region of the recording in each of its outputs, (channels,)."""
-    signals = recorded.samples.signals[:, recorded.columns]
-    low, high = np.quantile(signals, [OUTERMOST, 1.0 - OUTERMOST], axis=0)
-    return low - MARGIN * (high - low), high + MARGIN * (high - low)
+    return Runs(np.array(points), np.array(growth), np.array(left), np.array(misfits))
 
 
 def _pieces(section: PoincareSection, length: int) -> np.ndarray:
@@ -358,129 +431,3 @@ def _pieces(section: PoincareSection, length: int) -> np.ndarray:
 def _unit(problem: Problem, coordinate: str) -> str:
     """Return the unit of a coordinate, "" if it is unknown."""
     return problem.model.units.get(channels_of([coordinate])[0], "")
-
-
-class Statistics:
-    """Statistics of runs and of the pieces of a recording, and their tests."""
-
-    def __init__(self, recorded: Recorded, runs: _Runs, pieces: np.ndarray, generator: np.random.Generator):
-        section = recorded.section
-        self.recorded, self.runs, self.generator = recorded, runs, generator
-        self.turning = np.isin(section.coordinates, section.angles)
-        self.size = np.where(self.turning, 2.0 * np.pi, np.ptp(section.points, axis=0))
-        self.noise = section.noise
-        self.measured = section.points[pieces]
-        sd = 0.0 if self.noise is None else self.noise
-        self.points = wrapped(runs.points + sd * generator.standard_normal(runs.points.shape), self.turning)
-        self.stays = ~runs.left
-        self.settled = self._settles(runs.points) & self.stays
-        self.measured_settled = self._settles(self.measured)
-        self.measured_left = self._measured_left(pieces)
-
-    def _settles(self, points: np.ndarray) -> np.ndarray:
-        """Return which of some series (series, points, d) repeat themselves at their ends."""
-        repeats = []
-        for period in range(1, LONGEST_CYCLE + 1):
-            away = wrapped(points[:, period:] - points[:, :-period], self.turning) / self.size
-            repeats.append(np.abs(away[:, -REPEATING:]).max(axis=(1, 2)) < REPEATS_WITHIN)
-        return np.any(repeats, axis=0)
-
-    def _measured_left(self, pieces: np.ndarray) -> np.ndarray:
-        """Return which pieces of the recording leave its region."""
-        low, high = _region(self.recorded)
-        signals = self.recorded.samples.signals[:, self.recorded.columns]
-        outside = ~np.all((low <= signals) & (signals <= high) | self.recorded.turning, axis=1)
-        counts = np.append(0, np.cumsum(outside))
-        ends = self.recorded.instants[pieces[:, [0, -1]]]
-        first, last = np.searchsorted(self.recorded.samples.time, ends).T
-        return counts[last] > counts[first]
-
-    def table(self) -> tuple[pd.DataFrame, pd.DataFrame]:
-        """Return the tests, and the exponents."""
-        import pandas as pd
-
-        exponents, difference = self._exponents()
-        rows = {DENSITY: self._density()}
-        rows[LEFT] = self.share(self.runs.left, self.measured_left)
-        rows[SETTLED] = self.share(self.settled, self.measured_settled)
-        one, other = exponents["local_maps"]
-        spread = ndtri(0.5 + 0.5 * PROBABILITY) * difference.sd
-        p = 2.0 * ndtr(-abs(difference.mean) / difference.sd)
-        rows[EXPONENT] = (one, other, other - spread, other + spread, float(p))
-        table = pd.DataFrame.from_dict(rows, "index", columns=["model", "recording", "low", "high", "p"])
-        adjusted = holm(table["p"].to_numpy())
-        tested = table["p"].notna().to_numpy()
-        table["verdict"] = np.select([~tested, adjusted < ADEQUACY_LEVEL], [UNTESTED, DIFFERENT], CONSISTENT)
-        whole = CONSISTENT if tested.any() else UNTESTED
-        table.loc[ALL] = [np.nan] * 4 + [
-            float(np.nanmin(adjusted)), DIFFERENT if (table["verdict"] == DIFFERENT).any() else whole
-        ]  # fmt: skip
-        return table, exponents
-
-    @staticmethod
-    def share(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, ...]:
-        """Return fractions of runs and pieces, the 90 % interval of the latter, and p of Fisher's one-sided test."""
-        from scipy.stats import binomtest, fisher_exact
-
-        counts = np.array([[one.sum(), (~one).sum()] for one in (ours, theirs)], dtype=int)
-        interval = binomtest(int(counts[1, 0]), theirs.size).proportion_ci(PROBABILITY)
-        p = fisher_exact(counts, alternative="greater")[1]
-        return float(ours.mean()), float(theirs.mean()), float(interval.low), float(interval.high), float(p)
-
-    def _density(self) -> tuple[float, ...]:
-        """Return the distance of the densities, that of the recording from itself, its range, and p."""
-        model = self.points[self.stays]
-        if len(model) < FEWEST_PIECES:
-            return (np.nan,) * 5
-        counts = self._counts(np.concatenate([model, self.measured]), len(model))
-        ours, theirs = counts[: len(model)], counts[len(model) :]
-        distance = 0.5 * np.abs(ours.sum(0) / ours.sum() - theirs.sum(0) / theirs.sum()).sum()
-        every, part = len(theirs), min(len(model), len(theirs) // 2)
-        scale = np.sqrt((1 / len(model) + 1 / every) / (1 / part + 1 / (every - part)))
-        chance = np.empty(DIVISIONS)
-        for k in range(DIVISIONS):
-            some = self.generator.permutation(every)[:part]
-            one = theirs[some].sum(0)
-            rest = theirs.sum(0) - one
-            chance[k] = scale * 0.5 * np.abs(one / one.sum() - rest / rest.sum()).sum()
-        p = (1 + np.sum(chance >= distance)) / (DIVISIONS + 1)
-        return float(distance), float(np.median(chance)), *map(float, np.quantile(chance, [0.05, 0.95])), float(p)
-
-    def _counts(self, series: np.ndarray, runs: int) -> np.ndarray:
-        """Return the counts (series, bins) of the points of series (series, points, d), the first those of runs."""
-        low = np.where(self.turning, -np.pi, self.measured.min(axis=(0, 1)))
-        width = np.where(self.turning, 2.0 * np.pi, np.ptp(self.measured, axis=(0, 1)))
-        best = np.zeros((len(series), 1))
-        for number in range(FEWEST_BINS, MOST_BINS + 1):
-            boxes = np.floor((series - low) / width * number).astype(np.int64)
-            _, which = np.unique(boxes.reshape(-1, boxes.shape[-1]), axis=0, return_inverse=True)
-            which = which.reshape(boxes.shape[:2])
-            occupied = np.unique(which[runs:]).size
-            if number > FEWEST_BINS and occupied * POINTS_EACH > min(runs, len(series) - runs) * series.shape[1]:
-                break
-            best = np.zeros((len(series), which.max() + 1))
-            np.add.at(best, (np.arange(len(series))[:, None], which), 1.0)
-        return best
-
-    def _exponents(self) -> tuple[pd.DataFrame, Growth]:
-        """Return the exponents of model and recording, and the difference of those by local maps, all in 1/s."""
-        import pandas as pd
-
-        some, frequency = np.flatnonzero(self.stays & ~self.settled), self.recorded.frequency
-        growth, chaotic = self.runs.growth[self.stays], self.runs.growth[some]
-        number = min(some.size, len(self.measured))
-        columns = ["exponent", "sd", "local_maps", "local_maps_sd"]
-        table = pd.DataFrame(np.nan, index=["model", "recording"], columns=columns)
-        if number < FEWEST_PIECES or self.noise is None:
-            return table, Growth(np.nan, np.nan)
-        turn = np.where(self.turning, 2.0 * np.pi, np.inf) / self.size
-        chosen = self.generator.permutation(some)[:number], self.generator.permutation(len(self.measured))[:number]
-        ours, theirs = (
-            growth_of_pieces(points / self.size, self.noise / self.size, turn)
-            for points in (self.points[chosen[0]], self.measured[chosen[1]])
-        )
-        mean, sd, bias = growth.mean(), growth.std(ddof=1) / np.sqrt(growth.size), ours.mean - chaotic.mean()
-        difference = float(np.hypot(ours.sd, theirs.sd))
-        table.loc["model"] = [mean, sd, ours.mean, ours.sd]
-        table.loc["recording"] = [theirs.mean, np.hypot(theirs.sd, bias), theirs.mean, theirs.sd]
-        return frequency * table, Growth(frequency * (ours.mean - theirs.mean), frequency * difference)

@@ -154,21 +154,23 @@ def enough_steps(recorded: Recorded, theta: np.ndarray, library: Library, start:
     return None
 
 
-def fitted_start(
-    recorded: Recorded, runner: Runner, theta: np.ndarray, library: Library, start: int, table: np.ndarray
+def explained_state(
+    recorded: Recorded, runner: Runner, theta: np.ndarray, library: Library, measured: np.ndarray, table: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the state (size,) that explains the measured outputs of the first period best, and its relative misfit.
+    """Return the state (size,) that explains measured outputs of a period best, and its relative misfit.
 
-    Gauss-Newton iterations begin at the states of the library with the nearest outputs. Directions of the state that
-    the outputs do not determine stay there. The misfit is the rms in units of the channels' standard deviations.
+    `measured` (phases, channels) are the first of the phases of a period, NaN for channels that are not known. The
+    iterations of Gauss and Newton begin at the states of the library with the nearest outputs. Directions of the state
+    that the outputs do not determine stay there. The misfit is the rms in units of the channels' standard deviations.
     """
-    measured, part, every = recorded.first_period(start), runner.part(table, 0), runner.steps // START_PHASES
+    part, every = runner.part(table, 0), runner.steps // START_PHASES
+    known = np.isfinite(measured)
 
     def residual(y: np.ndarray) -> np.ndarray:
         outputs = runner.outputs(theta, runner.path(theta, y, part), part, every)
-        return recorded.misfit(outputs[:, recorded.places], measured).ravel()
+        return recorded.misfit(outputs[: len(measured), recorded.places], measured)[known]
 
-    distances = np.mean(recorded.misfit(library.outputs, measured) ** 2, axis=(1, 2))
+    distances = np.mean(recorded.misfit(library.outputs[:, : len(measured)], measured)[:, known] ** 2, axis=1)
     best, least = library.states[0], np.inf
     for candidate in np.argsort(distances)[:CANDIDATES]:
         y, cost = _gauss_newton(residual, library.states[candidate], library.size)

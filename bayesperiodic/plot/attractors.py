@@ -32,7 +32,7 @@ def attractor(prediction: AttractorPrediction, *, figure: Figure | None = None) 
     --------
     >>> figure = bp.plot.attractor(attractor_prediction)
     >>> [axes.get_title() for axes in figure.axes[:2]]
-    ['measured (1002 points)', 'model (2500 points)']
+    ['measured (2026 points)', 'model (1040 points)']
     """
     _checks.instance("prediction", prediction, AttractorPrediction)
     figure = figure or plt.figure(figsize=(8.4, 6.4), layout="constrained")
