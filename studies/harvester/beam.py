@@ -10,18 +10,19 @@ import bayesperiodic as bp
 
 # Parameters of both equations but those of the polynomials, and their units; the velocity is in units of the laser.
 OTHERS = {
-    "damping": "1/s", "back": "1/s**2", "drive_gain": "", "decay": "1/s", "laser_gain": "", "offset": "V",
+    "damping": "1/s", "cubic_damping": "s", "back": "1/s**2", "drive_gain": "", "decay": "1/s", "laser_gain": "",
+    "offset": "V",
 }  # fmt: skip
 # Of the simulated recording.
 SYNTHETIC = {
-    "f1": 2000.0, "f2": 0.0, "f3": -7.6e4, "f4": 0.0, "f5": -1e5, "s0": -0.7, "damping": 1.2, "back": 80.0,
+    "f1": 2000.0, "f2": 0.0, "f3": -7.6e4, "f4": 0.0, "f5": -1e5, "s0": -0.7, "damping": 1.2, "cubic_damping": 0.005, "back": 80.0,
     "drive_gain": 14.5, "decay": 6.3, "laser_gain": 18.0, "offset": 0.0,
 }  # fmt: skip
 # Harmonics of the forcing in derivatives of waveforms, and phases a period.
 HIGHEST, PHASES = 16, 64
 # Grid points a period, relative spread of priors, and random starts of the regression.
 SAMPLES, SPREAD, STARTS = 128, 0.5, 6
-POSITIVE = ("damping", "back", "drive_gain", "decay", "laser_gain")
+POSITIVE = ("damping", "cubic_damping", "back", "drive_gain", "decay", "laser_gain")
 SMALLEST = 0.1  # of priors' standard deviations, as a fraction of the term's size
 
 
@@ -50,7 +51,7 @@ def model(degree: int, coupling: int) -> bp.Model:
         inputs=["drive", "base"],
         parameters=parameters(degree, coupling),
         equations=[
-            f"ddx + damping*dx - ({spring}) + back*v + drive_gain*drive",
+            f"ddx + damping*dx + cubic_damping*dx**3 - ({spring}) + back*v + drive_gain*drive",
             f"dv + decay*v + ({element})*dx",
         ],
         outputs={"velocity": "dx + laser_gain*base", "voltage": "v + offset"},
@@ -145,7 +146,7 @@ def _as_start(z: np.ndarray, waves: list[_Waves], degree: int, coupling: int, sc
     values = dict(zip(names, spring.coef[1:].tolist(), strict=True))
     values |= dict(zip(couplings, element.coef.tolist(), strict=True))
     values |= {
-        "damping": max(-force[degree + 1], 0.5), "back": -force[degree + 2], "drive_gain": -force[degree + 3],
+        "damping": max(-force[degree + 1], 0.5), "cubic_damping": 0.003, "back": -force[degree + 2], "drive_gain": -force[degree + 3],
         "decay": -piezo[0], "laser_gain": scale[1] * z[len(waves)], "offset": 0.0,
     }  # fmt: skip
     late = 1e-3 * z[len(waves) + 1 :] if z.size > len(waves) + 1 else (0.0, 0.0)
@@ -157,7 +158,9 @@ def priors_about(start: Start) -> dict[str, Any]:
     """Return priors about starting values: a factor of 1.6 for positive ones, half the size for others."""
     priors: dict[str, Any] = {}
     for name, value in start.values.items():
-        if name in POSITIVE:
+        if name == "cubic_damping":
+            priors[name] = bp.LogNormal(value, 2.0 * SPREAD)
+        elif name in POSITIVE:
             priors[name] = bp.LogNormal(abs(value), SPREAD)
         elif name == "offset":
             priors[name] = bp.Normal(0.0, 0.01)

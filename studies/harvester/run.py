@@ -1,0 +1,208 @@
+"""A measured chaotic motion: a bistable beam with a piezo element, identified from its unstable periodic orbits.
+
+Velocity, voltage and the drive are measured in pieces, the displacement is not. Orbits are found without a model in the
+first two thirds; restoring force, coupling and damping are estimated from their waveforms, one orbit after the other, and
+sampled with emcee. The last third of the recording judges free runs of the model.
+"""
+
+import argparse
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import bayesperiodic as bp
+from studies import common
+from studies.harvester import beam, recording
+from studies.harvester.recording import FREQUENCY, Delays
+
+COORDINATES = ("voltage", "voltage[-0.2]", "voltage[-0.4]", "voltage[-0.6]", "voltage[-0.8]")
+SECTION = ("velocity", "voltage")
+# Local maps a period, sections a period, and the share of the recording in which orbits are found.
+STEPS, PHASES, SHARE = 7, 4, 2.0 / 3.0
+# Orbits are used that were found in so many sections, with errors of at most this fraction of the waveform.
+FEWEST_SECTIONS, LARGEST_ERROR = 2, 0.04
+DEGREES, COUPLING = (3, 5, 7, 9), 4
+DELAY_SD = 2e-3  # s, of their priors
+RUNS, RETURNS = 60, 30
+
+
+class Chosen(NamedTuple):
+    """A model with its estimate."""
+
+    degree: int
+    estimate: bp.OrbitsEstimate
+    predicted: bp.AttractorPrediction  # Of the part of the recording from which the orbits are
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the study."""
+    watch = common.Stopwatch()
+    with watch.part("recording", "the recording"):
+        given = common.find_data(options.data, recording.RELATIVE)
+        whole, about = recording.read(given[0]) if given else recording.simulated(options.seed, options.quick)
+        fitted, left_out = recording.divided(whole, SHARE)
+    print(f"  {'SYNTHETIC' if about['synthetic'] else 'measured'}, {sum(one.time.size for one in whole)} samples")
+    with watch.part("orbits", "finding orbits without a model, at several phases"):
+        orbits = found_orbits(fitted, options.quick)
+        used = reliable(orbits)
+    print(f"{orbits}\n  {len(used)} are used")
+    with watch.part("delays", "delays of the channels against the drive"):
+        delays, errors = delays_of(used, options.seed)
+    print(f"  velocity {1e3 * delays.velocity:.2f} ± {1e3 * errors.velocity:.2f} ms, voltage "
+          f"{1e3 * delays.voltage:.2f} ± {1e3 * errors.voltage:.2f} ms later than the drive")  # fmt: skip
+    runs = [beam.shifted(beam.experiment(orbit), *delays) for orbit in used]
+    sections = [section_of([recording.aligned(one, delays) for one in part]) for part in (fitted, left_out)]
+    with watch.part("models", "models of several degrees, from the orbits one after the other"):
+        tried = [one for degree in (DEGREES[:2] if options.quick else DEGREES)
+                 if (one := fit_of(degree, used, runs, sections[0], options.seed)) is not None]  # fmt: skip
+    best = min(tried, key=lambda one: (one.predicted.left + one.predicted.settled, one.degree))
+    problem, fit = best.estimate.problem, best.estimate.fit
+    print(f"{best.estimate}\n  force of degree {best.degree} has the fewest runs that leave the region")
+    with watch.part("posterior", "sampling the posterior with emcee"):
+        posterior = bp.sample(problem, fit, seed=options.seed, max_steps=200 if options.quick else 5000,
+                              progress=False)  # fmt: skip
+    print(posterior)
+    with watch.part("prediction", "free runs against the last third of the recording"):
+        predicted = bp.predict_attractor(problem, posterior, sections[1], runs=RUNS, periods=RETURNS,
+                                         seed=options.seed, progress=False)  # fmt: skip
+        known = bp.identifiability(problem, posterior)
+    print(f"{predicted}\n{known}")
+    with watch.part("figures", "drawing"):
+        drawn = {
+            "attractor": bp.plot.attractor(predicted),
+            "orbits": drawn_orbits(best.estimate),
+            "corner": corner(problem, fit, posterior),
+        }
+        paths = common.save_figures(options.out, drawn)
+    results = {
+        "recording": about, "seed": options.seed, "quick": options.quick,
+        "orbits": [orbit_row(orbit, orbit in used) for orbit in orbits],
+        "delays": {"seconds": delays._asdict(), "sd": errors._asdict()},
+        "models": [model_row(one) for one in tried],
+        "degree": best.degree,
+        "estimates": {n: [fit.theta[n], fit.robust_sd[n], fit.sd[n]] for n in fit.theta},
+        "dropped": best.estimate.dropped,
+        "multipliers": {n: str(m) for n, m in best.estimate.table["multiplier"].items()},
+        "unexplained": dict(fit.fvu),
+        "posterior": {n: np.quantile(posterior.draws(n), [0.05, 0.5, 0.95]).tolist() for n in fit.theta},
+        "left_out": prediction_row(predicted),
+    }  # fmt: skip
+    common.finish(options.out, results, watch, paths, synthetic=about["synthetic"])
+
+
+def found_orbits(recordings: list[bp.Recording], quick: bool) -> bp.Orbits:
+    """Return the orbits of sections at several phases of the drive."""
+    sections = [
+        bp.PoincareSection.from_recordings(
+            recordings, COORDINATES, frequency=FREQUENCY, origin=k / (PHASES * FREQUENCY)
+        )
+        for k in range(1 if quick else PHASES)
+    ]
+    return bp.find_orbits(sections, periods=range(1, 4 if quick else 6), steps=STEPS)
+
+
+def error_of(orbit: bp.Orbit) -> float:
+    """Return the largest standard error of a channel, rms over the period, as a fraction of its standard deviation."""
+    assert orbit.waveform is not None
+    values, sd = orbit.waveform.values, orbit.waveform.sd
+    return max(float(np.sqrt(np.mean(sd[n] ** 2)) / np.std(values[n])) for n in orbit.waveform.outputs)
+
+
+def reliable(orbits: bp.Orbits) -> list[bp.Orbit]:
+    """Return the orbits that are used, by period and multiplier."""
+    seen = min(FEWEST_SECTIONS, max(one.sections for one in orbits))
+    return [one for one in orbits if one.sections >= seen and error_of(one) < LARGEST_ERROR]
+
+
+def section_of(recordings: list[bp.Recording]) -> bp.PoincareSection:
+    """Return the section of the measured channels once a period."""
+    return bp.PoincareSection.from_recordings(recordings, SECTION, frequency=FREQUENCY)
+
+
+def delays_of(orbits: list[bp.Orbit], seed: int) -> tuple[Delays, Delays]:
+    """Return the delays of velocity and voltage by a model with them as parameters, and their standard deviations."""
+    degree = 7
+    start = beam.start_from(orbits, degree, COUPLING, delays=True, seed=seed)
+    near = {"velocity": start.velocity_delay, "voltage": start.voltage_delay}
+    problem = bp.Problem(
+        beam.model(degree, COUPLING), [beam.experiment(one) for one in orbits], priors=beam.priors_about(start),
+        sensors={name: bp.Sensor(delay=bp.Normal(value, DELAY_SD)) for name, value in near.items()},
+    )  # fmt: skip
+    first = start.values | {f"delay[{name}]": value for name, value in near.items()}
+    fit = bp.estimate_orbits(problem, start=first, progress=False).fit
+    means, sds = ([by_name[f"delay[{name}]"] for name in near] for by_name in (fit.theta, fit.robust_sd))
+    return Delays(*means), Delays(*sds)
+
+
+def fit_of(
+    degree: int, orbits: list[bp.Orbit], runs: list[bp.Experiment], section: bp.PoincareSection, seed: int
+) -> Chosen | None:
+    """Return the estimate with a restoring force of this degree, and its free runs; None if no orbit can be included."""
+    start = beam.start_from(orbits, degree, COUPLING, delays=True, seed=seed)
+    problem = bp.Problem(beam.model(degree, COUPLING), runs, priors=beam.priors_about(start))
+    try:
+        estimate = bp.estimate_orbits(problem, start=start.values, progress=False)
+        predicted = bp.predict_attractor(
+            estimate.problem, estimate.fit, section, runs=RUNS, periods=RETURNS, seed=seed, progress=False
+        )
+    except (ValueError, RuntimeError) as error:
+        print(f"  degree {degree}: {error}")
+        return None
+    left = {name: f"{value:.2%}" for name, value in estimate.fit.fvu.items()}
+    print(f"  degree {degree}: {len(estimate.problem.experiments)} of {len(runs)} orbits, unexplained {left}, "
+          f"{predicted.left} of {predicted.runs} runs leave, {predicted.settled} settle")  # fmt: skip
+    return Chosen(degree, estimate, predicted)
+
+
+def orbit_row(orbit: bp.Orbit, used: bool) -> dict[str, Any]:
+    """Return a row of the results."""
+    large = complex(orbit.eigenvalues[0])
+    return {
+        "name": orbit.name, "period": orbit.period, "eigenvalue": [large.real, large.imag],
+        "eigenvalue_sd": float(orbit.eigenvalue_sd[0]), "returns": orbit.returns, "sections": orbit.sections,
+        "error": error_of(orbit), "used": used,
+    }  # fmt: skip
+
+
+def model_row(one: Chosen) -> dict[str, Any]:
+    """Return a row of the results."""
+    return {
+        "degree": one.degree, "orbits": len(one.estimate.problem.experiments), "dropped": one.estimate.dropped,
+        "unexplained": dict(one.estimate.fit.fvu), **prediction_row(one.predicted),
+    }  # fmt: skip
+
+
+def prediction_row(predicted: bp.AttractorPrediction) -> dict[str, Any]:
+    """Return the statistics of free runs."""
+    return {
+        "runs": predicted.runs, "left": predicted.left, "settled": predicted.settled, "unfitted": predicted.unfitted,
+        "tests": predicted.table.to_dict(orient="index"), "exponents": predicted.exponents.to_dict(orient="index"),
+    }  # fmt: skip
+
+
+def drawn_orbits(estimate: bp.OrbitsEstimate) -> Figure:
+    """Return the measured and the fitted waveforms, voltage over velocity, of each orbit."""
+    experiments = estimate.problem.experiments
+    columns = min(4, len(experiments))
+    rows = -(-len(experiments) // columns)
+    figure = Figure(figsize=(2.3 * columns, 2.3 * rows + 0.5), layout="constrained")
+    every = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axes in every.flat[len(experiments) :]:
+        axes.set_axis_off()
+    for axes, one in zip(every.flat, experiments, strict=False):
+        solution = estimate.fit.solutions[one.name]
+        axes.plot(one.outputs["velocity"], one.outputs["voltage"], color="0.6", linewidth=3.0, label="measured")
+        axes.plot(solution.outputs["velocity"], solution.outputs["voltage"], linewidth=1.0, label="model")
+        large = complex(solution.multipliers[0]).real
+        axes.set_title(f"{one.periods} periods, multiplier {large:.0f}", fontsize=8)
+    every[0, 0].legend(fontsize=7)
+    figure.supxlabel("velocity [units of the laser]", fontsize=9)
+    figure.supylabel("voltage [V]", fontsize=9)
+    return figure
+
+
+def corner(problem: bp.Problem, fit: bp.MapEstimate, posterior: bp.Posterior) -> Figure:
+    """Return the joint posterior of restoring force, damping and gains, with Laplace's ellipses."""
+    names = [n for n in ("f1", "f3", "f5", "f7", "damping", "cubic_damping", "back", "drive_gain") if n in fit.theta]
+    return bp.plot.corner(posterior, names, laplace=fit, problem=problem)
