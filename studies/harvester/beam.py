@@ -15,8 +15,8 @@ OTHERS = {
 }  # fmt: skip
 # Of the simulated recording.
 SYNTHETIC = {
-    "f1": 2000.0, "f2": 0.0, "f3": -7.6e4, "f4": 0.0, "f5": -1e5, "s0": -0.7, "damping": 1.2, "cubic_damping": 0.005, "back": 80.0,
-    "drive_gain": 14.5, "decay": 6.3, "laser_gain": 18.0, "offset": 0.0,
+    "f1": 2000.0, "f2": 0.0, "f3": -7.6e4, "f4": 0.0, "f5": -1e5, "s0": -0.7, "damping": 1.2, "cubic_damping": 0.005,
+    "back": 80.0, "drive_gain": 14.5, "decay": 6.3, "laser_gain": 18.0, "offset": 0.0,
 }  # fmt: skip
 # Harmonics of the forcing in derivatives of waveforms, and phases a period.
 HIGHEST, PHASES = 16, 64
@@ -146,8 +146,8 @@ def _as_start(z: np.ndarray, waves: list[_Waves], degree: int, coupling: int, sc
     values = dict(zip(names, spring.coef[1:].tolist(), strict=True))
     values |= dict(zip(couplings, element.coef.tolist(), strict=True))
     values |= {
-        "damping": max(-force[degree + 1], 0.5), "cubic_damping": 0.003, "back": -force[degree + 2], "drive_gain": -force[degree + 3],
-        "decay": -piezo[0], "laser_gain": scale[1] * z[len(waves)], "offset": 0.0,
+        "damping": max(-force[degree + 1], 0.5), "cubic_damping": 0.003, "back": -force[degree + 2],
+        "drive_gain": -force[degree + 3], "decay": -piezo[0], "laser_gain": scale[1] * z[len(waves)], "offset": 0.0,
     }  # fmt: skip
     late = 1e-3 * z[len(waves) + 1 :] if z.size > len(waves) + 1 else (0.0, 0.0)
     rms = tuple(float(np.std(r)) for r in residuals)

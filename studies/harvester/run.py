@@ -1,8 +1,8 @@
 """A measured chaotic motion: a bistable beam with a piezo element, identified from its unstable periodic orbits.
 
-Velocity, voltage and the drive are measured in pieces, the displacement is not. Orbits are found without a model in the
-first two thirds; restoring force, coupling and damping are estimated from their waveforms, one orbit after the other, and
-sampled with emcee. The last third of the recording judges free runs of the model.
+Velocity, voltage and the drive are measured in pieces, the displacement is not. Orbits are found without a model in
+the first two thirds; restoring force, coupling and damping are estimated from their waveforms, one orbit after the
+other, and sampled with emcee. The last third of the recording judges free runs of the model.
 """
 
 import argparse
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("prediction", "free runs against the last third of the recording"):
         predicted = bp.predict_attractor(problem, posterior, sections[1], runs=RUNS, periods=RETURNS,
                                          seed=options.seed, progress=False)  # fmt: skip
-        known = bp.identifiability(problem, posterior)
+        known = bp.identifiability(problem, fit, posterior, profile=False)
     print(f"{predicted}\n{known}")
     with watch.part("figures", "drawing"):
         drawn = {
@@ -138,7 +138,7 @@ def delays_of(orbits: list[bp.Orbit], seed: int) -> tuple[Delays, Delays]:
 def fit_of(
     degree: int, orbits: list[bp.Orbit], runs: list[bp.Experiment], section: bp.PoincareSection, seed: int
 ) -> Chosen | None:
-    """Return the estimate with a restoring force of this degree, and its free runs; None if no orbit can be included."""
+    """Return the estimate with a restoring force of this degree, and its free runs; None without any orbit."""
     start = beam.start_from(orbits, degree, COUPLING, delays=True, seed=seed)
     problem = bp.Problem(beam.model(degree, COUPLING), runs, priors=beam.priors_about(start))
     try:
@@ -205,4 +205,4 @@ def drawn_orbits(estimate: bp.OrbitsEstimate) -> Figure:
 def corner(problem: bp.Problem, fit: bp.MapEstimate, posterior: bp.Posterior) -> Figure:
     """Return the joint posterior of restoring force, damping and gains, with Laplace's ellipses."""
     names = [n for n in ("f1", "f3", "f5", "f7", "damping", "cubic_damping", "back", "drive_gain") if n in fit.theta]
-    return bp.plot.corner(posterior, names, laplace=fit, problem=problem)
+    return bp.plot.corner(posterior, names=names, laplace=fit, problem=problem)
