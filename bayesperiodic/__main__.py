@@ -24,9 +24,7 @@ def main(arguments: list[str] | None = None) -> int:
         for option in ("format", "encoding", "separator", "decimal", "thousands", "date-format"):
             command.add_argument(f"--{option}", help="as for Recording.from_file, where it is not recognised")
         command.add_argument("--header", type=int, help="line of the names, from 1, or 0 for none")
-    fitted = (
-        f"estimate, and sample if there is a table [sample]; write PROBLEM{FIT} and PROBLEM{POSTERIOR}"
-    )
+    fitted = f"estimate, and sample if there is a table [sample]; write PROBLEM{FIT} and PROBLEM{POSTERIOR}"
     page = f"write PROBLEM{PAGE} of the results of fit"
     for name, text in (("fit", fitted), ("report", page)):
         command = commands.add_parser(name, help=text, description=text)

@@ -23,13 +23,14 @@ from bayesperiodic.models.model import Model
 from bayesperiodic.priors.stored import STORABLE
 from bayesperiodic.problem.sensors import Sensor
 
-# Arguments of `Problem` that are passed on as they are, all that a file contains, and the tables of options.
-PLAIN_ARGUMENTS = ("fixed", "tied", "local", "scheme", "input_noise")
+# Arguments of `Problem` that are passed on as they are, with their types, the others, and the tables of options.
+PLAIN_ARGUMENTS = {"fixed": (dict,), "tied": (dict,), "local": (tuple,), "scheme": (str,), "input_noise": (str, dict)}
 BUILT_ARGUMENTS = ("model", "experiments", "priors", "joint_priors", "noise", "sensors")
 OPTIONS = ("map_estimate", "sample")
 KIND, LIBRARY, DIGEST, OF_SCIPY = "kind", "library", "sha256", "scipy.stats."
 # Keys of the data file of an experiment; they say how it is read.
 SAVED, RECORDING, TABLE = "saved", "recording", "table"
+TYPES: dict[type, str] = {dict: "a table", tuple: "a list", str: "a text"}
 # What the objects raise for values that do not fit them.
 REFUSALS = (ValueError, TypeError, AttributeError, OSError, ImportError)
 ARGUMENT = re.compile(r"(\w+)((?:\[(?:'.*?'|\".*?\"|\d+)\])*)")
@@ -65,7 +66,7 @@ class ProblemFile:
         for key in ("model", "experiments"):
             if key not in self.content:
                 raise self._error(f"{key}: must be given, got none.", ())
-        given = {key: self.content[key] for key in PLAIN_ARGUMENTS if key in self.content}
+        given = {key: self._plain(key, types) for key, types in PLAIN_ARGUMENTS.items() if key in self.content}
         given |= {"model": self._model(), "experiments": self._experiments(), "priors": self._priors()}
         if "noise" in self.content:
             given["noise"] = self._noise()
@@ -92,7 +93,10 @@ class ProblemFile:
         try:
             yield
         except REFUSALS as error:
-            raise self._error(str(error), (*place, *self._named(str(error), place))) from error
+            message = str(error)
+            if not isinstance(error, ValueError | OSError | ImportError):
+                message = f"{_written(place) or 'problem file'}: must have values of the types in Python, got others: {error}."
+            raise self._error(message, (*place, *self._named(str(error), place))) from error
 
     def _error(self, message: str, place: Place) -> ValueError:
         line = self._line(place)
@@ -102,12 +106,16 @@ class ProblemFile:
         """Return the entry of a table that a message begins with, or the experiment that it contains."""
         if message.startswith("priors[("):
             return ("joint_priors",)
-        start = ARGUMENT.match(message)
+        start, got = ARGUMENT.match(message), re.search(r", got '([^']+)'", message)
         if start and _at(self.content, (*place, start[1])) is not None:
             keys = re.findall(r"\[(?:'(.*?)'|\"(.*?)\"|\d+)\]", start[2])
-            return (start[1], *(one or other for one, other in keys if one or other))
+            within = (start[1], *(one or other for one, other in keys if one or other))
+            refused = got is not None and _at(self.content, (*place, *within, got[1])) is not None
+            return (*within, got[1]) if got and refused else within
         numbers = [i for name, i in self._experiment_names.items() if not place and repr(name) in message]
-        return ("experiments", numbers[0]) if numbers else ()
+        if numbers:
+            return ("experiments", numbers[0])
+        return _place_of(got[1], _at(self.content, place)) if got and place else ()
 
     def _line(self, place: Place) -> int:
         """Return the line at which the statement begins that defines a place, or what contains it; 0 without any.
@@ -136,6 +144,13 @@ class ProblemFile:
         if not isinstance(value := _at(self.content, place), dict):
             raise self._error(f"{_written(place)}: must be a table, got {_checks.shortened(value)}.", place)
         return dict(value)
+
+    def _plain(self, key: str, types: tuple[type, ...]) -> Any:
+        value = self.content[key]
+        if not isinstance(value, types) or value == "":
+            wanted = " or ".join(TYPES[one] for one in types)
+            raise self._error(f"{key}: must be {wanted}, got {_checks.shortened(value)}.", (key,))
+        return value
 
     def _entries(self, key: str) -> tuple[Any, ...]:
         entries = self.content.get(key, ())
@@ -278,17 +293,20 @@ class ProblemFile:
         arguments = {key: value for key, value in given.items() if key not in others} | {"path": file}
         read = self._call(Recording.from_file, arguments, place, also=others)
         fold = self._table(*place, "fold") if "fold" in given else {}
+        part = given.get("between")
+        if "between" in given and not (isinstance(part, tuple) and len(part) == 2):
+            raise self._error(f"between: must be [start, stop] in seconds, got {part!r}.", (*place, "between"))
         for recording in read if isinstance(read, list) else [read]:
-            if "between" in given:
+            if part:
                 with self.located(*place, "between"):
-                    recording = recording.between(*given["between"])
+                    recording = recording.between(*part)
             yield recording, fold
 
     def _data_file(self, kind: str, place: Place) -> Path:
         """Return the path of a data file, relative to the problem file; raise a ValueError if it has changed."""
         table = self._table(*place)
         with self.located(*place, kind):
-            file = self.path.parent / table[kind]
+            file = self.path.parent / _checks.text(kind, table[kind])
             content = file.read_bytes() if file.is_file() else None
         if content is None:
             raise self._error(f"{kind}: must be an existing file, got {str(file)!r}.", (*place, kind))
@@ -326,6 +344,15 @@ def _at(content: Any, place: Place) -> Any:
         except (KeyError, IndexError, TypeError):
             return None
     return content
+
+
+def _place_of(text: str, content: Any) -> Place:
+    """Return the place of the only entry of nested tables that is a text; empty for none and for several."""
+    if not isinstance(content, dict | tuple):
+        return ()
+    items = content.items() if isinstance(content, dict) else enumerate(content)
+    places = [(key, *_place_of(text, item)) for key, item in items if item == text or _place_of(text, item)]
+    return places[0] if len(places) == 1 else ()
 
 
 def _written(place: Place) -> str:

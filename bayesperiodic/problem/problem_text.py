@@ -16,7 +16,7 @@ from bayesperiodic import _checks, models
 from bayesperiodic._files import in_folder
 from bayesperiodic.likelihood.noise import NAMED, Noise
 from bayesperiodic.models.model import CondensedModel, Model
-from bayesperiodic.models.names import as_text
+from bayesperiodic.models.names import as_expression, as_text
 from bayesperiodic.periodic.schemes import SCHEMES, Scheme
 from bayesperiodic.priors.stored import STORABLE
 from bayesperiodic.problem.description import Description
@@ -25,7 +25,7 @@ from bayesperiodic.problem.problem_file import DIGEST, KIND, LIBRARY, OF_SCIPY, 
 from bayesperiodic.problem.sensors import Sensor
 
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-LONGEST_LINE = 110
+LONGEST_LINE, LONGEST_SHOWN = 110, 200
 HEADER = "# A problem of bayesperiodic, with the arguments of bayesperiodic.Problem.\n"
 # Seed of the draws of a file that nobody has edited.
 SEED = 1
@@ -64,12 +64,7 @@ def _check(problem: Description, draft: Path) -> None:
         reason = re.sub(r"^.*?\.toml(:\d+)?: ", "", str(error))
         raise ValueError(f"problem: must be a problem that texts describe, got one that is refused: {reason}") from None
     if changed := changed_parts(fingerprint(problem), fingerprint(again)):
-        remedy = (
-            " Its equations are not exactly those of their texts; give texts, Model(equations=[…], outputs={…})."
-            if "model" in changed
-            else ""
-        )
-        raise ValueError(f"problem: must be a problem that texts describe, got another {', '.join(changed)}.{remedy}")
+        raise ValueError(f"problem: must be a problem that texts describe, got another {', '.join(changed)}.")
 
 
 def _content(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -101,19 +96,38 @@ def _model(model: Model) -> dict[str, Any]:
             f"model: must have equations in a problem file, got {model.name!r}, which is condensed; make it with "
             "Model.from_matrices(…, condensed=False), of few degrees of freedom."
         )
-    spaces = (model.state_symbols, model.input_symbols, model.parameter_symbols, model.time_symbols)
-    texts = [model.texts.get(one) or as_text(one, spaces) for one in (*model.equations, *model.output_expressions)]
+    texts = [_expression(model, "equations", one) for one in model.equations]
+    outputs = [_expression(model, "outputs", one) for one in model.output_expressions]
     units = dict(model.units)
     parameters: Any = model.parameters
     if all(name in units for name in parameters):
         parameters = {name: units.pop(name) for name in parameters}
     table = {
         "name": model.name, "states": model.states, "inputs": model.inputs, "parameters": parameters,
-        "equations": texts[: len(model.states)],
-        "outputs": dict(zip(model.outputs, texts[len(model.states) :], strict=True)),
+        "equations": texts,
+        "outputs": dict(zip(model.outputs, outputs, strict=True)),
         "angles": model.angles, "units": units, "description": vars(model).get("__doc__", ""),
     }  # fmt: skip
     return {key: value for key, value in table.items() if value or key == "parameters"}
+
+
+def _expression(model: Model, argument: str, expression: Any) -> str:
+    """Return the text of an expression, if it gives the expression exactly."""
+    if expression in model.texts:
+        return model.texts[expression]
+    spaces = (model.state_symbols, model.input_symbols, model.parameter_symbols, model.time_symbols)
+    text = as_text(expression, spaces)
+    try:
+        reason = "" if as_expression(argument, text, spaces) == expression else "whose numbers differ from those of it"
+    except ValueError as error:
+        reason = f"which is refused: {error}"
+    if reason:
+        raise ValueError(
+            f"{argument}: must be texts, or expressions that their texts give exactly, in a problem file, got one of "
+            f"the text {text[:LONGEST_SHOWN]!r}, {reason.removesuffix('.')}; make the model of texts, "
+            "Model(equations=[…], outputs={…})."
+        )
+    return text
 
 
 def _of_library(model: Model) -> dict[str, Any]:
