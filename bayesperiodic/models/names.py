@@ -8,7 +8,7 @@ import sympy as sp
 from sympy.printing.str import StrPrinter
 
 from bayesperiodic import _checks
-from bayesperiodic._expressions import parse
+from bayesperiodic._expressions import FLOAT, parse
 
 DERIVATIVES = ("", "d", "dd")
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
@@ -92,7 +92,7 @@ def as_text(expression: sp.Expr, spaces: Iterable[Mapping[str, sp.Symbol]]) -> s
 
 
 class _TextPrinter(StrPrinter):
-    """SymPy's texts with plain names, and with all digits of floats."""
+    """SymPy's texts with plain names, and with floats that are no fractions."""
 
     def __init__(self, names: Mapping[sp.Symbol, str]):
         super().__init__()
@@ -102,7 +102,7 @@ class _TextPrinter(StrPrinter):
         return self.names[expr]
 
     def _print_Float(self, expr: Any) -> str:  # noqa: N802
-        return repr(float(expr))
+        return f"{FLOAT}({float(expr)!r})"
 
     def _print_Abs(self, expr: Any) -> str:  # noqa: N802
         return f"abs({self._print(expr.args[0])})"

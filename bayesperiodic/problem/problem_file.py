@@ -95,7 +95,8 @@ class ProblemFile:
         except REFUSALS as error:
             message = str(error)
             if not isinstance(error, ValueError | OSError | ImportError):
-                message = f"{_written(place) or 'problem file'}: must have values of the types in Python, got others: {error}."
+                table = _written(place) or "problem file"
+                message = f"{table}: must have values of the types in Python, got others: {error}."
             raise self._error(message, (*place, *self._named(str(error), place))) from error
 
     def _error(self, message: str, place: Place) -> ValueError:

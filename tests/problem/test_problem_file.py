@@ -2,6 +2,8 @@
 
 import hashlib
 import inspect
+import re
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -60,6 +62,7 @@ def with_model(model):
     return bp.Problem(model, [duffing_run()], priors=DUFFING_PRIORS, fixed={"m": 1.0})
 
 
+CENTRAL = {"first": {-1: -0.5, 1: 0.5}, "second": {-1: 1.0, 0: -2.0, 1: 1.0}}
 MATRICES = {
     "mass": np.diag([1.0, 0.3]), "stiffness": {"k": [[2.0, -1.0], [-1.0, 1.0 / 3.0]]}, "damping": 0.1 * np.eye(2),
     "forces": {"force": 0}, "outputs": {"displacement": (1, "displacement")},
@@ -83,11 +86,10 @@ MORE = {
         duffing_run(), priors={"c": bp.LogNormal(0.2, 0.3), ("k", "k3"): JOINT}, scheme="central4"
     ),
     "priors of SciPy": lambda: duffing(
-        duffing_run(), priors={"c": scipy.stats.gamma(2, scale=0.1), "k": scipy.stats.norm(1.0, 0.3)}, fixed={"m": 1, "k3": 0.5},
-        noise=bp.noise.Independent(prior=scipy.stats.invgamma(3.0)), scheme=bp.Scheme(
-            "central2", 2, first={-1: -0.5, 1: 0.5}, second={-1: 1.0, 0: -2.0, 1: 1.0}
-        ),
+        duffing_run(), priors={"c": scipy.stats.gamma(2, scale=0.1), "k": scipy.stats.norm(1.0, 0.3)},
+        fixed={"m": 1, "k3": 0.5}, noise=bp.noise.Independent(prior=scipy.stats.invgamma(3.0)),
     ),
+    "scheme as an object": lambda: duffing(duffing_run(), scheme=bp.Scheme("central2", 2, **CENTRAL)),
     "values by experiment": lambda: duffing(
         duffing_run('run "1" = β'), duffing_run("run 2", 0.13), local=["m"],
         fixed={"m": {'run "1" = β': 1.0, "run 2": 1.1}, "variance[displacement]": 1e-4},
@@ -180,26 +182,47 @@ def test_every_model_of_the_library_is_called_by_its_name(name, tmp_path):
         assert again.model.definition == model.definition and again.model is model
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: with_model(own_model(**FUNCTIONS | {"outputs": lambda s, p, u: {"displacement": s.x / 3 + 0.5 * s.dx}})),
-         r"outputs: must be texts, or .* got one of the text 'x/3 \+ 0.5\*dx', whose numbers differ"),
-        (lambda: with_model(own_model(**FUNCTIONS | {"outputs": lambda s, p, u: {"displacement": sp.sign(s.x)}})),
-         r"outputs: must be texts, .* which is refused: outputs: functions in 'sign\(x\)' must be one of"),
-        (lambda: bp.Problem(bp.Model.from_matrices("frame", **MATRICES), [duffing_run()],
-                            priors={"k": bp.LogNormal(1, 0.1)}), "equations: must be texts, or expressions"),
-        (lambda: bp.Problem(bp.Model.from_matrices("frame", **MATRICES, condensed=True), [duffing_run()],
-                            priors={"k": bp.LogNormal(1, 0.1)}), "must have equations in a problem file, got 'frame'"),
-        (lambda: duffing(duffing_run(), scheme=bp.Scheme("mine", 2, first={-1: -0.5, 1: 0.5},
-                                                         second={-1: 1.0, 0: -2.0, 1: 1.0})), "scheme: must be one of"),
-        (lambda: duffing(duffing_run(), noise=OwnNoise()), "noise: must be one of 'independent', .*, got a OwnNoise"),
-        (lambda: duffing(duffing_run(), priors=DUFFING_PRIORS | {"k": OwnPrior(0.0, 2.0)}), r"priors\['k'\]: must be a prior of"),
-        (lambda: duffing(duffing_run(), priors=DUFFING_PRIORS | {"k": OwnScipy()(loc=1.0)}), r"priors\['k'\]: must be a prior of"),
-        (lambda: duffing(duffing_run()).anchored([0.2, 1.0, 0.5]), "must be without anchors in a problem file"),
-    ],
-)  # fmt: skip
-def test_what_texts_do_not_describe_is_refused_and_nothing_is_written(make, message, tmp_path):
+def with_output(output):
+    return with_model(own_model(**FUNCTIONS | {"outputs": lambda s, p, u: {"displacement": output(s)}}))
+
+
+def with_matrices(**changes):
+    model = bp.Model.from_matrices("frame", **MATRICES, **changes)
+    return bp.Problem(model, [duffing_run()], priors={"k": bp.LogNormal(1, 0.1)})
+
+
+def with_prior(prior):
+    return duffing(duffing_run(), priors=DUFFING_PRIORS | {"k": prior})
+
+
+NO_TEXT = {
+    "a number that its text changes": (
+        lambda: with_output(lambda s: s.x / 3 + 0.5 * s.dx),
+        r"outputs: must be texts, or .* got one of the text 'x/3 \+ 0.5\*dx', whose numbers differ",
+    ),
+    "a function without a text": (
+        lambda: with_output(lambda s: sp.sign(s.x)),
+        "outputs: must be texts, .* which is refused: outputs: functions in .* must be one of",
+    ),
+    "numbers in matrices": (with_matrices, "equations: must be texts, or expressions"),
+    "a condensed model": (lambda: with_matrices(condensed=True), "must have equations in a problem file, got 'frame'"),
+    "a scheme": (
+        lambda: duffing(duffing_run(), scheme=bp.Scheme("mine", 2, **CENTRAL)),
+        "scheme: must be one of",
+    ),
+    "a noise model": (
+        lambda: duffing(duffing_run(), noise=OwnNoise()),
+        "noise: must be one of 'independent', .*, got a OwnNoise",
+    ),
+    "a prior": (lambda: with_prior(OwnPrior(0.0, 2.0)), r"priors\['k'\]: must be a prior of"),
+    "a distribution": (lambda: with_prior(OwnScipy()(loc=1.0)), r"priors\['k'\]: must be a prior of"),
+    "anchors": (lambda: duffing(duffing_run()).anchored([0.2, 1.0, 0.5]), "must be without anchors in a problem file"),
+}
+
+
+@pytest.mark.parametrize("name", NO_TEXT)
+def test_what_texts_do_not_describe_is_refused_and_nothing_is_written(name, tmp_path):
+    make, message = NO_TEXT[name]
     with pytest.raises(ValueError, match=message):
         make().to_toml(tmp_path / "problem.toml")
     assert not [*tmp_path.iterdir()]
@@ -285,6 +308,7 @@ seed = 1
 """
 
 
+MODEL = WRITTEN[WRITTEN.index("name =") : WRITTEN.index("[[exp")]
 TABLE = WRITTEN[WRITTEN.index("[[experiments]]\ntable") : WRITTEN.index("[priors]")]
 
 
@@ -317,9 +341,9 @@ def test_a_written_file_gives_the_objects_of_python(folder):
     )  # fmt: skip
     expected = bp.Problem(
         model, [recording.between(1.0, 40.0).fold(32, harmonics={"displacement": 5}), *runs],
-        priors={"c": bp.LogNormal(0.2, 0.3), "k": scipy.stats.norm(1.0, scale=0.1)}, fixed={"m": 1}, tied={"k3": "0.5*k"},
-        local=["c"], noise=bp.noise.Circulant(kernel="exponential"), scheme="central4", input_noise="exact",
-        sensors={"displacement": bp.Sensor(gain=bp.LogNormal(1.0, 0.02))},
+        priors={"c": bp.LogNormal(0.2, 0.3), "k": scipy.stats.norm(1.0, scale=0.1)}, fixed={"m": 1},
+        tied={"k3": "0.5*k"}, local=["c"], noise=bp.noise.Circulant(kernel="exponential"),
+        scheme="central4", input_noise="exact", sensors={"displacement": bp.Sensor(gain=bp.LogNormal(1.0, 0.02))},
     )  # fmt: skip
     at = expected.median(), np.full(len(expected.noise_names), 0.1)
     assert repr(problem) == repr(expected) and np.isfinite(expected.log_posterior(*at))
@@ -335,32 +359,52 @@ def changed(folder, old, new):
     return path
 
 
-def line_of(path, text):
-    """Return the number of the first line that contains a text, from 1."""
-    return next(n for n, line in enumerate(path.read_text("utf-8").split("\n"), 1) if text in line)
-
-
 REFUSED = {
     "no TOML": ("states = [", "states = = [", "states", "Invalid value"),
     "a key twice": ("[fixed]", "[fixed]\nm = 2", "m = 1", "Cannot overwrite"),
     "an unknown key": ("local =", "locl =", "locl", "problem file: must be one of .* Did you mean 'local'"),
     "an unknown argument": ("states =", "state =", "state =", r"model: must be one of .* Did you mean 'states'"),
     "no argument that is needed": ("inputs = {force = 0.5}\n", "", "[[experiments]]\ntable", "must have 'inputs'"),
-    "an unknown library model": (WRITTEN[WRITTEN.index("name ="):WRITTEN.index("[[exp")], 'library = "dufing"\n\n', "dufing", "Did you mean"),
-    "a module for a model": (WRITTEN[WRITTEN.index("name ="):WRITTEN.index("[[exp")], 'library = "elements"\n\n', "elements", "must be one of"),
+    "an unknown library model": (MODEL, 'library = "dufing"\n\n', "dufing", "Did you mean"),
+    "a module for a model": (MODEL, 'library = "elements"\n\n', "elements", "must be one of"),
     "arguments of a library model": ('name = "spring"', 'library = "duffing"', "states", "model: must be 'library'"),
-    "code for an equation": ("k3*x**3", "x.__class__", "equations", r"equations: must consist of .* an attribute \(a dot\)"),
+    "code for an equation": (
+        "k3*x**3",
+        "x.__class__",
+        "equations",
+        r"equations: must consist of .* an attribute \(a dot\)",
+    ),
     "a call in an equation": ("k3*x**3", "open(x)", "equations", "Did you mean|must be one of"),
     "an unknown name in an equation": ("k3*x**3", "k3*y**3", "equations", "equations: names .* must be one of"),
-    "code for a tied parameter": ("0.5*k\"", "().__class__\"", "k3 = ", r"tied\['k3'\]: must consist of"),
-    "an unknown prior": ('"LogNormal", median = 0.2', '"LogNorml", median = 0.2', "median = 0.2", "Did you mean 'LogNormal'"),
-    "no prior": ('c = {kind = "LogNormal", median = 0.2, spread = 0.3}', "c = 0.2", "c = 0.2", r"priors\['c'\]: must be a table, got 0.2"),
+    "code for a tied parameter": ('0.5*k"', '().__class__"', "k3 = ", r"tied\['k3'\]: must consist of"),
+    "an unknown prior": (
+        '"LogNormal", median = 0.2',
+        '"LogNorml", median = 0.2',
+        "median = 0.2",
+        "Did you mean 'LogNormal'",
+    ),
+    "no prior": (
+        'c = {kind = "LogNormal", median = 0.2, spread = 0.3}',
+        "c = 0.2",
+        "c = 0.2",
+        r"priors\['c'\]: must be a table, got 0.2",
+    ),
     "a wrong number in a prior": ("median = 0.2", "median = -0.2", "median = -0.2", "median: must be > 0, got -0.2"),
     "an argument that a prior lacks": ("median = 0.2, ", "", "c = {", r"priors\['c'\]: must have 'median'"),
     "a prior of no parameter": ("k = {kind", "q = {kind", "q = {", "priors: must be one of"),
-    "a discrete distribution": ("scipy.stats.norm", "scipy.stats.poisson", "k = {", "must be a continuous distribution"),
+    "a discrete distribution": (
+        "scipy.stats.norm",
+        "scipy.stats.poisson",
+        "k = {",
+        "must be a continuous distribution",
+    ),
     "a module of SciPy": ("scipy.stats.norm", "scipy.stats.__loader__", "k = {", "must be a continuous distribution"),
-    "a function of SciPy": ("scipy.stats.norm", "scipy.stats.rv_continuous", "k = {", "must be a continuous distribution"),
+    "a function of SciPy": (
+        "scipy.stats.norm",
+        "scipy.stats.rv_continuous",
+        "k = {",
+        "must be a continuous distribution",
+    ),
     "an argument SciPy lacks": ("scale = 0.1", "sigma = 0.1", "sigma", "sigma"),
     "an unknown noise model": ('"circulant"', '"circular"', "noise", "Did you mean 'circulant'"),
     "an unknown kernel": ('"exponential"', '"gauss"', "noise", "kernel: must be one of"),
@@ -372,7 +416,12 @@ REFUSED = {
     "a sensor of nothing": ("[sensors.displacement]", "[sensors.q]", "[sensors.q]", "sensors"),
     "no data file": ('"run.csv"', '"none.csv"', "none.csv", "recording: must be an existing file"),
     "a number for a file": ('"table.csv"', "1", "table = 1", "table: must be a text"),
-    "two data files": ('recording = "run.csv"', 'recording = "run.csv"\nsaved = "x.h5"', "[[experiments]]\nrec", "must have one of 'saved', 'recording' and 'table'"),
+    "two data files": (
+        'recording = "run.csv"',
+        'recording = "run.csv"\nsaved = "x.h5"',
+        "[[experiments]]\nrec",
+        "must have one of 'saved', 'recording' and 'table'",
+    ),
     "another digest": ('sha256 = "', 'sha256 = "0', "sha256", "sha256: must be that of"),
     "an unknown column": ('"x_mm"', '"y_mm"', "y_mm", "got 'y_mm'"),
     "an unknown unit": ('["mm", "m"]', '["mn", "m"]', "mn", "mn"),
@@ -380,11 +429,21 @@ REFUSED = {
     "one limit": ("[1.0, 40.0]", "[60.0]", "between", r"between: must be \[start, stop\]"),
     "a wrong argument of fold": ("samples = 32, h", "samples = 2, h", "fold", "samples: must be an integer >= 4"),
     "an unknown argument of fold": ("samples = 32, h", "sample = 32, h", "fold", "Did you mean 'samples'"),
-    "a file that is no result": ('recording = "run.csv"', 'saved = "run.csv"', "time =", r"experiments\[0\]: must be one of 'saved', 'sha256'"),
+    "a file that is no result": (
+        'recording = "run.csv"',
+        'saved = "run.csv"',
+        "time =",
+        r"experiments\[0\]: must be one of 'saved', 'sha256'",
+    ),
     "an unknown column of a table": ('1 = "A"', '1 = "B"', "B", "'B'"),
-    "a wrong argument of a table": ('frequency = "f"', 'frequency = "f"\nsweep = "left"', "left", "sweep: must be 'up'"),
+    "a wrong argument of a table": (
+        'frequency = "f"',
+        'frequency = "f"\nsweep = "left"',
+        "left",
+        "sweep: must be 'up'",
+    ),
     "the same name twice": (TABLE, f"{TABLE}\n{TABLE}", "[[experiments]]", "experiments: names must differ"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -396,3 +455,59 @@ def test_the_line_of_whatever_is_refused_is_named(name, folder):
     with pytest.raises(ValueError, match=message) as caught:
         bp.Problem.from_toml(path)
     assert str(caught.value).startswith(f"{path}:{line}: ")
+
+
+@pytest.mark.parametrize("value", ["3", "{a = 1}"])
+def test_values_of_wrong_types_are_refused_with_a_line(value, folder):
+    """Every value in the file is replaced in turn; what is accepted has a meaning in Python too."""
+    text = (folder / "problem.toml").read_text("utf-8")
+    accepted = []
+    path = folder / "changed.toml"
+    for place in re.finditer(r"^(\w+) = (.+?)(?=  #|$)", text.partition("[map_estimate]")[0], re.MULTILINE):
+        if place[2] == "[":
+            continue
+        path.write_text(f"{text[: place.start(2)]}{value}{text[place.end(2) :]}", encoding="utf-8")
+        try:
+            bp.Problem.from_toml(path)
+            accepted.append(place[1])
+        except ValueError as error:
+            assert re.match(rf"{re.escape(str(path))}:\d+: .+ must ", str(error))
+    assert accepted == (["m", "gain", "offset"] if value == "3" else [])
+
+
+def test_a_file_that_is_no_text_or_is_missing_is_refused(tmp_path):
+    path = tmp_path / "problem.toml"
+    with pytest.raises(FileNotFoundError):
+        bp.Problem.from_toml(path)
+    path.write_bytes(b"\xff\xfe[\x00")
+    with pytest.raises(ValueError, match=f"^{re.escape(str(path))}: must be TOML in UTF-8"):
+        bp.Problem.from_toml(path)
+    path.write_text("noise = 'measured'")
+    with pytest.raises(ValueError, match=f"^{re.escape(str(path))}: model: must be given"):
+        bp.Problem.from_toml(path)
+
+
+def test_a_saved_file_that_has_changed_or_is_no_experiment_is_refused(tmp_path):
+    problem, path = duffing(duffing_run()), tmp_path / "problem.toml"
+    problem.to_toml(path)
+    line = path.read_text("utf-8").split("\n").index('saved = "problem.experiment1.h5"') + 1
+    replace(duffing_run(), frequency=0.11).save(tmp_path / "problem.experiment1.h5")
+    with pytest.raises(ValueError, match=f":{line + 1}: sha256: must be that of .*problem.experiment1.h5"):
+        bp.Problem.from_toml(path)
+    path.write_text(re.sub("sha256.*", "", path.read_text("utf-8")), encoding="utf-8")
+    assert bp.Problem.from_toml(path).experiments[0].frequency == 0.11
+    bp.Recording.from_arrays(*recorded()).check().save(tmp_path / "problem.experiment1.h5")
+    with pytest.raises(ValueError, match=f":{line}: saved: must be a Experiment, got RecordingCheck"):
+        bp.Problem.from_toml(path)
+
+
+def recorded():
+    t = np.arange(0, 50, 0.05)
+    return t, {"x": np.cos(2 * np.pi * 0.2 * t)}
+
+
+def test_files_are_replaced_by_a_problem_with_other_data(tmp_path):
+    path = tmp_path / "problem.toml"
+    duffing(duffing_run(), duffing_run("run 2", 0.13)).to_toml(path)
+    again = written_and_read(duffing(duffing_run(frequency=0.12)), tmp_path)
+    assert [e.frequency for e in again.experiments] == [0.12]
