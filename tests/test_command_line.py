@@ -90,7 +90,7 @@ def test_report_of_an_estimate_alone_and_of_another_problem(problem, capsys, tmp
     assert sorted(file.suffix for file in tmp_path.iterdir()) == [".h5", ".h5", ".toml"]
     assert command.main(["report", str(path)]) == 0
     (tmp_path / "problem.html").unlink()
-    problem.replace(noise="measured" if False else bp.noise.Independent(prior="flat")).to_toml(path)
+    problem.replace(noise=bp.noise.Independent(prior="flat")).to_toml(path)
     assert command.main(["report", str(path)]) == 1
     assert "got one of a problem with other noise" in capsys.readouterr().err
 

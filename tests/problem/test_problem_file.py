@@ -18,6 +18,7 @@ from bayesperiodic.periodic.schemes import find_scheme
 from bayesperiodic.priors.joint import FromScipy
 from bayesperiodic.priors.single import Univariate
 from tests.density import test_special_points as special_points
+from tests.layout import ROOT
 from tests.problems import CASES, DUFFING_PRIORS, duffing, duffing_run
 
 SPRING = {
@@ -76,6 +77,10 @@ JOINT = bp.MultivariateNormal([1.0, 0.5], [[0.01, 1e-3], [1e-3, 0.04]])
 MORE = {
     "own equations": lambda: with_model(own_model(**TEXTS)),
     "own functions": lambda: with_model(own_model(**FUNCTIONS)),
+    "numbers that are no fractions": lambda: with_output(
+        lambda s: s.x - 0.5 * s.dx + 1e-3 * bp.smooth_sign(s.dx, 0.02) * abs(s.x) ** 1.5 / (0.1 + s.x**2)
+    ),
+    "matrices": lambda: with_matrices(),
     "table": lambda: duffing(*table()),
     "errors of inputs": lambda: duffing(noisy_run(), noise="measured"),
     "errors of inputs as parameters": lambda: duffing(noisy_run(), input_noise="joint"),
@@ -197,14 +202,13 @@ def with_prior(prior):
 
 NO_TEXT = {
     "a number that its text changes": (
-        lambda: with_output(lambda s: s.x / 3 + 0.5 * s.dx),
-        r"outputs: must be texts, or .* got one of the text 'x/3 \+ 0.5\*dx', whose numbers differ",
+        lambda: with_output(lambda s: sp.pi * s.x / 3),
+        r"outputs: must be texts, or .* got one of the text 'pi\*x/3', whose numbers differ",
     ),
     "a function without a text": (
         lambda: with_output(lambda s: sp.sign(s.x)),
         "outputs: must be texts, .* which is refused: outputs: functions in .* must be one of",
     ),
-    "numbers in matrices": (with_matrices, "equations: must be texts, or expressions"),
     "a condensed model": (lambda: with_matrices(condensed=True), "must have equations in a problem file, got 'frame'"),
     "a scheme": (
         lambda: duffing(duffing_run(), scheme=bp.Scheme("mine", 2, **CENTRAL)),
@@ -511,3 +515,20 @@ def test_files_are_replaced_by_a_problem_with_other_data(tmp_path):
     duffing(duffing_run(), duffing_run("run 2", 0.13)).to_toml(path)
     again = written_and_read(duffing(duffing_run(frequency=0.12)), tmp_path)
     assert [e.frequency for e in again.experiments] == [0.12]
+
+
+def test_the_file_in_the_documentation_is_a_problem(folder, tmp_path):
+    page = (ROOT / "docs" / "how_to" / "problem_file.md").read_text("utf-8")
+    (text,) = re.findall(r"^```toml\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    t = np.arange(0, 300, 0.05)
+    columns = {"t": t, "F": np.cos(2 * np.pi * 0.2 * t), "x_mm": 500 * np.cos(2 * np.pi * 0.2 * t - 0.3)}
+    noise = np.random.default_rng(1).standard_normal((2, t.size))
+    columns = columns | {"F": columns["F"] + 0.01 * noise[0], "x_mm": columns["x_mm"] + 5.0 * noise[1]}
+    pd.DataFrame(columns).to_csv(tmp_path / "run1.csv", index=False)
+    path = tmp_path / "spring.toml"
+    path.write_text(text, encoding="utf-8")
+    assert bp.Problem.from_toml(path).names == ("c", "k", "k3")
+    path.write_text(text.replace("median = 0.2", "median = -0.2"), encoding="utf-8")
+    with pytest.raises(ValueError) as caught:
+        bp.Problem.from_toml(path)
+    assert f"error: {str(caught.value).removeprefix(f'{tmp_path}/')}" in page
