@@ -66,7 +66,7 @@ OPERATIONS = {
 }
 CONSTANTS = {"pi": np.pi}
 # A function of a number, which is then no fraction in symbolic form; SymPy distinguishes 0.5 and 1/2.
-FLOAT = "float"
+FLOAT_FUNCTION = "float"
 DESCRIBED = {
     "Attribute": "an attribute (a dot)",
     "BitXor": "^ (powers are written **)",
@@ -268,7 +268,7 @@ class _Parser:
         if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
             return [node.left, node.right]
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-            self._check_name(node.func.id, (*OPERATIONS, FLOAT), "functions")
+            self._check_name(node.func.id, (*OPERATIONS, FLOAT_FUNCTION), "functions")
             if node.keywords or len(node.args) != 1:
                 self.refuse(f"in which {node.func.id} has not exactly one argument")
             return node.args
@@ -286,9 +286,9 @@ class _Parser:
             return [CONSTANTS[node.id]]
         numbers = [part[0] for part in operands if len(part) == 1 and isinstance(part[0], float)]
         called = isinstance(node, ast.Call)
-        if called and node.func.id == FLOAT:
+        if called and node.func.id == FLOAT_FUNCTION:
             if not numbers:
-                self.refuse(f"in which {FLOAT} has an argument that is no number")
+                self.refuse(f"in which {FLOAT_FUNCTION} has an argument that is no number")
             return [Float(numbers[0])]
         operation = OPERATIONS[node.func.id] if called else OPERATORS[type(node.op)]
         if operation is OPERATORS[ast.Pow] and isinstance(exponent := operands[1][-1], float):

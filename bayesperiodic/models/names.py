@@ -8,7 +8,7 @@ import sympy as sp
 from sympy.printing.str import StrPrinter
 
 from bayesperiodic import _checks
-from bayesperiodic._expressions import FLOAT, parse
+from bayesperiodic._expressions import FLOAT_FUNCTION, parse
 
 DERIVATIVES = ("", "d", "dd")
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
@@ -102,7 +102,7 @@ class _TextPrinter(StrPrinter):
         return self.names[expr]
 
     def _print_Float(self, expr: Any) -> str:  # noqa: N802
-        return f"{FLOAT}({float(expr)!r})"
+        return f"{FLOAT_FUNCTION}({float(expr)!r})"
 
     def _print_Abs(self, expr: Any) -> str:  # noqa: N802
         return f"abs({self._print(expr.args[0])})"

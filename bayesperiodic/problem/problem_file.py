@@ -10,6 +10,7 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,8 @@ from bayesperiodic.problem.sensors import Sensor
 # Arguments of `Problem` that are passed on as they are, with their types, the others, and the tables of options.
 PLAIN_ARGUMENTS = {"fixed": (dict,), "tied": (dict,), "local": (tuple,), "scheme": (str,), "input_noise": (str, dict)}
 BUILT_ARGUMENTS = ("model", "experiments", "priors", "joint_priors", "noise", "sensors")
-OPTIONS = ("map_estimate", "sample")
-KIND, LIBRARY, DIGEST, OF_SCIPY = "kind", "library", "sha256", "scipy.stats."
+OPTION_TABLES = ("map_estimate", "sample")
+KIND, LIBRARY, DIGEST_KEY, OF_SCIPY = "kind", "library", "sha256", "scipy.stats."
 # Keys of the data file of an experiment; they say how it is read.
 SAVED, RECORDING, TABLE = "saved", "recording", "table"
 TYPES: dict[type, str] = {dict: "a table", tuple: "a list", str: "a text"}
@@ -62,7 +63,7 @@ class ProblemFile:
 
     def build(self, kind: Callable[..., Any]) -> Any:
         """Return the problem, of a class that takes the arguments of `Problem`."""
-        self._check_keys(self.content, (*BUILT_ARGUMENTS, *PLAIN_ARGUMENTS, *OPTIONS), ())
+        self._check_keys(self.content, (*BUILT_ARGUMENTS, *PLAIN_ARGUMENTS, *OPTION_TABLES), ())
         for key in ("model", "experiments"):
             if key not in self.content:
                 raise self._error(f"{key}: must be given, got none.", ())
@@ -83,8 +84,8 @@ class ProblemFile:
 
     def recordings(self) -> Iterator[tuple[Recording, dict[str, Any]]]:
         """Yield the recordings of the file, and the arguments with which each is folded."""
-        for i, table in enumerate(self._entries("experiments")):
-            if RECORDING in table:
+        for i, _ in enumerate(self._entries("experiments")):
+            if RECORDING in self._table("experiments", i):
                 yield from self._recordings("experiments", i)
 
     @contextmanager
@@ -275,13 +276,13 @@ class ProblemFile:
                 yield self._call(recording.fold, fold, (*place, "fold"))
             return
         file = self._data_file(kinds[0], place)
-        for key in (DIGEST, kinds[0]):
+        for key in (DIGEST_KEY, kinds[0]):
             given.pop(key, None)
         if kinds == [TABLE]:
             by_harmonic = {key: _by_harmonic(given[key]) for key in ("outputs", "phases") if key in given}
-            yield from self._call(response_table, given | by_harmonic | {TABLE: file}, place, also=(DIGEST,))
+            yield from self._call(partial(response_table, file), given | by_harmonic, place, also=(TABLE, DIGEST_KEY))
             return
-        self._check_keys(given, (SAVED, DIGEST), place)
+        self._check_keys(given, (SAVED, DIGEST_KEY), place)
         with self.located(*place, SAVED):
             experiment = load(file)
             _checks.instance(SAVED, experiment, Experiment)
@@ -290,9 +291,9 @@ class ProblemFile:
     def _recordings(self, *place: str | int) -> Iterator[tuple[Recording, dict[str, Any]]]:
         """Yield the recordings of an entry, several if it is split, and the arguments of `fold`."""
         given, file = self._table(*place), self._data_file(RECORDING, place)
-        others = (RECORDING, DIGEST, "between", "fold")
-        arguments = {key: value for key, value in given.items() if key not in others} | {"path": file}
-        read = self._call(Recording.from_file, arguments, place, also=others)
+        others = (RECORDING, DIGEST_KEY, "between", "fold")
+        arguments = {key: value for key, value in given.items() if key not in others}
+        read = self._call(partial(Recording.from_file, file), arguments, place, also=others)
         fold = self._table(*place, "fold") if "fold" in given else {}
         part = given.get("between")
         if "between" in given and not (isinstance(part, tuple) and len(part) == 2):
@@ -311,11 +312,11 @@ class ProblemFile:
             content = file.read_bytes() if file.is_file() else None
         if content is None:
             raise self._error(f"{kind}: must be an existing file, got {str(file)!r}.", (*place, kind))
-        if DIGEST in table and (digest := hashlib.sha256(content).hexdigest()) != str(table[DIGEST]).lower():
+        if DIGEST_KEY in table and (digest := hashlib.sha256(content).hexdigest()) != str(table[DIGEST_KEY]).lower():
             raise self._error(
-                f"{DIGEST}: must be that of {str(file)!r}, {digest}, got {table[DIGEST]!r}; the data are not those for "
-                "which the problem file was written.",
-                (*place, DIGEST),
+                f"{DIGEST_KEY}: must be that of {str(file)!r}, {digest}, got {table[DIGEST_KEY]!r}; the data have changed "
+                "since the problem file was written.",
+                (*place, DIGEST_KEY),
             )
         return file
 

@@ -21,12 +21,12 @@ from bayesperiodic.periodic.schemes import SCHEMES, Scheme
 from bayesperiodic.priors.stored import STORABLE
 from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.fingerprint import changed_parts, fingerprint
-from bayesperiodic.problem.problem_file import DIGEST, KIND, LIBRARY, OF_SCIPY, SAVED, ProblemFile
+from bayesperiodic.problem.problem_file import DIGEST_KEY, KIND, LIBRARY, OF_SCIPY, SAVED, ProblemFile
 from bayesperiodic.problem.sensors import Sensor
 
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-LONGEST_LINE, LONGEST_SHOWN = 110, 200
-HEADER = "# A problem of bayesperiodic, with the arguments of bayesperiodic.Problem.\n"
+WRAPPED_FROM, LONGEST_SHOWN = 110, 200
+FIRST_LINE = "# A problem of bayesperiodic, with the arguments of bayesperiodic.Problem."
 # Seed of the draws of a file that nobody has edited.
 SEED = 1
 
@@ -48,7 +48,7 @@ def write(problem: Description, path: str | Path) -> None:
             file = Path(folder, f"{target.stem}.experiment{number}.h5")
             experiment.save(file)
             digest = hashlib.sha256(file.read_bytes()).hexdigest()
-            content["experiments"].append({SAVED: file.name, DIGEST: digest})
+            content["experiments"].append({SAVED: file.name, DIGEST_KEY: digest})
         draft = Path(folder, target.name)
         draft.write_text(_toml(content), encoding="utf-8", newline="\n")
         _check(problem, draft)
@@ -61,7 +61,7 @@ def _check(problem: Description, draft: Path) -> None:
     try:
         again = ProblemFile(draft).build(type(problem))
     except ValueError as error:
-        reason = re.sub(r"^.*?\.toml(:\d+)?: ", "", str(error))
+        reason = re.sub(rf"^{re.escape(str(draft))}(:\d+)?: ", "", str(error))
         raise ValueError(f"problem: must be a problem that texts describe, got one that is refused: {reason}") from None
     if changed := changed_parts(fingerprint(problem), fingerprint(again)):
         raise ValueError(f"problem: must be a problem that texts describe, got another {', '.join(changed)}.")
@@ -69,7 +69,7 @@ def _check(problem: Description, draft: Path) -> None:
 
 def _content(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of a problem as tables of plain values, without experiments."""
-    content: dict[str, Any] = {key: settings[key] for key in ("local", "input_noise") if settings[key]}
+    content: dict[str, Any] = {"local": settings["local"], "input_noise": settings["input_noise"]}
     if (scheme := settings["scheme"]) is not None:
         content["scheme"] = scheme if isinstance(scheme, str) else _scheme(scheme)
     content["noise"] = settings["noise"] if isinstance(settings["noise"], str) else _noise(settings["noise"])
@@ -82,10 +82,10 @@ def _content(settings: Mapping[str, Any]) -> dict[str, Any]:
         for key, prior in settings["priors"].items()
         if key not in single
     ]
-    content |= {key: settings[key] for key in ("fixed", "tied")}
-    content["sensors"] = {channel: _sensor(channel, one) for channel, one in (settings["sensors"] or {}).items()}
+    sensors = {channel: _sensor(channel, one) for channel, one in (settings["sensors"] or {}).items()}
+    content |= {"fixed": settings["fixed"], "tied": settings["tied"], "sensors": sensors}
     content["sample"] = {"seed": SEED}
-    return content
+    return {key: value for key, value in content.items() if value or key in ("input_noise", "experiments")}
 
 
 def _model(model: Model) -> dict[str, Any]:
@@ -186,11 +186,11 @@ def _sensor(channel: str, sensor: Sensor) -> dict[str, Any]:
 
 
 def _toml(content: Mapping[str, Any]) -> str:
-    """Return nested values as TOML, the plain ones first; numbers have all digits, and no empty table is written."""
-    lines, tables = [HEADER.rstrip()], []
+    """Return nested values as TOML, the plain ones first; numbers have all digits."""
+    lines, tables = [FIRST_LINE], []
     for key, value in content.items():
         if isinstance(value, Mapping):
-            tables += ["", f"[{key}]", *_entries(value)] if value else []
+            tables += ["", f"[{key}]", *_entries(value)]
         elif isinstance(value, list) and all(isinstance(one, Mapping) for one in value):
             tables += [line for one in value for line in ("", f"[[{key}]]", *_entries(one))]
         else:
@@ -201,7 +201,7 @@ def _toml(content: Mapping[str, Any]) -> str:
 def _entries(table: Mapping[str, Any]) -> Iterable[str]:
     for key, value in table.items():
         line = f"{_key(key)} = {_value(key, value)}"
-        if len(line) > LONGEST_LINE and isinstance(value, list | tuple):
+        if len(line) > WRAPPED_FROM and isinstance(value, list | tuple):
             items = "".join(f"    {_value(key, item)},\n" for item in value)
             line = f"{_key(key)} = [\n{items}]"
         yield line

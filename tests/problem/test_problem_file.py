@@ -85,6 +85,7 @@ MORE = {
     "errors of inputs": lambda: duffing(noisy_run(), noise="measured"),
     "errors of inputs as parameters": lambda: duffing(noisy_run(), input_noise="joint"),
     "given errors of inputs": lambda: duffing(noisy_run(), input_noise={"force": np.float64(0.01)}),
+    "no errors of inputs": lambda: duffing(noisy_run(), input_noise={}),
     "covariance of errors": lambda: duffing(noisy_run(), input_noise={"force": 1e-4 * np.eye(5)}),
     "sensors": lambda: duffing(duffing_run(), sensors=SENSORS),
     "joint prior": lambda: duffing(
@@ -427,6 +428,12 @@ REFUSED = {
         "must have one of 'saved', 'recording' and 'table'",
     ),
     "another digest": ('sha256 = "', 'sha256 = "0', "sha256", "sha256: must be that of"),
+    "a path beside the data file": (
+        'time = "t"',
+        'time = "t"\npath = "other.csv"',
+        "path",
+        "must be one of .* got 'path'",
+    ),
     "an unknown column": ('"x_mm"', '"y_mm"', "y_mm", "got 'y_mm'"),
     "an unknown unit": ('["mm", "m"]', '["mn", "m"]', "mn", "mn"),
     "too much cut off": ("[1.0, 40.0]", "[60.0, 70.0]", "between", "must select at least two samples"),
