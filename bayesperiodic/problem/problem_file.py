@@ -312,10 +312,11 @@ class ProblemFile:
             content = file.read_bytes() if file.is_file() else None
         if content is None:
             raise self._error(f"{kind}: must be an existing file, got {str(file)!r}.", (*place, kind))
-        if DIGEST_KEY in table and (digest := hashlib.sha256(content).hexdigest()) != str(table[DIGEST_KEY]).lower():
+        digest = hashlib.sha256(content).hexdigest()
+        if (stated := table.get(DIGEST_KEY, digest)) != digest:
             raise self._error(
-                f"{DIGEST_KEY}: must be that of {str(file)!r}, {digest}, got {table[DIGEST_KEY]!r}; the data have changed "
-                "since the problem file was written.",
+                f"{DIGEST_KEY}: must be that of {str(file)!r}, {digest}, got {stated!r}; the data have changed since the "
+                "problem file was written.",
                 (*place, DIGEST_KEY),
             )
         return file
