@@ -315,8 +315,8 @@ class ProblemFile:
         digest = hashlib.sha256(content).hexdigest()
         if (stated := table.get(DIGEST_KEY, digest)) != digest:
             raise self._error(
-                f"{DIGEST_KEY}: must be that of {str(file)!r}, {digest}, got {stated!r}; the data have changed since the "
-                "problem file was written.",
+                f"{DIGEST_KEY}: must be that of {str(file)!r}, {digest}, got {stated!r}; the data have changed since "
+                "the problem file was written.",
                 (*place, DIGEST_KEY),
             )
         return file
