@@ -151,6 +151,9 @@ def test_ruinous_faults_and_unreadable_files_are_an_exit_status(recording, capsy
     assert command.main(["check", str(recording), str(stuck)]) == 1
     out = capsys.readouterr().out
     assert "Recording 'run'" in out and "ruinous: f is stuck" in out
+    short = recording.with_name("short.csv")
+    short.write_text("\n".join(recording.read_text("utf-8").split("\n")[:150]), encoding="utf-8")
+    assert command.main(["check", str(short)]) == 1 and "no mean period" in capsys.readouterr().out
     assert command.main(["check", str(recording.with_name("none.csv")), str(recording)]) == 1
     streams = capsys.readouterr()
     assert "none.csv" in streams.err and "Recording 'run'" in streams.out

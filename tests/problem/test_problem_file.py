@@ -17,6 +17,7 @@ from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.schemes import find_scheme
 from bayesperiodic.priors.joint import FromScipy
 from bayesperiodic.priors.single import Univariate
+from bayesperiodic.problem import problem_text
 from tests.density import test_special_points as special_points
 from tests.layout import ROOT
 from tests.problems import CASES, DUFFING_PRIORS, duffing, duffing_run
@@ -76,6 +77,7 @@ JOINT = bp.MultivariateNormal([1.0, 0.5], [[0.01, 1e-3], [1e-3, 0.04]])
 # What a problem may consist of, beside the cases of `tests.problems`.
 MORE = {
     "own equations": lambda: with_model(own_model(**TEXTS)),
+    "own angles": lambda: with_model(own_model(**TEXTS, angles=["x", "displacement"])),
     "own functions": lambda: with_model(own_model(**FUNCTIONS)),
     "numbers that are no fractions": lambda: with_output(
         lambda s: s.x - 0.5 * s.dx + 1e-3 * bp.smooth_sign(s.dx, 0.02) * abs(s.x) ** 1.5 / (0.1 + s.x**2)
@@ -248,6 +250,18 @@ class OwnScipy(scipy.stats.rv_continuous):
         return np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("independent", "got another noise"), ("own", r"got one that is refused: noise: must be one of .*, got 'own'")],
+)
+def test_what_has_been_written_is_read_and_compared(text, message, monkeypatch, tmp_path):
+    """Here the entry of a table is lost, as that of a later version may be forgotten."""
+    monkeypatch.setattr(problem_text, "_noise", lambda noise: text)
+    with pytest.raises(ValueError, match=f"^problem: must be a problem that texts describe, {message}"):
+        duffing(duffing_run(), noise=bp.noise.Independent(per="experiment")).to_toml(tmp_path / "problem.toml")
+    assert not [*tmp_path.iterdir()]
+
+
 def test_errors_of_inputs_of_an_estimate_are_refused(tmp_path):
     problem = duffing(noisy_run())
     fit = bp.map_estimate(problem, checks=False, progress=False)
@@ -353,6 +367,22 @@ def test_a_written_file_gives_the_objects_of_python(folder):
     at = expected.median(), np.full(len(expected.noise_names), 0.1)
     assert repr(problem) == repr(expected) and np.isfinite(expected.log_posterior(*at))
     assert problem.log_posterior(*at) == expected.log_posterior(*at)
+
+
+def test_a_file_of_an_editor_of_windows_is_read(folder):
+    """It begins with a mark of the encoding, and its lines end with two characters."""
+    path = folder / "windows.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + (folder / "problem.toml").read_bytes().replace(b"\n", b"\r\n"))
+    assert repr(bp.Problem.from_toml(path)) == repr(bp.Problem.from_toml(folder / "problem.toml"))
+    path.write_bytes(path.read_bytes().replace(b"median = 0.2", b"median = -0.2"))
+    line = line_of(WRITTEN, "median = 0.2")
+    with pytest.raises(ValueError, match=f"windows.toml:{line}: median"):
+        bp.Problem.from_toml(path)
+
+
+def line_of(text, part):
+    """Return the number of the line in which a part of a text begins, from 1."""
+    return text[: text.index(part)].count("\n") + 1
 
 
 def changed(folder, old, new):
@@ -461,8 +491,7 @@ REFUSED = {
 def test_the_line_of_whatever_is_refused_is_named(name, folder):
     old, new, marker, message = REFUSED[name]
     path = changed(folder, old, new)
-    text = path.read_text("utf-8")
-    line = text[: text.index(marker)].count("\n") + 1
+    line = line_of(path.read_text("utf-8"), marker)
     with pytest.raises(ValueError, match=message) as caught:
         bp.Problem.from_toml(path)
     assert str(caught.value).startswith(f"{path}:{line}: ")
