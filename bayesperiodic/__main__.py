@@ -58,10 +58,8 @@ def _check(path: str, **options: Any) -> int:
     folded = ProblemFile(path).recordings() if path.endswith(PROBLEM) else [(as_recording(path, **options), {})]
     for recording, fold in folded:
         frequency, periods = fold.get("frequency"), fold.get("periods", 1)
-        seen = recording.check(
-            frequency[0] if isinstance(frequency, tuple) else frequency,
-            periods=1 if isinstance(periods, str) else periods,
-        )
+        known: Any = frequency[0] if isinstance(frequency, tuple) and frequency else frequency
+        seen = recording.check(known, periods=1 if isinstance(periods, str) else periods)
         print(seen)
         status = max(status, int(bool(seen.reason) or seen.severity == RUINOUS))
     return status

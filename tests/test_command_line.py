@@ -174,6 +174,9 @@ def test_check_of_a_problem_file_is_that_of_its_recordings(recording, capsys):
         bp.Recording.from_file(recording.with_name("stuck.csv"), **read).check(),
     ]
     assert capsys.readouterr().out == "".join(f"{one}\n" for one in checks)
+    path.write_text(entry.format("run", "fold = {frequency = []}"), encoding="utf-8")
+    assert command.main(["check", str(path)]) == 1
+    assert "error: frequency: must be a real number" in capsys.readouterr().err
 
 
 def test_module_is_a_command_with_four_subcommands():
