@@ -65,6 +65,8 @@ OPERATIONS = {
     "abs": Operation(np.abs, (lambda a: np.where(a == 0.0, np.nan, np.sign(a)),), "Abs"),
 }
 CONSTANTS = {"pi": np.pi}
+# A function of a number, which is then no fraction in symbolic form; SymPy distinguishes 0.5 and 1/2.
+FLOAT_FUNCTION = "float"
 DESCRIBED = {
     "Attribute": "an attribute (a dot)",
     "BitXor": "^ (powers are written **)",
@@ -73,6 +75,10 @@ DESCRIBED = {
     "Subscript": "a subscript",
 }
 ALLOWED_EXPRESSION = f"numbers, names, pi, + - * / **, parentheses and {', '.join(OPERATIONS)} of one argument"
+
+
+class Float(float):
+    """A number that was written as ``float(0.5)``, or computed from one."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +133,8 @@ class Expression:
                 stack.append((symbols[step], (degrees or {}).get(step, 1.0)))
             else:
                 exact = Fraction(step).limit_denominator(MAX_DENOMINATOR)
-                stack.append((sp.Rational(exact) if float(exact) == step else sp.Float(step), 0.0))
+                simple = float(exact) == step and not isinstance(step, Float)
+                stack.append((sp.Rational(exact) if simple else sp.Float(step), 0.0))
         return stack[0]
 
     def _evaluate(self, values: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -168,7 +175,8 @@ def parse(argument: str, text: Any, names: Iterable[str], note: str = "") -> Exp
     """Parse a text such as ``"k1/(m*l**2)"``.
 
     Only numbers, `names`, pi, + - * / **, parentheses and `OPERATIONS` are accepted; a name pi replaces the constant.
-    Numbers are floats, and parts without names are evaluated when the text is parsed. A ValueError, which names the
+    Numbers are floats, and parts without names are evaluated when the text is parsed; ``float(0.5)`` is 0.5, but no
+    fraction in symbolic form. A ValueError, which names the
     `argument` and for an unknown name ends with the `note`, is raised for anything else, more than 1000 characters, a
     number or a part without names that is not finite, and a constant exponent beyond ±1000.
 
@@ -260,7 +268,7 @@ class _Parser:
         if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
             return [node.left, node.right]
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-            self._check_name(node.func.id, OPERATIONS, "functions")
+            self._check_name(node.func.id, (*OPERATIONS, FLOAT_FUNCTION), "functions")
             if node.keywords or len(node.args) != 1:
                 self.refuse(f"in which {node.func.id} has not exactly one argument")
             return node.args
@@ -278,6 +286,10 @@ class _Parser:
             return [CONSTANTS[node.id]]
         numbers = [part[0] for part in operands if len(part) == 1 and isinstance(part[0], float)]
         called = isinstance(node, ast.Call)
+        if called and node.func.id == FLOAT_FUNCTION:
+            if not numbers:
+                self.refuse(f"in which {FLOAT_FUNCTION} has an argument that is no number")
+            return [Float(numbers[0])]
         operation = OPERATIONS[node.func.id] if called else OPERATORS[type(node.op)]
         if operation is OPERATORS[ast.Pow] and isinstance(exponent := operands[1][-1], float):
             if abs(exponent) > MAX_EXPONENT:
@@ -288,7 +300,7 @@ class _Parser:
             result = float(operation.value(*numbers))
         if not np.isfinite(result):
             self.refuse("in which a part without names is not finite")
-        return [result]
+        return [Float(result) if any(isinstance(number, Float) for number in numbers) else result]
 
     def _check_name(self, name: str, allowed: Iterable[str], kind: str) -> None:
         try:

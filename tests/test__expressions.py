@@ -20,6 +20,7 @@ TEXTS = {
     "log(k)*tan(b) - atan(m/k)": lambda k, m, b: np.log(k) * np.tan(b) - np.arctan(m / k),
     "sinh(k)+cosh(b*b)*tanh(m)": lambda k, m, b: np.sinh(k) + np.cosh(b * b) * np.tanh(m),
     " 1e-3*(k\n+ m*0x10) ": lambda k, m, b: 1e-3 * (k + m * 16),
+    "k**float(0.5) - 2*float(-0.5)*m/float(3)": lambda k, m, b: k**0.5 + m / 3.0,
 }
 SILLY = [
     "__import__('os').system('x')",
@@ -57,6 +58,9 @@ SILLY = [
     "k == m",
     "k < m",
     "k and m",
+    "float(k)",
+    "float(0.5, 2)",
+    "float('1')",
     "not k",
     "~k",
     "k ^ 2",
@@ -216,6 +220,19 @@ def test_sympy_expression_has_the_same_value(text):
 def test_high_degrees_are_refused_where_they_are_analysed(text):
     with pytest.raises(ValueError, match="^tied: must have powers and products of a degree up to 20, got .* of degree"):
         parse("tied", text, VALUES).symbolic("tied", {name: sp.Symbol(name) for name in VALUES})
+
+
+def test_number_called_a_float_is_no_fraction_in_sympy():
+    k = sp.Symbol("k")
+    for text, expected in {
+        "0.5*k": k / 2,
+        "float(0.5)*k": 0.5 * k,
+        "-float(0.1)*k - float(3.0)": -0.1 * k - 3.0,
+        "k**float(2.0)": k**2.0,
+        "2*float(0.25)*k": 0.5 * k,
+        "k/float(0.3)": k / sp.Float(0.3),
+    }.items():
+        assert sp.srepr(parse("e", text, ["k"]).symbolic("e", {"k": k})[0]) == sp.srepr(expected)
 
 
 def test_sympy_never_reads_a_text():

@@ -12,6 +12,7 @@ from bayesperiodic._io import Result, Storable
 from bayesperiodic._printing import printable
 from bayesperiodic.data.formats import recognise
 from bayesperiodic.data.formats.contents import Clock, Contents, StoredChannel, unique_names
+from bayesperiodic.data.recording import Recording
 from bayesperiodic.data.times import dates
 from bayesperiodic.data.units import question
 
@@ -246,22 +247,34 @@ def _range(values: Any) -> tuple[float, float, str]:
     return (float(finite.min()), float(finite.max()), note) if finite.size else (np.nan, np.nan, note)
 
 
+def as_recording(path: str | Path, *, format: str | None = None, **options: Any) -> Recording:
+    """Return all usable channels of a file as outputs, without missing samples; the options are those of `inspect`."""
+    whole = recognise.contents(path, format, (), options)
+    usable, time = _usable(whole, tuple(map(_summary, whole.channels))), whole.suggested_time or None
+    return Recording.from_file(path, outputs=usable, time=time, format=format, missing="drop", **options)
+
+
+def _usable(whole: Contents, channels: tuple[FileChannel, ...]) -> dict[str, Any]:
+    """Return the channels of numbers, except that of the times, by names that channels of a model may have."""
+    usable = [one for one in channels if not np.isnan(one.low) and one.name != whole.suggested_time]
+    names = [channel.name for channel in channels]
+    result: dict[str, Any] = {}
+    for name, channel in zip(unique_names(_identifier(one.name) for one in usable), usable, strict=True):
+        key = re.sub(r"[^0-9A-Za-z_]+", "_", name).strip("_")
+        while key in result:
+            key += "_"
+        result[key] = channel.name if names.count(channel.name) == 1 else (channel.group, channel.name)
+    return result
+
+
 def _code(path: str | Path, whole: Contents, channels: tuple[FileChannel, ...], options: dict[str, Any]) -> str:
     """Return a call that reads the usable channels."""
-    usable = [
-        channel for channel in channels
-        if not np.isnan(channel.low) and channel.name != whole.suggested_time
-    ]  # fmt: skip
-    names = [channel.name for channel in channels]
-    pairs = []
-    for name, channel in zip(unique_names(_identifier(one.name) for one in usable), usable, strict=True):
-        key = channel.name if names.count(channel.name) == 1 else (channel.group, channel.name)
-        pairs.append(f"{re.sub(r'[^0-9A-Za-z_]+', '_', name).strip('_')!r}: {key!r}")
+    pairs = [f"{name!r}: {key!r}" for name, key in _usable(whole, channels).items()]
     shown = ", ".join(pairs[:MOST_SUGGESTED])
     arguments = [repr(str(path)), f"inputs={{}}, outputs={{{shown}}}"]
     if whole.suggested_time:
         arguments.append(f"time={whole.suggested_time!r}")
-    elif any(np.isnan(channel.rate) for channel in usable):
+    elif any(np.isnan(one.rate) and not np.isnan(one.low) for one in channels):
         arguments.append("sampling_rate=…")
     arguments += [f"{key}={value!r}" for key, value in options.items()]
     more = f"  # and {len(pairs) - MOST_SUGGESTED} more" if len(pairs) > MOST_SUGGESTED else ""

@@ -3,7 +3,8 @@
 import math
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 
@@ -14,7 +15,9 @@ from bayesperiodic.density.recorded_orbits import recorded_orbits
 from bayesperiodic.density.responses import Guesses, ResponseSolver
 from bayesperiodic.likelihood.input_noise import EXACT, InputErrors, same
 from bayesperiodic.periodic.solution import PeriodicSolution
+from bayesperiodic.problem import problem_text
 from bayesperiodic.problem.description import Description, written_out
+from bayesperiodic.problem.problem_file import ProblemFile
 
 METHODS = ("adjoint", "forward")
 
@@ -101,6 +104,64 @@ class Problem(Description):
     >>> problem.gradient(*at).shape, problem.solve(at[0])["synthetic duffing"].status
     ((3,), 'converged')
     """
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """Build the problem of a problem file; no text in it is executed.
+
+        The format, a table for each argument, is that of the page "Describe a problem in a file".
+
+        Parameters
+        ----------
+        path : path
+            Paths of data files are relative to its folder.
+
+        Returns
+        -------
+        Problem
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is no such file.
+        ValueError
+            For whatever the objects in Python refuse, for unknown or missing entries, and for data that have another
+            sha256 than the file states. The message begins with the path and the line.
+
+        Examples
+        --------
+        >>> import pathlib, tempfile
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "spring.toml"
+        >>> problem.to_toml(path)
+        >>> bp.Problem.from_toml(path).priors == problem.priors
+        True
+        """
+        return ProblemFile(path).build(cls)
+
+    def to_toml(self, path: str | Path) -> None:
+        """Write the problem to a problem file, and its experiments beside it, as by `Experiment.save`.
+
+        `from_toml` gives the same problem, bit for bit, and so do estimates and draws with the same version of this
+        package on a processor of the same kind. ``python -m bayesperiodic fit`` computes them. Existing files of these
+        names are replaced: that of the path, and ``NAME.experiment1.h5``, ``NAME.experiment2.h5``, … for ``NAME.toml``.
+
+        Parameters
+        ----------
+        path : path
+            The folder must exist.
+
+        Raises
+        ------
+        OSError
+            If a file cannot be written.
+        TypeError
+            If an experiment contains something other than plain data.
+        ValueError
+            For what texts do not describe: a condensed model, equations of functions that differ from their texts, a
+            noise model, a prior or a scheme of your own, and anchors or errors of inputs of an estimate. Nothing is
+            written then.
+        """
+        problem_text.write(self, path)
 
     @cached_property
     def _densities(self) -> dict[tuple[str, str], LogPosterior]:

@@ -95,6 +95,7 @@ class Noise(ABC):
         prior = as_prior("prior", self.prior)
         if prior.support[0] < 0.0:
             raise ValueError(f"prior: must have positive support, as a variance has, got {self.prior!r}.")
+        object.__setattr__(self, "prior", prior)  # one of scipy.stats prints its address instead of its numbers
 
     @property
     def proper(self) -> bool:

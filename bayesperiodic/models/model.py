@@ -13,11 +13,18 @@ import sympy as sp
 from bayesperiodic import _checks
 from bayesperiodic._compile.code_generation import Kernels, SymbolicModel, VjpKernels, grid_functions
 from bayesperiodic._compile.grid_function import GridFunction
-from bayesperiodic._expressions import parse
 from bayesperiodic._printing import Printed
 from bayesperiodic.models.internal_states import motion_of_elements
 from bayesperiodic.models.matrices import definition, of_modes, structure
-from bayesperiodic.models.names import DERIVATIVES, RESERVED, Names, called, check_derivative_names, with_derivatives
+from bayesperiodic.models.names import (
+    DERIVATIVES,
+    RESERVED,
+    Names,
+    as_expression,
+    called,
+    check_derivative_names,
+    with_derivatives,
+)
 from bayesperiodic.models.structure import MatrixStructure
 
 LARGEST_FLOAT = np.finfo(float).max
@@ -144,6 +151,7 @@ class Model(Printed):
         self.input_symbols = with_derivatives("u", self.inputs)
         self.parameter_symbols = {n: sp.Symbol(f"p_{n}", real=True) for n in self.parameters}
         self.time_symbols = {n: sp.Symbol(f"t_{n}", real=True) for n in ("tau", "frequency")}
+        self.texts: dict[sp.Expr, str] = {}  # of the expressions that were given as such
 
     def _warn_of_unused(self, expressions: Iterable[sp.Expr], names: Iterable[str]) -> None:
         used = _symbols(expressions)
@@ -289,7 +297,9 @@ class Model(Printed):
         if isinstance(given, int | float):
             given = sp.Float(given)
         if isinstance(given, str):
-            given = self._parsed(argument, given)
+            text, spaces = given, (self.state_symbols, self.input_symbols, self.parameter_symbols, self.time_symbols)
+            given = as_expression(argument, text, spaces)
+            self.texts[given] = text
         if not isinstance(given, sp.Expr):
             raise ValueError(
                 f"{argument}: must be SymPy expressions of s, p and u, got {given!r}; write an equation left = right "
@@ -305,20 +315,6 @@ class Model(Printed):
         if unknown := sorted(map(str, given.free_symbols - known)):
             raise ValueError(f"{argument}: must contain only symbols of s, p and u, got {', '.join(unknown)}.")
         return given
-
-    def _parsed(self, argument: str, text: str) -> sp.Expr:
-        """Return a text as an expression of states, inputs, parameters and time, by their plain names."""
-        spaces = (self.state_symbols, self.input_symbols, self.parameter_symbols, self.time_symbols)
-        symbols = {name: symbol for space in spaces for name, symbol in space.items()}
-        if "=" in text:
-            raise ValueError(f"{argument}: must be without '=', got {text!r}; write left = right as left - (right).")
-        parsed = parse(argument, text, symbols)
-        for name in parsed.names:
-            if sum(name in space for space in spaces) > 1:
-                raise ValueError(
-                    f"{argument}: must have a single meaning of {name!r}, got {text!r}; rename one of them."
-                )
-        return parsed.symbolic(argument, symbols)[0]
 
     def _order(self, state: str) -> int:
         for order in (2, 1):

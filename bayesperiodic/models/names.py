@@ -1,12 +1,14 @@
-"""Symbols of states, inputs and parameters by name."""
+"""Symbols of states, inputs and parameters by name, and expressions of them as texts."""
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import sympy as sp
+from sympy.printing.str import StrPrinter
 
 from bayesperiodic import _checks
+from bayesperiodic._expressions import FLOAT_FUNCTION, parse
 
 DERIVATIVES = ("", "d", "dd")
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
@@ -68,3 +70,39 @@ def check_derivative_names(argument: str, space: str, names: tuple[str, ...]) ->
                     f"out and write {space}.{derivative}."
                 )
     _checks.identifiers(argument, [d + n for d in DERIVATIVES for n in names], RESERVED)
+
+
+def as_expression(argument: str, text: str, spaces: Iterable[Mapping[str, sp.Symbol]]) -> sp.Expr:
+    """Return a text as an expression of states, inputs, parameters and time, by their plain names."""
+    spaces = tuple(spaces)
+    symbols = {name: symbol for space in spaces for name, symbol in space.items()}
+    if "=" in text:
+        raise ValueError(f"{argument}: must be without '=', got {text!r}; write left = right as left - (right).")
+    parsed = parse(argument, text, symbols)
+    for name in parsed.names:
+        if sum(name in space for space in spaces) > 1:
+            raise ValueError(f"{argument}: must have a single meaning of {name!r}, got {text!r}; rename one of them.")
+    return parsed.symbolic(argument, symbols)[0]
+
+
+def as_text(expression: sp.Expr, spaces: Iterable[Mapping[str, sp.Symbol]]) -> str:
+    """Return an expression as a text; `as_expression` may refuse it, or return one that differs by rounding."""
+    names = {symbol: name for space in spaces for name, symbol in space.items()}
+    return str(_TextPrinter(names).doprint(expression))
+
+
+class _TextPrinter(StrPrinter):
+    """SymPy's texts with plain names, and with floats that are no fractions."""
+
+    def __init__(self, names: Mapping[sp.Symbol, str]):
+        super().__init__()
+        self.names = names
+
+    def _print_Symbol(self, expr: Any) -> str:  # noqa: N802  SymPy calls it by the class
+        return self.names[expr]
+
+    def _print_Float(self, expr: Any) -> str:  # noqa: N802
+        return f"{FLOAT_FUNCTION}({float(expr)!r})"
+
+    def _print_Abs(self, expr: Any) -> str:  # noqa: N802
+        return f"abs({self._print(expr.args[0])})"

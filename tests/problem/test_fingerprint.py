@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import sympy as sp
+from scipy import stats
 
 import bayesperiodic as bp
 from bayesperiodic.problem.fingerprint import changed_parts, check_results, fingerprint
@@ -221,3 +222,11 @@ def test_truths_are_marked_in_corner_plots(two):
 def test_first_tries_are_refused_at_the_problem(changes, message):
     with pytest.raises(ValueError, match=message):
         mark(**changes)
+
+
+def test_equal_priors_of_scipy_in_a_noise_model_are_no_difference():
+    """A frozen distribution prints its address, which differs from process to process."""
+    one, other, wider = (
+        mark(noise=bp.noise.Independent(prior=stats.invgamma(3.0, scale=scale))) for scale in (2.0, 2.0, 3.0)
+    )
+    assert one == other and changed_parts(one, wider) == ["noise"]
