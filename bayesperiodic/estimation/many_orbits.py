@@ -18,6 +18,8 @@ from bayesperiodic.estimation.result import MapEstimate
 if TYPE_CHECKING:
     import pandas as pd
 
+# Fraction of a channel's variance over an orbit from which the model's orbit is another one, with so many values.
+MOST_UNEXPLAINED, FEWEST_VALUES = 0.25, 3
 # Multipliers are printed as real up to this relative imaginary part.
 REAL = 1e-6
 
@@ -74,7 +76,8 @@ def estimate_orbits(
     Strongly unstable orbits exist only near the parameters at which they were measured: from a distant start, one of
     many turns into another orbit or is lost, and with it the estimate. With one orbit more at a time, each is solved at
     parameters that the others have determined. One with which the estimate does not converge, or with which an orbit
-    turns into another one, is dropped and tried once more at the end.
+    turns into another one (then a quarter of the variance of a channel and more is unexplained), is dropped and tried
+    once more at the end.
 
     Parameters
     ----------
@@ -113,7 +116,7 @@ def estimate_orbits(
     >>> orbits = [orbit for orbit in pendulum_orbits if abs(orbit.eigenvalues[0]) < 50]
     >>> known = {name: value for name, value in pendulum_parameters.items() if name != "l"}
     >>> runs = [orbit.experiment(states={"phi": "angle"}) for orbit in orbits]
-    >>> wide = bp.Problem(bp.models.pendulum, runs, priors={"l": bp.LogNormal(0.09, 0.3)}, fixed=known)
+    >>> wide = bp.Problem(bp.models.pendulum, runs, priors={"l": bp.LogNormal(0.27, 0.3)}, fixed=known)
     >>> estimate = bp.estimate_orbits(wide, progress=False)
     >>> estimate.dropped, abs(estimate.fit.theta["l"] - pendulum_parameters["l"]) < 3 * estimate.fit.sd["l"]
     ({}, True)
@@ -164,7 +167,25 @@ def _with_one_more(
     if fit.other_orbits:
         name, reason = next(iter(fit.other_orbits.items()))
         return f"{name!r} turns into another orbit ({reason})"
-    return fit if fit.converged else f"the estimate with it ends {fit.status!r}"
+    if not fit.converged:
+        return f"the estimate with it ends {fit.status!r}"
+    for one in experiments:
+        if (share := _unexplained(one, fit)) > MOST_UNEXPLAINED:
+            return f"{one.name!r} turns into another orbit, which leaves {share:.0%} of the measured one unexplained"
+    return fit
+
+
+def _unexplained(experiment: Experiment, fit: MapEstimate) -> float:
+    """Return the largest fraction of the variance of an output over the orbit that is not explained."""
+    values = (
+        np.ones(experiment.samples * experiment.periods, dtype=bool) if experiment.mask is None else experiment.mask
+    )
+    shares = [0.0]
+    for name, residual in fit.residuals[experiment.name].items():
+        seen = experiment.outputs[name][values]
+        if seen.size >= FEWEST_VALUES and np.ptp(seen) > 0.0 and not experiment.winding:
+            shares.append(float(np.mean(residual[values] ** 2) / np.var(seen)))
+    return max(shares)
 
 
 def _of(problem: Problem, theta: Mapping[str, float]) -> dict[str, float]:

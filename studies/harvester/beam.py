@@ -108,9 +108,13 @@ def start_from(orbits: list[bp.Orbit], degree: int, coupling: int, *, delays: bo
     for attempt in range(STARTS):
         means = generator.normal(0.0, size, len(waves)) if attempt else np.zeros(len(waves))
         first = np.concatenate([means / size, [0.5], [0.0, 0.0] if delays else []])
-        ends.append(least_squares(lambda z: np.concatenate(_equations(z, waves, degree, coupling, scale)[2]), first))
+        ends.append(least_squares(_residuals, first, args=(waves, degree, coupling, scale)))
     best = min(ends, key=lambda end: float(end.cost))
     return _as_start(best.x, waves, degree, coupling, scale)
+
+
+def _residuals(z: np.ndarray, *problem: Any) -> np.ndarray:
+    return np.concatenate(_equations(z, *problem)[2])
 
 
 def _equations(
