@@ -154,6 +154,19 @@ def orbits(count, draws, results):
     return bp.plot.orbits((found * 9)[:count], units={"x": "m", "y": "m/s"})
 
 
+def attractor(count, draws, results):
+    """Draw orbits of as many periods, up to seven, in coordinates with units."""
+    points, orbits = henon().points, bp.find_orbits(henon(), periods=range(1, min(count, 7) + 1))
+    coordinates = ("a_long_name_of_a_coordinate", "a_long_name_of_a_coordinate[-0.25]")
+    result = bp.AttractorPrediction(
+        table=pd.DataFrame({"verdict": ["different"]}, ["all"]), exponents=pd.DataFrame(), section=points,
+        model_section=points[None, ::2], coordinates=coordinates, units=dict.fromkeys(coordinates, "m/s"),
+        orbits={orbit.name: orbit.points for orbit in orbits}, orbit_table=pd.DataFrame(), runs=100, unfitted=2,
+        left=12, settled=0, pieces=60, periods=30, misfit=0.01, synthetic=True,
+    )  # fmt: skip
+    return bp.plot.attractor(result)
+
+
 def recording(count, draws, results):
     """Draw a recording with faults of every kind that can be together."""
     time = np.concatenate([np.arange(0.0, 20.0, 0.01), np.arange(20.2, 60.0, 0.01)])
@@ -189,8 +202,8 @@ def population(count, draws, results):
 
 
 DRAWERS = [
-    branch, comparison, corner, elements, fit, loops, marginals, missing_terms, models, modes, orbits, population,
-    profile, ranks, recording, response, section, summary, traces,
+    attractor, branch, comparison, corner, elements, fit, loops, marginals, missing_terms, models, modes, orbits,
+    population, profile, ranks, recording, response, section, summary, traces,
 ]  # fmt: skip
 
 

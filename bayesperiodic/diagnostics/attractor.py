@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 # Returns at the start of a run that are left out; fewest returns and runs.
-DISCARDED, FEWEST_RETURNS, FEWEST_RUNS = 5, 20, 20
+DISCARDED, SHORTEST_RUN, FEWEST_RUNS = 5, 20, 20
 # A start is not fitted if the misfit of its first period exceeds this fraction of the outputs' standard deviation.
 LARGEST_MISFIT = 0.5
 # Runs of the library from which starts are taken, and attempts to draw parameters within the support of the prior.
@@ -47,7 +47,7 @@ LIBRARY_RUNS, DRAWING_ATTEMPTS = 40, 100
 # Draws at which orbits are sought.
 ORBIT_DRAWS = 20
 # Standard errors from which on an orbit is named.
-FAR = 4.0
+FAR_ORBIT = 4.0
 
 
 @dataclass(frozen=True)
@@ -166,9 +166,9 @@ class AttractorPrediction(Result):
             return ""
         missing, count = self.missing_orbits, len(self.orbit_table)
         scores = self.orbit_table[["z_multiplier", "z_points"]].drop(missing).abs().max(axis=1)
-        apart = [str(name) for name in scores.index[scores > FAR]]
+        apart = [str(name) for name in scores.index[scores > FAR_ORBIT]]
         names = f", not {'; '.join(missing)}" if missing else ""
-        far = f" More than {FAR:g} standard errors away: {'; '.join(apart)}." if apart else ""
+        far = f" More than {FAR_ORBIT:g} standard errors away: {'; '.join(apart)}." if apart else ""
         return f"Of {count} measured orbits the model has {count - len(missing)} near the measured points{names}.{far}"
 
 
@@ -256,7 +256,7 @@ def predict_attractor(
     _checks.instance("problem", problem, Problem)
     _checks.instance("posterior", posterior, (Posterior, MapEstimate))
     _checks.instance("section", section, PoincareSection)
-    runs, periods = _checks.integer("runs", runs, FEWEST_RUNS), _checks.integer("periods", periods, FEWEST_RETURNS)
+    runs, periods = _checks.integer("runs", runs, FEWEST_RUNS), _checks.integer("periods", periods, SHORTEST_RUN)
     generator = np.random.default_rng(_checks.integer("seed", seed, 0))
     of = {"fit" if isinstance(posterior, MapEstimate) else "posterior": posterior}
     problem = check_results(problem, **of)
@@ -377,14 +377,14 @@ def _prepared(
     recorded: Recorded, middle: np.ndarray, seeds: list[np.ndarray], generator: np.random.Generator
 ) -> tuple[Runner, free_runs.Library]:
     """Return what integrates the model accurately, and states on its motion at one θ; RuntimeError without motion."""
-    coarse = Runner(recorded.model, recorded.frequency, free_runs.FEWEST_STEPS)
+    coarse = Runner(recorded.model, recorded.frequency, free_runs.FEWEST_STEPS_EACH)
     some = generator.choice(recorded.starts, LIBRARY_RUNS)
     library = free_runs.library_of(recorded, coarse, middle, seeds, some) if seeds else None
     runner = free_runs.enough_steps(recorded, middle, library, some[0]) if library and len(library.states) else None
     if library is None or runner is None:
         raise RuntimeError(
             "posterior: its parameters must give a bounded motion of the model with the measured inputs, got none that "
-            f"at most {free_runs.MOST_STEPS} steps a period integrate. Check units and the phase of the forcing."
+            f"at most {free_runs.MOST_STEPS_EACH} steps a period integrate. Check units and the phase of the forcing."
         )
     return runner, library
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CONSISTENT, DIFFERENT = with_tone("consistent", GOOD), with_tone("different", BAD)
-DENSITY, LEFT, SETTLED, EXPONENT = "density", "runs that leave", "runs that settle", "Lyapunov exponent"
+DENSITY, LEFT, SETTLED, LYAPUNOV = "density", "runs that leave", "runs that settle", "Lyapunov exponent"
 # Fewest runs or pieces of the recording for a test.
 FEWEST_PIECES = 10
 # The region of the recording: its quantiles from this one on, and the margin as a fraction of their distance.
@@ -26,7 +26,7 @@ OUTERMOST, MARGIN = 1e-3, 0.25
 # A run has settled if its last points repeat within this fraction of the section's size, after at most so many returns.
 REPEATING, REPEATS_WITHIN, LONGEST_CYCLE = 10, 0.02, 4
 # Mean number of the runs' points in a bin, bins along a coordinate, and random divisions of the recording.
-POINTS_EACH, FEWEST_BINS, MOST_BINS, DIVISIONS = 20, 3, 64, 999
+POINTS_EACH, COARSEST_BINS, FINEST_BINS, DIVISIONS = 20, 3, 64, 999
 # Largest fraction of starts without a fit that does not prevent a verdict.
 MOST_UNFITTED = 0.1
 
@@ -93,7 +93,7 @@ class Statistics:
         one, other = exponents["local_maps"]
         spread = ndtri(0.5 + 0.5 * PROBABILITY) * difference.sd
         p = 2.0 * ndtr(-abs(difference.mean) / difference.sd)
-        rows[EXPONENT] = (one, other, other - spread, other + spread, float(p))
+        rows[LYAPUNOV] = (one, other, other - spread, other + spread, float(p))
         table = pd.DataFrame.from_dict(rows, "index", columns=["model", "recording", "low", "high", "p"])
         adjusted = holm(table["p"].to_numpy())
         tested = table["p"].notna().to_numpy()
@@ -139,12 +139,12 @@ class Statistics:
         low = np.where(self.turning, -np.pi, self.measured.min(axis=(0, 1)))
         width = np.where(self.turning, 2.0 * np.pi, np.ptp(self.measured, axis=(0, 1)))
         best = np.zeros((len(series), 1))
-        for number in range(FEWEST_BINS, MOST_BINS + 1):
+        for number in range(COARSEST_BINS, FINEST_BINS + 1):
             boxes = np.floor((series - low) / width * number).astype(np.int64)
             _, which = np.unique(boxes.reshape(-1, boxes.shape[-1]), axis=0, return_inverse=True)
             which = which.reshape(boxes.shape[:2])
             occupied = np.unique(which[runs:]).size
-            if number > FEWEST_BINS and occupied * POINTS_EACH > min(runs, len(series) - runs) * series.shape[1]:
+            if number > COARSEST_BINS and occupied * POINTS_EACH > min(runs, len(series) - runs) * series.shape[1]:
                 break
             best = np.zeros((len(series), which.max() + 1))
             np.add.at(best, (np.arange(len(series))[:, None], which), 1.0)

@@ -17,14 +17,14 @@ from bayesperiodic.orbits.stretches import local_fit
 # Phases of the first period at which the measured outputs are compared with those of a run.
 START_PHASES = 16
 # Steps of the integration in a period, fewest and most; largest error of a period, in units of the states' size.
-FEWEST_STEPS, MOST_STEPS, STEP_ERROR = 128, 4096, 1e-3
+FEWEST_STEPS_EACH, MOST_STEPS_EACH, STEP_ERROR = 128, 4096, 1e-3
 # Fit of a start: candidates, iterations, halvings; relative step of derivatives, smallest relative singular value, and
 # the decrease of the misfit that is none.
-CANDIDATES, START_ITERATIONS, START_HALVINGS, START_STEP, LEAST_DETERMINED, NO_DECREASE = 3, 10, 4, 1e-6, 1e-6, 1e-4
+CANDIDATES, START_ITERATIONS, START_HALVINGS, START_STEP, LEAST_SLOPE, NO_DECREASE = 3, 10, 4, 1e-6, 1e-6, 1e-4
 # Small difference of two runs, in units of the states' size.
 APART_BY = 1e-7
 # Degree of the splines of the measured inputs, and the samples beyond the ends of a run.
-INPUT_DEGREE, BEYOND = 5, 12
+INPUT_SPLINE, BEYOND_RUN = 5, 12
 
 
 class Runner:
@@ -93,10 +93,10 @@ class Recorded:
             return np.zeros((half.size, 0))
         time, stretch = self.samples.time, self.stretch[start]
         begin, end = self.instants[start], self.instants[start + self.periods]
-        first, last = np.searchsorted(time, [begin, end]) + np.array([-BEYOND, BEYOND])
+        first, last = np.searchsorted(time, [begin, end]) + np.array([-BEYOND_RUN, BEYOND_RUN])
         span = slice(max(first, self.samples.starts[stretch]), min(last, self.samples.stops[stretch]))
         columns = [self.section.channels.index(name) for name in self.model.inputs]
-        spline = make_interp_spline(time[span] - begin, self.samples.signals[span, columns], k=INPUT_DEGREE)
+        spline = make_interp_spline(time[span] - begin, self.samples.signals[span, columns], k=INPUT_SPLINE)
         at = np.minimum(half / (2 * steps * self.frequency), time[span][-1] - begin)
         return np.ascontiguousarray(np.hstack([spline(at, nu=order) for order in range(3)]))
 
@@ -140,9 +140,9 @@ def library_of(
 
 def enough_steps(recorded: Recorded, theta: np.ndarray, library: Library, start: int) -> Runner | None:
     """Return a runner with so many steps that a period is accurate from states of the library; None without one."""
-    steps = FEWEST_STEPS
+    steps = FEWEST_STEPS_EACH
     some = library.states[:: max(1, len(library.states) // 20)]
-    while steps <= MOST_STEPS:
+    while steps <= MOST_STEPS_EACH:
         coarse, fine = (Runner(recorded.model, recorded.frequency, n) for n in (steps, 2 * steps))
         one, other = (
             np.array([r.path(theta, y, recorded.table(start, r.steps))[-1] for y in some]) for r in (coarse, fine)
@@ -190,7 +190,7 @@ def _gauss_newton(
         slopes = np.stack([(residual(y + step) - here) / START_STEP for step in steps], axis=1)
         if not np.isfinite(slopes).all():
             break
-        move, before = -np.linalg.lstsq(slopes, here, rcond=LEAST_DETERMINED)[0] * size, cost
+        move, before = -np.linalg.lstsq(slopes, here, rcond=LEAST_SLOPE)[0] * size, cost
         for halving in range(START_HALVINGS):
             there = residual(y + move / 2**halving)
             new = float(np.mean(there**2))

@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesperiodic.orbits.return_map import KERNEL_REACH, SMALLEST_BANDWIDTH, ReturnMap
+from bayesperiodic.orbits.return_map import FEWEST_FITTED, KERNEL_REACH, SMALLEST_BANDWIDTH, ReturnMap
 
 # Returns over which the direction of growth develops.
 ALIGNING = 5
-# Neighbours of a local fit, as a multiple of the number of quadratic terms, and their fewest.
-FITTED_EACH, FEWEST_NEIGHBOURS = 3.0, 30
+# Neighbours of a local fit, as a multiple of the number of quadratic terms.
+FITTED_EACH = 3.0
 
 
 class Growth(NamedTuple):
@@ -35,7 +35,7 @@ def growth_of_pieces(pieces: np.ndarray, noise: np.ndarray, turn: np.ndarray) ->
     after -= np.where(np.isfinite(turn), turn, 0.0) * np.round(after / turn)
     increments = np.where((np.diff(stretches) == 0)[:, None], after, np.nan)
     maps = ReturnMap(points, increments, turn, not np.isfinite(turn).any(), noise, stretches)
-    neighbours = max(FEWEST_NEIGHBOURS, int(FITTED_EACH * comb(d + 2, 2)))
+    neighbours = max(FEWEST_FITTED, int(FITTED_EACH * comb(d + 2, 2)))
     phases = np.zeros(len(maps.arguments))
     while 8 * neighbours < maps.count:
         reach = np.median(maps.nearest(maps.arguments, phases, neighbours)[0][:, -1])

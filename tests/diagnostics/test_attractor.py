@@ -39,7 +39,7 @@ def force(time):
 def section_of(number=0, periods=900, names=("x", "y", "v"), noise=0.002):
     """Return the section of one of several successive parts of the motion, with white noise."""
     first = number * (periods + 1) * wells.SAMPLES
-    clean = wells.motion(24 * (periods + 1))[first : first + periods * wells.SAMPLES]
+    clean = wells.motion(24 * 901)[first : first + periods * wells.SAMPLES]
     noisy = clean + noise * np.ptp(clean, axis=0) * np.random.default_rng([number, 3]).standard_normal(clean.shape)
     time = np.arange(len(clean)) * wells.PERIOD / wells.SAMPLES
     kept = [name for name in wells.CHANNELS if name in {one.split("[")[0] for one in names}]
@@ -128,6 +128,47 @@ def test_exponent_of_the_henon_map_from_its_points():
     assert abs(growth.mean - 0.4192) < 3.0 * growth.sd
 
 
+def test_exponent_of_the_ikeda_map_from_its_points():
+    """The other exponent is that of two neighbouring orbits of the map, over the same points."""
+
+    def following(z):
+        return 1.0 + 0.9 * z * np.exp(1j * (0.4 - 6.0 / (1.0 + abs(z) ** 2)))
+
+    z, direction, points, growths = 0.3 + 0.2j, 1.0, [], []
+    for _ in range(20100):
+        away = (following(z + 1e-8 * direction) - following(z)) / 1e-8
+        growths.append(np.log(abs(away)))
+        points.append((z.real, z.imag))
+        z, direction = following(z), away / abs(away)
+    points = np.array(points)[100:]
+    pieces = points.reshape(500, 40, 2) / np.ptp(points, axis=0)
+    growth = growth_of_pieces(pieces, np.zeros(2), np.full(2, np.inf))
+    assert growth.mean == pytest.approx(np.mean(growths[100:]), rel=0.03)
+
+
+def test_multipliers_of_orbits_of_period_three_and_more(fitted):
+    """Newton's method on the flow gives the orbits, without noise."""
+    section = section_of(names=("x", "y", "v"))
+    orbits = [one for one, _ in wells.known_orbits(3000, 4) if len(one.states) > 2][:3]
+    measured = []
+    for number, one in enumerate(orbits):
+        path = np.concatenate([wells.flow(state, 1, wells.SAMPLES, wells.STEPS)[:-1] for state in one.states])
+        size = one.states.size
+        measured.append(
+            bp.Orbit(
+                name=str(number), coordinates=section.coordinates, angles=(), frequency=FREQUENCY,
+                period=len(one.states), winding=0, points=one.states, joint_covariance=1e-6 * np.eye(size + 3),
+                eigenvalues=one.multipliers, eigenvalue_bias=np.zeros(3), returns=10, quality=1.0,
+                cycle=dict(zip(wells.CHANNELS, path[::2].T, strict=True)),
+            )
+        )  # fmt: skip
+    problem, fit = fitted
+    result = bp.predict_attractor(problem, fit, section, runs=20, orbits=measured, progress=False)
+    assert len(orbits) > 0 and result.missing_orbits == []
+    for name, one in zip(result.orbit_table.index, orbits, strict=True):
+        assert result.orbit_table.loc[name, "predicted"] == pytest.approx(one.multipliers[0].real, rel=0.03)
+
+
 def test_hidden_state_is_that_of_the_recording():
     section = section_of(names=HIDDEN, noise=0.0)
     recorded = free_runs.Recorded(section, MODEL, 20)
@@ -211,13 +252,13 @@ def test_pendulum_that_turns_is_predicted_without_inputs():
 
 @pytest.fixture(scope="module")
 def orbits():
-    return bp.find_orbits(section_of(periods=1500), periods=[1, 2])
+    return bp.find_orbits(section_of(periods=2400, noise=0.001), periods=[1, 2])
 
 
 def test_orbits_of_the_right_model_are_those_of_newtons_method_on_the_flow(fitted, orbits):
     """Points and multipliers are within four standard errors; chance exceeds them in 0.3 % of cases, of 40 values."""
     problem, fit = fitted
-    result = bp.predict_attractor(problem, fit, section_of(periods=1500), orbits=orbits, progress=False)
+    result = bp.predict_attractor(problem, fit, section_of(periods=2400, noise=0.001), orbits=orbits, progress=False)
     assert len(orbits) > 1 and result.missing_orbits == []
     assert f"the model has {len(orbits)} near the measured points.\n" in repr(result) + "\n"
     table = result.orbit_table
@@ -230,11 +271,12 @@ def test_orbits_of_the_right_model_are_those_of_newtons_method_on_the_flow(fitte
 
 def test_orbits_of_a_wrong_model_are_missing_or_far(fitted, orbits):
     problem, fit = fitted
-    section = section_of(periods=1500)
+    section = section_of(periods=2400, noise=0.001)
+    orbits = list(orbits)[:3]
     names = [orbit.name for orbit in orbits]
     for changed in ({"c": 0.3}, {"k": 0.55}):
         wrong = replace(fit, theta=fit.theta | changed)
-        result = bp.predict_attractor(problem, wrong, section, orbits=orbits, progress=False)
+        result = bp.predict_attractor(problem, wrong, section, runs=20, orbits=orbits, progress=False)
         scores = result.orbit_table[["z_points", "z_multiplier"]].abs().max(axis=1)
         assert {*result.missing_orbits, *scores.index[scores > 4.0]} == {*names}
         assert all(name in repr(result) for name in names)
