@@ -19,7 +19,13 @@ from tests.pages import BLOCKS, DOCS, PAGES, README, ROOT, TOUR, name
 NUMBER = re.compile(r"(?<![\w])-?\d[\d,]*\.?\d*(?:e[+-]?\d+)?")
 # Tolerances of printed numbers: of pages that print statistics of draws, and of others.
 DRAWN, SAME = {"rel": 0.25, "abs": 0.1}, {"rel": 0.1, "abs": 2e-3}
-DRAWING = ("README.md", TOUR, "docs/start/specimens.md")
+DRAWING = (
+    "README.md",
+    TOUR,
+    "docs/start/specimens.md",
+    "docs/how_to/populations.md",
+    "docs/how_to/priors.md",
+)
 # Code that is shown but does not run here.
 CLUSTER = "docs/how_to/running.md"
 LINES, WORDS, PICTURES, EXAMPLE = 150, 1200, 4, 15
