@@ -30,9 +30,10 @@ default_role, nitpicky, add_module_names, smartquotes = "autolink", True, False,
 
 # The notebooks are shown with the outputs that they store; `pytest -m document` executes them.
 nb_execution_mode, nb_merge_streams = "off", True
-myst_enable_extensions, myst_heading_anchors = ["dollarmath"], 3
+myst_enable_extensions, myst_heading_anchors = ["attrs_block", "dollarmath"], 3
 
 html_theme, html_title = "furo", f"bayesperiodic {release}"
+html_static_path, html_css_files = ["_static"], ["cards.css"]
 html_show_sourcelink = html_copy_source = False
 html_math_renderer = "mathml"
 # On file systems without case these names equal those of classes.

@@ -77,7 +77,8 @@ def _expressions(
         expressions |= {f"{name}**{power}": e**power for power in range(HIGHEST_DEGREE + 1, HIGHEST_POWER + 1)}
     widths = {name: deviations.get(name, 1.0) for name in moving}
     for name, e in moving.items():
-        size = smooth_abs(e, ABS_WIDTH * widths[name])
+        # smooth_abs tends to the absolute value less the width, which would change the coefficients of other terms.
+        size = smooth_abs(e, ABS_WIDTH * widths[name]) + ABS_WIDTH * widths[name]
         expressions[f"abs({name})"] = size
         expressions |= {f"{other}*abs({name})": factor * size for other, factor in moving.items()}
         expressions[f"sign({name})"] = smooth_sign(e, SIGN_WIDTH * widths[name])

@@ -391,8 +391,8 @@ def _components(orbit: Orbit, winding: int, samples: int, multipliers: bool, who
     """Return the arguments that compare the Fourier components of the waveform."""
     if multipliers or not whole or orbit.waveform is None:
         raise ValueError(
-            f"model_error: must be False without the whole waveform of {orbit.name!r}, or with multipliers, got True. Give "
-            "whole=True, with find_orbits(..., waveforms=True)."
+            f"model_error: must be False without the whole waveform of {orbit.name!r}, or with multipliers, got True. "
+            "Give whole=True, with find_orbits(..., waveforms=True)."
         )
     names, highest = orbit.waveform.outputs, COMPARED_HARMONICS * orbit.period
     sd = orbit.waveform.sd

@@ -320,7 +320,9 @@ class PoincareSection(Result):
         level = float(np.median(values)) if level is None else _checks.finite_number("level", level)
         height = samples._replace(signals=direction * (values - level))
         delays = delays_of(names)
-        crossings = upward_crossings(height, height.time.size // (2 * FEWEST_POINTS)).within(samples, delays.min(), delays.max())
+        crossings = upward_crossings(height, height.time.size // (2 * FEWEST_POINTS)).within(
+            samples, delays.min(), delays.max()
+        )
         _check_count(crossings.instants.size)
         longest = longest_window_of_crossings(names, channel, samples.sampling_rate, crossings.returns)
         crossings, error = refined(height, crossings, longest)
