@@ -115,7 +115,7 @@ def estimate_orbits(
 
     >>> orbits = [orbit for orbit in pendulum_orbits if abs(orbit.eigenvalues[0]) < 50]
     >>> known = {name: value for name, value in pendulum_parameters.items() if name != "l"}
-    >>> runs = [orbit.experiment(states={"phi": "angle"}) for orbit in orbits]
+    >>> runs = [orbit.experiment(samples=1600, states={"phi": "angle"}) for orbit in orbits]
     >>> wide = bp.Problem(bp.models.pendulum, runs, priors={"l": bp.LogNormal(0.27, 0.3)}, fixed=known)
     >>> estimate = bp.estimate_orbits(wide, progress=False)
     >>> estimate.dropped, abs(estimate.fit.theta["l"] - pendulum_parameters["l"]) < 3 * estimate.fit.sd["l"]
