@@ -157,6 +157,45 @@ def coordinate_signals(
     return names, angle_names, signals
 
 
+def given_recordings(recordings: Iterable[Recording]) -> list[Recording]:
+    """Return recordings as a list; raise a ValueError unless they are some."""
+    if isinstance(recordings, Recording) or not isinstance(recordings, Iterable):
+        raise ValueError(
+            f"recordings: must be a list of recordings, got {type(recordings).__name__}; from_recording takes one."
+        )
+    given = list(recordings)
+    if not given:
+        raise ValueError("recordings: must be one or more, got none.")
+    for k, recording in enumerate(given):
+        _checks.instance(f"recordings[{k}]", recording, Recording)
+    return given
+
+
+def other_channels(
+    recordings: Sequence[Recording], coordinates: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the channels of all recordings that are none of the coordinates, inputs last, and the inputs."""
+    outputs, inputs = (
+        tuple(c for c in getattr(recordings[0], kind) if all(c in getattr(one, kind) for one in recordings))
+        for kind in ("outputs", "inputs")
+    )
+    return tuple(c for c in (*outputs, *inputs) if c not in channels_of(coordinates)), inputs
+
+
+def with_others(recording: Recording, signals: np.ndarray, others: Sequence[str]) -> np.ndarray:
+    """Return signals (samples, channels) with those of other channels in further columns."""
+    every = {**recording.outputs, **recording.inputs}
+    return np.column_stack([signals, *(every[name] for name in others)])
+
+
+def unwrapped(samples: Stretches, turning: np.ndarray) -> Stretches:
+    """Return signals whose angles are continuous where recordings are joined."""
+    signals = samples.signals.copy()
+    for channel in np.flatnonzero(turning):
+        signals[:, channel] = np.unwrap(signals[:, channel])
+    return samples._replace(signals=signals)
+
+
 def _check_angle(name: str, values: np.ndarray) -> None:
     """Raise a ValueError for an angle that jumps by other than 2π, or moves half a turn between samples."""
     step = np.abs(np.diff(values))

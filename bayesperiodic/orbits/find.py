@@ -172,10 +172,11 @@ def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.nd
 def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
     """Return which delayed coordinate would let local maps predict best, in the units of the maps."""
     errors, size = {}, np.ptp(section.points, axis=0)
-    channels = dict.fromkeys([*channels_of(section.coordinates), *([section.crossed] if section.crossed else [])])
-    delays = [f"{d / section.frequency:.2g} s" for d in DELAYS_TRIED] if section.crossed else DELAYS_TRIED
+    channels = dict.fromkeys([*channels_of(section.coordinates), *filter(None, [section.crossed])])
+    # For crossings, fractions of the mean return.
+    delays = [f"{d / section.frequency:.2g} s" if section.crossed else str(d) for d in DELAYS_TRIED]
     for name in (f"{channel}[{d}]" for channel in channels if channel not in section.angles for d in delays):
-        values = None if name in section.coordinates else section.delayed(name)
+        values = None if name in section.coordinates or not section.may_add(name) else section.delayed(name)
         if values is None:
             continue
         column = values[:, None] / np.ptp(values[np.isfinite(values)])

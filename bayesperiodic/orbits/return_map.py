@@ -471,6 +471,8 @@ def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
 LONGEST_PERIOD = 32
 # As fractions of the median distance between two random points: points that coincide, unpredictable images.
 SAME_POINT, UNPREDICTED = 0.05, 0.08
+# Noise of this part of the error of predictions explains it.
+EXPLAINED = 0.75
 # Neighbours of a prediction, as a multiple of the number of terms.
 PREDICTING = 1.5
 # Median of the absolute value of a standard normal number.
@@ -489,7 +491,7 @@ def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, floa
     Returns the error of predictions by local maps and the part of noise in it, as fractions of the distance of random
     points. `remedy` returns which coordinate to add where the points do not determine the next ones.
     """
-    section, generator = maps.points, np.random.default_rng(0)
+    section, d, generator = maps.points, maps.points.shape[1], np.random.default_rng(0)
     starts = maps.followed(DIVERGING_STEPS + 1)
     if starts.size < FEWEST_FOLLOWED:
         raise ValueError(
@@ -513,11 +515,14 @@ def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, floa
     now = np.median(maps.distance(section[centre], section[neighbour]))
     error, from_noise = prediction_error(maps)
     if error > UNPREDICTED:
+        advice = f"If the system has more states than coordinates, add one: {remedy()}. Otherwise check for a wrong "
+        advice += "frequency or level, and for noise as large as the motion."
+        if from_noise > EXPLAINED * error:
+            advice = "The noise is too large: sample faster, record with less noise, or choose coordinates with less."
         raise ValueError(
-            f"section: must show a return map, got images that local maps of the {section.shape[1]} coordinates "
+            f"section: must show a return map, got images that local maps of {d} coordinate{'s' * (d > 1)} "
             f"predict with errors of {error:.0%} of the distance of random points, {from_noise:.1%} from known noise. "
-            f"If the system has more states than coordinates, add one: {remedy()}. Otherwise check for a wrong "
-            "frequency, and for noise as large as the motion."
+            f"{advice}"
         )
     later = np.median(maps.distance(section[centre + DIVERGING_STEPS], section[neighbour + DIVERGING_STEPS]))
     if later < DIVERGED * now:

@@ -18,8 +18,12 @@ from bayesperiodic.orbits.coordinates import (
     coordinate_signals,
     coordinate_values,
     delays_of,
+    given_recordings,
     longest_window,
     longest_window_of_crossings,
+    other_channels,
+    unwrapped,
+    with_others,
     wrapped,
 )
 from bayesperiodic.orbits.crossings import Crossings, refined, upward_crossings
@@ -31,6 +35,8 @@ from bayesperiodic.orbits.stretches import (
 )
 
 FEWEST_POINTS, CYCLE_SAMPLES = 200, 64
+# Points coincide if their standard deviations are below this many of the noise, or this fraction of the motion's range.
+SCATTER, SAME = 2.0, 2e-3
 
 
 @dataclass(frozen=True)
@@ -217,12 +223,12 @@ class PoincareSection(Result):
         """
         frequency = _checks.positive("frequency", frequency)
         origin = _checks.finite_number("origin", origin)
-        given = _recordings(recordings)
+        given = given_recordings(recordings)
         parts = [coordinate_signals(recording, coordinates, angles) for recording in given]
         names, angle_names = parts[0][:2]
-        others, inputs = _other_channels(given, names)
-        signals = [_with_others(one, values, others) for one, (*_, values) in zip(given, parts, strict=True)]
-        samples = _unwrapped(joined(given, signals, frequency), np.isin((*channels_of(names), *others), angle_names))
+        others, inputs = other_channels(given, names)
+        signals = [with_others(one, values, others) for one, (*_, values) in zip(given, parts, strict=True)]
+        samples = unwrapped(joined(given, signals, frequency), np.isin((*channels_of(names), *others), angle_names))
         if samples.sampling_rate < FEWEST_SAMPLES * frequency:
             rate = f"{samples.sampling_rate / frequency:.3g}"
             raise ValueError(
@@ -306,21 +312,27 @@ class PoincareSection(Result):
         >>> section = bp.PoincareSection.from_crossings(roessler, ("x[-0.7 s]", "x[-1.4 s]"), channel="x")
         >>> section
         """
-        given = _recordings([recordings] if isinstance(recordings, Recording) else recordings)
+        given = given_recordings([recordings] if isinstance(recordings, Recording) else recordings)
         parts = [coordinate_signals(recording, coordinates, angles, forced=False) for recording in given]
         names, angle_names = parts[0][:2]
-        others, inputs = _other_channels(given, names)
+        others, inputs = other_channels(given, names)
         every = (*channels_of(names), *others)
         _checks.one_of("channel", channel, [c for c in every if c not in names and c not in inputs])
         if direction not in (1, -1):
             raise ValueError(f"direction: must be 1 (upwards) or -1 (downwards), got {direction!r}.")
-        signals = [_with_others(one, values, others) for one, (*_, values) in zip(given, parts, strict=True)]
-        samples = _unwrapped(joined(given, signals, None), np.isin(every, angle_names))
+        signals = [with_others(one, values, others) for one, (*_, values) in zip(given, parts, strict=True)]
+        samples = unwrapped(joined(given, signals, None), np.isin(every, angle_names))
         values = samples.signals[:, [every.index(channel)]]
         level = float(np.median(values)) if level is None else _checks.finite_number("level", level)
         height = samples._replace(signals=direction * (values - level))
         delays = delays_of(names)
-        crossings = upward_crossings(height, height.time.size // (2 * FEWEST_POINTS)).within(samples, delays.min(), delays.max())
+        crossings = upward_crossings(height, samples.time.size // (2 * FEWEST_POINTS))
+        if crossings.band > values.std():
+            raise ValueError(
+                f"outputs[{channel!r}]: must be a motion that samples resolve and noise does not hide, got noise alone "
+                f"at {samples.sampling_rate:.4g} samples a second. Sample faster, or choose another channel."
+            )
+        crossings = crossings.within(samples, delays.min(), delays.max())
         _check_count(crossings.instants.size)
         longest = longest_window_of_crossings(names, channel, samples.sampling_rate, crossings.returns)
         crossings, error = refined(height, crossings, longest)
@@ -329,7 +341,15 @@ class PoincareSection(Result):
             samples, names, angle_names, crossings.instants, crossings.stretch, 0, synthetic, others, inputs,
             1.0 / float(crossings.returns.mean()), longest, channel,
         )  # fmt: skip
-        return section if section.noise is None else section._with_errors_of(crossings, error)
+        section = section if section.noise is None else section._with_errors_of(crossings, error)
+        extent = np.array([np.ptp(signal) for signal in samples.signals.T])[columns_of(names)]
+        least = 0.0 if section.noise is None else SCATTER * section.noise
+        if np.all(section.points.std(axis=0) < np.maximum(least, SAME * extent)):
+            raise ValueError(
+                "recordings: must be chaotic, got points that coincide within their noise. The motion has period 1, or "
+                "the coordinates vary too little at the crossings: use recording.fold, or other coordinates."
+            )
+        return section
 
     @classmethod
     def from_points(
@@ -442,6 +462,18 @@ class PoincareSection(Result):
         values = local_fit(samples._replace(signals=samples.signals[:, column]), np.clip(at, first, last), stretch)[0]
         return np.where((first <= at) & (at <= last), values[:, 0], np.nan)
 
+    def may_add(self, coordinate: str) -> bool:
+        """Return whether a delayed coordinate shares no noise with those of crossings; True with a forcing."""
+        if self.crossed is None or self.measured is None:
+            return True
+        samples, instants, stretch = self.measured
+        returns = np.diff(instants)[np.diff(stretch) == 0]
+        try:
+            longest_window_of_crossings((*self.coordinates, coordinate), self.crossed, samples.sampling_rate, returns)
+        except ValueError:
+            return False
+        return True
+
     @property
     def unit(self) -> float:
         """The unit of delays [s]."""
@@ -488,10 +520,7 @@ class PoincareSection(Result):
         if measured is None:
             raise ValueError(f"steps: must be 1 for points alone, got {steps}. Make the section of a recording.")
         if self.crossed:
-            raise ValueError(
-                f"steps: must be 1 for crossings, got {steps}. Coordinates that determine the next crossing need not "
-                "determine it from between the crossings."
-            )
+            raise ValueError(f"steps: must be 1 for crossings, got {steps}; between them other coordinates are needed.")
         samples, returns, stretch = measured
         after = np.append(np.diff(returns), 0.0)
         followed = np.append(np.diff(stretch) == 0, False)
@@ -562,44 +591,6 @@ def _usual(instants: np.ndarray) -> float:
 def _within(increments: np.ndarray, stretch: np.ndarray) -> np.ndarray:
     """Return increments (count − 1, d) with NaN where the next point (count,) is in another stretch."""
     return np.where((np.diff(stretch) == 0)[:, None], increments, np.nan)
-
-
-def _recordings(recordings: Iterable[Recording]) -> list[Recording]:
-    if isinstance(recordings, Recording) or not isinstance(recordings, Iterable):
-        raise ValueError(
-            f"recordings: must be a list of recordings, got {type(recordings).__name__}; from_recording takes one."
-        )
-    given = list(recordings)
-    if not given:
-        raise ValueError("recordings: must be one or more, got none.")
-    for k, recording in enumerate(given):
-        _checks.instance(f"recordings[{k}]", recording, Recording)
-    return given
-
-
-def _other_channels(
-    recordings: Sequence[Recording], coordinates: Sequence[str]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the channels of all recordings that are none of the coordinates, inputs last, and the inputs."""
-    outputs, inputs = (
-        tuple(c for c in getattr(recordings[0], kind) if all(c in getattr(one, kind) for one in recordings))
-        for kind in ("outputs", "inputs")
-    )
-    return tuple(c for c in (*outputs, *inputs) if c not in channels_of(coordinates)), inputs
-
-
-def _with_others(recording: Recording, signals: np.ndarray, others: Sequence[str]) -> np.ndarray:
-    """Return signals (samples, channels) with those of other channels in further columns."""
-    every = {**recording.outputs, **recording.inputs}
-    return np.column_stack([signals, *(every[name] for name in others)])
-
-
-def _unwrapped(samples: Stretches, turning: np.ndarray) -> Stretches:
-    """Return signals whose angles are continuous where recordings are joined."""
-    signals = samples.signals.copy()
-    for channel in np.flatnonzero(turning):
-        signals[:, channel] = np.unwrap(signals[:, channel])
-    return samples._replace(signals=signals)
 
 
 def _check_count(count: int) -> None:

@@ -101,9 +101,7 @@ def usual_step(time: np.ndarray) -> float:
     return float(np.quantile(np.diff(time), USUAL_STEP))
 
 
-def smoothed(
-    samples: Stretches, at: np.ndarray, stretch: np.ndarray, longest: float
-) -> tuple[np.ndarray, np.ndarray]:
+def smoothed(samples: Stretches, at: np.ndarray, stretch: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
     """Return signals (instants, channels) at given instants, and the standard deviation of their errors (channels,).
 
     Windows are no longer than `longest`.
