@@ -65,18 +65,16 @@ def longest_window_of_crossings(names: Sequence[str], channel: str, rate: float,
     """
     every = (channel, *names)
     columns, delays = columns_of(every), delays_of(every)
-    until_next, least = float(np.quantile(returns, SHORT_RETURN)), 2 * SMALLEST_WINDOW / rate * (1.0 - 1e-9)
-    for column in np.unique(columns):
-        places = np.sort(delays[columns == column])
-        apart, span = np.diff(places).min(initial=np.inf), places[-1] - places[0]
-        if min(apart, until_next - span) < least:
-            raise ValueError(
-                f"coordinates: must have values of a channel at least {least:.3g} s ({2 * SMALLEST_WINDOW} samples) "
-                f"apart, and no longer before the next crossing, {until_next:.3g} s later, got {list(every)}. "
-                "Otherwise they share their noise: choose other delays."
-            )
-        until_next = min(apart, until_next - span)
-    return until_next
+    until_next, least = float(np.quantile(returns, SHORT_RETURN)), 2 * SMALLEST_WINDOW / rate
+    places = [np.sort(delays[columns == column]) for column in np.unique(columns)]
+    shortest = min(float(np.diff(one, append=one[0] + until_next).min()) for one in places)
+    if shortest < least * (1.0 - 1e-9):
+        raise ValueError(
+            f"coordinates: must have values of a channel at least {least:.3g} s ({2 * SMALLEST_WINDOW} samples) apart, "
+            f"and so long before the first one of the next crossing, {until_next:.3g} s later, got {shortest:.2g} s for "
+            f"{list(every)}. Otherwise they share their noise: choose other delays."
+        )
+    return shortest
 
 
 def coordinate_values(

@@ -469,8 +469,9 @@ def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
 
 
 LONGEST_PERIOD = 32
-# As fractions of the median distance between two random points: points that coincide, unpredictable images.
-SAME_POINT, UNPREDICTED = 0.05, 0.08
+# Points that coincide, as a fraction of this quantile of the distances between two random points; unpredictable images,
+# as a fraction of their median.
+SAME_POINT, FAR, UNPREDICTED = 0.05, 0.9, 0.08
 # Noise of this part of the error of predictions explains it.
 EXPLAINED = 0.75
 # Neighbours of a prediction, as a multiple of the number of terms.
@@ -500,12 +501,13 @@ def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, floa
             "without gaps."
         )
     one, other = generator.integers(len(section), size=(2, 4 * DIVERGING_PROBES))
-    random = np.median(maps.distance(section[one], section[other]))
+    # Not the median: that of a motion of period 2 is within one of its two points, or not, by chance.
+    far = np.quantile(maps.distance(section[one], section[other]), FAR)
     for period in range(1, min(LONGEST_PERIOD, len(section) // 10) + 1):
         back = maps.followed(period)
         if back.size < FEWEST_FOLLOWED:
             break
-        if np.median(maps.distance(section[back + period], section[back])) < SAME_POINT * random:
+        if np.median(maps.distance(section[back + period], section[back])) < SAME_POINT * far:
             raise ValueError(
                 f"section: must be of a chaotic motion, got one of period {period}. Use recording.fold with "
                 f"periods={period} instead."

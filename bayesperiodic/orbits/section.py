@@ -265,24 +265,21 @@ class PoincareSection(Result):
     ) -> "PoincareSection":
         """Evaluate recordings where a channel crosses a level, as for autonomous systems.
 
-        The crossings are those of the smoothed channel, which must go below the level and above it by more than a band,
-        a tenth of the channel's standard deviation and at least five of the smoothed channel's errors: noise and small
-        ripple add none.
+        Between two crossings the smoothed channel goes below the level and above it by more than a tenth of its standard
+        deviation and five standard errors, so that noise adds none.
 
         Parameters
         ----------
         recordings : Recording or sequence of them
-            At least 8 samples between two crossings; pieces, gaps and joined recordings as for `from_recordings`.
+            At least 8 samples a return; gaps and several recordings as for `from_recordings`.
         coordinates : sequence of str
-            Two or more outputs that determine the next crossing, one fewer than the system has states, or more. What is
-            not measured is replaced by delayed coordinates, the delay in seconds with the unit:
-            ``("current[-0.1 s]", "current[-0.2 s]")`` are the values of the only channel 0.1 s and 0.2 s before it
-            crosses the level. They lie within the shortest time between two crossings.
+            Outputs that determine the next crossing: one fewer than the system has states; or one, if the points are
+            nearly on a curve, as for strong contraction. What is not measured is replaced by delays in seconds:
+            ``"current[-0.1 s]"`` is the current 0.1 s before the crossing. They are within the shortest return.
         channel : str
-            Output whose crossings define the section; among the coordinates only with delays.
+            Output whose crossings define the section; a coordinate only with delays.
         level : float, optional
-            By default the median of the channel, which every motion crosses. It should be where the channel is steep,
-            and be crossed once an oscillation; all orbits must cross it.
+            By default the channel's median. It should be crossed steeply, once an oscillation.
         direction : {1, -1}
             Upwards or downwards.
         angles
@@ -291,26 +288,30 @@ class PoincareSection(Result):
         Returns
         -------
         PoincareSection
-            `frequency` is the mean number of returns per second. The times between the crossings are data too: an orbit
-            has its own period with an error (`Orbit.duration`).
+            `frequency` is the mean number of returns per second; orbits have their own period, `Orbit.duration`.
 
         Raises
         ------
         ValueError
-            For an unknown channel, too few crossings or samples, delays of one channel that are too close or too long,
-            and as for `from_recordings`.
+            As for `from_recordings`, for an unknown channel or one of noise alone, too few crossings, delays of a
+            channel that are too close or too long, and points that coincide within their noise.
 
         Notes
         -----
-        The error of a crossing's instant moves all coordinates along the flow; the standard deviations `noise` contain
-        it.
+        Errors of the instants move the points along the flow and are part of `noises`, less for a coordinate near a
+        maximum or minimum of its channel, such as a quarter of a return after the crossing.
 
         Examples
         --------
-        One channel of the Roessler system with two delays, where the channel crosses its median upwards:
+        One channel of the Roessler system, whose attractor is thin: each maximum determines the next one.
 
-        >>> section = bp.PoincareSection.from_crossings(roessler, ("x[-0.7 s]", "x[-1.4 s]"), channel="x")
-        >>> section
+        >>> model = bp.Model("roessler", states=["x", "y", "z"], inputs=[], parameters=["a", "b", "c"],
+        ...                  equations=["dx + y + z", "dy - x - a*y", "dz - b - z*(x - c)"], outputs={"x": "x"})
+        >>> recording = bp.simulate(model, {"a": 0.2, "b": 0.2, "c": 5.7}, frequency=0.17, duration=6000,
+        ...                         sampling_rate=8, start={"x": 1})
+        >>> section = bp.PoincareSection.from_crossings(recording, ["x[1.5 s]"], channel="x", level=0)
+        >>> round(bp.find_orbits(section, periods=[1])[0].duration, 3)
+        5.881
         """
         given = given_recordings([recordings] if isinstance(recordings, Recording) else recordings)
         parts = [coordinate_signals(recording, coordinates, angles, forced=False) for recording in given]
@@ -327,10 +328,10 @@ class PoincareSection(Result):
         height = samples._replace(signals=direction * (values - level))
         delays = delays_of(names)
         crossings = upward_crossings(height, samples.time.size // (2 * FEWEST_POINTS))
-        if crossings.band > values.std():
+        if not crossings.instants.size:
             raise ValueError(
-                f"outputs[{channel!r}]: must be a motion that samples resolve and noise does not hide, got noise alone "
-                f"at {samples.sampling_rate:.4g} samples a second. Sample faster, or choose another channel."
+                f"level: must be crossed by {channel!r}, got no crossing of {level:.6g} by more than noise, "
+                f"{crossings.band:.3g}. Choose another level or channel, or sample faster."
             )
         crossings = crossings.within(samples, delays.min(), delays.max())
         _check_count(crossings.instants.size)
