@@ -70,9 +70,9 @@ def longest_window_of_crossings(names: Sequence[str], channel: str, rate: float,
     shortest = min(float(np.diff(one, append=one[0] + until_next).min()) for one in places)
     if shortest < least * (1.0 - 1e-9):
         raise ValueError(
-            f"coordinates: must have values of a channel at least {least:.3g} s ({2 * SMALLEST_WINDOW} samples) apart, "
-            f"and so long before the first one of the next crossing, {until_next:.3g} s later, got {shortest:.2g} s for "
-            f"{list(every)}. Otherwise they share their noise: choose other delays."
+            f"coordinates: must have values of a channel {least:.3g} s ({2 * SMALLEST_WINDOW} samples) apart or more, "
+            f"and so long before the first one of the next crossing, {until_next:.3g} s later, got {shortest:.2g} s "
+            f"for {list(every)}. Otherwise they share their noise: choose other delays."
         )
     return shortest
 

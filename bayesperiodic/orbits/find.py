@@ -30,8 +30,8 @@ SEARCHES = ("chained", "boxes")
 QUALITY_DEGREE, FEWEST_NEIGHBOURS = 3, 32
 # Bandwidth of the local fits of the search, in standard deviations of the noise.
 SEARCH_WIDTH = 4.0
-# Bandwidth with one coordinate, in standard deviations of the noise.
-WIDTH_OF_ONE = 20.0
+# Bandwidth with one coordinate: in standard deviations of the noise, and at most.
+WIDTH_OF_ONE, WIDEST_OF_ONE = 20.0, 0.018
 # Largest standard deviation of a point, in units of the attractor's size.
 LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
@@ -205,7 +205,8 @@ def _wide_enough(maps: ReturnMap, neighbours: int) -> int:
         return neighbours
     centres = maps.arguments[:: max(1, len(maps.arguments) // 500)]
     width = np.median(maps.nearest(centres, np.zeros(len(centres)), most)[0][:, -1]) / KERNEL_REACH
-    return int(np.clip(most * WIDTH_OF_ONE * maps.noise.max() / width, neighbours, most))
+    wanted = min(WIDTH_OF_ONE * float(maps.noise.max()), WIDEST_OF_ONE)
+    return int(np.clip(most * wanted / width, neighbours, most))
 
 
 def _search_count(maps: ReturnMap, neighbours: int) -> int:

@@ -265,7 +265,7 @@ class PoincareSection(Result):
     ) -> "PoincareSection":
         """Evaluate recordings where a channel crosses a level, as for autonomous systems.
 
-        Between two crossings the smoothed channel goes below the level and above it by more than a tenth of its standard
+        Between two crossings the smoothed channel goes below the level and above it by a tenth of its standard
         deviation and five standard errors, so that noise adds none.
 
         Parameters

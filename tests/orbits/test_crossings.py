@@ -255,7 +255,7 @@ def test_arguments_that_are_refused():
     with pytest.raises(ValueError, match="channel: must be .*got 'y'"):
         crossing("y", channel="y")
     with pytest.raises(
-        ValueError, match=r"at least 1.17 s \(8 samples\) apart, .* got 0.5 s for \['x', 'x\[-0.5 s\]'\]"
+        ValueError, match=r"1.17 s \(8 samples\) apart or more, .* got 0.5 s for \['x', 'x\[-0.5 s\]'\]"
     ):
         crossing("x[-0.5 s]")
     with pytest.raises(ValueError, match="before the first one of the next crossing, 4"):
