@@ -57,6 +57,9 @@ def find_orbits(
 ) -> Orbits:
     """Find the unstable periodic orbits in a section of a chaotic motion, without a model.
 
+    Orbits of a section by crossings have their own period, `Orbit.duration`, with an error: the times between crossings
+    are fitted like the return map.
+
     "chained": points that nearly recur after p returns are near an orbit of period p. Local quadratic polynomials
     approximate the return map at the p points, and Newton's method moves all points together until the maps close the
     chain. The orbits found are fitted once more, with cubic polynomials in neighbourhoods as wide as the curvature of
@@ -74,11 +77,12 @@ def find_orbits(
         Prime periods in returns.
     method : {"chained", "boxes"}
     neighbours : int
-        Smallest effective number of neighbours of a local fit, at least 16.
+        Smallest effective number of neighbours of a local fit, at least 16; more are used with one coordinate.
     box : float
         Size of a box for "boxes", as a fraction of the attractor's size.
     steps : int
-        Local maps a return for "chained", from one phase of the forcing to the next, if the section is of a recording.
+        Local maps a return for "chained", from one phase of the forcing to the next, if the section is of a recording
+        and not by crossings.
         A map over a part of the period stretches less and is closer to a polynomial: more orbits are found where one
         return stretches much, but each map needs the noise of its points to be small against its bandwidth.
     waveforms : bool

@@ -469,9 +469,9 @@ def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
 
 
 LONGEST_PERIOD = 32
-# Points that coincide, as a fraction of this quantile of the distances between two random points; unpredictable images,
-# as a fraction of their median.
-SAME_POINT, FAR, UNPREDICTED = 0.05, 0.9, 0.08
+# As fractions of the median distance between two random points: points that coincide, unpredictable images. Points also
+# coincide within this many standard deviations of the noise.
+SAME_POINT, UNPREDICTED, SAME_NOISE = 0.05, 0.08, 2.0
 # Noise of this part of the error of predictions explains it.
 EXPLAINED = 0.75
 # Neighbours of a prediction, as a multiple of the number of terms.
@@ -501,13 +501,14 @@ def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, floa
             "without gaps."
         )
     one, other = generator.integers(len(section), size=(2, 4 * DIVERGING_PROBES))
-    # Not the median: that of a motion of period 2 is within one of its two points, or not, by chance.
-    far = np.quantile(maps.distance(section[one], section[other]), FAR)
+    apart = maps.distance(section[one], section[other])
+    # Half of the distances of a motion of period 2 are zero, so that their median may be.
+    same = max(SAME_POINT * max(np.median(apart), np.mean(apart)), SAME_NOISE * float(maps.noise.max()))
     for period in range(1, min(LONGEST_PERIOD, len(section) // 10) + 1):
         back = maps.followed(period)
         if back.size < FEWEST_FOLLOWED:
             break
-        if np.median(maps.distance(section[back + period], section[back])) < SAME_POINT * far:
+        if np.median(maps.distance(section[back + period], section[back])) < same:
             raise ValueError(
                 f"section: must be of a chaotic motion, got one of period {period}. Use recording.fold with "
                 f"periods={period} instead."

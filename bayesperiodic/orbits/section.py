@@ -241,7 +241,7 @@ class PoincareSection(Result):
         synthetic = any(recording.synthetic for recording in given)
         section = cls._of(
             samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency,
-            longest * _usual(instants),
+            longest * float(np.median(np.diff(instants))),
         )  # fmt: skip
         extent = np.array([np.ptp(signal) for signal in samples.signals.T])[columns_of(names)]
         if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * extent):
@@ -468,9 +468,9 @@ class PoincareSection(Result):
         if self.crossed is None or self.measured is None:
             return True
         samples, instants, stretch = self.measured
-        returns = np.diff(instants)[np.diff(stretch) == 0]
+        returns, rate = np.diff(instants)[np.diff(stretch) == 0], samples.sampling_rate
         try:
-            longest_window_of_crossings((*self.coordinates, coordinate), self.crossed, samples.sampling_rate, returns)
+            longest_window_of_crossings((*self.coordinates, coordinate), self.crossed, rate, returns)
         except ValueError:
             return False
         return True
@@ -528,8 +528,8 @@ class PoincareSection(Result):
         instants = returns[:, None] + after[:, None] * np.arange(steps) / steps
         present = followed[:, None] | (np.arange(steps) == 0)
         each = np.broadcast_to(stretch[:, None], present.shape)[present]
-        names, rate = self.coordinates, samples.sampling_rate
-        longest = longest_window(names, rate / self.frequency, steps) * _usual(returns) / steps
+        names = self.coordinates
+        longest = longest_window(names, samples.sampling_rate / self.frequency, steps) * float(np.median(after)) / steps
         values, noise = coordinate_values(samples, names, instants[present], each, self.unit, longest)
         if noise is None:
             raise ValueError(f"steps: must be 1 for stretches too short to determine the noise, got {steps}.")
@@ -583,10 +583,6 @@ class PoincareSection(Result):
         lost = f"; {self.left_out} points in gaps left out" if self.left_out else ""
         names = ", ".join(self.coordinates)
         return f"PoincareSection({len(self.points)} points of {names} at {self.frequency:.6g} Hz from {source}{lost})"
-
-
-def _usual(instants: np.ndarray) -> float:
-    return float(np.median(np.diff(instants)))
 
 
 def _within(increments: np.ndarray, stretch: np.ndarray) -> np.ndarray:

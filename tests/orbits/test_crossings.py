@@ -210,7 +210,7 @@ def test_periodic_recordings_are_refused(noise):
             bp.PoincareSection.from_crossings(bp.Recording(time, {"x": values}, {}), names, channel="x")
 
 
-@pytest.mark.parametrize("noise", [1e-6, 0.005])
+@pytest.mark.parametrize("noise", [1e-6, 0.005, 0.05])
 def test_a_motion_of_period_two_is_refused(noise):
     time = np.arange(60_000) * 0.05
     values = np.sin(time) + 0.3 * np.sin(0.5 * time + 1) + noise * np.random.default_rng(0).standard_normal(time.size)
