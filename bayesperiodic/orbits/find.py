@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
-from bayesperiodic.orbits.coordinates import channels_of, wrapped
+from bayesperiodic.orbits.coordinates import channels_of, longest_window_of_crossings, wrapped
 from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.return_map import (
@@ -180,7 +180,7 @@ def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
     # For crossings, fractions of the mean return.
     delays = [f"{d / section.frequency:.2g} s" if section.crossed else str(d) for d in DELAYS_TRIED]
     for name in (f"{channel}[{d}]" for channel in channels if channel not in section.angles for d in delays):
-        values = None if name in section.coordinates or not section.may_add(name) else section.delayed(name)
+        values = None if name in section.coordinates or not _separate(section, name) else section.delayed(name)
         if values is None:
             continue
         column = values[:, None] / np.ptp(values[np.isfinite(values)])
@@ -193,6 +193,19 @@ def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
         return "another output"
     best = min(errors, key=errors.__getitem__)
     return f"another output or a delayed one, with {best!r} errors are {errors[best]:.1%}"
+
+
+def _separate(section: PoincareSection, coordinate: str) -> bool:
+    """Return whether a delayed coordinate shares no samples with those of crossings."""
+    if section.crossed is None or section.measured is None:
+        return True
+    samples, instants, stretch = section.measured
+    returns, rate = np.diff(instants)[np.diff(stretch) == 0], samples.sampling_rate
+    try:
+        longest_window_of_crossings((*section.coordinates, coordinate), section.crossed, rate, returns)
+    except ValueError:
+        return False
+    return True
 
 
 def _with_steps(section: PoincareSection, maps: ReturnMap, size: np.ndarray, steps: int) -> ReturnMap:

@@ -473,7 +473,7 @@ LONGEST_PERIOD = 32
 # coincide within this many standard deviations of the noise.
 SAME_POINT, UNPREDICTED, SAME_NOISE = 0.05, 0.08, 2.0
 # Noise of this part of the error of predictions explains it.
-EXPLAINED = 0.75
+NOISE_EXPLAINS = 0.75
 # Neighbours of a prediction, as a multiple of the number of terms.
 PREDICTING = 1.5
 # Median of the absolute value of a standard normal number.
@@ -520,7 +520,7 @@ def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, floa
     if error > UNPREDICTED:
         advice = f"If the system has more states than coordinates, add one: {remedy()}. Otherwise check for a wrong "
         advice += "frequency or level, and for noise as large as the motion."
-        if from_noise > EXPLAINED * error:
+        if from_noise > NOISE_EXPLAINS * error:
             advice = "The noise is too large: sample faster, record with less noise, or choose coordinates with less."
         raise ValueError(
             f"section: must show a return map, got images that local maps of {d} coordinate{'s' * (d > 1)} "

@@ -36,7 +36,7 @@ from bayesperiodic.orbits.stretches import (
 
 FEWEST_POINTS, CYCLE_SAMPLES = 200, 64
 # Points coincide if their standard deviations are below this many of the noise, or this fraction of the motion's range.
-SCATTER, SAME = 2.0, 2e-3
+SCATTER, SMALLEST_SCATTER = 2.0, 2e-3
 
 
 @dataclass(frozen=True)
@@ -345,7 +345,7 @@ class PoincareSection(Result):
         section = section if section.noise is None else section._with_errors_of(crossings, error)
         extent = np.array([np.ptp(signal) for signal in samples.signals.T])[columns_of(names)]
         least = 0.0 if section.noise is None else SCATTER * section.noise
-        if np.all(section.points.std(axis=0) < np.maximum(least, SAME * extent)):
+        if np.all(section.points.std(axis=0) < np.maximum(least, SMALLEST_SCATTER * extent)):
             raise ValueError(
                 "recordings: must be chaotic, got points that coincide within their noise. The motion has period 1, or "
                 "the coordinates vary too little at the crossings: use recording.fold, or other coordinates."
@@ -462,18 +462,6 @@ class PoincareSection(Result):
         first, last = samples.time[samples.starts[stretch]], samples.time[samples.stops[stretch] - 1]
         values = local_fit(samples._replace(signals=samples.signals[:, column]), np.clip(at, first, last), stretch)[0]
         return np.where((first <= at) & (at <= last), values[:, 0], np.nan)
-
-    def may_add(self, coordinate: str) -> bool:
-        """Return whether a delayed coordinate shares no noise with those of crossings; True with a forcing."""
-        if self.crossed is None or self.measured is None:
-            return True
-        samples, instants, stretch = self.measured
-        returns, rate = np.diff(instants)[np.diff(stretch) == 0], samples.sampling_rate
-        try:
-            longest_window_of_crossings((*self.coordinates, coordinate), self.crossed, rate, returns)
-        except ValueError:
-            return False
-        return True
 
     @property
     def unit(self) -> float:

@@ -8,6 +8,8 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 import bayesperiodic as bp
+from bayesperiodic.orbits.return_times import ReturnTimes
+from bayesperiodic.orbits.waveform import _moved
 from tests.orbits import roessler
 
 STEP = roessler.RETURN / 40
@@ -37,7 +39,8 @@ def x_after(point, delay):
 
 
 def sines(time):
-    return np.sin(2 * np.pi * time), np.cos(0.7 * time), np.sin(0.7 * time)
+    """Return a sine of 0.8 Hz and two slower ones."""
+    return np.sin(1.6 * np.pi * time), np.cos(0.7 * time), np.sin(0.7 * time)
 
 
 def test_the_shot_orbits_are_those_of_the_literature():
@@ -55,11 +58,10 @@ def test_delays_are_in_seconds():
     names = ("u", "v[0.31 s]", "x[-0.2s]", "u[-0.33 s]")
     section = bp.PoincareSection.from_crossings(recording, names, channel="x", level=0.5)
     at = section.instants
-    np.testing.assert_allclose(at, 1 / 12 + np.round(at - 1 / 12), atol=1e-6)
+    # The first crossing, at 1/9.6 s, is earlier than the longest delay.
+    np.testing.assert_allclose(at, 1 / 9.6 + 1.25 * np.arange(1, len(at) + 1), atol=1e-6)
     expected = [sines(at)[1], sines(at + 0.31)[2], sines(at - 0.2)[0], sines(at - 0.33)[1]]
     np.testing.assert_allclose(section.points, np.stack(expected, axis=1), atol=1e-5)
-    # The first crossing is earlier than the longest delay.
-    assert at[0] == pytest.approx(1 + 1 / 12)
     np.testing.assert_allclose(section.delayed("v[-0.4 s]"), sines(at - 0.4)[2], atol=2e-5)
 
 
@@ -79,7 +81,7 @@ def test_the_stated_noise_contains_the_errors_of_the_instants():
     samples = 40 * 6000
     noisy, clean = (
         bp.PoincareSection.from_crossings(
-            roessler.recording(samples, STEP, noise), ("y", "x[-1.2 s]"), channel="x", level=0.0
+            roessler.recording(samples, STEP, noise), ("y", "y[-1.2 s]"), channel="x", level=0.0
         )
         for noise in (0.002, 0.0)
     )
@@ -104,6 +106,15 @@ def test_no_return_crosses_a_gap_and_recordings_are_joined():
     nearest = np.abs(section.instants[:, None] - every.instants).argmin(axis=1)
     inner = np.abs(section.instants - 3050.0) > 52.0
     np.testing.assert_allclose(section.points[inner], every.points[nearest][inner], atol=0.1)
+
+
+def test_a_crossing_in_a_gap_is_none():
+    time = np.arange(20_000) / 50.3
+    time = time[(time < 99.9) | (time > 100.3)]
+    recording = bp.Recording(time, dict(zip("xuv", sines(time), strict=True)), {})
+    section = bp.PoincareSection.from_crossings(recording, ("u", "v"), channel="x", level=0.0)
+    assert np.abs(section.instants - 100.0).min() == pytest.approx(1.25, abs=1e-4)
+    assert np.isnan(section.increments[:, 0]).sum() == 1
 
 
 def test_exact_recordings_give_the_orbits_of_shooting():
@@ -171,6 +182,24 @@ def test_waveforms_are_equally_spaced_in_time_over_the_own_period():
             assert np.abs(away).max() < 0.01 * np.ptp(values)
 
 
+def test_errors_of_the_return_times_move_the_waveform():
+    """Two parts of a motion with times that are wrong by a small amount: the difference of the resampled motion."""
+    true, wrong, samples = np.array([1.0, 1.4]), np.array([1.0 + 2e-5, 1.4 - 3e-5]), 400
+
+    def sampled(times):
+        at = times.sum() * np.arange(samples) / samples
+        second = at >= times[0]
+        phases = [at[~second] / times[0], (at[second] - times[0]) / times[1]]
+        motion = np.sin(2 * np.pi / 2.4 * np.concatenate([phases[0] * true[0], true[0] + phases[1] * true[1]]))
+        return motion[:, None], phases
+
+    motion, phases = sampled(true)
+    order = np.array([1, 0])
+    moved = _moved(motion, ReturnTimes(true[order], (wrong - true)[None, order], 0.0), order, phases)
+    expected = sampled(wrong)[0] - motion
+    np.testing.assert_allclose(moved[0, 2:-2], expected[2:-2], atol=1e-2 * np.abs(expected).max())
+
+
 def test_parameters_follow_from_the_orbits_of_an_autonomous_model():
     """Three parameters within 5 standard errors and 0.1 %, from waveforms and measured frequencies."""
     model = bp.Model(
@@ -219,6 +248,14 @@ def test_a_motion_of_period_two_is_refused(noise):
     )
     with pytest.raises(ValueError, match="got one of period 2"):
         bp.find_orbits(section, periods=[1])
+
+
+def test_points_of_a_motion_of_period_two_are_refused():
+    points = np.array([[0.0, 1.0], [1.0, -1.0]])[np.arange(4000) % 2]
+    for noise in (0.0, 0.001):
+        noisy = points + noise * np.random.default_rng(0).standard_normal(points.shape)
+        with pytest.raises(ValueError, match="got one of period 2"):
+            bp.find_orbits(bp.PoincareSection.from_points(noisy, ("x", "y"), frequency=1.0), periods=[1])
 
 
 @pytest.mark.parametrize("seed", range(3))
