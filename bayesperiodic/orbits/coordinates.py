@@ -65,18 +65,16 @@ def longest_window_of_crossings(names: Sequence[str], channel: str, rate: float,
     """
     every = (channel, *names)
     columns, delays = columns_of(every), delays_of(every)
-    until_next, least = float(np.quantile(returns, SHORT_RETURN)), 2 * SMALLEST_WINDOW / rate * (1.0 - 1e-9)
-    for column in np.unique(columns):
-        places = np.sort(delays[columns == column])
-        apart, span = np.diff(places).min(initial=np.inf), places[-1] - places[0]
-        if min(apart, until_next - span) < least:
-            raise ValueError(
-                f"coordinates: must have values of a channel at least {least:.3g} s ({2 * SMALLEST_WINDOW} samples) "
-                f"apart, and no longer before the next crossing, {until_next:.3g} s later, got {list(every)}. "
-                "Otherwise they share their noise: choose other delays."
-            )
-        until_next = min(apart, until_next - span)
-    return until_next
+    until_next, least = float(np.quantile(returns, SHORT_RETURN)), 2 * SMALLEST_WINDOW / rate
+    places = [np.sort(delays[columns == column]) for column in np.unique(columns)]
+    shortest = min(float(np.diff(one, append=one[0] + until_next).min()) for one in places)
+    if shortest < least * (1.0 - 1e-9):
+        raise ValueError(
+            f"coordinates: must have values of a channel {least:.3g} s ({2 * SMALLEST_WINDOW} samples) apart or more, "
+            f"and so long before the first one of the next crossing, {until_next:.3g} s later, got {shortest:.2g} s "
+            f"for {list(every)}. Otherwise they share their noise: choose other delays."
+        )
+    return shortest
 
 
 def coordinate_values(
@@ -155,6 +153,45 @@ def coordinate_signals(
             if other != k:
                 _check_rate(name, channels[other], recording.time, signals[:, k], signals[:, other])
     return names, angle_names, signals
+
+
+def given_recordings(recordings: Iterable[Recording]) -> list[Recording]:
+    """Return recordings as a list; raise a ValueError unless they are some."""
+    if isinstance(recordings, Recording) or not isinstance(recordings, Iterable):
+        raise ValueError(
+            f"recordings: must be a list of recordings, got {type(recordings).__name__}; from_recording takes one."
+        )
+    given = list(recordings)
+    if not given:
+        raise ValueError("recordings: must be one or more, got none.")
+    for k, recording in enumerate(given):
+        _checks.instance(f"recordings[{k}]", recording, Recording)
+    return given
+
+
+def other_channels(
+    recordings: Sequence[Recording], coordinates: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the channels of all recordings that are none of the coordinates, inputs last, and the inputs."""
+    outputs, inputs = (
+        tuple(c for c in getattr(recordings[0], kind) if all(c in getattr(one, kind) for one in recordings))
+        for kind in ("outputs", "inputs")
+    )
+    return tuple(c for c in (*outputs, *inputs) if c not in channels_of(coordinates)), inputs
+
+
+def with_others(recording: Recording, signals: np.ndarray, others: Sequence[str]) -> np.ndarray:
+    """Return signals (samples, channels) with those of other channels in further columns."""
+    every = {**recording.outputs, **recording.inputs}
+    return np.column_stack([signals, *(every[name] for name in others)])
+
+
+def unwrapped(samples: Stretches, turning: np.ndarray) -> Stretches:
+    """Return signals whose angles are continuous where recordings are joined."""
+    signals = samples.signals.copy()
+    for channel in np.flatnonzero(turning):
+        signals[:, channel] = np.unwrap(signals[:, channel])
+    return samples._replace(signals=signals)
 
 
 def _check_angle(name: str, values: np.ndarray) -> None:

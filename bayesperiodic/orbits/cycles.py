@@ -150,11 +150,8 @@ def _converge(
     maps: ReturnMap, images: Images, chains: np.ndarray, steps: int, longest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Move chains (m, period, 2); return their last steps and the chains into which they were merged."""
-    noise, heir, converged = (
-        float(maps.noise.max()),
-        np.arange(len(chains)),
-        for_coordinates(CONVERGED_CORRECTION, len(maps.turn)),
-    )
+    noise, heir = float(maps.noise.max()), np.arange(len(chains))
+    converged = for_coordinates(CONVERGED_CORRECTION, len(maps.turn))
     step, active = np.full(len(chains), np.inf), heir
     for _ in range(steps):
         if active.size == 0:

@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
-from bayesperiodic.orbits.coordinates import channels_of, wrapped
+from bayesperiodic.orbits.coordinates import channels_of, longest_window_of_crossings, wrapped
 from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.phases import merged, phases_of, with_late_partners
@@ -31,8 +31,8 @@ SEARCHES = ("chained", "boxes")
 QUALITY_DEGREE, FEWEST_NEIGHBOURS = 3, 32
 # Bandwidth of the local fits of the search, in standard deviations of the noise.
 SEARCH_WIDTH = 4.0
-# Bandwidth with one coordinate, in standard deviations of the noise.
-WIDTH_OF_ONE = 20.0
+# Bandwidth with one coordinate: in standard deviations of the noise, and at most.
+WIDTH_OF_ONE, WIDEST_OF_ONE = 20.0, 0.018
 # Largest standard deviation of a point, in units of the attractor's size.
 LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
@@ -58,6 +58,9 @@ def find_orbits(
 ) -> Orbits:
     """Find the unstable periodic orbits in a section of a chaotic motion, without a model.
 
+    Orbits of a section by crossings have their own period, `Orbit.duration`, with an error: the times between crossings
+    are fitted like the return map.
+
     "chained": points that nearly recur after p returns are near an orbit of period p. Local quadratic polynomials
     approximate the return map at the p points, and Newton's method moves all points together until the maps close the
     chain. The orbits found are fitted once more, with cubic polynomials in neighbourhoods as wide as the curvature of
@@ -78,11 +81,12 @@ def find_orbits(
         Prime periods in returns.
     method : {"chained", "boxes"}
     neighbours : int
-        Smallest effective number of neighbours of a local fit, at least 16.
+        Smallest effective number of neighbours of a local fit, at least 16; more are used with one coordinate.
     box : float
         Size of a box for "boxes", as a fraction of the attractor's size.
     steps : int
-        Local maps a return for "chained", from one phase of the forcing to the next, if the section is of a recording.
+        Local maps a return for "chained", from one phase of the forcing to the next, if the section is of a recording
+        and not by crossings.
         A map over a part of the period stretches less and is closer to a polynomial: more orbits are found where one
         return stretches much, but each map needs the noise of its points to be small against its bandwidth.
     waveforms : bool
@@ -196,10 +200,11 @@ def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.nd
 def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
     """Return which delayed coordinate would let local maps predict best, in the units of the maps."""
     errors, size = {}, np.ptp(section.points, axis=0)
-    channels = dict.fromkeys([*channels_of(section.coordinates), *([section.crossed] if section.crossed else [])])
-    delays = [f"{d / section.frequency:.2g} s" for d in DELAYS_TRIED] if section.crossed else DELAYS_TRIED
+    channels = dict.fromkeys([*channels_of(section.coordinates), *filter(None, [section.crossed])])
+    # For crossings, fractions of the mean return.
+    delays = [f"{d / section.frequency:.2g} s" if section.crossed else str(d) for d in DELAYS_TRIED]
     for name in (f"{channel}[{d}]" for channel in channels if channel not in section.angles for d in delays):
-        values = None if name in section.coordinates else section.delayed(name)
+        values = None if name in section.coordinates or not _separate(section, name) else section.delayed(name)
         if values is None:
             continue
         column = values[:, None] / np.ptp(values[np.isfinite(values)])
@@ -212,6 +217,19 @@ def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
         return "another output"
     best = min(errors, key=errors.__getitem__)
     return f"another output or a delayed one, with {best!r} errors are {errors[best]:.1%}"
+
+
+def _separate(section: PoincareSection, coordinate: str) -> bool:
+    """Return whether a delayed coordinate shares no samples with those of crossings."""
+    if section.crossed is None or section.measured is None:
+        return True
+    samples, instants, stretch = section.measured
+    returns, rate = np.diff(instants)[np.diff(stretch) == 0], samples.sampling_rate
+    try:
+        longest_window_of_crossings((*section.coordinates, coordinate), section.crossed, rate, returns)
+    except ValueError:
+        return False
+    return True
 
 
 def _with_steps(section: PoincareSection, maps: ReturnMap, size: np.ndarray, steps: int) -> ReturnMap:
@@ -228,7 +246,8 @@ def _wide_enough(maps: ReturnMap, neighbours: int) -> int:
         return neighbours
     centres = maps.arguments[:: max(1, len(maps.arguments) // 500)]
     width = np.median(maps.nearest(centres, np.zeros(len(centres)), most)[0][:, -1]) / KERNEL_REACH
-    return int(np.clip(most * WIDTH_OF_ONE * maps.noise.max() / width, neighbours, most))
+    wanted = min(WIDTH_OF_ONE * float(maps.noise.max()), WIDEST_OF_ONE)
+    return int(np.clip(most * wanted / width, neighbours, most))
 
 
 def _search_count(maps: ReturnMap, neighbours: int) -> int:

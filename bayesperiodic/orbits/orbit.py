@@ -27,8 +27,8 @@ TURN = 2.0 * np.pi
 # Harmonics of the forcing that are compared of a waveform with independent values at 16 phases.
 COMPARED_HARMONICS = INDEPENDENT // 2 - 1
 _COLUMNS = (
-    "name", "period", "duration", "duration_sd", "winding", "returns", "quality", "multiplier", "multiplier_sd", "contraction", "contraction_sd",
-    "estimated", "modulus", "partner", "equilibrium", "remark", "rejected",
+    "name", "period", "duration", "duration_sd", "winding", "returns", "quality", "multiplier", "multiplier_sd",
+    "contraction", "contraction_sd", "estimated", "modulus", "partner", "equilibrium", "remark", "rejected",
 )  # fmt: skip
 
 
@@ -171,11 +171,13 @@ class Orbit(Result):
     ) -> Experiment:
         """Return the orbit as an experiment: its section points at tau = 0, 1, …, as in de Kraker et al. (1997).
 
-        For a section by crossings give ``whole=True``: the experiment, for an autonomous model, is the waveform over the
-        orbit's own period, of which the frequency 1/`duration` with its standard error is data.
         Their covariance is known up to one factor, the noise parameter "scale", common to all orbits of a problem. The
         inputs are those of the waveform, taken as exact. Delayed coordinates are left out, because all outputs of an
         experiment are compared at the same tau.
+
+        For a section by crossings give ``whole=True``: the experiment, of an autonomous model, is the waveform over the
+        orbit's own period. The frequency 1/`duration` with its standard error is data too; its covariance with the
+        waveform is neglected.
 
         Parameters
         ----------
@@ -219,8 +221,8 @@ class Orbit(Result):
         _checks.integer("samples", samples, 4)
         if self.return_times is not None and not (whole and self.waveform is not None):
             raise ValueError(
-                f"whole: must be True for {self.name!r} of a section by crossings, of which the points are not at equal "
-                "distances in time, with the waveform of find_orbits(..., waveforms=True)."
+                f"whole: must be True for {self.name!r}, whose points are crossings at unequal times, got {whole}, and "
+                "the orbit must have the waveform of find_orbits(..., waveforms=True)."
             )
         winding = counted_turns(self) if self.solution is None else sum(self.solution.winding.values())
         if winding is None:
@@ -487,7 +489,7 @@ def _row(orbit: Orbit, names: list[str], reason: str) -> tuple[Any, ...]:
     partner = "" if orbit.partner is None or orbit.partner >= len(names) else names[orbit.partner]
     multiplier_sd, contraction_sd = np.append(orbit.eigenvalue_sd, np.nan)[:2]
     return (
-        orbit.name, orbit.period, orbit.duration, orbit.duration_sd, orbit.winding, orbit.returns, orbit.quality, multiplier, multiplier_sd, contraction,
-        contraction_sd, bool(np.isfinite(multiplier_sd)), float(abs(orbit.eigenvalues[0])), partner,
-        orbit.equilibrium, orbit.remark, reason, *sds,
+        orbit.name, orbit.period, orbit.duration, orbit.duration_sd, orbit.winding, orbit.returns, orbit.quality,
+        multiplier, multiplier_sd, contraction, contraction_sd, bool(np.isfinite(multiplier_sd)),
+        float(abs(orbit.eigenvalues[0])), partner, orbit.equilibrium, orbit.remark, reason, *sds,
     )  # fmt: skip

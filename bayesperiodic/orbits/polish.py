@@ -145,6 +145,8 @@ class _Polisher:
             _checks.positive(f"parameter_sd[{name!r}]", sd)
         PeriodicEquations.build(model, inputs, frequency=1.0, samples=samples, scheme=scheme)
         for orbit in orbits:
+            if orbit.return_times is not None:
+                raise ValueError(f"orbits: must be of a section with a forcing, got {orbit.name!r} between crossings.")
             if any(channel_and_delay(name)[0] != name for name in orbit.coordinates):
                 raise ValueError(
                     f"orbits: must be of a section without delayed coordinates, got {orbit.coordinates}. Use the "

@@ -469,8 +469,11 @@ def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
 
 
 LONGEST_PERIOD = 32
-# As fractions of the median distance between two random points: points that coincide, unpredictable images.
-SAME_POINT, UNPREDICTED = 0.05, 0.08
+# As fractions of the median distance between two random points: points that coincide, unpredictable images. Points also
+# coincide within this many standard deviations of the noise.
+SAME_POINT, UNPREDICTED, SAME_NOISE = 0.05, 0.08, 2.0
+# Noise of this part of the error of predictions explains it.
+NOISE_EXPLAINS = 0.75
 # Neighbours of a prediction, as a multiple of the number of terms.
 PREDICTING = 1.5
 # Median of the absolute value of a standard normal number.
@@ -489,7 +492,7 @@ def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, floa
     Returns the error of predictions by local maps and the part of noise in it, as fractions of the distance of random
     points. `remedy` returns which coordinate to add where the points do not determine the next ones.
     """
-    section, generator = maps.points, np.random.default_rng(0)
+    section, d, generator = maps.points, maps.points.shape[1], np.random.default_rng(0)
     starts = maps.followed(DIVERGING_STEPS + 1)
     if starts.size < FEWEST_FOLLOWED:
         raise ValueError(
@@ -498,12 +501,14 @@ def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, floa
             "without gaps."
         )
     one, other = generator.integers(len(section), size=(2, 4 * DIVERGING_PROBES))
-    random = np.median(maps.distance(section[one], section[other]))
+    apart = maps.distance(section[one], section[other])
+    # Half of the distances of a motion of period 2 are zero, so that their median may be.
+    same = max(SAME_POINT * max(np.median(apart), np.mean(apart)), SAME_NOISE * float(maps.noise.max()))
     for period in range(1, min(LONGEST_PERIOD, len(section) // 10) + 1):
         back = maps.followed(period)
         if back.size < FEWEST_FOLLOWED:
             break
-        if np.median(maps.distance(section[back + period], section[back])) < SAME_POINT * random:
+        if np.median(maps.distance(section[back + period], section[back])) < same:
             raise ValueError(
                 f"section: must be of a chaotic motion, got one of period {period}. Use recording.fold with "
                 f"periods={period} instead."
@@ -513,11 +518,14 @@ def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, floa
     now = np.median(maps.distance(section[centre], section[neighbour]))
     error, from_noise = prediction_error(maps)
     if error > UNPREDICTED:
+        advice = f"If the system has more states than coordinates, add one: {remedy()}. Otherwise check for a wrong "
+        advice += "frequency or level, and for noise as large as the motion."
+        if from_noise > NOISE_EXPLAINS * error:
+            advice = "The noise is too large: sample faster, record with less noise, or choose coordinates with less."
         raise ValueError(
-            f"section: must show a return map, got images that local maps of the {section.shape[1]} coordinates "
+            f"section: must show a return map, got images that local maps of {d} coordinate{'s' * (d > 1)} "
             f"predict with errors of {error:.0%} of the distance of random points, {from_noise:.1%} from known noise. "
-            f"If the system has more states than coordinates, add one: {remedy()}. Otherwise check for a wrong "
-            "frequency, and for noise as large as the motion."
+            f"{advice}"
         )
     later = np.median(maps.distance(section[centre + DIVERGING_STEPS], section[neighbour + DIVERGING_STEPS]))
     if later < DIVERGED * now:

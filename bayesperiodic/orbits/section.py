@@ -18,8 +18,12 @@ from bayesperiodic.orbits.coordinates import (
     coordinate_signals,
     coordinate_values,
     delays_of,
+    given_recordings,
     longest_window,
     longest_window_of_crossings,
+    other_channels,
+    unwrapped,
+    with_others,
     wrapped,
 )
 from bayesperiodic.orbits.crossings import Crossings, refined, upward_crossings
@@ -31,6 +35,8 @@ from bayesperiodic.orbits.stretches import (
 )
 
 FEWEST_POINTS, CYCLE_SAMPLES = 200, 64
+# Points coincide if their standard deviations are below this many of the noise, or this fraction of the motion's range.
+SCATTER, SMALLEST_SCATTER = 2.0, 2e-3
 
 
 @dataclass(frozen=True)
@@ -217,12 +223,12 @@ class PoincareSection(Result):
         """
         frequency = _checks.positive("frequency", frequency)
         origin = _checks.finite_number("origin", origin)
-        given = _recordings(recordings)
+        given = given_recordings(recordings)
         parts = [coordinate_signals(recording, coordinates, angles) for recording in given]
         names, angle_names = parts[0][:2]
-        others, inputs = _other_channels(given, names)
-        signals = [_with_others(one, values, others) for one, (*_, values) in zip(given, parts, strict=True)]
-        samples = _unwrapped(joined(given, signals, frequency), np.isin((*channels_of(names), *others), angle_names))
+        others, inputs = other_channels(given, names)
+        signals = [with_others(one, values, others) for one, (*_, values) in zip(given, parts, strict=True)]
+        samples = unwrapped(joined(given, signals, frequency), np.isin((*channels_of(names), *others), angle_names))
         if samples.sampling_rate < FEWEST_SAMPLES * frequency:
             rate = f"{samples.sampling_rate / frequency:.3g}"
             raise ValueError(
@@ -235,7 +241,7 @@ class PoincareSection(Result):
         synthetic = any(recording.synthetic for recording in given)
         section = cls._of(
             samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency,
-            longest * _usual(instants),
+            longest * float(np.median(np.diff(instants))),
         )  # fmt: skip
         extent = np.array([np.ptp(signal) for signal in samples.signals.T])[columns_of(names)]
         if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * extent):
@@ -259,24 +265,21 @@ class PoincareSection(Result):
     ) -> "PoincareSection":
         """Evaluate recordings where a channel crosses a level, as for autonomous systems.
 
-        The crossings are those of the smoothed channel, which must go below the level and above it by more than a band,
-        a tenth of the channel's standard deviation and at least five of the smoothed channel's errors: noise and small
-        ripple add none.
+        Between two crossings the smoothed channel goes below the level and above it by a tenth of its standard
+        deviation and five standard errors, so that noise adds none.
 
         Parameters
         ----------
         recordings : Recording or sequence of them
-            At least 8 samples between two crossings; pieces, gaps and joined recordings as for `from_recordings`.
+            At least 8 samples a return; gaps and several recordings as for `from_recordings`.
         coordinates : sequence of str
-            Two or more outputs that determine the next crossing, one fewer than the system has states, or more. What is
-            not measured is replaced by delayed coordinates, the delay in seconds with the unit:
-            ``("current[-0.1 s]", "current[-0.2 s]")`` are the values of the only channel 0.1 s and 0.2 s before it
-            crosses the level. They lie within the shortest time between two crossings.
+            Outputs that determine the next crossing: one fewer than the system has states; or one, if the points are
+            nearly on a curve, as for strong contraction. What is not measured is replaced by delays in seconds:
+            ``"current[-0.1 s]"`` is the current 0.1 s before the crossing. They are within the shortest return.
         channel : str
-            Output whose crossings define the section; among the coordinates only with delays.
+            Output whose crossings define the section; a coordinate only with delays.
         level : float, optional
-            By default the median of the channel, which every motion crosses. It should be where the channel is steep,
-            and be crossed once an oscillation; all orbits must cross it.
+            By default the channel's median. It should be crossed steeply, once an oscillation.
         direction : {1, -1}
             Upwards or downwards.
         angles
@@ -285,44 +288,52 @@ class PoincareSection(Result):
         Returns
         -------
         PoincareSection
-            `frequency` is the mean number of returns per second. The times between the crossings are data too: an orbit
-            has its own period with an error (`Orbit.duration`).
+            `frequency` is the mean number of returns per second; orbits have their own period, `Orbit.duration`.
 
         Raises
         ------
         ValueError
-            For an unknown channel, too few crossings or samples, delays of one channel that are too close or too long,
-            and as for `from_recordings`.
+            As for `from_recordings`, for an unknown channel or one of noise alone, too few crossings, delays of a
+            channel that are too close or too long, and points that coincide within their noise.
 
         Notes
         -----
-        The error of a crossing's instant moves all coordinates along the flow; the standard deviations `noise` contain
-        it.
+        Errors of the instants move the points along the flow and are part of `noises`, less for a coordinate near a
+        maximum or minimum of its channel, such as a quarter of a return after the crossing.
 
         Examples
         --------
-        One channel of the Roessler system with two delays, where the channel crosses its median upwards:
+        One channel of the Roessler system, whose attractor is thin: each maximum determines the next one.
 
-        >>> section = bp.PoincareSection.from_crossings(roessler, ("x[-0.7 s]", "x[-1.4 s]"), channel="x")
-        >>> section
+        >>> model = bp.Model("roessler", states=["x", "y", "z"], inputs=[], parameters=["a", "b", "c"],
+        ...                  equations=["dx + y + z", "dy - x - a*y", "dz - b - z*(x - c)"], outputs={"x": "x"})
+        >>> recording = bp.simulate(model, {"a": 0.2, "b": 0.2, "c": 5.7}, frequency=0.17, duration=6000,
+        ...                         sampling_rate=8, start={"x": 1})
+        >>> section = bp.PoincareSection.from_crossings(recording, ["x[1.5 s]"], channel="x", level=0)
+        >>> round(bp.find_orbits(section, periods=[1])[0].duration, 3)
+        5.881
         """
-        given = _recordings([recordings] if isinstance(recordings, Recording) else recordings)
+        given = given_recordings([recordings] if isinstance(recordings, Recording) else recordings)
         parts = [coordinate_signals(recording, coordinates, angles, forced=False) for recording in given]
         names, angle_names = parts[0][:2]
-        others, inputs = _other_channels(given, names)
+        others, inputs = other_channels(given, names)
         every = (*channels_of(names), *others)
         _checks.one_of("channel", channel, [c for c in every if c not in names and c not in inputs])
         if direction not in (1, -1):
             raise ValueError(f"direction: must be 1 (upwards) or -1 (downwards), got {direction!r}.")
-        signals = [_with_others(one, values, others) for one, (*_, values) in zip(given, parts, strict=True)]
-        samples = _unwrapped(joined(given, signals, None), np.isin(every, angle_names))
+        signals = [with_others(one, values, others) for one, (*_, values) in zip(given, parts, strict=True)]
+        samples = unwrapped(joined(given, signals, None), np.isin(every, angle_names))
         values = samples.signals[:, [every.index(channel)]]
         level = float(np.median(values)) if level is None else _checks.finite_number("level", level)
         height = samples._replace(signals=direction * (values - level))
         delays = delays_of(names)
-        crossings = upward_crossings(height, height.time.size // (2 * FEWEST_POINTS)).within(
-            samples, delays.min(), delays.max()
-        )
+        crossings = upward_crossings(height, samples.time.size // (2 * FEWEST_POINTS))
+        if not crossings.instants.size:
+            raise ValueError(
+                f"level: must be crossed by {channel!r}, got no crossing of {level:.6g} by more than noise, "
+                f"{crossings.band:.3g}. Choose another level or channel, or sample faster."
+            )
+        crossings = crossings.within(samples, delays.min(), delays.max())
         _check_count(crossings.instants.size)
         longest = longest_window_of_crossings(names, channel, samples.sampling_rate, crossings.returns)
         crossings, error = refined(height, crossings, longest)
@@ -331,7 +342,15 @@ class PoincareSection(Result):
             samples, names, angle_names, crossings.instants, crossings.stretch, 0, synthetic, others, inputs,
             1.0 / float(crossings.returns.mean()), longest, channel,
         )  # fmt: skip
-        return section if section.noise is None else section._with_errors_of(crossings, error)
+        section = section if section.noise is None else section._with_errors_of(crossings, error)
+        extent = np.array([np.ptp(signal) for signal in samples.signals.T])[columns_of(names)]
+        least = 0.0 if section.noise is None else SCATTER * section.noise
+        if np.all(section.points.std(axis=0) < np.maximum(least, SMALLEST_SCATTER * extent)):
+            raise ValueError(
+                "recordings: must be chaotic, got points that coincide within their noise. The motion has period 1, or "
+                "the coordinates vary too little at the crossings: use recording.fold, or other coordinates."
+            )
+        return section
 
     @classmethod
     def from_points(
@@ -490,18 +509,15 @@ class PoincareSection(Result):
         if measured is None:
             raise ValueError(f"steps: must be 1 for points alone, got {steps}. Make the section of a recording.")
         if self.crossed:
-            raise ValueError(
-                f"steps: must be 1 for crossings, got {steps}. Coordinates that determine the next crossing need not "
-                "determine it from between the crossings."
-            )
+            raise ValueError(f"steps: must be 1 for crossings, got {steps}; between them other coordinates are needed.")
         samples, returns, stretch = measured
         after = np.append(np.diff(returns), 0.0)
         followed = np.append(np.diff(stretch) == 0, False)
         instants = returns[:, None] + after[:, None] * np.arange(steps) / steps
         present = followed[:, None] | (np.arange(steps) == 0)
         each = np.broadcast_to(stretch[:, None], present.shape)[present]
-        names, rate = self.coordinates, samples.sampling_rate
-        longest = longest_window(names, rate / self.frequency, steps) * _usual(returns) / steps
+        names = self.coordinates
+        longest = longest_window(names, samples.sampling_rate / self.frequency, steps) * float(np.median(after)) / steps
         values, noise = coordinate_values(samples, names, instants[present], each, self.unit, longest)
         if noise is None:
             raise ValueError(f"steps: must be 1 for stretches too short to determine the noise, got {steps}.")
@@ -557,51 +573,9 @@ class PoincareSection(Result):
         return f"PoincareSection({len(self.points)} points of {names} at {self.frequency:.6g} Hz from {source}{lost})"
 
 
-def _usual(instants: np.ndarray) -> float:
-    return float(np.median(np.diff(instants)))
-
-
 def _within(increments: np.ndarray, stretch: np.ndarray) -> np.ndarray:
     """Return increments (count − 1, d) with NaN where the next point (count,) is in another stretch."""
     return np.where((np.diff(stretch) == 0)[:, None], increments, np.nan)
-
-
-def _recordings(recordings: Iterable[Recording]) -> list[Recording]:
-    if isinstance(recordings, Recording) or not isinstance(recordings, Iterable):
-        raise ValueError(
-            f"recordings: must be a list of recordings, got {type(recordings).__name__}; from_recording takes one."
-        )
-    given = list(recordings)
-    if not given:
-        raise ValueError("recordings: must be one or more, got none.")
-    for k, recording in enumerate(given):
-        _checks.instance(f"recordings[{k}]", recording, Recording)
-    return given
-
-
-def _other_channels(
-    recordings: Sequence[Recording], coordinates: Sequence[str]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the channels of all recordings that are none of the coordinates, inputs last, and the inputs."""
-    outputs, inputs = (
-        tuple(c for c in getattr(recordings[0], kind) if all(c in getattr(one, kind) for one in recordings))
-        for kind in ("outputs", "inputs")
-    )
-    return tuple(c for c in (*outputs, *inputs) if c not in channels_of(coordinates)), inputs
-
-
-def _with_others(recording: Recording, signals: np.ndarray, others: Sequence[str]) -> np.ndarray:
-    """Return signals (samples, channels) with those of other channels in further columns."""
-    every = {**recording.outputs, **recording.inputs}
-    return np.column_stack([signals, *(every[name] for name in others)])
-
-
-def _unwrapped(samples: Stretches, turning: np.ndarray) -> Stretches:
-    """Return signals whose angles are continuous where recordings are joined."""
-    signals = samples.signals.copy()
-    for channel in np.flatnonzero(turning):
-        signals[:, channel] = np.unwrap(signals[:, channel])
-    return samples._replace(signals=signals)
 
 
 def _check_count(count: int) -> None:

@@ -203,7 +203,7 @@ def section(
 ) -> Figure:
     """Draw a Poincaré section with the points of periodic orbits by period (de Kraker et al. 1997, fig. 5).
 
-    Of more than two coordinates the first two are drawn.
+    Of more than two coordinates the first two are drawn, of one each point and the next one.
 
     Parameters
     ----------
@@ -224,18 +224,24 @@ def section(
     if ax is None:
         ax = (figure or plt.figure(figsize=(7.0, 5.2), layout="constrained")).add_subplot()
     every = 1 + len(section.points) // MOST_POINTS_DRAWN
-    shown = section.points[::every]
     name = "section" if every == 1 else f"section, one point in {every}"
-    ax.plot(*shown[:, :2].T, ",", color="0.65", rasterized=True, zorder=1)
+    plane = section.points[:, :2]
+    if len(section.coordinates) == 1:
+        # NaN across breaks.
+        plane = np.column_stack([section.points[:-1], section.points[:-1] + section.increments])
+    shown = plane[::every]
+    ax.plot(*shown.T, ",", color="0.65", rasterized=True, zorder=1)
     handles = [plt.Line2D([], [], marker=".", ls="", color="0.65", label=f"{name} ({len(shown)})")]
     periods = sorted({orbit.period for orbit in orbits})
     for period, marker, colour in zip(periods, cycle(PERIOD_MARKERS), cycle(ENSEMBLES), strict=False):
         members = [orbit for orbit in orbits if orbit.period == period]
-        points = np.concatenate([orbit.points for orbit in members])
+        points = np.concatenate(
+            [np.column_stack([orbit.points, np.roll(orbit.points, -1, axis=0)])[:, :2] for orbit in members]
+        )
         size = max(6.5 - period, 3.0)
         look: dict[str, Any] = {"marker": marker, "color": colour, "ls": "", "ms": size, "mec": "black", "mew": 0.4}
         # Longer orbits have many points, and cover none of the shorter ones.
-        ax.plot(*points[:, :2].T, zorder=3 + 1 / period, **look)
+        ax.plot(*points.T, zorder=3 + 1 / period, **look)
         noun = "orbit" if len(members) == 1 else "orbits"
         handles.append(plt.Line2D([], [], label=f"period {period}: {len(members)} {noun}", **look))
     across, up = _coordinate_labels(section, units)
@@ -262,7 +268,7 @@ def orbits(
     Raises
     ------
     ValueError
-        Without orbits.
+        Without orbits, and for a section of one coordinate.
 
     Examples
     --------
@@ -273,6 +279,8 @@ def orbits(
     _checks.instance("orbits", orbits, (Orbits, list, tuple))
     if not len(orbits):
         raise ValueError("orbits: must be at least one, got none.")
+    if len(orbits[0].coordinates) == 1:
+        raise ValueError("orbits: must have two coordinates or more, got one. Draw their points with plot.section.")
     rows = -(-len(orbits) // ORBITS_ACROSS)
     columns = -(-len(orbits) // rows)
     figure = figure or plt.figure(figsize=(1.9 * columns + 0.6, 1.85 * rows + 0.7), layout="constrained")
@@ -318,10 +326,10 @@ def _cycles(orbit: Orbit) -> dict[str, Mapping[str, np.ndarray]]:
 
 def _delayed(signals: Mapping[str, np.ndarray], orbit: Orbit) -> dict[str, np.ndarray]:
     """Return the first two coordinates over the period, from the channels."""
-    result = {}
+    result, unit = {}, orbit.period if orbit.return_times is None else orbit.duration
     for coordinate in orbit.coordinates[:2]:
         channel, delay = channel_and_delay(coordinate)
-        result[coordinate] = np.roll(signals[channel], -round(delay * len(signals[channel]) / orbit.period))
+        result[coordinate] = np.roll(signals[channel], -round(delay * len(signals[channel]) / unit))
     return result
 
 
@@ -334,4 +342,5 @@ def _multiplier(orbit: Orbit) -> str:
 
 def _coordinate_labels(plane: PoincareSection | Orbit, units: Mapping[str, str] | None) -> list[str]:
     known = dict.fromkeys(plane.angles, "rad") | dict(units or {})
-    return [axis_label(coordinate, known.get(coordinate, "")) for coordinate in plane.coordinates[:2]]
+    labels = [axis_label(coordinate, known.get(coordinate, "")) for coordinate in plane.coordinates[:2]]
+    return labels if len(labels) == 2 else [*labels, f"{labels[0]}, next"]

@@ -143,8 +143,6 @@ def test_delays_that_are_refused_elsewhere():
     recording = recorded(np.arange(9000) / 23.7)
     with pytest.raises(ValueError, match="no delays of an angle"):
         bp.PoincareSection.from_recording(recording, ("x", "y", "x[-0.25]"), frequency=1.0, angles=["x"])
-    with pytest.raises(ValueError, match="without delays for crossings"):
-        bp.PoincareSection.from_crossings(recording, ("x", "x[-0.25]"), channel="y")
     section = bp.PoincareSection.from_recording(recording, ("x", "x[-0.4]"), frequency=1.0)
     with pytest.raises(ValueError, match="modulo 1/5 of a period, got 0 .*another number of steps"):
         section.between(5)

@@ -181,12 +181,13 @@ def test_errors_of_the_motion_until_the_next_point_are_the_errors_of_that_point(
     maps, _, _ = find._scaled(map_section(coupled, 4000, 0.001), 32)
     increments = maps.increments
     images = SimpleNamespace(
-        signals=lambda index, near, columns: near + increments[index], count=1, angles=[], outputs=slice(None)
+        signals=lambda index, near, columns, phases: near + increments[index], angles=[], outputs=slice(None)
     )
+    start = [np.zeros(1)] * 2
     checked = 0
     for _, estimate in find._chained(maps, Atlas(maps, find._search_count(maps, 32)), 2, 32):
         _, _, errors = errors_by_run(maps, estimate.fits.narrow)
-        parts = _parts(images, maps, estimate, images.outputs, REFINING_DEGREE, 1.0)
+        parts = _parts(images, maps, estimate, start, images.outputs, REFINING_DEGREE, 1.0)
         for k, part in enumerate(parts):
             following = errors[:, 2 * ((k + 1) % 2) :][:, :2]
             scale = np.abs(following).max()

@@ -1,0 +1,329 @@
+"""Sections where a channel crosses a level, and the orbits of autonomous systems with their own periods."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+import bayesperiodic as bp
+from bayesperiodic.orbits.return_times import ReturnTimes
+from bayesperiodic.orbits.waveform import _moved
+from tests.orbits import roessler
+
+STEP = roessler.RETURN / 40
+# The maximum of x follows a quarter of a return after its crossing.
+MAXIMUM = "x[1.5 s]"
+
+
+@cache
+def found(noise, seed=0, coordinate="y", density=40, waveforms=False):
+    """Return the section and orbits of 2,500 returns, `density` samples a return."""
+    recording = roessler.recording(2500 * density, roessler.RETURN / density, noise, seed, seed)
+    section = bp.PoincareSection.from_crossings(recording, [coordinate], channel="x", level=0.0)
+    return section, bp.find_orbits(section, periods=[1, 2, 3], waveforms=waveforms)
+
+
+def counterpart(orbit):
+    """Return the known orbit whose return times are nearest, and the shift of its points."""
+    known = roessler.known_orbits(orbit.period)
+    pairs = [(one, shift) for one in known for shift in range(orbit.period)]
+    return min(pairs, key=lambda pair: np.abs(np.roll(pair[0].times, -pair[1]) - orbit.return_times).max())
+
+
+def x_after(point, delay):
+    """Return x a time after a crossing of x = 0 at (y, z), before it for negative times."""
+    motion = roessler.solve_ivp(roessler.rates, (0.0, delay), [0.0, *point], method="DOP853", rtol=1e-11, atol=1e-12)
+    return motion.y[0, -1]
+
+
+def sines(time):
+    """Return a sine of 0.8 Hz and two slower ones."""
+    return np.sin(1.6 * np.pi * time), np.cos(0.7 * time), np.sin(0.7 * time)
+
+
+def test_the_shot_orbits_are_those_of_the_literature():
+    """Periods and multipliers of P. Cvitanović et al., Chaos: Classical and Quantum, chaosbook.org, for a = b = 0.2."""
+    (one,), (two,) = roessler.known_orbits(1), roessler.known_orbits(2)
+    assert one.times.sum() == pytest.approx(5.881088, abs=1e-6) and one.multiplier == pytest.approx(-2.40395, abs=1e-5)
+    assert two.times.sum() == pytest.approx(11.758626, abs=1e-6) and two.multiplier == pytest.approx(
+        -3.512007, abs=1e-6
+    )
+
+
+def test_delays_are_in_seconds():
+    time = np.arange(20_000) / 50.3
+    recording = bp.Recording(time, dict(zip("xuv", sines(time), strict=True)), {})
+    names = ("u", "v[0.31 s]", "x[-0.2s]", "u[-0.33 s]")
+    section = bp.PoincareSection.from_crossings(recording, names, channel="x", level=0.5)
+    at = section.instants
+    # The first crossing, at 1/9.6 s, is earlier than the longest delay.
+    np.testing.assert_allclose(at, 1 / 9.6 + 1.25 * np.arange(1, len(at) + 1), atol=1e-6)
+    expected = [sines(at)[1], sines(at + 0.31)[2], sines(at - 0.2)[0], sines(at - 0.33)[1]]
+    np.testing.assert_allclose(section.points, np.stack(expected, axis=1), atol=1e-5)
+    np.testing.assert_allclose(section.delayed("v[-0.4 s]"), sines(at - 0.4)[2], atol=2e-5)
+
+
+def test_noise_adds_no_crossings_and_the_default_level_is_the_median():
+    """Noise of 40 % of the amplitude: single samples cross the level many times a return."""
+    time = np.arange(100_000) / 200
+    signals = {"x": 3.0 + np.sin(2 * np.pi * time), "u": np.cos(0.7 * time)}
+    noisy = {"x": signals["x"] + 0.4 * np.random.default_rng(0).standard_normal(time.size), "u": signals["u"]}
+    assert np.count_nonzero(np.diff(np.sign(noisy["x"] - 3.0)) > 0) > 5 * 500
+    section = bp.PoincareSection.from_crossings(bp.Recording(time, noisy, {}), ("u", "u[0.25 s]"), channel="x")
+    assert len(section) == 499
+    assert np.abs(section.instants - np.round(section.instants)).max() < 0.1
+
+
+def test_the_stated_noise_contains_the_errors_of_the_instants():
+    """White noise; standard deviations of 6,000 errors within 8 %, and of those in each half of the points."""
+    samples = 40 * 6000
+    noisy, clean = (
+        bp.PoincareSection.from_crossings(
+            roessler.recording(samples, STEP, noise), ("y", "y[-1.2 s]"), channel="x", level=0.0
+        )
+        for noise in (0.002, 0.0)
+    )
+    assert len(noisy) == len(clean)
+    errors = noisy.points - clean.points
+    np.testing.assert_allclose(noisy.noise, errors.std(axis=0), rtol=0.08)
+    for half in np.array_split(np.argsort(noisy.noises[:, 1]), 2):
+        np.testing.assert_allclose(
+            np.sqrt(np.mean(noisy.noises[half] ** 2, axis=0)), errors[half].std(axis=0), rtol=0.1
+        )
+
+
+def test_no_return_crosses_a_gap_and_recordings_are_joined():
+    whole = roessler.recording(40 * 900, STEP, 0.001)
+    ends = ((0.0, 1700.0), (1700.01, 3000.0), (3100.0, 5000.0))
+    files = [whole.between(*times) for times in ends]
+    every = bp.PoincareSection.from_crossings(whole, ["y"], channel="x", level=0.0)
+    section = bp.PoincareSection.from_crossings(files[::-1], ["y"], channel="x", level=0.0)
+    assert np.isnan(section.increments[:, 0]).sum() == 1 and np.unique(section.stretches).size == 2
+    gap = (every.instants > 3000.0) & (every.instants < 3100.0)
+    assert abs(np.count_nonzero(~gap & (every.instants < 5000.0)) - len(section)) <= 1
+    nearest = np.abs(section.instants[:, None] - every.instants).argmin(axis=1)
+    inner = np.abs(section.instants - 3050.0) > 52.0
+    np.testing.assert_allclose(section.points[inner], every.points[nearest][inner], atol=0.1)
+
+
+def test_a_crossing_in_a_gap_is_none():
+    time = np.arange(20_000) / 50.3
+    time = time[(time < 99.9) | (time > 100.3)]
+    recording = bp.Recording(time, dict(zip("xuv", sines(time), strict=True)), {})
+    section = bp.PoincareSection.from_crossings(recording, ("u", "v"), channel="x", level=0.0)
+    assert np.abs(section.instants - 100.0).min() == pytest.approx(1.25, abs=1e-4)
+    assert np.isnan(section.increments[:, 0]).sum() == 1
+
+
+def test_exact_recordings_give_the_orbits_of_shooting():
+    section, orbits = found(0.0)
+    assert [orbit.period for orbit in orbits].count(3) == 2 and len(orbits) == 4
+    for orbit in orbits:
+        known, shift = counterpart(orbit)
+        np.testing.assert_allclose(orbit.points[:, 0], np.roll(known.points[:, 0], -shift), atol=2e-4)
+        np.testing.assert_allclose(orbit.return_times, np.roll(known.times, -shift), atol=2e-4)
+        assert orbit.duration == pytest.approx(known.times.sum(), abs=2e-4)
+        assert orbit.eigenvalues[0] == pytest.approx(known.multiplier, rel=2e-3)
+        assert orbit.remark == ""
+    assert orbits.prediction_error[0] < 1e-3
+
+
+@pytest.mark.parametrize(("noise", "coordinate"), [(0.003, "y"), (0.003, MAXIMUM), (0.01, "y")])
+def test_noisy_recordings_give_them_within_the_stated_errors(noise, coordinate):
+    """All errors within 4 standard deviations, which one of 300 groups of 50 normal ones exceeds."""
+    _, orbits = found(noise, coordinate=coordinate, density=100 if noise == 0.01 else 40)
+    assert len(orbits) >= 3
+    for orbit in orbits:
+        known, shift = counterpart(orbit)
+        points = np.roll(known.points, -shift, axis=0)
+        exact = points[:, 0] if coordinate == "y" else np.array([x_after(point, 1.5) for point in points])
+        assert np.all(np.abs(orbit.points[:, 0] - exact) < 4.0 * np.sqrt(np.diag(orbit.covariance)))
+        assert abs(orbit.duration - known.times.sum()) < 4.0 * orbit.duration_sd < 0.1
+        if np.isfinite(orbit.eigenvalue_sd[0]):
+            assert abs(np.log(orbit.eigenvalues[0] / known.multiplier)) < 4.0 * np.sqrt(orbit.joint_covariance[-1, -1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("coordinate", ["y", MAXIMUM])
+def test_intervals_of_the_period_have_nominal_coverage(coordinate):
+    """Nominal 90 % intervals of about 60 orbits of 20 recordings; false-alarm rate 0.5 %, one-sided.
+
+    Stated errors include the estimated bias, so that coverage may be higher.
+    """
+    durations = []
+    for seed in range(20):
+        for orbit in found(0.003, seed=seed, coordinate=coordinate)[1]:
+            known, _ = counterpart(orbit)
+            durations.append((orbit.duration - known.times.sum()) / orbit.duration_sd)
+    durations = np.array(durations)
+    inside = np.count_nonzero(np.abs(durations) < 1.645)
+    print(f"{coordinate}: {inside} of {durations.size} inside, rms {np.sqrt(np.mean(durations**2)):.2f}")
+    assert durations.size >= 50
+    assert inside >= binom.ppf(0.005, durations.size, 0.9)
+
+
+def test_waveforms_are_equally_spaced_in_time_over_the_own_period():
+    """All channels of the orbits; 2,000 dependent values within 5 standard errors."""
+    _, orbits = found(0.001, density=100, waveforms=True)
+    assert len(orbits) >= 3
+    for orbit in orbits:
+        known, shift = counterpart(orbit)
+        start, span = np.array([0.0, *known.points[shift]]), known.times.sum()
+        size = len(orbit.waveform.values["x"])
+        exact = roessler.solve_ivp(
+            roessler.rates, (0.0, span), start, method="DOP853", rtol=1e-11, atol=1e-12,
+            t_eval=span * np.arange(size) / size,
+        ).y  # fmt: skip
+        for name, values in zip("xyz", exact, strict=True):
+            away = orbit.waveform.values[name] - values
+            assert np.abs(away / orbit.waveform.sd[name]).max() < 5.0
+            assert np.abs(away).max() < 0.01 * np.ptp(values)
+
+
+def test_errors_of_the_return_times_move_the_waveform():
+    """Two parts of a motion with times that are wrong by a small amount: the difference of the resampled motion."""
+    true, wrong, samples = np.array([1.0, 1.4]), np.array([1.0 + 2e-5, 1.4 - 3e-5]), 400
+
+    def sampled(times):
+        at = times.sum() * np.arange(samples) / samples
+        second = at >= times[0]
+        phases = [at[~second] / times[0], (at[second] - times[0]) / times[1]]
+        motion = np.sin(2 * np.pi / 2.4 * np.concatenate([phases[0] * true[0], true[0] + phases[1] * true[1]]))
+        return motion[:, None], phases
+
+    motion, phases = sampled(true)
+    order = np.array([1, 0])
+    moved = _moved(motion, ReturnTimes(true[order], (wrong - true)[None, order], 0.0), order, phases)
+    expected = sampled(wrong)[0] - motion
+    np.testing.assert_allclose(moved[0, 2:-2], expected[2:-2], atol=1e-2 * np.abs(expected).max())
+
+
+def test_parameters_follow_from_the_orbits_of_an_autonomous_model():
+    """Three parameters within 5 standard errors and 0.1 %, from waveforms and measured frequencies."""
+    model = bp.Model(
+        "roessler", states=["x", "y", "z"], inputs=[], parameters=["a", "b", "c"],
+        equations=["dx + y + z", "dy - x - a*y", "dz - b - z*(x - c)"], outputs={"x": "x", "y": "y", "z": "z"},
+    )  # fmt: skip
+    orbits = [orbit for orbit in found(0.001, density=100, waveforms=True)[1] if orbit.period < 3]
+    runs = [orbit.experiment(whole=True, samples=256, states={name: name for name in "xyz"}) for orbit in orbits]
+    for run, orbit in zip(runs, orbits, strict=True):
+        assert run.periods == 1 and 1.0 / run.frequency == pytest.approx(orbit.duration)
+        assert run.frequency_se / run.frequency == pytest.approx(orbit.duration_sd / orbit.duration)
+    priors = {name: bp.LogNormal(centre, 0.5) for name, centre in {"a": 0.25, "b": 0.25, "c": 5.0}.items()}
+    problem = bp.Problem(model, runs, priors=priors, fixed={"scale": 1.0})
+    fit = bp.map_estimate(problem, start={"a": 0.205, "b": 0.21, "c": 5.6}, progress=False)
+    for name, truth in {"a": 0.2, "b": 0.2, "c": 5.7}.items():
+        assert abs(fit.theta[name] - truth) < min(5.0 * fit.sd[name], 2e-3 * truth)
+
+
+def test_a_coordinate_that_does_not_determine_the_next_point_is_refused_with_the_delay_to_add():
+    """Two incommensurate oscillations: one value has two successors, with another one it has one."""
+    time = np.arange(60_000) * 0.05
+    recording = bp.Recording(time, {"x": np.sin(time) + 0.3 * np.sin(time * (np.sqrt(5) - 1) / 2)}, {})
+    section = bp.PoincareSection.from_crossings(recording, [MAXIMUM], channel="x", level=0.0)
+    with pytest.raises(ValueError, match=r"maps of 1 coordinate predict .* with 'x\[-3\.1 s\]' errors are 0\.0%"):
+        bp.find_orbits(section, periods=[1])
+    more = bp.PoincareSection.from_crossings(recording, [MAXIMUM, "x[-1.6 s]"], channel="x", level=0.0)
+    with pytest.raises(ValueError, match="must be of a chaotic motion, got a quasi-periodic one"):
+        bp.find_orbits(more, periods=[1])
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.1])
+def test_periodic_recordings_are_refused(noise):
+    time = np.arange(60_000) * 0.05
+    values = np.sin(time) + 0.3 * np.sin(2 * time + 1) + noise * np.random.default_rng(0).standard_normal(time.size)
+    for names in ([MAXIMUM], ["x[-0.8 s]", "x[-1.6 s]"]):
+        with pytest.raises(ValueError, match="coincide within their noise. The motion has period 1"):
+            bp.PoincareSection.from_crossings(bp.Recording(time, {"x": values}, {}), names, channel="x")
+
+
+@pytest.mark.parametrize("noise", [1e-6, 0.005, 0.05])
+def test_a_motion_of_period_two_is_refused(noise):
+    time = np.arange(60_000) * 0.05
+    values = np.sin(time) + 0.3 * np.sin(0.5 * time + 1) + noise * np.random.default_rng(0).standard_normal(time.size)
+    section = bp.PoincareSection.from_crossings(
+        bp.Recording(time, {"x": values}, {}), [MAXIMUM], channel="x", level=0.0
+    )
+    with pytest.raises(ValueError, match="got one of period 2"):
+        bp.find_orbits(section, periods=[1])
+
+
+@pytest.mark.parametrize("count", [2000, 2500, 4500])
+def test_points_of_a_motion_of_period_two_are_refused(count):
+    points = np.array([[0.0, 1.0], [1.0, -1.0]])[np.arange(count) % 2]
+    for noise in (0.0, 0.001):
+        noisy = points + noise * np.random.default_rng(0).standard_normal(points.shape)
+        with pytest.raises(ValueError, match="got one of period 2"):
+            bp.find_orbits(bp.PoincareSection.from_points(noisy, ("x", "y"), frequency=1.0), periods=[1])
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("names", [["x[0.8 s]"], ["x[-0.4 s]", "x[-0.8 s]"]])
+def test_coloured_noise_is_refused(names, seed):
+    """Narrow-band noise, which looks like an oscillation of varying amplitude."""
+    white = np.random.default_rng(seed).standard_normal(60_000)
+    values = lfilter([1.0], [1.0, -2 * 0.999 * np.cos(0.1), 0.999**2], white)
+    recording = bp.Recording(np.arange(60_000) * 0.05, {"x": values}, {})
+    with pytest.raises(ValueError, match="must show a return map"):
+        bp.find_orbits(bp.PoincareSection.from_crossings(recording, names, channel="x"), periods=[1])
+
+
+def test_white_noise_and_noise_as_large_as_the_motion_are_refused():
+    generator = np.random.default_rng(0)
+    recording = bp.Recording(np.arange(60_000) * 0.05, {"x": generator.standard_normal(60_000)}, {})
+    with pytest.raises(ValueError, match="must be crossed by 'x', got no crossing of .* by more than noise"):
+        bp.PoincareSection.from_crossings(recording, [MAXIMUM], channel="x")
+    section = bp.PoincareSection.from_crossings(roessler.recording(100_000, STEP, 0.03), ["y"], channel="x", level=0.0)
+    with pytest.raises(ValueError, match="The noise is too large: sample faster"):
+        bp.find_orbits(section, periods=[1])
+
+
+def test_arguments_that_are_refused():
+    recording = roessler.recording(40 * 300, STEP)
+
+    def crossing(*names, channel="x", level=0.0, **options):
+        return bp.PoincareSection.from_crossings(recording, names, channel=channel, level=level, **options)
+
+    with pytest.raises(ValueError, match=r"the delay in seconds with the unit, such as 'y\[-0.25 s\]', got 'y\[-1\]'"):
+        crossing("y", "y[-1]")
+    with pytest.raises(ValueError, match=r"the delay in forcing periods, such as 'y\[-0.25\]', got 'y\[-1 s\]'"):
+        bp.PoincareSection.from_recording(recording, ("x", "y[-1 s]"), frequency=0.17)
+    with pytest.raises(ValueError, match="channel: must be .*got 'y'"):
+        crossing("y", channel="y")
+    with pytest.raises(
+        ValueError, match=r"1.17 s \(8 samples\) apart or more, .* got 0.5 s for \['x', 'x\[-0.5 s\]'\]"
+    ):
+        crossing("x[-0.5 s]")
+    with pytest.raises(ValueError, match="before the first one of the next crossing, 4"):
+        crossing("x[-4.5 s]")
+    with pytest.raises(ValueError, match="level: must be crossed by 'x', got no crossing of 100 "):
+        crossing("y", level=100.0)
+    with pytest.raises(ValueError, match="coordinates: must be one or more outputs"):
+        crossing()
+    section, orbits = found(0.003)
+    with pytest.raises(ValueError, match="steps: must be 1 for crossings, got 2"):
+        bp.find_orbits(section, periods=[1], steps=2)
+    with pytest.raises(ValueError, match="whole: must be True for .*, whose points are crossings"):
+        orbits[0].experiment(states={"y": "y"})
+    with pytest.raises(ValueError, match="orbits: must be of a section with a forcing"):
+        bp.polish_orbits(bp.models.pendulum, orbits, dict.fromkeys(bp.models.pendulum.parameters, 1.0))
+    with pytest.raises(ValueError, match="must have two coordinates or more, got one"):
+        bp.plot.orbits(orbits)
+
+
+def test_sections_and_orbits_are_saved_printed_and_drawn(tmp_path):
+    section, orbits = found(0.003)
+    orbits.save(tmp_path / "orbits.h5")
+    section.save(tmp_path / "section.h5")
+    again, same = bp.load(tmp_path / "orbits.h5"), bp.load(tmp_path / "section.h5")
+    assert repr(again) == repr(orbits) and repr(same) == repr(section)
+    np.testing.assert_array_equal(again[0].return_times, orbits[0].return_times)
+    assert same.crossed == "x"
+    assert f"duration {orbits[0].duration:.6g} s (sd " in repr(orbits[0])
+    assert orbits.table["duration"][0] == orbits[0].duration
+    axes = bp.plot.section(section, orbits).axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("y", "y, next")
+    x, y = axes.lines[0].get_data()
+    np.testing.assert_allclose(y[:-1], x[1:])
