@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> None:
     problem, fit = best.estimate.problem, best.estimate.fit
     print(f"{best.estimate}\n  force of degree {best.degree} has the fewest runs that leave the region")
     with watch.part("posterior", "sampling the posterior with emcee"):
-        posterior = bp.sample(problem, fit, seed=options.seed, max_steps=200 if options.quick else 5000,
+        posterior = bp.sample(problem, fit, seed=options.seed, max_steps=100 if options.quick else 1000,
                               progress=False)  # fmt: skip
     print(posterior)
     with watch.part("prediction", "free runs against the last third of the recording"):
