@@ -11,15 +11,17 @@ from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic._printing import Printed, progress_bar
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.estimation.map_estimate import NoFiniteDensity, map_estimate
+from bayesperiodic.estimation.climbs import first_iterate
+from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# Fraction of a channel's variance over an orbit from which the model's orbit is another one, with so many values.
-MOST_UNEXPLAINED, FEWEST_VALUES = 0.25, 3
+# Fewest values of a channel of which the unexplained variance is judged.
+FEWEST_JUDGED = 3
 # Multipliers are printed as real up to this relative imaginary part.
 REAL = 1e-6
 
@@ -39,7 +41,12 @@ class OrbitsEstimate(Printed):
 
     Examples
     --------
-    See `estimate_orbits`.
+    >>> known = {name: value for name, value in pendulum_parameters.items() if name != "l"}
+    >>> runs = [orbit.experiment(samples=1600, states={"phi": "angle"}) for orbit in pendulum_orbits[:2]]
+    >>> given = bp.Problem(bp.models.pendulum, runs, priors={"l": bp.LogNormal(0.27, 0.3)}, fixed=known)
+    >>> estimate = bp.estimate_orbits(given, progress=False)
+    >>> len(estimate.problem.experiments), list(estimate.table.columns)
+    (2, ['periods', 'multiplier', 'rms[angle]', 'rms[rate]'])
     """
 
     problem: Problem
@@ -76,7 +83,7 @@ def estimate_orbits(
     Strongly unstable orbits exist only near the parameters at which they were measured: from a distant start, one of
     many turns into another orbit or is lost, and with it the estimate. With one orbit more at a time, each is solved at
     parameters that the others have determined. One with which the estimate does not converge, or with which an orbit
-    turns into another one (then a quarter of the variance of a channel and more is unexplained), is dropped and tried
+    turns into another one (then more than half of the variance of a channel may be unexplained), is dropped and tried
     once more at the end.
 
     Parameters
@@ -123,6 +130,8 @@ def estimate_orbits(
     """
     _checks.instance("problem", problem, Problem)
     _checks.instance("progress", progress, bool)
+    for name in start or {}:
+        _checks.one_of("start", name, problem.names)
     theta: Mapping[str, float] | None = start
     included: list[Experiment] = []
     dropped: dict[str, str] = {}
@@ -157,13 +166,12 @@ def _with_one_more(
 ) -> MapEstimate | str:
     """Return the estimate from these experiments, or why there is none with the last one."""
     used = problem.with_experiments(experiments)
+    start = _of(used, {} if theta is None else theta)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        try:
-            start = None if theta is None else _of(used, theta)
-            fit = map_estimate(used, start=start, checks=False, progress=False)
-        except NoFiniteDensity:
+        if first_iterate(used, used.vector(start)) is None:
             return "the model has no such orbit near the estimate from the others"
+        fit = map_estimate(used, start=None if theta is None else start, checks=False, progress=False)
     if fit.other_orbits:
         name, reason = next(iter(fit.other_orbits.items()))
         return f"{name!r} turns into another orbit ({reason})"
@@ -183,7 +191,7 @@ def _unexplained(experiment: Experiment, fit: MapEstimate) -> float:
     shares = [0.0]
     for name, residual in fit.residuals[experiment.name].items():
         seen = experiment.outputs[name][values]
-        if seen.size >= FEWEST_VALUES and np.ptp(seen) > 0.0 and not experiment.winding:
+        if seen.size >= FEWEST_JUDGED and np.ptp(seen) > 0.0 and not experiment.winding:
             shares.append(float(np.mean(residual[values] ** 2) / np.var(seen)))
     return max(shares)
 

@@ -72,10 +72,6 @@ INFORMED = 0.01
 MOST_LINEARISATIONS, STEPS_BETWEEN, SETTLED_INPUTS = 40, 5, 1e-5
 
 
-class NoFiniteDensity(ValueError):
-    """The log-posterior is not finite at the start."""
-
-
 @in_one_thread
 def map_estimate(
     problem: Problem,
@@ -182,7 +178,7 @@ def map_estimate(
     first = first_iterate(problem, near[0]) if near else None
     first = first or first_iterate(problem, theta)
     if first is None:
-        raise NoFiniteDensity(_not_finite(problem, theta, start is not None))
+        raise ValueError(_not_finite(problem, theta, start is not None))
     objective = objective_near(problem, first.here)
     end = on_best_sheets(problem, climbed(objective, first, progress), progress)
     end = on_measured_orbits(problem, theta, end, progress)

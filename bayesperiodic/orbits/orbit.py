@@ -25,7 +25,7 @@ NOISE_FLOOR = 5.0
 MOST_BIAS = 0.5
 TURN = 2.0 * np.pi
 # Harmonics of the forcing that are compared of a waveform with independent values at 16 phases.
-COMPARED_HARMONICS = INDEPENDENT // 2 - 1
+WAVEFORM_HARMONICS = INDEPENDENT // 2 - 1
 _COLUMNS = (
     "name", "period", "duration", "duration_sd", "winding", "returns", "quality", "multiplier", "multiplier_sd",
     "contraction", "contraction_sd", "estimated", "modulus", "partner", "equilibrium", "remark", "rejected",
@@ -396,7 +396,7 @@ def _components(orbit: Orbit, winding: int, samples: int, multipliers: bool, who
             f"model_error: must be False without the whole waveform of {orbit.name!r}, or with multipliers, got True. "
             "Give whole=True, with find_orbits(..., waveforms=True)."
         )
-    names, highest = orbit.waveform.outputs, COMPARED_HARMONICS * orbit.period
+    names, highest = orbit.waveform.outputs, WAVEFORM_HARMONICS * orbit.period
     sd = orbit.waveform.sd
     return {
         "outputs": _resampled(orbit, winding, samples, names),
