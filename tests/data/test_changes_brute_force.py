@@ -27,7 +27,7 @@ def evidence(y, covariance):
 
 
 def brute_force(shape, every, independent):
-    """Return the probability of each course, and by component mean and second moment of its sizes, and of any change."""
+    """Return the probability of each course, and by component moments of its sizes, and of any change."""
     count, components = shape.shape
     ratio = np.zeros((3, len(every.kind), components))
     first = np.zeros((3, len(every.kind), 2, components))
@@ -109,9 +109,9 @@ def test_courses_and_their_probabilities(transient, count, longest):
     assert probability[decaying].sum() == pytest.approx(transient)
     rest = 1.0 - transient
     linear = ~decaying & (every.kind == module.DRIFT)
-    assert [probability[one].sum() / rest for one in (linear, every.kind == module.STEP, every.kind == module.TONE)] == (
-        pytest.approx([0.4, 0.1, 0.1])
-    )
+    assert [
+        probability[one].sum() / rest for one in (linear, every.kind == module.STEP, every.kind == module.TONE)
+    ] == (pytest.approx([0.4, 0.1, 0.1]))
     assert every.constant == pytest.approx(0.4 * rest)
     decays = np.unique(every.place[decaying])
     np.testing.assert_allclose(decays, np.geomspace(0.3, 0.5 * count, 12))
@@ -121,12 +121,16 @@ def test_courses_and_their_probabilities(transient, count, longest):
         assert np.array_equal(turns[-12:], np.linspace(0.0, np.pi, 13)[1:]) and turns[0] == 0.0
         near = turns[:-12]
         assert all(angle == 0.0 or angle * decay in (pytest.approx(0.7), pytest.approx(1.5)) for angle in near)
-        assert near.max() < np.pi / 12 / 1.5 and probability[these][: near.size].sum() == pytest.approx(0.7 * transient / 12)
+        assert near.max() < np.pi / 12 / 1.5 and probability[these][: near.size].sum() == pytest.approx(
+            0.7 * transient / 12
+        )
         assert {*every.kind[these]} == {module.TRANSIENT if decay <= longest * count else module.DRIFT}
     wave = np.exp(-cycle / np.where(decaying, every.place, np.inf)[:, None] + 1j * every.turn[:, None] * cycle)
     waves = decaying | (every.kind == module.TONE)
     np.testing.assert_allclose(every.values[waves, :, 0], wave.real[waves], atol=1e-9)
-    np.testing.assert_allclose(every.values[waves, :, 1], np.where(every.single[waves, None], 0.0, wave.imag[waves]), atol=1e-9)
+    np.testing.assert_allclose(
+        every.values[waves, :, 1], np.where(every.single[waves, None], 0.0, wave.imag[waves]), atol=1e-9
+    )
     np.testing.assert_allclose(every.values[linear][0, :, 0], np.linspace(0.0, 1.0, count))
     steps = every.kind == module.STEP
     assert every.place[steps].min() == 2 and every.place[steps].max() == count - 2
@@ -184,7 +188,10 @@ def test_a_beat_is_named_by_its_turn_and_decay(turn):
     shape = 0.01 * np.random.default_rng(1).standard_normal((40, 4))
     shape[:, 2] += np.exp(-cycle / 30.0) * np.cos(turn * cycle + 0.3)
     seen = module.changes(shape, 0.6)
-    assert seen.oscillating > 0.99 and seen.beat == (pytest.approx(2 * np.pi / turn, rel=0.01), pytest.approx(30, rel=0.15))
+    assert seen.oscillating > 0.99 and seen.beat == (
+        pytest.approx(2 * np.pi / turn, rel=0.01),
+        pytest.approx(30, rel=0.15),
+    )
     assert seen.swing[2] == pytest.approx(1.0, rel=0.1) and np.delete(seen.swing, 2).max() < 0.05
 
 
@@ -208,7 +215,7 @@ def test_a_course_is_refined_to_that_of_the_components(decay, turn):
 
 
 def test_number_of_independent_components():
-    """Of white noise of its own in each component nearly all, of one noise in all components one; rests of rank one too."""
+    """Of white noise of its own in each component nearly all, of one noise in all components one."""
     generator = np.random.default_rng(3)
     white = generator.standard_normal((200, 20))
     assert module._independent(white, None) == pytest.approx(20.0, rel=0.25)

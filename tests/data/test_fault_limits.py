@@ -23,7 +23,8 @@ def with_runs(values, *runs):
     "count, runs, pairs, held",
     [
         (1100, [3], 0, [3]), (900, [3], 0, []), (900, [4], 0, [4]), (900, [3, 3], 0, [3, 3]), (1000, [3], 9, []),
-        (1100, [4], 9, [4]), (800, [4], 9, []), (900, [2], 0, []), (5000, [3, 3, 3], 4, [3, 3, 3]), (900, [9, 3], 0, [9, 3]),
+        (1100, [4], 9, [4]), (800, [4], 9, []), (900, [2], 0, []), (5000, [3, 3, 3], 4, [3, 3, 3]),
+        (900, [9, 3], 0, [9, 3]),
     ],
 )  # fmt: skip
 def test_short_runs_are_held_if_chance_gives_so_many_once_in_a_thousand(count, runs, pairs, held):
@@ -160,7 +161,9 @@ def test_noise_at_the_same_phase_of_three_samples_is_that_from_their_line():
     values = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     rest = np.array([0.5, 1.0, 0.5, 0.0]) / np.sqrt(1.5)
     assert faults.repeat_noise(phase, values, np.zeros(0, int)) == pytest.approx(1.4826 * np.median(rest))
-    assert faults.repeat_noise(phase[::-1] + 7.0, values[::-1], np.zeros(0, int)) == pytest.approx(1.4826 * np.median(rest))
+    assert faults.repeat_noise(phase[::-1] + 7.0, values[::-1], np.zeros(0, int)) == pytest.approx(
+        1.4826 * np.median(rest)
+    )
     quarter = np.array([0.0, 0.1, 0.4, 0.5, 0.8, 0.9])
     rest = np.array([0.25, 1.0, 0.75 / 1, 0.0])
     weights = np.array([0.25, 0.75, 0.25, 0.75])
@@ -206,7 +209,9 @@ def test_clipped_samples_are_six_times_more_than_at_other_levels(arguments, clip
         assert (high if sign > 0 else low).tolist() == np.flatnonzero(values == 1.0).tolist() * clipped
         assert (low if sign > 0 else high).size == 0
     if clipped and "scattered" not in arguments:
-        assert faults.clipped_of(values, [slice(*(np.flatnonzero(values == 1.0)[[0, -1]] + [0, 1]))])[1].size == 0  # stuck
+        assert (
+            faults.clipped_of(values, [slice(*(np.flatnonzero(values == 1.0)[[0, -1]] + [0, 1]))])[1].size == 0
+        )  # stuck
 
 
 @pytest.mark.parametrize("gap, clipped", [(19.0, True), (21.0, False)])

@@ -31,7 +31,10 @@ def test_beats_are_lines_beside_the_amplitude(turns, size, both):
 
 def test_noise_and_constants_have_no_beat():
     generator = np.random.default_rng(1)
-    assert cycle_findings._beat(1.0 + 0.1 * (generator.standard_normal(60) + 1j * generator.standard_normal(60))) == (0, 0)
+    assert cycle_findings._beat(1.0 + 0.1 * (generator.standard_normal(60) + 1j * generator.standard_normal(60))) == (
+        0,
+        0,
+    )
     assert cycle_findings._beat(np.full(60, 2.0 + 0j)) == (0.0, 0.0)
 
 
@@ -53,10 +56,16 @@ def test_a_beat_of_one_turn_may_be_ramps():
     assert seen.text.endswith(", or ramps up and down") and seen.cure.endswith("; of ramps record the steady part")
 
 
-@pytest.mark.parametrize("count, size, severity", [(48, 0.03, HARMLESS), (48, 0.1, SERIOUS), (23, 0.1, None), (48, 0.005, None)])
+@pytest.mark.parametrize(
+    "count, size, severity", [(48, 0.03, HARMLESS), (48, 0.1, SERIOUS), (23, 0.1, None), (48, 0.005, None)]
+)
 def test_periodic_modulations_of_a_cycle_are_beats(count, size, severity):
     """From 1 % on, serious from 5 %; at least 24 cycles are needed."""
-    sizes = 1.0 + size * np.cos(2 * np.pi * 8.0 * np.arange(count) / 48) + 1e-4 * np.random.default_rng(0).standard_normal(count)
+    sizes = (
+        1.0
+        + size * np.cos(2 * np.pi * 8.0 * np.arange(count) / 48)
+        + 1e-4 * np.random.default_rng(0).standard_normal(count)
+    )
     listed = [*cycle_findings._beats(("x",), TIME, windows_of(sizes), 3.0)]
     assert [one.severity for one in listed] == [severity] * (severity is not None)
     if severity:
@@ -73,7 +82,9 @@ def test_steps_of_the_phase_in_words():
         "the phase of x steps by -18° (-0.025 s, 2.5 samples) at about 12.5 s: samples were lost, or the clock or the "
         "drive stepped"
     )
-    assert cycle_findings.stepped("", 0.05, 12.5, 100.0, 2.0).startswith("the phase of all channels steps by 18° (0.025 s")
+    assert cycle_findings.stepped("", 0.05, 12.5, 100.0, 2.0).startswith(
+        "the phase of all channels steps by 18° (0.025 s"
+    )
 
 
 def steady_of(components, bias=0.0, transient=0.0):
@@ -82,7 +93,8 @@ def steady_of(components, bias=0.0, transient=0.0):
     part = windows_of(amplitude, mean=mean)
     shape = np.column_stack([part.amplitudes[:, 0].real, part.amplitudes[:, 0, 1:].imag])
     return Steady(
-        part, slice(0, 5 * len(part.first)), (0, 5 * len(part.first)), np.zeros((1, 3)), np.zeros((2, 1)), bias, transient,
+        part, slice(0, 5 * len(part.first)),
+        (0, 5 * len(part.first)), np.zeros((1, 3)), np.zeros((2, 1)), bias, transient,
         changes(shape, 0.6),
     )  # fmt: skip
 
@@ -111,10 +123,18 @@ def test_changes_are_named_with_size_place_and_severity(course, mean, kind, seve
     size = float(seen.text.split(" by ")[1].split("%")[0])
     assert size == pytest.approx(100 * (change[-1] - change[0]), rel=0.15, abs=0.1)
     if "step" in kind:
-        assert "at about 17 s: " in seen.text and seen.times.tolist() == [[17.0, 17.0]] and (seen.count, seen.share) == (1, 1 / 40)
+        assert (
+            "at about 17 s: " in seen.text
+            and seen.times.tolist() == [[17.0, 17.0]]
+            and (seen.count, seen.share) == (1, 1 / 40)
+        )
         assert seen.cure == "fold the parts before and after it: recording.between(start, stop)"
     else:
-        assert "over the part used: " in seen.text and seen.times.tolist() == [[0.0, 39.8]] and (seen.count, seen.share) == (40, 1.0)
+        assert (
+            "over the part used: " in seen.text
+            and seen.times.tolist() == [[0.0, 39.8]]
+            and (seen.count, seen.share) == (40, 1.0)
+        )
         assert seen.cure == "select a steadier part with recording.between(start, stop)"
     assert (" of the amplitude" in seen.text) == ("mean" in said)
     effect = float(seen.text.split(": ")[1].split()[0])
@@ -129,7 +149,10 @@ def test_rest_of_a_transient_is_named_by_its_bias(bias, transient, severity):
     listed = [*cycle_findings._changes(("x",), TIME, steady, {})]
     assert [(one.kind, one.severity) for one in listed] == [("transient", severity)] * (severity is not None)
     if severity:
-        assert f"is in the part used, 0 to 39.8 s, and biases the amplitudes by {bias:.2g} standard errors" in listed[0].text
+        assert (
+            f"is in the part used, 0 to 39.8 s, and biases the amplitudes by {bias:.2g} standard errors"
+            in listed[0].text
+        )
         few = replace(steady, part=steady.part.chosen(slice(0, 3)), samples=slice(0, 15), changes=None)
         (least,) = cycle_findings._changes(("x",), TIME, few, {})
         assert least.severity == SERIOUS and f"by at least {bias:.2g} standard errors" in least.text

@@ -14,7 +14,9 @@ from bayesperiodic.data.steadiness import Windows
 def windows_of(amplitudes, overlap=1, cycles=1, slip=0.0):
     count, channels = amplitudes.shape[:2]
     first = 10 * np.arange(count)
-    return Windows(first, first + 10, np.arange(count), overlap, cycles, amplitudes, np.full(channels, slip), np.zeros(channels))
+    return Windows(
+        first, first + 10, np.arange(count), overlap, cycles, amplitudes, np.full(channels, slip), np.zeros(channels)
+    )
 
 
 def test_phases_are_those_of_the_strongest_harmonics_in_cycles_of_the_fundamental():
@@ -47,7 +49,9 @@ def phases(turns, sizes=None, slip=0.0, order=1, length=1):
     return Phases(2.0 * cycle, cycle, length, turns, sizes, np.full(channels, order), np.full(channels, slip))
 
 
-@pytest.mark.parametrize("spread, slip, limit", [(0.0, 0.0, 0.08), (0.01, 0.0, 6 * 0.014826), (0.0, 0.01, 0.08 + 0.02 * np.pi)])
+@pytest.mark.parametrize(
+    "spread, slip, limit", [(0.0, 0.0, 0.08), (0.01, 0.0, 6 * 0.014826), (0.0, 0.01, 0.08 + 0.02 * np.pi)]
+)
 def test_windows_are_alike_within_a_range_or_six_standard_deviations(spread, slip, limit):
     """The median deviation of the windows used is `spread`; the logarithms of the amplitudes are compared."""
     sizes = np.zeros((40, 2))
@@ -90,7 +94,7 @@ def test_four_windows_may_be_missing_at_a_step(gap, seen):
 
 
 def test_curves_and_noise_are_no_steps():
-    """40 series of 200 windows of white noise; a step of eight standard deviations is none of them by chance (1e-12)."""
+    """40 series of 200 windows of white noise; none has a step by chance (1e-12)."""
     cycle = np.arange(200.0)
     for seed in range(40):
         assert clocks.steps_of(np.random.default_rng(seed).standard_normal(200), cycle, 1e-6) == []
@@ -110,7 +114,9 @@ def test_steps_of_channels_relative_to_the_first_and_of_all():
     every = np.ones(60, dtype=bool)
     listed, places = clocks.steps(CHANNELS, phases(turns, order=2), every)
     assert [(s.channel, s.other, s.order) for s in listed] == [("x", "u", 2), ("y", "u", 2)]
-    assert [s.turns for s in listed] == pytest.approx([0.05, -0.04]) and [s.time for s in listed] == pytest.approx([39, 59], abs=1.1)
+    assert [s.turns for s in listed] == pytest.approx([0.05, -0.04]) and [s.time for s in listed] == pytest.approx(
+        [39, 59], abs=1.1
+    )
     assert [p.tolist() for p in places] == [[k for k in (19, 20) if 2.0 * k == listed[0].time], [
         k for k in (29, 30) if 2.0 * k == listed[1].time]]  # fmt: skip
     # Of all channels together, and of the first one alone.
@@ -176,7 +182,11 @@ def test_drifts_beside_steps_and_of_the_drive_are_not_those_of_a_clock():
     cycle, every = np.arange(200.0), np.ones(200, dtype=bool)
     noise = 1e-3 * np.random.default_rng(2).standard_normal(200)
     jump = phases(np.column_stack([np.zeros(200), 0.3 * (cycle > 90) + noise]))
-    assert len([*clocks.drifts(jump, every, [np.array([90])])]) == 0 < len([*clocks.drifts(jump, every, [np.zeros(0, int)])])
+    assert (
+        len([*clocks.drifts(jump, every, [np.array([90])])])
+        == 0
+        < len([*clocks.drifts(jump, every, [np.zeros(0, int)])])
+    )
     both = phases(np.column_stack([np.zeros(200), 0.3 * (cycle > 90) + 1e-4 * cycle + noise]))
     (found,) = clocks.drifts(both, every, [np.array([90])])
     assert found.rate == pytest.approx(1e-4, rel=0.15)
@@ -192,7 +202,13 @@ def test_drifts_that_amplitudes_explain_are_not_steady_and_small_ones_are_harmle
     """An amplitude that changes by 10 % may turn the phase by 0.2 rad; up to 0.05 rad it is harmless."""
     cycle, every = np.arange(100.0), np.ones(100, dtype=bool)
     noise = 1e-6 * np.random.default_rng(2).standard_normal(100)
-    for turn, growth, steady in ((0.1, 0.0, [True]), (0.1, 0.1, [False]), (0.3, 0.1, [True]), (0.04, 0.1, []), (0.06, 0.1, [False])):
+    for turn, growth, steady in (
+        (0.1, 0.0, [True]),
+        (0.1, 0.1, [False]),
+        (0.3, 0.1, [True]),
+        (0.04, 0.1, []),
+        (0.06, 0.1, [False]),
+    ):
         sizes = np.column_stack([np.zeros(100), growth * cycle / 100])
         turns = turn / (2 * np.pi) * cycle / 100 + noise
         for order in (1, 3):
@@ -215,10 +231,12 @@ def test_findings_of_steps_name_delay_angle_and_lost_samples():
     one, two = clocks.step_findings(listed, {"u": 50.0, "x": 100.0, "y": 200.0}, 2.0, 40)
     assert one.text == (
         "x is earlier by 0.01 s (7.2°, up to whole cycles) against u from about 3 s on, as after 1 lost samples of x; "
-        "x is earlier by 0.005 s (3.6°, up to whole cycles) against u from about 5 s on, as after 0.5 lost samples of x "
-        "(2 steps)"
+        "x is earlier by 0.005 s (3.6°, up to whole cycles) against u from about 5 s on, as after 0.5 lost samples of "
+        "x (2 steps)"
     )
-    assert two.text.startswith("y is later by 0.02 s (14.4°, up to whole cycles) against u from about 4 s on, as after 1 ")
+    assert two.text.startswith(
+        "y is later by 0.02 s (14.4°, up to whole cycles) against u from about 4 s on, as after 1 "
+    )
     assert "lost samples of u" in two.text and "steps)" not in two.text
     assert (one.kind, one.channel, one.count, one.share) == ("phase step", "x", 2, 0.05)
     assert one.times.tolist() == [[3.0, 3.0], [5.0, 5.0]] and "recording.between(start, stop)" in one.cure
@@ -234,7 +252,9 @@ def test_steps_are_ruinous_by_their_angle_at_the_harmonic(turns, order, severity
 
 
 def test_findings_of_steps_of_all_channels():
-    (found,) = clocks.step_findings([step("", "", 3.0, 0.01), step("", "", 5.0, -0.03)], {"x": 50.0, "u": 100.0}, 2.0, 10)
+    (found,) = clocks.step_findings(
+        [step("", "", 3.0, 0.01), step("", "", 5.0, -0.03)], {"x": 50.0, "u": 100.0}, 2.0, 10
+    )
     assert (found.channel, found.severity, found.count, found.share) == ("", SERIOUS, 2, 0.2)
     assert "recording.between(start, stop)" in found.cure and "(2 steps)" in found.text and "5" in found.text
 
@@ -244,8 +264,8 @@ def test_findings_of_drifts_name_angle_difference_and_cycles():
     (found,) = clocks.drift_findings([drift], CHANNELS, (1.0, 9.0), 40, 50)
     assert (found.kind, found.channel, found.severity, found.count) == ("clock", "x", RUINOUS, 40)
     assert found.text == (
-        "the phase of x drifts steadily against u, by 7.2° over the cycles used (40 of 50), as if its frequency were 30 ± "
-        "2 ppm above: two clocks, or a system that changes"
+        "the phase of x drifts steadily against u, by 7.2° over the cycles used (40 of 50), as if its frequency were "
+        "30 ± 2 ppm above: two clocks, or a system that changes"
     )
     assert "fold(clocks={'second': ['x']})" in found.cure and found.times.tolist() == [[1.0, 9.0]]
     (below,) = clocks.drift_findings([replace(drift, rate=-3e-5, turns=-0.02)], CHANNELS, (1.0, 9.0), 40, 50)

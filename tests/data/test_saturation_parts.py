@@ -49,13 +49,17 @@ def test_means_are_those_of_the_samples_with_their_variances():
     means = saturation.means_of(bins, residuals, wave, 0.0)
     number = bins.centre.size
     each = [residuals[bins.place % number == k] for k in range(number)]
-    expected = [_fourier.at_times(wave[None], np.array([c]))[0][0] + r.mean() for c, r in zip(bins.centre, each, strict=True)]
+    expected = [
+        _fourier.at_times(wave[None], np.array([c]))[0][0] + r.mean() for c, r in zip(bins.centre, each, strict=True)
+    ]
     np.testing.assert_allclose(means.values, expected, rtol=1e-9)
     np.testing.assert_allclose(means.phase, bins.centre)
     within = sum(((r - r.mean()) ** 2).sum() for r in each) / (residuals.size - number)
     exact = (1e-3 * means.values.std()) ** 2
     ratio = (1.0 / means.weights - exact) * [r.size for r in each] / within
-    assert np.ptp(ratio) < 1e-6 and 1.0 - 1e-9 < ratio[0] < 2.0  # the noise is white, and slow harmonics have no more of it
+    assert (
+        np.ptp(ratio) < 1e-6 and 1.0 - 1e-9 < ratio[0] < 2.0
+    )  # the noise is white, and slow harmonics have no more of it
     assert means.error == pytest.approx(np.sqrt(within / residuals.size)) and means.order == 3
     rest = means.values - _fourier.at_times(wave[None, :4], means.phase)[0]
     assert means.misfit == pytest.approx(means.weights @ rest**2 + 7.0 * np.log(number))
@@ -68,7 +72,9 @@ def test_noise_that_differs_from_cycle_to_cycle_widens_the_variances():
     bins, _, wave, residuals = example(0.1, slow=0.3)
     first = saturation.means_of(bins, residuals, wave, 0.0)
     number = bins.centre.size
-    half = [0.5 * (residuals[bins.place == k + number].mean() - residuals[bins.place == k].mean()) for k in range(number)]
+    half = [
+        0.5 * (residuals[bins.place == k + number].mean() - residuals[bins.place == k].mean()) for k in range(number)
+    ]
     power = np.abs(np.exp(-2j * np.pi * np.outer(np.arange(1, 9), bins.centre)) @ half) ** 2
     within = sum(r.size * r.var() for r in (residuals[bins.place % number == k] for k in range(number)))
     within /= residuals.size - number
@@ -79,7 +85,7 @@ def test_noise_that_differs_from_cycle_to_cycle_widens_the_variances():
 
 @pytest.mark.parametrize("size, order", [(0.0, 1), (0.5, 1), (2.0, 4)])
 def test_order_is_that_of_harmonics_beyond_noise(size, order):
-    """Of power a²/2·Σw beyond 2 for each harmonic and 2·ln(n) for each more: 3·(2·ln n − 2) + 2·ln n + 2 in all here."""
+    """Of power a²/2·Σw beyond 2 for each harmonic, and 2·ln(n) for each more."""
     bins, phase, wave, residuals = example(0.1)
     number = bins.centre.size
     clean = saturation.means_of(bins, residuals, np.array([0.0, 1.0 + 0j]), 0.0)
@@ -114,7 +120,9 @@ def test_levels_that_cut_a_series_are_found(level, low, harmonics):
     np.testing.assert_allclose(seen.excess, series - np.clip(series, low or -np.inf, level), atol=0.02)
     far = np.abs(series - level) > 0.01
     assert np.array_equal(seen.flat[1][far], (series > level)[far])
-    assert seen.share == pytest.approx(np.mean((series > level) | (series < (-np.inf if low is None else low))), abs=0.02)
+    assert seen.share == pytest.approx(
+        np.mean((series > level) | (series < (-np.inf if low is None else low))), abs=0.02
+    )
     assert seen.like_a_sensor
     assert np.array_equal(seen.holds(means.phase + 3.0), seen.flat.any(axis=0))
     assert seen.holds(np.array([0.0, 0.5]))[0]

@@ -25,7 +25,9 @@ def test_windows_are_chosen_joined_and_turned():
     assert given.strongest.tolist() == [1, 2] and given.sizes[0].tolist() == pytest.approx([1.0, 5.0])
     assert given.lines[3] == pytest.approx([np.exp(0.9j), 5.0 * np.exp(1.8j)])
     some = given.chosen(slice(2, 5))
-    assert some.first.tolist() == [10, 15, 20] and some.place.tolist() == [2, 3, 4] and some.last.tolist() == [15, 20, 25]
+    assert (
+        some.first.tolist() == [10, 15, 20] and some.place.tolist() == [2, 3, 4] and some.last.tolist() == [15, 20, 25]
+    )
     of_all = some.among(3 * np.arange(40) + 1)
     assert of_all.first.tolist() == [31, 46, 61] and of_all.last.tolist() == [44, 59, 74]
     # Each window is turned as a whole; harmonic 2 turns twice as much.

@@ -15,8 +15,12 @@ PRIORS = {"k": bp.Normal(800.0, 60.0), "coulomb": bp.Normal(20.0, 10.0)}
 @pytest.fixture(scope="module")
 def fit():
     """Return a fit of k in common, coulomb of each of two runs, c tied to k, and a known variance."""
-    runs = [linear_experiment(np.array([900.0, 45.0, f]), 3.0, seed=1, name=name) for name, f in (("a", 25.0), ("b", 15.0))]
-    problem = bp.Problem(LINEAR, runs, priors=PRIORS, fixed={"variance[force]": 9.0}, tied={"c": "k/20"}, local=("coulomb",))
+    runs = [
+        linear_experiment(np.array([900.0, 45.0, f]), 3.0, seed=1, name=name) for name, f in (("a", 25.0), ("b", 15.0))
+    ]
+    problem = bp.Problem(
+        LINEAR, runs, priors=PRIORS, fixed={"variance[force]": 9.0}, tied={"c": "k/20"}, local=("coulomb",)
+    )
     return bp.map_estimate(problem, progress=False)
 
 
@@ -46,7 +50,9 @@ def test_names_that_are_not_shared_need_the_experiment(fit):
         fit.derive({"x": "2*coulomb"})
     with pytest.raises(ValueError, match="experiment: must be one of 'a', 'b', got 'd'"):
         fit.derive({"x": "2*coulomb"}, experiment="d")
-    with pytest.raises(ValueError, match=r"expressions\['x'\]: must be finite at the estimate, got nan for 'log\(-k\)'.$"):
+    with pytest.raises(
+        ValueError, match=r"expressions\['x'\]: must be finite at the estimate, got nan for 'log\(-k\)'.$"
+    ):
         fit.derive({"x": "log(-k)"})
     with pytest.raises(ValueError, match="got 'k'"):
         fit.derive({"k": "2*c"})
@@ -55,7 +61,9 @@ def test_names_that_are_not_shared_need_the_experiment(fit):
 
 def test_infinite_variances_of_other_parameters_do_not_matter():
     matrix = np.array([[4.0, 1.0, 0.5], [1.0, 9.0, 2.0], [0.5, 2.0, np.inf]])
-    found = carried_covariance(matrix, [np.array([1.0, 0.0, 0.0]), np.array([2.0, -1.0, 0.0]), np.array([0.0, 0.0, 3.0])])
+    found = carried_covariance(
+        matrix, [np.array([1.0, 0.0, 0.0]), np.array([2.0, -1.0, 0.0]), np.array([0.0, 0.0, 3.0])]
+    )
     assert found.tolist() == [[4.0, 7.0, 1.5], [7.0, 21.0, -3.0], [1.5, -3.0, np.inf]]
 
 
@@ -73,11 +81,15 @@ def test_part_of_the_covariance_is_a_prior(fit):
 
 
 def test_a_prior_needs_a_converged_estimate_and_finite_deviations(fit):
-    with pytest.warns(UserWarning, match=r"The estimate has not converged \(max_steps\), and the prior is unreliable. Try"):
+    with pytest.warns(
+        UserWarning, match=r"The estimate has not converged \(max_steps\), and the prior is unreliable. Try"
+    ):
         replace(fit, status="max_steps").as_prior(("k", "coulomb[a]"))
     lost = fit.covariance.copy()
     lost.loc["k", "k"] = np.inf
-    with pytest.raises(ValueError, match="names: must be parameters with a finite standard deviation, got 'k', which the"):
+    with pytest.raises(
+        ValueError, match="names: must be parameters with a finite standard deviation, got 'k', which the"
+    ):
         replace(fit, covariance=lost).as_prior(("k", "coulomb[a]"))
     assert replace(fit, covariance=lost).as_prior(("coulomb[b]", "coulomb[a]")).log_prob(np.array([15.0, 25.0])) > -50
 
@@ -86,5 +98,8 @@ def test_what_was_not_computed_is_named_with_the_call_that_does():
     run = linear_experiment(np.array([900.0, 45.0, 25.0]), 3.0, seed=1)
     problem = bp.Problem(LINEAR, [run], priors=PRIORS, fixed={"c": 45.0})
     bare = bp.map_estimate(problem, progress=False, checks=False)
-    with pytest.raises(ValueError, match="checks: must be computed before 'misfit' is used, got an estimate with checks=False; take map_est"):
+    with pytest.raises(
+        ValueError,
+        match="checks: must be computed before 'misfit' is used, got an estimate with checks=False; take map_est",
+    ):
         bare.misfit  # noqa: B018

@@ -37,7 +37,8 @@ def item(kind):
     "kind, stored, packing, remark",
     [
         ("i2", {}, Packing(), ""), ("f8", {}, Packing(missing=(9.969209968386869e36,)), ""),
-        ("f2", {}, Packing(), ""), ("O", {"scale_factor": 2.0}, Packing(), ""), ("S5", {"_FillValue": 1}, Packing(), ""),
+        ("f2", {}, Packing(), ""), ("O", {"scale_factor": 2.0}, Packing(), ""),
+        ("S5", {"_FillValue": 1}, Packing(), ""),
         ("i2", {"scale_factor": 0.5}, Packing(0.5), "stored values are multiplied by 0.5 and 0 is added"),
         ("i2", {"add_offset": 2}, Packing(1.0, 2.0), "stored values are multiplied by 1 and 2 is added"),
         ("i2", {"scale_factor": 1.0, "add_offset": 0.0}, Packing(), ""),
@@ -50,7 +51,8 @@ def item(kind):
         ("i2", {"valid_min": -5, "valid_max": 5}, Packing(low=-5.0, high=5.0), ""),
         ("i2", {"valid_range": (-5, 5), "valid_min": -3}, Packing(low=-3.0, high=5.0), ""),
         ("i1", {"_Unsigned": "TRUE", "_FillValue": -1}, Packing(missing=(255.0,), unsigned=True), ""),
-        ("i2", {"_Unsigned": "true", "_FillValue": -1, "missing_value": 0}, Packing(missing=(65535.0, 0.0), unsigned=True),
+        ("i2", {"_Unsigned": "true", "_FillValue": -1, "missing_value": 0},
+         Packing(missing=(65535.0, 0.0), unsigned=True),
          ""), ("i2", {"_Unsigned": "false", "_FillValue": -1}, Packing(missing=(-1.0,)), ""),
     ],
 )  # fmt: skip
@@ -104,14 +106,19 @@ def test_dates_after_iso_8601_in_the_years_of_nanoseconds(text, date):
 @pytest.mark.parametrize(
     "unit, size",
     [
-        ("s", 1), ("Seconds", 1), ("ms", 1e-3), ("usec", 1e-6), ("µs", 1e-6), ("ns", 1e-9), ("min", 60), ("hours", 3600),
+        ("s", 1), ("Seconds", 1), ("ms", 1e-3), ("usec", 1e-6), ("µs", 1e-6), ("ns", 1e-9), ("min", 60),
+        ("hours", 3600),
         ("h", 3600), ("days", 86_400), (" s ", 1), ("mm", None), ("", None), ("m", None),
     ],
 )  # fmt: skip
 def test_units_of_time(unit, size):
     since = Since.of(unit, {})
     assert since is None if size is None else since.seconds(3) == pytest.approx(3 * size, rel=1e-15)
-    assert since is None or since.seconds(np.arange(3.0)).tolist() == [0.0, pytest.approx(size), pytest.approx(2 * size)]
+    assert since is None or since.seconds(np.arange(3.0)).tolist() == [
+        0.0,
+        pytest.approx(size),
+        pytest.approx(2 * size),
+    ]
     since = Since.of(f"{unit} since 2026-01-31", {})
     assert (since.origin is None) == bool(since.refusal) == (size is None) if since else not unit.strip()
 
@@ -122,11 +129,15 @@ def test_dates_that_cannot_be_read_are_refused_with_what_reads_them():
         ("weeks since 2026-01-01", {}, "dates in 'weeks since 2026-01-01' of calendar 'standard'; "),
         ("days since noon", {}, "dates since 'noon'; "),
     ):
-        assert Since.of(unit, stored).refusal == f"{what}read it by xarray.open_dataset, and give seconds to from_arrays"
+        assert (
+            Since.of(unit, stored).refusal == f"{what}read it by xarray.open_dataset, and give seconds to from_arrays"
+        )
     assert Since.of("days since 2026-01-01", {"calendar": "Gregorian"}).refusal == ""
 
 
-@pytest.mark.parametrize("unit, count, step", [("days", 2, 86_400e9), ("ms", 7, 1e6), ("ns", 5, 1), ("minutes", 3, 60e9)])
+@pytest.mark.parametrize(
+    "unit, count, step", [("days", 2, 86_400e9), ("ms", 7, 1e6), ("ns", 5, 1), ("minutes", 3, 60e9)]
+)
 def test_dates_of_integers_and_floats(unit, count, step):
     """By integer arithmetic of NumPy; a missing float is a missing date."""
     since = Since.of(f"{unit} since 2026-01-31T12:00:00", {})
@@ -145,7 +156,9 @@ def test_dates_may_be_rounded_by_a_thousandth_of_their_step(part, exact):
     if exact:
         assert (since.dates(values) - since.origin).astype(int).tolist() == [0, 1, 2, 3]
     else:
-        with pytest.raises(ValueError, match="its dates are finer than nanoseconds; read them with xarray and give seconds"):
+        with pytest.raises(
+            ValueError, match="its dates are finer than nanoseconds; read them with xarray and give seconds"
+        ):
             since.dates(values)
     assert since.dates(np.array([0.3, 0.3])).size == 2  # without a step
 
@@ -168,7 +181,8 @@ def test_dates_beyond_the_years_of_nanoseconds_are_refused(years, inside):
         ({"dt": 10.0, "dt_unit": "ms", "t0": 2.0, "t0_unit": "s"}, 2.0, 0.01),
         ({"fs": 0.1, "fs_unit": "kHz", "t0": 99_999_999.0}, 99_999_999.0, 0.01),
         ({"dt": 0.01, "fs": 100.0 * (1 + 1e-13)}, 0.0, 0.01), ({"dt": 1.0, "time_unit": "min"}, 0.0, 60.0),
-        ({"dt": 0.01, "sampling_unit": "Hz", "fs": 100.0}, 0.0, 0.01), ({"fs": 2.0, "sampling_unit": "GHz"}, 0.0, 5e-10),
+        ({"dt": 0.01, "sampling_unit": "Hz", "fs": 100.0}, 0.0, 0.01),
+        ({"fs": 2.0, "sampling_unit": "GHz"}, 0.0, 5e-10),
     ],
 )  # fmt: skip
 def test_times_by_rate_or_interval_and_start(stored, start, step):
@@ -176,13 +190,16 @@ def test_times_by_rate_or_interval_and_start(stored, start, step):
     assert clock.refusal == "" and (clock.start, clock.origin, clock.error) == (start, None, 0.0)
     assert clock.step == pytest.approx(step, rel=1e-12)
     shown = [f"{key} = {value}" for key, value in stored.items() if "t0" != key]
-    assert clock.remarks[0].startswith("times are those of its attributes ") and all(x in clock.remarks[0] for x in shown)
+    assert clock.remarks[0].startswith("times are those of its attributes ") and all(
+        x in clock.remarks[0] for x in shown
+    )
 
 
 @pytest.mark.parametrize(
     "stored, what",
     [
-        ({"dt": 0.01, "fs": 100.0 * (1 + 1e-11)}, "whose attributes dt = 0.01, fs = 100.000000001 contradict each other"),
+        ({"dt": 0.01, "fs": 100.0 * (1 + 1e-11)},
+         "whose attributes dt = 0.01, fs = 100.000000001 contradict each other"),
         ({"fs": -1.0}, "whose attributes say fs = -1.0"), ({"fs": 0}, "whose attributes say fs = 0"),
         ({"fs": np.inf}, "whose attributes say fs = inf"), ({"fs": (1, 2)}, "whose attributes say fs = (1, 2)"),
         ({"fs": 1.0, "fs_unit": "mHz"}, "whose attributes fs = 1.0, fs_unit = mHz do not say one unit"),
@@ -192,7 +209,8 @@ def test_times_by_rate_or_interval_and_start(stored, start, step):
         ({"dt": 1.0, "t0": -1e8}, "whose attribute t0 = -100000000.0 is no start in seconds or after ISO 8601"),
         ({"dt": 1.0, "t0": np.nan}, "whose attribute t0 = nan is no start in seconds or after ISO 8601"),
         ({"dt": 1.0, "dt_unit": "ms", "t0": 2.0}, "whose attribute t0 = 2.0 has no unit"),
-        ({"dt": 1.0, "t0": 1.0, "start_time": 2.0}, "whose attributes t0 = 1.0, start_time = 2.0 contradict each other"),
+        ({"dt": 1.0, "t0": 1.0, "start_time": 2.0},
+         "whose attributes t0 = 1.0, start_time = 2.0 contradict each other"),
     ],
 )  # fmt: skip
 def test_times_that_attributes_leave_open_are_refused_with_the_attributes(stored, what):
@@ -206,4 +224,6 @@ def test_zero_start_needs_no_unit_and_other_attributes_say_no_times():
     assert clock.origin == np.datetime64("2026-01-31T11:00:00", "ns") and clock.start == 0.0
     assert sampling({"t0": 1.0, "rate": "fast", "units": "mm"}) is None
     assert sampling({"dt": np.float32(1 / 48000)}).error == pytest.approx(0.5e-12, rel=1e-3)  # of 2.0833333e-05
-    assert sampling({"dt": np.float32(1 / 48), "dt_unit": "ms"}).error == pytest.approx(0.5e-12, rel=1e-3)  # 0.020833334
+    assert sampling({"dt": np.float32(1 / 48), "dt_unit": "ms"}).error == pytest.approx(
+        0.5e-12, rel=1e-3
+    )  # 0.020833334

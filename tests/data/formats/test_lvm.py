@@ -276,11 +276,17 @@ def edited(old, new, text=None, count=1):
         (edited("Samples\t50\t50", "Samples\t51\t51"), "it is cut off: it has 50 rows, and 51 samples by its header"),
         (edited("Samples\t50\t50", "Samples\t49\t49"), "it has 50 rows, and 49 samples by its header"),
         (edited("Channels\t2", "Channels\t0"), "it has 0 channels by its header, and the names .* from line "),
-        (edited("\ta\tb\tComment", "\ta\tb\tc"), "it has 2 channels by its header, and the names .*'c'. from line 23 on"),
+        (
+            edited("\ta\tb\tComment", "\ta\tb\tc"),
+            "it has 2 channels by its header, and the names .*'c'. from line 23 on",
+        ),
         (edited("X_Value", "Y_Value"), "it is cut off, or has no rows of numbers"),
         (head(), "it is cut off, or has no rows of numbers"),
         (head() + "***Start_Special***\n", "it is cut off, or has no rows of numbers"),
-        ((head() + segment()).rstrip("\n")[:-3], "it seems to be cut off: its last line has no end; add one if its last"),
+        (
+            (head() + segment()).rstrip("\n")[:-3],
+            "it seems to be cut off: its last line has no end; add one if its last",
+        ),
         ((head() + segment(comment=False)) + "0.05\t1\t2\t3\t4\n", r"row 51 after line 23 has 5 fields, and 3 have"),
         ((head() + segment(comment=False)) + "0.05\t1\n", r"row 51 after line 23 has 2 fields, and 3 have names"),
     ],
@@ -305,7 +311,9 @@ def test_times_without_a_rate_must_be_given(tmp_path):
 def test_times_that_are_missing_are_refused(tmp_path):
     lines = (head() + segment()).split("\n")
     lines[-5] = "\t".join(["", *lines[-5].split("\t")[1:]])
-    refused(tmp_path, "\n".join(lines), "channel 'a' of run.lvm, some of whose times are missing; sampling_rate= gives it")
+    refused(
+        tmp_path, "\n".join(lines), "channel 'a' of run.lvm, some of whose times are missing; sampling_rate= gives it"
+    )
 
 
 @pytest.mark.parametrize("change, taken", [(0.0, True), (2.1e-8, True), (5e-8, False), (-5e-8, False)])
@@ -315,7 +323,9 @@ def test_step_may_differ_from_the_times_by_their_last_digit(tmp_path, change, ta
     if taken:
         assert read(tmp_path, text).time[-1] == pytest.approx(0.049, rel=2.2e-5)
     else:
-        refused(tmp_path, text, f"whose times are 0.001 s apart, while Delta_X is {1e-3 + change!r:.8}.* s; sampling_rate=")
+        refused(
+            tmp_path, text, f"whose times are 0.001 s apart, while Delta_X is {1e-3 + change!r:.8}.* s; sampling_rate="
+        )
 
 
 @pytest.mark.parametrize("shift, even", [(0.0, True), (-1e-6, True), (1e-6, False), (-2e-6, False)])
@@ -344,7 +354,9 @@ def test_arguments_are_in_the_suggested_code(tmp_path):
     assert "decimal='.'" in code and "encoding='cp1252'" in code
 
 
-@pytest.mark.parametrize("texts, digit", [(["0.5"], 0.1), (["1", "2.25", "3.5"], 0.01), ([" 7 "], 1.0), (["1E-3", "5.0E-1"], 1e-3)])
+@pytest.mark.parametrize(
+    "texts, digit", [(["0.5"], 0.1), (["1", "2.25", "3.5"], 0.01), ([" 7 "], 1.0), (["1E-3", "5.0E-1"], 1e-3)]
+)
 def test_last_digit_is_that_of_the_longest_number(texts, digit):
     assert lvm._digit(texts, ".") == pytest.approx(digit)
     assert lvm._digit([text.replace(".", ",") for text in texts], ",") == pytest.approx(digit)
@@ -366,7 +378,8 @@ def test_error_of_a_step_is_half_of_its_last_digit_unless_its_rate_is_round(text
     "date, time, instant",
     [
         ("2026/01/31", "12:00:00.25", "2026-01-31T12:00:00.25"), ("2026/1/3", "1:02:03", "2026-01-03T01:02:03"),
-        ("2026/01/31", "12:00:00,5000000000000000000", "2026-01-31T12:00:00.5"), (" 2026/01/31 ", " 23:59:59.9999999999",
+        ("2026/01/31", "12:00:00,5000000000000000000", "2026-01-31T12:00:00.5"),
+        (" 2026/01/31 ", " 23:59:59.9999999999",
         "2026-01-31T23:59:59.999999999"), ("31.01.2026", "12:00:00", None), ("2026/01/31", "12 o'clock", None),
         ("2026/01/31x", "12:00:00", None), (None, "12:00:00", None), ("2026/01/31", None, None),
     ],

@@ -465,7 +465,9 @@ def test_times_in_seconds_by_any_name_are_taken(tmp_path, unit):
 )  # fmt: skip
 def test_other_times_are_refused_and_a_rate_takes_their_place(tmp_path, master, reason):
     content = one_channel(master=master)
-    which = f"whose times 't' {reason}" if reason else "which is recorded over an unknown quantity .'t'. and not over time"
+    which = (
+        f"whose times 't' {reason}" if reason else "which is recorded over an unknown quantity .'t'. and not over time"
+    )
     refused(tmp_path, content, f"time: must be known, got channel 'g/x' of run.mf4, {which}.*; sampling_rate= gives it")
     assert read(tmp_path, content, sampling_rate=10.0).time[1] == pytest.approx(0.1)
 
@@ -502,7 +504,10 @@ def test_times_of_single_precision_are_taken(tmp_path):
     [
         ({"master": 1}, "texts or bytes of any length, which are not read"),
         ({"flags": 1}, "samples that are all marked as invalid"),
-        ({"conversion": FORMULA}, "a conversion by a formula; read it by asammdf with raw=True, and convert it for from"),
+        (
+            {"conversion": FORMULA},
+            "a conversion by a formula; read it by asammdf with raw=True, and convert it for from",
+        ),
     ],
 )
 def test_channels_that_are_not_read_are_refused_with_the_reason(tmp_path, x, reason):
@@ -560,7 +565,6 @@ def test_instants_of_files_are_their_origin(tmp_path):
     ):  # fmt: skip
         path.write_bytes(simple().replace(struct.pack("<Q", 1_769_860_800 * 10**9), struct.pack("<Q", start)))
         assert {one.clock.origin for one in mdf.contents(path, []).channels} == {origin}
-
 
 
 @pytest.mark.parametrize("content", [simple(kind=LINEAR, values=[0, 1.0]), invalidated(), version_3()])

@@ -1,4 +1,4 @@
-"""Blocks of MDF files, built after ASAM MDF 4.1 and Vector's description of MDF 3.3: sound ones pass, others are named."""
+"""Blocks of MDF files, built after ASAM MDF 4.1 and Vector's description of MDF 3.3: sound or named."""
 
 import io
 import struct
@@ -13,8 +13,8 @@ from tests.data.formats.test_mdf import (
     LINEAR,
     MASTER,
     TIME,
-    X,
     Blocks,
+    X,
     channel,
     conversion,
     header,

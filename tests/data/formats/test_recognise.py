@@ -36,9 +36,12 @@ def zipped(*names):
         ("a", b"\r\n\r\n    -1  \r\n    58", "uff"), ("a", b"   -1\n", "csv"), ("a", b"    -1 2\n", "csv"),
         ("a", zipped("a.npy", "b.npy"), "npz"), ("a", zipped("xl/workbook.xml", "b"), "excel"), ("a", b"t,x\n", "csv"),
         ("a.dat", MAT4, "csv"), ("a.mat", b"t,x\n0,1\n", "csv"), ("a.mat", MAT4[:19], "csv"),
-        ("a.mat", struct.pack("<5i", 0, 2, 3, 0, 2) + b"xy", "csv"), ("a.mat", struct.pack("<5i", 0, -1, 3, 0, 2) + b"x\0", "csv"),
-        ("a.mat", struct.pack("<5i", 0, 2, 3, 2, 2) + b"x\0", "csv"), ("a.mat", struct.pack("<5i", 60, 2, 3, 0, 2) + b"x\0", "csv"),
-        ("a.mat", struct.pack("<5i", 3, 2, 3, 0, 2) + b"x\0", "csv"), ("a.mat", struct.pack("<5i", 100, 2, 3, 0, 2) + b"x\0", "csv"),
+        ("a.mat", struct.pack("<5i", 0, 2, 3, 0, 2) + b"xy", "csv"),
+        ("a.mat", struct.pack("<5i", 0, -1, 3, 0, 2) + b"x\0", "csv"),
+        ("a.mat", struct.pack("<5i", 0, 2, 3, 2, 2) + b"x\0", "csv"),
+        ("a.mat", struct.pack("<5i", 60, 2, 3, 0, 2) + b"x\0", "csv"),
+        ("a.mat", struct.pack("<5i", 3, 2, 3, 0, 2) + b"x\0", "csv"),
+        ("a.mat", struct.pack("<5i", 100, 2, 3, 0, 2) + b"x\0", "csv"),
         ("a.mat", struct.pack("<5i", 0, 2, 3, 0, 1) + b"\0", "csv"),
     ],
 )  # fmt: skip
@@ -52,11 +55,16 @@ def test_formats_are_recognised_by_their_first_bytes(tmp_path, name, content, fo
     "name, content, what",
     [
         ("a", b"", "which is empty."), ("a", b"\x1f\x8b\x08", "a compressed file (gzip); unpack it first."),
-        ("a", b"\xd0\xcf\x11\xe0", "an old Excel file (.xls); save it as .xlsx."), ("a", b"\x80\x04", "a pickle of Python; "),
-        ("a", b"\x93NUMPY", "one array (.npy); read it by numpy.load for from_arrays."), ("a.mat", MAT4, "a MAT file of "
-        "version 4; load it in MATLAB, and save it by save('run.mat', '-v7')."), ("a.mat", struct.pack(">5i", 1000, 2, 3, 1,
-        2) + b"x\0", "a MAT file of version 4;"), ("a.mat", struct.pack("<5i", 52, 0, 3, 1, 2) + b"x\0", "a MAT file of"),
-        ("a", zipped("a.npy", "b.txt"), "a ZIP archive that is no workbook and has no arrays of NumPy; unpack it first."),
+        ("a", b"\xd0\xcf\x11\xe0", "an old Excel file (.xls); save it as .xlsx."),
+        ("a", b"\x80\x04", "a pickle of Python; "),
+        ("a", b"\x93NUMPY", "one array (.npy); read it by numpy.load for from_arrays."),
+        ("a.mat", MAT4, "a MAT file of "
+        "version 4; load it in MATLAB, and save it by save('run.mat', '-v7')."),
+        ("a.mat", struct.pack(">5i", 1000, 2, 3, 1,
+        2) + b"x\0", "a MAT file of version 4;"),
+        ("a.mat", struct.pack("<5i", 52, 0, 3, 1, 2) + b"x\0", "a MAT file of"),
+        ("a", zipped("a.npy", "b.txt"),
+         "a ZIP archive that is no workbook and has no arrays of NumPy; unpack it first."),
     ],
 )  # fmt: skip
 def test_other_files_are_refused_with_what_they_are(tmp_path, name, content, what):
@@ -76,10 +84,14 @@ def test_file_that_does_not_exist_or_arguments_of_other_formats_are_refused(tmp_
     with pytest.raises(ValueError, match="format: must be one of .*, got 'text'"):
         bp.inspect(path, format="text")
     np.savez(tmp_path / "run.npz", t=np.arange(3.0))
-    with pytest.raises(ValueError, match="^decimal: must be left out for 'run.npz', read as 'npz', which takes none of thes"):
+    with pytest.raises(
+        ValueError, match="^decimal: must be left out for 'run.npz', read as 'npz', which takes none of thes"
+    ):
         bp.inspect(tmp_path / "run.npz", decimal=",")
     path.write_bytes(b"LabVIEW Measurement\t\n")
-    with pytest.raises(ValueError, match="^header: must be left out for 'run.csv', read as 'lvm', which takes encoding, dec"):
+    with pytest.raises(
+        ValueError, match="^header: must be left out for 'run.csv', read as 'lvm', which takes encoding, dec"
+    ):
         bp.inspect(path, header=1)
 
 
@@ -93,7 +105,8 @@ def raised(error):
     [
         (ValueError("it is cut off"), "path: must be a file of a kind, got 'run.x' (it is cut off)."),
         (KeyError("a"), "path: must be a file of a kind, got 'run.x' (KeyError: 'a')."),
-        (ValueError("x: must be 1"), "x: must be 1"), (ValueError("x['a']: must be 1"), "x['a']: must be 1"),
+        (ValueError("x: must be 1"), "x: must be 1"),
+        (ValueError("x['a']: must be 1"), "x['a']: must be 1"),
         (ValueError("column of run.csv: must be 1"), "column of run.csv: must be 1"),
         (ValueError("column 'x' of run.csv"), "column 'x' of run.csv"),
         (TypeError("x: must be 1"), "path: must be a file of a kind, got 'run.x' (TypeError: x: must be 1)."),
@@ -107,7 +120,9 @@ def test_any_error_of_a_package_is_one_of_the_file(error, message):
 
 
 def test_package_that_is_not_installed_is_named_with_its_extra():
-    with pytest.raises(ImportError, match=r"got odd files, which is read by Odd \(No module.*pip install \"bayesperiodic.files"):
+    with pytest.raises(
+        ImportError, match=r"got odd files, which is read by Odd \(No module.*pip install \"bayesperiodic.files"
+    ):
         contents.package("no_such_module", "Odd", "odd files")
 
 
@@ -124,8 +139,9 @@ def test_channels_are_found_by_name_number_or_group(key, place):
     [
         (0, "channel of run.x: must be a number from 1 to 3, got 0."), (4, "must be a number from 1 to 3, got 4."),
         (("c", "x"), "channel of run.x: must be one of ('a', 'x'), ('b', 'x'), ('', 'y'), got ('c', 'x')."),
-        ("x", "channel of run.x: must be the name of one channel, got 'x', the name of 2; give the group too: ('a', 'x'), "
-              "('b', 'x')."), ("z", "channel of run.x: must be one of 'x', 'x', 'y', got 'z'"), (True, "must be one of"),
+        ("x", "channel of run.x: must be the name of one channel, got 'x', the name of 2; give the group too: ('a', "
+              "'x'), ('b', 'x')."), ("z", "channel of run.x: must be one of 'x', 'x', 'y', got 'z'"),
+              (True, "must be one of"),
     ],
 )  # fmt: skip
 def test_other_keys_are_refused_with_those_that_are_there(key, message):
@@ -151,7 +167,8 @@ def test_error_of_a_decimal_number_is_half_a_unit_of_its_last_digit(text, half):
     "text, error",
     [
         ("0.0025", 0), ("0.00250000", 0), ("0.00390625", 0), ("1.953125E-05", 0), ("1.95313E-05", 5e-11), ("0.0333", 0),
-        ("0.03333", 5e-6), ("0", 0), ("-0.03333", 0), ("0.00122", 0), ("0.001221", 5e-7), ("0.0008192", 5e-8), ("1E3", 0),
+        ("0.03333", 5e-6), ("0", 0), ("-0.03333", 0), ("0.00122", 0), ("0.001221", 5e-7), ("0.0008192", 5e-8),
+        ("1E3", 0),
     ],
 )  # fmt: skip
 def test_steps_of_three_digits_and_reciprocals_of_six_are_exact(text, error):
@@ -168,10 +185,13 @@ def test_texts_that_are_no_numbers_are_named(text):
 @pytest.mark.parametrize(
     "content, encoding, remark",
     [
-        (b"t,x\n", "utf-8", ""), ("t,µ\n".encode(), "utf-8", ""), ("t,µ".encode("utf-16"), "utf-16", "by its byte order"),
-        ("t,µ".encode("utf-32"), "utf-32", "by its byte order"), (b"\xef\xbb\xbft,x", "utf-8", "'utf-8', by its byte order"),
+        (b"t,x\n", "utf-8", ""), ("t,µ\n".encode(), "utf-8", ""),
+        ("t,µ".encode("utf-16"), "utf-16", "by its byte order"),
+        ("t,µ".encode("utf-32"), "utf-32", "by its byte order"),
+        (b"\xef\xbb\xbft,x", "utf-8", "'utf-8', by its byte order"),
         ("t,µ\n".encode("cp1252"), "cp1252", "read as the characters 'µ': if they are others"),
-        ("€ äöüßÄÖÜé\n".encode("cp1252"), "cp1252", "'€', 'Ä', 'Ö', 'Ü', 'ß', 'ä', 'é', 'ö': if they are others, give enc"),
+        ("€ äöüßÄÖÜé\n".encode("cp1252"), "cp1252",
+         "'€', 'Ä', 'Ö', 'Ü', 'ß', 'ä', 'é', 'ö': if they are others, give enc"),
     ],
 )  # fmt: skip
 def test_encoding_is_that_of_the_bytes(tmp_path, content, encoding, remark):
@@ -179,7 +199,11 @@ def test_encoding_is_that_of_the_bytes(tmp_path, content, encoding, remark):
     path = tmp_path / "run.csv"
     path.write_bytes(content)
     text = encodings.opened(path, None)
-    assert (text.encoding, repr(text)) == (encoding, repr(str(path))) and remark in text.remark and bool(remark) == bool(text.remark)
+    assert (
+        (text.encoding, repr(text)) == (encoding, repr(str(path)))
+        and remark in text.remark
+        and bool(remark) == bool(text.remark)
+    )
     with text.open() as lines:
         assert lines.read() == content.decode("utf-8-sig" if encoding == "utf-8" else encoding)
     given = encodings.opened(path, encoding)
@@ -196,9 +220,8 @@ def test_encoding_is_that_of_the_bytes(tmp_path, content, encoding, remark):
 def test_byte_that_is_not_in_the_encoding_is_named_with_its_line(tmp_path, content, encoding, line, byte):
     path = tmp_path / "run.csv"
     path.write_bytes(content)
-    message = rf"path: must be a CSV file in {encoding or 'UTF-8'}, got .*, whose line {line} has the byte 0x{byte}; it may".replace(
-        "in utf-8", "in UTF-8"
-    )
+    name = "UTF-8" if encoding in (None, "utf-8") else encoding
+    message = f"path: must be a CSV file in {name}, got .*, whose line {line} has the byte 0x{byte}; it may"
     with pytest.raises(ValueError, match=message):
         encodings.opened(path, encoding)
 

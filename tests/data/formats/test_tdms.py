@@ -289,7 +289,10 @@ FIRST, AT_ZERO = stamp("2026-01-31T12:00:00"), {"wf_start_offset": 0.0}
         ({"wf_increment": -0.01}, "whose wf_increment is -0.01 and wf_start_offset 0.0; sampling_rate= gives it"),
         ({"wf_increment": np.nan}, "whose wf_increment is nan and wf_start_offset 0.0; sampling_rate= gives it"),
         ({"wf_increment": 0.01, "wf_start_offset": np.inf}, "is 0.01 and wf_start_offset inf; sampling_rate= gives it"),
-        ({"wf_increment": 0.01, "wf_start_time": 5}, "whose wf_start_time is no timestamp, but 5; sampling_rate= gives"),
+        (
+            {"wf_increment": 0.01, "wf_start_time": 5},
+            "whose wf_start_time is no timestamp, but 5; sampling_rate= gives",
+        ),
         ({"wf_increment": 0.01, "wf_xunit_string": "ms"}, "whose axis is in 'ms', no time in seconds; sampling_rate="),
         ({"wf_increment": 1.0}, "whose wf_increment of 1 without wf_start_time is also that of samples without a wave"),
     ],
@@ -329,7 +332,9 @@ def test_a_later_segment_continues_the_first_one_to_half_a_step(tmp_path, first,
         start = first.get("wf_start_offset", 0.0)
         np.testing.assert_allclose(read(tmp_path, content).time, start + np.arange(600) / 100, atol=1e-9)
     else:
-        refused(tmp_path, content, f"whose segment from sample 300 starts {passed} s after the first one and not 3 s, as")
+        refused(
+            tmp_path, content, f"whose segment from sample 300 starts {passed} s after the first one and not 3 s, as"
+        )
 
 
 def test_each_later_segment_is_compared(tmp_path):
@@ -344,7 +349,8 @@ def days(date):
 @pytest.mark.parametrize(
     "seconds, fraction, date",
     [
-        (0, 0, "1904-01-01T00:00:00"), (86_400, 2**63, "1904-01-02T00:00:00.5"), (1, 2**34 * 3, "1904-01-01T00:00:01.000000003"),
+        (0, 0, "1904-01-01T00:00:00"), (86_400, 2**63, "1904-01-02T00:00:00.5"),
+        (1, 2**34 * 3, "1904-01-01T00:00:01.000000003"),
         (1, 2**33, "1904-01-01T00:00:01"), (-1, 0, None), (days("2262-01-01") * 86_400, 0, None),
         (days("2261-01-01") * 86_400, 0, "2261-01-01"),
     ],
@@ -385,7 +391,9 @@ def test_unit_of_a_scale_is_used_where_there_is_no_other(tmp_path):
     np.testing.assert_allclose(run.outputs["x"], 1e-2 * X)
 
 
-@pytest.mark.parametrize("announced, remarked", [(300, False), (100, False), (1, False), (0, False), (-7, False), (301, True), (200, True)])
+@pytest.mark.parametrize(
+    "announced, remarked", [(300, False), (100, False), (1, False), (0, False), (-7, False), (301, True), (200, True)]
+)
 def test_samples_are_whole_records_of_those_that_are_announced(tmp_path, announced, remarked):
     read(tmp_path, channel(X, wf_increment=0.01, wf_samples=announced))
     shown = f"wf_samples announces {announced} samples, there are 300"

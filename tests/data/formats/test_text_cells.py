@@ -164,7 +164,8 @@ def test_dates_and_times_in_one_order(cells, step, remark):
     "cells",
     [
         ["OL", "10:00:00"], [1.5, "10:00:00"], [np.nan, np.nan], ["10:00:00", "OL"], ["10:00:00.0123456789"] * 2,
-        ["10:00.5", "10:00:00.5"], ["10:99:00"], ["10:00:00", "10:00:60"], ["10:00:00", "1 days 10:00:00"], ["12.03.2026 10:00:00.0123456789"], ["12.03.2026", "OL"],
+        ["10:00.5", "10:00:00.5"], ["10:99:00"], ["10:00:00", "10:00:60"], ["10:00:00", "1 days 10:00:00"],
+        ["12.03.2026 10:00:00.0123456789"], ["12.03.2026", "OL"],
         ["31.13.2026"], ["2026-03-12T10:00:00", "2026-03-12T10:00:01"], ["12.03.2026 25:00:00"], ["12.03-2026"],
     ],
 )  # fmt: skip
@@ -178,7 +179,8 @@ def test_other_texts_are_no_times_and_have_no_reason_to_be_refused(cells):
     [
         (["11:59:59 AM", "12:00:00 PM"], "times of twelve hours", ["%I:%M:%S %p"]),
         (["10:00", "10:01"], "times such as '10:00', which may be hours and minutes or minutes", ["%H:%M", "%M:%S"]),
-        (["12.03.26", "13.03.26"], "dates such as '12.03.26', in which the year has no four digits", ["%d.%m.%y %H:%M:%S"]),
+        (["12.03.26", "13.03.26"], "dates such as '12.03.26', in which the year has no four digits",
+         ["%d.%m.%y %H:%M:%S"]),
         (["03/12/2026", "04/12/2026"], "dates such as '03/12/2026', in which day and month", ["%m/%d/%Y", "%d/%m/%Y"]),
         (["03-12-2026 10:00"] * 2, "'03-12-2026 10:00', in which day", ["%m-%d-%Y %H:%M", "%d-%m-%Y %H:%M"]),
         (["03/12/2026 10:00:00 AM"] * 2, "day and month may be", ["%m/%d/%Y %I:%M:%S %p", "%d/%m/%Y %I:%M:%S %p"]),

@@ -1,4 +1,4 @@
-"""Headers of texts: names, units and the first row of data as a reader of the file sees them, or a refusal with a cure."""
+"""Headers of texts: names, units and the first row of data as a reader sees them, or a refusal with a cure."""
 
 import re
 
@@ -109,19 +109,27 @@ def test_layouts_of_headers(write, layout):
 
 
 REFUSED = {
-    "a broken cell": ("t,x,y\nOL,0,1\n", {}, "got None, as line 2 has neither names nor only numbers, .*'OL'.*; give the number"),
+    "a broken cell": ("t,x,y\nOL,0,1\n", {},
+                      "got None, as line 2 has neither names nor only numbers, .*'OL'.*; give the number"),
     "two broken rows": ("t,x,y\nOL,OL,OL\nOL,OL,OL\n", {}, "got None, as lines 2 and 3 are alike, .*; give the number"),
-    "two lines of names": ("CH1,CH2,CH3\nt,F,V\n", {}, "as line 2 may be names or units, .*; give the number of the line"),
+    "two lines of names": ("CH1,CH2,CH3\nt,F,V\n", {},
+                           "as line 2 may be names or units, .*; give the number of the line"),
     "more names than columns": ("t,x,y,z\n", {}, "line above the data has 4 fields for 3 columns; give the number of"),
-    "fewer names than columns": ("t,x\n", {}, "line above the data has 2 fields for 3 columns; .* or header=0 for none"),
-    "a line that is empty": ("t,x,y\n\n", {"header": 2}, "header: must be the number of the line of the names, or 0 for none, got 2"),
+    "fewer names than columns": ("t,x\n", {},
+                                 "line above the data has 2 fields for 3 columns; .* or header=0 for none"),
+    "a line that is empty": ("t,x,y\n\n", {"header": 2},
+                             "header: must be the number of the line of the names, or 0 for none, got 2"),
     "a line beyond the end": ("t,x,y\n", {"header": 50}, "path: must be a CSV file .* no rows of numbers"),
-    "a line of no units": ("t,x,y\nTakte,Impulse,Stufen\n", {"header": 1}, "got 1, and line 2 is .*neither numbers nor known units"),
-    "rows of two widths": ("0,1\n1,2\n2,3\n", {}, "must be a CSV file with one table, .* rows of 3 fields after rows of numbers with other"),
+    "a line of no units": ("t,x,y\nTakte,Impulse,Stufen\n", {"header": 1},
+                           "got 1, and line 2 is .*neither numbers nor known units"),
+    "rows of two widths": ("0,1\n1,2\n2,3\n", {},
+                           "must be a CSV file with one table, .* rows of 3 fields after rows of numbers with other"),
     "a negative line": ("t,x,y\n", {"header": -1}, "header: must be "),
     "a line that is no number": ("t,x,y\n", {"header": "one"}, "header: must be "),
-    "nearly a number": ("t,x,y\n-00:00:01,1,2\n", {}, "got None, as line 2 has neither names nor only numbers, .*; give the number"),
-    "a broken first row": ("OL,1,2\n", {"header": 0}, "got 0, and line 1 has the cell 'OL' above numbers, .*; correct the cell"),
+    "nearly a number": ("t,x,y\n-00:00:01,1,2\n", {},
+                        "got None, as line 2 has neither names nor only numbers, .*; give the number"),
+    "a broken first row": ("OL,1,2\n", {"header": 0},
+                           "got 0, and line 1 has the cell 'OL' above numbers, .*; correct the cell"),
 }  # fmt: skip
 
 

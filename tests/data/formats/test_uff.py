@@ -408,11 +408,14 @@ def with_field(start, text, line=8):
         (with_field(43, f"{'nan':>13}"), "its data set 1 has an abscissa that is not finite"),
         (units164() + function(binary="<").replace(f"{11:12d}".encode(), f"{12:12d}".encode(), 1),
          "its data set 2 has 12 lines before its values, not 11"),
-        (function(binary="<", form=1), "its data set 1 has numbers of format 1 and byte order 1, not those of IEEE 754"),
-        (function() + function().replace(f"{58:6d}".encode(), b"  no58", 1), "it has a data set whose number is 'no58'"),
+        (function(binary="<", form=1),
+         "its data set 1 has numbers of format 1 and byte order 1, not those of IEEE 754"),
+        (function() + function().replace(f"{58:6d}".encode(), b"  no58", 1),
+         "it has a data set whose number is 'no58'"),
         (function()[:-7], "it is cut off"),
         (b"nothing", "it has no data set 58, but none"),
-        (units164() + function().replace(f"{58:6d}".encode(), f"{151:6d}".encode(), 1), "it has no data set 58, but 151, 164"),
+        (units164() + function().replace(f"{58:6d}".encode(), f"{151:6d}".encode(), 1),
+         "it has no data set 58, but 151, 164"),
     ],
 )  # fmt: skip
 def test_files_of_another_form_are_refused_with_the_number_of_the_set(saved, content, reason):
@@ -466,7 +469,9 @@ def test_times_may_be_rounded_to_a_hundredth_of_a_step(saved, step, taken):
             read(path)
 
 
-@pytest.mark.parametrize("start, digits", [("   1.2345E+01", "0.001"), ("  1.23000E+01", None), ("  -1.2345E+01", "0.001")])
+@pytest.mark.parametrize(
+    "start, digits", [("   1.2345E+01", "0.001"), ("  1.23000E+01", None), ("  -1.2345E+01", "0.001")]
+)
 def test_start_of_one_set_among_others_must_be_known_to_a_hundredth_of_a_step(saved, start, digits):
     lines = function(title="late").split(b"\n")
     lines[8] = lines[8][:30] + start.encode() + lines[8][43:]
@@ -475,7 +480,9 @@ def test_start_of_one_set_among_others_must_be_known_to_a_hundredth_of_a_step(sa
         assert read(path, "late").time[0] == 12.3
         return
     assert read(path, "top").time[0] == 0.0
-    with pytest.raises(ValueError, match=f"which starts at -?12.345 s, rounded to {digits} s with a step of 0.01 s, and"):
+    with pytest.raises(
+        ValueError, match=f"which starts at -?12.345 s, rounded to {digits} s with a step of 0.01 s, and"
+    ):
         bp.Recording.from_file(path, outputs={"x": "late", "y": "top"})
 
 

@@ -17,7 +17,9 @@ def stored(code, length, force):
 
 
 @pytest.mark.parametrize("code", SI)
-@pytest.mark.parametrize("error, known", [(0.0, True), (0.9e-4, True), (-0.9e-4, True), (1.1e-4, False), (-1.1e-4, False)])
+@pytest.mark.parametrize(
+    "error, known", [(0.0, True), (0.9e-4, True), (-0.9e-4, True), (1.1e-4, False), (-1.1e-4, False)]
+)
 def test_units_are_those_of_the_factors_to_four_digits(code, error, known):
     length, metres, force, newtons = SI[code]
     units = stored(code, metres / (1.0 + error), newtons)
@@ -51,7 +53,8 @@ def test_units_of_quantities_by_their_direction(kind, way, expected):
     "kind, way, label, units, expected",
     [
         (8, 1, "um", None, "um"), (8, 1, "[um]", None, "um"), (8, 1, "none", None, ""), (8, 1, "mm", MM, "mm"),
-        (8, 1, "(mm)", MM, "mm"), (8, 1, "millimeter", MM, "millimeter"), (8, 1, "m", MM, "m (label) or mm (data set 164)"),
+        (8, 1, "(mm)", MM, "mm"), (8, 1, "millimeter", MM, "millimeter"),
+        (8, 1, "m", MM, "m (label) or mm (data set 164)"),
         (8, 1, "g", MM, "g (label) or mm (data set 164)"), (8, 0, "", MM, "mm, mN (unknown)"), (8, 0, "um", MM, "um"),
         (8, 0, "", METRES, "m"), (9, 0, "", METRES, "N"), (1, 1, "", MM, "mm, mN (unknown)"), (1, 1, "V", MM, "V"),
         (1, 1, "", METRES, ""), (3, 1, "", MM, ""), (8, 1, "", UNCLEAR, f"{UNCLEAR.problem} (unknown)"),
@@ -78,7 +81,16 @@ def test_units_of_frequency_responses(label, denominator, units, expected):
 
 @pytest.mark.parametrize(
     "label, seconds",
-    [("s", 1.0), ("", 1.0), ("NONE", 1.0), ("[ms]", 1e-3), ("min", 60.0), ("Hz", None), ("mm", None), ("furlong x", None)],
+    [
+        ("s", 1.0),
+        ("", 1.0),
+        ("NONE", 1.0),
+        ("[ms]", 1e-3),
+        ("min", 60.0),
+        ("Hz", None),
+        ("mm", None),
+        ("furlong x", None),
+    ],
 )
 def test_seconds_of_a_unit_of_time(label, seconds):
     assert seconds_of(label) == (pytest.approx(seconds) if seconds else None)
