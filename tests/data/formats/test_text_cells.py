@@ -213,7 +213,7 @@ def test_dates_in_a_format_that_is_given(cells, form, step):
     assert text_cells.times(column(*cells), "%S") == text_cells.times(column("x", *cells), form) == (None, "", "")
 
 
-@pytest.mark.parametrize("mark, order", itertools.product("./-", ["%d{0}%m{0}%Y", "%m{0}%d{0}%Y", "%Y{0}%m{0}%d"]))
+@pytest.mark.parametrize("mark, order", [*itertools.product("./-", ["%d{0}%m{0}%Y", "%m{0}%d{0}%Y", "%Y{0}%m{0}%d"])])
 def test_all_days_of_a_year_in_any_order_are_read_or_refused(mark, order):
     """A year has days beyond 12, which tell the orders apart; with points, the day is the first."""
     days = pd.date_range("2026-01-01", "2026-12-31")
