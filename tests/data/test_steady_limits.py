@@ -186,3 +186,46 @@ def test_jumps_make_windows_differ_by_a_sample():
     slip, jump = steadiness._slip(noise, np.arange(0, 10_000, 100))
     assert slip[0] == pytest.approx(2 * 6**0.5 * 2.6, rel=0.1) and jump[0] == 0.0
     assert steadiness._slip(np.zeros((2, 2)), np.array([0]))[0].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("driven", [True, False])
+def test_steady_part_of_a_ramp_and_level_cycles(driven):
+    """Windows of eighths of a cycle, of which those that do not overlap are kept; the ramp ends at window 40."""
+    generator = np.random.default_rng(3)
+    sizes = np.minimum(np.arange(200) / 40.0, 1.0) * (1.0 + 1e-4 * generator.standard_normal(200))
+    every = windows_of(sizes * np.exp(1e-4j * generator.standard_normal(200)), overlap=8)
+    steady = steadiness.steady_part(every, driven)
+    places = steady.part.place
+    assert np.all(np.diff(places) == 8) and places[-1] == 199 and 37 <= places[0] <= 52
+    assert steady.samples == slice(5 * int(places[0]), 5 * 199 + 40) and steady.level == (
+        steady.samples.start,
+        5 * 199 + 40,
+    )
+    assert steady.change.shape == (2, 1) and np.all(np.abs(steady.change) < 1e-2)
+    assert steady.squares.shape == (1, 3) and steady.changes is not None and steady.bias < 0.1
+    of_all = steady.among(2 * np.arange(2000) + 1)
+    assert of_all.samples == slice(2 * steady.samples.start + 1, 2 * (steady.samples.stop - 1) + 2)
+    assert of_all.level == (2 * steady.level[0] + 1, 2 * (steady.level[1] - 1) + 2)
+
+
+@pytest.mark.parametrize("count, steady", [(16, False), (17, True)])
+def test_three_cycles_of_one_level_are_needed(count, steady):
+    """Of windows of eighths of a cycle, the first and the last of three cycles are 16 windows apart."""
+    assert (steadiness.steady_part(windows_of(np.ones(count), overlap=8), True) is not None) == steady
+    few = steadiness.steady_part(windows_of(np.ones(4)), True)
+    assert few.changes is None and few.squares.tolist() == [[0.0] * 3] and (few.bias, few.transient) == (0.0, 0.0)
+    assert steadiness.steady_part(windows_of(np.ones(2)), True) is None
+
+
+def test_rest_of_a_transient_is_left_out_where_its_bias_exceeds_the_noise():
+    """Four times its squared bias plus the variance of the mean over the others is least."""
+    cycle, generator = np.arange(60), np.random.default_rng(1)
+    sizes = 1.0 + 0.05 * np.exp(-cycle / 4.0) + 1e-3 * generator.standard_normal(60)
+    every = windows_of(sizes + 1e-3j * generator.standard_normal(60))
+    steady = steadiness.steady_part(every, True)
+    first = int(steady.part.place[0])
+    later = 0.05 * np.array([np.exp(-cycle[k:] / 4.0).mean() for k in range(60)])
+    error = (1.0 + 4.0 * (later / 1e-3) ** 2 * (60 - cycle)) / (60 - cycle)
+    best = int(np.argmin(error[:57]))
+    assert abs(first - best) <= 8 and steady.transient > 0.99 and steady.bias < 1.0
+    assert steady.level[0] == 0 and steady.samples == slice(5 * first, 300)

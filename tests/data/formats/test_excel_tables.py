@@ -153,8 +153,12 @@ def test_times_change_from_the_first_to_the_last_cell(cells, times):
 def test_cells_in_the_format_of_percents_are_ratios(unit, percents, left, remarked, refused):
     seen = excel._without_percent(StoredChannel("x", 1, np.zeros, unit=unit), percents)
     assert seen.unit == left and bool(seen.remarks) == remarked and bool(seen.refusal) == refused
-    assert not remarked or seen.remarks == ("cells in the format of percents, which store a hundredth: a ratio without a unit",)
-    assert not refused or seen.refusal.startswith(f"the unit {unit!r} and cells in the format of percents, which store a hund")
+    assert not remarked or seen.remarks == (
+        "cells in the format of percents, which store a hundredth: a ratio without a unit",
+    )
+    assert not refused or seen.refusal.startswith(
+        f"the unit {unit!r} and cells in the format of percents, which store a hund"
+    )
     before = excel._without_percent(StoredChannel("x", 1, np.zeros, unit="%/s", refusal="other"), {True})
     assert before.refusal == "other"
 

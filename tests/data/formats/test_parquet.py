@@ -258,7 +258,10 @@ def channels(path, **columns):
 @pytest.mark.parametrize(
     "column, remark",
     [
-        (pa.array([1, 2], pa.timestamp("us", tz="Europe/Berlin")), "dates in us, stored in UTC, shown in Europe/Berlin"),
+        (
+            pa.array([1, 2], pa.timestamp("us", tz="Europe/Berlin")),
+            "dates in us, stored in UTC, shown in Europe/Berlin",
+        ),
         (pa.array([1, 2], pa.timestamp("ms")), "dates in ms, without a time zone"),
         (pa.array([decimal.Decimal("1.5")] * 2), "decimal numbers, read as the nearest floats"),
         (pa.array([1, 2], pa.time64("us")), "times of day, which go on after midnight"),
@@ -348,7 +351,9 @@ def test_integers_with_nulls_are_those_that_floats_hold(path, value, exact):
     if exact:
         assert read(path, missing="drop")[1] == [float(value), 5.0]
     else:
-        with pytest.raises(ValueError, match=r"its column 2 has integers beyond 2\*\*53 and missing values; store it as fl"):
+        with pytest.raises(
+            ValueError, match=r"its column 2 has integers beyond 2\*\*53 and missing values; store it as fl"
+        ):
             read(path, missing="drop")
     write(path, t=pa.array([0, 1, 2]), x=pa.array([2**31 - 1, None, 5], pa.int32()))
     assert read(path, missing="drop")[1] == [2.0**31 - 1, 5.0]
@@ -374,7 +379,9 @@ def test_tables_without_rows_or_of_too_many_are_refused_with_their_size(path, mo
     for limit, refused in ((16 * COUNT, False), (16 * COUNT - 1, True)):
         monkeypatch.setattr(parquet, "LARGEST_ARRAY", limit)
         if refused:
-            with pytest.raises(ValueError, match=f"its header states {COUNT} rows, more than .* GB or than fit in the fil"):
+            with pytest.raises(
+                ValueError, match=f"its header states {COUNT} rows, more than .* GB or than fit in the fil"
+            ):
                 bp.inspect(path)
         else:
             assert len(bp.inspect(path).channels) == 2

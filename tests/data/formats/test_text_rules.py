@@ -91,7 +91,9 @@ ROWS = "".join(f"{k},{k + 0.5},{k % 3}\n" for k in range(40))
 def test_summaries_stand_in_a_column_of_numbers_beside_numbers(write, row, refused):
     path = write("t,x,y\n" + ROWS + row + "\n")
     if refused:
-        with pytest.raises(ValueError, match="path: must be a CSV file with a sample in each row, .* seems to be a summary; r"):
+        with pytest.raises(
+            ValueError, match="path: must be a CSV file with a sample in each row, .* seems to be a summary; r"
+        ):
             bp.inspect(path)
     else:
         assert bp.inspect(path).channels[0].samples == 41
@@ -138,26 +140,34 @@ def test_columns_that_were_not_wanted_are_read_when_they_are_asked_for(tmp_path)
     assert channels["x"].values().tolist() == [1.5, 2.5] and channels["z"].values().tolist() == [1, 2]
     assert channels["y"].values().tolist() == ["a", "b"] and channels["t"].samples == 2
     path.write_text("t;x\n0;1,234\n1;2,345\n")
-    with pytest.raises(ValueError, match="its column 2 has numbers such as '1,234', whose comma may be the decimal sign or"):
+    with pytest.raises(
+        ValueError, match="its column 2 has numbers such as '1,234', whose comma may be the decimal sign or"
+    ):
         text.contents(path, ["t"]).channels[1].values()
 
 
 def test_several_columns_of_a_name_need_the_number(write):
     path = write("t,x,x\n0,1,2\n1,2,3\n")
-    with pytest.raises(ValueError, match=r"must be the name of one column, got 'x', the name of 2 \(columns 2, 3\); give its"):
+    with pytest.raises(
+        ValueError, match=r"must be the name of one column, got 'x', the name of 2 \(columns 2, 3\); give its"
+    ):
         bp.Recording.from_csv(path, time="t", outputs={"x": "x"})
     assert bp.Recording.from_csv(path, time="t", outputs={"x": "x (1)"}).outputs["x"].tolist() == [1, 2]
 
 
 @pytest.mark.parametrize("content", ["t,x\n", "t,x\n\n\n", "x\n"])
 def test_names_without_rows_are_refused(write, content):
-    with pytest.raises(ValueError, match="path: must be a CSV file with rows of data, got .*, which has none|no rows of numbers"):
+    with pytest.raises(
+        ValueError, match="path: must be a CSV file with rows of data, got .*, which has none|no rows of numbers"
+    ):
         bp.Recording.from_csv(write(content), sampling_rate=1.0, outputs={"x": "x"})
 
 
 def test_second_table_is_named_with_the_row_of_its_name(write):
     content = "t,x\n0,1\n1,2\nt,x\n0,5\n"
-    with pytest.raises(ValueError, match="got the name 'x' again in data row 3: the file has several tables; save each"):
+    with pytest.raises(
+        ValueError, match="got the name 'x' again in data row 3: the file has several tables; save each"
+    ):
         bp.Recording.from_csv(write(content), sampling_rate=1.0, outputs={"x": "x"})
 
 
