@@ -18,8 +18,10 @@ T, UNITS = ("t", "x", "y"), ("s", "mm", "N")
 @pytest.mark.parametrize(
     "rows, line, names, units, first, remark",
     [
-        ([T], None, [*T], ["", "", ""], 1, "names in row 1"), ([("Rig 3",), (), T], None, [*T], ["", "", ""], 3, "row 3"),
-        ([T, UNITS], None, [*T], [*UNITS], 2, "names in row 1"), ([UNITS, T], None, [*T], [*UNITS], 2, "names in row 2"),
+        ([T], None, [*T], ["", "", ""], 1, "names in row 1"), ([("Rig 3",),
+        (), T], None, [*T], ["", "", ""], 3, "row 3"),
+        ([T, UNITS], None, [*T], [*UNITS], 2, "names in row 1"),
+        ([UNITS, T], None, [*T], [*UNITS], 2, "names in row 2"),
         ([T, ("Unit:", "[mm]", "(N)")], None, [*T], ["", "mm", "N"], 2, "names in row 1"),
         ([], None, ["column 1", "column 2", "column 3"], ["", "", ""], 0, "no names: columns by number"),
         ([("Rig 3",)], None, ["column 1", "column 2", "column 3"], ["", "", ""], 1, "no names: columns by number"),
@@ -41,13 +43,19 @@ def test_tables_of_sheets(rows, line, names, units, first, remark):
 @pytest.mark.parametrize(
     "rows, line, message",
     [
-        ([T, ("OL", 1, 2)], None, "got None, and row 2 has the cell 'OL' beside numbers; correct the cell, or give the row"),
-        ([T, (1, "OL", 2)], 1, "got 1, and row 2 has the cell 'OL' beside numbers; correct the cell, or give the row of"),
-        ([T, ("Takte", "Impulse", "Worte")], None, "got None, as row 2 may be names or units, ['Takte', 'Impulse', 'Worte'];"),
-        ([("a", "b", "c"), ("a", "b", "c")], None, "got None, as row 2 may be names or units, ['a', 'b', 'c']; give the"),
-        ([("a", "b", "c"), ("t", "m", "N")], None, "got None, as row 2 may be names or units, ['t', 'm', 'N']; give the"),
+        ([T, ("OL", 1, 2)], None,
+         "got None, and row 2 has the cell 'OL' beside numbers; correct the cell, or give the row"),
+        ([T, (1, "OL", 2)], 1,
+         "got 1, and row 2 has the cell 'OL' beside numbers; correct the cell, or give the row of"),
+        ([T, ("Takte", "Impulse", "Worte")], None,
+         "got None, as row 2 may be names or units, ['Takte', 'Impulse', 'Worte'];"),
+        ([("a", "b", "c"),
+        ("a", "b", "c")], None, "got None, as row 2 may be names or units, ['a', 'b', 'c']; give the"),
+        ([("a", "b", "c"),
+        ("t", "m", "N")], None, "got None, as row 2 may be names or units, ['t', 'm', 'N']; give the"),
         ([T, ("Takte", "Impulse", "Worte")], 1, "got 1, and row 2 has neither numbers nor known units."),
-        ([("a", "b", "c"), UNITS, T], None, "got None, as row 2 may be units, and it is not the one below the names; give"),
+        ([("a", "b", "c"), UNITS, T], None,
+         "got None, as row 2 may be units, and it is not the one below the names; give"),
     ],
 )  # fmt: skip
 def test_unclear_rows_above_a_table_are_refused_with_their_number(rows, line, message):
@@ -92,10 +100,13 @@ def column(cells, formula=None, date_format=None, name="x", unit=""):
 @pytest.mark.parametrize(
     "cells, remarks, refusal",
     [
-        ([1.0, None], (), ""), ([DATE, None], ("dates, to the microsecond",), ""), ([CLOCK], ("times of day or durations",), ""),
+        ([1.0, None], (), ""), ([DATE, None], ("dates, to the microsecond",), ""),
+        ([CLOCK], ("times of day or durations",), ""),
         ([CLOCK, datetime.timedelta(1)], ("times of day or durations",), ""), (["a", "b"], (), ""),
-        ([1.0, " 1,5 "], (), "numbers that are stored as texts, such as ' 1,5 ' in row 6; convert them in Excel (Data, Text"),
-        ([DATE, 1.0], (), "dates among other values, or times beyond 24 h among times of day; format the column as numbers"),
+        ([1.0, " 1,5 "], (),
+         "numbers that are stored as texts, such as ' 1,5 ' in row 6; convert them in Excel (Data, Text"),
+        ([DATE, 1.0], (),
+         "dates among other values, or times beyond 24 h among times of day; format the column as numbers"),
         ([DATE, CLOCK], (), "dates among other values"), ([DATE, "a"], (), "dates among other values"),
         ([DATE, datetime.date(2026, 1, 31)], ("dates, to the microsecond",), ""),
     ],
@@ -121,7 +132,8 @@ def test_texts_of_dates_in_a_format_that_is_given():
     "times, expected",
     [
         ([0, 999_999, 2_000_001], [0, 1_000_000, 2_000_000]), ([0, 999_998, 2_000_000], [0, 999_998, 2_000_000]),
-        ([0, 1001, 1999], [0, 1000, 2000]), ([0, 101, 299], [0, 100, 300]), ([0, 11, 29], [0, 10, 30]), ([0, 3, 6], [0, 3, 6]),
+        ([0, 1001, 1999], [0, 1000, 2000]), ([0, 101, 299], [0, 100, 300]), ([0, 11, 29], [0, 10, 30]),
+        ([0, 3, 6], [0, 3, 6]),
         ([0, 12, 29], [0, 12, 29]), ([], []),
     ],
 )  # fmt: skip
@@ -134,7 +146,8 @@ def test_times_are_multiples_of_the_longest_unit_within_a_microsecond(times, exp
 @pytest.mark.parametrize(
     "cells, times",
     [
-        ([0.0, 1.0], True), ([0.0], False), ([0.0, 1.0, 0.0], False), ([0.0, "a", 1.0], False), ([None, 0.0, "", 1.0], True),
+        ([0.0, 1.0], True), ([0.0], False), ([0.0, 1.0, 0.0], False), ([0.0, "a", 1.0], False),
+        ([None, 0.0, "", 1.0], True),
         ([DATE, CLOCK], True), ([], False),
     ],
 )  # fmt: skip

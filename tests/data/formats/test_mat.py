@@ -162,11 +162,14 @@ def test_sparse_matrices_are_those_of_scipy(seed):
     "places, starts, values, reason",
     [
         ([0, 2], [0, 1, 2], [1.0, 2.0], ""), ([0, 3], [0, 1, 2], [1.0, 2.0], "rows beyond its size"),
-        ([0, -1], [0, 1, 2], [1.0, 2.0], "rows beyond its size"), ([0, 2], [0, 1], [1.0, 2.0], "other starts of columns"),
+        ([0, -1], [0, 1, 2], [1.0, 2.0], "rows beyond its size"),
+        ([0, 2], [0, 1], [1.0, 2.0], "other starts of columns"),
         ([0, 2], [0, 1, 3], [1.0, 2.0], "other starts of columns"), ([0, 2], [1, 1, 2], [1.0, 2.0], "other starts of"),
-        ([0, 2], [0, 2, 1], [1.0, 2.0], "other starts of columns"), ([2, 2], [0, 2, 2], [1.0, 2.0], "two values in one"),
+        ([0, 2], [0, 2, 1], [1.0, 2.0], "other starts of columns"),
+        ([2, 2], [0, 2, 2], [1.0, 2.0], "two values in one"),
         ([2, 2], [0, 1, 2], [1.0, 2.0], ""), ([0, 1], [0, 1, 1], [1.0, 2.0], ""), ([], [0, 0, 0], [], ""),
-        ([0, 2], [0, 1, 2], [1.0j, 2.0], "is no matrix of real numbers"), ([0], [0, 1, 2], [1.0, 2.0], "other starts of"),
+        ([0, 2], [0, 1, 2], [1.0j, 2.0], "is no matrix of real numbers"),
+        ([0], [0, 1, 2], [1.0, 2.0], "other starts of"),
         ([0, 2], [0, 1, 2], [1.0], "other starts of columns"),
     ],
 )  # fmt: skip

@@ -319,7 +319,8 @@ def test_index_of_pandas_is_remarked_and_shown_by_a_plain_name(path):
     [
         ({"a": pa.array([1, 2]), "Time": pa.array([0.0, 1.0])}, "Time"), ({"a": pa.array([1, 2])}, None),
         ({"t": pa.array([0, 1]), "when": pa.array([1, 2], pa.timestamp("ms"))}, "when"),
-        ({"t": pa.array([0, 1]), "d": pa.array([1, 2], pa.duration("ms"))}, "d"), ({"date": pa.array(["a", "b"])}, None),
+        ({"t": pa.array([0, 1]), "d": pa.array([1, 2], pa.duration("ms"))}, "d"),
+        ({"date": pa.array(["a", "b"])}, None),
         ({"t": pa.array([0.0, 1.0, 0.0])}, None), ({"t": pa.array([0.0])}, None), ({"zeit": pa.array([2, 1])}, "zeit"),
         ({"t": pa.array([[1.0], [2.0]]), "x": pa.array([1.0, 2.0])}, None),
     ],

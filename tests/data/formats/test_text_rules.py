@@ -23,8 +23,10 @@ def write(tmp_path):
 @pytest.mark.parametrize(
     "given, expected",
     [
-        ((None, None, None), (None, None, None)), ((",", None, None), (",", None, None)), ((None, ".", None), (",", ".", None)),
-        ((None, ",", None), (".", ",", None)), ((None, "'", None), (None, "'", None)), ((",", " ", "%H"), (",", " ", "%H")),
+        ((None, None, None), (None, None, None)), ((",", None, None), (",", None, None)), ((None, ".", None),
+        (",", ".", None)),
+        ((None, ",", None), (".", ",", None)), ((None, "'", None), (None, "'", None)), ((",", " ", "%H"),
+        (",", " ", "%H")),
         ((".", "\u202f", None), (".", "\u202f", None)),
     ],
 )  # fmt: skip
@@ -51,7 +53,8 @@ def test_other_signs_and_formats_are_refused(given, message):
     "content, remark",
     [
         ("t,x\n0,1\n1,2\n", "separator ',', names in line 1"), ("t,x\n0,1.5\n1,2\n", "names in line 1, decimal point"),
-        ("t;x\n0;1,5\n1;2\n", "separator ';', names in line 1, decimal comma"), ("t;x\n0;1.5\n1;2\n", "line 1, decimal point"),
+        ("t;x\n0;1,5\n1;2\n", "separator ';', names in line 1, decimal comma"),
+        ("t;x\n0;1.5\n1;2\n", "line 1, decimal point"),
         ("t,x\n0,1.500\n1,2.500\n", "separator ',', names in line 1, decimal point"),
     ],
 )  # fmt: skip
@@ -63,8 +66,10 @@ def test_decimal_sign_that_was_recognised_is_remarked(write, content, remark):
 @pytest.mark.parametrize(
     "content, suggested",
     [
-        ("t,x\n0,1\n1,2\n", "t"), ("a,x\n0,2\n1,2\n", None), ("x,Time [s]\n1,0\n2,1\n", "Time [s]"), ("t,x\n1,1\n0,2\n", None),
-        ("t,x\n0,1\n0,2\n", None), ("t,x\n0,1\n", None), ("a [ms],x\n0,1\n1,2\n", "a [ms]"), ("a [mm],x\n0,2\n1,2\n", None),
+        ("t,x\n0,1\n1,2\n", "t"), ("a,x\n0,2\n1,2\n", None), ("x,Time [s]\n1,0\n2,1\n", "Time [s]"),
+        ("t,x\n1,1\n0,2\n", None),
+        ("t,x\n0,1\n0,2\n", None), ("t,x\n0,1\n", None), ("a [ms],x\n0,1\n1,2\n", "a [ms]"),
+        ("a [mm],x\n0,2\n1,2\n", None),
         ("x [s],t\n0,1\n1,2\n", "t"), ("a,x\n10:00:00,1\n10:00:01,2\n", "a"), ("a,x\n10:00:00,1\n10:00:00,2\n", None),
         ("a,x\n2026-01-31T10:00:00,1\n2026-01-31T10:00:01,2\n", "a"), ("t,x\nOL,1\n1,2\n2,3\n", None),
     ],
@@ -114,7 +119,7 @@ def test_summaries_are_among_the_last_twenty_rows(write, after, refused):
     [("0,1\n1,2\n2,3,4\n", 3, 3), ("0,1\n1\n2,3\n", 1, 2), ("0,1\n\n1,2,3\n", 3, 2), ("0,1,5\n1,2\n", 3, 1)],
 )
 def test_rows_of_other_numbers_of_fields_are_named(write, rows, fields, number):
-    message = f"must be a CSV file with 2 fields in each row, as many as there are names, got {fields} in data row {number} of"
+    message = f"with 2 fields in each row, as many as there are names, got {fields} in data row {number} of"
     with pytest.raises(ValueError, match=message):
         bp.Recording.from_csv(write("t,x\n" + rows), sampling_rate=1.0, outputs={"x": "x"}, missing="drop")
 
