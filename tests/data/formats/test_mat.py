@@ -220,3 +220,15 @@ def test_elements_are_padded_to_eight_bytes_and_small_ones_packed(order):
     assert found == [(5, b"abc"), (1, b"xy"), (15, b"zip"), (9, b"12345678")]
     with pytest.raises(ValueError, match="it is cut off"):
         list(mat._elements(memoryview(content)[:-1], order))
+
+
+@pytest.mark.parametrize(
+    "value, what",
+    [("text", "of MATLAB class 4"), (np.array([1, "a"], dtype=object), "of MATLAB class 1"), (1j * TIME, "complex")],
+)
+def test_other_variables_are_refused_with_their_class(tmp_path, value, what):
+    """MathWorks numbers the classes: cells are 1, texts are 4."""
+    path = tmp_path / "run.mat"
+    scipy.io.savemat(path, {"t": TIME, "v": value})
+    with pytest.raises(ValueError, match=f"its variable 'v' is no array of real numbers, but {what}"):
+        bp.Recording.from_mat(path, time="t", outputs={"x": "v"})
