@@ -15,8 +15,8 @@ C, SE = 40.0, 0.02
 
 def fitted(prior_sd, names=("run",), se=SE):
     """Return a fit of c alone, whose force c·dx/dt is in proportion to the frequency."""
-    runs = [replace(linear_experiment(np.array([900.0, C, 25.0]), SD, seed=k, name=name), frequency_se=se) for k, name in
-            enumerate(names)]  # fmt: skip
+    clean = np.array([900.0, C, 25.0])
+    runs = [replace(linear_experiment(clean, SD, seed=k, name=name), frequency_se=se) for k, name in enumerate(names)]
     problem = bp.Problem(
         LINEAR, runs, priors={"c": bp.Normal(C, prior_sd)},
         fixed={"k": 900.0, "coulomb": 25.0, "variance[force]": SD**2}, input_noise="measured",
