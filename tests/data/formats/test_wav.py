@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.data.formats import wav
+from bayesperiodic.data.formats import wav as reader
 from tests.data.test_damaged_files import damaged
 
 # What follows the format in the identifier of an extensible header.
@@ -160,8 +160,8 @@ def form(tag, channels, rate, block, bits, *, valid=None, inner=None, size=None,
     """Return the format that a chunk states, after Microsoft's description."""
     content = struct.pack(f"{order}HHIIHH", tag, channels, rate, rate * block, block, bits)
     if inner is not None:
-        content += struct.pack(f"{order}HHIH", 22, valid, 0, inner) + bytes(14)
-    found = wav._form(io.BytesIO(content), order, len(content) if size is None else size)
+        content += struct.pack(f"{order}HHII", 22, valid, 0, inner) + bytes(12)
+    found = reader._form(io.BytesIO(content), order, len(content) if size is None else size)
     return found.channels, found.rate, found.bits, found.valid
 
 
