@@ -193,9 +193,9 @@ def test_formats_of_samples(arguments, given, expected, order):
         ((1, 2, 8000, 3, 16), {}, "it has 2 channels of 8000 Hz in blocks of 3 bytes"),
         ((1, 1, 8000, 4, 24), {}, "its samples have 24 of 24 bits in 4 bytes, which has several meanings"),
         ((1, 1, 8000, 2, 17), {}, "its samples have 17 of 17 bits in 2 bytes"), ((1, 1, 8000, 2, 8), {},
-         "8 of 8 bits in 2"),
+         "its samples have 8 of 8 bits in 2"),
         ((3, 1, 8000, 2, 16), {}, "its samples have 16 of 16 bits in 2 bytes"), ((1, 1, 8000, 5, 40), {},
-         "40 of 40 bits"),
+         "its samples have 40 of 40 bits"),
         ((0xFFFE, 1, 8000, 4, 32), {"valid": 33, "inner": 1}, "its samples have 33 of 32 bits in 4 bytes"),
     ],
 )  # fmt: skip
