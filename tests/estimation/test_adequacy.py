@@ -15,6 +15,7 @@ from bayesperiodic.estimation.unexplained import Unexplained
 from bayesperiodic.likelihood.mean_period import MeanPeriod
 from bayesperiodic.likelihood.samples import Samples
 from bayesperiodic.likelihood.section_points import SectionPoints
+from tests.known import LINEAR, linear_experiment
 
 TABLE = pd.DataFrame(
     {
@@ -111,3 +112,36 @@ def test_p_of_the_harmonic_content_is_that_of_f_tests_by_bonferroni():
     ]
     found = Unexplained(e, np.zeros((1, 11)), harmonic).harmonic_content()
     assert found == (pytest.approx(min(1.0, len(sets) * min(p))), 4.0)
+
+
+def judged(extra, sd=3.0, known=True):
+    """Return the table of a linear problem whose force has this error in addition to white noise."""
+    run = linear_experiment(np.array([900.0, 40.0, 25.0]), sd, seed=1, samples=64)
+    run = replace(run, outputs={"force": run.outputs["force"] + extra(2 * np.pi * np.arange(64) / 64)})
+    priors = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
+    problem = bp.Problem(LINEAR, [run], priors=priors, fixed={"variance[force]": sd**2} if known else {})
+    fit = bp.map_estimate(problem, starts=1, progress=False)
+    here = problem.density().linearise(problem.vector(fit.theta))
+    return adequacy.adequacy(problem, here, problem.noise_values(fit.noise)[None], {})
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_table_of_the_tests_of_a_right_model(known):
+    """Any p-value is below 1e-3 by chance once in a thousand; the seed is fixed."""
+    table = judged(lambda _: 0.0, known=known)
+    assert [*table.index] == ["run force", adequacy.ALL]
+    assert table.loc["run force", ["experiment", "channel"]].tolist() == ["run", "force"]
+    row = table.loc["run force"]
+    assert 1e-3 < row["whiteness"] <= 1.0 and 1e-3 < row["harmonics"] <= 1.0 and 1e-3 < row["p"] <= 1.0
+    assert table["verdict"].tolist() == ["adequate", "adequate"] and table.loc[adequacy.ALL, "p"] == row["p"]
+    assert row["spectrum"] == adequacy.ASSUMED_SPECTRUM and np.isfinite(row["size"]) == known
+
+
+@pytest.mark.parametrize("harmonic", [2, 4, 9])
+def test_power_in_one_harmonic_is_found_and_the_harmonic_named(harmonic):
+    """Even harmonics are in no term of the model; of five noise sds a sample, the whole misfit is 800 in χ² of 64."""
+    table = judged(lambda phase: 15.0 * np.cos(harmonic * phase))
+    row = table.loc["run force"]
+    assert row["harmonics"] < 1e-6 and row["harmonic"] == harmonic and row["size"] < 1e-6 and row["p"] < 1e-5
+    assert row["verdict"] == table.loc[adequacy.ALL, "verdict"] == "misspecified"
+    assert 0.0 < row["model_error_share"] < 1.0
