@@ -181,3 +181,17 @@ def test_distance_under_power_scaling_of_a_normal_is_that_of_quadrature():
     order = np.random.default_rng(0).permutation(4000)
     assert identifiability._sensitivity(x[order], log_density[order]) == pytest.approx(np.mean(expected), rel=1e-6)
     assert identifiability.cumulative_jensen_shannon(np.ones(5), np.full(5, 0.2)) == 0.0
+
+
+def test_widths_by_draws_have_the_monte_carlo_error_of_their_effective_number():
+    """Of normal draws: half of the central 68 % interval has 1.1 times the relative error 1/√2n of the sd."""
+    generator = np.random.default_rng(3)
+    values = {"a": 0.2 * generator.standard_normal(40_000), "b": 0.5 * generator.standard_normal(40_000)}
+    prior = SimpleNamespace(sample=lambda count, _: np.random.default_rng(4).standard_normal((count, 2)))
+    problem = SimpleNamespace(names=("a", "b"), joint_prior=prior)
+    posterior = SimpleNamespace(draws=values.get, ess={"a": 800.0, "b": 3200.0})
+    information = SimpleNamespace(coordinates=lambda theta: theta)
+    widths, errors = identifiability._widths(problem, None, posterior, information)
+    assert widths == pytest.approx([0.2, 0.5], rel=0.03)
+    # Of the contraction 1 − w², whose derivative is 2 w.
+    assert errors == pytest.approx(2.0 * widths * widths * 1.1 / np.sqrt([1600.0, 6400.0]))
