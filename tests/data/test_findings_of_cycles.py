@@ -70,7 +70,9 @@ def test_periodic_modulations_of_a_cycle_are_beats(count, size, severity):
     assert [one.severity for one in listed] == [severity] * (severity is not None)
     if severity:
         assert listed[0].text == f"the amplitude of x beats at {8 * 3.0 / 48:.4g} Hz by {size:.1%}"
-        assert [*cycle_findings._beats(("x",), TIME, windows_of(sizes, slip=size), 3.0)] == []
+        assert [*cycle_findings._beats(("x",), TIME, windows_of(2.0 * sizes, slip=2.0 * size), 3.0)] == []
+        large = cycle_findings._beats(("x",), TIME, windows_of(9.0 * sizes, slip=0.1 * size), 3.0)
+        assert [one.severity for one in large] == [severity]
     noise = 1.0 + 0.1 * np.random.default_rng(2).standard_normal(48)
     assert [*cycle_findings._beats(("x",), TIME, windows_of(noise), 3.0)] == []
 
@@ -136,7 +138,7 @@ def test_changes_are_named_with_size_place_and_severity(course, mean, kind, seve
             and (seen.count, seen.share) == (40, 1.0)
         )
         assert seen.cure == "select a steadier part with recording.between(start, stop)"
-    assert (" of the amplitude" in seen.text) == ("mean" in said)
+    assert ("% of the amplitude " in seen.text) == ("mean" in said)
     effect = float(seen.text.split(": ")[1].split()[0])
     assert seen.bias == pytest.approx(effect, rel=0.05) and "which are added to their errors" in seen.text
 

@@ -57,6 +57,8 @@ def test_fields_of_structures_are_read_by_their_path(saved, compressed):
     run = bp.Recording.from_file(path, time="data.t", outputs={"x": "data.x", "n": "data.deep.n"}, inputs={"y": "y"})
     assert np.array_equal(run.time, TIME) and np.array_equal(run.outputs["x"], SWING)
     assert run.outputs["n"].tolist() == [*range(50)] and np.array_equal(run.inputs["y"], 2 * SWING)
+    sizes = {one.name: one.samples for one in mat.contents(path, []).channels}
+    assert sizes["data.x"] == sizes["data.deep.n"] == sizes["y"] == 50
     with pytest.raises(ValueError, match=r"its variable 'data.z' is no array of real numbers, but complex"):
         bp.Recording.from_file(path, time="data.t", outputs={"z": "data.z"})
     with pytest.raises(ValueError, match=r"column of run.mat: must be one of .*Did you mean 'data.x'"):

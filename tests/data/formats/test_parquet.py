@@ -358,6 +358,8 @@ def test_integers_with_nulls_are_those_that_floats_hold(path, value, exact):
             read(path, missing="drop")
     write(path, t=pa.array([0, 1, 2]), x=pa.array([2**31 - 1, None, 5], pa.int32()))
     assert read(path, missing="drop")[1] == [2.0**31 - 1, 5.0]
+    write(path, t=pa.array([0, 1, 2]), x=pa.array([-128, None, 5], pa.int8()))
+    assert read(path, missing="drop")[1] == [-128.0, 5.0]
     write(path, t=pa.array([0, 1]), x=pa.array([2**60, 2**60 + 2**8]))
     assert read(path)[1] == [2.0**60, 2.0**60 + 2**8]
 
