@@ -286,7 +286,6 @@ def _effects(every: Courses, posterior: _Posterior) -> Changes:
     turning = (drifting | (every.kind == TONE)) & (every.turn * count > LEAST_TURN)
     fastest = int(np.argmax(np.where(turning, weight, 0.0)))
     ends = every.values[slow, -1] - every.values[slow, 0]
-    least = SMALLEST_NOISE / np.sqrt(count)
     return Changes(
         transient=mean,
         squares=squares,
@@ -294,7 +293,7 @@ def _effects(every: Courses, posterior: _Posterior) -> Changes:
         probability=probability,
         moving=posterior.moving,
         size=np.einsum("ma,mad->d", ends, first[slow]),
-        error=np.maximum(posterior.error, least) * np.sqrt(count / remaining)[:, None],
+        error=posterior.error * np.sqrt(count / remaining)[:, None],
         place=int(every.place[steps[np.argmax(weight[steps])]]),
         swing=np.abs(np.einsum("mka,mad->mkd", every.values[turning], first[turning]))
         .max(axis=1, initial=0.0)

@@ -284,7 +284,7 @@ def _warn(name: str, pace: Pace, cycles: int, seen: Inspection, estimated: bool)
             UserWarning,
             stacklevel=4,
         )
-    elif cycles < total and cycles <= total // 2:
+    elif cycles <= total // 2:
         last = seen.used[0].stop == seen.groups[0].time.size
         which, others = ("the last ", "those before") if last else ("", "the others")
         warnings.warn(

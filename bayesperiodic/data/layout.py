@@ -97,12 +97,8 @@ class _Column:
         stored = contents.find(layout.file, key)
         argument = f"{contents.word} {stored.label!r} of {layout.file}"
         if stored.refusal:
-            raise ValueError(
-                f"{contents.word} {stored.label!r} of {layout.file}: must be usable, got {stored.refusal}."
-            )
-        values = stored.values()
-        argument = f"{contents.word} {stored.label!r} of {layout.file}"
-        return cls(stored, numbers(argument, values, text=text, time=time))
+            raise ValueError(f"{argument}: must be usable, got {stored.refusal}.")
+        return cls(stored, numbers(argument, stored.values(), text=text, time=time))
 
     def part(self, first: int, last: int) -> "_Column":
         return _Column(self.stored, self.values[first:last])

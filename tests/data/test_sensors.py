@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.data import sensors
+from bayesperiodic.data.harmonics import fit_harmonics
+from bayesperiodic.data.signals import Signals
 
 RATE, CYCLES, NOISE = 50, 60, 0.01
 TIME = np.arange(CYCLES * RATE) / RATE
@@ -150,3 +153,36 @@ def test_a_stuck_stretch_beside_clipping_is_found():
     values[1003:1018] = values[1003]
     check = recorded(values).check(1.0)
     assert check.bad["x"]["stuck"].tolist() == [*range(1003, 1018)]
+
+
+@pytest.mark.parametrize("share, left_out", [(0.019, False), (0.021, True)])
+def test_others_at_a_phase_are_left_out_if_two_percent_of_them_are_clipped(share, left_out):
+    """Of 1000 samples at each of ten phases, whose intervals they fill."""
+    phase = np.repeat(np.arange(1000), 10) + np.tile(np.arange(10) / 10, 1000)
+    clipped = 10 * np.arange(round(1000 * share)) + 3
+    beside = sensors._same_phases(phase, clipped)
+    assert beside.tolist() == (10 * np.arange(1000) + 3).tolist() * left_out
+
+
+def example(highest):
+    """Return signals whose phases lie in the first 0.6 of each cycle, with this highest harmonic, and a fit of two."""
+    time = (np.arange(50)[:, None] + np.arange(60) / 100).ravel() / 4.0
+    values = 2.0 + np.cos(8 * np.pi * time) + 0.5 * np.cos(8 * np.pi * highest * time + 0.3)
+    values = values + 1e-3 * np.random.default_rng(1).standard_normal(time.size)
+    used = Signals("run", time, ("x",), values[None], 0)
+    return used, fit_harmonics(time, values[None], 4.0, 2)
+
+
+def test_harmonics_that_are_shown_and_not_determined_are_named_with_share_period_and_channel():
+    used, fit = example(3)
+    text = sensors.undetermined(used, fit, 9)
+    assert text.startswith(
+        "recording: must have samples at all phases of its period, got 'run', in which none are at 40% of"
+    )
+    assert (
+        "each period of 0.25 s: the others determine 2 harmonics, and 'x' has 3 at least. Record again without" in text
+    )
+    one = fit_harmonics(used.time, used.values, 4.0, 1)
+    assert "the others determine 1 harmonic, and 'x' has" in sensors.undetermined(used, one, 9)
+    assert sensors.undetermined(used, fit, 2) == ""  # no more are resolved
+    assert sensors.undetermined(*example(2), 9) == "" == sensors.undetermined(*example(1), 9)

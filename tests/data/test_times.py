@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import bayesperiodic as bp
-from bayesperiodic.data.times import seconds
+from bayesperiodic.data.times import channel_seconds, seconds, shared
 
 COUNT, STEP = 400, 10_000_019  # nanoseconds, no round number
 NANOSECONDS = np.arange(COUNT) * STEP
@@ -110,6 +110,70 @@ def test_integers_that_are_no_seconds_are_refused_with_their_unit(first, step, m
 def test_integers_that_may_be_seconds_are_seconds(first, step):
     time = first + step * np.arange(COUNT)
     assert np.array_equal(bp.Recording.from_arrays(time, {"x": SIGNAL}).time, time)
+
+
+@pytest.mark.parametrize(
+    ("first", "step", "unit"),
+    [
+        (99_999_999_999, 1, None), (10**11, 1, "ms"), (-(10**11), 1, "ms"), (10**14 - 1, 1, "ms"), (10**14, 1, "us"),
+        (10**17 - 1, 1, "us"), (10**17, 1, "ns"), (0, 999, None), (0, 1000, "us"), (0, 1020, None), (0, 999_999, "us"),
+        (0, 10**6, "ns"), (5000, -1001, "us"),
+    ],
+)  # fmt: skip
+def test_integers_are_smaller_units_from_a_size_or_step_on(first, step, unit):
+    """Of the year 5138, of 1000 s and no whole minutes, and of more than a second of microseconds."""
+    values = first + step * np.arange(5)
+    if unit is None:
+        assert seconds("time", values) is values
+        return
+    got = f"{first}, as {unit} since 1970" if step == 1 else f"integers in steps of {abs(step):.6g}, as {unit}"
+    kind = "datetime64" if step == 1 else "timedelta64"
+    message = f"time: must be in seconds, got {got}; give times.astype('{kind}[{unit}]') for these (of a file, units="
+    for given in (values, list(map(int, values)), np.ma.array(values), [*map(int, values), None]):
+        with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
+            seconds("time", np.array(given, dtype=object) if isinstance(given, list) else given)
+    with pytest.raises(ValueError, match=re.escape(message).replace("time:", r"time\['x'\]:")):
+        channel_seconds({"x": values})
+    assert seconds("time", values, unit=True) is not None and seconds("time", values.astype(float)).dtype == float
+
+
+def test_single_integers_and_tables_are_left_to_other_checks():
+    for values in (np.array([10**12]), np.full((2, 2), 10**12), np.array([0.5, 10**12])):
+        assert seconds("time", values) is values
+    mixed = np.array([10**12, 1.5], dtype=object)
+    assert seconds("time", mixed) is mixed
+
+
+@pytest.mark.parametrize(
+    "values, exact",
+    [([0, 2**53], True), ([-(2**53), 0], True), ([0, 2**53 + 1], False), ([-(2**53) - 1, 0], False), ([], True)],
+)
+def test_integers_that_floats_hold_are_not_shifted(values, exact):
+    array = np.array(values, dtype=np.int64)
+    read = seconds("time", array, unit=True)
+    assert read is array if exact else read.tolist() == [value - values[0] for value in values]
+
+
+def test_masked_dates_are_missing():
+    masked = np.ma.array(DATES[:3], mask=[True, False, False])
+    read = seconds("time", masked)
+    assert np.isnan(read[0]) and read[1:].tolist() == [0.0, float(STEP) / 1e9]
+    assert np.isnan(seconds("time", np.ma.array(DATES[:3], mask=True))).all()
+
+
+def test_channels_with_the_same_times_share_an_array():
+    a, b = np.arange(3.0), np.arange(4.0)
+    result = shared({"x": a, "y": a.copy(), "z": b, "u": b.copy(), "v": a, "w": np.array([0.0, 1.0, 3.0])})
+    assert result["x"] is result["y"] is result["v"] is a and result["z"] is result["u"] is b
+    assert result["w"].tolist() == [0.0, 1.0, 3.0] and [*result] == [*"xyzuvw"]
+
+
+def test_dates_of_channels_count_from_the_earliest_one_that_is_not_missing():
+    first = np.array(["NaT", "2026-01-01T00:00:02"], "datetime64[s]")
+    read = channel_seconds({"x": first, "y": first[1:] - np.timedelta64(1, "s"), "z": first[1]})
+    assert np.isnan(read["x"][0]) and [read["x"][1], read["y"][0], read["z"][0]] == [1.0, 0.0, 1.0]
+    durations = channel_seconds({"x": np.array([1500, 2000], "m8[ms]"), "y": np.array([1], "m8[s]")})
+    assert durations["x"].tolist() == [0.5, 1.0] and durations["y"].tolist() == [0.0]
 
 
 def test_integers_of_a_file_need_a_unit(tmp_path):

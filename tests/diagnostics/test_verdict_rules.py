@@ -67,6 +67,14 @@ def test_an_end_must_be_wrong_by_three_standard_errors(size, expected):
     assert verdict(sd=0.8, size=size) == expected
 
 
+@pytest.mark.parametrize(("size", "expected"), [(7000.0, "fine"), (7800.0, "too wide")])
+def test_an_end_too_far_out_must_be_wrong_by_three_standard_errors(size, expected):
+    """Φ(−1.645 · 1.2 + 0.25) = 0.0424, less than 0.05 by three errors √(0.05 · 0.95/n) from n = 7400 on."""
+    beyond = stats.norm.cdf(-1.6448536 * 1.2 + 0.25)
+    assert 7200 < 9 * 0.05 * 0.95 / (beyond - 0.05) ** 2 < 7600
+    assert verdict(sd=1.2, size=size) == expected
+
+
 @pytest.mark.parametrize(("end", "expected"), [(1.66, "wrong shape"), (1.69, "too narrow")])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_draws_are_piled_up_if_five_percent_are_within_a_quarter_sd_of_an_end(end, sign, expected):

@@ -1,6 +1,7 @@
 """Separate optima of the log-posterior: which are found, their masses, and what is said of them."""
 
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -114,6 +115,13 @@ def test_number_of_starts_follows_from_the_number_of_unknowns():
     assert default_starts(duffing(*runs[:2], scheme="fourier")) == (8, 8)
     assert default_starts(duffing(*runs, scheme="fourier")) == (2, 2)
     assert default_starts(duffing(*(duffing_run(f"run {i}") for i in range(50)))) == (1, 1)
+    # A response of eight periods has eight times as many unknowns.
+    problem = duffing(runs[0])
+    long = SimpleNamespace(
+        experiments=[SimpleNamespace(samples=1000, periods=8)], scheme="central4", model=problem.model
+    )
+    states = len(problem.model.states)
+    assert default_starts(long)[0] == int(np.clip(16_000 / (states * 8000), 1, 8)) == 2
 
 
 def test_a_given_start_is_the_only_one():

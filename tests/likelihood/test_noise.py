@@ -658,3 +658,10 @@ def test_a_parameter_of_one_harmonic_has_the_degrees_of_freedom_of_its_measured_
     # Half of the variance of a complex amplitude is in phase with the input.
     assert fit.sd["a"] == pytest.approx(np.sqrt(0.5 * 0.01), rel=0.02)
     assert fit.degrees_of_freedom["a"] == pytest.approx(freedom, rel=0.02)
+
+
+def test_values_of_a_model_without_a_covariance_of_its_own_are_independent():
+    problem = bp.Problem(LINEAR, [run(12)], priors=PRIORS)
+    (block,) = problem.likelihood.blocks
+    covariance, slopes = noise.Independent().covariance(block, np.array([2.5]))
+    assert np.array_equal(covariance, 2.5 * np.eye(block.size)) and np.array_equal(slopes, [2.5 * np.eye(block.size)])

@@ -100,7 +100,7 @@ def _check(path: Path, encoding: str) -> tuple[int, bool]:
     Raise a ValueError if the file is not in its encoding, or contains characters 0, at which numbers end.
     """
     name = "UTF-8" if encoding == "utf-8" else encoding
-    comment, before, blanks, decoder = (0, 0), "\n", False, codecs.getincrementaldecoder(encoding)()
+    comment, before, blanks, decoder = (0, -1), "\n", False, codecs.getincrementaldecoder(encoding)()
     plain = codecs.lookup(encoding).name in ASCII_ENCODINGS
     with path.open("rb") as content:
         for number, part in enumerate(itertools.chain(iter(lambda: content.read(PART_BYTES), b""), [b""])):
@@ -126,7 +126,7 @@ def _check(path: Path, encoding: str) -> tuple[int, bool]:
                     comment = number, text.count("\n", 0, match.end() - 1)
             blanks = blanks or (number > 0 and (" " in text or plain and b" " in part))
             before = text[-1:] or before
-    return _lines(path, comment[0] * PART_BYTES) + comment[1] + 1 if comment != (0, 0) else 0, blanks
+    return _lines(path, comment[0] * PART_BYTES) + comment[1] + 1, blanks
 
 
 def _lines(path: Path, size: int) -> int:

@@ -15,6 +15,7 @@ PLAIN_POINT = re.compile(rf"[+-]?(?:[0-9]+\.[0-9]*|\.[0-9]+){EXPONENT}")
 EITHER = re.compile(r"[+-]?[1-9][0-9]{0,2}[.,][0-9]{3}")
 TIME, DATED = re.compile(TIME_OF_DAY), re.compile(DATE)
 DATE_PARTS = re.compile(r"([0-9]{1,4})([-./])([0-9]{1,2})\2([0-9]{1,4})([T ]+.*)?")
+DURATION = r"[0-9]+:[0-5][0-9](?::[0-5][0-9])?(?:[.,][0-9]+)?"
 HALF_DAY, DAY = np.timedelta64(12, "h"), np.timedelta64(24, "h")
 MOST_DECIMALS = 9  # of a second, which nanoseconds hold
 
@@ -147,10 +148,11 @@ def _times_of_day(texts: Any) -> tuple[np.ndarray | None, str, str]:
     given = texts[texts.notna()]
     if given.str.lower().str.endswith("m").any():
         return None, "", "times of twelve hours; give date_format='%I:%M:%S %p'"
+    # pandas takes 99 minutes as 1:39.
     short = given.str.count(":") == 1
+    if not given.str.fullmatch(DURATION).all() or short.any() != short.all():
+        return None, "", ""
     if short.any():
-        if not given.str.fullmatch(r"[0-9]{1,2}:[0-9]{2}([.,][0-9]+)?").all():
-            return None, "", ""
         if not given.str.contains(r"[.,]").any():
             return (
                 None,

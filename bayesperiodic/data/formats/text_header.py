@@ -32,7 +32,7 @@ WORDS = {",": "','", ";": "';'", "\t": "tab", "|": "'|'", BLANKS: "blanks"}
 EXPONENT = r"(?:[eE][+-]?[0-9]+|[dD][+-][0-9]{2,3})?"
 GROUPS = r"[0-9]{1,3}(?:(?P<mark>[.,'’ \u00a0\u202f])[0-9]{3})(?:(?P=mark)[0-9]{3})*(?:[.,][0-9]+)?"
 PLAIN_NUMBER = rf"(?:[0-9]+(?:\.[0-9]*|,[0-9]+)?|[.,][0-9]+){EXPONENT}|[Ii]nf(?:inity)?"
-TIME_OF_DAY = r"[0-9]{1,2}:[0-9]{2}(?::[0-9]{2})?(?:[.,][0-9]+)?(?: ?[AaPp][Mm])?"
+TIME_OF_DAY = r"[0-9]{1,2}:[0-5][0-9](?::[0-5][0-9])?(?:[.,][0-9]+)?(?: ?[AaPp][Mm])?"
 DATE = rf"[0-9]{{1,4}}[-./][0-9]{{1,2}}[-./][0-9]{{1,4}}(?:[T ]+{TIME_OF_DAY})?(?:Z|[+-][0-9]{{2}}:?[0-9]{{2}})?"
 NUMBER_CELL = re.compile(rf"[+-]?(?:{PLAIN_NUMBER}|{GROUPS})")
 USABLE = re.compile(rf"[+-]?(?:{PLAIN_NUMBER}|{GROUPS})|{TIME_OF_DAY}|{DATE}")

@@ -248,6 +248,147 @@ def test_digits_of_a_step():
         assert lvm._error(text, ".") == pytest.approx(error, rel=1e-9)
 
 
+def test_encoding_is_given_or_recognised_and_named(tmp_path):
+    text = head() + segment(units=("µm", "N"))
+    for encoding, used in (("utf-8", "utf-8"), ("utf-8-sig", "utf-8"), ("latin-1", "cp1252")):
+        assert_read(read(tmp_path, text, encoding), 1e-6)
+        assert f"in {used}" in bp.inspect(tmp_path / "run.lvm").remarks
+    path, channels = tmp_path / "run.lvm", {"outputs": {"a": "a", "b": "b"}}
+    path.write_bytes(text.encode("cp850"))
+    assert_read(bp.Recording.from_file(path, encoding="cp850", **channels), 1e-6)
+    with pytest.raises(ValueError, match="encoding: must be Python's name of that of the file, got 'latin-one'; leave"):
+        bp.Recording.from_file(path, encoding="latin-one", **channels)
+    refused(tmp_path, text.encode("cp850").replace("µ".encode("cp850"), b"\x81"),
+            "its encoding is neither UTF-8 nor that of Windows; see encoding, such as encoding='utf-16'")  # fmt: skip
+
+
+def edited(old, new, text=None, count=1):
+    text = text or head() + segment()
+    assert old in text
+    return text.replace(old, new, count)
+
+
+@pytest.mark.parametrize(
+    "text, reason",
+    [
+        (edited("X_Columns\tOne", "X_Columns\tTwo"), "its X_Columns is 'Two' and not No, One or Multi"),
+        (edited("Samples\t50\t50", "Samples\t50\t50\t50"), "its Samples has 3 values for 2 channels"),
+        (edited("Samples\t50\t50", "Samples\t51\t51"), "it is cut off: it has 50 rows, and 51 samples by its header"),
+        (edited("Samples\t50\t50", "Samples\t49\t49"), "it has 50 rows, and 49 samples by its header"),
+        (edited("Channels\t2", "Channels\t0"), "it has 0 channels by its header, and the names .* from line "),
+        (
+            edited("\ta\tb\tComment", "\ta\tb\tc"),
+            "it has 2 channels by its header, and the names .*'c'. from line 23 on",
+        ),
+        (edited("X_Value", "Y_Value"), "it is cut off, or has no rows of numbers"),
+        (head(), "it is cut off, or has no rows of numbers"),
+        (head() + "***Start_Special***\n", "it is cut off, or has no rows of numbers"),
+        (
+            (head() + segment()).rstrip("\n")[:-3],
+            "it seems to be cut off: its last line has no end; add one if its last",
+        ),
+        ((head() + segment(comment=False)) + "0.05\t1\t2\t3\t4\n", r"row 51 after line 23 has 5 fields, and 3 have"),
+        ((head() + segment(comment=False)) + "0.05\t1\n", r"row 51 after line 23 has 2 fields, and 3 have names"),
+    ],
+)
+def test_files_that_contradict_themselves_are_refused_with_the_numbers(tmp_path, text, reason):
+    refused(tmp_path, text, f"path: must be a LabVIEW measurement file .*run.lvm.*{reason}")
+
+
+def test_rows_beyond_the_stated_samples_are_read_with_one_heading(tmp_path):
+    """With Multi_Headings No, the header is that of the first packet."""
+    assert_read(read(tmp_path, edited("Samples\t50\t50", "Samples\t25\t25", head(headings="No") + segment())))
+
+
+def test_times_without_a_rate_must_be_given(tmp_path):
+    for step in ("0.0000000000000000E+0", "-1.0000000000000000E-3", None):
+        text = head("No") + segment(columns="No", step=step or STEP)
+        text = text if step else edited("Delta_X", "Other", text)
+        refused(tmp_path, text, "time: must be given or sampling_rate")
+        assert read(tmp_path, text, sampling_rate=10.0).time[1] == pytest.approx(0.1)
+
+
+def test_times_that_are_missing_are_refused(tmp_path):
+    lines = (head() + segment()).split("\n")
+    lines[-5] = "\t".join(["", *lines[-5].split("\t")[1:]])
+    refused(
+        tmp_path, "\n".join(lines), "channel 'a' of run.lvm, some of whose times are missing; sampling_rate= gives it"
+    )
+
+
+@pytest.mark.parametrize("change, taken", [(0.0, True), (2.1e-8, True), (5e-8, False), (-5e-8, False)])
+def test_step_may_differ_from_the_times_by_their_last_digit(tmp_path, change, taken):
+    """Over 49 steps of 1 ms, a unit of the sixth decimal is 2.04e-8 s of a step; 1e-9 s of it are rounding."""
+    text = head() + segment(step=f"{1e-3 + change:.16E}", x=np.arange(50) / 1000)
+    if taken:
+        assert read(tmp_path, text).time[-1] == pytest.approx(0.049, rel=2.2e-5)
+    else:
+        refused(
+            tmp_path, text, f"whose times are 0.001 s apart, while Delta_X is {1e-3 + change!r:.8}.* s; sampling_rate="
+        )
+
+
+@pytest.mark.parametrize("shift, even", [(0.0, True), (-1e-6, True), (1e-6, False), (-2e-6, False)])
+def test_times_are_even_to_a_unit_of_their_last_digit(tmp_path, shift, even):
+    """Of 20 steps of 1/3000 s, six decimals are 0.33e-6 s too late, and with the shift -0.67e-6 s or 1.33e-6 s."""
+    x = np.round(np.arange(50) / 3000, 6)
+    x[20] += shift
+    time = read(tmp_path, head() + segment(x=x, step=f"{1 / 3000:.16E}")).time
+    assert (time[20] == pytest.approx(20 / 3000, rel=1e-9)) == even
+
+
+def test_segments_have_their_numbers_and_a_remark(tmp_path):
+    read(tmp_path, head() + segment() + "\t\n" + segment(), outputs={"a": ("segment 1", "a")})
+    seen = bp.inspect(tmp_path / "run.lvm")
+    assert "2 segments, with times of their own" in seen.remarks
+    assert [(one.group, one.name) for one in seen.channels] == [(f"segment {k}", n) for k in (1, 2) for n in "ab"]
+    read(tmp_path, head() + segment())
+    assert bp.inspect(tmp_path / "run.lvm").remarks == ("in utf-8",)
+
+
+def test_arguments_are_in_the_suggested_code(tmp_path):
+    read(tmp_path, head() + segment())
+    path = tmp_path / "run.lvm"
+    assert "decimal" not in bp.inspect(path).code and "encoding" not in bp.inspect(path).code
+    code = bp.inspect(path, decimal=".", encoding="cp1252").code
+    assert "decimal='.'" in code and "encoding='cp1252'" in code
+
+
+@pytest.mark.parametrize(
+    "texts, digit", [(["0.5"], 0.1), (["1", "2.25", "3.5"], 0.01), ([" 7 "], 1.0), (["1E-3", "5.0E-1"], 1e-3)]
+)
+def test_last_digit_is_that_of_the_longest_number(texts, digit):
+    assert lvm._digit(texts, ".") == pytest.approx(digit)
+    assert lvm._digit([text.replace(".", ",") for text in texts], ",") == pytest.approx(digit)
+
+
+@pytest.mark.parametrize(
+    "text, error",
+    [
+        ("", 0.0), ("0", 0.0), ("-0.001", 0.0), ("0.0010000", 0.0), ("0.000977", 5e-7), ("0.0009765625", 0.0),
+        ("1.9531E-5", 5e-10), ("0.0000195", 5e-8), ("0.00002", 0.0), ("0.010000", 0.0), ("1,5", 0.05),
+    ],
+)  # fmt: skip
+def test_error_of_a_step_is_half_of_its_last_digit_unless_its_rate_is_round(text, error):
+    """Rates of four digits are round: 51.2 kHz, 1024 Hz, 100 Hz; of 1.5 s it is 0.6667."""
+    assert lvm._error(text, ",") == lvm._error(text.replace(",", "."), ".") == pytest.approx(error, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "date, time, instant",
+    [
+        ("2026/01/31", "12:00:00.25", "2026-01-31T12:00:00.25"), ("2026/1/3", "1:02:03", "2026-01-03T01:02:03"),
+        ("2026/01/31", "12:00:00,5000000000000000000", "2026-01-31T12:00:00.5"),
+        (" 2026/01/31 ", " 23:59:59.9999999999",
+        "2026-01-31T23:59:59.999999999"), ("31.01.2026", "12:00:00", None), ("2026/01/31", "12 o'clock", None),
+        ("2026/01/31x", "12:00:00", None), (None, "12:00:00", None), ("2026/01/31", None, None),
+    ],
+)  # fmt: skip
+def test_instants_of_segments(date, time, instant):
+    origin = lvm._origin(date, time)
+    assert origin is None if instant is None else origin == np.datetime64(instant, "ns")
+
+
 def test_damaged_file_is_read_or_refused_by_one_error(tmp_path, capfd):
     generator, file = np.random.default_rng(2), tmp_path / "run.lvm"
     whole = (head() + segment(units=("µm", "N")) + "\t\n" + segment()).encode("latin-1")

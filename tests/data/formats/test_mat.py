@@ -10,8 +10,10 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+import scipy.sparse
 
 import bayesperiodic as bp
+from bayesperiodic.data.formats import mat
 from tests.data.test_damaged_files import damaged
 
 TIME = 0.01 * np.arange(50)
@@ -55,6 +57,8 @@ def test_fields_of_structures_are_read_by_their_path(saved, compressed):
     run = bp.Recording.from_file(path, time="data.t", outputs={"x": "data.x", "n": "data.deep.n"}, inputs={"y": "y"})
     assert np.array_equal(run.time, TIME) and np.array_equal(run.outputs["x"], SWING)
     assert run.outputs["n"].tolist() == [*range(50)] and np.array_equal(run.inputs["y"], 2 * SWING)
+    sizes = {one.name: one.samples for one in mat.contents(path, []).channels}
+    assert sizes["data.x"] == sizes["data.deep.n"] == sizes["y"] == 50
     with pytest.raises(ValueError, match=r"its variable 'data.z' is no array of real numbers, but complex"):
         bp.Recording.from_file(path, time="data.t", outputs={"z": "data.z"})
     with pytest.raises(ValueError, match=r"column of run.mat: must be one of .*Did you mean 'data.x'"):
@@ -147,3 +151,86 @@ def test_pickle_is_named_and_never_unpickled(tmp_path, protocol):
     path.write_bytes(pickle.dumps({"x": SWING}, protocol))
     with pytest.raises(ValueError, match="a pickle of Python; load it by the program that wrote it, for from_arrays"):
         bp.inspect(path)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sparse_matrices_are_those_of_scipy(seed):
+    matrix = scipy.sparse.random(7, 5, 0.4, "csc", random_state=seed)
+    found = mat._dense("A", matrix.shape, matrix.indices, matrix.indptr, matrix.data)
+    assert np.array_equal(found, matrix.toarray())
+
+
+@pytest.mark.parametrize(
+    "places, starts, values, reason",
+    [
+        ([0, 2], [0, 1, 2], [1.0, 2.0], ""), ([0, 3], [0, 1, 2], [1.0, 2.0], "rows beyond its size"),
+        ([0, -1], [0, 1, 2], [1.0, 2.0], "rows beyond its size"),
+        ([0, 2], [0, 1], [1.0, 2.0], "other starts of columns"),
+        ([0, 2], [0, 1, 3], [1.0, 2.0], "other starts of columns"), ([0, 2], [1, 1, 2], [1.0, 2.0], "other starts of"),
+        ([0, 2], [0, 2, 1], [1.0, 2.0], "other starts of columns"),
+        ([2, 2], [0, 2, 2], [1.0, 2.0], "two values in one"),
+        ([2, 2], [0, 1, 2], [1.0, 2.0], ""), ([0, 1], [0, 1, 1], [1.0, 2.0], ""), ([], [0, 0, 0], [], ""),
+        ([0, 2], [0, 1, 2], [1.0j, 2.0], "is no matrix of real numbers"),
+        ([0], [0, 1, 2], [1.0, 2.0], "other starts of"),
+        ([0, 2], [0, 1, 2], [1.0], "other starts of columns"),
+    ],
+)  # fmt: skip
+def test_places_of_sparse_matrices_are_checked(places, starts, values, reason):
+    """Of three rows and two columns; values beyond those used are ignored."""
+    arguments = "A", (3, 2), np.array(places, int), np.array(starts), np.array(values)
+    if reason:
+        with pytest.raises(ValueError, match=f"^its (matrix|variable) 'A' .*{reason}"):
+            mat._dense(*arguments)
+        return
+    expected = np.zeros((3, 2))
+    for column in range(2):
+        for k in range(starts[column], starts[column + 1]):
+            expected[places[k], column] = values[k]
+    assert np.array_equal(mat._dense(*arguments), expected)
+
+
+def test_matrices_of_more_than_the_limit_are_refused(monkeypatch):
+    given = np.array([0]), np.array([0, 1, 1]), np.array([1.0])
+    for limit, refused in ((48, False), (47, True)):
+        monkeypatch.setattr(mat, "LARGEST_ARRAY", limit)
+        if refused:
+            with pytest.raises(
+                ValueError, match="its matrix 'A' has more than 4.7e-08 GB; read the part that you need"
+            ):
+                mat._dense("A", (3, 2), *given)
+        else:
+            assert mat._dense("A", (3, 2), *given)[0, 0] == 1.0
+
+
+def test_objects_of_matlab_are_refused_with_what_to_type():
+    assert mat.object_refusal("duration", "s.d") == (
+        "a MATLAB object (duration), whose format is not documented; in MATLAB: t = seconds(s.d); save('run.mat', 't', "
+        "'-append')"
+    )
+    assert (
+        "in MATLAB: save its numbers as plain arrays, such as x = double(s.x); save('run.mat', 'x')"
+        in mat.object_refusal("odd", "s")
+    )
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_elements_are_padded_to_eight_bytes_and_small_ones_packed(order):
+    """After MathWorks' description: compressed elements are not padded, and four bytes may stand in the head."""
+    content = struct.pack(f"{order}II", 5, 3) + b"abc" + bytes(5) + struct.pack(f"{order}I", 2 << 16 | 1) + b"xy\0\0"
+    content += struct.pack(f"{order}II", 15, 3) + b"zip" + struct.pack(f"{order}II", 9, 8) + b"12345678"
+    found = [(kind, bytes(data)) for kind, data in mat._elements(memoryview(content), order)]
+    assert found == [(5, b"abc"), (1, b"xy"), (15, b"zip"), (9, b"12345678")]
+    with pytest.raises(ValueError, match="it is cut off"):
+        list(mat._elements(memoryview(content)[:-1], order))
+
+
+@pytest.mark.parametrize(
+    "value, what",
+    [("text", "of MATLAB class 4"), (np.array([1, "a"], dtype=object), "of MATLAB class 1"), (1j * TIME, "complex")],
+)
+def test_other_variables_are_refused_with_their_class(tmp_path, value, what):
+    """MathWorks numbers the classes: cells are 1, texts are 4."""
+    path = tmp_path / "run.mat"
+    scipy.io.savemat(path, {"t": TIME, "v": value})
+    with pytest.raises(ValueError, match=f"its variable 'v' is no array of real numbers, but {what}"):
+        bp.Recording.from_mat(path, time="t", outputs={"x": "v"})

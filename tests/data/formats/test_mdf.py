@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.data.formats import mdf_blocks
+from bayesperiodic.data.formats import mdf, mdf_blocks
 from tests.data.test_damaged_files import damaged
 
 TIME = np.arange(200) / 1000
@@ -433,6 +433,138 @@ def test_file_is_not_deleted_for_its_name(tmp_path, name):
     """The package asammdf deletes an uncompressed file of the name run.gzip or run.bz2 when it closes it."""
     read(tmp_path, simple(), name)
     assert (tmp_path / name).read_bytes() == simple()
+
+
+def one_channel(*, master=None, kind=F8, time=TIME, name="g", x=None, extra=(), record=16):
+    """Return a file of a group of a master, by default of time, a channel x, and others after them."""
+    blocks = Blocks()
+    following = 0
+    for one in reversed(extra):
+        following = one(blocks, following)
+    following = channel(blocks, following, "x", "mm", F8, 8, **(x or {}))
+    given = {"master": MASTER, "sync": 1} | {k: v(blocks) if callable(v) else v for k, v in (master or {}).items()}
+    first = channel(blocks, following, "t", given.pop("unit", "s"), kind, 0, **given)
+    header(blocks, group(blocks, 0, first, record, 200, np.array([time, X]).T.tobytes(), name=name))
+    return blocks.bytes()
+
+
+@pytest.mark.parametrize("unit", ["", "s", "sec", "Sec", "seconds"])
+def test_times_in_seconds_by_any_name_are_taken(tmp_path, unit):
+    np.testing.assert_array_equal(read(tmp_path, one_channel(master={"unit": unit})).time, TIME)
+
+
+@pytest.mark.parametrize(
+    "master, reason",
+    [
+        ({"unit": "min"}, "have the unit 'min'"),
+        ({"conversion": lambda b: conversion(b, TABLE, [0.0, 5.0, 1.0, 6.0])}, "have a conversion that is not linear"),
+        ({"conversion": lambda b: conversion(b, FORMULA, [], [b.text("X1")])}, "have a conversion that is not linear"),
+        ({"flags": 1}, "have samples that are all marked as invalid"),
+        ({"sync": 9}, None),
+    ],
+)  # fmt: skip
+def test_other_times_are_refused_and_a_rate_takes_their_place(tmp_path, master, reason):
+    content = one_channel(master=master)
+    which = (
+        f"whose times 't' {reason}" if reason else "which is recorded over an unknown quantity .'t'. and not over time"
+    )
+    refused(tmp_path, content, f"time: must be known, got channel 'g/x' of run.mf4, {which}.*; sampling_rate= gives it")
+    assert read(tmp_path, content, sampling_rate=10.0).time[1] == pytest.approx(0.1)
+
+
+def test_two_channels_of_time_are_refused(tmp_path):
+    second = lambda blocks, following: channel(blocks, following, "t2", "s", F8, 8, master=MASTER, sync=1)  # noqa: E731
+    refused(tmp_path, one_channel(extra=[second]), "whose times 't' have 2 channels of time; sampling_rate= gives it")
+
+
+def test_times_marked_as_invalid_are_missing(tmp_path):
+    blocks = Blocks()
+    last = channel(blocks, 0, "x", "mm", F8, 8)
+    first = channel(blocks, last, "t", "s", F8, 0, master=MASTER, sync=1, flags=2, bits=0)
+    marks = np.zeros(200, "u1")
+    marks[5:8] = 1
+    table = np.rec.fromarrays([TIME, X, marks], dtype=[("t", "<f8"), ("x", "<f8"), ("m", "u1")])
+    header(blocks, group(blocks, 0, first, 16, 200, table.tobytes(), invalid=1))
+    refused(tmp_path, blocks.bytes(), r"time.*: must be finite, got nan at index 5 \(3 of 200")
+    assert read(tmp_path, blocks.bytes(), missing="drop").time.size == 197
+
+
+def test_times_of_single_precision_are_taken(tmp_path):
+    blocks = Blocks()
+    last = channel(blocks, 0, "x", "mm", F8, 4)
+    first = channel(blocks, last, "t", "s", (32, FLOAT), 0, master=MASTER, sync=1)
+    table = np.rec.fromarrays([TIME.astype("f4"), X], dtype=[("t", "<f4"), ("x", "<f8")])
+    header(blocks, group(blocks, 0, first, 12, 200, table.tobytes()))
+    time = read(tmp_path, blocks.bytes()).time
+    assert time.dtype == float and np.array_equal(time, TIME.astype("f4"))
+
+
+@pytest.mark.parametrize(
+    "x, reason",
+    [
+        ({"master": 1}, "texts or bytes of any length, which are not read"),
+        ({"flags": 1}, "samples that are all marked as invalid"),
+        (
+            {"conversion": FORMULA},
+            "a conversion by a formula; read it by asammdf with raw=True, and convert it for from",
+        ),
+    ],
+)
+def test_channels_that_are_not_read_are_refused_with_the_reason(tmp_path, x, reason):
+    blocks = Blocks()
+    given = x | ({"conversion": conversion(blocks, FORMULA, [], [blocks.text("X1")])} if "conversion" in x else {})
+    last = channel(blocks, 0, "x", "mm", F8, 8, **given)
+    first = channel(blocks, last, "t", "s", F8, 0, master=MASTER, sync=1)
+    header(blocks, group(blocks, 0, first, 16, 200, np.array([TIME, X]).T.tobytes()))
+    refused(tmp_path, blocks.bytes(), f"channel 'g/x' of run.mf4: must be usable, got {reason}")
+
+
+@pytest.mark.parametrize("place, sound", [(8, True), (9, False), (7, True)])
+def test_samples_end_with_their_record(tmp_path, place, sound):
+    """Of records of 16 bytes, those of 8 bytes begin at byte 8 at most."""
+    blocks = Blocks()
+    last = channel(blocks, 0, "x", "mm", F8, place)
+    first = channel(blocks, last, "t", "s", F8, 0, master=MASTER, sync=1)
+    header(blocks, group(blocks, 0, first, 16, 200, np.array([TIME, X]).T.tobytes()))
+    (tmp_path / "run.mf4").write_bytes(blocks.bytes())
+    assert ("beyond the end of the records" not in str(bp.inspect(tmp_path / "run.mf4"))) == sound
+
+
+@pytest.mark.parametrize(
+    "names, expected",
+    [
+        (["g"], ["g"]), ([""], [""]), (["", ""], ["group 1", "group 2"]), (["g", "g"], ["g", "g (2)"]),
+        (["a\nmore", "b\r\n"], ["a", "b"]), (["<x/>", "b"], ["group 1", "b"]), (["<TX>a &amp; b</TX>"], ["a & b"]),
+    ],
+)  # fmt: skip
+def test_names_of_groups(tmp_path, names, expected):
+    """The first line of the text, without XML around it; a number where there is none and several groups."""
+    blocks, following = Blocks(), 0
+    for name in reversed(names):
+        last = channel(blocks, 0, "x", "mm", F8, 8)
+        first = channel(blocks, last, "t", "s", F8, 0, master=MASTER, sync=1)
+        following = group(blocks, following, first, 16, 200, np.array([TIME, X]).T.tobytes(), name=name)
+    header(blocks, following)
+    (tmp_path / "run.mf4").write_bytes(blocks.bytes())
+    assert [one.group for one in bp.inspect(tmp_path / "run.mf4").channels] == expected
+
+
+@pytest.mark.parametrize("stated, text", [
+    (" mm\0", "mm"), (None, ""), ("<x><TX xml='1'> mm </TX></x>", "mm"), ("<x>mm</x>", "<x>mm</x>"), ("a<TX>b</TX>",
+    "a<TX>b</TX>"), ("<TX>&lt;5&amp;</TX>", "<5&"), ("<TX>a\nb</TX>", "a\nb"),
+])  # fmt: skip
+def test_texts_within_xml(stated, text):
+    assert mdf._text(stated) == text
+
+
+def test_instants_of_files_are_their_origin(tmp_path):
+    path = tmp_path / "run.mf4"
+    for start, origin in (
+        (1_769_860_800 * 10**9, np.datetime64("2026-01-31T12:00:00", "ns")), (0, None), (2**63, None),
+        (2**63 - 1, np.datetime64(2**63 - 1, "ns")),
+    ):  # fmt: skip
+        path.write_bytes(simple().replace(struct.pack("<Q", 1_769_860_800 * 10**9), struct.pack("<Q", start)))
+        assert {one.clock.origin for one in mdf.contents(path, []).channels} == {origin}
 
 
 @pytest.mark.parametrize("content", [simple(kind=LINEAR, values=[0, 1.0]), invalidated(), version_3()])

@@ -2,6 +2,7 @@
 
 import datetime
 import decimal
+import json
 import os
 import struct
 import subprocess
@@ -14,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.data.formats import parquet
 from tests.data.test_damaged_files import damaged
 
 COUNT = 64
@@ -199,6 +201,7 @@ import sys, warnings
 import numpy as np
 import pytest
 import bayesperiodic as bp
+from bayesperiodic.data.formats import parquet
 from tests.data.formats.test_parquet import TIME, X, by_hand
 from tests.data.test_damaged_files import damaged
 warnings.simplefilter("error")
@@ -244,3 +247,163 @@ def test_columns_of_texts_and_of_one_date_are_not_the_time(path):
     date = pa.array([datetime.datetime(2026, 3, 12)] * 2)
     write(path, date=date, time=pa.array(["a", "b"]), zeit=pa.array([0.0, 1.0]), x=pa.array([1.0, 2.0]))
     assert "time='zeit'" in bp.inspect(path).code
+
+
+def channels(path, **columns):
+    """Return the channels of a file of columns by name."""
+    write(path, **columns)
+    return {channel.name: channel for channel in bp.inspect(path).channels}
+
+
+@pytest.mark.parametrize(
+    "column, remark",
+    [
+        (
+            pa.array([1, 2], pa.timestamp("us", tz="Europe/Berlin")),
+            "dates in us, stored in UTC, shown in Europe/Berlin",
+        ),
+        (pa.array([1, 2], pa.timestamp("ms")), "dates in ms, without a time zone"),
+        (pa.array([decimal.Decimal("1.5")] * 2), "decimal numbers, read as the nearest floats"),
+        (pa.array([1, 2], pa.time64("us")), "times of day, which go on after midnight"),
+        (pa.array([1.0, 2.0]), None),
+    ],
+)
+def test_what_a_user_would_not_guess_is_remarked(path, column, remark):
+    remarks = channels(path, x=column)["x"].remarks
+    assert remarks[:1] == ((remark,) if remark else ())
+
+
+def test_unit_of_a_field_is_that_of_any_of_its_usual_keys(path):
+    for key in ("unit", "Units", "UOM", "unit_string"):
+        field = pa.field("x", pa.float64(), metadata={"a": "b", key: ' "mm" '})
+        pq.write_table(pa.table([pa.array([1.5, 2.5])], schema=pa.schema([field])), path)
+        assert read(path, time=None, sampling_rate=1.0)[1] == [0.0015, 0.0025]
+    assert channels(path, **{"x [mm]": (pa.array([1.5]), "cm"), "y [mm]": pa.array([1.5])})["x [mm]"].unit == "cm"
+    assert channels(path, **{"y [mm]": pa.array([1.5])})["y [mm]"].unit == "mm"
+
+
+def of_pandas(path, **metadata):
+    """Write two columns with the metadata of pandas."""
+    table = pa.table({"t": [0.0, 1.0], "x": [1.5, 2.5]})
+    stored = {key: json.dumps(value).encode() for key, value in metadata.items()}
+    pq.write_table(table.replace_schema_metadata(stored), path)
+    return bp.inspect(path)
+
+
+def test_units_of_pandas_are_in_its_own_or_in_other_metadata(path):
+    for given in (
+        {"pandas": {"attributes": {"units": {"x": "mm"}}}}, {"pandas": {"attributes": {"unit": {"x": "mm"}}}},
+        {"PANDAS_ATTRS": {"units": {"x": "mm"}}},
+    ):  # fmt: skip
+        assert [channel.unit for channel in of_pandas(path, **given).channels] == ["", "mm"]
+    for given in ({"pandas": {"attributes": ["mm"]}}, {"pandas": {"attributes": {"units": "mm"}}}, {"pandas": {}}, {}):
+        assert [channel.unit for channel in of_pandas(path, **given).channels] == ["", ""]
+
+
+def test_index_of_pandas_is_remarked_and_shown_by_a_plain_name(path):
+    seen = of_pandas(path, pandas={"index_columns": ["t"]})
+    assert seen.channels[0].remarks == ("the index of the table in pandas",) and seen.channels[1].remarks == ()
+    for start, step, shown in ((0, 1, False), (0, 2, True), (5, 1, True)):
+        kind = {"kind": "range", "start": start, "stop": 9, "step": step}
+        text = f"the index of the table in pandas, from {start} by {step}, is not stored"
+        assert (text in of_pandas(path, pandas={"index_columns": [kind]}).remarks) == shown
+    assert of_pandas(path, pandas={"index_columns": [{"kind": "other", "start": 5, "step": 2}]}).remarks == ()
+    pd.DataFrame({"x": [1.5, 2.5]}, index=[0.0, 1.0]).to_parquet(path)
+    assert [one.name for one in bp.inspect(path).channels] == ["x", "index"]
+    pd.DataFrame({"x": [1.5, 2.5], "index": [3, 4]}, index=[0.0, 1.0]).to_parquet(path)
+    assert [one.name for one in bp.inspect(path).channels] == ["x", "index", "__index_level_0__"]
+
+
+@pytest.mark.parametrize(
+    "columns, suggested",
+    [
+        ({"a": pa.array([1, 2]), "Time": pa.array([0.0, 1.0])}, "Time"), ({"a": pa.array([1, 2])}, None),
+        ({"t": pa.array([0, 1]), "when": pa.array([1, 2], pa.timestamp("ms"))}, "when"),
+        ({"t": pa.array([0, 1]), "d": pa.array([1, 2], pa.duration("ms"))}, "d"),
+        ({"date": pa.array(["a", "b"])}, None),
+        ({"t": pa.array([0.0, 1.0, 0.0])}, None), ({"t": pa.array([0.0])}, None), ({"zeit": pa.array([2, 1])}, "zeit"),
+        ({"t": pa.array([[1.0], [2.0]]), "x": pa.array([1.0, 2.0])}, None),
+    ],
+)  # fmt: skip
+def test_suggested_time_has_a_type_or_name_of_times_and_changes(path, columns, suggested):
+    write(path, **columns)
+    code = bp.inspect(path).code
+    assert (f"time={suggested!r}" in code) if suggested else "time=" not in code
+
+
+@pytest.mark.parametrize(
+    "column, kind",
+    [
+        (pa.array([[1.0], [2.0]]), "list<element: double>"), (pa.array([{"a": 1.0}] * 2), "struct<a: double>"),
+        (pa.array([b"a", b"b"]), "binary"), (pa.array([b"a", b"b"], pa.large_binary()), "large_binary"),
+        (pa.array([b"a", b"b"], pa.binary(1)), "fixed_size_binary"),
+    ],
+)  # fmt: skip
+def test_columns_of_other_types_are_refused_with_the_type(path, column, kind):
+    write(path, x=column)
+    with pytest.raises(ValueError, match=f"column 'x' of run.parquet: must be usable, got values of type {kind}"):
+        read(path, time=None, sampling_rate=1.0)
+    assert ("one array for each channel" in str(bp.inspect(path))) == ("binary" not in kind)
+
+
+@pytest.mark.parametrize("value, exact", [(2**53, True), (-(2**53), True), (2**53 + 1, False), (-(2**53) - 1, False)])
+def test_integers_with_nulls_are_those_that_floats_hold(path, value, exact):
+    write(path, t=pa.array([0, 1, 2]), x=pa.array([value, None, 5]))
+    if exact:
+        assert read(path, missing="drop")[1] == [float(value), 5.0]
+    else:
+        with pytest.raises(
+            ValueError, match=r"its column 2 has integers beyond 2\*\*53 and missing values; store it as fl"
+        ):
+            read(path, missing="drop")
+    write(path, t=pa.array([0, 1, 2]), x=pa.array([2**31 - 1, None, 5], pa.int32()))
+    assert read(path, missing="drop")[1] == [2.0**31 - 1, 5.0]
+    write(path, t=pa.array([0, 1, 2]), x=pa.array([-128, None, 5], pa.int8()))
+    assert read(path, missing="drop")[1] == [-128.0, 5.0]
+    write(path, t=pa.array([0, 1]), x=pa.array([2**60, 2**60 + 2**8]))
+    assert read(path)[1] == [2.0**60, 2.0**60 + 2**8]
+
+
+@pytest.mark.parametrize("unit, kind", [("s", pa.time32), ("ms", pa.time32), ("us", pa.time64), ("ns", pa.time64)])
+def test_times_of_day_with_nulls_go_on_after_midnight(path, unit, kind):
+    second = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[unit]
+    column = pa.array([86_399 * second, None, second, 3 * second], kind(unit))
+    write(path, t=column, x=pa.array([1.0, 2.0, 3.0, 4.0]))
+    with pytest.raises(ValueError, match="must be finite, got nan at index 1"):
+        read(path)
+    assert read(path, missing="drop") == ([0.0, 2.0, 4.0], [1.0, 3.0, 4.0])
+
+
+def test_tables_without_rows_or_of_too_many_are_refused_with_their_size(path, monkeypatch):
+    write(path, x=pa.array([], pa.float64()))
+    with pytest.raises(ValueError, match="path: must be a Parquet file, got .*run.parquet' .it has no rows"):
+        bp.inspect(path)
+    write(path, t=pa.array(TIME), x=pa.array(X))
+    for limit, refused in ((16 * COUNT, False), (16 * COUNT - 1, True)):
+        monkeypatch.setattr(parquet, "LARGEST_ARRAY", limit)
+        if refused:
+            with pytest.raises(
+                ValueError, match=f"its header states {COUNT} rows, more than .* GB or than fit in the fil"
+            ):
+                bp.inspect(path)
+        else:
+            assert len(bp.inspect(path).channels) == 2
+    monkeypatch.setattr(parquet, "LARGEST_ARRAY", 2**31)
+    monkeypatch.setattr(parquet, "VALUES_PER_BYTE", COUNT / path.stat().st_size * 0.999)
+    with pytest.raises(ValueError, match=f"its header states {COUNT} rows, more than 2.15 GB or than fit in the file"):
+        bp.inspect(path)
+
+
+def test_row_groups_are_joined_and_columns_too_large_named(path, monkeypatch):
+    table = pa.table({"t": TIME, "a.b": X, "x": 2 * X})
+    pq.write_table(table, path, row_group_size=10, compression="none", use_dictionary=False)
+    assert read(path) == (TIME.tolist(), (2 * X).tolist())
+    size = sum(pq.ParquetFile(path).metadata.row_group(k).column(2).total_uncompressed_size for k in range(7))
+    for limit in (size, size - 1):
+        monkeypatch.setattr(parquet, "LARGEST_ARRAY", limit)
+        monkeypatch.setattr(parquet, "BYTES_PER_VALUE", 1)
+        if limit == size:
+            assert parquet._values(path, 2).tolist() == (2 * X).tolist()
+        else:
+            with pytest.raises(ValueError, match="its column 3 has .* GB, more than .* GB"):
+                parquet._values(path, 2)

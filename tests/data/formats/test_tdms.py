@@ -1,6 +1,8 @@
 """TDMS files, written here after NI's description of their internal structure."""
 
+import datetime
 import logging
+import re
 import struct
 import warnings
 
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.data.formats import tdms
 from tests.data.test_damaged_files import damaged
 
 META, NEW, RAW, INTERLEAVED, DAQMX = 2, 4, 8, 32, 128
@@ -274,6 +277,127 @@ def test_big_endian_file(tmp_path):
     run = read(tmp_path, head + meta + data)
     np.testing.assert_array_equal(run.outputs["x"], X)
     assert run.sampling_rate == pytest.approx(100.0)
+
+
+FIRST, AT_ZERO = stamp("2026-01-31T12:00:00"), {"wf_start_offset": 0.0}
+
+
+@pytest.mark.parametrize(
+    "properties, reason",
+    [
+        ({"wf_increment": "0.01"}, "whose wf_increment is '0.01' and wf_start_offset 0.0; sampling_rate= gives it"),
+        ({"wf_increment": -0.01}, "whose wf_increment is -0.01 and wf_start_offset 0.0; sampling_rate= gives it"),
+        ({"wf_increment": np.nan}, "whose wf_increment is nan and wf_start_offset 0.0; sampling_rate= gives it"),
+        ({"wf_increment": 0.01, "wf_start_offset": np.inf}, "is 0.01 and wf_start_offset inf; sampling_rate= gives it"),
+        (
+            {"wf_increment": 0.01, "wf_start_time": 5},
+            "whose wf_start_time is no timestamp, but 5; sampling_rate= gives",
+        ),
+        ({"wf_increment": 0.01, "wf_xunit_string": "ms"}, "whose axis is in 'ms', no time in seconds; sampling_rate="),
+        ({"wf_increment": 1.0}, "whose wf_increment of 1 without wf_start_time is also that of samples without a wave"),
+    ],
+)
+def test_unclear_times_of_a_waveform_are_refused_with_their_values_and_overridden(tmp_path, properties, reason):
+    refused(tmp_path, channel(X, **properties), re.escape(reason))
+    assert read(tmp_path, channel(X, **properties), sampling_rate=10.0).sampling_rate == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize("unit", ["", "s", "sec", "Sec", "seconds", " s "])
+def test_axis_in_seconds_by_any_name_is_the_time(tmp_path, unit):
+    assert read(tmp_path, channel(X, wf_increment=0.25, wf_xunit_string=unit)).time[-1] == pytest.approx(299 / 4)
+
+
+def test_increment_of_one_second_with_an_offset_is_one(tmp_path):
+    assert read(tmp_path, channel(X, wf_increment=1.0, wf_start_offset=0.5)).time[:2].tolist() == [0.5, 1.5]
+
+
+@pytest.mark.parametrize(
+    "first, later, passed",
+    [
+        (AT_ZERO, {"wf_start_offset": 3.0}, None), (AT_ZERO, {"wf_start_offset": 3.0049}, None),
+        (AT_ZERO, {"wf_start_offset": 3.0051}, "3.0051"), (AT_ZERO, {"wf_start_offset": 2.9949}, "2.9949"),
+        ({"wf_start_offset": 0.5}, {"wf_start_offset": 3.5}, None), ({"wf_start_offset": 0.5}, {"wf_start_offset": 3.0},
+        "2.5"), ({"wf_start_time": FIRST}, {"wf_start_time": stamp("2026-01-31T12:00:03.004")}, None),
+        ({"wf_start_time": FIRST}, {"wf_start_time": stamp("2026-01-31T12:00:03.006")}, "3.006"),
+        ({"wf_start_time": FIRST, "wf_start_offset": 0.0},
+         {"wf_start_time": stamp("2026-01-31T12:00:02"), "wf_start_offset": 1.0}, None),
+        ({"wf_start_time": FIRST, "wf_start_offset": 0.0},
+         {"wf_start_time": stamp("2026-01-31T12:00:03"), "wf_start_offset": 1.0}, "4"),
+    ],
+)  # fmt: skip
+def test_a_later_segment_continues_the_first_one_to_half_a_step(tmp_path, first, later, passed):
+    """300 samples of 0.01 s are 3 s; of start and offset, the later segment may change either or both."""
+    content = channel(X, wf_increment=0.01, **first) + channel(X, **later)
+    if passed is None:
+        start = first.get("wf_start_offset", 0.0)
+        np.testing.assert_allclose(read(tmp_path, content).time, start + np.arange(600) / 100, atol=1e-9)
+    else:
+        refused(
+            tmp_path, content, f"whose segment from sample 300 starts {passed} s after the first one and not 3 s, as"
+        )
+
+
+def test_each_later_segment_is_compared(tmp_path):
+    parts = [channel(X, wf_increment=0.01, **AT_ZERO)] + [channel(X, wf_start_offset=start) for start in (3.0, 7.0)]
+    refused(tmp_path, b"".join(parts), "whose segment from sample 600 starts 7 s after the first one and not 6 s")
+
+
+def days(date):
+    return (datetime.date.fromisoformat(date) - datetime.date(1904, 1, 1)).days
+
+
+@pytest.mark.parametrize(
+    "seconds, fraction, date",
+    [
+        (0, 0, "1904-01-01T00:00:00"), (86_400, 2**63, "1904-01-02T00:00:00.5"),
+        (1, 2**34 * 3, "1904-01-01T00:00:01.000000003"),
+        (1, 2**33, "1904-01-01T00:00:01"), (-1, 0, None), (days("2262-01-01") * 86_400, 0, None),
+        (days("2261-01-01") * 86_400, 0, "2261-01-01"),
+    ],
+)  # fmt: skip
+def test_timestamps_of_the_years_of_nanoseconds_are_dates(seconds, fraction, date):
+    """Fractions are of 2**64, rounded to nanoseconds (2**34.1 of them)."""
+    given = type("Stamp", (), {"seconds": seconds, "second_fractions": fraction})
+    if date is None:
+        with pytest.raises(ValueError, match="it has timestamps before 1904 or after 2261"):
+            tdms._dates(given)
+    else:
+        assert tdms._dates(given) == np.datetime64(date, "ns")
+
+
+def of_group(properties, **channels):
+    """Return a segment of a group with properties, and a channel x of it."""
+    objects = [(path("g"), struct.pack("<I", 0xFFFFFFFF), properties)]
+    return segment([*objects, (path("g", "x"), index("<f8", len(X)), {"wf_increment": 0.01} | channels)], X.tobytes())
+
+
+def test_scale_of_a_group_is_that_of_its_channels_without_one(tmp_path):
+    scale = {key.replace("[1]", "[0]"): value for key, value in scaled("Linear").items() if "Source" not in key}
+    scale |= {"NI_Number_Of_Scales": 1, "wf_increment": 7.0}
+    content = of_group(scale | {"unit_string": "mm", "wf_start_offset": 9.0})
+    run = read(tmp_path, content)
+    np.testing.assert_allclose(run.outputs["x"], 1e-3 * (0.5 * X + 3.0))
+    assert run.time[0] == 0.0  # only scales and units are
+    np.testing.assert_allclose(read(tmp_path, of_group(scale | {"unit_string": "mm"}, unit_string="m")).outputs["x"],
+                               0.5 * X + 3.0)  # fmt: skip
+    refused(tmp_path, of_group(scale | {"NI_Scale[0]_Scale_Type": "Wheatstone"}), "a scale of type 'Wheatstone'")
+    np.testing.assert_allclose(read(tmp_path, of_group({"unit_string": "mm"})).outputs["x"], X)
+
+
+def test_unit_of_a_scale_is_used_where_there_is_no_other(tmp_path):
+    run = read(tmp_path, channel(X, wf_increment=0.01, NI_UnitDescription="mm"))
+    np.testing.assert_allclose(run.outputs["x"], 1e-3 * X)
+    run = read(tmp_path, channel(X, wf_increment=0.01, NI_UnitDescription="mm", unit_string="cm"))
+    np.testing.assert_allclose(run.outputs["x"], 1e-2 * X)
+
+
+@pytest.mark.parametrize(
+    "announced, remarked", [(300, False), (100, False), (1, False), (0, False), (-7, False), (301, True), (200, True)]
+)
+def test_samples_are_whole_records_of_those_that_are_announced(tmp_path, announced, remarked):
+    read(tmp_path, channel(X, wf_increment=0.01, wf_samples=announced))
+    shown = f"wf_samples announces {announced} samples, there are 300"
+    assert (shown in str(bp.inspect(tmp_path / "run.tdms"))) == remarked
 
 
 def test_damaged_file_is_read_or_refused_by_one_error(tmp_path, capfd):

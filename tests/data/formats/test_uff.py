@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.data.formats import uff
 from tests.data.test_damaged_files import damaged
 
 MARK = "    -1\n"
@@ -387,3 +388,147 @@ def test_frequency_response_whose_units_are_open_needs_them(saved):
     path = saved(function(h, time_unit="rad/s", unit="m", denominator=(13, "N"), title="H", function=4, abscissa=18))
     with pytest.raises(ValueError, match="an abscissa that is no frequency in Hz, but 'rad/s'"):
         bp.response_table(path, **arguments)
+
+
+def with_field(start, text, line=8):
+    """Return a function whose line of numbers, that of the form by default, has a text from a column on."""
+    lines = function().split(b"\n")
+    lines[line] = lines[line][:start] + text.encode() + lines[line][start + len(text) :]
+    return b"\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    "content, reason",
+    [
+        (with_field(0, f"{3:10d}"), "its data set 1 has an unknown form of data"),
+        (with_field(0, f"{1:10d}"), "its data set 1 has an unknown form of data"),
+        (with_field(10, f"{-1:10d}"), "its data set 1 has an unknown form of data"),
+        (with_field(20, f"{2:10d}"), "its data set 1 has an unknown form of data"),
+        (with_field(30, f"{'inf':>13}"), "its data set 1 has an abscissa that is not finite"),
+        (with_field(43, f"{'nan':>13}"), "its data set 1 has an abscissa that is not finite"),
+        (units164() + function(binary="<").replace(f"{11:12d}".encode(), f"{12:12d}".encode(), 1),
+         "its data set 2 has 12 lines before its values, not 11"),
+        (function(binary="<", form=1),
+         "its data set 1 has numbers of format 1 and byte order 1, not those of IEEE 754"),
+        (function() + function().replace(f"{58:6d}".encode(), b"  no58", 1),
+         "it has a data set whose number is 'no58'"),
+        (function()[:-7], "it is cut off"),
+        (b"nothing", "it has no data set 58, but none"),
+        (units164() + function().replace(f"{58:6d}".encode(), f"{151:6d}".encode(), 1),
+         "it has no data set 58, but 151, 164"),
+    ],
+)  # fmt: skip
+def test_files_of_another_form_are_refused_with_the_number_of_the_set(saved, content, reason):
+    path = saved(content)
+    with pytest.raises(ValueError, match=f"path: must be a universal file with data sets 58, got .*run.uff' .{reason}"):
+        bp.inspect(path, format="uff")
+
+
+@pytest.mark.parametrize(
+    "arguments, reason",
+    [
+        ({"step": 0.0}, "whose interval is 0"), ({"step": -0.01}, "whose interval is -0.01"),
+        ({"values": [1.0], "x": [0.5]}, "of fewer than two samples"),
+        ({"abscissa": 18, "time_unit": "Hz"}, "whose abscissa is no time, but of type 18 in 'Hz'"),
+        ({"abscissa": 1, "time_unit": "mm"}, "whose abscissa is no time, but of type 1 in 'mm'"),
+    ],
+)  # fmt: skip
+def test_abscissas_that_are_no_times_are_refused_with_what_they_are(saved, arguments, reason):
+    path = saved(function(**arguments))
+    assert reason in str(bp.inspect(path)) or len(arguments) == 2 and "values" in arguments
+    with pytest.raises(ValueError, match=f"time: must be known, got channel '3:.X/top' of run.uff, {reason}"):
+        read(path)
+
+
+@pytest.mark.parametrize("abscissa", [0, 1, 17])
+@pytest.mark.parametrize("time_unit, size", [("s", 1.0), ("sec", 1.0), ("NONE", 1.0), ("", 1.0), ("ms", 1e-3)])
+def test_abscissas_of_the_time_and_of_no_stated_type_are_times(saved, abscissa, time_unit, size):
+    run = read(saved(function(abscissa=abscissa, time_unit=time_unit, start=2.0, step=0.5)))
+    np.testing.assert_allclose(run.time, size * (2.0 + 0.5 * np.arange(50)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("end, error", [(0.49, "5e-07"), (4.9, "5e-06"), (99.9, "5e-05"), (100.0, "0.0005")])
+def test_error_of_stored_times_is_half_of_their_sixth_digit(saved, end, error):
+    times = np.linspace(0.0, end, 50) ** 2 / end
+    shown = str(bp.inspect(saved(function(x=times))))
+    assert f"times are stored with an error of up to {error} s" in shown
+    times = times.astype("f4").astype(float)
+    single = float(f"{np.spacing(np.float32(end)) / 2:.2g}")
+    assert f"an error of up to {single:.2g} s" in str(bp.inspect(saved(function(x=times, binary="<", double=False))))
+    assert "an error of up to 0 s" in str(bp.inspect(saved(function(x=times, binary="<"))))
+
+
+@pytest.mark.parametrize("step, taken", [(2.1e-3, False), (9.9e-3, False), (1.01e-2, True)])
+def test_times_may_be_rounded_to_a_hundredth_of_a_step(saved, step, taken):
+    """Around 20 s, six digits are 1e-4 s, and the error is half of that."""
+    path = saved(function(x=20.0 + 0.5 * step * np.arange(50)))
+    if taken:
+        assert read(path).time.size == 50
+    else:
+        with pytest.raises(ValueError, match="whose times are rounded to 0.0001 s, with a mean step of .* even"):
+            read(path)
+
+
+@pytest.mark.parametrize(
+    "start, digits", [("   1.2345E+01", "0.001"), ("  1.23000E+01", None), ("  -1.2345E+01", "0.001")]
+)
+def test_start_of_one_set_among_others_must_be_known_to_a_hundredth_of_a_step(saved, start, digits):
+    lines = function(title="late").split(b"\n")
+    lines[8] = lines[8][:30] + start.encode() + lines[8][43:]
+    path = saved(b"\n".join(lines), function())
+    if digits is None:
+        assert read(path, "late").time[0] == 12.3
+        return
+    assert read(path, "top").time[0] == 0.0
+    with pytest.raises(
+        ValueError, match=f"which starts at -?12.345 s, rounded to {digits} s with a step of 0.01 s, and"
+    ):
+        bp.Recording.from_file(path, outputs={"x": "late", "y": "top"})
+
+
+def sets(*heads):
+    """Return functions by number, first line of their names, node, direction and name of the part."""
+    kinds = {"id1": "NONE", "rsp_ent_name": "NONE", "rsp_node": 0, "rsp_dir": 0}
+    return [uff._Set(k, kinds | head, "", "", ("", "", ""), None) for k, head in enumerate(heads, 1)]
+
+
+@pytest.mark.parametrize(
+    "heads, names, groups",
+    [
+        ([{}], ["set 1"], [""]), ([{"id1": "a"}], ["a"], [""]), ([{"rsp_node": 3}], ["3"], [""]),
+        ([{"rsp_dir": -2}], ["0:-Y"], [""]), ([{"rsp_node": 3, "rsp_dir": 6}], ["3:+RZ"], [""]),
+        ([{"rsp_node": 3, "rsp_dir": 9}], ["3"], [""]), ([{"rsp_node": 3, "rsp_dir": -4}], ["3:-RX"], [""]),
+        ([{"rsp_ent_name": "wing", "rsp_node": 3, "rsp_dir": 1}], ["wing:3:+X"], [""]),
+        ([{"id1": "a", "rsp_node": 1}, {"id1": "b", "rsp_node": 2}], ["a", "b"], ["1", "2"]),
+        ([{"id1": "a", "rsp_node": 1}, {"id1": "a", "rsp_node": 2}], ["1", "2"], ["", ""]),
+        ([{"id1": "a", "rsp_node": 1}, {"id1": "a", "rsp_node": 1}], ["1", "1 (2)"], ["", ""]),
+        ([{"id1": "a", "rsp_node": 1}, {"id1": "a"}], ["a", "a"], ["1", ""]),
+        ([{"id1": "a"}, {"id1": "a"}, {"id1": "b"}], ["a", "a (2)", "b"], ["", "", ""]),
+        ([{"id1": "a"}, {"rsp_node": 2}, {}], ["a", "2", "set 3"], ["", "", ""]),
+    ],
+)  # fmt: skip
+def test_names_are_the_first_lines_and_groups_the_places(heads, names, groups):
+    """Where all first lines are the same, as of the model, the places are the names."""
+    assert uff._names(sets(*heads)) == (names, groups)
+
+
+def test_dates_that_differ_are_both_named(saved):
+    dates = ("01-Jan-26 10:00:00", "01-Jan-26 11:00:00")
+    shown = str(bp.inspect(saved(*(function(date=date, title=date[-8:-6]) for date in dates))))
+    assert f"the sets have different dates ({dates[0]!r} to {dates[1]!r}) and may be different runs" in shown
+    for parts in ((dates[0],) * 2, (dates[0],)):
+        assert "different dates" not in str(bp.inspect(saved(*(function(date=date) for date in parts))))
+    # The date of a function that is no time signal does not count.
+    other = function(date=dates[1], function=4, abscissa=18, time_unit="Hz", title="H")
+    assert "different dates" not in str(bp.inspect(saved(function(date=dates[0]), other)))
+
+
+@pytest.mark.parametrize("spare, read_", [(0, True), (5, True), (6, False)])
+def test_text_may_have_values_up_to_the_end_of_its_line(saved, spare, read_):
+    """Of six single numbers in a line, five at most fill it."""
+    path = saved(function(fill=(9.0,) * spare, double=False))
+    if read_:
+        assert read(path).time.size == 50
+    else:
+        with pytest.raises(ValueError, match="has 56 values, and its header says 50; it is cut off or damaged"):
+            read(path)

@@ -1,5 +1,6 @@
 """WAV files, written after their specification: samples at the right scale, or refused."""
 
+import io
 import struct
 import warnings
 import wave
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.data.formats import wav as reader
 from tests.data.test_damaged_files import damaged
 
 # What follows the format in the identifier of an extensible header.
@@ -152,3 +154,51 @@ def test_damaged_file_is_refused_or_read_as_a_whole(tmp_path, arguments):
                 assert "must" in str(error)
                 continue
         assert 2 <= run.time.size <= 120
+
+
+def form(tag, channels, rate, block, bits, *, valid=None, inner=None, size=None, order="<"):
+    """Return the format that a chunk states, after Microsoft's description."""
+    content = struct.pack(f"{order}HHIIHH", tag, channels, rate, rate * block, block, bits)
+    if inner is not None:
+        content += struct.pack(f"{order}HHII", 22, valid, 0, inner) + bytes(12)
+    found = reader._form(io.BytesIO(content), order, len(content) if size is None else size)
+    return found.channels, found.rate, found.bits, found.valid
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(
+    "arguments, given, expected",
+    [
+        ((1, 2, 8000, 4, 16), {}, (16, 16)), ((1, 1, 8000, 1, 8), {}, (8, 8)), ((1, 3, 8000, 9, 24), {}, (24, 24)),
+        ((1, 1, 8000, 4, 32), {}, (32, 32)), ((1, 1, 8000, 8, 64), {}, (64, 64)), ((3, 2, 8000, 8, 32), {}, (32, 32)),
+        ((3, 1, 8000, 8, 64), {}, (64, 64)), ((1, 1, 8000, 2, 12), {}, (16, 12)), ((1, 1, 8000, 1, 5), {}, (8, 8)),
+        ((0xFFFE, 1, 8000, 4, 32), {"valid": 20,
+         "inner": 1}, (32, 20)), ((0xFFFE, 1, 8000, 4, 32), {"valid": 0, "inner": 1},
+        (32, 32)), ((0xFFFE, 1, 8000, 4, 32), {"valid": 32, "inner": 3}, (32, 32)),
+    ],
+)  # fmt: skip
+def test_formats_of_samples(arguments, given, expected, order):
+    assert form(*arguments, **given, order=order) == (arguments[1], 8000, *expected)
+
+
+@pytest.mark.parametrize(
+    "arguments, given, reason",
+    [
+        ((2, 1, 8000, 2, 16), {}, "its samples are of format 0x0002, and not linear PCM or floats"),
+        ((0xFFFE, 1, 8000, 2, 16), {}, "its samples are of format 0xfffe, and not linear PCM or floats"),
+        ((0xFFFE, 1, 8000, 2, 16), {"valid": 16, "inner": 1, "size": 39}, "its samples are of format 0xfffe"),
+        ((0xFFFE, 1, 8000, 2, 16), {"valid": 16, "inner": 2}, "its samples are of format 0x0002"),
+        ((1, 0, 8000, 2, 16), {}, "it has 0 channels of 8000 Hz in blocks of 2 bytes"),
+        ((1, 1, 0, 2, 16), {}, "it has 1 channels of 0 Hz in blocks of 2 bytes"),
+        ((1, 2, 8000, 3, 16), {}, "it has 2 channels of 8000 Hz in blocks of 3 bytes"),
+        ((1, 1, 8000, 4, 24), {}, "its samples have 24 of 24 bits in 4 bytes, which has several meanings"),
+        ((1, 1, 8000, 2, 17), {}, "its samples have 17 of 17 bits in 2 bytes"), ((1, 1, 8000, 2, 8), {},
+         "its samples have 8 of 8 bits in 2"),
+        ((3, 1, 8000, 2, 16), {}, "its samples have 16 of 16 bits in 2 bytes"), ((1, 1, 8000, 5, 40), {},
+         "its samples have 40 of 40 bits"),
+        ((0xFFFE, 1, 8000, 4, 32), {"valid": 33, "inner": 1}, "its samples have 33 of 32 bits in 4 bytes"),
+    ],
+)  # fmt: skip
+def test_other_formats_are_refused_with_their_numbers(arguments, given, reason):
+    with pytest.raises(ValueError, match=f"^{reason}"):
+        form(*arguments, **given)

@@ -1,0 +1,45 @@
+"""What all readers have in common: each file is called by its format, and its channels by the word of the format."""
+
+import io
+
+import h5py
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from tests.data.formats import test_excel, test_lvm, test_mdf, test_parquet, test_tdms, test_uff, test_wav
+from tests.data.test_damaged_files import saved
+
+
+def hdf5():
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        file["x"] = np.arange(5.0)
+    return content.getvalue()
+
+
+FILES = {
+    "TDMS file": ("tdms", test_tdms.channel(test_tdms.X, wf_increment=0.01), "channel"),
+    "MDF file": ("mf4", test_mdf.simple(), "channel"),
+    "universal file": ("uff", test_uff.function(), "channel"),
+    "WAV file": ("wav", test_wav.wav(), "channel"),
+    "LabVIEW measurement file": ("lvm", (test_lvm.head() + test_lvm.segment()).encode("latin-1"), "channel"),
+    "HDF5 file": ("h5", hdf5(), "channel"),
+    "MAT file": ("mat", saved("mat 5"), "column"),
+    "NPZ file": ("npz", saved("npz"), "column"),
+    "CSV file": ("csv", b"t,x\n0,1\n1,2\n", "column"),
+    "Excel workbook": ("xlsx", test_excel.workbook({"run": [["t", "x"], [0, 1.5], [1, 2.5]]}), "column"),
+    "Parquet file": ("parquet", test_parquet.by_hand({b"t": test_parquet.TIME, b"x": test_parquet.X}), "column"),
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_files_are_called_by_their_format_and_their_channels_by_its_word(tmp_path, kind):
+    ending, content, word = FILES[kind]
+    path = tmp_path / f"run.{ending}"
+    path.write_bytes(content)
+    assert str(bp.inspect(path)).startswith(f"{kind} {str(path)!r}, ")
+    with pytest.raises(ValueError, match=f"^{word} of run.{ending}: must be (one of )?'.*', got 'no such'"):
+        bp.Recording.from_file(path, sampling_rate=1.0, outputs={"x": "no such"})
+    with pytest.raises(ValueError, match=f"^{word} of run.{ending}: must be a number from 1 to "):
+        bp.Recording.from_file(path, sampling_rate=1.0, outputs={"x": 99})

@@ -1,0 +1,229 @@
+"""Attributes of HDF5 files: packing and dates after the conventions of netCDF, rates, starts and their units."""
+
+from types import SimpleNamespace
+
+import h5py
+import numpy as np
+import pytest
+
+from bayesperiodic.data.formats import hdf5_attributes
+from bayesperiodic.data.formats.hdf5_attributes import Packing, Since, sampling
+
+
+@pytest.mark.parametrize(
+    "value, expected",
+    [
+        (0.5, 0.5), (np.int16(7), 7), ("mm", "mm"), (b"mm", "mm"), (np.bytes_("\u00b5m".encode()), "µm"),
+        (np.array([5]), 5), (np.array([[5.0]]), 5.0), (np.arange(3), (0, 1, 2)), (np.zeros(64), (0.0,) * 64),
+        (np.zeros(65), "65 values"), (["a", "b"], "2 values"), (np.array(["a"], dtype=object), "a"),
+        (h5py.Empty("f8"), None), (np.zeros(0), None), (1j, None), (True, None),
+    ],
+)  # fmt: skip
+def test_attributes_are_numbers_texts_or_how_many_there_are(tmp_path, value, expected):
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        if isinstance(value, np.ndarray) and value.dtype == object:
+            file.attrs.create("a", value, dtype=h5py.string_dtype())
+        else:
+            file.attrs["a"] = value
+        file.attrs["other"] = 1
+        assert hdf5_attributes.attributes(file) == ({} if expected is None else {"a": expected}) | {"other": 1}
+
+
+def item(kind):
+    return SimpleNamespace(dtype=np.dtype(kind))
+
+
+@pytest.mark.parametrize(
+    "kind, stored, packing, remark",
+    [
+        ("i2", {}, Packing(), ""), ("f8", {}, Packing(missing=(9.969209968386869e36,)), ""),
+        ("f2", {}, Packing(), ""), ("O", {"scale_factor": 2.0}, Packing(), ""),
+        ("S5", {"_FillValue": 1}, Packing(), ""),
+        ("i2", {"scale_factor": 0.5}, Packing(0.5), "stored values are multiplied by 0.5 and 0 is added"),
+        ("i2", {"add_offset": 2}, Packing(1.0, 2.0), "stored values are multiplied by 1 and 2 is added"),
+        ("i2", {"scale_factor": 1.0, "add_offset": 0.0}, Packing(), ""),
+        ("i2", {"scale_factor": 0.0}, Packing(unused="scale_factor = 0.0"), ""),
+        ("i2", {"scale_factor": np.inf, "add_offset": 1.0}, Packing(unused="scale_factor = inf, add_offset = 1.0"), ""),
+        ("i2", {"scale_factor": (1.0, 2.0)}, Packing(unused="scale_factor = (1.0, 2.0)"), ""),
+        ("i2", {"_FillValue": -9, "missing_value": (-8, -7)}, Packing(missing=(-9.0, -8.0, -7.0)), ""),
+        ("i2", {"missing_value": "nan"}, Packing(missing=(np.nan,)), ""),
+        ("i2", {"valid_range": (-5, 5)}, Packing(low=-5.0, high=5.0), ""),
+        ("i2", {"valid_min": -5, "valid_max": 5}, Packing(low=-5.0, high=5.0), ""),
+        ("i2", {"valid_range": (-5, 5), "valid_min": -3}, Packing(low=-3.0, high=5.0), ""),
+        ("i1", {"_Unsigned": "TRUE", "_FillValue": -1}, Packing(missing=(255.0,), unsigned=True), ""),
+        ("i2", {"_Unsigned": "true", "_FillValue": -1, "missing_value": 0},
+         Packing(missing=(65535.0, 0.0), unsigned=True),
+         ""), ("i2", {"_Unsigned": "false", "_FillValue": -1}, Packing(missing=(-1.0,)), ""),
+    ],
+)  # fmt: skip
+def test_packing_after_the_conventions_of_netcdf(kind, stored, packing, remark):
+    seen = Packing.of(stored, item(kind))
+    assert repr(seen) == repr(packing) and seen.remark == remark  # NaN is not equal to itself
+
+
+@pytest.mark.parametrize(
+    "stored, what",
+    [
+        ({"_FillValue": (1, 2)}, "_FillValue = (1, 2), which is no number"),
+        ({"valid_range": (1, 2, 3)}, "valid_range = (1, 2, 3), which is no range"),
+        ({"valid_min": "zero"}, "valid_min = zero, which is no number"),
+        ({"missing_value": "65 values"}, "missing_value = 65 values, which is no number"),
+    ],
+)
+def test_other_limits_are_refused_with_their_attribute(stored, what):
+    refusal = Packing.of(stored, item("f8")).refusal
+    assert refusal.startswith(f"an attribute {what}; ") and "give it to from_arrays" in refusal
+
+
+def test_limits_belong_to_the_valid_values():
+    """Values of the stored type are compared, before scale and offset."""
+    values = np.arange(-3, 4).astype("i2")
+    packing = Packing(0.5, 10.0, missing=(0.0,), low=-2.0, high=2.0)
+    assert np.array_equal(packing.unpacked(values), [np.nan, 9, 9.5, np.nan, 10.5, 11, np.nan], equal_nan=True)
+    assert Packing().unpacked(values) is values and Packing(missing=(7.0,)).unpacked(values).dtype == np.int16
+    assert Packing(offset=1.0).unpacked(values).tolist() == [*range(-2, 5)]
+    assert Packing(scale=3.0).unpacked(values).tolist() == [*range(-9, 10, 3)]
+    words = np.array(["a"])
+    assert Packing(2.0).unpacked(words) is words
+    assert Packing(unsigned=True).unpacked(np.array([-1, 5], "i1")).tolist() == [255, 5]
+    assert Packing(unsigned=True).unpacked(np.array([-1.0, 5.0])).tolist() == [-1.0, 5.0]
+
+
+@pytest.mark.parametrize(
+    "text, date",
+    [
+        ("2026-01-31", "2026-01-31"), ("2026-1-31 12:00", "2026-01-31T12:00"), ("2026-01-31T12:00:00+02:00",
+        "2026-01-31T10:00"), ("2026-01-31T12:00:00.123456789Z", "2026-01-31T12:00:00.123456789"), ("1678-01-01",
+        "1678-01-01"), ("2261-12-31", "2261-12-31"), ("1677-12-31", None), ("2262-01-01", None), ("1-1-1", None),
+        ("2026-13-01", None), ("now", None), ("NaT", None), ("20260131", None),
+    ],
+)  # fmt: skip
+def test_dates_after_iso_8601_in_the_years_of_nanoseconds(text, date):
+    seen = hdf5_attributes._date(text)
+    assert seen is None if date is None else seen == np.datetime64(date, "ns") and seen.dtype == "datetime64[ns]"
+
+
+@pytest.mark.parametrize(
+    "unit, size",
+    [
+        ("s", 1), ("Seconds", 1), ("ms", 1e-3), ("usec", 1e-6), ("µs", 1e-6), ("ns", 1e-9), ("min", 60),
+        ("hours", 3600),
+        ("h", 3600), ("days", 86_400), (" s ", 1), ("mm", None), ("", None), ("m", None),
+    ],
+)  # fmt: skip
+def test_units_of_time(unit, size):
+    since = Since.of(unit, {})
+    assert since is None if size is None else since.seconds(3) == pytest.approx(3 * size, rel=1e-15)
+    assert since is None or since.seconds(np.arange(3.0)).tolist() == [
+        0.0,
+        pytest.approx(size),
+        pytest.approx(2 * size),
+    ]
+    since = Since.of(f"{unit} since 2026-01-31", {})
+    assert (since.origin is None) == bool(since.refusal) == (size is None) if since else not unit.strip()
+
+
+def test_dates_that_cannot_be_read_are_refused_with_what_reads_them():
+    for unit, stored, what in (
+        ("days since 2026-01-01", {"calendar": "360_day"}, "dates in 'days since 2026-01-01' of calendar '360_day'; "),
+        ("weeks since 2026-01-01", {}, "dates in 'weeks since 2026-01-01' of calendar 'standard'; "),
+        ("days since noon", {}, "dates since 'noon'; "),
+    ):
+        assert (
+            Since.of(unit, stored).refusal == f"{what}read it by xarray.open_dataset, and give seconds to from_arrays"
+        )
+    assert Since.of("days since 2026-01-01", {"calendar": "Gregorian"}).refusal == ""
+
+
+@pytest.mark.parametrize(
+    "unit, count, step", [("days", 2, 86_400e9), ("ms", 7, 1e6), ("ns", 5, 1), ("minutes", 3, 60e9)]
+)
+def test_dates_of_integers_and_floats(unit, count, step):
+    """By integer arithmetic of NumPy; a missing float is a missing date."""
+    since = Since.of(f"{unit} since 2026-01-31T12:00:00", {})
+    expected = np.datetime64("2026-01-31T12:00:00", "ns") + (np.arange(-count, count) * int(step)).astype("m8[ns]")
+    for kind in ("i4", "i8", "f8"):
+        assert np.array_equal(since.dates(np.arange(-count, count).astype(kind)), expected)
+    lost = since.dates(np.array([0.0, np.nan, 1.0, np.inf]))
+    assert np.isnat(lost).tolist() == [False, True, False, True] and lost[2] == expected[count + 1]
+    assert since.dates(np.zeros(0)).size == 0
+
+
+@pytest.mark.parametrize("part, exact", [(0.0, True), (0.9e-3, True), (1.1e-3, False), (-1.1e-3, False), (0.5, False)])
+def test_dates_may_be_rounded_by_a_thousandth_of_their_step(part, exact):
+    since = Since.of("ns since 2026-01-31", {})
+    values = np.array([0.0, 1.0 + part, 2.0, 3.0])
+    if exact:
+        assert (since.dates(values) - since.origin).astype(int).tolist() == [0, 1, 2, 3]
+    else:
+        with pytest.raises(
+            ValueError, match="its dates are finer than nanoseconds; read them with xarray and give seconds"
+        ):
+            since.dates(values)
+    assert since.dates(np.array([0.3, 0.3])).size == 2  # without a step
+
+
+@pytest.mark.parametrize("years, inside", [(292.0, True), (293.0, False), (-293.0, False)])
+def test_dates_beyond_the_years_of_nanoseconds_are_refused(years, inside):
+    """2**63 ns are 292.3 years of 365.2425 days."""
+    since = Since.of("days since 1970-01-01", {})
+    if inside:
+        assert since.dates(np.array([years * 365.0]))[0] < np.datetime64("2262-01-01")
+        return
+    with pytest.raises(ValueError, match="its dates are outside of the years from 1678 to 2261"):
+        since.dates(np.array([0.0, years * 365.2425]))
+
+
+@pytest.mark.parametrize(
+    "stored, start, step",
+    [
+        ({"dt": 0.01}, 0.0, 0.01), ({"Sampling Rate": 250}, 0.0, 0.004), ({"dt": 0.01, "t0": 2.0}, 2.0, 0.01),
+        ({"dt": 10.0, "dt_unit": "ms", "t0": 2.0, "t0_unit": "s"}, 2.0, 0.01),
+        ({"fs": 0.1, "fs_unit": "kHz", "t0": 99_999_999.0}, 99_999_999.0, 0.01),
+        ({"dt": 0.01, "fs": 100.0 * (1 + 1e-13)}, 0.0, 0.01), ({"dt": 1.0, "time_unit": "min"}, 0.0, 60.0),
+        ({"dt": 0.01, "sampling_unit": "Hz", "fs": 100.0}, 0.0, 0.01),
+        ({"fs": 2.0, "sampling_unit": "GHz"}, 0.0, 5e-10),
+    ],
+)  # fmt: skip
+def test_times_by_rate_or_interval_and_start(stored, start, step):
+    clock = sampling(stored)
+    assert clock.refusal == "" and (clock.start, clock.origin, clock.error) == (start, None, 0.0)
+    assert clock.step == pytest.approx(step, rel=1e-12)
+    shown = [f"{key} = {value}" for key, value in stored.items() if "t0" != key]
+    assert clock.remarks[0].startswith("times are those of its attributes ") and all(
+        x in clock.remarks[0] for x in shown
+    )
+
+
+@pytest.mark.parametrize(
+    "stored, what",
+    [
+        ({"dt": 0.01, "fs": 100.0 * (1 + 1e-11)},
+         "whose attributes dt = 0.01, fs = 100.000000001 contradict each other"),
+        ({"fs": -1.0}, "whose attributes say fs = -1.0"), ({"fs": 0}, "whose attributes say fs = 0"),
+        ({"fs": np.inf}, "whose attributes say fs = inf"), ({"fs": (1, 2)}, "whose attributes say fs = (1, 2)"),
+        ({"fs": 1.0, "fs_unit": "mHz"}, "whose attributes fs = 1.0, fs_unit = mHz do not say one unit"),
+        ({"dt": 1.0, "sampling_unit": "kHz"}, "whose attributes dt = 1.0, sampling_unit = kHz do not say one unit"),
+        ({"fs": 1.0, "sampling_unit": "ms"}, "whose attributes fs = 1.0, sampling_unit = ms do not say one unit"),
+        ({"dt": 1.0, "t0": 1e8}, "whose attribute t0 = 100000000.0 is no start in seconds or after ISO 8601"),
+        ({"dt": 1.0, "t0": -1e8}, "whose attribute t0 = -100000000.0 is no start in seconds or after ISO 8601"),
+        ({"dt": 1.0, "t0": np.nan}, "whose attribute t0 = nan is no start in seconds or after ISO 8601"),
+        ({"dt": 1.0, "dt_unit": "ms", "t0": 2.0}, "whose attribute t0 = 2.0 has no unit"),
+        ({"dt": 1.0, "t0": 1.0, "start_time": 2.0},
+         "whose attributes t0 = 1.0, start_time = 2.0 contradict each other"),
+    ],
+)  # fmt: skip
+def test_times_that_attributes_leave_open_are_refused_with_the_attributes(stored, what):
+    assert sampling(stored).refusal == what
+
+
+def test_zero_start_needs_no_unit_and_other_attributes_say_no_times():
+    clock = sampling({"dt": 1.0, "dt_unit": "ms", "t0": 0.0})
+    assert (clock.refusal, clock.start) == ("", 0.0)
+    clock = sampling({"dt": 1.0, "start_time": "2026-01-31T12:00:00+01:00"})
+    assert clock.origin == np.datetime64("2026-01-31T11:00:00", "ns") and clock.start == 0.0
+    assert sampling({"t0": 1.0, "rate": "fast", "units": "mm"}) is None
+    assert sampling({"dt": np.float32(1 / 48000)}).error == pytest.approx(0.5e-12, rel=1e-3)  # of 2.0833333e-05
+    assert sampling({"dt": np.float32(1 / 48), "dt_unit": "ms"}).error == pytest.approx(
+        0.5e-12, rel=1e-3
+    )  # 0.020833334

@@ -1,0 +1,182 @@
+"""Rules for whole texts of columns: signs of numbers, times, summaries, numbers of fields, and wide files."""
+
+import re
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.data.formats import text
+from bayesperiodic.data.formats.text import _Notation
+
+
+@pytest.fixture
+def write(tmp_path):
+    def written(content):
+        path = tmp_path / "run.csv"
+        path.write_text(content, "utf-8")
+        return path
+
+    return written
+
+
+@pytest.mark.parametrize(
+    "given, expected",
+    [
+        ((None, None, None), (None, None, None)), ((",", None, None), (",", None, None)), ((None, ".", None),
+        (",", ".", None)),
+        ((None, ",", None), (".", ",", None)), ((None, "'", None), (None, "'", None)), ((",", " ", "%H"),
+        (",", " ", "%H")),
+        ((".", "\u202f", None), (".", "\u202f", None)),
+    ],
+)  # fmt: skip
+def test_a_sign_between_thousands_leaves_the_other_one(given, expected):
+    assert text._notation(*given) == _Notation(*expected)
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ((";", None, None), "decimal: must be one of '.', ',', got ';'"),
+        ((None, "x", None), "thousands: must be one of '.', ',', \"'\""),
+        ((",", ",", None), "thousands: must differ from decimal, got ',' for both."),
+        ((None, None, "d.m.y"), "date_format: must be a format such as '%d.%m.%Y %H:%M:%S.%f', got 'd.m.y'."),
+        ((None, None, 5), "date_format: must be "),
+    ],
+)
+def test_other_signs_and_formats_are_refused(given, message):
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
+        text._notation(*given)
+
+
+@pytest.mark.parametrize(
+    "content, remark",
+    [
+        ("t,x\n0,1\n1,2\n", "separator ',', names in line 1"), ("t,x\n0,1.5\n1,2\n", "names in line 1, decimal point"),
+        ("t;x\n0;1,5\n1;2\n", "separator ';', names in line 1, decimal comma"),
+        ("t;x\n0;1.5\n1;2\n", "line 1, decimal point"),
+        ("t,x\n0,1.500\n1,2.500\n", "separator ',', names in line 1, decimal point"),
+    ],
+)  # fmt: skip
+def test_decimal_sign_that_was_recognised_is_remarked(write, content, remark):
+    shown = bp.inspect(write(content)).remarks[0]
+    assert shown.endswith(remark)
+
+
+@pytest.mark.parametrize(
+    "content, suggested",
+    [
+        ("t,x\n0,1\n1,2\n", "t"), ("a,x\n0,2\n1,2\n", None), ("x,Time [s]\n1,0\n2,1\n", "Time [s]"),
+        ("t,x\n1,1\n0,2\n", None),
+        ("t,x\n0,1\n0,2\n", None), ("t,x\n0,1\n", None), ("a [ms],x\n0,1\n1,2\n", "a [ms]"),
+        ("a [mm],x\n0,2\n1,2\n", None),
+        ("x [s],t\n0,1\n1,2\n", "t"), ("a,x\n10:00:00,1\n10:00:01,2\n", "a"), ("a,x\n10:00:00,1\n10:00:00,2\n", None),
+        ("a,x\n2026-01-31T10:00:00,1\n2026-01-31T10:00:01,2\n", "a"), ("t,x\nOL,1\n1,2\n2,3\n", None),
+    ],
+)  # fmt: skip
+def test_suggested_time_increases_and_has_a_name_a_unit_or_dates(write, content, suggested):
+    try:
+        code = bp.inspect(write(content)).code
+    except ValueError:
+        assert "OL" in content
+        return
+    assert (f"time={suggested!r}" in code) if suggested else "time=" not in code
+
+
+ROWS = "".join(f"{k},{k + 0.5},{k % 3}\n" for k in range(40))
+
+
+@pytest.mark.parametrize(
+    "row, refused",
+    [
+        ("Mean,20,1", True), ("  max. ,39.5,2", True), ("RMS:,20,1", True), ("Mean,,", False), ("Mean,a,b", False),
+        ("means,1,2", False), ("40,Sum,3", True), ("40,5,OL", False),
+    ],
+)  # fmt: skip
+def test_summaries_stand_in_a_column_of_numbers_beside_numbers(write, row, refused):
+    path = write("t,x,y\n" + ROWS + row + "\n")
+    if refused:
+        with pytest.raises(
+            ValueError, match="path: must be a CSV file with a sample in each row, .* seems to be a summary; r"
+        ):
+            bp.inspect(path)
+    else:
+        assert bp.inspect(path).channels[0].samples == 41
+
+
+@pytest.mark.parametrize("after, refused", [(19, True), (20, False)])
+def test_summaries_are_among_the_last_twenty_rows(write, after, refused):
+    path = write("t,x,y\n" + ROWS + "Mean,20,1\n" + "".join(f"{k},{k + 0.5},1\n" for k in range(after)))
+    if refused:
+        with pytest.raises(ValueError, match="seems to be a summary"):
+            bp.inspect(path)
+    else:
+        assert bp.inspect(path).channels[1].samples == 41 + after
+
+
+@pytest.mark.parametrize(
+    "rows, fields, number",
+    [("0,1\n1,2\n2,3,4\n", 3, 3), ("0,1\n1\n2,3\n", 1, 2), ("0,1\n\n1,2,3\n", 3, 2), ("0,1,5\n1,2\n", 3, 1)],
+)
+def test_rows_of_other_numbers_of_fields_are_named(write, rows, fields, number):
+    message = f"with 2 fields in each row, as many as there are names, got {fields} in data row {number} of"
+    with pytest.raises(ValueError, match=message):
+        bp.Recording.from_csv(write("t,x\n" + rows), sampling_rate=1.0, outputs={"x": "x"}, missing="drop")
+
+
+@pytest.mark.parametrize("limit", [1, 10**9])
+@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
+def test_wide_files_are_read_like_narrow_ones(write, monkeypatch, limit, separator):
+    monkeypatch.setattr(text, "NARROW_COLUMNS", limit)
+    names = [f"c{k}" for k in range(9)]
+    rows = [[f"{k * j % 7}.5" for j in range(9)] for k in range(30)]
+    path = write("\n".join(separator.join(row) for row in [names, *rows]) + "\n\n")
+    run = bp.Recording.from_csv(path, sampling_rate=1.0, outputs={"a": "c8", "b": "c3"}, inputs={"u": "c0"})
+    for channel, place in (("a", 8), ("b", 3), ("u", 0)):
+        values = (run.outputs | run.inputs)[channel]
+        assert values.tolist() == [k * place % 7 + 0.5 for k in range(30)]
+
+
+def test_columns_that_were_not_wanted_are_read_when_they_are_asked_for(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("t,x,y,z\n0,1.5,a,1,\n1,2.5,b,2,\n".replace(",\n", "\n"))
+    whole = text.contents(path, ["x"])
+    channels = {channel.name: channel for channel in whole.channels}
+    assert channels["x"].values().tolist() == [1.5, 2.5] and channels["z"].values().tolist() == [1, 2]
+    assert channels["y"].values().tolist() == ["a", "b"] and channels["t"].samples == 2
+    path.write_text("t;x\n0;1,234\n1;2,345\n")
+    with pytest.raises(
+        ValueError, match="its column 2 has numbers such as '1,234', whose comma may be the decimal sign or"
+    ):
+        text.contents(path, ["t"]).channels[1].values()
+
+
+def test_several_columns_of_a_name_need_the_number(write):
+    path = write("t,x,x\n0,1,2\n1,2,3\n")
+    with pytest.raises(
+        ValueError, match=r"must be the name of one column, got 'x', the name of 2 \(columns 2, 3\); give its"
+    ):
+        bp.Recording.from_csv(path, time="t", outputs={"x": "x"})
+    assert bp.Recording.from_csv(path, time="t", outputs={"x": "x (1)"}).outputs["x"].tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("content", ["t,x\n", "t,x\n\n\n", "x\n"])
+def test_names_without_rows_are_refused(write, content):
+    with pytest.raises(
+        ValueError, match="path: must be a CSV file with rows of data, got .*, which has none|no rows of numbers"
+    ):
+        bp.Recording.from_csv(write(content), sampling_rate=1.0, outputs={"x": "x"})
+
+
+def test_second_table_is_named_with_the_row_of_its_name(write):
+    content = "t,x\n0,1\n1,2\nt,x\n0,5\n"
+    with pytest.raises(
+        ValueError, match="got the name 'x' again in data row 3: the file has several tables; save each"
+    ):
+        bp.Recording.from_csv(write(content), sampling_rate=1.0, outputs={"x": "x"})
+
+
+def test_logical_values_are_remarked_and_read_as_ones_and_zeros(write):
+    path = write("t,x\n0,True\n1,False\n2,True\n")
+    assert bp.inspect(path).channels[1].remarks == ("logical values, 1 for True and 0 for False",)
+    assert np.array_equal(bp.Recording.from_csv(path, time="t", outputs={"x": "x"}).outputs["x"], [1.0, 0.0, 1.0])
