@@ -15,8 +15,9 @@ OTHERS = {
 }  # fmt: skip
 # Of the simulated recording.
 SYNTHETIC = {
-    "f1": 2000.0, "f2": 0.0, "f3": -7.6e4, "f4": 0.0, "f5": -1e5, "s0": -0.7, "damping": 1.2, "cubic_damping": 0.005,
-    "back": 80.0, "drive_gain": 14.5, "decay": 6.3, "laser_gain": 18.0, "offset": 0.0,
+    "f1": 2224.0, "f2": -2690.0, "f3": -1.034e5, "f4": 3.21e4, "f5": 1.189e6, "f6": -1.03e5, "f7": -5.23e6,
+    "s0": -0.633, "s1": 0.98, "s2": -11.8, "s3": -8.4, "s4": 96.3, "damping": 0.88, "cubic_damping": 0.012,
+    "back": 91.4, "drive_gain": 14.55, "decay": 6.31, "laser_gain": 18.3, "offset": 0.0,
 }  # fmt: skip
 # Harmonics of the forcing in derivatives of waveforms, and phases a period.
 HIGHEST, PHASES = 16, 64

@@ -17,8 +17,8 @@ FREQUENCY, GRAVITY = 6.5, 9.80665  # Hz, m/s²
 # Corner of the filter without which the integral of the acceleration drifts [Hz], and its order.
 CORNER, ORDER = 2.0, 4
 # Of the simulated recording: drive periods, samples a period, amplitude of the base [m/s²], noise by channel.
-PERIODS, SAMPLES, AMPLITUDE = 2000, 64, 4.6
-NOISE = {"velocity": 0.02, "voltage": 1e-4, "drive": 0.01}
+PERIODS, SAMPLES, AMPLITUDE = 3000, 320, 4.6
+NOISE = {"velocity": 0.02, "voltage": 2e-6, "drive": 0.01}
 
 
 class Delays(NamedTuple):
@@ -46,15 +46,15 @@ def read(path: Path) -> tuple[list[bp.Recording], dict[str, Any]]:
     return recordings, about
 
 
-def simulated(seed: int, quick: bool) -> tuple[list[bp.Recording], dict[str, Any]]:
-    """Return a simulated recording of the beam with a restoring force of degree five."""
+def simulated(seed: int) -> tuple[list[bp.Recording], dict[str, Any]]:
+    """Return a simulated recording of the beam with a restoring force of degree seven."""
     values = SYNTHETIC
-    omega = 2.0 * np.pi * FREQUENCY
-    beam = model(5, 0)
+    omega, angle = 2.0 * np.pi * FREQUENCY, 2.0 * np.pi * np.arange(SAMPLES) / SAMPLES
+    beam = model(7, 4)
     run = bp.simulate(
-        beam, {name: values[name] for name in parameters(5, 0)},
-        {"drive": lambda t: AMPLITUDE * np.cos(omega * t), "base": lambda t: AMPLITUDE / omega * np.sin(omega * t)},
-        frequency=FREQUENCY, duration=(PERIODS // 4 if quick else PERIODS) / FREQUENCY,
+        beam, {name: values[name] for name in parameters(7, 4)},
+        {"drive": AMPLITUDE * np.cos(angle), "base": AMPLITUDE / omega * np.sin(angle)},
+        frequency=FREQUENCY, duration=PERIODS / FREQUENCY,
         sampling_rate=SAMPLES * FREQUENCY, start={"x": 0.1},
         noise={name: sd for name, sd in NOISE.items() if name in ("velocity", "voltage", "drive")}, seed=seed,
     )  # fmt: skip

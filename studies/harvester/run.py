@@ -20,11 +20,11 @@ COORDINATES = ("voltage", "voltage[-0.2]", "voltage[-0.4]", "voltage[-0.6]", "vo
 SECTION = ("velocity", "voltage")
 # Local maps a period, sections a period, and the share of the recording in which orbits are found.
 STEPS, PHASES, SHARE = 7, 4, 2.0 / 3.0
-# Orbits are used that were found in so many sections, with errors of at most this fraction of the waveform.
-FEWEST_SECTIONS, LARGEST_ERROR = 2, 0.04
+# Orbits are used whose errors are at most this fraction of the waveform.
+LARGEST_ERROR = 0.04
 DEGREES, COUPLING = (3, 5, 7, 9), 4
 DELAY_SD = 2e-3  # s, of their priors
-RUNS, RETURNS = 60, 30
+RUNS, RETURNS = 200, 30
 
 
 class Chosen(NamedTuple):
@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> None:
     watch = common.Stopwatch()
     with watch.part("recording", "the recording"):
         given = common.find_data(options.data, recording.RELATIVE)
-        whole, about = recording.read(given[0]) if given else recording.simulated(options.seed, options.quick)
+        whole, about = recording.read(given[0]) if given else recording.simulated(options.seed)
         fitted, left_out = recording.divided(whole, SHARE)
     print(f"  {'SYNTHETIC' if about['synthetic'] else 'measured'}, {sum(one.time.size for one in whole)} samples")
     with watch.part("orbits", "finding orbits without a model, at several phases"):
@@ -97,7 +97,7 @@ def found_orbits(recordings: list[bp.Recording], quick: bool) -> bp.Orbits:
         bp.PoincareSection.from_recordings(
             recordings, COORDINATES, frequency=FREQUENCY, origin=k / (PHASES * FREQUENCY)
         )
-        for k in range(1 if quick else PHASES)
+        for k in range(PHASES)
     ]
     return bp.find_orbits(sections, periods=range(1, 4 if quick else 6), steps=STEPS)
 
@@ -110,9 +110,14 @@ def error_of(orbit: bp.Orbit) -> float:
 
 
 def reliable(orbits: bp.Orbits) -> list[bp.Orbit]:
-    """Return the orbits that are used, by period and multiplier."""
-    seen = min(FEWEST_SECTIONS, max(one.sections for one in orbits))
-    return [one for one in orbits if one.sections >= seen and error_of(one) < LARGEST_ERROR]
+    """Return the orbits that are used, by period and multiplier; raise a ValueError if there is none."""
+    used = [one for one in orbits if error_of(one) < LARGEST_ERROR]
+    if not used:
+        raise ValueError(
+            f"--data: must be a recording with orbits whose errors are below {LARGEST_ERROR:.0%}, got none of "
+            f"{len(orbits)}. Record more periods."
+        )
+    return used
 
 
 def section_of(recordings: list[bp.Recording]) -> bp.PoincareSection:
