@@ -56,9 +56,9 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("models", "models of several degrees, from the orbits one after the other"):
         tried = [one for degree in (DEGREES[:2] if options.quick else DEGREES)
                  if (one := fit_of(degree, used, runs, sections[0], options.seed)) is not None]  # fmt: skip
-    best = min(tried, key=lambda one: (one.predicted.left + one.predicted.settled, one.degree))
+    best = simplest(tried)
     problem, fit = best.estimate.problem, best.estimate.fit
-    print(f"{best.estimate}\n  force of degree {best.degree} has the fewest runs that leave the region")
+    print(f"{best.estimate}\n  the force of degree {best.degree} is used")
     with watch.part("posterior", "sampling the posterior with emcee"):
         posterior = bp.sample(problem, fit, seed=options.seed, max_steps=100 if options.quick else 1000,
                               progress=False)  # fmt: skip
@@ -158,6 +158,12 @@ def fit_of(
     print(f"  degree {degree}: {len(estimate.problem.experiments)} of {len(runs)} orbits, unexplained {left}, "
           f"{predicted.left} of {predicted.runs} runs leave, {predicted.settled} settle")  # fmt: skip
     return Chosen(degree, estimate, predicted)
+
+
+def simplest(tried: list[Chosen]) -> Chosen:
+    """Return the lowest degree with the fewest runs that leave or settle, but for chance: two standard deviations."""
+    wrong = [one.predicted.left + one.predicted.settled for one in tried]
+    return next(one for one, count in zip(tried, wrong, strict=True) if count <= min(wrong) + 2.0 * (min(wrong) ** 0.5))
 
 
 def orbit_row(orbit: bp.Orbit, used: bool) -> dict[str, Any]:
