@@ -8,11 +8,12 @@ from scipy.optimize import least_squares
 
 import bayesperiodic as bp
 
-# Parameters of both equations but those of the polynomials, and their units; the velocity is in units of the laser.
+# Parameters of both equations but those of the polynomials, and their units; u is the unit of the laser's velocity.
 OTHERS = {
-    "damping": "1/s", "cubic_damping": "s", "back": "1/s**2", "drive_gain": "", "decay": "1/s", "laser_gain": "",
-    "offset": "V",
+    "damping": "1/s", "cubic_damping": "s/u²", "back": "u/(V s)", "drive_gain": "u s/m", "decay": "1/s",
+    "laser_gain": "u s/m", "offset": "V",
 }  # fmt: skip
+UNITS = {"velocity": "u", "voltage": "V", "drive": "m/s²", "base": "m/s", "x": "u s", "v": "V"}
 # Of the simulated recording.
 SYNTHETIC = {
     "f1": 2224.0, "f2": -2690.0, "f3": -1.034e5, "f4": 3.21e4, "f5": 1.189e6, "f6": -1.03e5, "f7": -5.23e6,
@@ -30,6 +31,12 @@ SMALLEST = 0.1  # of priors' standard deviations, as a fraction of the term's si
 def polynomials(degree: int, coupling: int) -> tuple[list[str], list[str]]:
     """Return the names of the coefficients of restoring force and coupling."""
     return [f"f{k}" for k in range(1, degree + 1)], [f"s{k}" for k in range(coupling + 1)]
+
+
+def units_of(degree: int, coupling: int) -> dict[str, str]:
+    """Return the units of all parameters."""
+    force = {f"f{k}": "1/s²" if k == 1 else f"1/(u^{k - 1} s^{k + 1})" for k in range(1, degree + 1)}
+    return OTHERS | force | {f"s{k}": "V/(u s)" if k == 0 else f"V/(u^{k + 1} s^{k + 1})" for k in range(coupling + 1)}
 
 
 def parameters(degree: int, coupling: int) -> list[str]:
@@ -56,6 +63,7 @@ def model(degree: int, coupling: int) -> bp.Model:
             f"dv + decay*v + ({element})*dx",
         ],
         outputs={"velocity": "dx + laser_gain*base", "voltage": "v + offset"},
+        units=UNITS,
     )
 
 

@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> None:
     problem, fit = best.estimate.problem, best.estimate.fit
     print(f"{best.estimate}\n  the force of degree {best.degree} is used")
     with watch.part("posterior", "sampling the posterior with emcee"):
-        posterior = bp.sample(problem, fit, seed=options.seed, max_steps=100 if options.quick else 1000,
+        posterior = bp.sample(problem, fit, seed=options.seed, max_steps=100 if options.quick else 5000,
                               progress=False)  # fmt: skip
     print(posterior)
     with watch.part("prediction", "free runs against the last third of the recording"):
@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> None:
         drawn = {
             "attractor": bp.plot.attractor(predicted),
             "orbits": drawn_orbits(best.estimate),
-            "corner": corner(problem, fit, posterior),
+            "corner": corner(best.degree, problem, fit, posterior),
         }
         paths = common.save_figures(options.out, drawn)
     results = {
@@ -208,12 +208,14 @@ def drawn_orbits(estimate: bp.OrbitsEstimate) -> Figure:
         large = complex(solution.multipliers[0]).real
         axes.set_title(f"{one.periods} periods, multiplier {large:.0f}", fontsize=8)
     every[0, 0].legend(fontsize=7)
-    figure.supxlabel("velocity [units of the laser]", fontsize=9)
+    figure.supxlabel("velocity [u, the unit of the laser]", fontsize=9)
     figure.supylabel("voltage [V]", fontsize=9)
     return figure
 
 
-def corner(problem: bp.Problem, fit: bp.MapEstimate, posterior: bp.Posterior) -> Figure:
+def corner(degree: int, problem: bp.Problem, fit: bp.MapEstimate, posterior: bp.Posterior) -> Figure:
     """Return the joint posterior of restoring force, damping and gains, with Laplace's ellipses."""
     names = [n for n in ("f1", "f3", "f5", "f7", "damping", "cubic_damping", "back", "drive_gain") if n in fit.theta]
-    return bp.plot.corner(posterior, names=names, laplace=fit, problem=problem)
+    units = beam.units_of(degree, COUPLING)
+    labels = [f"{n}\n[{units[n]}]" for n in names]
+    return bp.plot.corner(posterior, names=names, labels=labels, laplace=fit, problem=problem)
