@@ -910,22 +910,23 @@ def measured_chaos():
     given = results("harvester")
     orbits, delays = given["orbits"], given["delays"]
     used = [one for one in orbits if one["used"]]
-    yield f"{len(orbits)} orbits of periods {orbits[0]['period']} to {orbits[-1]['period']} are found, and {len(used)} are"
+    first, last = orbits[0]["period"], orbits[-1]["period"]
+    yield f"{len(orbits)} orbits of periods {first} to {last} are found, and {len(used)} are"
     for name in ("velocity", "voltage"):
         yield f"{name} {1e3 * delays['seconds'][name]:.2f} ± {1e3 * delays['sd'][name]:.2f} ms"
     for one in given["models"]:
         left = [f"{100 * one['unexplained'][name]:.2f} %" for name in ("velocity", "voltage")]
-        yield f"| {one['degree']} | {one['orbits']} of {len(used)} | {left[0]} | {left[1]} | {one['left']} of {one['runs']} |"
+        ran = f"{one['left']} of {one['runs']}"
+        yield f"| {one['degree']} | {one['orbits']} of {len(used)} | {left[0]} | {left[1]} | {ran} |"
     for orbit in used:
         if orbit["name"] in given["multipliers"] and orbit["sections"] > 2:
             model = float(given["multipliers"][orbit["name"]])
-            yield (
-                f"| {orbit['period']} | {orbit['returns']} | {orbit['eigenvalue'][0]:.1f} ± {orbit['eigenvalue_sd']:.1f} "
-                f"| {model:.1f} |"
-            ).replace(" ± nan", "")
+            measured = f"{orbit['eigenvalue'][0]:.1f}" + (f" ± {sd:.1f}" if (sd := orbit["eigenvalue_sd"]) else "")
+            yield f"| {orbit['period']} | {orbit['returns']} | {measured} | {model:.1f} |"
     tests, exponents = given["left_out"]["tests"], given["left_out"]["exponents"]
     density, exponent = tests["density"], tests["Lyapunov exponent"]
-    yield f"The distance of the densities is {density['model']:.3f}, by chance {density['low']:.3f} to {density['high']:.3f}"
+    chance = f"{density['low']:.3f} to {density['high']:.3f}"
+    yield f"The distance of the densities is {density['model']:.3f}, by chance {chance}"
     yield f"{given['left_out']['left']} of {given['left_out']['runs']} runs leave the region"
     yield f"exponent is {exponent['model']:.2f} 1/s, by chance {exponent['low']:.2f} to {exponent['high']:.2f}"
     yield f"that of two neighbouring runs {exponents['model']['exponent']:.2f} ± {exponents['model']['sd']:.2f}"

@@ -135,20 +135,24 @@ def estimate_orbits(
     theta: Mapping[str, float] | None = start
     included: list[Experiment] = []
     dropped: dict[str, str] = {}
-    again = list(problem.experiments)
-    with progress_bar(total=len(again), desc="orbits", disable=not progress) as bar:
+    waiting, again, fewest = list(problem.experiments), [], _fewest(problem)
+    with progress_bar(total=len(waiting), desc="orbits", disable=not progress) as bar:
         for last in (False, True):
-            waiting, again = again, []
-            for one in waiting:
-                fit = _with_one_more(problem, [*included, one], theta)
+            while waiting:
+                # The first ones determine the parameters and the noise only together.
+                more = waiting[: 1 if included else fewest]
+                fit = _with_more(problem, [*included, *more], theta)
                 if isinstance(fit, str):
-                    dropped[one.name] = fit
-                    again.append(one)
-                else:
+                    dropped[more[0].name] = fit
+                    again.append(waiting.pop(0))
+                    bar.update(last)
+                    continue
+                theta, included = fit.theta, _at_solutions([*included, *more], fit)
+                for one in more:
                     dropped.pop(one.name, None)
-                    theta, included = fit.theta, _at_solutions([*included, one], fit)
-                if last or one.name not in dropped:
+                    waiting.remove(one)
                     bar.update()
+            waiting, again = again, []
     if not included:
         reasons = "; ".join(f"{name!r}: {reason}" for name, reason in dropped.items())
         raise ValueError(
@@ -161,11 +165,23 @@ def estimate_orbits(
     return OrbitsEstimate(used, fit, dropped)
 
 
-def _with_one_more(
-    problem: Problem, experiments: list[Experiment], theta: Mapping[str, float] | None
-) -> MapEstimate | str:
-    """Return the estimate from these experiments, or why there is none with the last one."""
-    used = problem.with_experiments(experiments)
+def _fewest(problem: Problem) -> int:
+    """Return how many of the first experiments are a problem, with enough values for its parameters."""
+    for count in range(1, len(problem.experiments)):
+        try:
+            problem.with_experiments(problem.experiments[:count])
+        except ValueError:
+            continue
+        return count
+    return len(problem.experiments)
+
+
+def _with_more(problem: Problem, experiments: list[Experiment], theta: Mapping[str, float] | None) -> MapEstimate | str:
+    """Return the estimate from these experiments, or why there is none with the last ones."""
+    try:
+        used = problem.with_experiments(experiments)
+    except ValueError as error:
+        return str(error)
     start = _of(used, {} if theta is None else theta)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)

@@ -298,7 +298,7 @@ class PoincareSection(Result):
 
         Notes
         -----
-        Errors of the instants move the points along the flow and are part of `noises`, less for a coordinate near a
+        Errors of the instants move the points along the flow and are part of ``noises``, less for a coordinate near a
         maximum or minimum of its channel, such as a quarter of a return after the crossing.
 
         Examples

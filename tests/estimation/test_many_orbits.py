@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from tests.orbits.test_waveform import BEAM, beam, beam_orbits
+from tests.orbits.test_waveform import BEAM, beam, beam_orbits, double_well_orbits
 
 
 def problem(factors, spread=0.4, **changes):
@@ -47,6 +47,23 @@ def test_an_orbit_that_the_model_does_not_have_is_dropped_and_named():
     assert list(estimate.dropped) == ["wrong"]
     assert [one.name for one in estimate.problem.experiments] == [one.name for one in given.experiments]
     assert "Dropped 'wrong': " in str(estimate)
+
+
+def test_orbits_that_determine_the_noise_only_together_are_taken_in_together():
+    """Two values of an orbit of period 1 determine no two parameters and a variance; within five standard deviations."""
+    orbits = [one for one in double_well_orbits(0, 2)[1] if abs(one.eigenvalues[0]) < 20]
+    runs = [one.experiment(samples=160, states={"x": "x"}) for one in orbits]
+    well = bp.Model(
+        "well", states=["x"], inputs=["u"], parameters=["c", "a"], equations=["ddx + c*dx - a*x*(1 - x**2) - u"],
+        outputs={"x": "x", "y": "dx"},
+    )  # fmt: skip
+    given = bp.Problem(well, runs, priors={"c": bp.LogNormal(0.2, 0.2), "a": bp.LogNormal(0.5, 0.2)})
+    with pytest.raises(ValueError, match="independent values"):
+        given.with_experiments(runs[:1])
+    estimate = bp.estimate_orbits(given, progress=False)
+    assert len(estimate.problem.experiments) >= 4
+    for name, value in {"c": 0.2, "a": 0.5}.items():
+        assert abs(estimate.fit.theta[name] - value) < 5.0 * estimate.fit.sd[name] < 0.05 * value
 
 
 def test_no_orbit_at_all_is_refused():
