@@ -50,9 +50,9 @@ def test_an_orbit_that_the_model_does_not_have_is_dropped_and_named():
 
 
 def test_orbits_that_determine_the_noise_only_together_are_taken_in_together():
-    """Two values of an orbit of period 1 determine no two parameters and a variance; within five standard deviations."""
+    """Two values of an orbit of period 1 determine no two parameters and a variance; within five sd of all."""
     orbits = [one for one in double_well_orbits(0, 2)[1] if abs(one.eigenvalues[0]) < 20]
-    runs = [one.experiment(samples=160, states={"x": "x"}) for one in orbits]
+    runs = [one.experiment(samples=960, states={"x": "x"}) for one in orbits]
     well = bp.Model(
         "well", states=["x"], inputs=["u"], parameters=["c", "a"], equations=["ddx + c*dx - a*x*(1 - x**2) - u"],
         outputs={"x": "x", "y": "dx"},
