@@ -929,7 +929,7 @@ def measured_chaos():
     yield f"The distance of the densities is {density['model']:.3f}, by chance {chance}"
     yield f"{given['left_out']['left']} of {given['left_out']['runs']} runs leave the region"
     yield f"exponent is {exponent['model']:.2f} 1/s, by chance {exponent['low']:.2f} to {exponent['high']:.2f}"
-    yield f"that of two neighbouring runs {exponents['model']['exponent']:.2f} ± {exponents['model']['sd']:.2f}"
+    yield f"that of two neighbouring runs {exponents['model']['exponent']:.2f} ± {exponents['model']['sd']:.2f} 1/s"
     for name, digits in (("f1", 0), ("drive_gain", 2), ("decay", 2)):
         value, robust, laplace = given["estimates"][name]
         yield f"| `{name}` | {value:.{digits}f} | {robust:.2g} | {laplace:.2g} |"
