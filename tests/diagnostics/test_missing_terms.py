@@ -10,6 +10,7 @@ import bayesperiodic as bp
 from bayesperiodic.diagnostics import missing_terms
 from bayesperiodic.diagnostics.candidates import (
     Term,
+    _expressions,
     coefficient_names,
     coefficient_unit,
     extended,
@@ -347,3 +348,14 @@ def test_a_term_whose_estimate_is_lost_is_refused_and_the_next_one_taken(monkeyp
     found = bp.missing_terms(problem, fit, wanted, equations=False, outputs=False, max_terms=1)
     assert [step.term for step in found.steps] == ["dx**3"]
     assert "no periodic solution" in found.refused["dx*abs(dx) in equation of x"]
+
+
+def test_generated_absolute_values_have_no_offset():
+    """At 1 and −2 standard deviations terms with abs differ from |x| by less than 1 %; an offset would bias others."""
+    x, y = sp.symbols("x y", real=True)
+    _, expressions = _expressions({"x": x, "dx": y}, {}, {"x": 0.5, "dx": 3.0})
+    for value, other in ((0.5, 3.0), (-1.0, -6.0)):
+        at = {x: value, y: other}
+        assert float(expressions["abs(dx)"].subs(at)) == pytest.approx(abs(other), rel=0.01)
+        assert float(expressions["dx*abs(dx)"].subs(at)) == pytest.approx(other * abs(other), rel=0.01)
+        assert float(expressions["dx*abs(x)"].subs(at)) == pytest.approx(other * abs(value), rel=0.01)
