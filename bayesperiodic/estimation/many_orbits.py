@@ -16,14 +16,13 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.climbs import first_iterate
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.orbits.polish import REAL
 
 if TYPE_CHECKING:
     import pandas as pd
 
 # Fewest values of a channel of which the unexplained variance is judged.
 FEWEST_JUDGED = 3
-# Multipliers are printed as real up to this relative imaginary part.
-REAL = 1e-6
 
 
 @dataclass(frozen=True, repr=False)
@@ -60,11 +59,11 @@ class OrbitsEstimate(Printed):
 
         rows = {}
         for one in self.problem.experiments:
-            solution, residuals = self.fit.solutions[one.name], self.fit.residuals[one.name]
+            solution, residuals, values = self.fit.solutions[one.name], self.fit.residuals[one.name], _compared(one)
             large = complex(solution.multipliers[0])
             shown = f"{large.real:.5g}" if abs(large.imag) < REAL * abs(large) else f"{large:.4g}"
             rows[one.name] = {"periods": one.periods, "multiplier": shown} | {
-                f"rms[{channel}]": float(np.sqrt(np.mean(values**2))) for channel, values in residuals.items()
+                f"rms[{channel}]": float(np.sqrt(np.mean(r[values] ** 2))) for channel, r in residuals.items()
             }
         return pd.DataFrame.from_dict(rows, orient="index")
 
@@ -199,11 +198,15 @@ def _with_more(problem: Problem, experiments: list[Experiment], theta: Mapping[s
     return fit
 
 
+def _compared(experiment: Experiment) -> np.ndarray:
+    """Return at which points of the grid outputs are compared, (samples·periods,)."""
+    points = experiment.samples * experiment.periods
+    return np.ones(points, dtype=bool) if experiment.mask is None else experiment.mask
+
+
 def _unexplained(experiment: Experiment, fit: MapEstimate) -> float:
     """Return the largest fraction of the variance of an output over the orbit that is not explained."""
-    values = (
-        np.ones(experiment.samples * experiment.periods, dtype=bool) if experiment.mask is None else experiment.mask
-    )
+    values = _compared(experiment)
     shares = [0.0]
     for name, residual in fit.residuals[experiment.name].items():
         seen = experiment.outputs[name][values]

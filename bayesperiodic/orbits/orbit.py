@@ -189,9 +189,8 @@ class Orbit(Result):
             are all smaller ones.
         whole : bool
             Compare the waveforms of all outputs instead, at 16 phases a forcing period and with their covariance,
-            which contain nearly all information. Without a
-            waveform, all samples of the measured cycle are compared, with a variance per channel: it is a close return
-            and does not close exactly; the gap counts as noise.
+            which contain nearly all information. Without a waveform, all samples of the measured cycle are compared,
+            with a variance per channel: it is a close return and does not close exactly; the gap counts as noise.
         model_error : bool
             With the whole waveform, compare its Fourier components, to seven times the forcing frequency, with an
             unknown variance per channel in place of the covariance: for models whose errors exceed those of the

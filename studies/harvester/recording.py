@@ -56,7 +56,7 @@ def simulated(seed: int) -> tuple[list[bp.Recording], dict[str, Any]]:
         {"drive": AMPLITUDE * np.cos(angle), "base": AMPLITUDE / omega * np.sin(angle)},
         frequency=FREQUENCY, duration=PERIODS / FREQUENCY,
         sampling_rate=SAMPLES * FREQUENCY, start={"x": 0.1},
-        noise={name: sd for name, sd in NOISE.items() if name in ("velocity", "voltage", "drive")}, seed=seed,
+        noise=NOISE, seed=seed,
     )  # fmt: skip
     channels = {"velocity": run.outputs["velocity"], "voltage": run.outputs["voltage"], "drive": run.inputs["drive"]}
     settled = 20 * SAMPLES

@@ -27,7 +27,7 @@ def test_orbits_one_after_the_other_give_the_parameters():
         assert abs(estimate.fit.theta[name] - value) < 5.0 * estimate.fit.sd[name]
     assert list(estimate.table.index) == [one.name for one in estimate.problem.experiments]
     for one in estimate.problem.experiments:
-        residuals = estimate.fit.residuals[one.name]["v"]
+        residuals = estimate.fit.residuals[one.name]["v"][:: one.samples // 16]  # the 16 phases that are compared
         assert estimate.table.loc[one.name, "rms[v]"] == pytest.approx(np.sqrt(np.mean(residuals**2)))
     # The first solves start at the solutions, so that the estimate is where it was.
     again = bp.map_estimate(estimate.problem, start=estimate.fit.theta, checks=False, progress=False)

@@ -98,7 +98,10 @@ def test_an_angle_keeps_its_turns_at_an_earlier_phase():
     orbit = next(one for one in found() if one.period == 3)
     count = orbit.waveform.noise.shape[1]
     tau = 3.0 * np.arange(count) / count
-    line = lambda t: 2.0 * np.pi * 2.0 * t / 3.0 + 0.1 * np.sin(2.0 * np.pi * t)  # noqa: E731
+
+    def line(t):
+        return 2.0 * np.pi * 2.0 * t / 3.0 + 0.1 * np.sin(2.0 * np.pi * t)
+
     wave = replace(orbit.waveform, values={**orbit.waveform.values, "x": line(tau + 0.25)})
     turning = replace(orbit, angles=("x",), winding=2, waveform=wave)
     np.testing.assert_allclose(_earlier(turning, 4).waveform.values["x"], line(tau), atol=1e-12)
@@ -107,7 +110,10 @@ def test_an_angle_keeps_its_turns_at_an_earlier_phase():
 def test_delayed_points_are_values_of_the_waveform_between_its_phases():
     orbit = next(one for one in found() if one.period == 2)
     count = orbit.waveform.noise.shape[1]
-    course = lambda t: np.sin(np.pi * t) + 0.3 * np.cos(2.0 * np.pi * t)  # noqa: E731
+
+    def course(t):
+        return np.sin(np.pi * t) + 0.3 * np.cos(2.0 * np.pi * t)
+
     wave = replace(orbit.waveform, values={**orbit.waveform.values, "x": course(2.0 * np.arange(count) / count + 0.5)})
     delayed = replace(orbit, coordinates=("x", "x[-0.33]"), waveform=wave)
     tau = np.arange(2)
