@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChannel
-from bayesperiodic.data.times import dates, seconds
+from bayesperiodic.data.times import between, dates, seconds
 from bayesperiodic.data.units import Units, from_file, is_duration
 
 DROP, INTERPOLATE = "drop", "interpolate"
@@ -236,7 +236,7 @@ def _offsets(layout: Layout, clocks: Mapping[str, Clock | None]) -> dict[str, fl
             "started together."
         )
     first = min(origins.values())
-    return {channel: (origin - first) / np.timedelta64(1, "ns") * 1e-9 for channel, origin in origins.items()}
+    return {channel: between(origin, first) for channel, origin in origins.items()}
 
 
 def _clocked(layout: Layout, contents: Contents, column: _Column, rate: float | None) -> np.ndarray:

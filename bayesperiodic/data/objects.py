@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic.data.formats.contents import Clock, Contents, StoredChannel
-from bayesperiodic.data.times import dates, seconds
+from bayesperiodic.data.times import dates, nanoseconds, seconds
 from bayesperiodic.data.units import from_file, is_duration
 
 # Relative difference of "fs" and "time" that is no rounding.
@@ -138,7 +138,7 @@ def _instant(argument: str, stamp: Any) -> np.datetime64:
     times = dates(argument, np.array([stamp], dtype=object))
     if times is None or np.isnat(times[0]):
         raise ValueError(f"{argument}: must be a date after ISO 8601, got {stamp!r}.")
-    return np.datetime64(times[0], "ns")
+    return nanoseconds(argument, times[0])
 
 
 def _of_coordinate(argument: str, values: Any, unit: str) -> Clock | None:
@@ -147,7 +147,7 @@ def _of_coordinate(argument: str, values: Any, unit: str) -> Clock | None:
     times = dates(argument, array) if np.asarray(array).dtype.kind in "mMO" else None
     if times is not None and times.ndim == 1 and not np.isnat(times).all():
         first = times[~np.isnat(times)][0]
-        origin = np.datetime64(first, "ns") if times.dtype.kind == "M" else None
+        origin = nanoseconds(argument, first) if times.dtype.kind == "M" else None
         shift = 0.0 if origin is not None else first / np.timedelta64(1, "ns") * 1e-9
         return Clock(stored=lambda: seconds(argument, times) + shift, origin=origin)
     if np.asarray(array).dtype.kind in "fiu" and is_duration(unit):

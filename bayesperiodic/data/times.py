@@ -12,6 +12,8 @@ from bayesperiodic import _checks
 # Seconds in the units of NumPy's dates and durations, and the units in a second; all are exact as floats.
 SECONDS = {"W": 604_800, "D": 86_400, "h": 3600, "m": 60, "s": 1}
 PER_SECOND = {"ms": 1e3, "us": 1e6, "ns": 1e9, "ps": 1e12, "fs": 1e15, "as": 1e18}
+# First year of which all dates have nanoseconds since 1970 in 64 bits, and the first year after the last one.
+YEARS = (1678, 2262)
 # Integers beyond this one are not all floats.
 LARGEST_EXACT = 2**53
 # Integers from which they are no seconds since 1970 (of the year 5138) but smaller units, with that unit.
@@ -31,7 +33,9 @@ def dates(argument: str, values: Any) -> np.ndarray | None:
     texts or objects of which only some are dates.
     """
     if type(getattr(values, "dtype", None)).__name__ == "DatetimeTZDtype":  # of pandas; as an array it has objects
-        return np.asarray(values.to_numpy("datetime64[ns]"))
+        import pandas as pd
+
+        return np.asarray(pd.DatetimeIndex(values).tz_convert(None).to_numpy())
     array = np.asarray(values)
     masked = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else np.zeros(array.shape, bool)
     if array.dtype.kind in "mM":
@@ -101,10 +105,45 @@ def channel_seconds(times: Mapping[str, Any]) -> dict[str, np.ndarray]:
         for channel, values in times.items():
             _refuse_integers(f"time[{channel!r}]", values)
         return {channel: _checks.real_array(f"time[{channel!r}]", values) for channel, values in times.items()}
-    given = [np.atleast_1d(values) for values in dated.values()]
-    every = _checks.real_array("time", seconds("time", np.concatenate(given)))
-    parts = np.split(every - np.nanmin(every), np.cumsum([values.size for values in given])[:-1])
-    return dict(zip(times, parts, strict=True))
+    kinds = {values.dtype.kind for values in dated.values()}
+    if len(kinds) > 1:
+        raise ValueError("time: must be dates of all channels or durations of all, got both; convert one kind of them.")
+    result = {}
+    for channel, values in dated.items():
+        argument = f"time[{channel!r}]"
+        result[channel] = np.atleast_1d(_checks.real_array(argument, seconds(argument, values)))
+    firsts = {channel: _first(values) for channel, values in dated.items()}
+    starts = (round(np.nanmin(result[name]) * 10**18) + first for name, first in firsts.items() if first is not None)
+    earliest = min(starts, default=0)
+    return {
+        channel: result[channel] + (0.0 if first is None else (first - earliest) / 10**18)
+        for channel, first in firsts.items()
+    }
+
+
+def nanoseconds(argument: str, date: Any) -> np.datetime64:
+    """Return a date in nanoseconds; raise a ValueError if they do not reach it, where NumPy 2.4 returns another."""
+    year = int(np.datetime64(date, "Y").astype(int)) + 1970
+    if not YEARS[0] <= year < YEARS[1]:
+        raise ValueError(f"{argument}: must be of the years from {YEARS[0]} to {YEARS[1] - 1}, got {date}.")
+    return np.datetime64(date, "ns")
+
+
+def between(later: np.datetime64, earlier: np.datetime64) -> float:
+    """Return the time [s] between two dates in nanoseconds, which NumPy's difference is only up to 292 years."""
+    return (int(later.astype(np.int64)) - int(earlier.astype(np.int64))) / 10**9
+
+
+def _first(times: np.ndarray) -> int | None:
+    """Return the first date that is not missing in attoseconds since 1970, or the first duration; None without one."""
+    given = times[~np.isnat(times)] if times.ndim else times[None][~np.isnat(times[None])]
+    if not given.size:
+        return None
+    if times.dtype.kind == "M" and np.datetime_data(times.dtype)[0] in ("Y", "M"):
+        given = given.astype("datetime64[s]")
+    base, step = np.datetime_data(given.dtype)
+    unit = SECONDS[base] * 10**18 if base in SECONDS else 10**18 // int(PER_SECOND[base])
+    return int(given[0].astype(np.int64)) * step * unit
 
 
 def shared(times: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -130,6 +130,11 @@ def test_series_after_sep005_count_from_the_earliest_start():
         ({"fs": 0.0}, r"channels\[0\]\['fs'\]: must be > 0, got 0.0"),
         ({"time": TIME[1:]}, "must have one time per value, got 399 and 400"),
         ({"start_timestamp": "yesterday"}, "must be a date after ISO 8601, got 'yesterday'"),
+        ({"start_timestamp": "2300-01-01"}, r"\['start_timestamp'\]: must be of the years from 1678 to 2261, got 2300"),
+        (
+            {"fs": None, "time": np.datetime64("2300", "s") + np.arange(400)},
+            r"\['time'\]: must be of the years from 1678 to 2261, got 2300-01-01",
+        ),
         (
             {"fs": None, "time": 1.7e9 + TIME, "start_timestamp": "2026-01-01"},
             "must have times from 'start_timestamp' on",

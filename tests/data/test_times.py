@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import bayesperiodic as bp
-from bayesperiodic.data.times import channel_seconds, seconds, shared
+from bayesperiodic.data.times import between, channel_seconds, nanoseconds, seconds, shared
 
 COUNT, STEP = 400, 10_000_019  # nanoseconds, no round number
 NANOSECONDS = np.arange(COUNT) * STEP
@@ -242,6 +242,45 @@ def test_dates_of_several_channels_are_counted_from_the_earliest_one():
     late = DATES + np.timedelta64(2, "s")
     run = bp.Recording.from_arrays({"x": late, "y": DATES}, {"x": SIGNAL, "y": SIGNAL})
     assert run.time["y"][0] == 0.0 and run.time["x"] == pytest.approx(run.time["y"] + 2.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "first, second, days",
+    [
+        (np.datetime64("1970-01-01", "ns"), np.datetime64("2290-01-01", "D"), 320 * 365 + 78),
+        (np.datetime64(0, "fs"), np.datetime64("2026-03-01", "s"), 56 * 365 + 14 + 59),
+        (np.datetime64(0, "as"), np.datetime64("2026-03-01", "us"), 56 * 365 + 14 + 59),
+        (np.datetime64("1970-01", "M"), np.datetime64("1970-01-31", "ns"), 30),
+    ],
+)
+def test_dates_of_channels_in_different_units_lose_nothing(first, second, days):
+    """NumPy 2.4 converts both to the smaller unit, in which the later one may be another date; 2.5 raises an error."""
+    read = channel_seconds({"x": first + np.arange(3), "y": second + np.arange(3)})
+    assert read["x"][0] == 0.0 and read["y"][0] == days * 86_400.0
+    assert np.all(np.diff(read["x"]) > 0.0) and np.all(np.diff(read["y"]) > 0.0)
+
+
+def test_dates_and_durations_of_channels_are_refused():
+    with pytest.raises(ValueError, match="time: must be dates of all channels or durations of all, got both"):
+        channel_seconds({"x": DATES, "y": DATES - START})
+
+
+def test_zoned_dates_beyond_nanoseconds_keep_their_unit():
+    time = pd.DatetimeIndex(np.array(["2500-01-01T00:00:00", "2500-01-01T00:00:01"], "datetime64[us]"), tz="UTC")
+    assert seconds("time", time).tolist() == [0.0, 1.0] and seconds("time", pd.Series(time)).tolist() == [0.0, 1.0]
+
+
+def test_time_between_dates_of_centuries_is_exact():
+    first, last = np.datetime64("1678-01-01", "ns"), np.datetime64("2261-12-31", "ns")
+    assert between(last, first) == (datetime.date(2261, 12, 31) - datetime.date(1678, 1, 1)).days * 86_400.0
+    assert between(first, last) == -between(last, first)
+
+
+@pytest.mark.parametrize("date, unit", [("1677-12-31", "D"), ("2262-01-01", "s"), ("9999-12-31", "us"), ("1300", "Y")])
+def test_dates_that_nanoseconds_do_not_reach_are_refused(date, unit):
+    with pytest.raises(ValueError, match=f"time: must be of the years from 1678 to 2261, got {date}"):
+        nanoseconds("time", np.datetime64(date, unit))
+    assert nanoseconds("time", np.datetime64("2261-12-31", unit)).astype("datetime64[D]").astype(object).year == 2261
 
 
 def test_dates_are_no_values_of_a_channel():

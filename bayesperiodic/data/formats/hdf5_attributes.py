@@ -13,6 +13,7 @@ import numpy as np
 
 from bayesperiodic.data.formats.contents import OTHERWISE, Clock
 from bayesperiodic.data.formats.decimals import step_error
+from bayesperiodic.data.times import YEARS
 
 # Types of attributes that are read: h5py crashes on some damaged lists and references.
 PLAIN_TYPES = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING)
@@ -63,8 +64,8 @@ SINCE_TEXT = re.compile(r"\s*(\w+)\s+since\s+(.+?)\s*", re.IGNORECASE)
 # pandas takes a year 1 as 2001.
 DATE_START, DAY_START = re.compile(r"\d{4}-\d"), re.compile(r"\d{4}-\d\d-\d\d(?![T ]\d\d?-)")
 CALENDARS = ("standard", "gregorian", "proleptic_gregorian")
-# Numbers from which a start is seconds since 1970; years that nanoseconds since 1970 reach.
-LEAST_EPOCH, YEARS = 1e8, (1678, 2262)
+# Numbers from which a start is seconds since 1970.
+LEAST_EPOCH = 1e8
 # Rounding of dates to nanoseconds, of a step.
 LARGEST_ROUNDING = 1e-3
 # Numbers of netCDF, with how many they are.
@@ -225,12 +226,16 @@ class Since:
 
     def dates(self, values: np.ndarray) -> np.ndarray:
         """Return dates in nanoseconds; raise a ValueError if that is too coarse."""
+        assert self.origin is not None
+        lost = ~np.isfinite(values)
+        given = values[~lost]
+        ends = [int(end * self.nanoseconds) for end in (given.min().item(), given.max().item())] if given.size else [0]
+        start = int(self.origin.astype(np.int64))
+        if not all(-(2**63) < end < 2**63 and -(2**63) < start + end < 2**63 for end in ends):
+            raise ValueError(f"its dates are outside of the years from {YEARS[0]} to {YEARS[1] - 1}")
         if values.dtype.kind in "iu":
             return np.asarray(self.origin + (values.astype(np.int64) * self.nanoseconds).astype("timedelta64[ns]"))
-        lost = ~np.isfinite(values)
         exact = np.where(lost, 0.0, values.astype(float)) * self.nanoseconds
-        if exact.size and np.abs(exact).max() >= 2.0**63:
-            raise ValueError("its dates are outside of the years from 1678 to 2261")
         whole = np.round(exact)
         steps = np.abs(np.diff(exact))
         if steps.any() and np.abs(whole - exact).max() > LARGEST_ROUNDING * np.median(steps[steps > 0]):

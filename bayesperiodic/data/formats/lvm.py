@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from bayesperiodic.data.formats.contents import BY_RATE, Clock, Contents, Key, StoredChannel, package, silenced
+from bayesperiodic.data.times import YEARS
 
 # Lines that begin parts of the file, and first characters of rows of numbers.
 CHANNEL_LINE, NAME_LINE, COMMENT_NAME = "Channels", "X_Value", "Comment"
@@ -251,5 +252,7 @@ def _origin(date: Any, time: Any) -> np.datetime64 | None:
         return None
     year, month, dom = map(int, day.groups())
     hours, minutes, seconds = map(int, clock.groups()[:3])
+    if not YEARS[0] <= year < YEARS[1]:
+        return None
     passed = (hours * 3600 + minutes * 60 + seconds) * 10**9 + int((clock.group(4) or "0")[:9].ljust(9, "0"))
     return np.datetime64(f"{year:04d}-{month:02d}-{dom:02d}", "ns") + np.timedelta64(passed, "ns")

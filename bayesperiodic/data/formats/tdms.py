@@ -21,8 +21,8 @@ SCALES_READ = (
 )  # fmt: skip
 SCALE_PROPERTY = re.compile(r"NI_Scal|NI_Number_Of_Scales|unit_string|NI_UnitDescription")
 SCALE_TYPE = re.compile(r"NI_Scale\[\d+\]_Scale_Type")
-# Dates of TDMS files count from 1904; those of NumPy in nanoseconds end in 2262.
-EPOCH, LAST_SECOND = np.datetime64("1904-01-01", "ns"), 358 * 365 * 86_400
+# Seconds from 1904, from which dates of TDMS files count, to 1970 and to the end of the dates in nanoseconds.
+UNIX_EPOCH, LAST_SECOND = 24_107 * 86_400, 358 * 365 * 86_400
 
 Change = tuple[int, str, Any, Any]  # samples before it, name, and both values of a property
 
@@ -139,7 +139,7 @@ def _dates(stamp: Any) -> Any:
     if np.any((seconds < 0) | (seconds > LAST_SECOND)):
         raise ValueError("it has timestamps before 1904 or after 2261")
     nanoseconds = ((fractions >> np.uint64(32)) * np.uint64(10**9) + np.uint64(2**31)) >> np.uint64(32)
-    return EPOCH + seconds.astype("m8[s]") + nanoseconds.astype(np.int64).astype("m8[ns]")
+    return (seconds - UNIX_EPOCH).astype("M8[s]").astype("M8[ns]") + nanoseconds.astype(np.int64).astype("m8[ns]")
 
 
 def _clock(properties: Mapping[str, Any], changes: list[Change]) -> Clock | None:

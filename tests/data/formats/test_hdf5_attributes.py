@@ -123,6 +123,18 @@ def test_units_of_time(unit, size):
     assert (since.origin is None) == bool(since.refusal) == (size is None) if since else not unit.strip()
 
 
+@pytest.mark.parametrize("kind", [np.int32, np.int64, np.uint64, np.float64])
+def test_dates_end_where_nanoseconds_do(kind):
+    """Integers are refused like floats: NumPy multiplies and adds them modulo 2**64."""
+    since = Since.of("days since 2000-01-01", {})
+    days = int((np.datetime64("2262-01-01") - np.datetime64("2000-01-01")).astype(int))
+    assert since.dates(np.array([days], kind))[0] == np.datetime64("2262-01-01")
+    for beyond in ([days + 200], [0, 2 * days], *([] if kind == np.uint64 else [[-10 * days]])):
+        with pytest.raises(ValueError, match="its dates are outside of the years from 1678 to 2261"):
+            since.dates(np.array(beyond, kind))
+    assert since.dates(np.array([], kind)).size == 0
+
+
 def test_dates_that_cannot_be_read_are_refused_with_what_reads_them():
     for unit, stored, what in (
         ("days since 2026-01-01", {"calendar": "360_day"}, "dates in 'days since 2026-01-01' of calendar '360_day'; "),

@@ -401,3 +401,9 @@ def test_damaged_file_is_read_or_refused_by_one_error(tmp_path, capfd):
             except ValueError as error:
                 assert "run.lvm" in str(error)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("date, origin", [("2261/12/31", "2261-12-31"), ("2300/01/31", None), ("1601/01/01", None)])
+def test_dates_beyond_nanoseconds_are_no_origin(date, origin):
+    """In nanoseconds NumPy reads the year 2300 as 1715."""
+    assert lvm._origin(date, "00:00:00") == (origin and np.datetime64(origin, "ns"))
