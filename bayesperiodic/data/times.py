@@ -39,7 +39,10 @@ def dates(argument: str, values: Any) -> np.ndarray | None:
     array = np.asarray(values)
     masked = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else np.zeros(array.shape, bool)
     if array.dtype.kind in "mM":
-        return np.where(masked, np.array("NaT", array.dtype), array)
+        if masked.any():
+            array = array.copy()
+            array.view(np.int64)[masked] = np.iinfo(np.int64).min  # NaT of every unit
+        return array
     if array.dtype.kind not in "OUT":
         return None
     import pandas as pd

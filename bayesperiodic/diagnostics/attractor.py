@@ -46,6 +46,8 @@ LARGEST_MISFIT = 0.5
 LIBRARY_RUNS, DRAWING_ATTEMPTS = 40, 100
 # Draws at which orbits are sought.
 ORBIT_DRAWS = 20
+# Forcing periods by which the inputs of an orbit and of the section differ in phase at most.
+LARGEST_PHASE = 1 / 64
 # Standard errors from which on an orbit is named.
 FAR_ORBIT = 4.0
 
@@ -205,7 +207,8 @@ def predict_attractor(
         Number of runs, at least 20, and their length in forcing periods, at least 20. The recording must contain at
         least 10 pieces of that length.
     orbits : Orbits or sequence of Orbit
-        Of the section, from `find_orbits`, such as those that are not part of the problem.
+        Of the section, or of another one at its phase, from `find_orbits`, such as those that are not part of the
+        problem. Phases are compared where orbits have waveforms of the inputs.
     seed : int
     progress : bool
         Show a progress bar.
@@ -261,7 +264,8 @@ def predict_attractor(
     of = {"fit" if isinstance(posterior, MapEstimate) else "posterior": posterior}
     problem = check_results(problem, **of)
     experiment = _experiment_of(problem)
-    recorded, given = _recorded(problem, section, periods), _orbits(section, orbits)
+    recorded = _recorded(problem, section, periods)
+    given = _orbits(recorded, section, orbits)
     thetas = np.ascontiguousarray(problem.parameters(_parameters(problem, posterior, runs, generator), experiment))
     middle = np.ascontiguousarray(np.median(thetas, axis=0))
     runner, library = _prepared(recorded, middle, _seeds(problem, posterior), generator)
@@ -318,8 +322,8 @@ def _recorded(problem: Problem, section: PoincareSection, periods: int) -> Recor
     return recorded
 
 
-def _orbits(section: PoincareSection, orbits: Orbits | Sequence[Orbit]) -> list[Orbit]:
-    """Return orbits; raise a ValueError unless they belong to a recorded section with these coordinates."""
+def _orbits(recorded: Recorded, section: PoincareSection, orbits: Orbits | Sequence[Orbit]) -> list[Orbit]:
+    """Return orbits; raise a ValueError unless they belong to a section with these coordinates and this phase."""
     _checks.instance("orbits", orbits, (Orbits, list, tuple))
     given = list(orbits)
     for k, orbit in enumerate(given):
@@ -329,7 +333,34 @@ def _orbits(section: PoincareSection, orbits: Orbits | Sequence[Orbit]) -> list[
                 f"orbits[{k}]: must be of a section of a recording with the coordinates {section.coordinates}, got "
                 f"{orbit.name!r} with {orbit.coordinates}."
             )
+        here, there = (_input_phases(recorded, of) for of in (section, orbit))
+        for name in here.keys() & there.keys():
+            away = float(np.angle(there[name] / here[name])) / (2.0 * np.pi)
+            if abs(away) > LARGEST_PHASE:
+                raise ValueError(
+                    f"orbits[{k}]: must be of a section at the phase of `section`, got {orbit.name!r}, whose "
+                    f"{name!r} is {away:+.3f} forcing periods off. Make both sections with the same origin, or give "
+                    "find_orbits that of `section` first."
+                )
     return given
+
+
+def _input_phases(recorded: Recorded, of: PoincareSection | Orbit) -> dict[str, complex]:
+    """Return the component at the forcing frequency, from the section's phase on, of inputs in which it dominates."""
+    result = {}
+    for name in recorded.model.inputs:
+        if isinstance(of, Orbit):
+            if of.waveform is None or name not in of.waveform.values:
+                continue
+            values = np.asarray(of.waveform.values[name])
+            turns = np.arange(values.size) * of.period / values.size
+        else:
+            values = recorded.samples.signals[:, of.channels.index(name)]
+            turns = recorded.frequency * (recorded.samples.time - recorded.instants[0])
+        component = complex(np.mean((values - values.mean()) * np.exp(-2j * np.pi * turns)))
+        if 2.0 * abs(component) ** 2 > 0.5 * values.var():
+            result[name] = component
+    return result
 
 
 def _parameters(

@@ -252,7 +252,7 @@ def test_pendulum_that_turns_is_predicted_without_inputs():
 
 @pytest.fixture(scope="module")
 def orbits():
-    return bp.find_orbits(section_of(periods=2400, noise=0.001), periods=[1, 2])
+    return bp.find_orbits(section_of(periods=2400, noise=0.001), periods=[1, 2], waveforms=True)
 
 
 def test_orbits_of_the_right_model_are_those_of_newtons_method_on_the_flow(fitted, orbits):
@@ -267,6 +267,19 @@ def test_orbits_of_the_right_model_are_those_of_newtons_method_on_the_flow(fitte
     for orbit in orbits:
         moduli = [one.multipliers[0].real for one in known if len(one.states) == orbit.period]
         assert np.abs(np.array(moduli) - table.loc[orbit.name, "predicted"]).min() < 0.02 * abs(orbit.eigenvalues[0])
+
+
+@pytest.mark.parametrize("late", [1, 11, 23])
+def test_orbits_of_a_section_at_another_phase_are_refused(fitted, orbits, late):
+    """Waveforms begin by 1/24 of the forcing period and more later."""
+    problem, fit = fitted
+    turned = []
+    for orbit in orbits:
+        by = -late * (len(orbit.waveform.values["force"]) // orbit.period) // 24
+        values = {name: np.roll(one, by) for name, one in orbit.waveform.values.items()}
+        turned.append(replace(orbit, waveform=replace(orbit.waveform, values=values)))
+    with pytest.raises(ValueError, match=r"orbits\[0\]: must be of a section at the phase of `section`, got 'period 1"):
+        bp.predict_attractor(problem, fit, section_of(), orbits=turned, progress=False)
 
 
 def test_orbits_of_a_wrong_model_are_missing_or_far(fitted, orbits):
