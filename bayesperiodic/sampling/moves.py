@@ -1,9 +1,12 @@
 """Moves of emcee: within several ensembles at once, and from a mixture. Importing emcee takes a second."""
 
+from dataclasses import dataclass
+
 import emcee
 import numpy as np
 
-from bayesperiodic.sampling.proposals import MIXTURE_STEPS, StudentMixture
+from bayesperiodic.sampling.proposals import MIXTURE_STEPS, AffineTransform, StudentMixture
+from bayesperiodic.sampling.surrogate import Surrogate
 
 
 class WithinEnsembles(emcee.moves.RedBlueMove):
@@ -29,17 +32,16 @@ class WithinEnsembles(emcee.moves.RedBlueMove):
         return np.concatenate(points), np.concatenate(factors)
 
 
-class MixtureMove(emcee.moves.MHMove):
-    """Proposals from a mixture, independent of the walkers, with their acceptance."""
+class CountedMove(emcee.moves.MHMove):
+    """Proposals that are independent of the other walkers, with their acceptance."""
 
-    def __init__(self, mixture: StudentMixture):
-        super().__init__(self._proposal)
-        self._mixture = mixture
+    def __init__(self) -> None:
+        super().__init__(self.proposal)
         self.proposed = self.accepted = 0
 
-    def _proposal(self, points: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        drawn = self._mixture.draw(len(points), random)
-        return drawn, self._mixture.log_density(points) - self._mixture.log_density(drawn)
+    def proposal(self, points: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        """Return proposals for points (walkers, dimension), and the logs of their factors."""
+        raise NotImplementedError
 
     def propose(self, model: emcee.model.Model, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
         """Move all walkers, and count."""
@@ -49,13 +51,61 @@ class MixtureMove(emcee.moves.MHMove):
         return state, accepted
 
 
-def moves(ensembles: int, mixture: MixtureMove | None) -> list[tuple[emcee.moves.Move, float]]:
+class MixtureMove(CountedMove):
+    """Proposals from a mixture."""
+
+    def __init__(self, mixture: StudentMixture):
+        super().__init__()
+        self._mixture = mixture
+
+    def proposal(self, points: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        """Return draws of the mixture, and its density at the points relative to that at the draws."""
+        drawn = self._mixture.draw(len(points), random)
+        return drawn, self._mixture.log_density(points) - self._mixture.log_density(drawn)
+
+
+class SurrogateMove(CountedMove):
+    """Proposals by moves that leave a surrogate of the density unchanged (J. S. Liu, Monte Carlo strategies, 2001)."""
+
+    def __init__(self, surrogate: Surrogate, transform: AffineTransform):
+        super().__init__()
+        self._surrogate, self._transform = surrogate, transform
+
+    def proposal(self, points: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        """Return moved points, and the surrogate's density over the coordinates at the points relative to theirs."""
+        one = self._surrogate
+        x = self._transform.unwhiten(points)
+        y = one.values(x)
+        moved = one.moved(y, random)
+        there = one.coordinates(moved)
+        volumes = np.sum((x - there)[:, one.logarithmic], axis=1)
+        return self._transform.whiten(there), one.log_density(y) - one.log_density(moved) + volumes
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Fractions of the steps that propose from a mixture, and by a surrogate."""
+
+    mixture: float
+    surrogate: float = 0.0
+
+
+def moves(
+    ensembles: int,
+    mixture: MixtureMove | None,
+    surrogate: SurrogateMove | None = None,
+    shares: Shares = Shares(MIXTURE_STEPS),
+) -> list[tuple[emcee.moves.Move, float]]:
     """Return the moves with their fractions of the steps.
 
     Of the steps within ensembles, seven in ten are differential evolution, two are stretch moves, and one is
     differential evolution of full length, which can jump between modes.
     """
-    share = 1.0 if mixture is None else 1.0 - MIXTURE_STEPS
+    weighted: list[tuple[emcee.moves.Move, float]] = []
+    if mixture:
+        weighted.append((mixture, shares.mixture))
+    if surrogate:
+        weighted.append((surrogate, shares.surrogate))
+    left = 1.0 - sum(share for _, share in weighted)
     within = (emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)
-    weighted = [(WithinEnsembles(move, ensembles), share * fraction) for move, fraction in within]
-    return weighted if mixture is None else [*weighted, (mixture, MIXTURE_STEPS)]
+    return [(WithinEnsembles(move, ensembles), left * fraction) for move, fraction in within] + weighted

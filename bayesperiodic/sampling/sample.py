@@ -52,7 +52,15 @@ from bayesperiodic.sampling.proposals import (
     fit_mixture,
 )
 from bayesperiodic.sampling.robust import add_robust
-from bayesperiodic.sampling.starts import FROM_LAPLACE, STARTS, laplace_mixture, mode_of, sampling_axes, start_points
+from bayesperiodic.sampling.starts import (
+    FROM_LAPLACE,
+    STARTS,
+    laplace_mixture,
+    mode_of,
+    sampling_axes,
+    start_points,
+    surrogate_of,
+)
 
 if TYPE_CHECKING:
     import emcee
@@ -67,6 +75,8 @@ ROUND, CHECKED = 25, 50
 # Burn-in ends when the autocorrelation time [steps] expected of the mixture is FAST_MIXTURE, or after
 # MOST_BURN_IN_ROUNDS.
 FAST_MIXTURE, MOST_BURN_IN_ROUNDS = 3.0, 40
+# Rounds after which a surrogate is tried, and fractions of the steps from the mixture and by it then.
+SURROGATE_ROUNDS, TRIED = 10, [0.4, 0.4]
 # It starts again, before MOST_BURN_IN_ROUNDS, if SLOW_MIXTURE is expected at the draws that are kept: their tails were
 # not known yet.
 SLOW_MIXTURE = 6.0
@@ -276,6 +286,7 @@ class _EnsembleRun:
 
         self.seed, self.density, self.fit, self.backend = seed, density, fit, backend
         self.ensembles, self.walkers = shape
+        self.surrogate = surrogate_of(density, fit)
         first, redraws, axes = np.random.SeedSequence(seed).spawn(3)
         self.redraws = np.random.default_rng(redraws)
         if "axes" in state:
@@ -293,6 +304,7 @@ class _EnsembleRun:
         self.state = state | {
             "origin": self.transform.origin.tolist(), "axes": self.transform.axes.tolist(),
             "mixture": first_mixture and first_mixture.as_lists(), "burnt": 0, "tries": [0, 0],
+            "shares": [MIXTURE_STEPS, 0.0], "moved": [0, 0],
             "steps": 0, "next": ROUND, "passes": 0, "missing": [ADAPTED], "tau": [],
             "converged": False, "reason": "",
         }  # fmt: skip
@@ -362,9 +374,11 @@ class _EnsembleRun:
         """Advance all ensembles to a number of steps."""
         import emcee
 
-        from bayesperiodic.sampling.moves import MixtureMove, moves
+        from bayesperiodic.sampling.moves import MixtureMove, Shares, SurrogateMove, moves
 
+        shares = Shares(*self.state["shares"])
         mixture = self.state["mixture"] and MixtureMove(StudentMixture.from_lists(self.state["mixture"]))
+        surrogate = SurrogateMove(self.surrogate, self.transform) if self.surrogate and shares.surrogate else None
         calls = CallCount()
 
         def log_prob(u: np.ndarray) -> np.ndarray:
@@ -375,16 +389,18 @@ class _EnsembleRun:
 
         np.random.RandomState().set_state(self.walk.random_state)  # raises, where emcee would go on with another one
         sampler = emcee.EnsembleSampler(
-            *self.walk.coords.shape, log_prob, moves=moves(self.ensembles, mixture), vectorize=True,
+            *self.walk.coords.shape, log_prob, moves=moves(self.ensembles, mixture, surrogate, shares), vectorize=True,
             backend=self.backend,
         )  # fmt: skip
-        tries, steps = self.state["tries"], until - self._done
+        tries, moved, steps = self.state["tries"], self.state["moved"], until - self._done
         with interrupts_deferred() as check:
             for walk in sampler.sample(self.walk, iterations=steps, skip_initial_state_check=True):
                 self.walk = walk
                 self.calls, calls = self.calls + calls, CallCount()
                 if mixture:
                     self.state["tries"] = [tries[0] + mixture.accepted, tries[1] + mixture.proposed]
+                if surrogate:
+                    self.state["moved"] = [moved[0] + surrogate.accepted, moved[1] + surrogate.proposed]
                 bar.update(self._done - bar.n)
                 check()
 
@@ -414,13 +430,28 @@ class _EnsembleRun:
         rounds, fast = state["steps"] // ROUND, False
         if present and rounds > 1 and new <= FAST_MIXTURE:
             fast = self._expected_time(StudentMixture.from_lists(state["mixture"]), half) <= FAST_MIXTURE
-        done = fast or rounds >= MOST_BURN_IN_ROUNDS
-        state |= {"tries": [0, 0], "next": state["steps"] + (CHECKED if done else ROUND)}
+        state["shares"] = [MIXTURE_STEPS, 0.0] if fast else self._shares(half)
+        led = state["shares"][1] == MIXTURE_STEPS and rounds >= 2 * SURROGATE_ROUNDS
+        done = fast or led or rounds >= MOST_BURN_IN_ROUNDS
+        state |= {"moved": [0, 0], "tries": [0, 0], "next": state["steps"] + (CHECKED if done else ROUND)}
         state |= {"burnt": state["steps"] if done else 0, "missing": [] if done else [ADAPTED], "tau": [], "passes": 0}
+
+    def _shares(self, first: int) -> list[float]:
+        """Return the fractions of the steps that propose from a slow mixture, and by the surrogate."""
+        state = self.state
+        if not self.surrogate or not state["mixture"] or state["steps"] < SURROGATE_ROUNDS * ROUND:
+            return [MIXTURE_STEPS, 0.0]
+        accepted, proposed = state["moved"]
+        if not proposed:
+            return TRIED
+        mixture = StudentMixture.from_lists(state["mixture"])
+        by_mixture = self._expected_time(mixture, first)
+        by_surrogate = 2.0 / max(MIXTURE_STEPS * accepted / proposed, np.finfo(float).tiny) - 1.0
+        return [0.1, MIXTURE_STEPS] if by_surrogate < by_mixture else [MIXTURE_STEPS - 0.1, 0.1]
 
     def _outdated(self) -> bool:
         """Return whether the burn-in ended too early: the draws since then have tails that the mixture lacks."""
-        if self.state["burnt"] >= MOST_BURN_IN_ROUNDS * ROUND:
+        if self.state["burnt"] >= MOST_BURN_IN_ROUNDS * ROUND or self.state["shares"][1]:
             return False
         mixture = StudentMixture.from_lists(self.state["mixture"])
         return self._expected_time(mixture, self._first_kept) > SLOW_MIXTURE

@@ -11,6 +11,7 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.noise_estimate import estimate_noise
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.sampling.proposals import HEAVY_TAILS, AffineTransform, CallCount, StudentMixture
+from bayesperiodic.sampling.surrogate import Surrogate
 
 FROM_LAPLACE, FROM_PRIOR, OVERDISPERSED = "laplace", "prior", "overdispersed"
 STARTS = (FROM_LAPLACE, FROM_PRIOR, OVERDISPERSED)
@@ -116,6 +117,12 @@ def laplace_mixture(density: SamplingCoordinates, fit: MapEstimate) -> tuple[Stu
     factors = np.stack([covariance_cholesky(covariance) for covariance in covariances])
     weights = np.array(masses) / np.sum(masses) if known else np.full(len(rows), 1.0 / len(rows))
     return StudentMixture(weights, means, factors, np.full(len(rows), HEAVY_TAILS)), np.array(rows)
+
+
+def surrogate_of(density: SamplingCoordinates, fit: MapEstimate) -> Surrogate | None:
+    """Return the surrogate at the estimate; None without positive parameters or a Laplace approximation."""
+    laplace = _laplace(density, fit) if density.logarithmic.any() else None
+    return laplace and Surrogate.of(density, *laplace)
 
 
 def mode_of(density: SamplingCoordinates, fit: MapEstimate, points: np.ndarray) -> np.ndarray | None:
