@@ -21,7 +21,7 @@ SCALES_READ = (
 )  # fmt: skip
 SCALE_PROPERTY = re.compile(r"NI_Scal|NI_Number_Of_Scales|unit_string|NI_UnitDescription")
 # Values of properties that a segment leaves out.
-LEFT_OUT = {WAVE_OFFSET: 0.0}
+IMPLIED_PROPERTIES = {WAVE_OFFSET: 0.0}
 SCALE_TYPE = re.compile(r"NI_Scale\[\d+\]_Scale_Type")
 # Dates of TDMS files count from 1904; those of NumPy in nanoseconds end in 2262.
 EPOCH, LAST_SECOND = np.datetime64("1904-01-01", "ns"), 358 * 365 * 86_400
@@ -99,7 +99,7 @@ def _structure(mapped: _Mapped) -> tuple[dict[str, list[Change]], bool]:
             for path, pairs in (properties or {}).items():
                 if (known := self.object_metadata.get(path)) and known.num_values:
                     for name, value in pairs:
-                        if (before := known.properties.get(name, LEFT_OUT.get(name, value))) != value:
+                        if (before := known.properties.get(name, IMPLIED_PROPERTIES.get(name, value))) != value:
                             changes.setdefault(path, []).append((known.num_values, name, before, value))
             return segment, properties
 
