@@ -5,8 +5,9 @@
 # Seen with asammdf 8.8.28, numpy 2.4.6:
 #     before: ['run.gzip'] samples: 3
 #     after: []
-# Where users meet it: a file that was unpacked and kept its name. `Recording.from_file` gives asammdf the contents
-# without a name.
+#
+# Where users meet it: a file that was unpacked and kept its name.
+# What the package does: `Recording.from_file` gives asammdf the contents without a name.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
-# asammdf 8.8.28: a rational conversion of integers, (P1*X**2 + P2*X + P3)/(P4*X**2 + P5*X + P6), computes X**2 in 32
-# bits, so that the physical values of counts above 46340 are wrong, and may be negative.
+# asammdf 8.8.28: a rational conversion of integers, `(P1*X**2 + P2*X + P3)/(P4*X**2 + P5*X + P6)`, computes `X**2` in
+# 32 bits, so that the physical values of counts above 46340 are wrong, and may be negative.
 #
 # Seen with asammdf 8.8.28, numpy 2.4.6:
 #     counts: [100, 46340, 50000] squares: [10000.0, 2147395600.0, -1794967296.0]
-# Where users meet it: sensors with a quadratic characteristic that are recorded with 16 bits. `Recording.from_file`
-# converts the counts to floats first.
+#
+# Where users meet it: sensors with a quadratic characteristic that are recorded with 16 bits.
+# What the package does: `Recording.from_file` converts the counts to floats first.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,14 +1,15 @@
 #!/usr/bin/env bash
-# corner 2.3.0 with draws of one quantity: a marked truth raises a TypeError that names neither the truth nor the shape,
-# and two quantiles, which are enough for the lines, are refused as soon as titles are shown.
+# corner 2.3.0: a truth that is marked in a plot of one quantity raises a TypeError that names neither the truth nor the
+# shape, and two quantiles, which are enough for the lines, are refused as soon as titles are shown.
 #
 # Seen with corner 2.3.0, matplotlib 3.11.2, numpy 2.4.6:
 #     one quantity, no truth: 1 panel
 #     one quantity, truth: TypeError: 'Axes' object is not subscriptable
 #     two quantities, truths: 4 panels
 #     two quantiles, titles: ValueError: 'title_quantiles' must contain exactly three values; ...
-# Where users meet it: a corner plot of a posterior with one parameter and its true value. `bayesperiodic.plot.corner`
-# with style="corner" draws the line of the truth, and the titles, itself.
+#
+# Where users meet it: a corner plot of a posterior with one parameter and its true value.
+# What the package does: `bp.plot.corner` with `style="corner"` draws the line of the truth, and the titles, itself.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,15 +1,17 @@
 #!/usr/bin/env bash
-# emcee 3.1.6: integrated_time of many walkers is a fifth too small for chains 50 autocorrelation times long, the length
-# that it asks for itself, and without the warning that shorter ones get. More walkers do not help, since the mean of each
-# walker's own values is subtracted: that takes about (2*window + 1)/steps of the sum of autocorrelations away (U. Wolff,
-# Computer Physics Communications 156 (2004) 143-153), and the window is 5 autocorrelation times.
+# emcee 3.1.6: `integrated_time` of many walkers is a fifth too small for chains 50 autocorrelation times long, the
+# length that it asks for itself, and without the warning that shorter ones get. More walkers do not help, since the
+# mean of each walker's own values is subtracted: that takes about `(2*window + 1)/steps` of the sum of autocorrelations
+# away (U. Wolff, Computer Physics Communications 156 (2004) 143-153), and the window is 5 autocorrelation times.
 #
-# Seen with emcee 3.1.6, numpy 2.4.6, scipy 1.17.1, on 2000 independent first-order autoregressive walkers with the known
-# time 9:
+# Seen with emcee 3.1.6, numpy 2.4.6, scipy 1.17.1, on 2000 independent first-order autoregressive walkers with the
+# known time 9:
 #     50 times long: 7.48 (0.83 of the known time); times 1 + (2*window + 1)/steps: 8.73 (0.97)
 #     100 times long: 8.21 (0.91 of the known time); times 1 + (2*window + 1)/steps: 8.97 (1.00)
-# Where users meet it: Monte Carlo errors from `sampler.get_autocorr_time()` of just long enough chains are 10 % too small,
-# and the time seems to grow with the length. `sample` and `population` multiply by that factor.
+#
+# Where users meet it: Monte Carlo errors from `sampler.get_autocorr_time()` of just long enough chains are 10 % too
+# small, and the time seems to grow with the length.
+# What the package does: `sample` and `population` multiply the time by `1 + (2*window + 1)/steps`.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,14 +1,16 @@
 #!/usr/bin/env bash
 # npTDMS 1.13.0: `time_track` applies the interval of the last segment of a channel to all samples, needs
-# wf_start_offset, which may be left out, and a .tdms_index beside the file is read in place of the file's own
+# `wf_start_offset`, which may be left out, and a `.tdms_index` beside the file is read in place of the file's own
 # properties, also if it is that of another file.
 #
 # Seen with nptdms 1.13.0, numpy 2.4.6:
 #     100 samples at 0.01 s, then 100 at 0.02 s: last time 3.98 s
 #     without wf_start_offset: Object does not have time properties available.
 #     with another index: wf_increment 9.0
+#
 # Where users meet it: appended measurements, waveforms of other writers, files that were renamed or copied over.
-# `Recording.from_file` refuses changed intervals and does not read the index.
+# What the package does: `Recording.from_file` refuses changed intervals and segments that do not continue the first
+# one, and does not read the index.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

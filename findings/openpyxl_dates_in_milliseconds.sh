@@ -5,7 +5,9 @@
 # Seen with openpyxl 3.1.5:
 #     samples: 50 times: 2
 #     steps at 60 Hz [ms]: [16.0, 17.0]
-# Where users meet it: date columns of data loggers in workbooks. `Recording.from_file` converts the stored numbers.
+#
+# Where users meet it: date columns of data loggers in workbooks.
+# What the package does: `Recording.from_file` converts the stored numbers.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -6,8 +6,9 @@
 # Seen with pandas 3.0.1, numpy 2.4.6:
 #     different texts: 3 different times: 1
 #     comma: ValueError: Time data 2026-01-01T00:00:00,5 is not ISO8601 format. ...
-# Where users meet it: time columns of oscilloscopes and of clocks synchronised by PTP. `Recording` refuses such texts
-# and asks for seconds as numbers.
+#
+# Where users meet it: time columns of oscilloscopes and of clocks synchronised by PTP.
+# What the package does: `Recording` refuses such texts and asks for seconds as numbers.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,13 +1,15 @@
 #!/usr/bin/env bash
-# pandas 3.0.1: thousands="." on a file with decimal points reads 1.25 as 125 without a word, as the places of the
+# pandas 3.0.1: `thousands="."` on a file with decimal points reads 1.25 as 125 without a word, as the places of the
 # signs are not checked; a separator at the end of the rows, but not of the header, makes the first column the index and
 # shifts the names of all columns by one.
 #
 # Seen with pandas 3.0.1, numpy 2.4.6:
 #     1.25 with thousands='.': 125
 #     column t of "t;x", "0;1.5;": 1.5
-# Where users meet it: one call for files of several programs. `Recording.from_csv` refuses the first and cures the
-# second.
+#
+# Where users meet it: one call for files of several programs.
+# What the package does: `Recording.from_csv` refuses such signs, and keeps the names of columns beside a separator at
+# the end of the rows.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -7,8 +7,10 @@
 #     default: rpm to Hz: 0.10472
 #     redefined: rpm to Hz: 0.10472
 #     redefined: mrad to deg: DimensionalityError: Cannot convert from 'milliradian' ([angle]) to 'degree' ...
-# Where users meet it: `units={"speed": ("rpm", "Hz")}`. `Recording` compares the powers of the angle on both sides
-# itself, and converts 600 rpm to 10 Hz.
+#
+# Where users meet it: `units={"speed": ("rpm", "Hz")}`.
+# What the package does: `Recording` compares the powers of the angle on both sides itself, and converts 600 rpm to 10
+# Hz.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -10,8 +10,10 @@
 #     EU: exaenzyme_unit
 #     pk: peck
 #     pp: point
-# Where users meet it: rows of units in CSV and Excel files. `Recording.from_file` converts only units on a list and asks
-# for the others, and a row of nothing but N/A below the names is a first sample that is missing.
+#
+# Where users meet it: rows of units in CSV and Excel files.
+# What the package does: `Recording.from_file` converts only units on a list and asks for the others, and takes a row of
+# nothing but N/A below the names for a first sample that is missing.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,11 +1,13 @@
 #!/usr/bin/env bash
-# pyuff 2.5.8: write_sets(sets, mode="overwrite") of a binary set (data set 58b) leaves a file of one line: the data are
-# lost without an error, because the file is opened for overwriting a second and a third time while it is written.
+# pyuff 2.5.8: `write_sets(sets, mode="overwrite")` of a binary set (data set 58b) leaves a file of one line: the data
+# are lost without an error, because the file is opened for overwriting a second and a third time while it is written.
 #
 # Seen with pyuff 2.5.8, numpy 2.4.6:
 #     overwrite: 7 bytes
 #     add: 8922 bytes
-# Where users meet it: files that are converted to universal files before they are read here. mode="add" is right.
+#
+# Where users meet it: files that are converted to universal files before they are read here.
+# What the package does: nothing, as it does not write such files; `mode="add"` is right.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -12,8 +12,10 @@
 #     different times of 2000 samples: 201
 #     samples: 6 header says 4
 #     data sets: 1 of 2
-# `Recording.from_file` names the interval with its error, refuses the staircase, takes as many values as the header
-# says, and refuses the file of which a set would be lost.
+#
+# Where users meet it: universal files of measurement programs, in which numbers have six digits.
+# What the package does: `Recording.from_file` names the interval with its error, refuses the staircase, takes as many
+# values as the header says, and refuses the file of which a set would be lost.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,16 +1,18 @@
 #!/usr/bin/env bash
-# SciPy 1.17.1: mean and variance of the distribution of Rice are infinite for true amplitudes of 37.6 standard deviations
-# and NaN from 40 on. They are computed as a product of exp(-b^2/2) and a confluent hypergeometric function, one of which
-# underflows while the other overflows. The median, random numbers and the density are right there; the mean is
-# b + 1/(2b) and the variance 1 to a thousandth.
+# SciPy 1.17.1: mean and variance of the distribution of Rice are infinite for true amplitudes of 37.6 standard
+# deviations and NaN from 40 on. They are computed as a product of `exp(-b^2/2)` and a confluent hypergeometric
+# function, one of which underflows while the other overflows. The median, random numbers and the density are right
+# there; the mean is `b + 1/(2b)` and the variance 1 to a thousandth.
 #
 # Seen with scipy 1.17.1, numpy 2.4.6:
 #     b = 30.0: mean 30.0167, variance 0.9994, median 30.0167
 #     b = 37.6: mean inf, variance inf, median 37.6133
 #     b = 40.0: mean nan, variance nan, median 40.0125
+#
 # Where users meet it: expected values of measured amplitudes (lock-in amplifiers, frequency response functions) with
-# errors of two per cent and less. `measurements.Amplitude` takes logarithms of the density with a scaled Bessel function,
-# and replicates by quantiles of the noncentral chi-square distribution, or by the normal limit.
+# errors of two per cent and less.
+# What the package does: `measurements.Amplitude` takes logarithms of the density with a scaled Bessel function, and
+# replicates by quantiles of the noncentral chi-square distribution, or by the normal limit.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

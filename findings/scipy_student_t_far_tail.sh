@@ -9,8 +9,10 @@
 #     3.0 degrees of freedom: 1e-100 1.000  1e-200 8.000  1e-300 at +inf; by betaincinv 1.000 1.000 1.000
 #     5.0 degrees of freedom: 1e-100 1.000  1e-200 1.000  1e-300 at +inf; by betaincinv 1.000 1.000 1.000
 #     t.ppf the same: True
+#
 # Where users meet it: maps from normal scores to heavy-tailed priors, Φ(-31) = 5e-211, as in samplers that work with
-# standard normal coordinates. `StudentT.quantile` takes the first term of the tail.
+# standard normal coordinates.
+# What the package does: `StudentT.quantile` takes the first term of the tail.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -9,8 +9,10 @@
 #     by subs: nan 0.7 1, after simplify: nan 0.7 1, by differences: 0.0 0.7 1.0
 #     lambdify: KeyError('ComplexInfinity')
 #     without transition, x = -1, 1: 0 1
-# Where users meet it: friction, gaps and stops in symbolic models. `bp.elements` are made of separate branches, whose
-# derivatives are finite; equations that cannot be compiled for this reason are refused with the expression.
+#
+# Where users meet it: friction, gaps and stops in symbolic models.
+# What the package does: `bp.elements` are made of separate branches, whose derivatives are finite; equations that
+# cannot be compiled for this reason are refused with the expression.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

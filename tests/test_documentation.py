@@ -27,6 +27,7 @@ from typing import Any
 import pytest
 
 import bayesperiodic as bp
+from tests import findings
 
 MODULES = {
     "": bp,
@@ -214,3 +215,16 @@ def test_docstrings_of_models_are_complete(name):
 def test_every_name_is_in_the_reference_once():
     listed = (Path(__file__).parents[1] / "docs" / "reference" / "api.rst").read_text("utf-8").split()
     assert [name for name in NAMES if listed.count(name) != 1] == []
+
+
+@pytest.mark.parametrize("page", findings.pages(), ids=lambda page: page.name)
+def test_pages_on_other_packages_are_those_of_the_scripts(page):
+    """Made by `python -m tests.findings`."""
+    assert page.read_text("utf-8") == findings.pages()[page]
+
+
+def test_every_public_name_is_in_a_table_of_tasks():
+    text = (findings.ROOT / "docs" / "reference" / "tasks.md").read_text("utf-8")
+    rows = " ".join(line for line in text.splitlines() if line.startswith("| "))
+    named = set(re.findall(r"\w+", " ".join(re.findall(r"`[^`]*`", rows))))
+    assert sorted(set(bp.__all__) - named) == []

@@ -23,9 +23,12 @@ DRAWING = (
     "README.md",
     TOUR,
     "docs/start/specimens.md",
+    "docs/how_to/calibrate.md",
     "docs/how_to/compare_models.md",
+    "docs/how_to/export.md",
     "docs/how_to/populations.md",
     "docs/how_to/priors.md",
+    "docs/how_to/sampler.md",
     "docs/how_to/wrong_model.md",
 )
 # Code that is shown but does not run here.

@@ -23,6 +23,7 @@ from bayesperiodic.models.names import (
     as_expression,
     called,
     check_derivative_names,
+    checked_units,
     with_derivatives,
 )
 from bayesperiodic.models.structure import MatrixStructure
@@ -59,7 +60,7 @@ class Model(Printed):
     angles : sequence of str, optional
         States that may wind (advance by a multiple of 2π per period) and outputs compared modulo 2π.
     units : mapping of str to str, optional
-        Units of states, inputs and outputs, for tables and axes.
+        Units of states, inputs, outputs and parameters, for tables and axes.
     description : str, optional
         Docstring of the instance.
 
@@ -129,12 +130,8 @@ class Model(Printed):
         self.angles = tuple(angles)
         for angle in self.angles:
             _checks.one_of("angles", angle, (*self.states, *self.outputs))
-        self.units = dict(parameters) if isinstance(parameters, Mapping) else {}
-        for channel, unit in (units or {}).items():
-            _checks.one_of("units", channel, (*self.states, *self.inputs, *self.outputs))
-            self.units[channel] = unit
-        for channel, unit in self.units.items():
-            _checks.text(f"units[{channel!r}]", unit)
+        units = {**(parameters if isinstance(parameters, Mapping) else {}), **(units or {})}
+        self.units = checked_units(units, (*self.states, *self.inputs, *self.outputs, *self.parameters))
         self.orders = {state: self._order(state) for state in self.states}
 
     def _set_names(self, name: str, states: Iterable[str], inputs: Iterable[str], parameters: Iterable[str]) -> None:
@@ -176,6 +173,7 @@ class Model(Printed):
         outputs: Mapping[str, tuple[Any, str]],
         elements: Iterable[Any] = (),
         condensed: bool | None = None,
+        units: Mapping[str, str] | None = None,
     ) -> "Model":
         """Return the model M ẍ + C ẋ + K x + elements = forces − M r z̈, with the motion z of a base.
 
@@ -207,6 +205,8 @@ class Model(Printed):
             Nonlinear parts. Each parameter of an element is a parameter of the model, called element_parameter.
         condensed : bool, optional
             By default True for more than ten degrees of freedom, if no element depends on the time.
+        units : mapping of str to str, optional
+            As in `Model`.
 
         Returns
         -------
@@ -228,7 +228,7 @@ class Model(Printed):
         (('x0', 'x1', 'joint'), ('alpha', 'joint_stiffness', 'joint_limit'))
         """
         matrices = {"mass": mass, "damping": damping, "stiffness": stiffness}
-        return cls._of_structure(name, structure(matrices, forces, base, outputs, elements), condensed)
+        return cls._of_structure(name, structure(matrices, forces, base, outputs, elements), condensed, units)
 
     @classmethod
     def from_modes(
@@ -243,6 +243,7 @@ class Model(Printed):
         outputs: Mapping[str, tuple[Any, str]],
         elements: Iterable[Any] = (),
         condensed: bool | None = None,
+        units: Mapping[str, str] | None = None,
     ) -> "Model":
         """Return the model of modes with nonlinear elements between points of the structure.
 
@@ -259,7 +260,7 @@ class Model(Printed):
             Damping over critical damping, ζ.
         shapes : array (points, modes)
             Mode shapes at the points of forces, outputs and elements, for unit modal mass [1/√kg].
-        forces, outputs, elements, condensed
+        forces, outputs, elements, condensed, units
             As in `from_matrices`, with the numbers of points for those of degrees of freedom.
         base : mapping of str to (direction, kind, participation), optional
             As in `from_matrices`, with the direction at the points, and the participation factors shapesᵀ M r of the
@@ -285,13 +286,15 @@ class Model(Printed):
         ('zeta', 'f1', 'mount_k3')
         """
         given = of_modes(frequencies, damping_ratios, shapes, forces, base, outputs, elements)
-        return cls._of_structure(name, given, condensed)
+        return cls._of_structure(name, given, condensed, units)
 
     @classmethod
-    def _of_structure(cls, name: str, given: MatrixStructure, condensed: bool | None) -> "Model":
+    def _of_structure(
+        cls, name: str, given: MatrixStructure, condensed: bool | None, units: Mapping[str, str] | None
+    ) -> "Model":
         if condensed is None:
             condensed = given.of_motion and bool(given.drives) and given.degrees > MOST_SYMBOLIC
-        return CondensedModel(name, given) if condensed else cls(name, **definition(given))
+        return CondensedModel(name, given, units) if condensed else cls(name, **definition(given), units=units)
 
     def _expression(self, argument: str, given: Any) -> sp.Expr:
         if isinstance(given, int | float):
@@ -452,6 +455,7 @@ class CondensedModel(Model):
     name : str
     structure : MatrixStructure
         Checked matrices, places and elements.
+    units : mapping of str to str, optional
 
     Raises
     ------
@@ -460,7 +464,7 @@ class CondensedModel(Model):
         first order and linear in the derivatives.
     """
 
-    def __init__(self, name: str, structure: MatrixStructure):
+    def __init__(self, name: str, structure: MatrixStructure, units: Mapping[str, str] | None = None):
         if not structure.of_motion:
             raise ValueError(
                 "elements: must be functions of displacement, velocity and internal states in a condensed model, got "
@@ -485,7 +489,8 @@ class CondensedModel(Model):
         self.element_names = tuple(element.name for element in structure.elements)
         # Functions cannot be pickled; what they returned is kept.
         self.structure = replace(structure, elements=())
-        self.angles, self.units, self.orders = (), {}, dict.fromkeys(self.states, 2)
+        self.angles, self.orders = (), dict.fromkeys(self.states, 2)
+        self.units = checked_units(units or {}, (*self.states, *self.inputs, *self.outputs, *self.parameters))
 
     def refusal(self) -> ValueError:
         """Return the error for what needs symbolic equations."""

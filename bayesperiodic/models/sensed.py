@@ -21,6 +21,11 @@ def sensor_name(kind: str, channel: str) -> str:
     return f"{kind}[{channel}]"
 
 
+def of_a_channel(name: str) -> bool:
+    """Return whether a parameter of a problem is a delay or acts on channels only, such as ``shift[run 1]``."""
+    return name.partition("[")[0] in (SHIFT, *SENSOR_KINDS) and ("[" in name or name == SHIFT)
+
+
 def sensor_symbol(kind: str, channel: str) -> sp.Symbol:
     """Return the symbol of a parameter of a sensor, whose name is an identifier."""
     return sp.Symbol(f"sensor_{kind}_{channel}", real=True)

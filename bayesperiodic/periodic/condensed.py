@@ -187,8 +187,12 @@ class CondensedEquations(PeriodicEquations):
         return result
 
     def reduced(self, states: np.ndarray) -> np.ndarray:
-        """Return the displacements of the elements (points, elements) for those of all degrees of freedom."""
-        return states @ self.model.structure.weights.T
+        """Return the displacements of the elements (points, elements) for those of all degrees of freedom.
+
+        The points are as many as those of the states, or the next power of two, on which the kernels work.
+        """
+        d, points = states @ self.model.structure.weights.T, 1 << (len(states) - 1).bit_length()
+        return d if points == len(d) else on_grid(resized(harmonics(d), points), points)
 
     def states(self, z: np.ndarray, drift: np.ndarray | None = None) -> np.ndarray:
         """Return d, ḋ, d̈ of the elements side by side, (points, 3·elements)."""

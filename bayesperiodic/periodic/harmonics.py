@@ -24,6 +24,8 @@ def resized(amplitudes: np.ndarray, points: int) -> np.ndarray:
 
 def transform_tables(points: int) -> tuple[np.ndarray, np.ndarray]:
     """Return exp(−2πi k/points) for half of the points, a power of two, and all bit-reversed numbers."""
+    if points < 1 or points & (points - 1):  # the kernels would write outside of their arrays
+        raise ValueError(f"points: must be a power of two, got {points}.")
     place = np.zeros(1, dtype=np.int64)
     while len(place) < points:
         place = np.concatenate([2 * place, 2 * place + 1])

@@ -11,6 +11,7 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic.models.model import Model, parameter_vector
+from bayesperiodic.models.sensed import of_a_channel
 from bayesperiodic.periodic.arclength import ParametrisedEquations
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations
 from bayesperiodic.periodic.floquet import first_order_matrix
@@ -68,7 +69,8 @@ def hopf_points(
     model : Model
         An autonomous one.
     parameters : mapping of str to float
-        A value for every parameter; that of `vary` is ignored.
+        A value for every parameter; that of `vary` is ignored. So are delays and sensors of the outputs, such as
+        ``shift[run 1]`` in `MapEstimate.theta`, which no equilibrium depends on.
     vary : str
         A parameter.
     between : (low, high)
@@ -99,7 +101,8 @@ def hopf_points(
     low, high = (_checks.finite_number(f"between[{i}]", value) for i, value in enumerate(between))
     if not low < high:
         raise ValueError(f"between: must be in ascending order, got {between!r}.")
-    theta = parameter_vector(model, dict(parameters) | {vary: low})
+    given = {name: value for name, value in parameters.items() if not of_a_channel(name)} | {vary: low}
+    theta = parameter_vector(model, given)
     equations = PeriodicEquations.build(model, None, frequency=1.0, samples=EQUILIBRIUM_SAMPLES, scheme="fourier")
 
     def at(value: float) -> np.ndarray:

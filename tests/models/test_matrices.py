@@ -157,3 +157,25 @@ def test_wrong_arguments_of_matrices_are_refused(changes, message):
 def test_wrong_elements_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         Element(*arguments)
+
+
+@pytest.mark.parametrize("condensed", [False, True])
+def test_models_of_structures_have_units_of_channels_and_parameters(condensed):
+    units = {"force": "N", "x": "m", "beta": "s", "joint_k3": "N/m^3", "x1": "m"}
+    places = {"forces": {"force": 0}, "outputs": {"x": (1, "displacement")}}
+    places |= {"elements": [Element("joint", bp.elements.cubic, 1)], "condensed": condensed}
+    k = chained(2)
+    of_matrices = bp.Model.from_matrices(
+        "frame", mass=np.eye(2), stiffness=k, damping={"beta": k}, units=units, **places
+    )
+    shapes = np.eye(2)
+    modes = {"frequencies": ["f", 1.0], "damping_ratios": 0.01, "shapes": shapes, **places}
+    of_modes = bp.Model.from_modes("modes", units={"f": "Hz", "x": "m"}, **modes)
+    assert of_matrices.units == units and of_modes.units == {"f": "Hz", "x": "m"}
+    with pytest.raises(ValueError, match="units: must be one of .*'beta'.*, got 'zeta'"):
+        bp.Model.from_matrices("frame", mass=np.eye(2), stiffness=k, damping={"beta": k}, units={"zeta": "1"}, **places)
+    force = cosine()
+    run = bp.Experiment("run", 0.1, {"x": force}, {"force": force}, samples=64)
+    priors = {"beta": bp.LogNormal(0.1, 1), "joint_k3": bp.Normal(0, 1)}
+    problem = bp.Problem(of_matrices, [run], priors=priors)
+    assert (problem.units["beta"], problem.units["x"]) == ("s", "m")

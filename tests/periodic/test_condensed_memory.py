@@ -428,3 +428,45 @@ def test_internal_state_whose_mean_is_arbitrary_is_no_solution():
 def test_internal_states_that_cannot_be_condensed_are_refused(given, message):
     with pytest.raises(ValueError, match=f"elements: .*{message}"):
         element(given)
+
+
+@pytest.mark.parametrize("points", [400, 51])
+def test_motion_of_elements_on_any_grid_is_that_on_the_next_power_of_two(points):
+    """The motion is a harmonic series of few terms, whose values are known everywhere."""
+    model = bp.Model.from_matrices(
+        "two", mass=np.eye(2), stiffness=chain(2), forces={"force": 0}, outputs={"x": (1, "displacement")},
+        elements=[Element("joint", bp.elements.jenkins, (1, 0), {"width": 0.1})], condensed=True,
+    )  # fmt: skip
+
+    def motion(count):
+        tau = 2 * np.pi * np.arange(count)[:, None] / count
+        return 0.3 + np.cos(tau) * [1.0, 2.0] + np.sin(3 * tau) * [0.5, -0.2]
+
+    equations = CondensedEquations.build(model, {"force": force(points)}, frequency=0.1, samples=points)
+    finer = motion(1 << (points - 1).bit_length())
+    np.testing.assert_allclose(equations.reduced(motion(points))[:, 0], finer[:, 1] - finer[:, 0], atol=1e-13)
+
+
+def test_estimate_with_noisy_force_on_400_points_is_that_of_the_symbolic_model():
+    """Both see one recording; a tenth of a standard deviation is more than the grids differ by."""
+    stiffness = 1e4 * chain(2)
+    joint = Element("joint", bp.elements.jenkins, (1, 0), {"width": 0.1})
+    true = {"beta": 2e-3, "joint_stiffness": 5e3, "joint_limit": 3.0}
+    fits = []
+    for condensed_too in (False, True):
+        model = bp.Model.from_matrices(
+            "frame", mass=np.diag([2.0, 1.0]), stiffness=stiffness, damping={"beta": stiffness}, forces={"force": 0},
+            outputs={"stretch": ((1, 0), "displacement")}, elements=[joint], condensed=condensed_too,
+        )  # fmt: skip
+        if not condensed_too:
+            load = {"force": 40 * np.cos(2 * np.pi * np.arange(64) / 64)}
+            noise = {"stretch": 1e-4, "force": 2.0}
+            run = bp.simulate(model, true, load, frequency=7, duration=4, sampling_rate=1000, noise=noise, seed=1)
+        priors = {name: bp.LogNormal(value, 1) for name, value in true.items()}
+        problem = bp.Problem(model, [run.between(2, 4).fold(400)], priors=priors)
+        fits.append(bp.map_estimate(problem, start=true, progress=False))
+    symbolic, other = fits
+    assert symbolic.converged and other.converged and set(symbolic.input_errors) == set(other.input_errors)
+    for name, sd in symbolic.sd.items():
+        assert abs(other.theta[name] - symbolic.theta[name]) < 0.1 * sd
+        assert other.sd[name] == pytest.approx(sd, rel=0.03)

@@ -28,6 +28,15 @@ def test_hopf_point_agrees_with_the_eigenvalues_of_the_published_matrices():
     assert np.abs(point.mode).max() == pytest.approx(1.0)
 
 
+def test_delays_and_sensors_of_an_estimate_do_not_move_the_hopf_point():
+    """The oscillator's equilibrium is a centre at mu = 0, of the frequency omega/2π, in closed form."""
+    estimate = {"mu": 0.8, "omega": 6.0, "shift[run 1]": 0.3, "gain[displacement]": 2.0, "shift": 0.1}
+    (point,) = bp.hopf_points(bp.models.van_der_pol, estimate, "mu", between=(-1.0, 1.5))
+    assert abs(point.value) < 1e-9 and point.frequency == pytest.approx(3.0 / np.pi, rel=1e-9)
+    with pytest.raises(ValueError, match=r"parameters: must be one of .*, got 'mu\[run 1\]'"):
+        bp.hopf_points(bp.models.van_der_pol, estimate | {"mu[run 1]": 0.8}, "mu", between=(-1.0, 1.5))
+
+
 def test_equilibria_that_do_not_change_have_no_hopf_point():
     assert bp.hopf_points(bp.models.flutter, VALUES, "U", between=(5.0, 15.0)) == ()
 

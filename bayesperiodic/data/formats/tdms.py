@@ -20,6 +20,8 @@ SCALES_READ = (
     "Polynomial", "Linear", "RTD", "Strain", "Table", "Thermistor", "Thermocouple", "Add", "Subtract", "AdvancedAPI",
 )  # fmt: skip
 SCALE_PROPERTY = re.compile(r"NI_Scal|NI_Number_Of_Scales|unit_string|NI_UnitDescription")
+# Values of properties that a segment leaves out.
+IMPLIED_PROPERTIES = {WAVE_OFFSET: 0.0}
 SCALE_TYPE = re.compile(r"NI_Scale\[\d+\]_Scale_Type")
 # Seconds from 1904, from which dates of TDMS files count, to 1970 and to the end of the dates in nanoseconds.
 UNIX_EPOCH, LAST_SECOND = 24_107 * 86_400, 358 * 365 * 86_400
@@ -97,7 +99,7 @@ def _structure(mapped: _Mapped) -> tuple[dict[str, list[Change]], bool]:
             for path, pairs in (properties or {}).items():
                 if (known := self.object_metadata.get(path)) and known.num_values:
                     for name, value in pairs:
-                        if (before := known.properties.get(name, value)) != value:
+                        if (before := known.properties.get(name, IMPLIED_PROPERTIES.get(name, value))) != value:
                             changes.setdefault(path, []).append((known.num_values, name, before, value))
             return segment, properties
 

@@ -337,6 +337,17 @@ def test_a_later_segment_continues_the_first_one_to_half_a_step(tmp_path, first,
         )
 
 
+@pytest.mark.parametrize("start", [{}, {"wf_start_time": FIRST}])
+def test_an_offset_that_only_a_later_segment_states_is_none_of_the_first_samples(tmp_path, start):
+    """The first 300 samples of 0.01 s start at zero; an offset of 3 s continues them, one of 5 s does not."""
+    one = channel(X, wf_increment=0.01, **start)
+    continued = read(tmp_path, one + channel(X, wf_start_offset=3.0))
+    np.testing.assert_allclose(continued.time, np.arange(600) / 100, atol=1e-9)
+    refused(
+        tmp_path, one + channel(X, wf_start_offset=5.0), "from sample 300 starts 5 s after the first one and not 3 s"
+    )
+
+
 def test_each_later_segment_is_compared(tmp_path):
     parts = [channel(X, wf_increment=0.01, **AT_ZERO)] + [channel(X, wf_start_offset=start) for start in (3.0, 7.0)]
     refused(tmp_path, b"".join(parts), "whose segment from sample 600 starts 7 s after the first one and not 6 s")
