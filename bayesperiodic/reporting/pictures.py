@@ -121,7 +121,7 @@ def _place(box: BboxBase, drawing: Figure) -> list[float]:
     """Return left, top, right and bottom of a box [pt]."""
     scale, height = POINTS_PER_INCH / drawing.dpi, POINTS_PER_INCH * drawing.get_figheight()
     sides = box.x0 * scale, height - box.y1 * scale, box.x1 * scale, height - box.y0 * scale
-    return [round(float(side), 3) for side in sides]
+    return [round(float(side), 6) for side in sides]
 
 
 def most_correlated(posterior: Posterior) -> tuple[list[str], str]:

@@ -7,7 +7,7 @@
 const SVG = "http://www.w3.org/2000/svg";
 // Names of which curves can be hidden, by the field of a curve that holds them.
 const FIELDS = { experiment: "Experiments", channel: "Channels", curve: "Curves" };
-const ZOOM_STEP = 1.5, LARGEST_ZOOM = 12, SAME_PLACE = 0.01, MARK_RADIUS = 3.5;
+const ZOOM_STEP = 1.5, LARGEST_ZOOM = 12, SAME_PLACE = 0.01, MARK_RADIUS = 3.5, READ_RESOLUTION = 1e-6;
 // Numbers of names from which all can be set at once, and from which they are folded away.
 const SEVERAL = 5, MANY = 13;
 const RAISED = "⁰¹²³⁴⁵⁶⁷⁸⁹";
@@ -29,7 +29,10 @@ function formatted(value) {
 
 function valueAt(axis, fraction) {
   const [low, high] = axis.limits;
-  return axis.scale === "log" ? low * (high / low) ** fraction : low + (high - low) * fraction;
+  if (axis.scale === "log") return low * (high / low) ** fraction;
+  // Coordinates in the image are rounded, so that zero would be a small number.
+  const resolution = Math.abs(high - low) * READ_RESOLUTION;
+  return Math.round((low + (high - low) * fraction) / resolution) * resolution;
 }
 
 function xValue(panel, x) {
@@ -174,7 +177,7 @@ class InteractiveFigure {
     this.percent = element("output", { textContent: "100 %" });
     this.slider = element("input", { type: "range", min: 0, step: 1, value: 0 });
     this.slider.setAttribute("aria-label", "Point to read");
-    this.slider.oninput = () => this.read(this.stops[this.slider.value]);
+    this.slider.onfocus = this.slider.oninput = () => this.read(this.stops[this.slider.value]);
     this.values = element("p", { className: "values" });
     const tools = element("div", { className: "tools" },
       button("Zoom out", () => this.enlarge(1 / ZOOM_STEP)), button("Zoom in", () => this.enlarge(ZOOM_STEP)),
