@@ -85,6 +85,16 @@ def test_report_fits_the_width_of_the_screen(open_page, size):
     assert page.locator("body *").evaluate_all(outside) == []
 
 
+@pytest.mark.parametrize("path", ["written", "several_written"], indirect=True)
+def test_printed_tables_and_figures_fit_the_paper(open_page):
+    """The printable width of A4 is 19 cm, at 96 pixels per inch 718 pixels."""
+    page = open_page()
+    page.set_viewport_size({"width": 718, "height": 1000})
+    page.emulate_media(media="print")
+    right = page.locator("table, .picture").evaluate_all("all => all.map(e => e.getBoundingClientRect().right)")
+    assert max(right) <= 719 and page.locator(".choice, .reading").locator("visible=true").count() == 0
+
+
 def test_equations_are_typeset_by_the_browser(open_page):
     page = open_page()
     tall = page.locator(".equations math").evaluate_all("all => all.map(m => m.getBoundingClientRect().height)")
