@@ -246,7 +246,9 @@ class InteractiveFigure {
     const { left, top, width, height } = this.svg.getBoundingClientRect();
     const [x0, y0, across, down] = this.svg.getAttribute("viewBox").split(/\s+/).map(Number);
     const x = x0 + (event.clientX - left) / width * across, y = y0 + (event.clientY - top) / height * down;
-    const panel = this.panels.find(({ box, shown }) => shown && x >= box[0] && x <= box[2] && y >= box[1] && y <= box[3]);
+    const within = ([low, high], at) => low <= at && at <= high;
+    const panel = this.panels.find(({ box, shown }) =>
+      shown && within([box[0], box[2]], x) && within([box[1], box[3]], y));
     if (!panel) return;
     const stop = panel.curves.length && panel.x && panel.y ? nearest(this.stops, panel, x, y) : null;
     if (stop) {
@@ -293,12 +295,16 @@ function choice(figures) {
     tell();
   };
   const tell = () => {
-    status.textContent = "Shown: " + Object.keys(boxes).map((field) =>
-      `${boxes[field].length - hidden[field].size} of ${boxes[field].length} ${FIELDS[field].toLowerCase()}`).join(", ");
+    const counts = Object.keys(boxes).map((field) => {
+      const every = boxes[field].length;
+      return `${every - hidden[field].size} of ${every} ${FIELDS[field].toLowerCase()}`;
+    });
+    status.textContent = `Shown: ${counts.join(", ")}`;
   };
   const panel = element("div", { className: "choice" });
   for (const [field, title] of Object.entries(FIELDS)) {
-    const names = [...new Set(curves.map((curve) => curve[field]))].sort(new Intl.Collator("en", { numeric: true }).compare);
+    const order = new Intl.Collator("en", { numeric: true }).compare;
+    const names = [...new Set(curves.map((curve) => curve[field]))].sort(order);
     if (names.length < 2) continue;
     boxes[field] = names.map((name) => element("input", { type: "checkbox", value: name, checked: true }));
     const set = (text, checked) => element("button", { type: "button", textContent: text, onclick: () => {
@@ -309,9 +315,8 @@ function choice(figures) {
     const both = names.length < SEVERAL ? [] : [set("All", true), set("None", false)];
     const group = element("fieldset", {}, element("legend", { textContent: title }),
       element("div", { className: "names" }, ...both, ...labels));
-    const folded = names.length < MANY ? group
-      : element("details", {}, element("summary", { textContent: `Choose of ${names.length} ${title.toLowerCase()}` }), group);
-    panel.append(folded);
+    const summary = element("summary", { textContent: `Choose of ${names.length} ${title.toLowerCase()}` });
+    panel.append(names.length < MANY ? group : element("details", {}, summary, group));
   }
   panel.addEventListener("change", update);
   if (!Object.keys(boxes).length) return;
