@@ -1,5 +1,6 @@
 """Figures of estimates: fitted periods, loops, and traces of the draws."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +14,17 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.diagnostics.predictive import Prediction
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, OF_TABLES, axis_label, caveats_of, chosen, draws_label, styled
+from bayesperiodic.plot.style import (
+    COLOURS,
+    ENSEMBLES,
+    OF_TABLES,
+    axis_label,
+    caveats_of,
+    chosen,
+    curve_id,
+    draws_label,
+    styled,
+)
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.sampling.draws import Posterior
 
@@ -75,8 +86,9 @@ def fit(
     for row, (e, name) in enumerate(noisy, 2 * len(shown)):
         axes, half = figure.add_subplot(grid[row]), NINETY * estimate.input_sd[e.name][name]
         error = e.inputs[name] - estimate.inputs[e.name][name]
-        axes.fill_between(e.time, error - half, error + half, lw=0, label="90 %", **PREDICTION_STYLE)
-        axes.plot(e.time, error, lw=1.2, label="MAP", **FITTED_STYLE | {"marker": None})
+        gid = curve_id(f"error of {name}", name, e.name)
+        axes.fill_between(e.time, error - half, error + half, lw=0, label="90 %", gid=gid, **PREDICTION_STYLE)
+        axes.plot(e.time, error, lw=1.2, label="MAP", gid=gid, **FITTED_STYLE | {"marker": None})
         axes.axhline(0.0, lw=1.0, color=COLOURS["measured"])
         if row == 2 * len(shown):
             axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 0.95), borderpad=0.0)
@@ -97,13 +109,16 @@ def draw_period(
     """Draw a measured mean period with the fitted one, and the residual below."""
     residual = estimate.residuals[e.name][channel]
     predicted = e.outputs[channel] - residual
+    gid = functools.partial(curve_id, channel=channel, experiment=e.name)
     if prediction is not None:
         low, high = prediction.low[e.name][channel], prediction.high[e.name][channel]
-        _band(top, e, low, high, f"{100 * prediction.probability:.0f} % predictive band")
-        _band(below, e, low - predicted, high - predicted, "_")
-    _curve(top, e, e.time, e.outputs[channel], lw=1.6, label=_measured(problem, e.cycles), **MEASURED_STYLE)
-    _curve(top, e, e.time, predicted, lw=1.2, label="MAP", **FITTED_STYLE)
-    _curve(below, e, e.time, residual, lw=1.0, **MEASURED_STYLE)
+        label = f"{100 * prediction.probability:.0f} % predictive band"
+        _band(top, e, low, high, label, gid(label))
+        _band(below, e, low - predicted, high - predicted, "_", gid(label))
+    label = _measured(problem, e.cycles)
+    _curve(top, e, e.time, e.outputs[channel], lw=1.6, label=label, gid=gid(_origin(problem)), **MEASURED_STYLE)
+    _curve(top, e, e.time, predicted, lw=1.2, label="MAP", gid=gid("MAP"), **FITTED_STYLE)
+    _curve(below, e, e.time, residual, lw=1.0, gid=gid("residual"), **MEASURED_STYLE)
     below.axhline(0.0, lw=1.0, color=COLOURS["map"], ls="--")
     unit = problem.model.units.get(channel, "")
     top.set(ylabel=axis_label(channel, unit), title=axis_label(e.name))
@@ -122,12 +137,12 @@ def _curve(axes: Axes, e: Experiment, x: np.ndarray, y: np.ndarray, closed: bool
         axes.plot(x[at], y[at], **look | {"ls": "none"})
 
 
-def _band(axes: Axes, e: Experiment, low: np.ndarray, high: np.ndarray, label: str) -> None:
+def _band(axes: Axes, e: Experiment, low: np.ndarray, high: np.ndarray, label: str, gid: str) -> None:
     at = e.measured_points
     if at.all():
-        axes.fill_between(e.time, low, high, lw=0, label=label, **PREDICTION_STYLE)
+        axes.fill_between(e.time, low, high, lw=0, label=label, gid=gid, **PREDICTION_STYLE)
     else:
-        axes.vlines(e.time[at], low[at], high[at], lw=8, label=label, **PREDICTION_STYLE)
+        axes.vlines(e.time[at], low[at], high[at], lw=8, label=label, gid=gid, **PREDICTION_STYLE)
 
 
 @styled
@@ -174,9 +189,10 @@ def loops(
         amplitudes = _fourier.coefficients(e.inputs[input])
         rate = _fourier.on_grid(_fourier.derivative(amplitudes, e.frequency / e.periods), measured.size)
         labels = (_measured(problem, e.cycles), "MAP") if number == 0 else (None, None)
+        gids = [curve_id(curve, output, e.name) for curve in (_origin(problem), "MAP")]
         for axes, across in ((left, e.inputs[input]), (right, rate)):
-            _curve(axes, e, across, measured, closed=True, lw=1.6, label=labels[0], **MEASURED_STYLE)
-            _curve(axes, e, across, predicted, closed=True, lw=1.2, label=labels[1], **FITTED_STYLE)
+            _curve(axes, e, across, measured, closed=True, lw=1.6, label=labels[0], gid=gids[0], **MEASURED_STYLE)
+            _curve(axes, e, across, predicted, closed=True, lw=1.2, label=labels[1], gid=gids[1], **FITTED_STYLE)
     unit = problem.model.units.get(input, "")
     left.set(xlabel=axis_label(input, unit), ylabel=axis_label(output, problem.model.units.get(output, "")))
     right.set_xlabel(axis_label(f"rate of {input}", f"{unit}/s" if unit else ""))
@@ -184,9 +200,12 @@ def loops(
     return figure
 
 
+def _origin(problem: Problem) -> str:
+    return "synthetic" if any(e.synthetic for e in problem.experiments) else "measured"
+
+
 def _measured(problem: Problem, cycles: int) -> str:
-    synthetic = any(e.synthetic for e in problem.experiments)
-    return f"{'synthetic' if synthetic else 'measured'}, {f'mean of {cycles} cycles' if cycles > 1 else '1 cycle'}"
+    return f"{_origin(problem)}, {f'mean of {cycles} cycles' if cycles > 1 else '1 cycle'}"
 
 
 @styled

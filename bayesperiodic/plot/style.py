@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import json
 import re
 import textwrap
 from collections.abc import Callable, Sequence
@@ -91,6 +92,11 @@ def axis_label(name: str, unit: str = "") -> str:
     powers = re.sub(r"(?:\^|\*\*)\(?(-?\d+)\)?(?![\d./])", lambda match: match[1].translate(TO_SUPERSCRIPTS), unit)
     text = f"{name} [{powers}]" if unit not in ("", "1") else name
     return text.replace("$", r"\$")
+
+
+def curve_id(curve: str, channel: str, experiment: str) -> str:
+    """Return the group id (`gid`) of a curve, a band or points, by which the report finds what they show."""
+    return json.dumps([curve, channel, experiment])
 
 
 def chosen(names: Sequence[str] | None, every: tuple[str, ...], argument: str = "names") -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from bayesperiodic.diagnostics.response_curves import (
     residuals,
 )
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, legend_entries, styled
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, curve_id, legend_entries, styled
 from bayesperiodic.problem.fingerprint import check_results
 from bayesperiodic.sampling.draws import Posterior
 
@@ -108,6 +108,13 @@ def response(
     return figure
 
 
+def _gid(curve: str, channel: str, table: Sequence[Experiment]) -> str:
+    """Return the group id of what is drawn of a table, whose name and direction stand for its experiments."""
+    sweep = table[0].sweep
+    names = [] if sweep is None else [sweep.table, *([f"sweep {sweep.direction}"] if sweep.direction else [])]
+    return curve_id(curve, channel, ", ".join(names))
+
+
 def _colours(count: int) -> Sequence[str]:
     return [COLOURS["map"]] if count == 1 else [ENSEMBLES[k % len(ENSEMBLES)] for k in range(count)]
 
@@ -143,9 +150,10 @@ def _draw_points(
     label = "measured" if sweep.direction is None else f"measured, sweep {sweep.direction}"
     look: dict[str, Any] = {"ls": "", "marker": marker, "ms": 4, "color": colour, "label": label}
     f = np.array([e.frequency for e in table])
-    axes.plot(f, values, zorder=5, **look)
+    axes.plot(f, values, zorder=5, gid=_gid("measured", quantity.channel, table), **look)
+    gid = _gid("jump", quantity.channel, table)
     for k in jumps:
-        axes.plot(f[k : k + 2], values[k : k + 2], ls=":", lw=1.2, color="black", label="jump", zorder=2)
+        axes.plot(f[k : k + 2], values[k : k + 2], ls=":", lw=1.2, color="black", label="jump", zorder=2, gid=gid)
 
 
 def _draw_branch(
@@ -165,10 +173,12 @@ def _draw_branch(
         stable = bool(curve.stable[begin])
         part = slice(max(begin - 1, 0), end)
         style: dict[str, Any] = {"ls": "-", "label": "MAP"} if stable else {"ls": "--", "label": "MAP, unstable"}
+        style |= {"gid": _gid(style["label"], quantity.channel, table)}
         axes.plot(curve.frequency[part], values[part], color=colour, lw=1.4, zorder=3, **style)
     at = curve.folds
     if at.any():
         look: dict[str, Any] = {"marker": "o", "mfc": "white", "mew": 1.4, "ls": "", "ms": 6}
+        look |= {"gid": _gid("fold", quantity.channel, table)}
         axes.plot(curve.frequency[at], values[at], color=colour, label="fold", zorder=4, **look)
     return near
 
@@ -215,6 +225,7 @@ def _draw_bands(
         for label, (low, high, alpha) in BANDS.items():
             bounds = np.nanquantile(values, [low, high], axis=1)
             look: dict[str, Any] = {"color": COLOURS["mcmc"], "alpha": alpha, "lw": 0, "label": label, "zorder": 1}
+            look |= {"gid": _gid(f"{label} of the draws", quantity.channel, table)}
             if len(part) > 1:
                 axes.fill_between(f, *bounds, **look)
             else:
@@ -228,10 +239,11 @@ def _jumps(table: Sequence[Experiment], sheets: Any) -> list[int]:
 
 def _draw_residuals(axes: Axes, channel: str, every: Any, left: Any) -> None:
     for table, colour, marker in zip(every.values(), _colours(len(every)), MARKERS * 9, strict=False):
-        for e in table:
-            for values in (part for name, part in left[e.name] if name == channel):
-                at = np.full(values.size, e.frequency)
-                axes.plot(at, values, ls="", marker=marker, ms=3, color=colour, mfc="none")
+        parts = [(e.frequency, values) for e in table for name, values in left[e.name] if name == channel]
+        at = [frequency for frequency, values in parts for _ in values]
+        heights = [height for _, values in parts for height in values]
+        gid = _gid("residual", channel, table)
+        axes.plot(at, heights, ls="", marker=marker, ms=3, color=colour, mfc="none", gid=gid)
     axes.axhline(0.0, lw=1.0, color="black")
     for line in (-2.0, 2.0):
         axes.axhline(line, lw=0.8, ls=":", color="black")

@@ -12,7 +12,7 @@ from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.predictive import Prediction
 from bayesperiodic.estimation.adequacy import ADEQUACY_LEVEL
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.reporting import contents, html
+from bayesperiodic.reporting import contents, html, pictures
 from bayesperiodic.sampling.draws import Posterior
 
 
@@ -32,8 +32,11 @@ def report(
 
     The report contains what was found in the recordings, the data, the model with its equations, the estimates (MAP,
     Laplace and MCMC side by side), the residual, the verdicts, the diagnostics of the sampler, and settings, seed and
-    versions, with figures. It is a single accessible file without scripts or external resources: figures are embedded
-    SVG images, equations MathML. All text is escaped. An existing file is replaced only by a complete one.
+    versions, with figures. It is a single accessible file without external resources: figures are embedded SVG images,
+    equations MathML. All text is escaped. An existing file is replaced only by a complete one.
+
+    Where the browser runs its script, values are read from the figures by pointer, keyboard or screen reader,
+    experiments, channels and curves are shown or hidden, and figures are enlarged. Without it the report is complete.
 
     Diagnostics that are not given are computed in a few seconds, except the profiles of `identifiability`, which solve
     anew for every parameter, and the search for missing terms: to include them, give
@@ -72,7 +75,7 @@ def report(
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     page = bp.report(problem, fit, None, f"{folder}/report.html").read_text(encoding="utf-8")
-    >>> page[:15], "<script" in page
+    >>> page[:15], 'src="http' in page
     ('<!DOCTYPE html>', False)
     """
     in_folder(path)
@@ -80,6 +83,7 @@ def report(
         title=title or problem.model.name,
         given=contents.ReportInputs(problem, fit, posterior, identifiability, comparison, prediction, missing),
         content=contents,
+        pictures=pictures,
         plot=plot,
         level=ADEQUACY_LEVEL,
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),

@@ -1,24 +1,18 @@
-"""Inputs, tables and images of the report; the texts around them are in the template."""
+"""Inputs and tables of the report; the texts around them are in the template."""
 
-import base64
 import importlib.metadata
-import io
 import platform
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from bayesperiodic import _checks
 from bayesperiodic._verdicts import CAUTION, TONES
-from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.density.problem import Problem
-from bayesperiodic.density.sweeps import tables
 from bayesperiodic.diagnostics.comparison import Comparison, compare
 from bayesperiodic.diagnostics.identifiability import identifiability
 from bayesperiodic.diagnostics.missing_terms import MissingTerms
@@ -39,9 +33,7 @@ from bayesperiodic.sampling.draws import Posterior
 
 # Level of the whiteness test, and the ratio of robust to Laplace sd above which the report warns.
 NOT_WHITE, LARGE_RATIO = 0.01, 1.5
-LONGEST_PRIOR, MOST_PANELS = 120, 7
-# Experiments whose period is drawn; each takes about half a second and 80 kB.
-MOST_DRAWN = 24
+LONGEST_PRIOR = 120
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "xarray", "matplotlib")
 
 
@@ -160,44 +152,6 @@ def other_than(good: str, verdicts: Mapping[Any, str]) -> list[str]:
 def rms(values: np.ndarray) -> float:
     """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
-
-
-def drawn(given: ReportInputs) -> list[Experiment]:
-    """Return the experiments whose period is drawn: all, or those with the largest residuals, in their order."""
-    every, residuals = [e for e in given.problem.experiments if e.outputs], given.fit.residuals
-    whole = {channel: max(size, np.finfo(float).tiny) for channel, size in given.fit.rms.items()}
-    deviations = [max(rms(left) / whole[c] for c, left in residuals[e.name].items()) for e in every]
-    kept = np.sort(np.argsort(np.negative(deviations), kind="stable")[:MOST_DRAWN])
-    return [every[i] for i in kept.tolist()]
-
-
-def has_tables(problem: Problem) -> bool:
-    """Return whether there are points of response tables, which `plot.response` draws."""
-    return bool(tables(problem))
-
-
-def embedded(drawing: Figure, name: str) -> str:
-    """Return a figure as a data URL of an SVG image, reproducibly, and close it."""
-    buffer = io.BytesIO()
-    with plt.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
-        drawing.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    plt.close(drawing)
-    return f"data:image/svg+xml;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
-
-
-def most_correlated(posterior: Posterior) -> tuple[list[str], str]:
-    """Return the names of the most correlated quantities, and a sentence on the strongest correlation."""
-    names = posterior.names
-    correlations = np.atleast_2d(np.corrcoef(np.stack([posterior.draws(name) for name in names])))
-    np.fill_diagonal(correlations, 0.0)
-    correlations = np.nan_to_num(correlations)
-    kept = np.sort(np.argsort(-np.abs(correlations).max(axis=0), kind="stable")[:MOST_PANELS])
-    strongest = ""
-    if len(names) > 1:
-        i, j = sorted(np.unravel_index(np.argmax(np.abs(correlations)), correlations.shape))
-        value = number(float(correlations[i, j]), 2)
-        strongest = f" The strongest correlation is {value}, between {names[i]} and {names[j]}."
-    return [names[i] for i in kept], strongest
 
 
 def experiments(given: ReportInputs) -> Rows:

@@ -1,9 +1,12 @@
 """Formatting of numbers, units, names and equations, and the template engine."""
 
 import re
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from hashlib import sha256
+from importlib.resources import files
 from itertools import groupby
 from math import floor, isfinite, isinf, isnan, log10
 from typing import Any
@@ -329,5 +332,7 @@ def _environment() -> Environment:
 
 
 def page(**content: Any) -> str:
-    """Render the page; all text is escaped."""
-    return _environment().get_template("page.html").render(content)
+    """Render the page; all text is escaped, and the browser runs no script but the one with this digest."""
+    script = (files("bayesperiodic.reporting") / "templates" / "page.js").read_text(encoding="utf-8")
+    digest = b64encode(sha256(script.encode()).digest()).decode("ascii")
+    return _environment().get_template("page.html").render(content, script=Markup(script), digest=digest)

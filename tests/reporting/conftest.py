@@ -1,4 +1,5 @@
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,6 +7,7 @@ import sympy as sp
 
 import bayesperiodic as bp
 from tests.known import LINEAR, linear_experiment
+from tests.problems import named, pendulum_problem, pendulum_run
 from tests.reporting.reading import Page
 
 ATTACK = "\"><script>alert(1)</script><img src=x onerror=alert(2)> & 'more' $x^$"
@@ -63,3 +65,17 @@ def hostile(tmp_path_factory):
         fit = bp.map_estimate(problem, progress=False)
         posterior = bp.sample(problem, fit, seed=1, ensembles=2, max_steps=100, progress=False)
         return bp.report(problem, fit, posterior, tmp_path_factory.mktemp("hostile") / "it's <b>.html", title=ATTACK)
+
+
+@pytest.fixture(scope="session")
+def several():
+    """Return a problem of two experiments with two channels, one of them measured at 20 points, and its estimate."""
+    masked = replace(pendulum_run(seed=2), name=NAME, mask=np.arange(200) % 10 == 0, independent={})
+    problem = pendulum_problem([named(pendulum_run(), "whole"), masked])
+    return problem, bp.map_estimate(problem, starts=1, progress=False)
+
+
+@pytest.fixture(scope="session")
+def several_written(several, tmp_path_factory):
+    """Return the path of its report."""
+    return bp.report(*several, None, tmp_path_factory.mktemp("several") / "report.html")
