@@ -79,7 +79,8 @@ class SurrogateMove(CountedMove):
         moved = one.moved(y, random)
         there = one.coordinates(moved)
         volumes = np.sum((x - there)[:, one.logarithmic], axis=1)
-        return self._transform.whiten(there), one.log_density(y) - one.log_density(moved) + volumes
+        factors = one.log_density(y) - one.log_density(moved) + volumes
+        return self._transform.whiten(there), np.where(np.all(moved == y, axis=1), -np.inf, factors)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ from bayesperiodic.density.log_posterior import SamplingCoordinates
 from bayesperiodic.priors.joint import JointPrior
 from bayesperiodic.sampling.proposals import LIGHT_TAILS
 
-# Trajectories of a proposal, largest number of leapfrog steps of each, and their length in units of the widths.
+# Trajectories of a proposal, largest number of leapfrog steps of each, and their length in units of the widths, from a
+# quarter of which to 1.6 times as much is drawn: it may be smaller far from the mode, where parameters are near zero.
 TRAJECTORIES, MOST_LEAPS, LEAP = 10, 15, 0.1
 # Curvature of the likelihood along an axis, in units of the posterior's, that counts as none.
 LEAST_CURVATURE = 0.01
@@ -53,7 +54,8 @@ class Surrogate:
         of_prior = np.zeros_like(precision)
         of_prior[:count, :count] = prior.curvature(mode[:count]) * np.outer(scale[:count], scale[:count])
         information = precision - of_prior + np.diag(by_prior * scale * logarithmic) + np.diag(slope * logarithmic)
-        widths = np.sqrt(np.diag(covariance)) * scale
+        widths = np.sqrt(np.diag(covariance))
+        widths = np.where(logarithmic, np.minimum(widths, 1.0), widths) * scale
         relative, directions = np.linalg.eigh(information * np.outer(widths / scale, widths / scale))
         curved = relative > LEAST_CURVATURE
         relative, directions = relative[curved], directions[:, curved]
@@ -92,7 +94,7 @@ class Surrogate:
         self, y: np.ndarray, here: np.ndarray, slope: np.ndarray, random: np.random.RandomState
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return values, log-densities and gradients after a trajectory; those that leave the support go back."""
-        momentum, leap = random.standard_normal(y.shape), LEAP * random.uniform(0.7, 1.3, (len(y), 1))
+        momentum, leap = random.standard_normal(y.shape), LEAP * 10.0 ** random.uniform(-0.6, 0.2, (len(y), 1))
         energy = here - 0.5 * np.sum(momentum**2, axis=1)
         there, inside, leaps = y, np.ones(len(y), dtype=bool), random.randint(MOST_LEAPS // 3, MOST_LEAPS + 1)
         new = slope
