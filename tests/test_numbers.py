@@ -874,7 +874,7 @@ def diode_forecasts():
     yield f"the {sum(not row['used'] for row in rows)} records outside the fit"
     draws, longest = study_of_diode.DRAWS, prediction.LONGEST
     yield (
-        f"From the numbers n of {draws} draws, the motions \"period 1\" to \"period {longest}\" and \"chaos\" have the "
+        f'From the numbers n of {draws} draws, the motions "period 1" to "period {longest}" and "chaos" have the '
         f"probabilities (n + 1/2)/{draws + len(held_out.CLASSES) * held_out.ADDED}"
     )
     texts = {
