@@ -16,6 +16,8 @@ import pytest
 
 from studies.benchmark import large
 from studies.coverage import run as study_of_coverage
+from studies.diode import held_out, prediction
+from studies.diode import run as study_of_diode
 from tests.numbers_without_results import WITHOUT_RESULTS
 
 ROOT = Path(__file__).parents[1]
@@ -865,6 +867,52 @@ def diode():
         f"{min(usual):.1f} to {max(usual):.0f} % away"
     )
     yield f"In the {len({o['frequency_Hz'] for o in orbits})} records without a period"
+
+
+@on("docs/studies/diode.md")
+def diode_forecasts():
+    d = results("diode")
+    rows, scores = d["records"], d["log_scores"]
+    yield f"the {sum(not row['used'] for row in rows)} records outside the fit"
+    draws, longest = study_of_diode.DRAWS, prediction.LONGEST
+    yield (
+        f'From the numbers n of {draws} draws, the motions "period 1" to "period {longest}" and "chaos" have the '
+        f"probabilities (n + 1/2)/{draws + len(held_out.CLASSES) * held_out.ADDED}"
+    )
+    texts = {
+        "posterior": "Laplace's covariance, as if the model were true", "robust": "Robust covariance",
+        "next record": "Robust covariance, model error of the next record",
+        "neighbours": "Two neighbouring records on each side, no model",
+        "all others": "Frequencies of the motions in all other records",
+    }  # fmt: skip
+    for name, words in texts.items():
+        own = scores[name]
+        less = "" if name == "posterior" else f"{own['difference']:.1f} ± {own['difference_sd']:.1f} "
+        line = (
+            f"| {words} | {own['sum']:.1f} | {own['expected']:.1f} ± {own['expected_sd']:.1f} | {less}| "
+            f"{own['right']} of {len(rows)} |"
+        )
+        yield line.replace("-", "−")
+    drives = d["effective_drives"].values()
+    frequency, amplitude = (
+        100 * np.sqrt(np.mean([own[key] ** 2 for own in drives])) for key in ("frequency", "amplitude")
+    )
+    yield f"differ from the measured ones by {frequency:.1f} and {amplitude:.1f} % (rms)"
+    # Each step makes the score better, by less than two standard errors; what is expected.
+    steps = [scores[name]["sum"] for name in ("posterior", "robust", "next record")]
+    assert steps == sorted(steps)
+    assert all(0.0 < own["difference"] < 2 * own["difference_sd"] for own in (scores["robust"], scores["next record"]))
+    over = [(own["expected"] - own["sum"]) / own["expected_sd"] for own in map(scores.get, texts)]
+    assert 0.5 < min(over[:2]) < max(over[:2]) < 1.5
+    assert abs(over[2]) < 0.1
+    better = np.log([row["held_out"]["next record"] / row["held_out"]["neighbours"] for row in rows])
+    yield f"better by {better.sum():.1f} ± {np.sqrt(better.size) * better.std(ddof=1):.1f}"
+    by_model = ("posterior", "robust", "next record")
+    *most, one = (
+        f"{row['frequency_Hz'] / 1e3:.0f}" for row in rows
+        if row["measured_period"] is None and max(row["held_out"][name] for name in by_model) < 0.1
+    )  # fmt: skip
+    yield f"give less than 0.1 to the chaos of the records at {', '.join(most)} and {one} kHz"
 
 
 def span(values):

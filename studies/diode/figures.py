@@ -100,3 +100,22 @@ def steps(fits: Mapping[str, rig.Fitted], used: Sequence[rig.Record], *, synthet
     ax.set_title("What each term explains" + (" (synthetic data)" if synthetic else ""))
     ax.legend(frameon=False, fontsize="small", loc="upper left")
     return figure
+
+
+def probabilities(table: Sequence[Mapping[str, Any]], *, synthetic: bool) -> Figure:
+    """Return the probability that each forecast gives the measured motion of a record, that was not fitted."""
+    figure, ax = plt.subplots(figsize=(8.0, 3.8), layout="constrained")
+    frequencies = [1e-3 * row["frequency_Hz"] for row in table]
+    styles = {
+        "neighbours": ("two records on each side", "_", "#555555"),
+        "posterior": ("draws as if the model were true", "v", "#E69F00"),
+        "robust": ("robust covariance", "o", "#0072B2"),
+        "next record": ("and model error of the next record", "D", "#D55E00"),
+    }
+    for name, (text, marker, colour) in styles.items():
+        values = [row["held_out"][name] for row in table]
+        ax.plot(frequencies, values, marker, ms=5, mew=1.4, mfc="none", color=colour, label=text)
+    ax.set(yscale="log", ylim=(0.003, 1.3), xlabel="drive frequency [kHz]", ylabel="probability of the measured motion")
+    ax.set_title("Predicted without the record itself" + (" (synthetic data)" if synthetic else ""))
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize="small")
+    return figure

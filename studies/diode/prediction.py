@@ -22,22 +22,21 @@ ORDER = ("R", "R_s", "L", "R_L", "C_L", "V_f", "C_j", "Q_0", "transit", "lifetim
 Draw = Mapping[str, float]
 
 
-def draws_of(final: rig.Fitted, count: int, seed: int) -> list[dict[str, float]]:
-    """Return draws of the parameters with the robust standard deviations and Laplace's correlations.
+def draws_of(final: rig.Fitted, count: int, seed: int, *, robust: bool = True) -> list[dict[str, float]]:
+    """Return draws of the parameters with the robust covariance, or with Laplace's as if the model were true.
 
     They are log-normal, but for the bypass, which can be zero: it is normal.
     """
     fit, known = final.fit, rig.values_of(final)
     names = [name for name in ORDER if name in fit.theta]
-    covariance = fit.covariance.loc[names, names].to_numpy()
+    table = fit.robust_covariance if robust else fit.covariance
+    estimate, positive = np.array([fit.theta[name] for name in names]), np.array(names) != "bypass"
+    scale = np.where(positive, estimate, 1.0)
+    covariance = table.loc[names, names].to_numpy() / np.outer(scale, scale)
     sd = np.sqrt(np.diag(covariance))
-    estimate = np.array([fit.theta[name] for name in names])
-    robust_sd = np.array([fit.robust_sd[name] for name in names])
-    correlation = covariance / np.outer(sd, sd)
     generator = np.random.default_rng(seed)
-    normal = generator.multivariate_normal(np.zeros(len(names)), correlation, size=count, method="cholesky")
-    values, positive = estimate + normal * robust_sd, np.array(names) != "bypass"
-    values[:, positive] = (estimate * np.exp(normal * robust_sd / np.where(positive, estimate, np.inf)))[:, positive]
+    normal = generator.multivariate_normal(np.zeros(len(names)), covariance / np.outer(sd, sd), count, method="eigh")
+    values = np.where(positive, estimate * np.exp(normal * sd), estimate + normal * sd)
     return [dict(zip(names, row.tolist(), strict=True)) | {n: known[n] for n in ("R", "R_s")} for row in values]
 
 
@@ -144,10 +143,9 @@ def measured_period(record: rig.Record) -> int | None:
     return period_of(np.tile(every, (LONGEST, 1)))
 
 
-def probabilities(motions: Sequence[int | None]) -> dict[str, float]:
-    """Return the fraction of draws by period as text, and of "chaos"."""
-    labels = pd.Series(["chaos" if own is None else str(own) for own in motions])
-    return {str(key): float(value) for key, value in labels.value_counts(normalize=True).items()}
+def probabilities(motions: Sequence[str]) -> dict[str, float]:
+    """Return the fraction of draws by motion."""
+    return {str(key): float(value) for key, value in pd.Series(motions).value_counts(normalize=True).items()}
 
 
 def doubling(draw: Draw, experiment: bp.Experiment, until: float, step: float = 2000.0) -> float | None:

@@ -15,7 +15,7 @@ import pandas as pd
 
 import bayesperiodic as bp
 from studies import common
-from studies.diode import chaos, figures, prediction, rig
+from studies.diode import chaos, figures, held_out, prediction, rig
 
 DRAWS, QUICK_DRAWS = 100, 8
 # Draws whose orbits are followed to their period doublings.
@@ -48,6 +48,7 @@ def run(options: argparse.Namespace) -> None:
                   f"true values {rig.TRUE}")  # fmt: skip
         # The last model first, for the predictions wait for it; then the search that takes longest.
         estimates = {LAST: pool.submit(rig.estimate, used, rig.STEPS_OF_MODEL[LAST], share)}
+        others = {r.frequency: pool.submit(held_out.left_out, r, used, rig.STEPS_OF_MODEL[LAST], share) for r in used}
         searches = {model: pool.submit(_search, model, used, share) for model in CHOSEN}
         estimates |= {
             model: pool.submit(rig.estimate, used, free, share)
@@ -55,11 +56,11 @@ def run(options: argparse.Namespace) -> None:
         }  # fmt: skip
         with watch.part("map", "finding the MAP points of four models, and what three of them lack"):
             final = estimates[LAST].result()
-        with watch.part("predict", f"integrating {draws} draws at the frequencies of all records"):
+        with watch.part("left out", "fitting the last model without each of the fitted records"):
+            left = {frequency: own.result() for frequency, own in others.items()}
+        with watch.part("predict", f"integrating {draws} draws of three forecasts at the frequencies of all records"):
+            forecasts, motions = held_out.forecasts(records, final, left, draws, options.seed)
             sample = prediction.draws_of(final, draws, options.seed)
-            frequencies, sources = [r.frequency for r in records], [prediction.source_of(r) for r in records]
-            swept = prediction.sweep(sample, frequencies, sources)
-            motions = [[prediction.period_of(v) for v in own] for own in swept]
         with watch.part("orbits", "solving the orbits of periodic records that were not fitted, and their multipliers"):
             table = _records(records, used, final, motions, sample[:FOLLOWED])
             doublings = _doublings(records, final, sample[:FOLLOWED])
@@ -70,7 +71,12 @@ def run(options: argparse.Namespace) -> None:
         with watch.part("missing terms", "waiting for the search for missing terms"):
             fits = {model: estimates[model].result() for model in rig.STEPS_OF_MODEL}
             found = {model: own.result() for model, own in searches.items()}
+    measured = [held_out.label(row["measured_period"]) for row in table]
+    for row, own, kind in zip(table, forecasts, measured, strict=True):
+        row["held_out"] = {name: p[kind] for name, p in own.items()}
+        row["next_record"] = own["next record"]
     with watch.part("figures", "drawing"):
+        drawn["probabilities"] = figures.probabilities(table, synthetic=data["synthetic"])
         drawn["steps"] = figures.steps(fits, used, synthetic=data["synthetic"])
         if unstable:
             drawn["chaos"] = figures.unstable_orbits(records, unstable, synthetic=data["synthetic"])
@@ -84,6 +90,8 @@ def run(options: argparse.Namespace) -> None:
         "doublings": doublings,
         "unstable_orbits": [{key: value for key, value in row.items() if key != "orbit"} for row in unstable],
         "score": _score(table),
+        "log_scores": held_out.log_scores(forecasts, measured),
+        "effective_drives": {f"{f / 1e3:g} kHz": own.drive and own.drive._asdict() for f, own in left.items()},
     }
     print("\n" + _tables(results, final, found) + "\n")
     common.finish(options.out, results, watch, paths, synthetic=data["synthetic"])
@@ -93,7 +101,7 @@ def _records(
     records: Sequence[rig.Record],
     used: Sequence[rig.Record],
     final: rig.Fitted,
-    motions: list[list[int | None]],
+    motions: list[dict[str, list[str]]],
     sample: list[dict[str, float]],
 ) -> list[dict[str, Any]]:
     """Return the row of every record."""
@@ -106,7 +114,7 @@ def _records(
             "used": at,
             "measured_period": prediction.measured_period(record),
             "tested_period": record.period,
-            "predicted": prediction.probabilities([own[number] for own in motions]),
+            "predicted": prediction.probabilities(motions[number]["robust"]),
             "unexplained": unexplained,
             "multiplier": None if solution is None else float(solution.multipliers.real[0]),
             "multiplier_sd": prediction.multiplier_sd(record, solution, sample) if at and solution else None,
@@ -227,9 +235,26 @@ def _tables(results: Mapping[str, Any], final: rig.Fitted, searches: Mapping[str
         f"{right['others'][0]} of {right['others'][1]} others.",
         f"Largest unexplained variance: {_percent(largest['used'])} of fitted records, "
         f"{_percent(largest['not_used'])} of periodic ones that were not fitted.",
-        *(_doubling_line(row) for row in results["doublings"]),
+        *(_doubling_line(row) for row in results["doublings"]), "",
+        _forecasts_table(results), "",
         "Unstable orbits in records without a period, of periods 1 to 4; distances in % of the variance:",
         _unstable_table(results["unstable_orbits"]),
+    ])  # fmt: skip
+
+
+def _forecasts_table(results: Mapping[str, Any]) -> str:
+    """Return the log scores of the forecasts, and the effective drives, as a table and a sentence."""
+    drives = [own for own in results["effective_drives"].values() if own]
+    sizes = " and ".join(
+        f"{_percent(float(np.sqrt(np.mean([own[name] ** 2 for own in drives]))))} in {name}"
+        for name in held_out.Drive._fields
+    )
+    return "\n".join([
+        "Log scores, the sum of ln p of the measured motions over all records, each predicted without itself:",
+        pd.DataFrame(results["log_scores"]).T.to_string(float_format="{:.2f}".format),
+        "`expected`: of a calibrated forecast; `difference`: from draws as if the model were true.",
+        f"The effective drives of {len(drives)} of {len(results['effective_drives'])} fitted records, in models of the "
+        f"others, differ from the measured ones by {sizes} (rms).",
     ])  # fmt: skip
 
 
