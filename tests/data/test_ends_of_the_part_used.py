@@ -16,7 +16,7 @@ NUMBER = np.arange(60)
 
 
 def parts_of(lines, first=20, last=40, level=None):
-    """Return 60 windows of channels, the second at harmonic 2, and the steady part from window `first` to `last` − 1."""
+    """Return 60 windows of channels, the second at harmonic 2, and the part from window `first` to `last` − 1."""
     lines = np.asarray(lines, dtype=complex)
     lines = lines[:, None] if lines.ndim == 1 else lines
     every = windows_of(lines)
