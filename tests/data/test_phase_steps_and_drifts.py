@@ -212,10 +212,10 @@ def test_steps_in_words():
     assert (x.kind, x.channel, x.severity, x.count, x.share) == ("phase step", "x", RUINOUS, 4, 0.08)
     assert x.times.tolist() == [[2.0, 2.0], [4.0, 4.0], [6.0, 6.0], [8.0, 8.0]]
     assert x.text == (
-        "x is earlier by 0.025 s (36°, up to whole cycles) against u from about 2 s on, as after 5 lost samples of x; x "
-        "is later by 0.0125 s (18°, up to whole cycles) against u from about 4 s on, as after 12.5 lost samples of u; x "
-        "is earlier by 0.0025 s (3.6°, up to whole cycles) against u from about 6 s on, as after 0.5 lost samples of x "
-        "(4 steps)"
+        "x is earlier by 0.025 s (36°, up to whole cycles) against u from about 2 s on, as after 5 lost samples of x; "
+        "x is later by 0.0125 s (18°, up to whole cycles) against u from about 4 s on, as after 12.5 lost samples of "
+        "u; x is earlier by 0.0025 s (3.6°, up to whole cycles) against u from about 6 s on, as after 0.5 lost samples "
+        "of x (4 steps)"
     )
     assert "which delay is right is unknown" in x.cure
     assert (every.channel, every.severity, every.count, every.share) == ("", SERIOUS, 2, 0.04)
