@@ -91,7 +91,7 @@ def test_the_order_of_parameters_does_not_change_the_test():
 
 
 def test_positive_parameters_are_tested_by_their_logarithms():
-    """Of a log-normal prior of c: the interval of the data is symmetric in ln c, and p that of the sum of variances there."""
+    """With a log-normal prior of c the interval of the data is symmetric in ln c; p is that of the sum of variances."""
     width = 0.2
     run = linear_experiment(TRUTH, SD, seed=1)
     priors = {"c": bp.LogNormal(60.0, width)}
