@@ -208,10 +208,16 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
 
 def fractions_left(problem: Problem, residuals: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, float]:
     """Return the fraction of each channel's variance that is left in residuals, of quantities of their mean square."""
-    measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} | _scales(e) for e in problem.experiments}
+    measured = {e.name: {c: _varying(e, y) for c, y in e.outputs.items()} | _scales(e) for e in problem.experiments}
     compared = (*problem.channels, *problem.quantities)
     power = {c: max(pooled(problem, c, measured) ** 2, np.finfo(float).tiny) for c in compared}
     return {c: pooled(problem, c, residuals) ** 2 / whole for c, whole in power.items()}
+
+
+def _varying(experiment: Experiment, output: np.ndarray) -> np.ndarray:
+    """Return an output about its mean over the measured points; itself where the points of a mask have one value."""
+    seen = output[experiment.measured_points]
+    return output - seen.mean() if experiment.mask is None or np.ptp(seen) > 0.0 else output
 
 
 def _scales(experiment: Experiment) -> dict[str, np.ndarray]:

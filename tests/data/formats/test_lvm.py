@@ -407,3 +407,11 @@ def test_damaged_file_is_read_or_refused_by_one_error(tmp_path, capfd):
 def test_dates_beyond_nanoseconds_are_no_origin(date, origin):
     """In nanoseconds NumPy reads the year 2300 as 1715."""
     assert lvm._origin(date, "00:00:00") == (origin and np.datetime64(origin, "ns"))
+
+
+@pytest.mark.parametrize("separator", [",", "\t", ";"])
+def test_the_last_row_is_shorter_by_its_last_number_only(separator):
+    """Files that end within a number; other columns may have fewer or more digits."""
+    rows = [separator.join(["0.1", "0.25"]), separator.join(["0.12345", "0.3"])]
+    assert lvm._is_shorter(rows, separator) and not lvm._is_shorter(rows[::-1], separator)
+    assert not lvm._is_shorter([rows[0], rows[0]], separator)
