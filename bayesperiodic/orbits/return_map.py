@@ -10,6 +10,7 @@ from math import comb
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.special import factorial
 
@@ -25,6 +26,8 @@ MOST_LEVERAGE = 0.9
 STEEPEST_SLOPE, CURVATURE_LENGTH = 10.0, 0.1
 # Largest distance from the nearest centre of an atlas, in bandwidths, with up to two coordinates and with more.
 FARTHEST_FROM_CENTRE = {2: 1.0, 3: 2.0}
+# Eigenvalues of normal equations below this fraction of the largest one are left out.
+SINGULAR = 1e-10
 # Distance of two phases in a search tree, in units of the attractor's size.
 APART = 1e3
 # What follows neighbours (n, values): of their positions (n,) among the arguments and the points (n, d) themselves.
@@ -46,24 +49,30 @@ def monomials(coordinates: int, degree: int) -> np.ndarray:
 
 
 class _Terms(NamedTuple):
-    """Terms of polynomials of one degree, their products, and where these are in sums by the last coordinate."""
+    """Terms of polynomials of one degree, and where their products are.
+
+    A product of two terms is a monomial of the other coordinates times a power of the last one.
+    """
 
     powers: np.ndarray  # (terms, d)
     factorials: np.ndarray  # products of the factorials of the powers, (terms,)
-    products: np.ndarray  # powers of the products of two terms, (products, d); the terms themselves come first
-    belongs: np.ndarray  # which product two terms have, as zeros and ones, (terms, terms, products)
-    others: np.ndarray  # powers of all coordinates but the last, (rows, d - 1)
-    row: np.ndarray  # among those, of the product of two terms, (terms, terms)
+    row: np.ndarray  # of the product of two terms, among monomials of the other coordinates, (terms, terms)
     column: np.ndarray  # power of the last coordinate in it, (terms, terms)
+    sizes: list[int]  # number of monomials of the other coordinates that each power of the last one goes with
+    belongs: csr_array  # which product two terms have, by the power and then the monomial, (terms·terms, products)
 
 
 @cache
 def _terms(coordinates: int, degree: int) -> _Terms:
-    powers, products = monomials(coordinates, degree), monomials(coordinates, 2 * degree)
-    others, sums = monomials(coordinates - 1, 2 * degree), powers[:, None] + powers
-    belongs = np.all(sums[..., None, :] == products, axis=-1).astype(float)
-    row = np.argmax(np.all(sums[..., None, :-1] == others, axis=-1), axis=-1)
-    return _Terms(powers, factorial(powers).prod(1), products, belongs, others, row, sums[..., -1])
+    powers, others = monomials(coordinates, degree), monomials(coordinates - 1, 2 * degree)
+    sums = powers[:, None] + powers
+    row, column = np.argmax(np.all(sums[..., None, :-1] == others, axis=-1), axis=-1), sums[..., -1]
+    # Monomials are in the order of their degree: those that a power goes with are the first ones.
+    sizes = [comb(coordinates - 1 + rest, rest) for rest in range(2 * degree, -1, -1)]
+    place = (np.cumsum(sizes) - sizes)[column] + row
+    pairs = np.arange(place.size)
+    belongs = csr_array((np.ones(place.size), (pairs, place.ravel())), shape=(place.size, sum(sizes)))
+    return _Terms(powers, factorial(powers).prod(1), row, column, sizes, belongs)
 
 
 class LocalFit(NamedTuple):
@@ -259,37 +268,41 @@ class ReturnMap:
         bandwidth = np.maximum(bandwidth, np.max(self.noise) / MOST_NOISE)
         away = self._away(centres, index)
         image, reference = self._images(away, index)
-        system = self._system(away, bandwidth, index, inside, degree, image if shrunk else None, wants_influence)
-        solution = system.solve(image)
-        influence = np.empty((len(centres), 0, 1 + away.shape[2], away.shape[2]))
+        system = self._system(away, bandwidth, index, inside, degree, image if shrunk else None)
+        solution, d = system.solve(image), away.shape[2]
+        influence = np.empty((len(centres), 0, 1 + d, d))
         if wants_influence:
-            influence = system.influence(image, solution)
+            each = np.repeat(np.eye(1 + d), d, axis=0), np.tile(np.eye(d), (1 + d, 1))
+            influence = system.influence(image, solution, *each).reshape(len(centres), 1 + d, d, -1)
+            influence = influence.transpose(0, 3, 1, 2)
         derivatives = solution * system.scale
         value = centres + reference + derivatives[:, 0]
         return LocalFit(value, derivatives, bandwidth, index, influence, system.effective)
 
     def regress(
-        self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray, degree: int, signals: Signals
-    ) -> list["Regression"]:
+        self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray, degree: int, signals: Signals,
+        *, influence: bool = True,
+    ) -> list["Regression"]:  # fmt: skip
         """Fit what follows the neighbours, as `fit_within` fits their images: the same neighbours and weights.
 
-        `signals` returns it, (n, values), for positions (n,) among the arguments and these points (n, d) near a centre.
+        Faster without `influence`. `signals` returns it, (n, values), for positions (n,) among the arguments and these points (n, d) near a centre.
         """
         results = []
         for centre, phase, width in zip(centres[:, None], phases[:, None], bandwidths[:, None], strict=True):
             index, inside, bandwidth = self._within(centre, phase, width, degree)
             index, inside = index[:, inside[0]], inside[:, inside[0]]
             away = self._away(centre, index)
-            system = self._system(away, bandwidth, index, inside, degree, self._images(away, index)[0], True)
+            system = self._system(away, bandwidth, index, inside, degree, self._images(away, index)[0])
             target = signals(index[0], centre + away[0])
             reference, target = target[:1], (target - target[:1])[None]
             solution = system.solve(target)
             derivatives = (solution * system.scale)[0]
             weights = (system.inverse @ system.regressors)[0, 0]
-            slopes, influence = derivatives[1 : 1 + len(self.turn)], system.influence(target, solution)[0, :, 0]
-            results.append(
-                Regression(reference[0] + derivatives[0], slopes, index[0], influence, float(np.sum(weights**2)))
-            )
+            value, slopes, values = reference[0] + derivatives[0], derivatives[1 : 1 + len(self.turn)], target.shape[2]
+            errors = np.empty((0, values))
+            if influence:
+                errors = system.influence(target, solution, np.ones((values, 1)), np.eye(values))[0].T
+            results.append(Regression(value, slopes, index[0], errors, float(np.sum(weights**2))))
         return results
 
     def _away(self, centres: np.ndarray, index: np.ndarray) -> np.ndarray:
@@ -306,7 +319,7 @@ class ReturnMap:
 
     def _system(
         self, away: np.ndarray, bandwidth: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int,
-        shrinking: np.ndarray | None, wants_influence: bool,
+        shrinking: np.ndarray | None,
     ) -> "_NormalEquations":  # fmt: skip
         """Return the normal equations of fits; the residuals of the images `shrinking` determine their shrinkage."""
         width = bandwidth[:, None, None]
@@ -316,57 +329,65 @@ class ReturnMap:
         d, weight = len(by_coordinate), by_coordinate[0][:, 0]
         terms = _terms(d, degree)
         orders = terms.powers.sum(1)
-        functions = _products(by_coordinate, terms.products if wants_influence else terms.powers)
+        rows = _products(by_coordinate[:-1], 2 * degree) if d > 1 else np.ones((1, 1, weight.shape[1]))
+        regressors = _with_last(rows, by_coordinate, degree)
         # The sums of products by powers of the last coordinate: one matrix product.
-        rows = _products(by_coordinate[:-1], terms.others) if d > 1 else np.ones((1, 1, weight.shape[1]))
         table = rows @ by_coordinate[-1].mT
         normal = table[:, terms.row, terms.column]
-        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+        inverse = _inverse(normal)
         effective = weight.sum(1) ** 2 / (weight**2).sum(1)
         if d > 2 and shrinking is not None:
-            target = functions[:, : len(orders)] @ shrinking
+            target = regressors @ shrinking
             rest = np.einsum("mn,mnc->mc", weight, shrinking**2) - (inverse @ target * target).sum(1)
             free = np.maximum(effective - len(orders), 1.0) / effective
             variance = np.maximum(rest, 0.0).max(1) / weight.sum(1) / free
             prior = STEEPEST_SLOPE * bandwidth[:, None] * (bandwidth[:, None] / CURVATURE_LENGTH) ** (orders - 1.0)
             shrinkage = np.where(orders > 0, variance[:, None] / prior**2, 0.0)
-            inverse = np.linalg.pinv(normal + shrinkage[:, :, None] * np.eye(len(orders)), rcond=1e-10, hermitian=True)
+            inverse = _inverse(normal + shrinkage[:, :, None] * np.eye(len(orders)))
         scale = (terms.factorials / bandwidth[:, None] ** orders)[..., None]
-        return _NormalEquations(functions, terms, inverse, scale, effective)
+        return _NormalEquations(regressors, rows, by_coordinate[-1], terms, inverse, scale, effective)
 
 
 class _NormalEquations(NamedTuple):
     """Normal equations of local polynomials about m centres, with n neighbours each."""
 
-    functions: np.ndarray  # the terms, and for `influence` also their other products, (m, terms or products, n)
+    regressors: np.ndarray  # the terms, (m, terms, n)
+    rows: np.ndarray  # monomials of all coordinates but the last up to twice the degree, (m, rows, n)
+    last: np.ndarray  # powers of the last coordinate, (m, powers, n)
     terms: _Terms
     inverse: np.ndarray  # (m, terms, terms)
     scale: np.ndarray  # derivatives over coefficients, (m, terms, 1)
     effective: np.ndarray  # effective number of neighbours, (m,)
 
-    @property
-    def regressors(self) -> np.ndarray:
-        """The terms, (m, terms, n)."""
-        return self.functions[:, : len(self.terms.powers)]
-
     def solve(self, target: np.ndarray) -> np.ndarray:
         """Return the coefficients (m, terms, values) of polynomials through targets (m, n, values)."""
         return self.inverse @ (self.regressors @ target)
 
-    def influence(self, target: np.ndarray, solution: np.ndarray) -> np.ndarray:
-        """Return the contribution (m, n, 1 + d, values) of each neighbour to the error of the value and slopes."""
+    def influence(self, target: np.ndarray, solution: np.ndarray, orders: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the contribution (m, k, n) of each neighbour to the errors of k combinations of the coefficients.
+
+        Each is a combination of value and slopes, `orders` (…, k, 1 or 1 + d), of a combination of the fitted values,
+        `values` (…, k, values).
+        """
         # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
-        terms, first = self.terms, self.inverse[:, : 1 + self.terms.powers.shape[1]]
-        weights = np.einsum("mka,mbc->mkcab", first, solution)
-        fitted = weights.reshape(len(target), -1, len(terms.powers) ** 2) @ terms.belongs.reshape(
-            -1, len(terms.products)
-        )
-        residual = (first @ self.regressors)[:, :, None] * target.mT[:, None]
-        residual -= (fitted @ self.functions).reshape(residual.shape)
-        leverages = np.einsum("mab,abf->mf", self.inverse, terms.belongs)[:, None] @ self.functions
-        leverage = np.clip(leverages, 0.0, MOST_LEVERAGE)
-        scale = self.scale[:, : first.shape[1], None]
-        return (residual * scale / (1.0 - leverage)[:, None]).transpose(0, 3, 1, 2)
+        some = slice(orders.shape[-1])
+        first, coefficients = orders @ (self.scale[:, some] * self.inverse[:, some]), values @ solution.mT
+        residual = (first @ self.regressors) * (values @ target.mT)
+        residual -= self._of_products(np.einsum("mka,mkb->mkab", first, coefficients))
+        residual /= 1.0 - np.clip(self._of_products(self.inverse[:, None]), 0.0, MOST_LEVERAGE)
+        return residual
+
+    def _of_products(self, weights: np.ndarray) -> np.ndarray:
+        """Return sums (m, k, n) of the products of two terms with weights (m, k, terms, terms)."""
+        m, k = weights.shape[:2]
+        by_product = np.asarray(weights.reshape(m * k, -1) @ self.terms.belongs).reshape(m, k, -1)
+        result, start = np.zeros((m, k, self.last.shape[-1])), 0
+        for power, size in enumerate(self.terms.sizes):
+            part = by_product[..., start : start + size] @ self.rows[:, :size]
+            part *= self.last[:, power, None]
+            result += part
+            start += size
+        return result
 
 
 def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.ndarray]:
@@ -392,12 +413,40 @@ def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.
     return moments
 
 
-def _products(by_coordinate: list[np.ndarray], powers: np.ndarray) -> np.ndarray:
-    """Return products (m, terms, n) of the functions of each coordinate with the given powers (terms, d)."""
-    result = by_coordinate[0][:, powers[:, 0]]
-    for functions, power in zip(by_coordinate[1:], powers.T[1:], strict=True):
-        result *= functions[:, power]
+def _inverse(normal: np.ndarray) -> np.ndarray:
+    """Return the inverses of symmetric matrices (m, k, k), without the smallest eigenvalues where they are singular."""
+    try:
+        inverse = np.linalg.inv(normal)
+    except np.linalg.LinAlgError:
+        return np.linalg.pinv(normal, rcond=SINGULAR, hermitian=True)
+    # Frobenius norms bound the ratio of the largest and smallest eigenvalue.
+    condition = np.linalg.norm(normal, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2))
+    singular = ~(condition < 1.0 / SINGULAR)
+    if singular.any():
+        inverse[singular] = np.linalg.pinv(normal[singular], rcond=SINGULAR, hermitian=True)
+    return inverse
+
+
+def _products(by_coordinate: list[np.ndarray], degree: int) -> np.ndarray:
+    """Return products (m, terms, n) of the functions of each coordinate with the powers of all monomials."""
+    if not by_coordinate:
+        return np.ones((1, 1, 1))
+    return _with_last(_products(by_coordinate[:-1], degree), by_coordinate, degree)
+
+
+def _with_last(rows: np.ndarray, by_coordinate: list[np.ndarray], degree: int) -> np.ndarray:
+    """Return the same, given those of all coordinates but the last."""
+    row, column = _nested(len(by_coordinate), degree)
+    result = by_coordinate[-1][:, column]
+    result *= rows[:, row]
     return result
+
+
+@cache
+def _nested(coordinates: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return where each monomial is among those of all coordinates but the last, and the power of the last."""
+    powers, others = monomials(coordinates, degree), monomials(coordinates - 1, degree)
+    return np.argmax(np.all(powers[:, None, :-1] == others, axis=-1), axis=-1), powers[:, -1]
 
 
 class Atlas:
