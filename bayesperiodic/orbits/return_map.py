@@ -285,7 +285,8 @@ class ReturnMap:
     ) -> list["Regression"]:  # fmt: skip
         """Fit what follows the neighbours, as `fit_within` fits their images: the same neighbours and weights.
 
-        Faster without `influence`. `signals` returns it, (n, values), for positions (n,) among the arguments and these points (n, d) near a centre.
+        `signals` returns it, (n, values), for positions (n,) among the arguments and these points (n, d) near a centre.
+        Faster without `influence`.
         """
         results = []
         for centre, phase, width in zip(centres[:, None], phases[:, None], bandwidths[:, None], strict=True):
