@@ -933,7 +933,6 @@ def measured_chaos():
     for name, digits in (("f1", 0), ("drive_gain", 2), ("decay", 2)):
         value, robust, laplace = given["estimates"][name]
         yield f"| `{name}` | {value:.{digits}f} | {robust:.2g} | {laplace:.2g} |"
-    yield f"{given['processor_seconds']:.0f} s of processor time"
 
 
 @on("docs/reference/files.md")

@@ -6,7 +6,6 @@ other, and sampled with emcee. The last third of the recording judges free runs 
 """
 
 import argparse
-import time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,7 +37,7 @@ class Chosen(NamedTuple):
 
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
-    watch, processor = common.Stopwatch(), time.process_time()
+    watch = common.Stopwatch()
     with watch.part("recording", "the recording"):
         given = common.find_data(options.data, recording.RELATIVE)
         whole, about = recording.read(given[0]) if given else recording.simulated(options.seed)
@@ -88,7 +87,6 @@ def run(options: argparse.Namespace) -> None:
         "unexplained": dict(fit.fvu),
         "posterior": {n: np.quantile(posterior.draws(n), [0.05, 0.5, 0.95]).tolist() for n in fit.theta},
         "left_out": prediction_row(predicted),
-        "processor_seconds": time.process_time() - processor,
     }  # fmt: skip
     common.finish(options.out, results, watch, paths, synthetic=about["synthetic"])
 
