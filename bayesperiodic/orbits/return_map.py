@@ -27,7 +27,7 @@ STEEPEST_SLOPE, CURVATURE_LENGTH = 10.0, 0.1
 # Largest distance from the nearest centre of an atlas, in bandwidths, with up to two coordinates and with more.
 FARTHEST_FROM_CENTRE = {2: 1.0, 3: 2.0}
 # Eigenvalues of normal equations below this fraction of the largest one are left out.
-SINGULAR = 1e-10
+SMALLEST_EIGENVALUE = 1e-10
 # Distance of two phases in a search tree, in units of the attractor's size.
 APART = 1e3
 # What follows neighbours (n, values): of their positions (n,) among the arguments and the points (n, d) themselves.
@@ -419,12 +419,12 @@ def _inverse(normal: np.ndarray) -> np.ndarray:
     try:
         inverse = np.linalg.inv(normal)
     except np.linalg.LinAlgError:
-        return np.linalg.pinv(normal, rcond=SINGULAR, hermitian=True)
+        return np.linalg.pinv(normal, rcond=SMALLEST_EIGENVALUE, hermitian=True)
     # Frobenius norms bound the ratio of the largest and smallest eigenvalue.
     condition = np.linalg.norm(normal, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2))
-    singular = ~(condition < 1.0 / SINGULAR)
+    singular = ~(condition < 1.0 / SMALLEST_EIGENVALUE)
     if singular.any():
-        inverse[singular] = np.linalg.pinv(normal[singular], rcond=SINGULAR, hermitian=True)
+        inverse[singular] = np.linalg.pinv(normal[singular], rcond=SMALLEST_EIGENVALUE, hermitian=True)
     return inverse
 
 
