@@ -4,15 +4,20 @@ All coordinates are in units of the attractor's size.
 """
 
 from collections.abc import Callable
-from functools import cache
-from itertools import combinations_with_replacement
 from math import comb
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
-from scipy.special import factorial
+
+from bayesperiodic.orbits.normal_equations import (
+    NormalEquations,
+    deconvoluted,
+    inverse_of,
+    products,
+    terms_of,
+    with_last,
+)
 
 # Fewest neighbours of a fit of given bandwidth.
 FEWEST_FITTED = 30
@@ -20,14 +25,11 @@ FEWEST_FITTED = 30
 KERNEL_REACH = 3.0
 # Largest noise as a fraction of the bandwidth; deconvolution needs less than one.
 MOST_NOISE = 0.75
-MOST_LEVERAGE = 0.9
 # Prior standard deviation of slopes, and the distance over which a slope changes by it, in more than two coordinates:
 # there the attractor is thin in some directions, and does not determine all coefficients.
 STEEPEST_SLOPE, CURVATURE_LENGTH = 10.0, 0.1
 # Largest distance from the nearest centre of an atlas, in bandwidths, with up to two coordinates and with more.
 FARTHEST_FROM_CENTRE = {2: 1.0, 3: 2.0}
-# Eigenvalues of normal equations below this fraction of the largest one are left out.
-SMALLEST_EIGENVALUE = 1e-10
 # Distance of two phases in a search tree, in units of the attractor's size.
 APART = 1e3
 # What follows neighbours (n, values): of their positions (n,) among the arguments and the points (n, d) themselves.
@@ -39,40 +41,6 @@ MOST_PRODUCTS, MOST_NEIGHBOURS = 4_000_000, 6_000_000
 def for_coordinates(values: dict[int, float], coordinates: int) -> float:
     """Return the value for the number of coordinates."""
     return values[min(max(coordinates, 2), 3)]
-
-
-@cache
-def monomials(coordinates: int, degree: int) -> np.ndarray:
-    """Return the powers (terms, coordinates) of all monomials up to a degree, such as 1, u, v, uu, uv, vv."""
-    factors = (one for n in range(degree + 1) for one in combinations_with_replacement(range(coordinates), n))
-    return np.array([np.bincount(np.array(one, dtype=int), minlength=coordinates) for one in factors])
-
-
-class _Terms(NamedTuple):
-    """Terms of polynomials of one degree, and where their products are.
-
-    A product of two terms is a monomial of the other coordinates times a power of the last one.
-    """
-
-    powers: np.ndarray  # (terms, d)
-    factorials: np.ndarray  # products of the factorials of the powers, (terms,)
-    row: np.ndarray  # of the product of two terms, among monomials of the other coordinates, (terms, terms)
-    column: np.ndarray  # power of the last coordinate in it, (terms, terms)
-    sizes: list[int]  # number of monomials of the other coordinates that each power of the last one goes with
-    belongs: csr_array  # which product two terms have, by the power and then the monomial, (terms·terms, products)
-
-
-@cache
-def _terms(coordinates: int, degree: int) -> _Terms:
-    powers, others = monomials(coordinates, degree), monomials(coordinates - 1, 2 * degree)
-    sums = powers[:, None] + powers
-    row, column = np.argmax(np.all(sums[..., None, :-1] == others, axis=-1), axis=-1), sums[..., -1]
-    # Monomials are in the order of their degree: those that a power goes with are the first ones.
-    sizes = [comb(coordinates - 1 + rest, rest) for rest in range(2 * degree, -1, -1)]
-    place = (np.cumsum(sizes) - sizes)[column] + row
-    pairs = np.arange(place.size)
-    belongs = csr_array((np.ones(place.size), (pairs, place.ravel())), shape=(place.size, sum(sizes)))
-    return _Terms(powers, factorial(powers).prod(1), row, column, sizes, belongs)
 
 
 class LocalFit(NamedTuple):
@@ -240,7 +208,7 @@ class ReturnMap:
     def predict(fit: LocalFit, away: np.ndarray) -> np.ndarray:
         """Return images (m, …, d) at displacements (m, …, d) from the centres."""
         _, terms, d = fit.derivatives.shape
-        polynomials = _terms(d, next(n for n in range(terms) if comb(d + n, n) == terms))
+        polynomials = terms_of(d, next(n for n in range(terms) if comb(d + n, n) == terms))
         products = np.stack([np.prod(away**power, axis=-1) for power in polynomials.powers[1:]], axis=-1)
         slopes = fit.derivatives[:, 1:] / polynomials.factorials[1:, None]
         shape = (len(away), *(1,) * (away.ndim - 2), d)
@@ -321,21 +289,21 @@ class ReturnMap:
     def _system(
         self, away: np.ndarray, bandwidth: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int,
         shrinking: np.ndarray | None,
-    ) -> "_NormalEquations":  # fmt: skip
+    ) -> NormalEquations:  # fmt: skip
         """Return the normal equations of fits; the residuals of the images `shrinking` determine their shrinkage."""
         width = bandwidth[:, None, None]
         noise = self.noise if self._noises is None else np.minimum(self._noises[index], MOST_NOISE * width)
-        by_coordinate = _deconvoluted(away / width, noise / width, 2 * degree)
+        by_coordinate = deconvoluted(away / width, noise / width, 2 * degree)
         by_coordinate[0] *= inside[:, None]
         d, weight = len(by_coordinate), by_coordinate[0][:, 0]
-        terms = _terms(d, degree)
+        terms = terms_of(d, degree)
         orders = terms.powers.sum(1)
-        rows = _products(by_coordinate[:-1], 2 * degree) if d > 1 else np.ones((1, 1, weight.shape[1]))
-        regressors = _with_last(rows, by_coordinate, degree)
+        rows = products(by_coordinate[:-1], 2 * degree) if d > 1 else np.ones((1, 1, weight.shape[1]))
+        regressors = with_last(rows, by_coordinate, degree)
         # The sums of products by powers of the last coordinate: one matrix product.
         table = rows @ by_coordinate[-1].mT
         normal = table[:, terms.row, terms.column]
-        inverse = _inverse(normal)
+        inverse = inverse_of(normal)
         effective = weight.sum(1) ** 2 / (weight**2).sum(1)
         if d > 2 and shrinking is not None:
             target = regressors @ shrinking
@@ -344,110 +312,9 @@ class ReturnMap:
             variance = np.maximum(rest, 0.0).max(1) / weight.sum(1) / free
             prior = STEEPEST_SLOPE * bandwidth[:, None] * (bandwidth[:, None] / CURVATURE_LENGTH) ** (orders - 1.0)
             shrinkage = np.where(orders > 0, variance[:, None] / prior**2, 0.0)
-            inverse = _inverse(normal + shrinkage[:, :, None] * np.eye(len(orders)))
+            inverse = inverse_of(normal + shrinkage[:, :, None] * np.eye(len(orders)))
         scale = (terms.factorials / bandwidth[:, None] ** orders)[..., None]
-        return _NormalEquations(regressors, rows, by_coordinate[-1], terms, inverse, scale, effective)
-
-
-class _NormalEquations(NamedTuple):
-    """Normal equations of local polynomials about m centres, with n neighbours each."""
-
-    regressors: np.ndarray  # the terms, (m, terms, n)
-    rows: np.ndarray  # monomials of all coordinates but the last up to twice the degree, (m, rows, n)
-    last: np.ndarray  # powers of the last coordinate, (m, powers, n)
-    terms: _Terms
-    inverse: np.ndarray  # (m, terms, terms)
-    scale: np.ndarray  # derivatives over coefficients, (m, terms, 1)
-    effective: np.ndarray  # effective number of neighbours, (m,)
-
-    def solve(self, target: np.ndarray) -> np.ndarray:
-        """Return the coefficients (m, terms, values) of polynomials through targets (m, n, values)."""
-        return self.inverse @ (self.regressors @ target)
-
-    def influence(self, target: np.ndarray, solution: np.ndarray, orders: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the contribution (m, k, n) of each neighbour to the errors of k combinations of the coefficients.
-
-        Each is a combination of value and slopes, `orders` (…, k, 1 or 1 + d), of a combination of the fitted values,
-        `values` (…, k, values).
-        """
-        # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
-        some = slice(orders.shape[-1])
-        first, coefficients = orders @ (self.scale[:, some] * self.inverse[:, some]), values @ solution.mT
-        residual = (first @ self.regressors) * (values @ target.mT)
-        residual -= self._of_products(np.einsum("mka,mkb->mkab", first, coefficients))
-        residual /= 1.0 - np.clip(self._of_products(self.inverse[:, None]), 0.0, MOST_LEVERAGE)
-        return residual
-
-    def _of_products(self, weights: np.ndarray) -> np.ndarray:
-        """Return sums (m, k, n) of the products of two terms with weights (m, k, terms, terms)."""
-        m, k = weights.shape[:2]
-        by_product = np.asarray(weights.reshape(m * k, -1) @ self.terms.belongs).reshape(m, k, -1)
-        result, start = np.zeros((m, k, self.last.shape[-1])), 0
-        for power, size in enumerate(self.terms.sizes):
-            part = by_product[..., start : start + size] @ self.rows[:, :size]
-            part *= self.last[:, power, None]
-            result += part
-            start += size
-        return result
-
-
-def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.ndarray]:
-    """Return, by coordinate, functions (m, power, n) whose expectations are the powers, the first times the kernel.
-
-    The noise is that of each neighbour (m, n, d), or of all (m, 1, d).
-
-    x^a exp(−x²/2) is the expectation, over noise of variance s², of the Gaussian of variance 1 − s² times the a-th
-    moment of a normal distribution with mean x/(1 − s²) and the negative variance −s²/(1 − s²).
-    """
-    left, moments = 1.0 - noise**2, []
-    exponent, divisor = np.zeros(away.shape[:2]), np.sqrt(left.prod(axis=-1))
-    for k, rest in enumerate(np.moveaxis(left, -1, 0)):
-        mean, variance = away[..., k] / rest, (rest - 1.0) / rest
-        exponent -= 0.5 * rest * mean**2
-        rows = np.empty((len(away), highest + 1, away.shape[1]))
-        rows[:, 0], rows[:, 1] = 1.0, mean
-        for order in range(2, highest + 1):
-            np.multiply(mean, rows[:, order - 1], out=rows[:, order])
-            rows[:, order] += (order - 1) * variance * rows[:, order - 2]
-        moments.append(rows)
-    moments[0] *= (np.exp(exponent) / divisor)[:, None]
-    return moments
-
-
-def _inverse(normal: np.ndarray) -> np.ndarray:
-    """Return the inverses of symmetric matrices (m, k, k), without the smallest eigenvalues where they are singular."""
-    try:
-        inverse = np.linalg.inv(normal)
-    except np.linalg.LinAlgError:
-        return np.linalg.pinv(normal, rcond=SMALLEST_EIGENVALUE, hermitian=True)
-    # Frobenius norms bound the ratio of the largest and smallest eigenvalue.
-    condition = np.linalg.norm(normal, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2))
-    singular = ~(condition < 1.0 / SMALLEST_EIGENVALUE)
-    if singular.any():
-        inverse[singular] = np.linalg.pinv(normal[singular], rcond=SMALLEST_EIGENVALUE, hermitian=True)
-    return inverse
-
-
-def _products(by_coordinate: list[np.ndarray], degree: int) -> np.ndarray:
-    """Return products (m, terms, n) of the functions of each coordinate with the powers of all monomials."""
-    if not by_coordinate:
-        return np.ones((1, 1, 1))
-    return _with_last(_products(by_coordinate[:-1], degree), by_coordinate, degree)
-
-
-def _with_last(rows: np.ndarray, by_coordinate: list[np.ndarray], degree: int) -> np.ndarray:
-    """Return the same, given those of all coordinates but the last."""
-    row, column = _nested(len(by_coordinate), degree)
-    result = by_coordinate[-1][:, column]
-    result *= rows[:, row]
-    return result
-
-
-@cache
-def _nested(coordinates: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return where each monomial is among those of all coordinates but the last, and the power of the last."""
-    powers, others = monomials(coordinates, degree), monomials(coordinates - 1, degree)
-    return np.argmax(np.all(powers[:, None, :-1] == others, axis=-1), axis=-1), powers[:, -1]
+        return NormalEquations(regressors, rows, by_coordinate[-1], terms, inverse, scale, effective)
 
 
 class Atlas:
