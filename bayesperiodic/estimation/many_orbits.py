@@ -11,6 +11,7 @@ from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic._printing import Printed, progress_bar
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.initial_orbits import experiments_guesses
 from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.climbs import first_iterate
@@ -184,6 +185,7 @@ def _with_more(problem: Problem, experiments: list[Experiment], theta: Mapping[s
     start = _of(used, {} if theta is None else theta)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
+        used = _with_guesses(used, used.vector(start))
         if first_iterate(used, used.vector(start)) is None:
             return "the model has no such orbit near the estimate from the others"
         fit = map_estimate(used, start=None if theta is None else start, checks=False, progress=False)
@@ -218,6 +220,14 @@ def _unexplained(experiment: Experiment, fit: MapEstimate) -> float:
 def _of(problem: Problem, theta: Mapping[str, float]) -> dict[str, float]:
     """Return the parameters of a problem, at the priors' medians where they are not known yet."""
     return {**dict(zip(problem.names, problem.median().tolist(), strict=True)), **theta}
+
+
+def _with_guesses(problem: Problem, theta: np.ndarray) -> Problem:
+    """Return the problem with the guesses that follow from the data at θ (names,), which cost more than the solves."""
+    if not np.isfinite(problem.joint_prior.log_prob(theta)):
+        return problem
+    guesses = experiments_guesses(problem, theta)
+    return problem.with_experiments([replace(one, guess=guesses[one.name]) for one in problem.experiments])
 
 
 def _at_solutions(experiments: list[Experiment], fit: MapEstimate) -> list[Experiment]:

@@ -239,7 +239,7 @@ def refine(maps: ReturnMap, points: np.ndarray, neighbours: int) -> Estimate | N
     """
     bandwidths = _bandwidths(maps, points, neighbours)
     narrow = _close(maps, points, bandwidths)
-    wide = _close(maps, points, WIDENED * bandwidths) if narrow is not None else None
+    wide = _close(maps, points, WIDENED * bandwidths, influence=False) if narrow is not None else None
     if narrow is None or wide is None:
         return None
     cycle, fit = narrow
@@ -256,13 +256,15 @@ def _turns(maps: ReturnMap, run: np.ndarray) -> float:
     return float(np.sum(run / maps.turn))
 
 
-def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> tuple[np.ndarray, LocalFit] | None:
+def _close(
+    maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray, *, influence: bool = True
+) -> tuple[np.ndarray, LocalFit] | None:
     """Return the points at which the chained fits close, and the fits; None without convergence."""
     cycle, last, refined = points.copy(), np.inf, max(REFINED, REFINED_NOISE * float(maps.noise.max()))
     for step in range(REFINING_STEPS):
         final = last < refined or step == REFINING_STEPS - 1
         phases = maps.phases(np.arange(len(cycle)))
-        fit = maps.fit_within(cycle, phases, bandwidths, REFINING_DEGREE, influence=final)
+        fit = maps.fit_within(cycle, phases, bandwidths, REFINING_DEGREE, influence=final and influence)
         (moved,), (size,) = _moved(maps, cycle[None], fit.value[None], fit.jacobian[None])
         if not np.isfinite(size) or np.abs(maps.wrap(cycle - points)).max() > 0.1:
             return None

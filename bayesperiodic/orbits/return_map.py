@@ -4,14 +4,20 @@ All coordinates are in units of the attractor's size.
 """
 
 from collections.abc import Callable
-from functools import cache
-from itertools import combinations_with_replacement
 from math import comb
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.special import factorial
+
+from bayesperiodic.orbits.normal_equations import (
+    NormalEquations,
+    deconvoluted,
+    inverse_of,
+    products,
+    terms_of,
+    with_last,
+)
 
 # Fewest neighbours of a fit of given bandwidth.
 FEWEST_FITTED = 30
@@ -19,7 +25,6 @@ FEWEST_FITTED = 30
 KERNEL_REACH = 3.0
 # Largest noise as a fraction of the bandwidth; deconvolution needs less than one.
 MOST_NOISE = 0.75
-MOST_LEVERAGE = 0.9
 # Prior standard deviation of slopes, and the distance over which a slope changes by it, in more than two coordinates:
 # there the attractor is thin in some directions, and does not determine all coefficients.
 STEEPEST_SLOPE, CURVATURE_LENGTH = 10.0, 0.1
@@ -36,34 +41,6 @@ MOST_PRODUCTS, MOST_NEIGHBOURS = 4_000_000, 6_000_000
 def for_coordinates(values: dict[int, float], coordinates: int) -> float:
     """Return the value for the number of coordinates."""
     return values[min(max(coordinates, 2), 3)]
-
-
-@cache
-def monomials(coordinates: int, degree: int) -> np.ndarray:
-    """Return the powers (terms, coordinates) of all monomials up to a degree, such as 1, u, v, uu, uv, vv."""
-    factors = (one for n in range(degree + 1) for one in combinations_with_replacement(range(coordinates), n))
-    return np.array([np.bincount(np.array(one, dtype=int), minlength=coordinates) for one in factors])
-
-
-class _Terms(NamedTuple):
-    """Terms of polynomials of one degree, their products, and where these are in sums by the last coordinate."""
-
-    powers: np.ndarray  # (terms, d)
-    factorials: np.ndarray  # products of the factorials of the powers, (terms,)
-    products: np.ndarray  # powers of the products of two terms, (products, d); the terms themselves come first
-    belongs: np.ndarray  # which product two terms have, as zeros and ones, (terms, terms, products)
-    others: np.ndarray  # powers of all coordinates but the last, (rows, d - 1)
-    row: np.ndarray  # among those, of the product of two terms, (terms, terms)
-    column: np.ndarray  # power of the last coordinate in it, (terms, terms)
-
-
-@cache
-def _terms(coordinates: int, degree: int) -> _Terms:
-    powers, products = monomials(coordinates, degree), monomials(coordinates, 2 * degree)
-    others, sums = monomials(coordinates - 1, 2 * degree), powers[:, None] + powers
-    belongs = np.all(sums[..., None, :] == products, axis=-1).astype(float)
-    row = np.argmax(np.all(sums[..., None, :-1] == others, axis=-1), axis=-1)
-    return _Terms(powers, factorial(powers).prod(1), products, belongs, others, row, sums[..., -1])
 
 
 class LocalFit(NamedTuple):
@@ -231,7 +208,7 @@ class ReturnMap:
     def predict(fit: LocalFit, away: np.ndarray) -> np.ndarray:
         """Return images (m, …, d) at displacements (m, …, d) from the centres."""
         _, terms, d = fit.derivatives.shape
-        polynomials = _terms(d, next(n for n in range(terms) if comb(d + n, n) == terms))
+        polynomials = terms_of(d, next(n for n in range(terms) if comb(d + n, n) == terms))
         products = np.stack([np.prod(away**power, axis=-1) for power in polynomials.powers[1:]], axis=-1)
         slopes = fit.derivatives[:, 1:] / polynomials.factorials[1:, None]
         shape = (len(away), *(1,) * (away.ndim - 2), d)
@@ -259,37 +236,42 @@ class ReturnMap:
         bandwidth = np.maximum(bandwidth, np.max(self.noise) / MOST_NOISE)
         away = self._away(centres, index)
         image, reference = self._images(away, index)
-        system = self._system(away, bandwidth, index, inside, degree, image if shrunk else None, wants_influence)
-        solution = system.solve(image)
-        influence = np.empty((len(centres), 0, 1 + away.shape[2], away.shape[2]))
+        system = self._system(away, bandwidth, index, inside, degree, image if shrunk else None)
+        solution, d = system.solve(image), away.shape[2]
+        influence = np.empty((len(centres), 0, 1 + d, d))
         if wants_influence:
-            influence = system.influence(image, solution)
+            each = np.repeat(np.eye(1 + d), d, axis=0), np.tile(np.eye(d), (1 + d, 1))
+            influence = system.influence(image, solution, *each).reshape(len(centres), 1 + d, d, -1)
+            influence = influence.transpose(0, 3, 1, 2)
         derivatives = solution * system.scale
         value = centres + reference + derivatives[:, 0]
         return LocalFit(value, derivatives, bandwidth, index, influence, system.effective)
 
     def regress(
-        self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray, degree: int, signals: Signals
-    ) -> list["Regression"]:
+        self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray, degree: int, signals: Signals,
+        *, influence: bool = True,
+    ) -> list["Regression"]:  # fmt: skip
         """Fit what follows the neighbours, as `fit_within` fits their images: the same neighbours and weights.
 
         `signals` returns it, (n, values), for positions (n,) among the arguments and these points (n, d) near a centre.
+        Faster without `influence`.
         """
         results = []
         for centre, phase, width in zip(centres[:, None], phases[:, None], bandwidths[:, None], strict=True):
             index, inside, bandwidth = self._within(centre, phase, width, degree)
             index, inside = index[:, inside[0]], inside[:, inside[0]]
             away = self._away(centre, index)
-            system = self._system(away, bandwidth, index, inside, degree, self._images(away, index)[0], True)
+            system = self._system(away, bandwidth, index, inside, degree, self._images(away, index)[0])
             target = signals(index[0], centre + away[0])
             reference, target = target[:1], (target - target[:1])[None]
             solution = system.solve(target)
             derivatives = (solution * system.scale)[0]
             weights = (system.inverse @ system.regressors)[0, 0]
-            slopes, influence = derivatives[1 : 1 + len(self.turn)], system.influence(target, solution)[0, :, 0]
-            results.append(
-                Regression(reference[0] + derivatives[0], slopes, index[0], influence, float(np.sum(weights**2)))
-            )
+            value, slopes, values = reference[0] + derivatives[0], derivatives[1 : 1 + len(self.turn)], target.shape[2]
+            errors = np.empty((0, values))
+            if influence:
+                errors = system.influence(target, solution, np.ones((values, 1)), np.eye(values))[0].T
+            results.append(Regression(value, slopes, index[0], errors, float(np.sum(weights**2))))
         return results
 
     def _away(self, centres: np.ndarray, index: np.ndarray) -> np.ndarray:
@@ -306,98 +288,33 @@ class ReturnMap:
 
     def _system(
         self, away: np.ndarray, bandwidth: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int,
-        shrinking: np.ndarray | None, wants_influence: bool,
-    ) -> "_NormalEquations":  # fmt: skip
+        shrinking: np.ndarray | None,
+    ) -> NormalEquations:  # fmt: skip
         """Return the normal equations of fits; the residuals of the images `shrinking` determine their shrinkage."""
         width = bandwidth[:, None, None]
         noise = self.noise if self._noises is None else np.minimum(self._noises[index], MOST_NOISE * width)
-        by_coordinate = _deconvoluted(away / width, noise / width, 2 * degree)
+        by_coordinate = deconvoluted(away / width, noise / width, 2 * degree)
         by_coordinate[0] *= inside[:, None]
         d, weight = len(by_coordinate), by_coordinate[0][:, 0]
-        terms = _terms(d, degree)
+        terms = terms_of(d, degree)
         orders = terms.powers.sum(1)
-        functions = _products(by_coordinate, terms.products if wants_influence else terms.powers)
+        rows = products(by_coordinate[:-1], 2 * degree) if d > 1 else np.ones((1, 1, weight.shape[1]))
+        regressors = with_last(rows, by_coordinate, degree)
         # The sums of products by powers of the last coordinate: one matrix product.
-        rows = _products(by_coordinate[:-1], terms.others) if d > 1 else np.ones((1, 1, weight.shape[1]))
         table = rows @ by_coordinate[-1].mT
         normal = table[:, terms.row, terms.column]
-        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+        inverse = inverse_of(normal)
         effective = weight.sum(1) ** 2 / (weight**2).sum(1)
         if d > 2 and shrinking is not None:
-            target = functions[:, : len(orders)] @ shrinking
+            target = regressors @ shrinking
             rest = np.einsum("mn,mnc->mc", weight, shrinking**2) - (inverse @ target * target).sum(1)
             free = np.maximum(effective - len(orders), 1.0) / effective
             variance = np.maximum(rest, 0.0).max(1) / weight.sum(1) / free
             prior = STEEPEST_SLOPE * bandwidth[:, None] * (bandwidth[:, None] / CURVATURE_LENGTH) ** (orders - 1.0)
             shrinkage = np.where(orders > 0, variance[:, None] / prior**2, 0.0)
-            inverse = np.linalg.pinv(normal + shrinkage[:, :, None] * np.eye(len(orders)), rcond=1e-10, hermitian=True)
+            inverse = inverse_of(normal + shrinkage[:, :, None] * np.eye(len(orders)))
         scale = (terms.factorials / bandwidth[:, None] ** orders)[..., None]
-        return _NormalEquations(functions, terms, inverse, scale, effective)
-
-
-class _NormalEquations(NamedTuple):
-    """Normal equations of local polynomials about m centres, with n neighbours each."""
-
-    functions: np.ndarray  # the terms, and for `influence` also their other products, (m, terms or products, n)
-    terms: _Terms
-    inverse: np.ndarray  # (m, terms, terms)
-    scale: np.ndarray  # derivatives over coefficients, (m, terms, 1)
-    effective: np.ndarray  # effective number of neighbours, (m,)
-
-    @property
-    def regressors(self) -> np.ndarray:
-        """The terms, (m, terms, n)."""
-        return self.functions[:, : len(self.terms.powers)]
-
-    def solve(self, target: np.ndarray) -> np.ndarray:
-        """Return the coefficients (m, terms, values) of polynomials through targets (m, n, values)."""
-        return self.inverse @ (self.regressors @ target)
-
-    def influence(self, target: np.ndarray, solution: np.ndarray) -> np.ndarray:
-        """Return the contribution (m, n, 1 + d, values) of each neighbour to the error of the value and slopes."""
-        # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
-        terms, first = self.terms, self.inverse[:, : 1 + self.terms.powers.shape[1]]
-        weights = np.einsum("mka,mbc->mkcab", first, solution)
-        fitted = weights.reshape(len(target), -1, len(terms.powers) ** 2) @ terms.belongs.reshape(
-            -1, len(terms.products)
-        )
-        residual = (first @ self.regressors)[:, :, None] * target.mT[:, None]
-        residual -= (fitted @ self.functions).reshape(residual.shape)
-        leverages = np.einsum("mab,abf->mf", self.inverse, terms.belongs)[:, None] @ self.functions
-        leverage = np.clip(leverages, 0.0, MOST_LEVERAGE)
-        scale = self.scale[:, : first.shape[1], None]
-        return (residual * scale / (1.0 - leverage)[:, None]).transpose(0, 3, 1, 2)
-
-
-def _deconvoluted(away: np.ndarray, noise: np.ndarray, highest: int) -> list[np.ndarray]:
-    """Return, by coordinate, functions (m, power, n) whose expectations are the powers, the first times the kernel.
-
-    The noise is that of each neighbour (m, n, d), or of all (m, 1, d).
-
-    x^a exp(−x²/2) is the expectation, over noise of variance s², of the Gaussian of variance 1 − s² times the a-th
-    moment of a normal distribution with mean x/(1 − s²) and the negative variance −s²/(1 − s²).
-    """
-    left, moments = 1.0 - noise**2, []
-    exponent, divisor = np.zeros(away.shape[:2]), np.sqrt(left.prod(axis=-1))
-    for k, rest in enumerate(np.moveaxis(left, -1, 0)):
-        mean, variance = away[..., k] / rest, (rest - 1.0) / rest
-        exponent -= 0.5 * rest * mean**2
-        rows = np.empty((len(away), highest + 1, away.shape[1]))
-        rows[:, 0], rows[:, 1] = 1.0, mean
-        for order in range(2, highest + 1):
-            np.multiply(mean, rows[:, order - 1], out=rows[:, order])
-            rows[:, order] += (order - 1) * variance * rows[:, order - 2]
-        moments.append(rows)
-    moments[0] *= (np.exp(exponent) / divisor)[:, None]
-    return moments
-
-
-def _products(by_coordinate: list[np.ndarray], powers: np.ndarray) -> np.ndarray:
-    """Return products (m, terms, n) of the functions of each coordinate with the given powers (terms, d)."""
-    result = by_coordinate[0][:, powers[:, 0]]
-    for functions, power in zip(by_coordinate[1:], powers.T[1:], strict=True):
-        result *= functions[:, power]
-    return result
+        return NormalEquations(regressors, rows, by_coordinate[-1], terms, inverse, scale, effective)
 
 
 class Atlas:

@@ -167,6 +167,8 @@ class Following:
             if name in section.angles
         ]
         self._halves, self.variance = self._windows(maps.steps)
+        self._phases = np.empty(0)  # at which the motion is in memory, for the arguments that are not NaN there
+        self._motion = np.empty(0)
 
     def _windows(self, steps: int) -> tuple[list[int], np.ndarray]:
         """Return half the number of samples in each channel's window, and the variance of the values' noise.
@@ -204,14 +206,27 @@ class Following:
 
     def signals(self, index: np.ndarray, near: np.ndarray, columns: slice, phases: np.ndarray) -> np.ndarray:
         """Return channels (n, phases·channels) after arguments (n,), whose angles are as in the points (n, d)."""
-        every = np.append(0.0, phases)
-        at = self._start[index, None] + self._length[index, None] * every
-        values, _ = windowed(self._samples, at.ravel(), np.repeat(self._stretch[index], every.size), self._halves)
-        values = values.reshape(len(index), every.size, -1)
+        values = self._after(index, phases)
         for k, column in self.angles:
             away = near[:, k] * self._size[k] - values[:, 0, column]
             values[:, :, column] += TURN * np.round(away / TURN)[:, None]
         return values[:, 1:, columns].reshape(len(index), -1)
+
+    def _after(self, index: np.ndarray, phases: np.ndarray) -> np.ndarray:
+        """Return the channels (n, 1 + phases, channels) at and after arguments (n,).
+
+        Neighbours are those of many fits, so the motion of all arguments at the last phases is kept.
+        """
+        every = np.append(0.0, phases)
+        if not np.array_equal(phases, self._phases):
+            self._phases = phases
+            self._motion = np.full((self._start.size, every.size, len(self.channels)), np.nan)
+        new = np.unique(index[np.isnan(self._motion[index, 0, 0])])
+        if new.size:
+            at = self._start[new, None] + self._length[new, None] * every
+            values, _ = windowed(self._samples, at.ravel(), np.repeat(self._stretch[new], every.size), self._halves)
+            self._motion[new] = values.reshape(new.size, every.size, -1)
+        return self._motion[index]
 
 
 class _MotionPart(NamedTuple):
@@ -279,7 +294,9 @@ def _parts(
     for j, places in enumerate(at):
         signals, one = partial(following.signals, columns=columns, phases=places), slice(j, j + 1)
         (fit,) = maps.regress(estimate.points[one], phases[one], fits.bandwidths[one], degree, signals)
-        (other,) = maps.regress(fits.wide_points[one], phases[one], WIDENED * fits.bandwidths[one], degree, signals)
+        (other,) = maps.regress(
+            fits.wide_points[one], phases[one], WIDENED * fits.bandwidths[one], degree, signals, influence=False
+        )
         errors = by_run[:, d * j : d * (j + 1)] @ fit.slopes
         np.add.at(errors, runs[np.searchsorted(pairs, maps.positions[fit.neighbours])], fit.influence)
         away = (other.value - fit.value).reshape(places.size, -1)

@@ -78,28 +78,35 @@ class Start(NamedTuple):
 
 
 class _Waves(NamedTuple):
-    """Channels (phases·period,) of an orbit."""
+    """Fourier amplitudes (harmonics,) of the channels of an orbit, which has `samples` phases."""
 
-    period: int
-    frequency: float
+    samples: int
+    rates: np.ndarray  # factors of derivatives, i times the angular frequency [1/s]
     velocity: np.ndarray
     voltage: np.ndarray
     drive: np.ndarray
+    base: np.ndarray  # velocity of the base, of mean zero
 
-    def changed(self, values: np.ndarray, order: int, late: float = 0.0) -> np.ndarray:
-        """Return a derivative, or the integral of mean zero for order −1, with a delay removed."""
-        rate = 2j * np.pi * self.frequency / self.period * np.arange(values.size // 2 + 1)
-        amplitudes = np.fft.rfft(values) * np.exp(rate * late)
-        if order < 0:
-            amplitudes[0], rate[0] = 0.0, 1.0
-        amplitudes *= rate**order
-        amplitudes[HIGHEST * self.period + 1 :] = 0.0
-        return np.fft.irfft(amplitudes, values.size)
+    def signals(self, gain: float, late: float, later: float) -> np.ndarray:
+        """Return displacement, velocity, acceleration, voltage, its derivative, and the drive, (6, samples).
+
+        Those of the beam relative to the base have mean zero, and the delays of velocity and voltage are removed.
+        """
+        velocity = self.velocity * np.exp(self.rates * late) - gain * self.base
+        velocity[0] = 0.0
+        displacement = velocity / np.where(self.rates == 0.0, 1.0, self.rates)
+        voltage = self.voltage * np.exp(self.rates * later)
+        amplitudes = [displacement, velocity, velocity * self.rates, voltage, voltage * self.rates, self.drive]
+        return np.fft.irfft(amplitudes, self.samples)
 
 
 def _waves(orbit: bp.Orbit) -> _Waves:
     run = orbit.experiment(samples=PHASES, whole=True, model_error=True)
-    return _Waves(orbit.period, orbit.frequency, run.outputs["velocity"], run.outputs["voltage"], run.inputs["drive"])
+    channels = [run.outputs["velocity"], run.outputs["voltage"], run.inputs["drive"]]
+    rates = 2j * np.pi * orbit.frequency / orbit.period * np.arange(HIGHEST * orbit.period + 1)
+    velocity, voltage, drive = np.fft.rfft(channels)[:, : rates.size]
+    base = np.append(0.0, drive[1:] / rates[1:])
+    return _Waves(channels[0].size, rates, velocity, voltage, drive, base)
 
 
 def start_from(orbits: list[bp.Orbit], degree: int, coupling: int, *, delays: bool, seed: int) -> Start:
@@ -109,10 +116,11 @@ def start_from(orbits: list[bp.Orbit], degree: int, coupling: int, *, delays: bo
     measured, and, with `delays`, those of velocity and voltage against the drive.
     """
     waves, generator = [_waves(orbit) for orbit in orbits], np.random.default_rng(seed)
-    size = np.std(np.concatenate([w.velocity for w in waves])) / (2.0 * np.pi * orbits[0].frequency)
-    gain = np.std(np.concatenate([w.velocity for w in waves])) / np.std(
-        np.concatenate([w.changed(w.drive, -1) for w in waves])
+    velocity, base = (
+        float(np.std(np.concatenate([np.fft.irfft(one, w.samples) for w, one in zip(waves, some, strict=True)])))
+        for some in ([w.velocity for w in waves], [w.base for w in waves])
     )
+    size, gain = velocity / (2.0 * np.pi * orbits[0].frequency), velocity / base
     ends, scale = [], (size, gain)
     for attempt in range(STARTS):
         means = generator.normal(0.0, size, len(waves)) if attempt else np.zeros(len(waves))
@@ -135,13 +143,12 @@ def _equations(
     late, later = 1e-3 * z[count + 1 :] if z.size > count + 1 else (0.0, 0.0)
     blocks = []
     for mean, w in zip(means, waves, strict=True):
-        seen, base = w.changed(w.velocity, 0, late), w.changed(w.drive, -1)
-        rate = seen - gain * base
-        rate -= rate.mean()
-        x, v = w.changed(rate, -1) + mean, w.changed(w.voltage, 0, later)
-        left = np.column_stack([x[:, None] ** np.arange(degree + 1), rate, v, w.drive])
-        right = np.column_stack([v, np.ones(v.size), rate[:, None] * x[:, None] ** np.arange(coupling + 1)])
-        blocks.append((left, w.changed(rate, 1), right, w.changed(w.voltage, 1, later), x))
+        x, rate, acceleration, v, change, drive = w.signals(gain, late, later)
+        x += mean
+        powers = np.vander(x, max(degree, coupling) + 1, increasing=True)
+        left = np.column_stack([powers[:, : degree + 1], rate, v, drive])
+        right = np.column_stack([v, np.ones(v.size), rate[:, None] * powers[:, : coupling + 1]])
+        blocks.append((left, acceleration, right, change, x))
     left, acceleration, right, change, x = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     force, piezo = (np.linalg.lstsq(m, t, rcond=None)[0] for m, t in ((left, acceleration), (right, change)))
     residuals = [(t - m @ c) / t.std() for m, c, t in ((left, force, acceleration), (right, piezo, change))]

@@ -55,6 +55,42 @@ def test_influences_give_the_variance_of_replicates():
     np.testing.assert_allclose(stated, actual, rtol=0.25)
 
 
+@pytest.mark.parametrize("coordinates", [1, 2, 3, 5])
+def test_influences_are_those_of_weighted_least_squares(coordinates):
+    """Without noise each is w_i r_i (X'WX)⁻¹ x_i / (1 − h_i) with the leverage h_i, here by a design matrix."""
+    generator = np.random.default_rng(5)
+    points = generator.uniform(-1.0, 1.0, (900, coordinates))
+    increments = np.sin(3.0 * points) - 0.5 * points[:, ::-1] ** 2
+    fitted = ReturnMap(points, increments, np.full(coordinates, np.inf), True, np.zeros(coordinates))
+    centre = points[:1] + 0.01
+    fit = fitted.fit(centre, np.zeros(1), 200, 2)
+    away = points[fit.neighbours[0]] - centre
+    pairs = [away[:, i] * away[:, j] for i in range(coordinates) for j in range(i, coordinates)]
+    design = np.column_stack([np.ones(len(away)), away, *pairs])
+    weight = np.exp(-0.5 * np.sum(away**2, axis=1) / fit.bandwidth[0] ** 2)
+    inverse = np.linalg.inv(design.T @ (weight[:, None] * design))
+    images = points[fit.neighbours[0]] + increments[fit.neighbours[0]]
+    coefficients = inverse @ design.T @ (weight[:, None] * images)
+    residual = images - design @ coefficients
+    leverage = weight * np.einsum("na,ab,nb->n", design, inverse, design)
+    assert leverage.max() < 0.9
+    expected = np.einsum("nk,nc->nkc", design @ inverse, residual * (weight / (1.0 - leverage))[:, None])
+    np.testing.assert_allclose(fit.value[0], coefficients[0], atol=1e-9)
+    np.testing.assert_allclose(fit.influence[0], expected[:, : 1 + coordinates], atol=1e-9)
+
+
+def test_what_points_on_a_line_do_not_determine_is_left_out():
+    """The normal equations are singular: on the line the map is fitted all the same."""
+    along = np.linspace(-1.0, 1.0, 400)[:, None]
+    points = along * [0.6, 0.8]
+    fitted = ReturnMap(points, quadratic(points) - points, OPEN, True, np.zeros(2))
+    fit = fitted.fit(points[150:250:20], np.zeros(5), 60, 2)
+    np.testing.assert_allclose(fit.value, quadratic(points[150:250:20]), atol=1e-9)
+    along_line = np.einsum("mij,j->mi", fit.jacobian, [0.6, 0.8])
+    exact = np.array([slopes(*point) @ [0.6, 0.8] for point in points[150:250:20]])
+    np.testing.assert_allclose(along_line, exact, atol=1e-6)
+
+
 def test_fits_of_given_bandwidths_are_those_of_as_many_neighbours():
     noisy, centres = maps(1500, 0.02, 1), np.array([[0.1, 0.2], [-0.6, 0.5], [0.9, -0.9]])
     phases, counts = np.zeros(3), (80, 250, 120)

@@ -10,9 +10,10 @@ from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
 import bayesperiodic as bp
-from bayesperiodic.orbits import find
+from bayesperiodic.orbits import find, waveform
 from bayesperiodic.orbits.cycles import REFINING_DEGREE, errors_by_run
 from bayesperiodic.orbits.return_map import Atlas, ReturnMap
+from bayesperiodic.orbits.stretches import windowed
 from bayesperiodic.orbits.waveform import INDEPENDENT, Following, _parts, mean_of_repeats
 from tests.orbits import chaos, wells
 from tests.orbits.test_find import coupled, map_section
@@ -135,6 +136,21 @@ def test_inputs_have_waveforms_at_the_same_phases():
         np.testing.assert_allclose(run.inputs["u"], 0.3 * np.cos(OMEGA * run.time), atol=largest)
         assert largest < 0.005
         np.testing.assert_allclose(run.guess["x"][:: 160 // 16], orbit.waveform.values["x"][::4], atol=0.02)
+
+
+def test_the_motion_after_a_point_is_evaluated_once(monkeypatch):
+    """Neighbours are those of many fits. The instant of a point is that of its first phase too."""
+    instants = []
+
+    def counted(samples, at, stretch, halves):
+        instants.append(at)
+        return windowed(samples, at, stretch, halves)
+
+    monkeypatch.setattr(waveform, "windowed", counted)
+    recordings = wells.recordings(800, (0, 0, 0))
+    section = bp.PoincareSection.from_recordings(recordings, ("x", "y", "v"), frequency=1 / PERIOD)
+    assert len(bp.find_orbits(section, periods=[1, 2], waveforms=True)) >= 2
+    assert len(instants) >= 6 and np.unique(np.concatenate(instants), return_counts=True)[1].max() == 2
 
 
 def test_nothing_is_taken_from_the_other_side_of_a_break():

@@ -1,4 +1,5 @@
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -59,23 +60,48 @@ def periodic_motion():
     return solve_ivp(rates, (0.0, at[-1]), [0.16, 0.0, 0.0], "DOP853", at, rtol=1e-10, atol=1e-12).y
 
 
+def waves(velocity, voltage, drive):
+    """Return what the regression takes of an orbit with these channels at 64 phases a period."""
+    period = velocity.size // 64
+    run = SimpleNamespace(outputs={"velocity": velocity, "voltage": voltage}, inputs={"drive": drive})
+    orbit = SimpleNamespace(period=period, frequency=recording.FREQUENCY, experiment=lambda **_: run)
+    return beam._waves(orbit)
+
+
 def test_regression_of_the_equations_gives_their_coefficients():
     """An exact motion about one well, of which a polynomial of degree three describes the force."""
     v, tau = beam.SYNTHETIC, np.arange(64) / 64
     motion = periodic_motion()
     drive = 2.0 * np.cos(2.0 * np.pi * tau)
     base = 2.0 / OMEGA * np.sin(2.0 * np.pi * tau)
-    wave = beam._Waves(1, recording.FREQUENCY, motion[1] + v["laser_gain"] * base, motion[2], drive)
+    wave = waves(motion[1] + v["laser_gain"] * base, motion[2], drive)
     mean, gain = motion[0].mean(), v["laser_gain"]
     z = np.array([0.0, 1.0])
     _, piezo, residuals, _ = beam._equations(z, [wave], 3, 2, (1.0, gain))
     assert np.std(residuals[0]) < 1e-2 and np.std(residuals[1]) < 1e-2
     assert piezo[0] == pytest.approx(-v["decay"], rel=0.1)
     # The displacement is the integral of the velocity of the beam, without its mean.
-    np.testing.assert_allclose(wave.changed(motion[1], -1), motion[0] - mean, atol=1e-6)
-    np.testing.assert_allclose(wave.changed(base, 1), drive, atol=1e-9)
-    late = beam._Waves(1, recording.FREQUENCY, wave.velocity, wave.voltage, drive)
-    np.testing.assert_allclose(late.changed(drive, 0, 0.01), 2.0 * np.cos(OMEGA * (tau / 6.5 + 0.01)), atol=1e-9)
+    displacement, velocity, *_, given = wave.signals(gain, 0.0, 0.0)
+    np.testing.assert_allclose(displacement, motion[0] - mean, atol=1e-6)
+    np.testing.assert_allclose(velocity, motion[1], atol=1e-5)
+    np.testing.assert_allclose(given, drive, atol=1e-9)
+
+
+def test_delays_are_removed_and_derivatives_are_exact():
+    """Two periods of sines, of which velocity and voltage are late."""
+    time, late, later = np.arange(128) / (64 * recording.FREQUENCY), 0.01, 0.02
+    drive, base = 2.0 * np.cos(OMEGA * time), 2.0 / OMEGA * np.sin(OMEGA * time)
+    velocity = np.cos(0.5 * OMEGA * (time - late)) + 3.0 * base
+    wave = waves(velocity, np.sin(1.5 * OMEGA * (time - later)), drive)
+    x, v, acceleration, voltage, change, _ = wave.signals(3.0, late, later)
+    # The velocity of the base is seen without delay, and its delay removed.
+    early = 6.0 / OMEGA * (np.sin(OMEGA * (time + late)) - np.sin(OMEGA * time))
+    np.testing.assert_allclose(v, np.cos(0.5 * OMEGA * time) + early, atol=1e-9)
+    np.testing.assert_allclose(np.gradient(x, time)[1:-1], v[1:-1], atol=2e-2)
+    steep = -0.5 * OMEGA * np.sin(0.5 * OMEGA * time) + 6.0 * (np.cos(OMEGA * (time + late)) - np.cos(OMEGA * time))
+    np.testing.assert_allclose(acceleration, steep, atol=1e-7)
+    np.testing.assert_allclose(voltage, np.sin(1.5 * OMEGA * time), atol=1e-9)
+    np.testing.assert_allclose(change, 1.5 * OMEGA * np.cos(1.5 * OMEGA * time), atol=1e-7)
 
 
 def test_model_is_that_of_the_equations():
