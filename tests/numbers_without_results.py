@@ -221,7 +221,7 @@ WITHOUT_RESULTS = {
         UNSTORED: (
             "rounded below 0.05", "comes out as -1.48 ± 0.01, the model has -1.34 with this friction and -1.52 without",
             "rises from 0.19 to 0.21", "local maps is 0.053, of which noise explains 0.041",
-            "without the drift 0.052 and 0.050", "at 0.5 effective draws per thousand; with ten it has 188",
+            "without the drift 0.052 and 0.050",
             "on 400 points takes 0.26 ms, a posterior of three parameters 10 s of processor time",
             "four such units 58 s", "which takes 0.18 ms there",
         ),
