@@ -15,7 +15,7 @@ from bayesperiodic.orbits.orbit import TURN, Orbit
 from bayesperiodic.orbits.section import PoincareSection
 from bayesperiodic.orbits.waveform import INDEPENDENT, Waveform
 
-# Largest distance of waveforms of the same orbit, rms over phases, in standard errors of the difference of each channel.
+# Largest distance of waveforms of the same orbit, rms over the phases of each channel, in standard errors of it.
 SAME_WAVEFORM = 3.0
 # Largest error of a phase that counts as a sixteenth of a period.
 EXACT_PHASE = 1e-6
