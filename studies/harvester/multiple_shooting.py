@@ -209,6 +209,7 @@ def estimate(given: Segments, theta: dict[str, float], scale: dict[str, float], 
     )
     residuals = problem.residuals(done.x).reshape(-1, 2)
     free = residuals.size - 3 * len(given.drive) - len(theta)
-    inverse = np.linalg.inv(done.jac.T @ done.jac) * float(np.sum(residuals**2)) / free
+    slopes = problem.slopes(done.x)
+    inverse = np.linalg.inv(slopes.T @ slopes) * float(np.sum(residuals**2)) / free
     left = dict(zip(("velocity", "voltage"), np.mean(residuals**2, axis=0).tolist(), strict=True))
     return Shot(problem.values(done.x), inverse * np.outer(steps, steps), left, len(given.drive), int(done.nfev))
