@@ -40,6 +40,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--populations", action="store_true", help="landing-gear: gears and theta16 as populations, only"
     )
+    parser.add_argument(
+        "--part", choices=("orbits", "shooting"), help="harvester: known orbits, or multiple shooting, only that"
+    )
     parser.add_argument("--scaling", action="store_true", help="calibration, population: measure the cost, only that")
     parser.add_argument("--guard", action="store_true", help="benchmark: a quick run's ratios against those kept")
     parser.add_argument("--cold-start", action="store_true", help="benchmark: times in new environments, only that")

@@ -994,6 +994,30 @@ def measured_chaos():
         yield f"| `{name}` | {value:.{digits}f} | {robust:.2g} | {laplace:.2g} |"
 
 
+@on("docs/studies/harvester.md")
+def known_orbits():
+    given = results("harvester/orbits")
+    yield f"{given['found']} of {len(given['orbits'])} are found by the"
+    for one in given["orbits"]:
+        if not one["found"]:
+            yield f"| {one['period']} | {one['returns']} | {one['multiplier']:.1f} |"
+    covered = given["covered"]
+    low, high = covered["band"]
+    inside = f"contain {covered['count']} of {covered['of']} true values of the voltage at the points"
+    yield f"{inside} (99 % band {low} to {high}"
+
+
+@on("docs/studies/harvester.md")
+def multiple_shooting():
+    orbits = results("harvester")
+    rows = {f"{one['periods']:g} periods": one for one in results("harvester/shooting")["lengths"]}
+    for name, one in (rows | {"orbits": orbits["left_out"] | {"unexplained": orbits["unexplained"]}}).items():
+        left = " | ".join(f"{100 * one['unexplained'][channel]:.2f} %" for channel in ("velocity", "voltage"))
+        density, exponent = one["tests"]["density"]["model"], one["exponents"]["model"]["exponent"]
+        ran = f"{one['left']} of {one['runs']} | {one['settled']}"
+        yield f"| {name} | {left} | {ran} | {density:.3f} | {exponent:.2f} |"
+
+
 @on("docs/reference/files.md")
 def formats():
     """Yield the number of damaged files, and each row of the table, whose tests must exist."""

@@ -15,7 +15,7 @@ from bayesperiodic.orbits.orbit import TURN, Orbit
 from bayesperiodic.orbits.section import PoincareSection
 from bayesperiodic.orbits.waveform import INDEPENDENT, Waveform
 
-# Largest distance of waveforms of the same orbit, rms over channels and phases, in standard errors of the difference.
+# Largest distance of waveforms of the same orbit, rms over the phases of each channel, in standard errors of it.
 SAME_WAVEFORM = 3.0
 # Largest error of a phase that counts as a sixteenth of a period.
 EXACT_PHASE = 1e-6
@@ -118,7 +118,8 @@ def _error(orbit: Orbit, size: np.ndarray) -> float:
 def _is_same(one: Orbit, other: Orbit, size: np.ndarray, *, mirrored: bool = False) -> bool:
     """Return whether two waveforms agree within their errors after some shift by whole forcing periods.
 
-    With `mirrored`, whether one is the other with all signs changed, half a period later.
+    All channels must agree: large errors of one say nothing about another. With `mirrored`, whether one is the other
+    with all signs changed, half a period later.
     """
     if one.period != other.period:
         return False
@@ -130,7 +131,7 @@ def _is_same(one: Orbit, other: Orbit, size: np.ndarray, *, mirrored: bool = Fal
         for k, name in enumerate(() if one.waveform is None else one.waveform.outputs):
             if name in one.angles:
                 difference[k] -= TURN * np.round(difference[k] / TURN)
-        if np.mean(difference**2) < SAME_WAVEFORM**2 * np.mean(sd**2 + other_sd**2):
+        if np.all(np.mean(difference**2, axis=1) < SAME_WAVEFORM**2 * np.mean(sd**2 + other_sd**2, axis=1)):
             return True
     return False
 

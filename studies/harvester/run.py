@@ -2,18 +2,22 @@
 
 Velocity, voltage and the drive are measured in pieces, the displacement is not. Orbits are found without a model in
 the first two thirds; restoring force, coupling and damping are estimated from their waveforms, one orbit after the
-other, and sampled with emcee. The last third of the recording judges free runs of the model.
+other, and sampled with emcee. The last third of the recording judges free runs of the model. `--part` has two
+comparisons: orbits of a simulated recording with those that are there, and multiple shooting of the measured one.
 """
 
 import argparse
+import json
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
 from studies import common
-from studies.harvester import beam, recording
+from studies.harvester import beam, multiple_shooting, recording, synthetic
 from studies.harvester.recording import FREQUENCY, Delays
 
 COORDINATES = ("voltage", "voltage[-0.2]", "voltage[-0.4]", "voltage[-0.6]", "voltage[-0.8]")
@@ -25,6 +29,7 @@ LARGEST_ERROR = 0.04
 DEGREES, COUPLING = (3, 5, 7, 9), 4
 DELAY_SD = 2e-3  # s, of their priors
 RUNS, RETURNS = 200, 30
+REACH = 0.25  # largest displacement of the measured beam, in units of the laser times s
 
 
 class Chosen(NamedTuple):
@@ -36,7 +41,10 @@ class Chosen(NamedTuple):
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the study."""
+    """Run the study, or with ``--part`` only that."""
+    if options.part:
+        {"orbits": orbits_part, "shooting": shooting_part}[options.part](options)
+        return
     watch = common.Stopwatch()
     with watch.part("recording", "the recording"):
         given = common.find_data(options.data, recording.RELATIVE)
@@ -89,6 +97,57 @@ def run(options: argparse.Namespace) -> None:
         "left_out": prediction_row(predicted),
     }  # fmt: skip
     common.finish(options.out, results, watch, paths, synthetic=about["synthetic"])
+
+
+def orbits_part(options: argparse.Namespace) -> None:
+    """Search for the orbits of simulated recordings, and compare them with those that are there."""
+    watch = common.Stopwatch()
+    with watch.part("orbits", "orbits of the flow, and those found in recordings of it"):
+        results = synthetic.campaign(PHASES, options.seed, quick=options.quick)
+    print(synthetic.table(results))
+    common.finish(options.out / "orbits", {"seed": options.seed, "quick": options.quick} | results, watch,
+                  synthetic=True)  # fmt: skip
+
+
+def shooting_part(options: argparse.Namespace) -> None:
+    """Estimate the parameters by multiple shooting, from the study's estimate, and judge them like that."""
+    watch, stored = common.Stopwatch(), options.out / "results.json"
+    if not stored.is_file():
+        raise ValueError(f"--part: must follow the study itself, got no {stored}. Run it without --part first.")
+    study = json.loads(stored.read_text("utf-8"))
+    if study["degree"] != multiple_shooting.DEGREE:
+        raise ValueError(f"--part: must follow a study with a force of degree {multiple_shooting.DEGREE}, got "
+                         f"{study['degree']}.")  # fmt: skip
+    given = common.find_data(options.data, recording.RELATIVE)
+    whole, about = recording.read(given[0]) if given else recording.simulated(options.seed)
+    delays, parts = Delays(**study["delays"]["seconds"]), recording.divided(whole, SHARE)
+    fitted, left_out = ([recording.aligned(one, delays) for one in part] for part in parts)
+    theta, scale = ({name: row[k] for name, row in study["estimates"].items()} for k in (0, 1))
+    with watch.part("problem", "a problem with the model, from an orbit"):
+        orbits = bp.find_orbits(
+            bp.PoincareSection.from_recordings(parts[0], COORDINATES, frequency=FREQUENCY), periods=[3, 4],
+            steps=STEPS, waveforms=True,
+        )  # fmt: skip
+        start = beam.Start(theta, *delays, left=(0.0, 0.0), reach=REACH)
+        problem = bp.Problem(
+            beam.model(multiple_shooting.DEGREE, COUPLING),
+            [beam.shifted(beam.experiment(one), *delays) for one in reliable(orbits)[:1]],
+            priors=beam.priors_about(start),
+        )
+        fit = bp.map_estimate(problem, start=theta, progress=False, checks=False)
+    rows = []
+    for periods in multiple_shooting.LENGTHS_OF_SEGMENTS[: 1 if options.quick else None]:
+        with watch.part(f"{periods:g}", f"segments of {periods:g} periods"):
+            shot = multiple_shooting.estimate(multiple_shooting.segments_of(fitted, periods), theta, scale, REACH)
+            covariance = pd.DataFrame(shot.covariance, [*shot.theta], [*shot.theta]).loc[[*fit.theta], [*fit.theta]]
+            shooting = replace(fit, theta={name: shot.theta[name] for name in fit.theta}, covariance=covariance)
+            predicted = bp.predict_attractor(problem, shooting, section_of(left_out), runs=RUNS, periods=RETURNS,
+                                             seed=options.seed, progress=False)  # fmt: skip
+        print(f"  {periods:g} periods: {shot.unexplained}, {shot.evaluations} evaluations\n{predicted}")
+        rows.append({"periods": periods, **shot._asdict(), "covariance": shot.covariance.tolist(),
+                     **prediction_row(predicted)})  # fmt: skip
+    common.finish(options.out / "shooting", {"recording": about, "seed": options.seed, "lengths": rows}, watch,
+                  synthetic=about["synthetic"])  # fmt: skip
 
 
 def found_orbits(recordings: list[bp.Recording], quick: bool) -> bp.Orbits:

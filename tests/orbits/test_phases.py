@@ -76,6 +76,19 @@ def test_errors_are_those_of_the_section_where_they_are_smallest():
                     assert here <= 1.001 * np.mean([np.mean(sd**2) for sd in other.waveform.sd.values()])
 
 
+def test_orbits_that_differ_in_one_channel_are_not_merged_by_large_errors_of_another():
+    """Two orbits, in one of which the errors of y are larger than its range."""
+    one, other = [orbit for orbit in found() if orbit.period == 2][:2]
+
+    def vague(orbit):
+        errors = orbit.waveform.errors.copy()
+        errors[:, list(orbit.waveform.values).index("y")] *= 1e5
+        return replace(orbit, waveform=replace(orbit.waveform, errors=errors))
+
+    assert np.mean(vague(other).waveform.sd["y"] ** 2) > np.ptp(one.waveform.values["y"]) ** 2
+    assert [len(merged([[one], [vague(orbit)]], [0, 0])) for orbit in (one, other)] == [1, 2]
+
+
 def test_mirror_images_are_half_a_period_later():
     """Signs of x and half a period changed at once leave the double well with its cosine as it is."""
     orbits, pairs = found(), 0

@@ -1,0 +1,241 @@
+"""A simulated beam with a piezo element in 120 pieces, its unstable orbits, and what a search finds of them.
+
+The true orbits come from a long simulation without noise and Newton's method on the flow, by SciPy.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.integrate import odeint
+from scipy.stats import binom
+
+import bayesperiodic as bp
+from studies import shooting
+from studies.harvester.recording import FREQUENCY
+
+# x'' = f1 x − f3 x³ − damping x' − back v − drive_gain a, v' = −decay v + coupling x'; a is the base's acceleration.
+TRUTH = {
+    "f1": 1300.0, "f3": 6.1e4, "damping": 10.0, "back": 206.0, "drive_gain": 25.0, "coupling": 0.633, "decay": 5.0,
+}  # fmt: skip
+MODEL = bp.Model(
+    "piezo_duffing",
+    states=["x", "v"],
+    inputs=["drive"],
+    parameters=[*TRUTH],
+    equations=["ddx + damping*dx - f1*x + f3*x**3 + back*v + drive_gain*drive", "dv + decay*v - coupling*dx"],
+    outputs={"displacement": "x", "velocity": "dx", "voltage": "v"},
+)
+AMPLITUDE = 4.6  # m/s²
+# Pieces, their periods, periods between them, of the long simulation, and at its start, which are left out.
+PIECES, LENGTH, PAUSE, LONG, SETTLING = 120, 26, 4, 10_000, 200
+RATE = 2048.0  # Hz
+# Coordinates of the sections, as many as states, and local maps a period.
+COORDINATES, STEPS = ("voltage", "voltage[-0.4]", "voltage[-0.8]"), 3
+NOISE = {"velocity": 0.02, "voltage": 2e-6, "drive": 2e-3}
+# True orbits: periods, largest multiplier, and fewest close returns in the recording, all points of which are within
+# this distance of the orbit, in ranges of the states.
+PERIODS, LARGEST, FEWEST, CLOSE = (1, 2, 3, 4), 100.0, 3, 0.08
+CANDIDATES = 50
+# Points a period of the Fourier series of an orbit.
+POINTS = 64
+# An orbit is found if all coordinates of its points are within this distance, in ranges of the coordinates; half width
+# of 90 % error bars in standard deviations, and the probability of the band of the number that they cover.
+TOLERANCE, HALF_WIDTH, BAND = 0.02, 1.6448536, 0.99
+# Guesses nearer to each other, and orbits nearer to each other than this are the same.
+ALIKE, SAME = 0.02, 1e-5
+
+
+class TrueOrbit(NamedTuple):
+    """A periodic orbit of the flow."""
+
+    states: np.ndarray  # x, x' and v at whole periods of the drive, (period, 3)
+    multipliers: np.ndarray  # (3,)
+
+    @property
+    def period(self) -> int:
+        """Number of drive periods."""
+        return len(self.states)
+
+
+def states_of(periods: int, rate: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and states (samples, 3) of a motion without noise, after a transient."""
+    angle = 2.0 * np.pi * np.arange(64) / 64
+    start = np.random.default_rng(seed).uniform(-0.1, 0.1)
+    run = bp.simulate(
+        MODEL, TRUTH, {"drive": AMPLITUDE * np.cos(angle)}, frequency=FREQUENCY,
+        duration=(SETTLING + periods) / FREQUENCY, sampling_rate=rate, start={"x": start},
+    )  # fmt: skip
+    kept = run.time >= (SETTLING - 1e-9) / FREQUENCY
+    return run.time[kept], np.stack([run.outputs[n][kept] for n in ("displacement", "velocity", "voltage")], axis=1)
+
+
+def flow(start: float, end: float, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the state at the end and its derivative by that at the start, times in drive periods."""
+    p = TRUTH
+    force, omega = p["drive_gain"] * AMPLITUDE, 2.0 * np.pi * FREQUENCY
+
+    def rates(t: float, z: np.ndarray) -> np.ndarray:
+        x, y, v = z[:3]
+        slope = p["f1"] - 3.0 * p["f3"] * x * x
+        a, b, c = z[3:6], z[6:9], z[9:]
+        result = np.empty(12)
+        result[:3] = (
+            y, (p["f1"] - p["f3"] * x * x) * x - p["damping"] * y - p["back"] * v - force * np.cos(omega * t),
+            p["coupling"] * y - p["decay"] * v,
+        )  # fmt: skip
+        result[3:6], result[6:9] = b, slope * a - p["damping"] * b - p["back"] * c
+        result[9:] = p["coupling"] * b - p["decay"] * c
+        return result
+
+    times = np.array([start, end]) / FREQUENCY
+    first = np.concatenate([state, np.eye(3).ravel()])
+    end_values = odeint(rates, first, times, tfirst=True, rtol=1e-11, atol=1e-12, mxstep=shooting.MOST_STEPS)[-1]
+    return end_values[:3], end_values[3:].reshape(3, 3)
+
+
+def recordings(seed: int) -> tuple[list[bp.Recording], np.ndarray]:
+    """Return the pieces with noise, and the true states at whole periods of the drive, (pieces, periods, 3)."""
+    time, states = states_of(PIECES * (LENGTH + PAUSE), RATE, seed)
+    drive = AMPLITUDE * np.cos(2.0 * np.pi * FREQUENCY * time)
+    generator = np.random.default_rng([seed, 1])
+    channels = {"velocity": states[:, 1], "voltage": states[:, 2], "drive": drive}
+    noisy = {n: v + NOISE[n] * generator.standard_normal(v.size) for n, v in channels.items()}
+    pieces = []
+    for first in (LENGTH + PAUSE) * np.arange(PIECES):
+        inside = (time >= time[0] + first / FREQUENCY) & (time < time[0] + (first + LENGTH) / FREQUENCY)
+        outputs = {name: noisy[name][inside] for name in ("velocity", "voltage")}
+        pieces.append(bp.Recording(time[inside], outputs, {"drive": noisy["drive"][inside]}, synthetic=True))
+    every = states_of(PIECES * (LENGTH + PAUSE), FREQUENCY, seed)[1][: PIECES * (LENGTH + PAUSE)]
+    return pieces, every.reshape(PIECES, LENGTH + PAUSE, 3)[:, :LENGTH]
+
+
+@cache
+def orbits_of_the_flow() -> tuple[TrueOrbit, ...]:
+    """Return the orbits near close returns of a long motion, whatever their multipliers."""
+    section = states_of(LONG, FREQUENCY, 0)[1]
+    size = np.ptp(section, axis=0)
+    result: list[TrueOrbit] = []
+    for period in PERIODS:
+        away = np.abs((section[period:] - section[:-period]) / size).max(axis=1)
+        guesses: list[np.ndarray] = []
+        for first in np.argsort(away):
+            if len(guesses) == CANDIDATES or away[first] > CLOSE:
+                break
+            guess = section[first : first + period]
+            if all(_apart(guess / size, other / size) > ALIKE for other in guesses):
+                guesses.append(guess)
+        for guess in guesses:
+            try:
+                orbit = shooting.closed(flow, np.arange(period + 1.0), guess, np.zeros(3), accuracy=1e-9)
+            except (RuntimeError, np.linalg.LinAlgError):
+                continue
+            known = [one.states for one in result if one.period == period]
+            shorter = [
+                _apart(np.roll(orbit.states, -k, axis=0)[:k], orbit.states[:k])
+                for k in range(1, period)
+                if period % k == 0
+            ]
+            if not any(a < SAME for a in shorter) and not any(_apart(orbit.states, one) < SAME for one in known):
+                result.append(TrueOrbit(orbit.states, orbit.multipliers))
+    return tuple(result)
+
+
+def _apart(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the largest distance of the states of two orbits of one period, at the shift with the smallest."""
+    return min(float(np.abs(np.roll(one, -k, axis=0) - other).max()) for k in range(len(one)))
+
+
+def close_returns(orbit: TrueOrbit, states: np.ndarray, size: np.ndarray) -> int:
+    """Return how many times the motion is close to the orbit at period + 1 successive points of one piece."""
+    p = orbit.period
+    chains = np.lib.stride_tricks.sliding_window_view(states, p + 1, axis=1).transpose(0, 1, 3, 2)
+    count = 0
+    for k in range(p):
+        closed = np.roll(np.concatenate([orbit.states, orbit.states]), -k, axis=0)[: p + 1]
+        count += int(np.sum(np.abs((chains - closed) / size).max((2, 3)) < CLOSE))
+    return count
+
+
+def voltage_of(orbit: TrueOrbit, at: np.ndarray) -> np.ndarray:
+    """Return the voltage of an orbit at times in drive periods, by the Fourier series of its points."""
+    course = []
+    for k, state in enumerate(orbit.states):
+        here = state
+        for j in range(POINTS):
+            course.append(here[2])
+            here = flow(k + j / POINTS, k + (j + 1) / POINTS, here)[0]
+    amplitudes = np.fft.rfft(course) / len(course)
+    amplitudes[1:] *= 2.0
+    turns = 2j * np.pi * np.arange(amplitudes.size) / orbit.period
+    return (np.exp(np.multiply.outer(at, turns)) @ amplitudes).real
+
+
+def counted_orbits(states: np.ndarray) -> list[tuple[TrueOrbit, int]]:
+    """Return the orbits that a search should find in a recording with these states, and their close returns."""
+    size = np.ptp(states, axis=(0, 1))
+    every = [(orbit, close_returns(orbit, states, size)) for orbit in orbits_of_the_flow()]
+    return [(o, count) for o, count in every if abs(o.multipliers[0]) < LARGEST and count >= FEWEST]
+
+
+def points_of(orbit: TrueOrbit, coordinates: Sequence[str]) -> np.ndarray:
+    """Return the points (period, d) of an orbit in the voltage and delayed ones, at phase zero."""
+    delays = [float(name.partition("[")[2].rstrip("]") or 0.0) for name in coordinates]
+    return voltage_of(orbit, np.arange(orbit.period)[:, None] + np.array(delays))
+
+
+def compared(
+    true: list[tuple[TrueOrbit, int]], orbits: bp.Orbits, sections: list[bp.PoincareSection]
+) -> list[dict[str, Any]]:
+    """Return a row for each true orbit: whether it is found, and how many of its points are within their error bars."""
+    rows, size = [], np.ptp(sections[0].points, axis=0)
+    for orbit, returns in true:
+        row: dict[str, Any] = {
+            "period": orbit.period, "multiplier": float(orbit.multipliers[0].real), "returns": returns, "found": False
+        }  # fmt: skip
+        points, closest = points_of(orbit, sections[0].coordinates), TOLERANCE
+        for one in orbits:
+            for k in range(orbit.period if one.period == orbit.period else 0):
+                away = np.roll(points, -k, axis=0) - one.points
+                if (distance := float(np.abs(away / size).max())) < closest:
+                    inside = np.abs(away) < HALF_WIDTH * np.sqrt(np.diag(one.covariance)).reshape(away.shape)
+                    row |= {
+                        "found": True, "away": (closest := distance), "sections": one.sections,
+                        "points": len(inside), "covered": int(inside[:, 0].sum()),
+                        "values": inside.size, "values_covered": int(inside.sum()),
+                        "estimate": float(one.eigenvalues[0].real), "estimate_sd": float(one.eigenvalue_sd[0]),
+                    }  # fmt: skip
+        rows.append(row)
+    return rows
+
+
+def campaign(phases: int, seed: int, *, quick: bool) -> dict[str, Any]:
+    """Return what a search finds of the orbits of the flow, and how many true values the error bars contain."""
+    pieces, states = recordings(seed)
+    sections = [
+        bp.PoincareSection.from_recordings(pieces, COORDINATES, frequency=FREQUENCY, origin=k / (phases * FREQUENCY))
+        for k in range(phases)
+    ]
+    wanted = PERIODS[:2] if quick else PERIODS
+    orbits = bp.find_orbits(sections, periods=wanted, steps=STEPS)
+    rows = compared([pair for pair in counted_orbits(states) if pair[0].period in wanted], orbits, sections)
+    there = [row for row in rows if row["found"]]
+    result: dict[str, Any] = {"truth": TRUTH, "orbits": rows, "all_found": len(orbits), "found": len(there)}
+    for name, of in (("covered", "points"), ("values_covered", "values")):
+        count = sum(row[of] for row in there)
+        result[name] = {
+            "count": sum(row[name] for row in there), "of": count,
+            "band": [int(end) for end in binom.interval(BAND, count, 0.9)],
+        }  # fmt: skip
+    return result
+
+
+def table(results: dict[str, Any]) -> str:
+    """Return the rows of the orbits, and the numbers found and covered, as text."""
+    lines = [pd.DataFrame(results["orbits"]).to_string(float_format="{:.4g}".format, na_rep="-")]
+    lines.append(f"{results['found']} of {len(results['orbits'])} orbits are found")
+    for name in ("covered", "values_covered"):
+        lines.append(f"{name}: {results[name]['count']} of {results[name]['of']}, 99 % band {results[name]['band']}")
+    return "\n".join(lines)
