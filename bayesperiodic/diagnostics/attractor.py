@@ -47,7 +47,7 @@ LIBRARY_RUNS, DRAWING_ATTEMPTS = 40, 100
 # Draws at which orbits are sought.
 ORBIT_DRAWS = 20
 # Forcing periods by which the inputs of an orbit and of the section differ in phase at most.
-LARGEST_PHASE = 1 / 64
+LARGEST_PHASE_ERROR = 1 / 64
 # Standard errors from which on an orbit is named.
 FAR_ORBIT = 4.0
 
@@ -336,7 +336,7 @@ def _orbits(recorded: Recorded, section: PoincareSection, orbits: Orbits | Seque
         here, there = (_input_phases(recorded, of) for of in (section, orbit))
         for name in here.keys() & there.keys():
             away = float(np.angle(there[name] / here[name])) / (2.0 * np.pi)
-            if abs(away) > LARGEST_PHASE:
+            if abs(away) > LARGEST_PHASE_ERROR:
                 raise ValueError(
                     f"orbits[{k}]: must be of a section at the phase of `section`, got {orbit.name!r}, whose "
                     f"{name!r} is {away:+.3f} forcing periods off. Make both sections with the same origin, or give "
