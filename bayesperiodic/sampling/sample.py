@@ -75,8 +75,9 @@ ROUND, CHECKED = 25, 50
 # Burn-in ends when the autocorrelation time [steps] expected of the mixture is FAST_MIXTURE, or after
 # MOST_BURN_IN_ROUNDS.
 FAST_MIXTURE, MOST_BURN_IN_ROUNDS = 3.0, 40
-# Rounds after which a surrogate is tried, and fractions of the steps from the mixture and by it then.
-SURROGATE_ROUNDS, TRIED = 10, [0.4, 0.4]
+# A surrogate is tried after SURROGATE_ROUNDS, at these fractions of the steps from the mixture and by it, if the time
+# expected of the mixture is then USELESS_MIXTURE.
+SURROGATE_ROUNDS, TRIED, USELESS_MIXTURE = 10, [0.4, 0.4], 50.0
 # It starts again, before MOST_BURN_IN_ROUNDS, if SLOW_MIXTURE is expected at the draws that are kept: their tails were
 # not known yet.
 SLOW_MIXTURE = 6.0
@@ -113,11 +114,13 @@ def sample(
     and stretch moves within each ensemble, for what the mixture misses. The narrow axes of the mixture follow quadratic
     forms of the wider ones, where ridges are curved. It is fitted to the draws of all ensembles every 25 steps of the
     burn-in, which is removed; that ends when a tau of at most 3 is expected, or after 1000 steps, and the mixture is
-    fixed. Before 1000 steps the burn-in starts again if later draws let a tau above 6 be expected. Where the mixture is
-    slow after 250 steps, as with many positive parameters of which the data determine sums, trajectories on a surrogate
-    propose instead: the prior times a normal likelihood, without periodic solves [4]_. On the posterior of
+    fixed. Before 1000 steps the burn-in starts again if later draws let a tau above 6 be expected. On the posterior of
     the damper, in six dimensions, tau is 2, with moves within the ensembles alone 23; on that of the landing gear's 15
     parameters and two variances 2.6 and 82.
+
+    Where a tau above 50 is expected after 250 steps, as with many positive parameters of which the data determine sums,
+    trajectories on a surrogate are tried: the prior times a normal likelihood, without periodic solves [4]_. They make
+    four steps in five if they are faster.
 
     Sampling stops if, twice in succession, the chain after the burn-in and after its first fifth is 50 autocorrelation
     times long, that time has changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and
@@ -444,11 +447,12 @@ class _EnsembleRun:
         state = self.state
         if not self.surrogate or not state["mixture"] or state["steps"] < SURROGATE_ROUNDS * ROUND:
             return [MIXTURE_STEPS, 0.0]
+        by_mixture = self._expected_time(StudentMixture.from_lists(state["mixture"]), first)
+        if by_mixture < USELESS_MIXTURE:
+            return [MIXTURE_STEPS, 0.0]
         accepted, proposed = state["moved"]
         if not proposed:
             return TRIED
-        mixture = StudentMixture.from_lists(state["mixture"])
-        by_mixture = self._expected_time(mixture, first)
         by_surrogate = 2.0 / max(MIXTURE_STEPS * accepted / proposed, np.finfo(float).tiny) - 1.0
         return [0.1, MIXTURE_STEPS] if by_surrogate < by_mixture else [MIXTURE_STEPS - 0.1, 0.1]
 
