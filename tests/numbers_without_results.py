@@ -57,6 +57,7 @@ WITHOUT_RESULTS = {
             "both ends of the 90 % interval", "above 0.7 Laplace is", "is 50 autocorrelation times long",
             "is at most 1.005 and their 5, 50 and 95 % quantiles", "92 for a median of 5000 and a spread of 2",
             "48 % for a tenth of the prior", "one with 3 % of the posterior mass",
+            "No mixture describes it in 20 dimensions. Where a tau above 50", "after 250 steps of the burn-in",
         ),
     },
     "docs/explanation/paper.md": {
@@ -274,6 +275,9 @@ WITHOUT_RESULTS = {
             "in 120 pieces of 4 s", "errors below 4 % of", "free runs over 30 periods", "The force of degree 7 is",
             "of three states in 120 pieces", "Of those of periods 1 to 4 whose multiplier is below 100",
             "within 8 % of their range", "The 90 % error bars",
+        ),
+        UNSTORED: (
+            "gave 0.028, with 19 runs that leave, and 0.004", "which is not measured, all 14 are found",
         ),
         ELSEWHERE: ("Cunha Jr, 2025", "CC BY-NC-ND 4.0"),
     },

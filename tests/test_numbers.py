@@ -986,6 +986,7 @@ def measured_chaos():
     density, exponent = tests["density"], tests["Lyapunov exponent"]
     chance = f"{density['low']:.3f} to {density['high']:.3f}"
     yield f"The distance of the densities is {density['model']:.3f}, by chance {chance}"
+    yield f"a joint p of {tests['all']['p']:.3f} where {0.01} is the limit"
     yield f"{given['left_out']['left']} of {given['left_out']['runs']} runs leave the region"
     yield f"exponent is {exponent['model']:.2f} 1/s, by chance {exponent['low']:.2f} to {exponent['high']:.2f}"
     yield f"that of two neighbouring runs {exponents['model']['exponent']:.2f} ± {exponents['model']['sd']:.2f} 1/s"
