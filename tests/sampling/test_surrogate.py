@@ -62,7 +62,7 @@ def test_a_wrong_surrogate_leaves_the_density_unchanged():
     assert distance < 2.23 * np.sqrt(tau / a.size) + 1e-3
 
 
-def collinear(count, sums, sd):
+def collinear(count, sums, sd, prior):
     """Return a problem whose outputs are sums of `count` parameters each, known up to `sd`, and its estimate."""
     names = [f"p{k}" for k in range(count * len(sums))]
     groups = {f"y{g}": names[g * count : (g + 1) * count] for g in range(len(sums))}
@@ -71,7 +71,7 @@ def collinear(count, sums, sd):
         lambda p: {channel: sum(getattr(p, name) for name in each) for channel, each in groups.items()},
     )  # fmt: skip
     problem = bp.Problem(
-        added, [run(**dict(zip(groups, sums, strict=True)))], priors=dict.fromkeys(names, bp.LogNormal(1.0, 1.0)),
+        added, [run(**dict(zip(groups, sums, strict=True)))], priors=dict.fromkeys(names, prior),
         fixed=known(**dict.fromkeys(groups, sd)), input_noise="exact",
     )  # fmt: skip
     return problem, bp.map_estimate(problem, start=dict.fromkeys(names, sums[0] / count), **QUIET)
@@ -79,7 +79,7 @@ def collinear(count, sums, sd):
 
 @pytest.mark.filterwarnings("ignore")
 def test_slope_and_curvature_at_the_mode_are_those_of_the_density():
-    problem, fit = collinear(3, (4.0, 5.0), 0.05)
+    problem, fit = collinear(3, (4.0, 5.0), 0.15, bp.LogNormal(1.0, 0.5))
     density = problem.anchored(
         problem.vector(fit.theta), {name: one.states for name, one in fit.solutions.items()}
     ).density(variances="collapsed")
@@ -105,7 +105,7 @@ def test_slope_and_curvature_at_the_mode_are_those_of_the_density():
     exact = derivatives(lambda x: density.evaluate(x[None]).log_prob[0])
     slope, curvature = derivatives(by_surrogate)
     assert slope == pytest.approx(exact[0], abs=0.05)
-    assert curvature == pytest.approx(exact[1], rel=0.02, abs=0.02 * np.abs(exact[1]).max() ** 0.5)
+    assert curvature == pytest.approx(exact[1], rel=1e-3, abs=0.8)
     y = surrogate.values(mode + 0.1 * np.random.default_rng(0).standard_normal((5, mode.size)))
     numeric = [
         [
@@ -124,7 +124,7 @@ def test_twenty_parameters_of_which_the_data_determine_two_sums():
 
     Kolmogorov's distances of 20 parameters: false-alarm rate 1e-3.
     """
-    problem, fit = collinear(10, (9.0, 25.0), 0.05)
+    problem, fit = collinear(10, (9.0, 25.0), 0.05, bp.LogNormal(1.0, 1.0))
     posterior = bp.sample(problem, fit, seed=1, ensembles=2, max_steps=6000, **QUIET)
     assert posterior.converged, posterior.reason
     assert min(posterior.ess.values()) > 0.02 * posterior.log_posterior_calls
