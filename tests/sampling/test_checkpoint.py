@@ -171,6 +171,18 @@ def test_chain_can_be_extended(problem, uninterrupted, tmp_path):
     assert again.reason == further.reason == uninterrupted[0].reason
 
 
+def test_checkpoint_of_a_version_without_surrogates_is_resumed(problem, uninterrupted, tmp_path, monkeypatch):
+    path, load = tmp_path / "run.h5", checkpoint.Checkpoint.load
+    bp.sample(*problem, checkpoint=path, **(RUN | {"max_steps": 100}))
+
+    def earlier(self):
+        backend, state = load(self)
+        return backend, {key: value for key, value in state.items() if key not in ("shares", "moved")}
+
+    monkeypatch.setattr(checkpoint.Checkpoint, "load", earlier)
+    assert bp.sample(*problem, checkpoint=path, **RUN).reason == uninterrupted[0].reason
+
+
 def test_checkpoint_that_is_damaged_locked_or_of_another_run_is_rejected(problem, tmp_path):
     path = tmp_path / "run.h5"
     bp.sample(*problem, checkpoint=path, **(RUN | {"max_steps": 50}))
