@@ -79,7 +79,7 @@ FAST_MIXTURE, MOST_BURN_IN_ROUNDS = 3.0, 40
 # expected of the mixture is then USELESS_MIXTURE.
 SURROGATE_ROUNDS, TRIED, USELESS_MIXTURE = 10, [0.4, 0.4], 50.0
 # Both fractions at first, and numbers of proposals by the surrogate that were accepted, and made.
-FIRST_SHARES: dict[str, Any] = {"shares": [MIXTURE_STEPS, 0.0], "moved": [0, 0]}
+SHARES_AT_FIRST: dict[str, Any] = {"shares": [MIXTURE_STEPS, 0.0], "moved": [0, 0]}
 # It starts again, before MOST_BURN_IN_ROUNDS, if SLOW_MIXTURE is expected at the draws that are kept: their tails were
 # not known yet.
 SLOW_MIXTURE = 6.0
@@ -298,7 +298,7 @@ class _EnsembleRun:
         first, redraws, axes = np.random.SeedSequence(seed).spawn(3)
         self.redraws = np.random.default_rng(redraws)
         if "axes" in state:
-            self.state = FIRST_SHARES | state  # which checkpoints of earlier versions lack
+            self.state = SHARES_AT_FIRST | state  # which checkpoints of earlier versions lack
             self.transform = AffineTransform(np.array(state["origin"]), np.array(state["axes"]))
             self.calls = CallCount(state["calls"], Counter(state["failures"]))
             self.walk = backend.get_last_sample()
@@ -309,7 +309,7 @@ class _EnsembleRun:
         starts = [start_points(density, fit, start, self.walkers, generator, self.calls) for _ in range(shape[0])]
         self.walk = emcee.State(self.transform.whiten(np.concatenate(starts)), random_state=random.get_state())
         first_mixture = self._first_mixture()
-        self.state = FIRST_SHARES | state | {
+        self.state = SHARES_AT_FIRST | state | {
             "origin": self.transform.origin.tolist(), "axes": self.transform.axes.tolist(),
             "mixture": first_mixture and first_mixture.as_lists(), "burnt": 0, "tries": [0, 0],
             "steps": 0, "next": ROUND, "passes": 0, "missing": [ADAPTED], "tau": [],
