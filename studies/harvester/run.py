@@ -24,8 +24,8 @@ COORDINATES = ("voltage", "voltage[-0.2]", "voltage[-0.4]", "voltage[-0.6]", "vo
 SECTION = ("velocity", "voltage")
 # Local maps a period, sections a period, and the share of the recording in which orbits are found.
 STEPS, PHASES, SHARE = 7, 4, 2.0 / 3.0
-# Orbits are used whose errors are at most this fraction of the waveform.
-LARGEST_ERROR = 0.04
+# Orbits are used whose errors are at most this fraction of the waveform; quick runs have fewer and less accurate ones.
+LARGEST_ERROR, QUICK_LARGEST_ERROR = 0.04, 0.1
 DEGREES, COUPLING = (3, 5, 7, 9), 4
 DELAY_SD = 2e-3  # s, of their priors
 RUNS, RETURNS = 200, 30
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"  {'SYNTHETIC' if about['synthetic'] else 'measured'}, {sum(one.time.size for one in whole)} samples")
     with watch.part("orbits", "finding orbits without a model, at several phases"):
         orbits = found_orbits(fitted, options.quick)
-        used = reliable(orbits)
+        used = reliable(orbits, QUICK_LARGEST_ERROR if options.quick else LARGEST_ERROR)
     print(f"{orbits}\n  {len(used)} are used")
     with watch.part("delays", "delays of the channels against the drive"):
         delays, errors = delays_of(used, options.seed)
@@ -131,7 +131,10 @@ def shooting_part(options: argparse.Namespace) -> None:
         start = beam.Start(theta, *delays, left=(0.0, 0.0), reach=REACH)
         problem = bp.Problem(
             beam.model(multiple_shooting.DEGREE, COUPLING),
-            [beam.shifted(beam.experiment(one), *delays) for one in reliable(orbits)[:1]],
+            [
+                beam.shifted(beam.experiment(one), *delays)
+                for one in reliable(orbits, QUICK_LARGEST_ERROR if options.quick else LARGEST_ERROR)[:1]
+            ],
             priors=beam.priors_about(start),
         )
         fit = bp.map_estimate(problem, start=theta, progress=False, checks=False)
@@ -168,12 +171,12 @@ def error_of(orbit: bp.Orbit) -> float:
     return max(float(np.sqrt(np.mean(sd[n] ** 2)) / np.std(values[n])) for n in orbit.waveform.outputs)
 
 
-def reliable(orbits: bp.Orbits) -> list[bp.Orbit]:
+def reliable(orbits: bp.Orbits, largest: float) -> list[bp.Orbit]:
     """Return the orbits that are used, by period and multiplier; raise a ValueError if there is none."""
-    used = [one for one in orbits if error_of(one) < LARGEST_ERROR]
+    used = [one for one in orbits if error_of(one) < largest]
     if not used:
         raise ValueError(
-            f"--data: must be a recording with orbits whose errors are below {LARGEST_ERROR:.0%}, got none of "
+            f"--data: must be a recording with orbits whose errors are below {largest:.0%}, got none of "
             f"{len(orbits)}. Record more periods."
         )
     return used
