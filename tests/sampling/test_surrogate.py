@@ -143,3 +143,14 @@ def test_twenty_parameters_of_which_the_data_determine_two_sums():
             draws = posterior.draws(f"p{k}")
             distance = stats.kstest(draws, lambda v, c=cdf, x=places * step: np.interp(v, x, c)).statistic
             assert distance < 2.3 / np.sqrt(posterior.ess[f"p{k}"]) + 2e-3, (k, distance)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_sampling_goes_on_where_a_matrix_is_singular_to_rounding(monkeypatch):
+    problem, fit = collinear(3, (4.0, 5.0), 0.15, bp.LogNormal(1.0, 0.5))
+
+    def singular(*given):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(np.linalg, "cholesky", singular)
+    assert surrogate_of(problem.density(), fit) is None
