@@ -1,6 +1,6 @@
 """Moves of emcee: within several ensembles at once, and from a mixture. Importing emcee takes a second."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import emcee
 import numpy as np
@@ -32,16 +32,19 @@ class WithinEnsembles(emcee.moves.RedBlueMove):
         return np.concatenate(points), np.concatenate(factors)
 
 
+Proposal = Callable[[np.ndarray, np.random.RandomState], tuple[np.ndarray, np.ndarray]]
+
+
 class CountedMove(emcee.moves.MHMove):
-    """Proposals that are independent of the other walkers, with their acceptance."""
+    """Proposals that are independent of the other walkers, at a `share` of the steps, with their acceptance.
 
-    def __init__(self) -> None:
-        super().__init__(self.proposal)
+    `proposal` returns those of points (walkers, dimension), and the logs of their factors.
+    """
+
+    def __init__(self, proposal: Proposal, share: float):
+        super().__init__(proposal)
+        self.share = share
         self.proposed = self.accepted = 0
-
-    def proposal(self, points: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """Return proposals for points (walkers, dimension), and the logs of their factors."""
-        raise NotImplementedError
 
     def propose(self, model: emcee.model.Model, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
         """Move all walkers, and count."""
@@ -51,62 +54,38 @@ class CountedMove(emcee.moves.MHMove):
         return state, accepted
 
 
-class MixtureMove(CountedMove):
-    """Proposals from a mixture."""
+def from_mixture(mixture: StudentMixture, share: float = MIXTURE_STEPS) -> CountedMove:
+    """Return proposals from a mixture."""
 
-    def __init__(self, mixture: StudentMixture):
-        super().__init__()
-        self._mixture = mixture
+    def proposal(points: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        drawn = mixture.draw(len(points), random)
+        return drawn, mixture.log_density(points) - mixture.log_density(drawn)
 
-    def proposal(self, points: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """Return draws of the mixture, and its density at the points relative to that at the draws."""
-        drawn = self._mixture.draw(len(points), random)
-        return drawn, self._mixture.log_density(points) - self._mixture.log_density(drawn)
+    return CountedMove(proposal, share)
 
 
-class SurrogateMove(CountedMove):
-    """Proposals by moves that leave a surrogate of the density unchanged (J. S. Liu, Monte Carlo strategies, 2001)."""
+def by_surrogate(surrogate: Surrogate, transform: AffineTransform, share: float) -> CountedMove:
+    """Return proposals by moves that leave a surrogate of the density unchanged (surrogate transitions, Liu 2001)."""
 
-    def __init__(self, surrogate: Surrogate, transform: AffineTransform):
-        super().__init__()
-        self._surrogate, self._transform = surrogate, transform
+    def proposal(points: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        x = transform.unwhiten(points)
+        y = surrogate.values(x)
+        moved = surrogate.moved(y, random)
+        there = surrogate.coordinates(moved)
+        volumes = np.sum((x - there)[:, surrogate.logarithmic], axis=1)
+        factors = surrogate.log_density(y) - surrogate.log_density(moved) + volumes
+        return transform.whiten(there), np.where(np.all(moved == y, axis=1), -np.inf, factors)
 
-    def proposal(self, points: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        """Return moved points, and the surrogate's density over the coordinates at the points relative to theirs."""
-        one = self._surrogate
-        x = self._transform.unwhiten(points)
-        y = one.values(x)
-        moved = one.moved(y, random)
-        there = one.coordinates(moved)
-        volumes = np.sum((x - there)[:, one.logarithmic], axis=1)
-        factors = one.log_density(y) - one.log_density(moved) + volumes
-        return self._transform.whiten(there), np.where(np.all(moved == y, axis=1), -np.inf, factors)
+    return CountedMove(proposal, share)
 
 
-@dataclass(frozen=True)
-class Shares:
-    """Fractions of the steps that propose from a mixture, and by a surrogate."""
-
-    mixture: float
-    surrogate: float = 0.0
-
-
-def moves(
-    ensembles: int,
-    mixture: MixtureMove | None,
-    surrogate: SurrogateMove | None = None,
-    shares: Shares = Shares(MIXTURE_STEPS),
-) -> list[tuple[emcee.moves.Move, float]]:
+def moves(ensembles: int, *independent: CountedMove) -> list[tuple[emcee.moves.Move, float]]:
     """Return the moves with their fractions of the steps.
 
     Of the steps within ensembles, seven in ten are differential evolution, two are stretch moves, and one is
     differential evolution of full length, which can jump between modes.
     """
-    weighted: list[tuple[emcee.moves.Move, float]] = []
-    if mixture:
-        weighted.append((mixture, shares.mixture))
-    if surrogate:
-        weighted.append((surrogate, shares.surrogate))
-    left = 1.0 - sum(share for _, share in weighted)
+    left = 1.0 - sum(move.share for move in independent)
     within = (emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)
-    return [(WithinEnsembles(move, ensembles), left * fraction) for move, fraction in within] + weighted
+    weighted = [(WithinEnsembles(move, ensembles), left * fraction) for move, fraction in within]
+    return [*weighted, *((move, move.share) for move in independent)]

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesperiodic._printing import progress_bar
 from bayesperiodic.sampling.convergence import PASSES, autocorrelation_time, unmet_criteria
-from bayesperiodic.sampling.moves import MixtureMove, moves
+from bayesperiodic.sampling.moves import from_mixture, moves
 from bayesperiodic.sampling.population_coordinates import Decoupled
 from bayesperiodic.sampling.population_density import PopulationDensity
 from bayesperiodic.sampling.proposals import (
@@ -56,9 +56,9 @@ class _Run:
             self.calls += len(u)
             return self.density.evaluate(self.transform.unwhiten(u)).log_prob
 
-        mixture = MixtureMove(self.mixture) if self.mixture else None
+        independent = [from_mixture(self.mixture)] if self.mixture else []
         sampler = emcee.EnsembleSampler(
-            *self.walk.coords.shape, log_prob, moves=moves(CHAINS, mixture), vectorize=True
+            *self.walk.coords.shape, log_prob, moves=moves(CHAINS, *independent), vectorize=True
         )  # fmt: skip
         for walk in sampler.sample(self.walk, iterations=steps, skip_initial_state_check=True):
             self.walk = walk

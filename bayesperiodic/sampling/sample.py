@@ -124,8 +124,8 @@ def sample(
     trajectories on a surrogate are tried: the prior times a normal likelihood, without periodic solves [4]_. They make
     four steps in five if they are faster.
 
-    Sampling stops if, twice in succession, the chain after the burn-in and after its first fifth is 50 autocorrelation
-    times long, that time has changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and
+    Sampling stops if, twice in succession, the chain after the burn-in and after its first fifth is 50 times as long as
+    its longest autocorrelation time, that time has changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and
     95 % quantiles agree within a quarter of a standard deviation; if there are several optima, the same holds for the
     fraction of draws at each. Ctrl-C or the loss of the executor's workers ends it with the steps so far, not
     converged. SIGTERM, unless your program handles it, ends the process, after the checkpoint was written.
@@ -381,11 +381,14 @@ class _EnsembleRun:
         """Advance all ensembles to a number of steps."""
         import emcee
 
-        from bayesperiodic.sampling.moves import MixtureMove, Shares, SurrogateMove, moves
+        from bayesperiodic.sampling.moves import by_surrogate, from_mixture, moves
 
-        shares = Shares(*self.state["shares"])
-        mixture = self.state["mixture"] and MixtureMove(StudentMixture.from_lists(self.state["mixture"]))
-        surrogate = SurrogateMove(self.surrogate, self.transform) if self.surrogate and shares.surrogate else None
+        of_mixture, of_surrogate = self.state["shares"]
+        mixture = self.state["mixture"] and from_mixture(StudentMixture.from_lists(self.state["mixture"]), of_mixture)
+        surrogate = (
+            by_surrogate(self.surrogate, self.transform, of_surrogate) if self.surrogate and of_surrogate else None
+        )
+        independent = [move for move in (mixture, surrogate) if move]
         calls = CallCount()
 
         def log_prob(u: np.ndarray) -> np.ndarray:
@@ -396,7 +399,7 @@ class _EnsembleRun:
 
         np.random.RandomState().set_state(self.walk.random_state)  # raises, where emcee would go on with another one
         sampler = emcee.EnsembleSampler(
-            *self.walk.coords.shape, log_prob, moves=moves(self.ensembles, mixture, surrogate, shares), vectorize=True,
+            *self.walk.coords.shape, log_prob, moves=moves(self.ensembles, *independent), vectorize=True,
             backend=self.backend,
         )  # fmt: skip
         tries, moved, steps = self.state["tries"], self.state["moved"], until - self._done

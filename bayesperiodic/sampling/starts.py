@@ -122,10 +122,7 @@ def laplace_mixture(density: SamplingCoordinates, fit: MapEstimate) -> tuple[Stu
 def surrogate_of(density: SamplingCoordinates, fit: MapEstimate) -> Surrogate | None:
     """Return the surrogate at the estimate; None without positive parameters, or where there is none."""
     laplace = _laplace(density, fit) if density.logarithmic.any() else None
-    try:
-        return laplace and Surrogate.of(density, *laplace)
-    except np.linalg.LinAlgError:  # of a matrix that is singular to rounding, as on a long and narrow ridge
-        return None
+    return laplace and Surrogate.of(density, *laplace)
 
 
 def mode_of(density: SamplingCoordinates, fit: MapEstimate, points: np.ndarray) -> np.ndarray | None:

@@ -38,8 +38,11 @@ class Surrogate:
     axes: np.ndarray  # (dimension, dimension), widths of the surrogate about m in its columns
 
     @classmethod
-    def of(cls, coordinates: SamplingCoordinates, mean: np.ndarray, covariance: np.ndarray) -> "Surrogate":
-        """Return the surrogate with mode and curvature of a Laplace approximation in sampling coordinates."""
+    def of(cls, coordinates: SamplingCoordinates, mean: np.ndarray, covariance: np.ndarray) -> "Surrogate | None":
+        """Return the surrogate with mode and curvature of a Laplace approximation in sampling coordinates.
+
+        None if the prior has no slope or curvature there.
+        """
         prior, count = coordinates.problem.joint_prior, len(coordinates.problem.names)
         logarithmic = np.append(coordinates.logarithmic, np.zeros(mean.size - count, dtype=bool))
         mode = np.where(logarithmic, np.exp(np.where(logarithmic, mean, 0.0)), mean)
@@ -56,12 +59,16 @@ class Surrogate:
         information = precision - of_prior + np.diag(by_prior * scale * logarithmic) + np.diag(slope * logarithmic)
         widths = np.sqrt(np.diag(covariance))
         widths = np.where(logarithmic, np.minimum(widths, 1.0), widths) * scale
-        relative, directions = np.linalg.eigh(information * np.outer(widths / scale, widths / scale))
+        information *= np.outer(widths / scale, widths / scale)
+        if not (np.isfinite(slope).all() and np.isfinite(information).all()):
+            return None
+        relative, directions = np.linalg.eigh(information)
         curved = relative > LEAST_CURVATURE
-        relative, directions = relative[curved], directions[:, curved]
-        away = widths * (directions @ (directions.T @ (widths * slope / scale) / relative))
+        relative = np.where(curved, relative, 0.0)
+        lengths = np.divide(1.0, relative, out=np.zeros(relative.size), where=curved)
+        away = widths * (directions @ (lengths * (directions.T @ (widths * slope / scale))))
         information = (directions * relative) @ directions.T / np.outer(widths, widths)
-        axes = np.linalg.cholesky(np.linalg.inv(information + np.diag(widths**-2.0)))
+        axes = widths[:, None] * directions / np.sqrt(1.0 + relative)
         return cls(prior, logarithmic, mode + away, slope / scale - information @ away, information, axes)
 
     def log_density(self, y: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesperiodic.sampling.moves import MixtureMove, WithinEnsembles, moves
+from bayesperiodic.sampling.moves import WithinEnsembles, from_mixture, moves
 from bayesperiodic.sampling.proposals import (
     StudentMixture,
     expected_time,
@@ -59,7 +59,7 @@ def test_a_target_of_two_unequal_modes_is_sampled_from_a_mixture_of_other_weight
         return np.log(0.7 * two[0].pdf(x[:, 0]) + 0.3 * two[1].pdf(x[:, 0]) + 1e-300)
 
     starts = np.repeat([4.0, -4.0], 32)[:, None] + 0.1 * np.random.default_rng(2).standard_normal((64, 1))
-    chain = walked(log_prob, starts, moves(2, MixtureMove(mixture(4.0, -4.0, width=0.7))), 1200)[200:, :, 0]
+    chain = walked(log_prob, starts, moves(2, from_mixture(mixture(4.0, -4.0, width=0.7))), 1200)[200:, :, 0]
     positive = chain > 0.0
     each = positive.reshape(1000, -1).mean(axis=0)
     assert abs(positive.mean() - 0.7) < 5.0 * each.std() / np.sqrt(each.size)
