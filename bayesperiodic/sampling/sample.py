@@ -125,10 +125,11 @@ def sample(
     four steps in five if they are faster.
 
     Sampling stops if, twice in succession, the chain after the burn-in and after its first fifth is 50 times as long as
-    its longest autocorrelation time, that time has changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and
-    95 % quantiles agree within a quarter of a standard deviation; if there are several optima, the same holds for the
-    fraction of draws at each. Ctrl-C or the loss of the executor's workers ends it with the steps so far, not
-    converged. SIGTERM, unless your program handles it, ends the process, after the checkpoint was written.
+    its longest autocorrelation time, that time has changed by less than 5 %, R-hat between the ensembles is at most
+    1.005 and their 5, 50 and 95 % quantiles agree within a quarter of a standard deviation; if there are several
+    optima, the same holds for the fraction of draws at each. Ctrl-C or the loss of the executor's workers ends it with
+    the steps so far, not converged. SIGTERM, unless your program handles it, ends the process, after the checkpoint was
+    written.
 
     ``sampler="nuts"`` checks the result: it samples the same density by its gradient, with the no-U-turn sampler [3]_
     of nutpie. Each ensemble is then a single chain with 300 tuning draws, which are removed, and must be 500
