@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.estimation import covariance
+from bayesperiodic.estimation import covariance, map_estimate
 from bayesperiodic.estimation.check import at_estimate
 from tests.estimation.test_changes_with_variances import MODEL, POINTS, PRIORS, run_of
 from tests.known import grid
@@ -141,3 +141,9 @@ def test_shifts_are_gauss_newton_steps_in_standard_deviations():
     assert covariance._shift(problem, peak, moved, spread) == pytest.approx(expected, rel=1e-8)
     twice = covariance._shift(problem, peak, [2.0 * part for part in moved], spread)
     assert twice == pytest.approx(2.0 * expected, rel=1e-8)
+
+
+def test_estimate_that_still_moves_names_what_cannot_be_linearised(monkeypatch):
+    monkeypatch.setattr(map_estimate, "MOST_LINEARISATIONS", 1)
+    with pytest.warns(UserWarning, match=r"errors of the inputs could not .*: estimate or inputs still .*'joint'"):
+        solved([run_of(cycles=1)], {"x": SD})

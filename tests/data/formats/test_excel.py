@@ -178,6 +178,14 @@ def test_texts_of_dates_are_read_by_their_format(write):
     assert read(write(rows), date_format="%d.%m.%Y %H:%M")[0] == [0.0, 60.0]
 
 
+def test_row_without_a_date_is_missing_and_those_after_it_are_not(write):
+    start = (datetime.datetime(2026, 3, 12) - datetime.datetime(1899, 12, 30)).days
+    rows = [["t", "x"], *([None if k == 2 else (start + k / 24, 1), float(k)] for k in range(5))]
+    with pytest.raises(ValueError, match=r"must be finite, got nan at index 2 \(1 of 5 values are NaN"):
+        read(write(rows))
+    assert read(write(rows), missing="drop") == ([0.0, 3600.0, 10_800.0, 14_400.0], [0.0, 1.0, 3.0, 4.0])
+
+
 def test_row_of_the_names_may_be_given(write):
     rows = [["a", "b"], ["t", "x"], [0, 1.5], [1, 2.5]]
     assert read(write(rows), header=2) == ([0.0, 1.0], [1.5, 2.5])

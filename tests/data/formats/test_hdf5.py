@@ -236,6 +236,17 @@ def test_coordinate_of_a_variable_is_its_time(tmp_path):
     np.testing.assert_allclose(run.times["y"], 0.25 + TIME[::2], atol=1e-9)
 
 
+def test_dimension_without_a_coordinate_is_no_time(tmp_path):
+    """NetCDF keeps such a dimension as an array of zeros, here with a unit of dates; its name says what it is."""
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        file["time"], file["x"] = np.zeros(60), SWING
+        file["time"].make_scale("This is a netCDF dimension but not a netCDF variable.        60")
+        file["time"].attrs["units"] = "seconds since 2026-01-01"
+        file["x"].dims[0].attach_scale(file["time"])
+    with pytest.raises(ValueError, match="does not say when channel 'x' was sampled"):
+        read(tmp_path / "run.h5")
+
+
 @pytest.mark.parametrize(
     "unit, calendar", [("days since 2026-01-01", "noleap"), ("fortnights since 2026-01-01", ""), ("s since 1-1-1", "")]
 )

@@ -134,6 +134,18 @@ def test_damaged_file_is_refused_or_read_as_a_whole(saved, tmp_path, compressed)
         assert run.time.size == 50
 
 
+def test_compressed_variable_that_is_cut_off_is_named(saved):
+    """The deflate stream of the last variable lacks its end, and the element that contains it says so."""
+    path = saved({"y": SWING, "z": TIME}, compressed=True)
+    content = path.read_bytes()
+    start = content.rindex(struct.pack("<I", 15), 128, len(content))
+    size = struct.unpack("<I", content[start + 4 : start + 8])[0] - 20
+    path.write_bytes(content[: start + 4] + struct.pack("<I", size) + content[start + 8 : start + 8 + size])
+    with pytest.raises(ValueError, match="variable 'z' is cut off"):
+        bp.Recording.from_file(path, sampling_rate=1.0, outputs={"z": "z"})
+    assert np.array_equal(bp.Recording.from_file(path, sampling_rate=1.0, outputs={"y": "y"}).outputs["y"], SWING)
+
+
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_version_4_is_named_with_its_conversion(tmp_path, order):
     """Written after MathWorks' "MAT-File Format": type, rows, columns, real numbers, length of the name."""

@@ -369,6 +369,7 @@ def test_file_of_version_3(tmp_path):
     run = read(tmp_path, version_3())
     np.testing.assert_array_equal(run.time, TIME)
     np.testing.assert_allclose(run.outputs["x"], X * 1e-6, rtol=1e-15)
+    assert [one.group for one in bp.inspect(tmp_path / "run.mf4").channels] == ["", ""]
     refused(tmp_path, version_3(order=">"), "begin with the highest byte")
 
 

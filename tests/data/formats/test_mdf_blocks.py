@@ -107,6 +107,16 @@ def test_bytes_of_invalidation_bits_are_part_of_a_record():
 def test_samples_of_any_length_are_not_counted():
     """A channel group of them states the number of its samples and no length; others beside it are counted."""
     assert checked(file_of(lambda b: b.add(b"SD", data=TABLE[:1001]), flags=mdf_blocks.VLSD)) == ""
+    blocks = Blocks()
+    last = channel(blocks, 0, "x", "mm", F8, 8)
+    first = channel(blocks, last, "t", "s", F8, 0, master=MASTER, sync=1)
+    counted = struct.pack("<QQHHIII", 0, 200, 0, 0, 0, 15, 0)
+    inner = blocks.add(b"CG", (0, first, blocks.text("g"), 0, 0, 0), counted)
+    any_length = struct.pack("<QQHHIII", 1, 3, mdf_blocks.VLSD, 0, 0, 40, 0)
+    outer = blocks.add(b"CG", (inner, 0, 0, 0, 0, 0), any_length)
+    data = blocks.add(b"DT", data=bytes(200 * 16 + 100))
+    header(blocks, blocks.add(b"DG", (0, outer, data, 0), b"\1" + bytes(7)))
+    assert checked(blocks.bytes()) == ""
 
 
 @pytest.mark.parametrize(

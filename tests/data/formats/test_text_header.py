@@ -114,6 +114,7 @@ REFUSED = {
     "two broken rows": ("t,x,y\nOL,OL,OL\nOL,OL,OL\n", {}, "got None, as lines 2 and 3 are alike, .*; give the number"),
     "two lines of names": ("CH1,CH2,CH3\nt,F,V\n", {},
                            "as line 2 may be names or units, .*; give the number of the line"),
+    "units above that may be names": ("V,N,V\nt,x,y\n", {}, "as line 1 may be units, .* give the number of the line"),
     "more names than columns": ("t,x,y,z\n", {}, "line above the data has 4 fields for 3 columns; give the number of"),
     "fewer names than columns": ("t,x\n", {},
                                  "line above the data has 2 fields for 3 columns; .* or header=0 for none"),

@@ -68,6 +68,12 @@ def test_samples_are_fractions_of_the_full_scale(read, kind, bits, order, extens
     np.testing.assert_allclose(run.time, np.arange(6) / 51200, rtol=1e-15)
 
 
+@pytest.mark.parametrize("kind, bits, given", [(1, 16, "as a fraction of the full scale"), (3, 32, "as stored")])
+def test_remark_says_what_the_values_are(tmp_path, kind, bits, given):
+    (tmp_path / "run.wav").write_bytes(wav(kind=kind, bits=bits))
+    assert f"values are {given}: give the full scale" in str(bp.inspect(tmp_path / "run.wav"))
+
+
 def test_24_bits_written_by_python_are_read_at_their_scale(tmp_path):
     with wave.open(str(tmp_path / "run.wav"), "wb") as file:
         file.setnchannels(2)
