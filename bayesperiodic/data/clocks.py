@@ -14,7 +14,7 @@ from bayesperiodic.data.steadiness import SMALL_RANGE, Windows
 SHORTEST_SIDE, SIDES, SIGNIFICANT_STEP = 3, 20, 8.0
 # Size of a step in standard deviations of what remains beside it: a transient is curved.
 SHARP = 5.0
-# Sides before and after a step outside of the steady part, with whose usual differences it is compared: a transient beats.
+# Sides on which a step outside of the steady part is compared with the usual differences: a transient beats.
 NEIGHBOURS = 4
 # Windows that may be missing at a step, and most steps that are searched for.
 MISSING_WINDOWS, MOST_PHASE_STEPS = 4, 50
@@ -152,8 +152,8 @@ def _usual_nearby(jump: np.ndarray, side: int, steady: np.ndarray | None) -> np.
 def steps(channels: Sequence[str], phases: Phases, used: np.ndarray) -> tuple[list[PhaseStep], list[np.ndarray]]:
     """Return the steps of phases, and the windows of each channel but the first in which its relative phase steps.
 
-    Steps of one channel relative to the others count wherever the amplitudes are those of the windows used, unless it is
-    a transient whose phase changes as much nearby; steps of all together only where they are used.
+    Steps of one channel relative to the others count wherever the amplitudes are those of the windows used, unless the
+    phase changes as much nearby, as in a transient; steps of all together only where they are used.
     """
     listed: list[PhaseStep] = []
     inside = phases.chosen(used)
