@@ -12,7 +12,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.formats.contents import Key
 from bayesperiodic.data.measurements import Amplitude, Measurement, PeakToPeak, Phase, RootMeanSquare
 from bayesperiodic.data.sweep import DOWN, RESOLUTION, UP, Sweep
-from bayesperiodic.data.table_columns import TableColumns, check_phases, contents_of
+from bayesperiodic.data.table_columns import TableColumns, check_phases, contents_of, warn_of_leads
 from bayesperiodic.data.units import Units
 
 # Values in the table over the amplitude of the fundamental.
@@ -264,6 +264,9 @@ class _Reader:
                 errors[h] = self.source.deviations(name, sd, key, values) * scale
             if (angle := self._angles(name, values, phases.get(h))) is not None:
                 angles[h] = angle - turn
+                if h == 1 and not one.to:
+                    order_of_rows = np.argsort(self.frequency, kind="stable")
+                    warn_of_leads(name, self.source.label, angle[order_of_rows], sizes[h][order_of_rows], self.lag)
         self._check_phases(name, columns, phases, angles)
         if phase_sd is not None and not angles:
             raise ValueError(f"phase_sd: must be of outputs with phases, got one for {name!r}.")

@@ -21,6 +21,8 @@ LARGEST_PHASE = 720.0
 FOLDED_PHASE, FOLDED_JUMP = 90.5, 120.0
 # Degrees within which phases may be radians, least range of these, and how much higher a peak is than both ends.
 IN_RADIANS, LEAST_PHASE_RANGE, PEAK_HEIGHT = 3.15, 1.0, 3.0
+# Degrees by which phases that rise over a peak are of the other sign.
+LEADING_RISE = 90.0
 # Names and units of levels.
 LEVEL = re.compile(r"(?<![A-Za-z])dB(?![A-Za-z])")
 
@@ -195,6 +197,24 @@ def check_phases(argument: str, label: str, angles: np.ndarray, sizes: np.ndarra
             f"{argument}: must be phases over the whole turn, got values within +-90 degrees that jump by "
             f"{jumps.max():.0f} degrees in {label}, as the arc tangent of a quotient does; take the one of two "
             "arguments, arctan2."
+        )
+
+
+def warn_of_leads(name: str, label: str, angles: np.ndarray, sizes: np.ndarray, lag: bool) -> None:
+    """Warn of phases [rad], in the order of frequencies, that rise over a peak of the amplitudes `sizes`.
+
+    The phase of a stable system against its force falls through each resonance, and rises between two of them at most
+    as much.
+    """
+    turned = np.degrees(np.unwrap(angles))
+    rise = float(turned[-1] - turned[0])
+    if rise > LEADING_RISE and sizes.max() > PEAK_HEIGHT * max(sizes[0], sizes[-1]):
+        remedy = "leave lag=True out" if lag else "give lag=True"
+        warnings.warn(
+            f"phases[{name!r}]: rise by {rise:.0f} degrees over the peak of the amplitudes in {label}, whereas a "
+            f"response falls behind its force there; if the table's phases have the other sign, {remedy}.",
+            UserWarning,
+            stacklevel=2,
         )
 
 

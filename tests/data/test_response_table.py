@@ -116,6 +116,23 @@ def test_phases_in_radians_without_their_unit_are_warned_of():
         bp.response_table({name: values[below] for name, values in table.items()}, **COLUMNS)
 
 
+def test_phases_of_the_other_sign_are_warned_of():
+    """Through a resonance a response falls behind its force; complex amplitudes may be of exp(-i omega t)."""
+    lags = TABLE | {"phi": -TABLE["phi"], "H": np.conj(H)}
+    of_complex = COLUMNS | {"outputs": {"x": "H"}, "phases": None, "per": "force"}
+    below = {name: values[: np.argmax(TABLE["A"])] for name, values in lags.items()}
+    for arguments in (COLUMNS, of_complex):
+        with pytest.warns(UserWarning, match=r"phases\['x'\]: rise by 1\d\d degrees .* give lag=True"):
+            bp.response_table(lags, **arguments)
+        with pytest.warns(UserWarning, match="leave lag=True out"):
+            bp.response_table(TABLE, **arguments, lag=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            bp.response_table(TABLE, **arguments)
+            bp.response_table(lags, **arguments, lag=True)
+            bp.response_table(below, **arguments)
+
+
 @pytest.mark.parametrize(
     "units, message",
     [
