@@ -55,7 +55,7 @@ def response_table(
     ----------
     table : pandas.DataFrame, mapping of str to array (rows,), or path
         Of a file in any format of `Recording.from_file`; of a universal file with frequency response functions these,
-        whose abscissa is the frequency.
+        whose abscissa is the frequency. Units in names such as "x [mm]" are converted to SI.
     outputs : mapping of str to str, int or (group, name), or to a mapping of int to these
         Column of the amplitudes of each channel, or of complex amplitudes; or columns by harmonic, {1: "A1", 3: "A3"}.
     inputs : mapping of str to float, str, int or (group, name)
@@ -110,7 +110,7 @@ def response_table(
     Warns
     -----
     UserWarning
-        If phases in degrees are probably radians.
+        If phases in degrees are probably radians, or of the other sign: rising over a peak.
 
     Examples
     --------

@@ -126,9 +126,7 @@ def test_values_without_a_time_history_are_data_with_their_units(tmp_path):
     assert size[2] == "m" and value(size[3]) == pytest.approx(abs(h[1]), rel=1e-3)
     assert value(size[4]) == pytest.approx(0.01 * abs(h[1]), rel=1e-2)
     (angle,) = [row for row in rows if row[:2] == ["phase of displacement", runs[2].name]]
-    assert angle[2] == "rad" and value(angle[3]) == pytest.approx(
-        np.angle(h[2]), rel=1e-3
-    )
+    assert angle[2] == "rad" and value(angle[3]) == pytest.approx(np.angle(h[2]), rel=1e-3)
     units = [row[1].text for row in written.tables["table-residuals"][1:]]
     assert units == ["m", "rad"]
 
