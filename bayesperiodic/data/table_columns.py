@@ -33,6 +33,11 @@ class TableColumns:
     def __init__(self, label: str, contents: Contents, units: Units):
         self.label, self.contents, self.units = label, contents, units
 
+    @property
+    def names(self) -> list[str]:
+        """Names of the columns."""
+        return [channel.name for channel in self.contents.channels]
+
     def column(self, key: Key) -> tuple[StoredChannel, np.ndarray]:
         """Return a column and its values."""
         stored = self.contents.find(self.label, key)
@@ -54,7 +59,8 @@ class TableColumns:
             unit = self.units.get("frequency")
             if stored.unit and unit is None and kind_of(stored.unit) != kind_of("Hz"):
                 raise ValueError(
-                    f"frequency: must be in Hz, got {stored.unit!r} of {stored.label!r}; give units={{'frequency': …}}."
+                    f"frequency: must be in Hz, got {stored.unit!r} of {stored.label!r}; give units={{'frequency': "
+                    f"({stored.unit!r}, 'Hz')}} if it is a frequency."
                 )
             values = from_file("frequency", values, unit, stored.unit)
         else:
@@ -118,14 +124,23 @@ class TableColumns:
     def deviations(self, name: str, given: Any, key: Key, values: np.ndarray) -> np.ndarray:
         """Return the standard deviations of an output's amplitudes: a share of them, a number or a column."""
         argument = f"sd[{name!r}]"
-        if isinstance(given, str) and given.strip().endswith("%"):
+        unit = self.contents.find(self.label, key).unit
+        if isinstance(given, str) and given.strip().endswith("%") and given not in self.names:
             share = _checks.positive(argument, _number(argument, given.strip()[:-1]))
             return 0.01 * share * np.abs(values)
         if is_number(given):
-            sd, unit = np.full(values.size, float(given)), self.contents.find(self.label, key).unit
+            sd = np.full(values.size, float(given))
         else:
             stored, sd = self.column(given)
-            unit = stored.unit or self.contents.find(self.label, key).unit
+            if (stored.unit or stored.name).strip().endswith("%") and unit.strip() != "%":
+                share = self.positive(argument, self.sized(argument, sd, values.size), "standard deviations")
+                return 0.01 * share * np.abs(values)
+            if stored.unit and kind_of(stored.unit) != kind_of(unit):
+                raise ValueError(
+                    f"{argument}: must be in a unit of the amplitudes ({unit or 'none'}) or in %, got {stored.unit!r} "
+                    f"of {stored.label!r} of {self.label}."
+                )
+            unit = stored.unit or unit
         sd = from_file(name, self.sized(argument, sd, values.size), self.units.get(name), unit)
         return self.positive(argument, sd, "standard deviations")
 

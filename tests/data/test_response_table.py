@@ -116,6 +116,29 @@ def test_phases_in_radians_without_their_unit_are_warned_of():
         bp.response_table({name: values[below] for name, values in table.items()}, **COLUMNS)
 
 
+@pytest.mark.parametrize(
+    "name, values, expected",
+    [
+        ("s [%]", 2.0, 0.02 * np.abs(H)),
+        ("s %", 3.0, 0.03 * np.abs(H)),
+        ("s [µm]", 50.0, 5e-5),
+        ("s", 0.2, 2e-4),
+    ],
+)
+def test_columns_of_standard_deviations_have_their_unit(name, values, expected):
+    """Amplitudes in mm; a column in percent is a share, one without a unit has that of the amplitudes."""
+    table = {"f": F, "x [mm]": 1e3 * abs(H), name: np.full(F.size, values)}
+    runs = bp.response_table(table, frequency="f", outputs={"x": "x [mm]"}, inputs={"force": 1.0}, sd={"x": name})
+    assert [run.measurements[0].sd for run in runs] == pytest.approx(np.broadcast_to(expected, F.shape))
+
+
+@pytest.mark.parametrize("unit", ["kg", "N", "dB"])
+def test_standard_deviations_of_another_kind_are_refused(unit):
+    table = {"f": F, "x [mm]": 1e3 * abs(H), f"s [{unit}]": np.ones(F.size)}
+    with pytest.raises(ValueError, match=r"sd\['x'\]: must be in a unit of the amplitudes \(mm\) or in %"):
+        bp.response_table(table, frequency="f", outputs={"x": "x [mm]"}, inputs={"force": 1.0}, sd={"x": f"s [{unit}]"})
+
+
 def test_phases_of_the_other_sign_are_warned_of():
     """Through a resonance a response falls behind its force; complex amplitudes may be of exp(-i omega t)."""
     lags = TABLE | {"phi": -TABLE["phi"], "H": np.conj(H)}
