@@ -88,7 +88,7 @@ def residual_variances(
 
     `changes` (parameters, size) and residuals (size,) are whitened, `information` is that of all blocks and priors.
     """
-    units, known = _units(likelihood, noise), []
+    units, known = likelihood.units(noise), []
     for block, s, r, unit, least in zip(
         likelihood.blocks, changes, residuals, units, _caused_variances(likelihood, noise), strict=True
     ):
@@ -97,22 +97,6 @@ def residual_variances(
             variance = _residual_variance(block, s, r, unit, information) if r.any() else np.zeros(block.size)
         known.append(np.maximum(variance, least))
     return known
-
-
-def _units(likelihood: Likelihood, noise: np.ndarray) -> list[np.ndarray]:
-    """Return a unit of each block's channel in units of the noise, one array (size,) a block.
-
-    Blocks that share errors of inputs are whitened together, so that each is taken without the others of its group,
-    whose channels may have other units.
-    """
-    rank = {b: k for shared in likelihood.shared for k, b in enumerate(shared.members)}
-    result = [np.zeros(block.size) for block in likelihood.blocks]
-    for k in range(1 + max(rank.values(), default=0)):
-        wanted = [rank.get(b, 0) == k for b in range(len(result))]
-        ones = [np.full(block.size, float(one)) for block, one in zip(likelihood.blocks, wanted, strict=True)]
-        white = likelihood.whitened(ones, noise)
-        result = [new if one else old for new, old, one in zip(white, result, wanted, strict=True)]
-    return result
 
 
 def _caused_variances(likelihood: Likelihood, noise: np.ndarray) -> list[np.ndarray]:
@@ -140,7 +124,9 @@ def _residual_variance(
     others = scaled(information - s @ s.T, scale)
     values, vectors = np.linalg.eigh(0.5 * (others + others.T))
     others = (vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T
-    s, score = s * scale[:, None], (s * scale[:, None]) @ r
+    s = s * scale[:, None]
+    # Where the prior is not concave its pull, which balances s r, has no end: the block alone decides there.
+    score = vectors @ (np.where(values > LEAST_INFORMATION, 1.0, 0.0) * (vectors.T @ (s @ r)))
     gram = (s / shape[:, None, :]) @ s.T
     pull = (r / shape) @ s.T
     size = np.ones(len(shape))
