@@ -133,8 +133,8 @@ class TableColumns:
         else:
             stored, sd = self.column(given)
             if (stored.unit or stored.name).strip().endswith("%") and unit.strip() != "%":
-                share = self.positive(argument, self.sized(argument, sd, values.size), "standard deviations")
-                return 0.01 * share * np.abs(values)
+                shares = self.positive(argument, self.sized(argument, sd, values.size), "standard deviations")
+                return 0.01 * shares * np.abs(values)
             if stored.unit and kind_of(stored.unit) != kind_of(unit):
                 raise ValueError(
                     f"{argument}: must be in a unit of the amplitudes ({unit or 'none'}) or in %, got {stored.unit!r} "
