@@ -22,7 +22,7 @@ MOST_PRINTED, MOST_SUGGESTED = 60, 6
 # Words of phases that are positive where the response is late.
 LAGS = ("lag", "nacheil")
 # Kinds of units of frequencies and angles, and derived SI units, which are not divided into those of the base.
-FREQUENCY, ANGLE, DERIVED = "1 / s", "rad", ("N", "Nm", "V", "A", "Pa", "J", "W", "Ω")
+KIND_OF_HERTZ, KIND_OF_ANGLE, DERIVED = "1 / s", "rad", ("N", "Nm", "V", "A", "Pa", "J", "W", "ohm")
 
 
 @dataclass(frozen=True)
@@ -305,7 +305,7 @@ def _unused_units(whole: Contents, columns: Mapping[str, Any]) -> dict[str, tupl
         said = stored.unit[:-1] if stored.unit.endswith("?") else header_units.unused(stored.name, stored.unit)
         if said and is_known(said) and not question(said):
             result[key] = (said, said[1:] if said[1:] in DERIVED else in_si(said).replace(" ", ""))
-            result[key] = (said, said) if said in DERIVED or kind_of(said) == FREQUENCY else result[key]
+            result[key] = (said, said) if said in DERIVED or kind_of(said) == KIND_OF_HERTZ else result[key]
     return {key: pair for key, pair in result.items() if pair[0] != pair[1]}
 
 
@@ -346,7 +346,9 @@ def _table_code(path: str | Path, usable: Mapping[str, Any], channels: tuple[Fil
     """Return a call that reads a table of responses: frequencies, amplitudes and perhaps phases; "" for other files."""
     kinds = {channel.name: kind_of(channel.unit) for channel in channels}
     kinds = {key: kinds.get(column, "") for key, column in usable.items()}
-    frequencies, phases = ([key for key, kind in kinds.items() if kind == one] for one in (FREQUENCY, ANGLE))
+    frequencies, phases = (
+        [key for key, kind in kinds.items() if kind == one] for one in (KIND_OF_HERTZ, KIND_OF_ANGLE)
+    )
     outputs = [key for key in kinds if key not in frequencies + phases]
     clocked = any(not np.isnan(channel.rate) for channel in channels)
     if clocked or len(frequencies) != 1 or not outputs or len(phases) > len(outputs):
