@@ -303,10 +303,16 @@ def _unused_units(whole: Contents, columns: Mapping[str, Any]) -> dict[str, tupl
     for key, column in columns.items():
         stored = whole.find("", column)
         said = stored.unit[:-1] if stored.unit.endswith("?") else header_units.unused(stored.name, stored.unit)
-        if said and is_known(said) and not question(said):
-            result[key] = (said, said[1:] if said[1:] in DERIVED else in_si(said).replace(" ", ""))
-            result[key] = (said, said) if said in DERIVED or kind_of(said) == KIND_OF_HERTZ else result[key]
-    return {key: pair for key, pair in result.items() if pair[0] != pair[1]}
+        if said and is_known(said) and not question(said) and (target := _target(said)) != said:
+            result[key] = (said, target)
+    return result
+
+
+def _target(unit: str) -> str:
+    """Return the SI unit of a unit; that of frequencies is left as it is, as cycles and radians are told apart."""
+    if unit in DERIVED or kind_of(unit) == KIND_OF_HERTZ:
+        return unit
+    return unit[1:] if unit[1:] in DERIVED else in_si(unit).replace(" ", "")
 
 
 def _usable(whole: Contents, channels: tuple[FileChannel, ...]) -> dict[str, Any]:
