@@ -140,12 +140,19 @@ def steps_of(
 
 
 def _usual_nearby(jump: np.ndarray, side: int, steady: np.ndarray | None) -> np.ndarray:
-    """Return the usual steps near each window outside of the steady ones, zero for these."""
+    """Return the usual steps near each window outside of the steady ones, zero for these.
+
+    It is the larger one of those before and after it: both are small beside lost samples, and the earlier ones are large
+    in a transient. It is infinite without windows on a side, which may be the transient.
+    """
     usual = np.zeros(jump.size)
     for k in [] if steady is None else np.flatnonzero(~steady[side:-side]):
-        away = np.abs(np.arange(jump.size) - k)
-        nearby = np.abs(jump[(away > side) & (away <= NEIGHBOURS * side)])
-        usual[k] = MEDIAN_TO_SD * float(np.median(nearby)) if nearby.size else 0.0
+        before, after = (
+            jump[max(k - NEIGHBOURS * side, 0) : max(k - side, 0)],
+            jump[k + side + 1 :][: NEIGHBOURS * side],
+        )
+        each = [float(np.median(np.abs(part))) if part.size else np.inf for part in (before, after)]
+        usual[k] = MEDIAN_TO_SD * max(each)
     return usual
 
 
