@@ -17,13 +17,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bayesperiodic", description="Identification from periodic states.")
     commands = parser.add_subparsers(dest="command", required=True)
     files = "print what is in a file of measurements, and the call that reads it"
-    checked = "look for faults in all channels of a file, or in the recordings of a problem file; status 1 if ruinous"
+    checked = "look for faults in all channels of a file, or in a problem file and its recordings; status 1 if ruinous"
     for name, text in (("inspect", files), ("check", checked)):
         command = commands.add_parser(name, help=text, description=text)
         command.add_argument("file", nargs="+")
         for option in ("format", "encoding", "separator", "decimal", "thousands", "date-format"):
             command.add_argument(f"--{option}", help="as for Recording.from_file, where it is not recognised")
         command.add_argument("--header", type=int, help="line of the names, from 1, or 0 for none")
+        if name == "check":
+            command.add_argument("--time", help="channel of the times, where it is not recognised")
+            command.add_argument("--sampling-rate", type=float, help="sampling rate [Hz] of a file without times")
     fitted = f"estimate, and sample if there is a table [sample]; write PROBLEM{FIT} and PROBLEM{POSTERIOR}"
     page = f"write PROBLEM{PAGE} of the results of fit"
     for name, text in (("fit", fitted), ("report", page)):
@@ -49,34 +52,48 @@ def _inspect(path: str, **options: Any) -> int:
 
 
 def _check(path: str, **options: Any) -> int:
-    """Print the check of each recording; return 1 if one has ruinous faults or no mean period."""
+    """Print the check of each recording; return 1 if one has ruinous faults or no mean period.
+
+    Of a problem file whose recordings have none, the problem is built and printed too.
+    """
     from bayesperiodic.data.file_inspection import as_recording
     from bayesperiodic.data.recording_check import RUINOUS
     from bayesperiodic.problem.problem_file import ProblemFile
 
-    status = 0
-    folded = ProblemFile(path).recordings() if path.endswith(PROBLEM) else [(as_recording(path, **options), {})]
+    status, file = 0, ProblemFile(path) if path.endswith(PROBLEM) else None
+    folded = file.recordings() if file else [(as_recording(path, **options), {})]
     for recording, fold in folded:
         frequency, periods = fold.get("frequency"), fold.get("periods", 1)
         known: Any = frequency[0] if isinstance(frequency, tuple) and frequency else frequency
         seen = recording.check(known, periods=1 if isinstance(periods, str) else periods)
         print(seen)
         status = max(status, int(bool(seen.reason) or seen.severity == RUINOUS))
+    if file and not status:
+        print(_problem_of(file)[0])
     return status
+
+
+def _problem_of(file: Any) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """Return the problem of a problem file, and the options of its estimate and its draws, none without a table."""
+    from bayesperiodic.density.problem import Problem
+    from bayesperiodic.estimation.map_estimate import map_estimate
+    from bayesperiodic.sampling.sample import sample
+
+    how = file.options(map_estimate, "map_estimate", GIVEN)
+    draws = file.options(sample, "sample", GIVEN) if "sample" in file.content else {}
+    return file.build(Problem), how, draws
 
 
 def _fit(path: str) -> int:
     """Estimate, sample, and save the results; return 1 if one has not converged."""
-    from bayesperiodic.density.problem import Problem
     from bayesperiodic.estimation.map_estimate import map_estimate
     from bayesperiodic.problem.problem_file import ProblemFile
     from bayesperiodic.sampling.sample import sample
 
     file, wanted = ProblemFile(path), [_beside(path, FIT)]
-    how, draws = file.options(map_estimate, "map_estimate", GIVEN), {}
     if "sample" in file.content:
-        draws, wanted = file.options(sample, "sample", GIVEN), [*wanted, _beside(path, POSTERIOR)]
-    problem = file.build(Problem)
+        wanted.append(_beside(path, POSTERIOR))
+    problem, how, draws = _problem_of(file)
     print(problem)
     with file.located("map_estimate"):
         results: list[Any] = [map_estimate(problem, **how)]

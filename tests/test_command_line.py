@@ -123,9 +123,14 @@ def test_every_refusal_of_a_problem_file_is_an_error_with_its_line(problem, caps
     path.write_text(text := path.read_text("utf-8").replace("sd = 60.0", "sd = -1"), encoding="utf-8")
     line = text[: text.index("sd = -1")].count("\n") + 1
     for name in ("fit", "check"):
-        status = command.main([name, str(path)])
-        assert status == (1 if name == "fit" else 0)  # `check` reads the recordings only
-    assert f"error: {path}:{line}: sd: must be > 0, got -1.\n" in capsys.readouterr().err
+        assert command.main([name, str(path)]) == 1
+        assert f"error: {path}:{line}: sd: must be > 0, got -1.\n" in capsys.readouterr().err
+
+
+def test_check_prints_the_problem_of_a_file_that_is_right(problem, capsys, tmp_path):
+    problem.to_toml(tmp_path / "problem.toml")
+    assert command.main(["check", str(tmp_path / "problem.toml")]) == 0
+    assert capsys.readouterr().out == f"{problem!r}\n"
 
 
 @pytest.fixture
@@ -157,6 +162,26 @@ def test_ruinous_faults_and_unreadable_files_are_an_exit_status(recording, capsy
     assert command.main(["check", str(recording.with_name("none.csv")), str(recording)]) == 1
     streams = capsys.readouterr()
     assert "none.csv" in streams.err and "Recording 'run'" in streams.out
+
+
+def test_check_needs_neither_units_nor_times_that_the_file_does_not_say(recording, capsys, tmp_path):
+    """Units that are doubtful, and a column with one value; the check is that of the values as they are."""
+    table = pd.read_csv(recording)
+    expected = bp.Recording.from_arrays(table["t"], {"a": table["F [N]"], "x": table["x"]}).check()
+    table = table.rename(columns={"F [N]": "a [g]"}).assign(start=[1.0] + [np.nan] * (len(table) - 1))
+    with_times, without = tmp_path / "with.csv", tmp_path / "without.csv"
+    table.to_csv(with_times, index=False)
+    table.drop(columns="t").to_csv(without, index=False)
+    table.rename(columns={"t": "clock"}).to_csv(tmp_path / "named.csv", index=False)
+    for file, *options in (
+        (with_times,), (without, "--sampling-rate", "100"), (tmp_path / "named.csv", "--time", "clock"),
+    ):  # fmt: skip
+        assert command.main(["check", str(file), *options]) == 0
+        first, *rows = capsys.readouterr().out.splitlines()
+        assert first.split(": ")[1] == str(expected).splitlines()[0].split(": ")[1]
+        assert [row.split() for row in rows] == [row.split() for row in str(expected).splitlines()[1:]]
+    assert command.main(["check", str(without)]) == 1
+    assert "error: time: must be given or sampling_rate" in capsys.readouterr().err
 
 
 def test_check_of_a_problem_file_is_that_of_its_recordings(recording, capsys):

@@ -323,9 +323,11 @@ def damper():
     )
     shown = listed(f"{one:,.0f}" for one in noisy)
     yield f"With the displacement's noise integrated out it is {shown} 1/m"
-    first, second = d["missing_terms"]
-    assert (first["term"], second["term"]) == ("w*displacement**2", "ddisplacement**3")
-    assert "w*displacement in force" in first["alternatives"] and second["verdict"] == "misspecified"
+    first, second, third = d["missing_terms"]
+    assert [one["term"] for one in (first, second)] == ["w*displacement**2", "ddisplacement**3"]
+    assert third["term"] == "w*abs(ddisplacement)" and third["verdict"] == "misspecified"
+    assert "w*displacement in force" in first["alternatives"]
+    yield f"in the equation of w, makes it {100 * third['unexplained']:.2f} %"
     yield f"lowers the unexplained variance from {100 * d['fvu']:.2f} % to {100 * first['unexplained']:.2f} %"
     yield f"do not distinguish it from {len(first['alternatives'])} other terms"
     yield (

@@ -14,6 +14,8 @@ from bayesperiodic.data.steadiness import SMALL_RANGE, Windows
 SHORTEST_SIDE, SIDES, SIGNIFICANT_STEP = 3, 20, 8.0
 # Size of a step in standard deviations of what remains beside it: a transient is curved.
 SHARP = 5.0
+# Sides on which a step outside of the steady part is compared with the usual differences: a transient beats.
+NEIGHBOURS = 4
 # Windows that may be missing at a step, and most steps that are searched for.
 MISSING_WINDOWS, MOST_PHASE_STEPS = 4, 50
 # Windows, like those of the steady part in amplitude: largest distance in robust standard deviations.
@@ -93,11 +95,14 @@ def alike(phases: Phases, used: np.ndarray) -> np.ndarray:
     return (np.abs(phases.sizes - middle) <= limit).all(axis=1)
 
 
-def steps_of(series: np.ndarray, cycle: np.ndarray, least: float) -> list[tuple[int, float]]:
+def steps_of(
+    series: np.ndarray, cycle: np.ndarray, least: float, steady: np.ndarray | None = None
+) -> list[tuple[int, float]]:
     """Return the steps of a series of phases [cycles]: windows in which they are, and sizes.
 
     A straight line and a step are fitted to as many windows before and after each window, which may contain the step;
-    the step is compared with those elsewhere. Slopes and slow curves, as of a transient, are no steps.
+    the step is compared with those elsewhere, and outside of the `steady` windows (bool) also with those near it.
+    Slopes, slow curves and beats, as of a transient, are no steps.
     """
     rest, listed = series.copy(), list[tuple[int, float]]()
     if series.size < FEWEST_WINDOWS:
@@ -117,9 +122,9 @@ def steps_of(series: np.ndarray, cycle: np.ndarray, least: float) -> list[tuple[
             jump, size_of_one = 2.0 * fitted[:, 2], 2.0 * float(np.linalg.norm(inverse[2]))
             curved = np.sqrt(np.sum((beside - fitted @ design.T) ** 2, axis=1) / (2 * side - design.shape[1]))
             usual = float(np.quantile(np.abs(jump), FEW)) / FEW_TO_SD
-            usual = max(usual, white * size_of_one)
+            usual = np.maximum(max(usual, white * size_of_one), _usual_nearby(jump, side, steady))
             near = cycle[2 * side :] - cycle[: -2 * side] <= (2 * side + MISSING_WINDOWS) * length
-            limit = np.maximum(max(SIGNIFICANT_STEP * few * usual, least), SHARP * curved)
+            limit = np.maximum(np.maximum(SIGNIFICANT_STEP * few * usual, least), SHARP * curved)
             score = np.where(near, np.abs(jump) / limit, 0.0)
             k = int(np.argmax(score))
             if score[k] > best[0]:
@@ -134,11 +139,28 @@ def steps_of(series: np.ndarray, cycle: np.ndarray, least: float) -> list[tuple[
     return listed
 
 
+def _usual_nearby(jump: np.ndarray, side: int, steady: np.ndarray | None) -> np.ndarray:
+    """Return the usual steps near each window outside of the steady ones, zero for these.
+
+    It is the larger one of those before and after it: both are small beside lost samples, and the earlier ones are large
+    in a transient. It is infinite without windows on a side, which may be the transient.
+    """
+    usual = np.zeros(jump.size)
+    for k in [] if steady is None else np.flatnonzero(~steady[side:-side]):
+        before, after = (
+            jump[max(k - NEIGHBOURS * side, 0) : max(k - side, 0)],
+            jump[k + side + 1 :][: NEIGHBOURS * side],
+        )
+        each = [float(np.median(np.abs(part))) if part.size else np.inf for part in (before, after)]
+        usual[k] = MEDIAN_TO_SD * max(each)
+    return usual
+
+
 def steps(channels: Sequence[str], phases: Phases, used: np.ndarray) -> tuple[list[PhaseStep], list[np.ndarray]]:
     """Return the steps of phases, and the windows of each channel but the first in which its relative phase steps.
 
-    Steps of one channel relative to the others count wherever the amplitudes are those of the windows used; steps of
-    all together only where they are used.
+    Steps of one channel relative to the others count wherever the amplitudes are those of the windows used, unless the
+    phase changes as much nearby, as in a transient; steps of all together only where they are used.
     """
     listed: list[PhaseStep] = []
     inside = phases.chosen(used)
@@ -150,7 +172,7 @@ def steps(channels: Sequence[str], phases: Phases, used: np.ndarray) -> tuple[li
     places = []
     for row, channel in enumerate(channels[1:], 1):
         least = ROUNDING_PHASE + phases.slip[[0, row]].max()
-        each = steps_of(near.turns[:, row] - near.turns[:, 0], near.cycle, least)
+        each = steps_of(near.turns[:, row] - near.turns[:, 0], near.cycle, least, used[same])
         places.append(same[[k for k, _ in each]])
         for k, turns in each:
             listed.append(PhaseStep(channel, channels[0], float(near.start[k]), turns, int(phases.order[row])))

@@ -2,7 +2,8 @@
 
 import keyword
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,18 @@ import numpy as np
 
 from bayesperiodic._io import Result, Storable
 from bayesperiodic._printing import printable
-from bayesperiodic.data.formats import recognise
+from bayesperiodic.data.formats import header_units, recognise
 from bayesperiodic.data.formats.contents import Clock, Contents, StoredChannel, unique_names
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.data.times import dates
-from bayesperiodic.data.units import question
+from bayesperiodic.data.units import in_si, is_known, kind_of, question
 
 # Channels that are printed, and that the suggested call names.
 MOST_PRINTED, MOST_SUGGESTED = 60, 6
+# Words of phases that are positive where the response is late.
+LAGS = ("lag", "nacheil")
+# Kinds of units of frequencies and angles, and derived SI units, which are not divided into those of the base.
+KIND_OF_HERTZ, KIND_OF_ANGLE, DERIVED = "1 / s", "rad", ("N", "Nm", "V", "A", "Pa", "J", "W", "ohm")
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,8 @@ class FileInspection(Result):
     remarks : tuple of str
         On the whole file.
     code : str
-        A call of `Recording.from_file`, in which inputs and outputs are still to be told apart.
+        A call of `Recording.from_file`, in which inputs and outputs are still to be told apart; of `response_table` if
+        there are frequencies and no times.
 
     Examples
     --------
@@ -165,7 +171,7 @@ def inspect(
         "header": header,
         "date_format": date_format,
     }
-    whole = recognise.contents(path, format, (), options)
+    whole = _with_times(recognise.contents(path, format, (), options))
     channels = tuple(_summary(channel) for channel in whole.channels)
     given = {key: value for key, value in {"format": format, **options}.items() if value is not None}
     return FileInspection(str(path), whole.kind, channels, whole.remarks, _code(path, whole, channels, given))
@@ -240,18 +246,73 @@ def _range(values: Any) -> tuple[float, float, str]:
     if array.dtype.kind not in "fiub":
         return np.nan, np.nan, "texts, or not only numbers" if array.dtype.kind in "OUT" else f"of type {array.dtype}"
     if array.ndim > 1:
-        return np.nan, np.nan, f"no column, but an array of shape {array.shape}"
+        how = "load it and give its rows or columns to Recording.from_arrays"
+        return np.nan, np.nan, f"no column, but an array of shape {array.shape}; {how}"
     finite = array[np.isfinite(array)] if array.dtype.kind == "f" else array
     lost = array.size - finite.size
     note = f"{lost} of {array.size} values are missing; missing='drop' leaves them out" if lost else ""
     return (float(finite.min()), float(finite.max()), note) if finite.size else (np.nan, np.nan, note)
 
 
-def as_recording(path: str | Path, *, format: str | None = None, **options: Any) -> Recording:
-    """Return all usable channels of a file as outputs, without missing samples; the options are those of `inspect`."""
+def as_recording(
+    path: str | Path,
+    *,
+    time: str | None = None,
+    sampling_rate: float | None = None,
+    format: str | None = None,
+    **options: Any,
+) -> Recording:
+    """Return all usable channels of a file as outputs, without missing samples; the options are those of `inspect`.
+
+    Units that `units` would have to decide are left as they are, because no fault depends on them.
+    """
     whole = recognise.contents(path, format, (), options)
-    usable, time = _usable(whole, tuple(map(_summary, whole.channels))), whole.suggested_time or None
-    return Recording.from_file(path, outputs=usable, time=time, format=format, missing="drop", **options)
+    whole = _with_times(whole) if time is None and sampling_rate is None else replace(whole, suggested_time=time or "")
+    usable, units = _usable(whole, tuple(map(_summary, whole.channels))), dict[str, Any]()
+    usable = {key: column for key, column in usable.items() if _known_values(whole.find(str(path), column)) > 1}
+    stored = {key: whole.find(str(path), column).unit for key, column in usable.items()}
+    units = {key: 1.0 for key, unit in stored.items() if unit.endswith("?") or question(unit)}
+    if whole.suggested_time:
+        units |= _unused_units(whole, {"time": whole.suggested_time})
+    return Recording.from_file(
+        path, outputs=usable, time=whole.suggested_time or None, sampling_rate=sampling_rate, units=units,
+        format=format, missing="drop", **options,
+    )  # fmt: skip
+
+
+def _known_values(channel: StoredChannel) -> int:
+    """Return the number of values that are not missing."""
+    return int(np.count_nonzero(~np.isnan(np.asarray(channel.values(), dtype=float))))
+
+
+def _with_times(whole: Contents) -> Contents:
+    """Return contents with the channel that seems to hold the times by its name, where nothing else says them."""
+    if whole.suggested_time or any(channel.clock for channel in whole.channels):
+        return whole
+    for channel in whole.channels:
+        if header_units.TIMES_NAME.fullmatch(channel.name) and not channel.refusal and channel.samples > 1:
+            values = np.squeeze(np.asarray(channel.values()))
+            if values.dtype.kind in "fiu" and values.ndim == 1 and (np.diff(values.astype(float)) > 0).all():
+                return replace(whole, suggested_time=channel.name)
+    return whole
+
+
+def _unused_units(whole: Contents, columns: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+    """Return the units that names of columns say and that are not used, with the SI unit, by the keys of columns."""
+    result = {}
+    for key, column in columns.items():
+        stored = whole.find("", column)
+        said = stored.unit[:-1] if stored.unit.endswith("?") else header_units.unused(stored.name, stored.unit)
+        if said and is_known(said) and not question(said) and (target := _target(said)) != said:
+            result[key] = (said, target)
+    return result
+
+
+def _target(unit: str) -> str:
+    """Return the SI unit of a unit; that of frequencies is left as it is, as cycles and radians are told apart."""
+    if unit in DERIVED or kind_of(unit) == KIND_OF_HERTZ:
+        return unit
+    return unit[1:] if unit[1:] in DERIVED else in_si(unit).replace(" ", "")
 
 
 def _usable(whole: Contents, channels: tuple[FileChannel, ...]) -> dict[str, Any]:
@@ -269,16 +330,43 @@ def _usable(whole: Contents, channels: tuple[FileChannel, ...]) -> dict[str, Any
 
 def _code(path: str | Path, whole: Contents, channels: tuple[FileChannel, ...], options: dict[str, Any]) -> str:
     """Return a call that reads the usable channels."""
-    pairs = [f"{name!r}: {key!r}" for name, key in _usable(whole, channels).items()]
+    usable, timed = _usable(whole, channels), bool(whole.suggested_time)
+    if not timed and not options and (table := _table_code(path, usable, channels)):
+        return table
+    pairs = [f"{name!r}: {key!r}" for name, key in usable.items()]
     shown = ", ".join(pairs[:MOST_SUGGESTED])
     arguments = [repr(str(path)), f"inputs={{}}, outputs={{{shown}}}"]
-    if whole.suggested_time:
+    if timed:
         arguments.append(f"time={whole.suggested_time!r}")
     elif any(np.isnan(one.rate) and not np.isnan(one.low) for one in channels):
         arguments.append("sampling_rate=…")
+    listed = dict([*usable.items()][:MOST_SUGGESTED]) | ({"time": whole.suggested_time} if timed else {})
+    if units := _unused_units(whole, listed):
+        arguments.append(f"units={units}")
     arguments += [f"{key}={value!r}" for key, value in options.items()]
     more = f"  # and {len(pairs) - MOST_SUGGESTED} more" if len(pairs) > MOST_SUGGESTED else ""
     return f"recording = bp.Recording.from_file({', '.join(arguments)}){more}"
+
+
+def _table_code(path: str | Path, usable: Mapping[str, Any], channels: tuple[FileChannel, ...]) -> str:
+    """Return a call that reads a table of responses: frequencies, amplitudes and perhaps phases; "" for other files."""
+    kinds = {channel.name: kind_of(channel.unit) for channel in channels}
+    kinds = {key: kinds.get(column, "") for key, column in usable.items()}
+    frequencies, phases = (
+        [key for key, kind in kinds.items() if kind == one] for one in (KIND_OF_HERTZ, KIND_OF_ANGLE)
+    )
+    outputs = [key for key in kinds if key not in frequencies + phases]
+    clocked = any(not np.isnan(channel.rate) for channel in channels)
+    if clocked or len(frequencies) != 1 or not outputs or len(phases) > len(outputs):
+        return ""
+    arguments = [repr(str(path)), f"frequency={usable[frequencies[0]]!r}"]
+    arguments.append(f"outputs={ {key: usable[key] for key in outputs} }".replace("{ ", "{").replace(" }", "}"))
+    if phases:
+        pairs = {output: usable[phase] for output, phase in zip(outputs, phases, strict=False)}
+        arguments.append(f"phases={pairs}")
+        if any(word in str(column).lower() for column in pairs.values() for word in LAGS):
+            arguments.append("lag=True")
+    return f"runs = bp.response_table({', '.join(arguments)}, inputs={{…: …}})"
 
 
 def _identifier(name: str) -> str:

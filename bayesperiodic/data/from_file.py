@@ -205,7 +205,7 @@ class FromFile(Channels):
         table : pandas.DataFrame
             Columns are channels; those with two levels of names are ``(group, name)``. An index of dates or durations
             has the times, another one with a name is a channel too. Units are those of ``table.attrs["units"]``, of
-            a column's ``attrs["units"]``, or of the type ``pint[…]`` of pint-pandas.
+            a column's ``attrs["units"]``, of the type ``pint[…]`` of pint-pandas, or of names such as "x [mm]".
         **arguments
             ``outputs, inputs, time, sampling_rate, units, missing, split, name`` as for `from_file`.
 

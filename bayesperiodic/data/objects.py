@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from bayesperiodic import _checks
+from bayesperiodic.data.formats import header_units
 from bayesperiodic.data.formats.contents import Clock, Contents, StoredChannel
 from bayesperiodic.data.times import dates, nanoseconds, seconds
 from bayesperiodic.data.units import from_file, is_duration
@@ -20,14 +21,15 @@ LONGEST_DELAY = 1e8
 
 
 def dataframe(table: Any) -> Contents:
-    """Return the columns of a DataFrame, and its index if it has a name."""
+    """Return the columns of a DataFrame, and its index if it has a name; units also from names such as "x [mm]"."""
     import pandas as pd
 
     _checks.instance("table", table, pd.DataFrame)
     units = table.attrs.get("units")
     units = dict(units) if isinstance(units, Mapping) else {}
     clock = _of_coordinate("index", table.index, "")
-    channels = []
+    labels = [str(label[-1] if isinstance(label, tuple) else label) for label in table.columns]
+    channels, in_names = [], header_units.in_names(labels)[0]
     for place, label in enumerate(table.columns):
         group, name = ("", label) if not isinstance(label, tuple) else (str(label[0]), label[-1])
         if isinstance(label, tuple) and len(label) > 2:
@@ -37,7 +39,7 @@ def dataframe(table: Any) -> Contents:
         values = column.to_numpy
         if str(column.dtype).startswith("pint["):  # of pint-pandas
             unit, values = str(column.dtype)[5:-1], column.pint.magnitude.to_numpy
-        unit = unit if isinstance(unit, str) else ""
+        unit = (unit if isinstance(unit, str) else "") or in_names[place]
         channels.append(StoredChannel(str(name), len(table), _copied(values), group, unit, clock))
     if table.index.name is not None and str(table.index.name) not in [channel.name for channel in channels]:
         channels.append(StoredChannel(str(table.index.name), len(table), _copied(table.index.to_numpy), clock=clock))

@@ -12,7 +12,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.formats.contents import Key
 from bayesperiodic.data.measurements import Amplitude, Measurement, PeakToPeak, Phase, RootMeanSquare
 from bayesperiodic.data.sweep import DOWN, RESOLUTION, UP, Sweep
-from bayesperiodic.data.table_columns import TableColumns, check_phases, contents_of
+from bayesperiodic.data.table_columns import TableColumns, check_phases, contents_of, warn_of_leads
 from bayesperiodic.data.units import Units
 
 # Values in the table over the amplitude of the fundamental.
@@ -55,7 +55,7 @@ def response_table(
     ----------
     table : pandas.DataFrame, mapping of str to array (rows,), or path
         Of a file in any format of `Recording.from_file`; of a universal file with frequency response functions these,
-        whose abscissa is the frequency.
+        whose abscissa is the frequency. Units in names such as "x [mm]" are converted to SI.
     outputs : mapping of str to str, int or (group, name), or to a mapping of int to these
         Column of the amplitudes of each channel, or of complex amplitudes; or columns by harmonic, {1: "A1", 3: "A3"}.
     inputs : mapping of str to float, str, int or (group, name)
@@ -110,7 +110,7 @@ def response_table(
     Warns
     -----
     UserWarning
-        If phases in degrees are probably radians.
+        If phases in degrees are probably radians, or of the other sign: rising over a peak.
 
     Examples
     --------
@@ -264,6 +264,9 @@ class _Reader:
                 errors[h] = self.source.deviations(name, sd, key, values) * scale
             if (angle := self._angles(name, values, phases.get(h))) is not None:
                 angles[h] = angle - turn
+                if h == 1 and not one.to:
+                    order_of_rows = np.argsort(self.frequency, kind="stable")
+                    warn_of_leads(name, self.source.label, angle[order_of_rows], sizes[h][order_of_rows], self.lag)
         self._check_phases(name, columns, phases, angles)
         if phase_sd is not None and not angles:
             raise ValueError(f"phase_sd: must be of outputs with phases, got one for {name!r}.")

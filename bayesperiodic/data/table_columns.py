@@ -21,6 +21,8 @@ LARGEST_PHASE = 720.0
 FOLDED_PHASE, FOLDED_JUMP = 90.5, 120.0
 # Degrees within which phases may be radians, least range of these, and how much higher a peak is than both ends.
 IN_RADIANS, LEAST_PHASE_RANGE, PEAK_HEIGHT = 3.15, 1.0, 3.0
+# Degrees by which phases that rise over a peak are of the other sign.
+LEADING_RISE = 90.0
 # Names and units of levels.
 LEVEL = re.compile(r"(?<![A-Za-z])dB(?![A-Za-z])")
 
@@ -30,6 +32,11 @@ class TableColumns:
 
     def __init__(self, label: str, contents: Contents, units: Units):
         self.label, self.contents, self.units = label, contents, units
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the columns."""
+        return [channel.name for channel in self.contents.channels]
 
     def column(self, key: Key) -> tuple[StoredChannel, np.ndarray]:
         """Return a column and its values."""
@@ -52,7 +59,8 @@ class TableColumns:
             unit = self.units.get("frequency")
             if stored.unit and unit is None and kind_of(stored.unit) != kind_of("Hz"):
                 raise ValueError(
-                    f"frequency: must be in Hz, got {stored.unit!r} of {stored.label!r}; give units={{'frequency': …}}."
+                    f"frequency: must be in Hz, got {stored.unit!r} of {stored.label!r}; give units={{'frequency': "
+                    f"({stored.unit!r}, 'Hz')}} if it is a frequency."
                 )
             values = from_file("frequency", values, unit, stored.unit)
         else:
@@ -116,14 +124,23 @@ class TableColumns:
     def deviations(self, name: str, given: Any, key: Key, values: np.ndarray) -> np.ndarray:
         """Return the standard deviations of an output's amplitudes: a share of them, a number or a column."""
         argument = f"sd[{name!r}]"
-        if isinstance(given, str) and given.strip().endswith("%"):
+        unit = self.contents.find(self.label, key).unit
+        if isinstance(given, str) and given.strip().endswith("%") and given not in self.names:
             share = _checks.positive(argument, _number(argument, given.strip()[:-1]))
             return 0.01 * share * np.abs(values)
         if is_number(given):
-            sd, unit = np.full(values.size, float(given)), self.contents.find(self.label, key).unit
+            sd = np.full(values.size, float(given))
         else:
             stored, sd = self.column(given)
-            unit = stored.unit or self.contents.find(self.label, key).unit
+            if (stored.unit or stored.name).strip().endswith("%") and unit.strip() != "%":
+                shares = self.positive(argument, self.sized(argument, sd, values.size), "standard deviations")
+                return 0.01 * shares * np.abs(values)
+            if stored.unit and kind_of(stored.unit) != kind_of(unit):
+                raise ValueError(
+                    f"{argument}: must be in a unit of the amplitudes ({unit or 'none'}) or in %, got {stored.unit!r} "
+                    f"of {stored.label!r} of {self.label}."
+                )
+            unit = stored.unit or unit
         sd = from_file(name, self.sized(argument, sd, values.size), self.units.get(name), unit)
         return self.positive(argument, sd, "standard deviations")
 
@@ -195,6 +212,24 @@ def check_phases(argument: str, label: str, angles: np.ndarray, sizes: np.ndarra
             f"{argument}: must be phases over the whole turn, got values within +-90 degrees that jump by "
             f"{jumps.max():.0f} degrees in {label}, as the arc tangent of a quotient does; take the one of two "
             "arguments, arctan2."
+        )
+
+
+def warn_of_leads(name: str, label: str, angles: np.ndarray, sizes: np.ndarray, lag: bool) -> None:
+    """Warn of phases [rad], in the order of frequencies, that rise over a peak of the amplitudes `sizes`.
+
+    The phase of a stable system against its force falls through each resonance, and rises between two of them at most
+    as much.
+    """
+    turned = np.degrees(np.unwrap(angles))
+    rise = float(turned[-1] - turned[0])
+    if rise > LEADING_RISE and sizes.max() > PEAK_HEIGHT * max(sizes[0], sizes[-1]):
+        remedy = "leave lag=True out" if lag else "give lag=True"
+        warnings.warn(
+            f"phases[{name!r}]: rise by {rise:.0f} degrees over the peak of the amplitudes in {label}, whereas a "
+            f"response falls behind its force there; if the table's phases have the other sign, {remedy}.",
+            UserWarning,
+            stacklevel=2,
         )
 
 

@@ -88,7 +88,7 @@ def residual_variances(
 
     `changes` (parameters, size) and residuals (size,) are whitened, `information` is that of all blocks and priors.
     """
-    units, known = likelihood.whitened([np.ones(b.size) for b in likelihood.blocks], noise), []
+    units, known = likelihood.units(noise), []
     for block, s, r, unit, least in zip(
         likelihood.blocks, changes, residuals, units, _caused_variances(likelihood, noise), strict=True
     ):
@@ -124,7 +124,9 @@ def _residual_variance(
     others = scaled(information - s @ s.T, scale)
     values, vectors = np.linalg.eigh(0.5 * (others + others.T))
     others = (vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T
-    s, score = s * scale[:, None], (s * scale[:, None]) @ r
+    s = s * scale[:, None]
+    # Where the prior is not concave its pull, which balances s r, has no end: the block alone decides there.
+    score = vectors @ (np.where(values > LEAST_INFORMATION, 1.0, 0.0) * (vectors.T @ (s @ r)))
     gram = (s / shape[:, None, :]) @ s.T
     pull = (r / shape) @ s.T
     size = np.ones(len(shape))

@@ -551,6 +551,19 @@ class Likelihood:
                 result[b] = part
         return result
 
+    def units(self, values: np.ndarray) -> list[np.ndarray]:
+        """Return the sd of whitened components by white noise of variance one in a block alone, (size,) by block.
+
+        Blocks that share errors of inputs are whitened together: each component is a mixture of all of the group, whose
+        channels may have other units.
+        """
+        result = self.whitened([np.ones(block.size) for block in self.blocks], values)
+        for b in (b for one in self.shared for b in one.members):
+            each = [np.zeros((self.blocks[b].size, block.size)) for block in self.blocks]
+            each[b] = np.eye(self.blocks[b].size)
+            result[b] = np.linalg.norm(self.whitened(each, values)[b], axis=0)
+        return result
+
     def simulate(self, values: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:
         """Return noise at values (draws, names): components (draws, size), one array a block."""
         result, spectra = [], self._spectra(values)

@@ -136,7 +136,7 @@ class ReportInputs:
             plain, _, place = name.partition("[")
             channel = units.get(place.rstrip("]").partition(",")[0], "")
             return html.unit(squared(channel) if plain == "variance" and channel else "")
-        return html.unit(units.get(self.problem.plain_names.get(name, name), ""))
+        return html.unit((self.problem.quantities | units).get(self.problem.plain_names.get(name, name), ""))
 
 
 def badge(verdict: str) -> html.Badge:
@@ -224,6 +224,21 @@ def channels(given: ReportInputs) -> Rows:
             for kind, channel, values in every
         ]
     return rows
+
+
+def measurements(given: ReportInputs) -> Rows:
+    """Return the table of the values that were measured without a time history."""
+    return [
+        {
+            "Quantity": one.label,
+            "Experiment": e.name,
+            "Unit": given.unit(one.label),
+            "Value": number(one.value, 4),
+            "Standard deviation": number(np.nan if one.sd is None else one.sd),
+        }
+        for e in given.problem.experiments
+        for one in e.measurements
+    ]
 
 
 def parameters(given: ReportInputs) -> Rows:

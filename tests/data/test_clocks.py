@@ -179,6 +179,29 @@ def test_lost_samples_of_one_channel_are_refused_with_the_delay(losses):
         one_clock(lost=lost).fold(32)
 
 
+def beating(seed, lost=0, rate=60.0, decay=2.0):
+    """Return 60 s from rest: a steady response and a free oscillation at 1.2 of its frequency, which decays."""
+    time, generator = np.arange(int(60 * rate)) / rate, np.random.default_rng(seed)
+    steady, free = response_at(time) / abs(RESPONSE), np.cos(1.2 * OMEGA * time + seed) * np.exp(-time / decay)
+    x = np.delete(steady + free + 1e-3 * generator.standard_normal(time.size), np.arange(1500, 1500 + lost))
+    return bp.Recording.from_arrays(time[: x.size], {"x": x}, {"force": force_at(time)[: x.size]})
+
+
+@pytest.mark.parametrize("decay", [0.5, 1.0, 2.0, 3.0])
+def test_beats_of_a_transient_are_no_lost_samples(decay):
+    """The phase of the response steps by up to 10 degrees between windows, where its amplitude is nearly steady."""
+    for seed in range(12):
+        recording = beating(seed, decay=decay)
+        assert not [f for f in recording.check().findings if f.kind == "phase step"]
+        assert abs(amplitude(recording.fold(32), "outputs", "x")) == pytest.approx(1.0, abs=5e-4)
+
+
+def test_samples_lost_after_a_transient_are_found():
+    for seed in range(6):
+        (finding,) = [f for f in beating(seed, 1).check().findings if f.kind == "phase step"]
+        assert finding.severity == "ruinous" and finding.times[0, 0] == pytest.approx(25.0, abs=2.0 / FREQUENCY)
+
+
 def test_samples_lost_by_the_force_are_attributed_to_it():
     time = np.arange(2400) / 60.0
     force = np.delete(force_at(time), np.arange(800, 806))

@@ -34,6 +34,54 @@ def test_table_has_channels_units_ranges_remarks_and_a_call_that_runs(path):
     assert names["recording"].time == pytest.approx([0.0, 1e-3, 2e-3])
 
 
+@pytest.mark.parametrize("ending", [".csv", ".npz"])
+def test_units_of_names_are_written_into_the_call(ending, tmp_path):
+    """Times by a name with its unit; a name such as v_mm_s says a quotient. The call is run."""
+    file = tmp_path / f"run{ending}"
+    columns = {"time_ms": [0, 1, 3], "x_mm": [2.0, 3.0, 2.5], "v_mm_s": [5.0, 6.0, 7.0], "F_kN": [1.0, 2.0, 3.0]}
+    columns |= {"F_N": [4.0, 5.0, 6.0], "n_max": [1.0, 2.0, 3.0]}
+    if ending == ".npz":
+        np.savez(file, **columns)
+    else:
+        file.write_text("\n".join(",".join(map(str, row)) for row in (columns, *zip(*columns.values(), strict=True))))
+    names = {"bp": bp}
+    exec(bp.inspect(file).code, names)
+    run = names["recording"]
+    assert run.time == pytest.approx([0.0, 1e-3, 3e-3])
+    expected = {"x_mm": [2e-3, 3e-3, 2.5e-3], "v_mm_s": [5e-3, 6e-3, 7e-3], "f_kn": [1e3, 2e3, 3e3]}
+    expected |= {"f_n": [4.0, 5.0, 6.0], "n_max": [1.0, 2.0, 3.0]}
+    assert {name: values.tolist() for name, values in run.outputs.items()} == {
+        name: pytest.approx(values) for name, values in expected.items()
+    }
+
+
+@pytest.mark.parametrize("name", ["t_max", "temperature", "times_x", "time_of_flight", "tempo_mm"])
+def test_other_names_are_no_times(name, tmp_path):
+    np.savez(tmp_path / "run.npz", **{name: [1.0, 2.0, 3.0], "x": [1.0, 2.0, 1.0]})
+    assert "sampling_rate=…" in bp.inspect(tmp_path / "run.npz").code
+
+
+def test_names_of_times_that_do_not_increase_are_no_times(tmp_path):
+    np.savez(tmp_path / "run.npz", t=[1.0, 2.0, 2.0], x=[1.0, 2.0, 1.0])
+    assert "sampling_rate=…" in bp.inspect(tmp_path / "run.npz").code
+
+
+def test_call_of_a_table_of_responses_reads_it(tmp_path):
+    """Frequencies without times; phases by their unit, of the other sign if the name says that they are lags."""
+    (tmp_path / "fig.csv").write_text("f / Hz;X / mm;phase lag / deg\n6,5;1,5;2\n7;2,5;10\n7,5;2;90\n")
+    code = bp.inspect(tmp_path / "fig.csv").code
+    assert "lag=True" in code
+    names = {"bp": bp}
+    exec(code.replace("{…: …}", "{'force': 3.0}"), names)
+    runs = names["runs"]
+    assert [run.frequency for run in runs] == [6.5, 7.0, 7.5]
+    c = [complex(run.outputs["x_mm"] @ np.exp(-2j * np.pi * np.arange(run.samples) / run.samples)) for run in runs]
+    assert np.degrees(np.angle(c)) == pytest.approx([-2.0, -10.0, -90.0])
+    assert 2 * np.abs(c) / runs[0].samples == pytest.approx([1.5e-3, 2.5e-3, 2e-3])
+    (tmp_path / "run.csv").write_text("f / Hz;X / mm;phi / deg\n6,5;1,5;-2\n7;2,5;-10\n")
+    assert "lag" not in bp.inspect(tmp_path / "run.csv").code
+
+
 def test_doubtful_unit_is_remarked(tmp_path):
     (tmp_path / "run.csv").write_text("t [s],a [g],F [N]\n0,1,2\n1,2,3\n2,3,5\n")
     t, a, force = bp.inspect(tmp_path / "run.csv").channels

@@ -12,6 +12,29 @@ X = np.cos(2 * np.pi * TIME)
 SERIES = {"name": "F", "unit_str": "kN", "fs": 100.0, "data": X}
 
 
+def test_units_in_names_of_a_table_are_those_of_the_same_table_in_a_file(tmp_path):
+    """A table read by pandas, and a dictionary, are converted as the file is; attributes have priority."""
+    table = pd.DataFrame({"t [ms]": 1e3 * TIME, "x [mm]": X, "F (kN)": X, "plain": X, "a [g]": X})
+    table.to_csv(tmp_path / "run.csv", index=False)
+    names = {"time": "t [ms]", "outputs": {"x": "x [mm]", "y": "plain"}, "inputs": {"force": "F (kN)"}}
+    one, other = bp.Recording.from_dataframe(table, **names), bp.Recording.from_csv(tmp_path / "run.csv", **names)
+    assert one.time == pytest.approx(TIME) == other.time
+    for run in (one, other):
+        assert run.outputs["x"] == pytest.approx(1e-3 * X) and run.inputs["force"] == pytest.approx(1e3 * X)
+        assert run.outputs["y"] == pytest.approx(X)
+    with pytest.raises(ValueError, match=r"units\['a'\]: must say what 'g'"):
+        bp.Recording.from_dataframe(table, time="t [ms]", outputs={"a": "a [g]"})
+    table.attrs["units"] = {"x [mm]": "cm"}
+    assert bp.Recording.from_dataframe(table, **names).outputs["x"] == pytest.approx(1e-2 * X)
+    responses = {"f [kHz]": [0.01, 0.02], "x [mm]": [3.0, 4.0]}
+    for units in (None, {"x": ("mm", "m")}, {"x": 1e-3}):
+        runs = bp.response_table(
+            responses, frequency="f [kHz]", outputs={"x": "x [mm]"}, inputs={"force": 1.0}, units=units
+        )
+        assert [run.frequency for run in runs] == pytest.approx([10.0, 20.0])
+        assert [run.measurements[0].value for run in runs] == pytest.approx([3e-3, 4e-3])
+
+
 def test_columns_of_two_levels_and_an_index_of_dates():
     index = pd.date_range("2026-03-29T01:59:59", periods=400, freq="10ms", tz="UTC").tz_convert("Europe/Berlin")
     table = pd.DataFrame({("A", "x"): X, ("B", "x"): 2 * X}, index=index)

@@ -117,6 +117,46 @@ def test_phases_in_radians_without_their_unit_are_warned_of():
 
 
 @pytest.mark.parametrize(
+    "name, values, expected",
+    [
+        ("s [%]", 2.0, 0.02 * np.abs(H)),
+        ("s %", 3.0, 0.03 * np.abs(H)),
+        ("s [µm]", 50.0, 5e-5),
+        ("s", 0.2, 2e-4),
+    ],
+)
+def test_columns_of_standard_deviations_have_their_unit(name, values, expected):
+    """Amplitudes in mm; a column in percent is a share, one without a unit has that of the amplitudes."""
+    table = {"f": F, "x [mm]": 1e3 * abs(H), name: np.full(F.size, values)}
+    runs = bp.response_table(table, frequency="f", outputs={"x": "x [mm]"}, inputs={"force": 1.0}, sd={"x": name})
+    assert [run.measurements[0].sd for run in runs] == pytest.approx(np.broadcast_to(expected, F.shape))
+
+
+@pytest.mark.parametrize("unit", ["kg", "N", "dB"])
+def test_standard_deviations_of_another_kind_are_refused(unit):
+    table = {"f": F, "x [mm]": 1e3 * abs(H), f"s [{unit}]": np.ones(F.size)}
+    with pytest.raises(ValueError, match=r"sd\['x'\]: must be in a unit of the amplitudes \(mm\) or in %"):
+        bp.response_table(table, frequency="f", outputs={"x": "x [mm]"}, inputs={"force": 1.0}, sd={"x": f"s [{unit}]"})
+
+
+def test_phases_of_the_other_sign_are_warned_of():
+    """Through a resonance a response falls behind its force; complex amplitudes may be of exp(-i omega t)."""
+    lags = TABLE | {"phi": -TABLE["phi"], "H": np.conj(H)}
+    of_complex = COLUMNS | {"outputs": {"x": "H"}, "phases": None, "per": "force"}
+    below = {name: values[: np.argmax(TABLE["A"])] for name, values in lags.items()}
+    for arguments in (COLUMNS, of_complex):
+        with pytest.warns(UserWarning, match=r"phases\['x'\]: rise by 1\d\d degrees .* give lag=True"):
+            bp.response_table(lags, **arguments)
+        with pytest.warns(UserWarning, match="leave lag=True out"):
+            bp.response_table(TABLE, **arguments, lag=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            bp.response_table(TABLE, **arguments)
+            bp.response_table(lags, **arguments, lag=True)
+            bp.response_table(below, **arguments)
+
+
+@pytest.mark.parametrize(
     "units, message",
     [
         ({"phi": "s"}, "phases: must be in degrees or radians, got 's'"),

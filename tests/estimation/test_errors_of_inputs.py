@@ -1,5 +1,7 @@
 """Errors of inputs given an estimate, by conditioning a normal distribution; models that are linear in the input."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ import bayesperiodic as bp
 from bayesperiodic.estimation import covariance, map_estimate
 from bayesperiodic.estimation.check import at_estimate
 from tests.estimation.test_changes_with_variances import MODEL, POINTS, PRIORS, run_of
-from tests.known import grid
+from tests.known import formula_model, grid
 
 KEPT = {"y": 4, "z": 2}
 SD = 0.05
@@ -114,6 +116,29 @@ def test_noise_that_inputs_cause_is_their_spread_times_the_gain(factor):
     half = {"run": loadings["run"], "second": 0.0 * loadings["second"]}
     less = covariance.caused_by_inputs(problem, half)
     assert less == pytest.approx({channel: value / np.sqrt(2) for channel, value in caused.items()})
+
+
+def robust(factor, names):
+    """Return the robust covariance with the second channel in another unit, which is `factor` of the first one."""
+    model = formula_model("static", ["a", "b"], lambda p, u, s: {"y": p.a * u.x + p.b * u.dx, "z": factor * p.b * u.x})
+    runs = [run_of(name, seed, cycles=1) for seed, name in enumerate(names)]
+    runs = [replace(run, outputs=run.outputs | {"z": factor * run.outputs["z"]}) for run in runs]
+    known = {"variance[y]": VARIANCE["y"], "variance[z]": factor**2 * VARIANCE["z"]}
+    problem = bp.Problem(model, runs, priors=PRIORS, scheme="fourier", input_noise={"x": SD}, fixed=known)
+    fit = bp.map_estimate(problem, starts=1, checks=False, progress=False)
+    objective, peak = at_estimate(problem, fit)
+    density = objective.density.problem
+    inverse = np.linalg.inv(covariance.uncertainty(density, peak, 1.0).information)
+    return covariance.robust_covariance(density, peak, inverse), inverse
+
+
+@pytest.mark.parametrize("names", [("run",), ("run", "second")])
+def test_robust_covariance_does_not_depend_on_units_of_channels_that_share_errors(names):
+    """The errors of an input are in both channels; one in mm instead of m is the same measurement."""
+    expected, laplace = robust(1.0, names)
+    for factor in (1e-5, 1e5):
+        assert robust(factor, names)[0] == pytest.approx(expected, rel=1e-5)
+    assert (np.diag(expected) < 4.0 * np.diag(laplace)).all()
 
 
 def test_linear_models_have_no_nonlinearity_and_fine_grids_no_shift():

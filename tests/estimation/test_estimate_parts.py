@@ -90,6 +90,23 @@ def test_variance_of_a_residual_is_that_of_restricted_likelihood_averaged_over_t
     assert found == pytest.approx(weight @ np.array(values) / weight.sum(), rel=5e-3)
 
 
+def test_a_prior_that_is_not_concave_has_no_pull_on_the_spectrum():
+    """Beyond the median of a lognormal prior; the residual is refitted as if the prior were flat there.
+
+    Then it does not matter what of it the parameters can explain.
+    """
+    generator = np.random.default_rng(3)
+    s = generator.standard_normal((2, 19)) * np.exp(-HARMONIC / 3.0)
+    for pull in (0.0, 0.5, 3.0):
+        r = generator.standard_normal(19)
+        alone = r - np.linalg.lstsq(s.T, r, rcond=None)[0] @ s
+        r = alone + pull * s[0]
+        flat = covariance._residual_variance(BLOCK, s, alone, np.ones(19), s @ s.T)
+        for curvature in (0.0, 0.02, 0.1):
+            found = covariance._residual_variance(BLOCK, s, r, np.ones(19), s @ s.T - np.diag([curvature, curvature]))
+            assert found == pytest.approx(flat, rel=1e-4)
+
+
 def test_degrees_of_freedom_are_those_of_satterthwaite():
     inverse = np.diag([2.0, 5.0])
     part = lambda a, b, freedom: covariance.VariancePart(np.diag([a, b]), np.eye(2), 1.0, freedom)  # noqa: E731

@@ -96,6 +96,42 @@ def test_report_of_a_fit_alone_states_that_there_are_no_draws(solved, tmp_path):
 
 
 @pytest.mark.usefixtures("pictures_left_out")
+def test_a_fit_alone_that_is_misspecified_is_said_to_be(solved, tmp_path):
+    problem, fit, _ = solved
+    rejected = replace(fit, checks=replace(fit.checks, misfit="The model is misspecified (a reason)"))
+    for one, badge, words in ((fit, "not tested", "do not reject"), (rejected, "misspecified", "reject the model")):
+        written = Page(bp.report(problem, one, None, tmp_path / "r.html").read_text(encoding="utf-8"))
+        summary = written.text.partition("Does the model explain the data?")[2][:150]
+        assert badge in summary and words in summary and "tests reject the model" not in summary
+
+
+@pytest.mark.usefixtures("pictures_left_out")
+def test_values_without_a_time_history_are_data_with_their_units(tmp_path):
+    """The table of a linear oscillator: 3 amplitudes [mm] and phases."""
+    f = np.array([3.0, 4.0, 5.0])
+    h = 1.0 / (800.0 - (2 * np.pi * f) ** 2 + 2j * np.pi * f * 3.0)
+    table = {"f": f, "x [mm]": 1e3 * abs(h), "phi": np.degrees(np.angle(h))}
+    runs = bp.response_table(
+        table, frequency="f", outputs={"displacement": "x [mm]"}, phases={"displacement": "phi"},
+        inputs={"force": 1.0}, sd={"displacement": "1%"}, phase_sd={"displacement": 0.5},
+    )  # fmt: skip
+    priors = {"c": bp.LogNormal(3.0, 1.0), "k": bp.LogNormal(800.0, 1.0)}
+    problem = bp.Problem(bp.models.duffing, runs, priors=priors, fixed={"m": 1.0, "k3": 0.0})
+    fit = bp.map_estimate(problem, progress=False)
+    written = Page(bp.report(problem, fit, None, tmp_path / "r.html").read_text(encoding="utf-8"))
+    assert "6 independent values of amplitude of displacement, phase of displacement" in written.text
+    rows = [[cell.text for cell in row] for row in written.tables["table-measurements"]]
+    assert len(rows) == 7
+    (size,) = [row for row in rows if row[:2] == ["amplitude of displacement", runs[1].name]]
+    assert size[2] == "m" and value(size[3]) == pytest.approx(abs(h[1]), rel=1e-3)
+    assert value(size[4]) == pytest.approx(0.01 * abs(h[1]), rel=1e-2)
+    (angle,) = [row for row in rows if row[:2] == ["phase of displacement", runs[2].name]]
+    assert angle[2] == "rad" and value(angle[3]) == pytest.approx(np.angle(h[2]), rel=1e-3)
+    units = [row[1].text for row in written.tables["table-residuals"][1:]]
+    assert units == ["m", "rad"]
+
+
+@pytest.mark.usefixtures("pictures_left_out")
 def test_failed_prediction_is_reported(solved, scored, tmp_path, monkeypatch):
     def fail(*_):
         raise RuntimeError("posterior: none of its draws has a periodic solution.")

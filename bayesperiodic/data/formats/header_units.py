@@ -30,10 +30,15 @@ BRACKETED = re.compile(
     r".*\S\s*(?:<\s*([^<>]+?)\s*>|\{\s*([^{}]+?)\s*\})\s*|\s*[\[(<{]\s*([^\[\](){}<>]+?)\s*[\])>}]\s*\S.*"
 )
 LAST_WORD = re.compile(r".*[^\W_].*?[\W_]([^\W_]+)\W*", re.DOTALL)
+QUOTIENT = re.compile(r".*[^\W_].*?_([^\W_]+)_(s2?)", re.DOTALL)
 TIME_WORD = re.compile(
     r"[\W_]*(?:[\[(<{].*?[\])>}]\W*)?(?:(?-i:t)|time|zeit|temps|tiempo|tempo|timestamp|zeitstempel|elapsed|dauer|duration)"
     r"(?![^\W_]).*", re.IGNORECASE | re.DOTALL,
 )  # fmt: skip
+# Names of times in arrays and columns without a unit of their own.
+TIMES_NAME = re.compile(
+    r"(?:t|time|zeit|temps|tiempo|tempo|timestamp|elapsed)(?:_(?:s|sec|ms|us|µs|ns|min|h))?", re.IGNORECASE
+)
 PARTS_OF_SECONDS, LONG_TIMES = ("ms", "us", "µs", "μs", "ns", "msec", "usec"), ("min", "mins", "minutes", "h", "hours")
 # Units that are not known but are no names either.
 UNIT_WORDS = re.compile(r"(?:milli|mikro|nano|m|µ)?(?:sekunden?|sek)\.?|minuten?|stunden?", re.IGNORECASE)
@@ -88,10 +93,19 @@ def remarks(name: str, unit: str) -> tuple[str, ...]:
     """Return what to say about a unit that a name may say."""
     if unit.endswith("?"):
         return (f"the name may say the unit {unit[:-1]!r}; units= decides, such as a factor or a pair of units",)
-    match = LAST_WORD.fullmatch(name) if not unit and not name[LONGEST_UNIT_NAME:] else None
-    if match and is_evident(match[1]):
-        return (f"the name may say the unit {match[1]!r}, which is not used; units= converts",)
+    if text := unused(name, unit):
+        return (f"the name may say the unit {text!r}, which is not used; units= converts",)
     return ()
+
+
+def unused(name: str, unit: str) -> str:
+    """Return the unit that a name such as "x_mm" or "v_mm_s" may say and that is not used, "" if there is none."""
+    if unit or name[LONGEST_UNIT_NAME:]:
+        return ""
+    if (match := QUOTIENT.fullmatch(name)) and is_evident(match[1]):
+        return f"{match[1]}/{match[2]}"
+    match = LAST_WORD.fullmatch(name)
+    return match[1] if match and is_evident(match[1]) else ""
 
 
 def _is_quantity(text: str, name: str) -> bool:
