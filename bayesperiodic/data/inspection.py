@@ -103,6 +103,8 @@ def inspect(
     sound = [_sound(*each, tracked, points) for each in zip(groups, calm, faults, moving, strict=True)]
     whole = all(these.size == group.time.size for these, group in zip(sound, groups, strict=True))
     sound = [_inside(these, part) for these, part in zip(sound, span, strict=True)]
+    counted = first.time
+    del calm, first  # their values can be copies
     some = [_selected(group, these) for group, these in zip(groups, sound, strict=True)]
     refined = frequency is None
     every, steady, tracked = _steady_of(some, tracked, points, refined, refined and not whole, other)
@@ -132,7 +134,7 @@ def inspect(
     seen += cycle_findings(channels, groups[0].time, outer, steady, fit.frequency, total, _ends(groups))
     if frequency is None:
         lead = parts[leading(groups)]
-        seen += sampling_findings(lead.time, lead.values, fit.frequency, first.time, behind)
+        seen += sampling_findings(lead.time, lead.values, fit.frequency, counted, behind)
     varies = pace.drifts or pace.wander > 0.0
     of_clocks, drifts = _clock_findings(groups, every, some[0].time, used[0], fit.frequency, total, varies)
     sizes = every.all.apart().sizes
@@ -233,7 +235,7 @@ def _calm(group: Signals, faults: list[ChannelFaults], moving: np.ndarray) -> Si
     """Return a group at the samples that move, without rare extremes; raise a ValueError if these are too few."""
     if moving.size < LEAST_MOVING * group.time.size:
         raise ValueError(_still(group, faults))
-    return replace(group, values=bounded(group.values)).part(moving)
+    return _selected(replace(group, values=bounded(group.values)), moving)
 
 
 def _selected(group: Signals, samples: np.ndarray) -> Signals:
@@ -345,7 +347,7 @@ def _sound(
         fault.brief = single(fault.brief, signals.time * fundamental)
         if fault.brief.size:
             moving = np.setdiff1d(moving, fault.brief)
-            calm = replace(signals, values=bounded(signals.values)).part(moving)
+            calm = _selected(replace(signals, values=bounded(signals.values)), moving)
     if not jumps(signals.values) and all(dropped_value(values) is None for values in signals.values):
         return moving
     limit = min(resolved_harmonics(calm.time, fundamental, points), ROUGH_HARMONICS)

@@ -113,7 +113,10 @@ def bounded(values: np.ndarray) -> np.ndarray:
     """Return values (channels, samples) without rare extremes, for a first estimate of the frequency."""
     some = values[:, :: 1 + values.shape[1] // faults.SCREENED]
     low, high = np.quantile(some, [EXTREMES, 1.0 - EXTREMES], axis=1, keepdims=True)
-    return np.where(high > low, np.clip(values, low - (high - low), high + (high - low)), values)
+    least, most = (np.where(high > low, end, wide) for end, wide in ((2 * low - high, -np.inf), (2 * high - low, np.inf)))
+    if (values.min(axis=1, keepdims=True) >= least).all() and (values.max(axis=1, keepdims=True) <= most).all():
+        return values
+    return np.clip(values, least, most)
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,7 @@ def effect_of(time: np.ndarray, values: np.ndarray, bad: np.ndarray, frequency: 
     used, best, order, fit = time[~bad], np.inf, 0, None
     for highest in FITTED_HARMONICS:
         if highest <= harmonics and used.size > 6 * highest and np.ptp(used) * frequency > 2.0:
-            moments = _fourier.sums(np.ones((1, used.size)), frequency * used, 2 * highest)[0]
+            moments = _fourier.moments(frequency * used, 2 * highest)
             spectrum = np.linalg.eigvalsh(toeplitz(moments))
             if spectrum[0] * LARGEST_FIT_CONDITION > spectrum[-1]:
                 trial = fit_harmonics(used, values[None, ~bad], frequency, highest)
