@@ -319,8 +319,9 @@ def _lone(far: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -
     flagged = far[first]
     first, length = first[flagged], length[flagged]
     # A jump into the run and out of it, larger than between the other samples.
-    change, inside = np.abs(np.diff(values)), ~(far[1:] | far[:-1])
-    usual = float(np.quantile(change[inside], 0.99)) if inside.any() else 0.0
+    change, inside = np.diff(values), ~(far[1:] | far[:-1])
+    np.abs(change, out=change)
+    usual = float(np.quantile(change[inside], 0.99, overwrite_input=True)) if inside.any() else 0.0
     before = np.where(first > 0, change[np.maximum(first - 1, 0)], np.inf)
     last = first + length - 1
     after = np.where(last < values.size - 1, change[np.minimum(last, change.size - 1)], np.inf)

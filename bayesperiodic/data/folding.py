@@ -77,10 +77,10 @@ def fold_signals(
     if seen.steady is None or seen.fit is None or seen.sizes is None:
         raise ValueError(seen.reason)
     fit, pace, parts, name = seen.fit, seen.pace, seen.parts, groups[0].name
-    seen = replace(seen, fit=None)  # without residuals at another frequency than that of the fit
     inputs = [channel for group in groups for channel in group.channels[: group.inputs]]
     parts, fit = _at_phases(parts, fit, pace, periods, given, seen.limits)
     drift = dict(zip(seen.channels, _drift(seen.sizes), strict=True))
+    seen = replace(seen, fit=None)  # whose residuals are not those of the fit at a given frequency
     _refuse_drift(name, drift, largest_drift)
     findings = _with_stated_clock(seen.findings, clocks)
     refuse(name, findings)

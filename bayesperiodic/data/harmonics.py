@@ -253,16 +253,19 @@ def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
     from scipy.fft import next_fast_len
 
     samples = time.size
-    length = next_fast_len(2 * samples, real=True)
+    lags = min(samples // 3 + 2, samples)
+    length = next_fast_len(samples + lags, real=True)
     step = (time[-1] - time[0]) / (samples - 1)
-    even = time[0] + step * np.arange(samples)
-    correlation = np.zeros(samples)
+    correlation = np.zeros(lags)
     for values in channels:
-        signal = np.interp(even, time, values)
-        signal = (signal - signal.mean()) / signal.std()
-        power = np.abs(np.fft.rfft(signal, length)) ** 2
-        correlation += np.fft.irfft(power, length)[:samples] / np.arange(samples, 0, -1)
-    correlation = correlation[: samples // 3 + 2]
+        signal = np.interp(time[0] + step * np.arange(samples), time, values)
+        signal -= signal.mean()
+        signal /= signal.std()
+        spectrum = np.fft.rfft(signal, length)
+        del signal
+        spectrum.real = spectrum.real**2 + spectrum.imag**2
+        spectrum.imag = 0.0
+        correlation += np.fft.irfft(spectrum, length)[:lags] / np.arange(samples, samples - lags, -1)
     negative = np.flatnonzero(correlation < 0.5 * correlation[0])
     if negative.size == 0:
         return None

@@ -16,7 +16,7 @@ LINES_NEAR_ZERO, WHITE_LINES, SLOW_LINES = 40, 8, 2
 # if its spectrum is flat below a quarter of a line.
 CORRELATION_TIMES, FLOORS, ZERO_OF_PINK = (0.45, 0.1, 0.05, 0.025), (0.0, 0.01, 0.1), 2.75
 # Points of the grid that are in memory together.
-GRID_POINTS = 1 << 19
+GRID_POINTS = 1 << 17
 # Part of a line's noise below which it is in the fitted harmonics, and the line is of no use.
 LEAST_LEFT = 0.05
 
