@@ -16,7 +16,7 @@ DRAWS = np.random.default_rng(0).standard_normal((2, 400, 100, len(NAMES)))
 
 @pytest.fixture(scope="module")
 def density():
-    """The log-posterior of the amplitudes of twenty terms."""
+    """Return the log-posterior of the amplitudes of twenty terms."""
     terms = " + ".join(f"{name}*cos({i}*u)" for i, name in enumerate(NAMES))
     model = bp.Model(
         "terms", states=["w"], inputs=["u"], parameters=NAMES, equations=["dw + w - u"], outputs={"y": terms}
