@@ -343,7 +343,7 @@ def test_full_disk_is_one_warning_that_advises_to_free_space(folder, monkeypatch
 
     built = []
     original = cache._announce
-    monkeypatch.setattr(cache, "_announce", lambda: built.append(original()))
+    monkeypatch.setattr(cache, "_announce", lambda source: built.append(original(source)))
     monkeypatch.setattr(Path, "write_text", full)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
