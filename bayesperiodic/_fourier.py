@@ -4,6 +4,7 @@ A real signal is sampled over one response period on an equidistant grid without
 c[h] satisfy y(t) = Re Σ_h c[h] exp(2πi h t / period), so that |c[h]| is the amplitude of harmonic h and c[0] the mean.
 """
 
+from collections.abc import Iterable, Iterator
 from math import factorial
 
 import numpy as np
@@ -66,32 +67,46 @@ def at_times(amplitudes: np.ndarray, phase: np.ndarray) -> np.ndarray:
 
     Taylor series about the points of a fine grid, so that the time does not depend on the number of harmonics.
     """
+    values = np.empty((*amplitudes.shape[:-1], phase.size))
+    for part, block in blocks_at(amplitudes, phase):
+        values[..., part] = block
+    return values
+
+
+def blocks_at(amplitudes: np.ndarray, phase: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+    """Yield parts of the times with the signals of `at_times` there, so that sums need none of the whole record."""
     points = _fine(amplitudes.shape[-1] - 1)
     rate = 2j * np.pi * np.arange(amplitudes.shape[-1]) / points
     tables = np.stack([on_grid(amplitudes * rate**p / factorial(p), points) for p in range(TAYLOR)])
-    values = np.empty((*amplitudes.shape[:-1], phase.size))
-    flat, rows = tables.reshape(TAYLOR, -1, points), values.reshape(-1, phase.size)
-    for first in range(0, phase.size, CHUNK):
-        part = slice(first, first + CHUNK)
+    flat = tables.reshape(TAYLOR, -1, points)
+    for part in _parts(phase.size, points):
         place, offset = _places(phase[part], points)
-        for channel, row in enumerate(rows):
+        block = np.empty((*amplitudes.shape[:-1], place.size))
+        for channel, row in enumerate(block.reshape(-1, place.size)):
             total = flat[-1, channel].take(place, mode="clip")
             for table in flat[-2::-1]:
                 total *= offset
                 total += table[channel].take(place, mode="clip")
-            row[part] = total
-    return values
+            row[:] = total
+        yield part, block
 
 
 def sums(values: np.ndarray, phase: np.ndarray, harmonics: int) -> np.ndarray:
     """Return Σ_t y(t) exp(−2πi h phase(t)), h = 0 … harmonics, of signals (channels, times), by the same grid."""
+    parts = _parts(phase.size, _fine(harmonics))
+    return sums_of_blocks(((part, values[:, part]) for part in parts), len(values), phase, harmonics)
+
+
+def sums_of_blocks(
+    blocks: Iterable[tuple[slice, np.ndarray]], channels: int, phase: np.ndarray, harmonics: int
+) -> np.ndarray:
+    """Return the same of signals that are given part by part."""
     points = _fine(harmonics)
-    tables, length = np.zeros((TAYLOR, len(values), points)), max(CHUNK, 4 * points)
-    for first in range(0, phase.size, length):
-        part = slice(first, first + length)
+    tables = np.zeros((TAYLOR, channels, points))
+    for part, values in blocks:
         place, offset = _places(phase[part], points)
         for channel, signal in enumerate(values):
-            weighted = np.array(signal[part], dtype=float)
+            weighted = np.array(signal, dtype=float)
             for table in tables:
                 table[channel] += np.bincount(place, weighted, points)
                 weighted *= offset
@@ -100,9 +115,20 @@ def sums(values: np.ndarray, phase: np.ndarray, harmonics: int) -> np.ndarray:
     return np.asarray(sum(rate**p / factorial(p) * spectrum for p, spectrum in enumerate(spectra)))
 
 
+def moments(phase: np.ndarray, harmonics: int) -> np.ndarray:
+    """Return Σ_t exp(−2πi h phase(t)), h = 0 … harmonics."""
+    return sums(np.broadcast_to(1.0, (1, phase.size)), phase, harmonics)[0]
+
+
 def _fine(harmonics: int) -> int:
     """Return how many grid points, a power of two, make Taylor series of all harmonics exact to rounding."""
     return 256 << max(harmonics - 1, 1).bit_length()
+
+
+def _parts(times: int, points: int) -> Iterator[slice]:
+    """Yield parts of so many times that are long compared with a grid."""
+    length = max(CHUNK, 4 * points)
+    return (slice(first, min(first + length, times)) for first in range(0, times, length))
 
 
 def _places(phase: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:

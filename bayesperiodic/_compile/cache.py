@@ -6,12 +6,14 @@ must equal the expected one, and every compiled file must have the digest record
 is removed, with a warning, and built again; if the folder cannot be used, the kernels are compiled in memory.
 """
 
+import ast
 import errno
 import gc
 import hashlib
 import json
 import os
 import platform
+import re
 import shutil
 import stat
 import sys
@@ -22,7 +24,7 @@ import types
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,7 @@ import numba
 import platformdirs
 
 from bayesperiodic._files import locked
+from bayesperiodic._printing import progress_bar
 
 try:
     from numba.core.compiler_lock import global_compiler_lock
@@ -42,6 +45,8 @@ SOURCE, MANIFEST, BUILDING = "kernels.py", "manifest.json", "building-"
 ABANDONED = 3600.0
 # Seconds for which a process waits for another one that builds the same entry, before it builds it too.
 LONGEST_WAIT = 600.0
+# Decorated functions of a text, and seconds from which their compilation is shown.
+KERNEL, NOTABLE, COMPILING = re.compile(r"^@", re.MULTILINE), 1.0, "compiling kernels (once per machine)"
 # Folders in which no entry could be built; this process does not try again.
 _UNUSABLE: set[Path] = set()
 
@@ -181,9 +186,11 @@ def _private_folder() -> Path:
     return folder
 
 
-@cache
-def _announce() -> None:
-    print("compiling kernels (once per machine) …", file=sys.stderr, flush=True)
+def _announce(source: str) -> None:
+    """Tell how many kernels are compiled, where no progress bar can be updated; functions of models take no time."""
+    count = len(KERNEL.findall(source))
+    if count and not sys.stderr.isatty():
+        print(f"compiling {count} kernels (once per machine) …", file=sys.stderr, flush=True)
 
 
 def _build(source: str, entry: Path, execute: Callable[..., types.ModuleType]) -> types.ModuleType:
@@ -195,7 +202,7 @@ def _build(source: str, entry: Path, execute: Callable[..., types.ModuleType]) -
     with global_compiler_lock, _alone(entry):  # in this order, because texts that are executed may load others
         if module := _stored(source, entry, execute):
             return module
-        _announce()
+        _announce(source)
         workshop = Path(tempfile.mkdtemp(prefix=BUILDING, dir=entry.parent))
         try:
             (workshop / SOURCE).write_text(source, encoding="utf-8")
@@ -242,7 +249,12 @@ def _digests(entry: Path) -> dict[str, str]:
 
 
 def _run(source: str, path: Path, module: types.ModuleType) -> None:
-    exec(compile(source, str(path), "exec"), module.__dict__)
+    """Execute a text one statement after the other, with a progress bar in a terminal if that takes long."""
+    settings = {"desc": COMPILING, "unit": "kernel", "delay": NOTABLE, "leave": False}
+    with progress_bar(total=len(KERNEL.findall(source)), disable=not sys.stderr.isatty(), **settings) as bar:
+        for statement in ast.parse(source, str(path)).body:
+            exec(compile(ast.Module([statement], []), str(path), "exec"), module.__dict__)
+            bar.update(isinstance(statement, ast.FunctionDef) and len(statement.decorator_list))
 
 
 def _execute(

@@ -62,7 +62,7 @@ def determined_harmonics(time: np.ndarray, fundamental: float, highest: int) -> 
     count = np.bincount(((phase - phase[0]) % 1.0 * bins).astype(int), minlength=bins)[:bins]
     if count.min() > 0 and np.ptp(count) <= max(EVEN_COUNTS, EVEN_SHARE * count.max()):
         return highest, np.ones(highest + 1)
-    moments = _fourier.sums(np.ones((1, time.size)), phase, 2 * highest)[0] / time.size
+    moments = _fourier.moments(phase, 2 * highest) / time.size
     known, unknown = 0, highest + 1
     while unknown - known > 1:
         middle = min(max(2 * known, 1), (known + unknown) // 2)

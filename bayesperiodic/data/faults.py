@@ -283,9 +283,12 @@ def dropped_value(values: np.ndarray) -> float | None:
 
 def jumps(values: np.ndarray) -> bool:
     """Return whether some steps between samples (channels, samples) are larger than smooth signals with noise have."""
-    steps = np.abs(np.diff(values, axis=1))
-    usual = np.quantile(steps[:, :: 1 + steps.shape[1] // SCREENED], USUAL, axis=1)
-    return bool((steps.max(axis=1) > JUMP * usual).any())
+    for row in values:
+        steps = np.diff(row)
+        np.abs(steps, out=steps)
+        if steps.max() > JUMP * np.quantile(steps[:: 1 + steps.size // SCREENED], USUAL):
+            return True
+    return False
 
 
 def outliers_of(residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -> np.ndarray:
@@ -293,12 +296,12 @@ def outliers_of(residuals: np.ndarray, phase: np.ndarray, values: np.ndarray, st
 
     `phase` is in cycles. What is far at the same phase of many cycles is part of the signal.
     """
-    middle = np.median(residuals)
-    distance = np.abs(residuals - middle)
+    distance = residuals - np.median(residuals)
+    np.abs(distance, out=distance)
     scale = MEDIAN_TO_SD * float(np.median(distance))
     if not scale > 0.0:
         scale = float(np.quantile(distance, 0.9))
-    least = max(FAR * scale, 2.0 * step, 1e-9 * np.abs(values).max())
+    least = max(FAR * scale, 2.0 * step, 1e-9 * max(values.max(), -values.min()))
     # Large outliers are in the mean period too, so that their neighbours are far from it as well.
     levels = {least, max(least, LARGE * float(distance.max()))}
     each = [_lone(distance > level, phase, values, step) for level in levels]
@@ -316,8 +319,9 @@ def _lone(far: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -
     flagged = far[first]
     first, length = first[flagged], length[flagged]
     # A jump into the run and out of it, larger than between the other samples.
-    change, inside = np.abs(np.diff(values)), ~(far[1:] | far[:-1])
-    usual = float(np.quantile(change[inside], 0.99)) if inside.any() else 0.0
+    change, inside = np.diff(values), ~(far[1:] | far[:-1])
+    np.abs(change, out=change)
+    usual = float(np.quantile(change[inside], 0.99, overwrite_input=True)) if inside.any() else 0.0
     before = np.where(first > 0, change[np.maximum(first - 1, 0)], np.inf)
     last = first + length - 1
     after = np.where(last < values.size - 1, change[np.minimum(last, change.size - 1)], np.inf)

@@ -23,7 +23,7 @@ from bayesperiodic.data.harmonics import (
     refine_frequency,
 )
 from bayesperiodic.data.inspection import Inspection
-from bayesperiodic.data.lines import LEAST_LEFT, Sampling
+from bayesperiodic.data.lines import LEAST_LEFT, Sampling, nearest
 from bayesperiodic.data.quantisation import REPEATED_FREEDOM, repeated_variance, rounded_step
 from bayesperiodic.data.recording_check import SERIOUS, Finding, refuse
 from bayesperiodic.data.response_period import FALSE_ALARM_RATE, aperiodic, even_times, response_period
@@ -70,7 +70,7 @@ def fold_signals(
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
     frequency = None if given is None else given[0]
-    groups = [replace(group, time=group.time - start) for group in groups]
+    groups = [replace(group, time=group.time - start) for group in groups] if start else groups
     chosen = _chosen(harmonics, [channel for group in groups for channel in group.channels])
     asked = max(chosen.values(), default=0)
     seen, others = inspect_clocks(groups, clocks, periods, frequency, points, asked)
@@ -80,6 +80,7 @@ def fold_signals(
     inputs = [channel for group in groups for channel in group.channels[: group.inputs]]
     parts, fit = _at_phases(parts, fit, pace, periods, given, seen.limits)
     drift = dict(zip(seen.channels, _drift(seen.sizes), strict=True))
+    seen = replace(seen, fit=None)  # whose residuals are not those of the fit at a given frequency
     _refuse_drift(name, drift, largest_drift)
     findings = _with_stated_clock(seen.findings, clocks)
     refuse(name, findings)
@@ -355,9 +356,7 @@ def _noise(signals: Signals, fit: HarmonicFit, row: int, sampling: Sampling) -> 
     of quantisation errors that repeat in every cycle.
     """
     residuals, harmonic = fit.residuals[row], np.arange(fit.amplitudes.shape[1])
-    signal = sampling.on_grid(residuals)
-    deviation = np.fft.rfft(signal, axis=1)[:, harmonic] / sampling.samples[:, None]
-    amplitude = sampling.between(signal)
+    amplitude, deviation = sampling.lines(residuals, harmonic.size)
     sides = len(sampling.left) // 2
     beside = np.concatenate([amplitude[:sides, harmonic], np.conj(amplitude[:sides, -harmonic])])
     near = np.sum(np.abs(beside) ** 2, axis=0) / np.maximum(sampling.left.sum(axis=0), LEAST_LEFT)
@@ -369,7 +368,7 @@ def _noise(signals: Signals, fit: HarmonicFit, row: int, sampling: Sampling) -> 
     total = np.divide((near + repeated) ** 2, uncertain, out=freedom.copy(), where=uncertain > 0.0)
     near += repeated
     scale = np.where(harmonic == 0, 1.0, 4.0)
-    one_cycle = scale * np.sum(np.abs(deviation) ** 2, axis=0) / (len(signal) - 1)
+    one_cycle = scale * np.sum(np.abs(deviation) ** 2, axis=0) / (len(deviation) - 1)
     return one_cycle, AmplitudeNoise(scale * near, total, freedom, beside)
 
 
@@ -429,15 +428,18 @@ def _repeated_error(
     values: np.ndarray, residuals: np.ndarray, amplitudes: np.ndarray, phase: np.ndarray, points: int
 ) -> float:
     """Return the variance of the mean over a cycle due to repeated quantisation errors; `phase` is in cycles."""
-    place = np.rint(phase * points).astype(int) % points
+    if not (step := rounded_step(values, phase)) > 0.0:
+        return 0.0
+    place = nearest(phase, points)
+    place %= points
     count = np.bincount(place, minlength=points)
-    square = np.sum(residuals**2) - np.sum(np.bincount(place, residuals, points) ** 2 / np.maximum(count, 1))
+    square = residuals @ residuals - np.sum(np.bincount(place, residuals, points) ** 2 / np.maximum(count, 1))
     phases = np.count_nonzero(count)
     again = values.size - phases
     if not again:
         return 0.0
     fitted = _fourier.on_grid(amplitudes, points)
-    return repeated_variance(rounded_step(values, phase), fitted, int(phases), scatter=square / again)
+    return repeated_variance(step, fitted, int(phases), scatter=square / again)
 
 
 def _last_significant(amplitudes: np.ndarray, noise: AmplitudeNoise) -> int:

@@ -1,5 +1,6 @@
 """Fourier series of sampled signals whose fundamental frequency is unknown: least-squares fits and frequencies."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -45,13 +46,10 @@ def fit_harmonics(time: np.ndarray, channels: np.ndarray, frequency: float, harm
     the highest harmonic.
     """
     phase = frequency * time
-    amplitudes = _solved(_moments(phase, harmonics), _fourier.sums(channels, phase, harmonics))
+    amplitudes = _solved(_fourier.moments(phase, 2 * harmonics), _fourier.sums(channels, phase, harmonics))
     amplitudes[:, 1:] *= 2.0
-    return HarmonicFit(frequency, amplitudes, channels - _fourier.at_times(amplitudes, phase))
-
-
-def _moments(phase: np.ndarray, harmonics: int) -> np.ndarray:
-    return _fourier.sums(np.ones((1, phase.size)), phase, 2 * harmonics)[0]
+    residuals = _fourier.at_times(amplitudes, phase)
+    return HarmonicFit(frequency, amplitudes, np.subtract(channels, residuals, out=residuals))
 
 
 def _solved(moments: np.ndarray, sums: np.ndarray) -> np.ndarray:
@@ -130,10 +128,8 @@ def normal_equation(
     fit = fit_harmonics(time, channels, frequency, harmonics)
     power = 0.5 * np.sum(np.abs(fit.amplitudes[:, 1:]) ** 2, axis=1)
     clear, weights = _clear(fit), counted / np.maximum(fit.variances, 1e-24 * power)
-    slope = _fourier.at_times(_fourier.derivative(clear, 1.0), frequency * time)
-    slope *= time - time.mean()
-    information = _information(frequency * time, slope, weights, harmonics)
-    return fit, clear, weights, float(weights @ np.einsum("ij,ij->i", slope, fit.residuals)), information
+    gradient, information = _slopes(time, fit, clear, weights)
+    return fit, clear, weights, gradient, information
 
 
 def _clear(fit: HarmonicFit) -> np.ndarray:
@@ -144,11 +140,22 @@ def _clear(fit: HarmonicFit) -> np.ndarray:
     return np.where((power > SIGNIFICANT_POWER * noise) | (power == largest), fit.amplitudes, 0.0)
 
 
-def _information(phase: np.ndarray, slope: np.ndarray, weights: np.ndarray, harmonics: int) -> float:
-    """Return Σ weight · ‖slope without its harmonics‖²."""
-    sums = _fourier.sums(slope, phase, harmonics)
-    inside = np.real(np.conj(sums) * _solved(_moments(phase, harmonics), sums)) @ np.r_[1.0, np.full(harmonics, 2.0)]
-    return float(weights @ (np.einsum("ij,ij->i", slope, slope) - inside))
+def _slopes(time: np.ndarray, fit: HarmonicFit, clear: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
+    """Return Σ weight · slope · residual and Σ weight · ‖slope without its harmonics‖², of the frequency's slopes."""
+    phase, middle, harmonics = fit.frequency * time, time.mean(), clear.shape[1] - 1
+    products, squares = np.zeros(len(clear)), np.zeros(len(clear))
+
+    def slopes() -> Iterator[tuple[slice, np.ndarray]]:
+        for part, slope in _fourier.blocks_at(_fourier.derivative(clear, 1.0), phase):
+            slope *= time[part] - middle
+            products[:] += np.einsum("ij,ij->i", slope, fit.residuals[:, part])
+            squares[:] += np.einsum("ij,ij->i", slope, slope)
+            yield part, slope
+
+    sums = _fourier.sums_of_blocks(slopes(), len(clear), phase, harmonics)
+    solved = _solved(_fourier.moments(phase, 2 * harmonics), sums)
+    inside = np.real(np.conj(sums) * solved) @ np.r_[1.0, np.full(harmonics, 2.0)]
+    return float(weights @ products), float(weights @ (squares - inside))
 
 
 def _pace(time: np.ndarray, fit: HarmonicFit, clear: np.ndarray, weights: np.ndarray, information: float) -> Pace:
@@ -162,10 +169,14 @@ def cycle_scores(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the gradients of phase and of amplitude in each cycle (cycles,), and the information of one cycle."""
     rate = _fourier.derivative(clear, 1.0)
-    turned = (_fourier.at_times(r, fit.frequency * time) * fit.residuals for r in (rate, 1j * rate))
-    score, quadrature = (np.bincount(cycle, weights @ part, cycles) for part in turned)
+    both, phase = np.zeros((2, cycles)), fit.frequency * time
+    for part, turned in _fourier.blocks_at(np.stack([rate, 1j * rate]), phase):
+        first = cycle[part][0]
+        for total, each in zip(both, turned, strict=True):
+            sums = np.bincount(cycle[part] - first, weights @ (each * fit.residuals[:, part]))
+            total[first : first + sums.size] += sums
     power = time.size * float(weights @ np.sum(np.abs(rate) ** 2, axis=1)) / 2.0 / cycles
-    return score, quadrature, power
+    return both[0], both[1], power
 
 
 def pace_of(score: np.ndarray, quadrature: np.ndarray, power: float, information: float) -> Pace:
@@ -242,16 +253,19 @@ def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
     from scipy.fft import next_fast_len
 
     samples = time.size
-    length = next_fast_len(2 * samples, real=True)
+    lags = min(samples // 3 + 2, samples)
+    length = next_fast_len(samples + lags, real=True)
     step = (time[-1] - time[0]) / (samples - 1)
-    even = time[0] + step * np.arange(samples)
-    correlation = np.zeros(samples)
+    correlation = np.zeros(lags)
     for values in channels:
-        signal = np.interp(even, time, values)
-        signal = (signal - signal.mean()) / signal.std()
-        power = np.abs(np.fft.rfft(signal, length)) ** 2
-        correlation += np.fft.irfft(power, length)[:samples] / np.arange(samples, 0, -1)
-    correlation = correlation[: samples // 3 + 2]
+        signal = np.interp(time[0] + step * np.arange(samples), time, values)
+        signal -= signal.mean()
+        signal /= signal.std()
+        spectrum = np.fft.rfft(signal, length)
+        del signal
+        spectrum.real = spectrum.real**2 + spectrum.imag**2
+        spectrum.imag = 0.0
+        correlation += np.fft.irfft(spectrum, length)[:lags] / np.arange(samples, samples - lags, -1)
     negative = np.flatnonzero(correlation < 0.5 * correlation[0])
     if negative.size == 0:
         return None

@@ -103,9 +103,13 @@ def inspect(
     sound = [_sound(*each, tracked, points) for each in zip(groups, calm, faults, moving, strict=True)]
     whole = all(these.size == group.time.size for these, group in zip(sound, groups, strict=True))
     sound = [_inside(these, part) for these, part in zip(sound, span, strict=True)]
+    counted = first.time
+    del calm, first  # their values can be copies
     some = [_selected(group, these) for group, these in zip(groups, sound, strict=True)]
     refined = frequency is None
+    times = some[0].time
     every, steady, tracked = _steady_of(some, tracked, points, refined, refined and not whole, other)
+    del some
     if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
         return stopped(_unsteady(groups, every.all, tracked), tracked, total)
     used = [
@@ -132,9 +136,9 @@ def inspect(
     seen += cycle_findings(channels, groups[0].time, outer, steady, fit.frequency, total, _ends(groups))
     if frequency is None:
         lead = parts[leading(groups)]
-        seen += sampling_findings(lead.time, lead.values, fit.frequency, first.time, behind)
+        seen += sampling_findings(lead.time, lead.values, fit.frequency, counted, behind)
     varies = pace.drifts or pace.wander > 0.0
-    of_clocks, drifts = _clock_findings(groups, every, some[0].time, used[0], fit.frequency, total, varies)
+    of_clocks, drifts = _clock_findings(groups, every, times, used[0], fit.frequency, total, varies)
     sizes = every.all.apart().sizes
     return Inspection(
         groups, faults, _worst_first(seen + of_clocks), total, steady, used, sizes, fit, pace, limits, inflation, drifts
@@ -233,7 +237,7 @@ def _calm(group: Signals, faults: list[ChannelFaults], moving: np.ndarray) -> Si
     """Return a group at the samples that move, without rare extremes; raise a ValueError if these are too few."""
     if moving.size < LEAST_MOVING * group.time.size:
         raise ValueError(_still(group, faults))
-    return replace(group, values=bounded(group.values)).part(moving)
+    return _selected(replace(group, values=bounded(group.values)), moving)
 
 
 def _selected(group: Signals, samples: np.ndarray) -> Signals:
@@ -344,15 +348,24 @@ def _sound(
     for fault in faults:
         fault.brief = single(fault.brief, signals.time * fundamental)
         if fault.brief.size:
-            moving = np.setdiff1d(moving, fault.brief)
-            calm = replace(signals, values=bounded(signals.values)).part(moving)
+            moving = _without(moving, fault.brief)
+            calm = _selected(replace(signals, values=bounded(signals.values)), moving)
     if not jumps(signals.values) and all(dropped_value(values) is None for values in signals.values):
         return moving
     limit = min(resolved_harmonics(calm.time, fundamental, points), ROUGH_HARMONICS)
     fit = fit_harmonics(calm.time, calm.values, fundamental, limit)
-    for fault, values, near, rest in zip(faults, signals.values[:, moving], calm.values, fit.residuals, strict=True):
-        fault.outliers = moving[outliers_of(values - near + rest, calm.time * fundamental, values, fault.step)]
-    return np.setdiff1d(moving, np.concatenate([fault.outliers for fault in faults]))
+    for fault, near, rest, measured in zip(faults, calm.values, fit.residuals, signals.values, strict=True):
+        values = measured if moving.size == measured.size else measured[moving]
+        rest += values - near
+        fault.outliers = moving[outliers_of(rest, calm.time * fundamental, values, fault.step)]
+    return _without(moving, np.concatenate([fault.outliers for fault in faults]))
+
+
+def _without(numbers: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return increasing numbers of samples without others."""
+    kept = np.ones(numbers.max(initial=-1) + 1, dtype=bool)
+    kept[others[others < kept.size]] = False
+    return numbers[kept[numbers]]
 
 
 def _unsteady(groups: list[Signals], every: Windows, frequency: float) -> str:

@@ -15,6 +15,8 @@ LINES_NEAR_ZERO, WHITE_LINES, SLOW_LINES = 40, 8, 2
 # Correlation times in recording lengths, white floors relative to line 1, and line 0 of 1/f noise relative to line 1
 # if its spectrum is flat below a quarter of a line.
 CORRELATION_TIMES, FLOORS, ZERO_OF_PINK = (0.45, 0.1, 0.05, 0.025), (0.0, 0.01, 0.1), 2.75
+# Points of the grid that are in memory together.
+GRID_POINTS = 1 << 17
 # Part of a line's noise below which it is in the fitted harmonics, and the line is of no use.
 LEAST_LEFT = 0.05
 
@@ -44,7 +46,7 @@ class Sampling:
         grid = FINENESS * int(np.ceil(max(per_cycle(time, frequency), 2 * harmonics + 1) - 1e-6))
         points = min(grid, max(FINEST, 2 * FINENESS * (harmonics + 1)))
         phase = (time - time[0]) * frequency
-        place = np.minimum(np.rint(phase * points).astype(int), points * cycles - 1)
+        place = np.minimum(nearest(phase, points), points * cycles - 1)
         samples = np.bincount(place // points, minlength=cycles)
         number = np.flatnonzero(samples)
         if number.size < cycles:
@@ -62,7 +64,7 @@ class Sampling:
     def _incomplete(self) -> "Sampling":
         """Return the same with the shares of white noise that are left, by the lines of the sampling itself."""
         sides, harmonics = len(self.left) // 2, self.left.shape[1] - 1
-        window = np.abs(self.between(self.on_grid(np.ones(self.place.size)))) ** 2
+        window = np.abs(self.lines(np.broadcast_to(1.0, self.place.size))[0]) ** 2
         # Lines from 2H below to 2H above harmonic 0, of which those from −H to H about each harmonic count.
         sums = np.cumsum(window[:, np.arange(-2 * harmonics - 1, 2 * harmonics + 1)], axis=1)
         left = np.maximum(1.0 - sums[:, 2 * harmonics + 1 :] + sums[:, : -2 * harmonics - 1], 0.0)
@@ -78,26 +80,40 @@ class Sampling:
             freedom=np.maximum(self.freedom / alike, 2.0),
         )
 
-    def on_grid(self, values: np.ndarray) -> np.ndarray:
-        """Return the sums of values (samples,) at the points of the grid, (covered, points)."""
-        return np.bincount(self.place, values, self.points * self.number.size).reshape(-1, self.points)
+    def lines(self, values: np.ndarray, harmonics: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lines of values (samples,) at the sides above harmonics 0 … points − 1, for each sample.
 
-    def between(self, signal: np.ndarray) -> np.ndarray:
-        """Return the lines at the sides above harmonics 0 … points − 1 of a signal (covered, points), for each sample.
-
-        By sums over the cycles first, so that the time does not depend on the prime factors of their number.
+        By sums over the cycles first, so that the time does not depend on the prime factors of their number. The second
+        array (covered, harmonics) is of the first harmonics in each cycle, for each of its samples.
         """
         side = 2.0 * np.pi * self.side[:, None]
-        turn = side * self.number
-        total = np.cos(turn) @ signal - 1j * (np.sin(turn) @ signal)
+        total = np.zeros((self.side.size, self.points), dtype=complex)
+        each = np.zeros((self.number.size, harmonics), dtype=complex)
+        length = max(GRID_POINTS // self.points, 1)
+        for first in range(0, self.number.size, length):
+            cycles = slice(first, min(first + length, self.number.size))
+            start = first * self.points
+            part = slice(*np.searchsorted(self.place, [start, cycles.stop * self.points]))
+            signal = np.bincount(self.place[part] - start, values[part], (cycles.stop - first) * self.points)
+            signal = signal.reshape(-1, self.points)
+            turn = side * self.number[cycles]
+            total += np.cos(turn) @ signal - 1j * (np.sin(turn) @ signal)
+            if harmonics:
+                each[cycles] = np.fft.rfft(signal, axis=1)[:, :harmonics] / self.samples[cycles, None]
         total *= np.exp(-1j / self.points * side * np.arange(self.points))
-        return np.asarray(np.fft.fft(total, axis=1)) / self.phase.size
+        return np.asarray(np.fft.fft(total, axis=1)) / self.phase.size, each
 
     def at_zero(self, lines: np.ndarray) -> tuple[float, float]:
-        """Return the expected power of the noise at frequency zero, and its freedom, from the lines `between`."""
+        """Return the expected power of the noise at frequency zero, and its freedom, from the `lines`."""
         power = np.abs(lines[:, : self.points // 2].T.ravel()[:LINES_NEAR_ZERO]) ** 2
         left = self.left_near_zero[: power.size]
         return _at_zero((power / np.maximum(left, LEAST_LEFT))[left > LEAST_LEFT])
+
+
+def nearest(phase: np.ndarray, points: int) -> np.ndarray:
+    """Return the numbers of the nearest points of a grid with so many in a cycle; phases are in cycles."""
+    place = phase * points
+    return np.rint(place, out=place).astype(int)
 
 
 def _at_zero(power: np.ndarray) -> tuple[float, float]:

@@ -113,7 +113,12 @@ def bounded(values: np.ndarray) -> np.ndarray:
     """Return values (channels, samples) without rare extremes, for a first estimate of the frequency."""
     some = values[:, :: 1 + values.shape[1] // faults.SCREENED]
     low, high = np.quantile(some, [EXTREMES, 1.0 - EXTREMES], axis=1, keepdims=True)
-    return np.where(high > low, np.clip(values, low - (high - low), high + (high - low)), values)
+    least, most = (
+        np.where(high > low, end, wide) for end, wide in ((2 * low - high, -np.inf), (2 * high - low, np.inf))
+    )
+    if (values.min(axis=1, keepdims=True) >= least).all() and (values.max(axis=1, keepdims=True) <= most).all():
+        return values
+    return np.clip(values, least, most)
 
 
 @dataclass(frozen=True)
@@ -139,26 +144,30 @@ UNKNOWN = Effect(np.nan, np.nan, np.zeros(0), np.nan, 0)
 
 def effect_of(time: np.ndarray, values: np.ndarray, bad: np.ndarray, frequency: float, harmonics: int) -> Effect:
     """Return the effect of faulty samples (bool), by the mean period of the others; unknown if they do not show it."""
-    used, best, order, fit = time[~bad], np.inf, 0, None
+    used, good, best, order, amplitudes, variance = time[~bad], values[None, ~bad], np.inf, 0, None, np.nan
     for highest in FITTED_HARMONICS:
         if highest <= harmonics and used.size > 6 * highest and np.ptp(used) * frequency > 2.0:
-            moments = _fourier.sums(np.ones((1, used.size)), frequency * used, 2 * highest)[0]
+            moments = _fourier.moments(frequency * used, 2 * highest)
             spectrum = np.linalg.eigvalsh(toeplitz(moments))
             if spectrum[0] * LARGEST_FIT_CONDITION > spectrum[-1]:
-                trial = fit_harmonics(used, values[None, ~bad], frequency, highest)
+                trial = fit_harmonics(used, good, frequency, highest)
                 # The Bayesian information criterion: needless harmonics predict nothing where samples are missing.
                 least = max(float(trial.variances[0]), 1e-24 * float(values.var()))
                 score = used.size * np.log(least) + 2 * highest * np.log(used.size)
                 if score < best:
-                    best, order, fit = score, highest, trial
-    if fit is None:
+                    best, order, amplitudes, variance = score, highest, trial.amplitudes, float(trial.variances[0])
+                del trial  # with residuals
+    if amplitudes is None:
         return UNKNOWN
-    predicted = _fourier.at_times(fit.amplitudes, frequency * time)[0]
-    noise = float(np.sqrt(fit.variances[0]))
-    if not np.isfinite(predicted).all() or noise > 0.9 * float(values[~bad].std()):
+    predicted = _fourier.at_times(amplitudes, frequency * time)[0]
+    noise = float(np.sqrt(variance))
+    if not np.isfinite(predicted).all() or noise > 0.9 * float(good.std()):
         return UNKNOWN
-    noise = max(noise, 1e-9 * float(np.abs(values[~bad]).max()))
-    return _effect(np.where(bad, values - predicted, 0.0), time, frequency, order, predicted, noise)
+    noise = max(noise, 1e-9 * float(max(good.max(), -good.min())))
+    del used, good
+    wrong = values - predicted
+    wrong[~bad] = 0.0
+    return _effect(wrong, time, frequency, order, predicted, noise)
 
 
 def _effect(
@@ -264,8 +273,9 @@ def _coarse(
     """
     if bad.all():
         return
-    phase, good = frequency * time, values[~bad]
-    step = rounded_step(good, phase[~bad])
+    sound = ~bad if bad.any() else slice(None)
+    phase, good = frequency * time, values[sound]
+    step = rounded_step(good, phase[sound])
     levels = round(float(np.ptp(good)) / step) + 1 if step else 0
     if not 2 <= levels <= MOST_COARSE_LEVELS:
         return

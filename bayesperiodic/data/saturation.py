@@ -48,12 +48,15 @@ def phase_bins(phase: np.ndarray) -> PhaseBins:
             max(phase.size // SAMPLES_OF_INTERVAL, 1),
         )
     )
-    shifted = phase + 0.5 / number
-    cycle = np.floor(shifted)
-    rest = shifted - cycle
-    place = np.minimum((rest * number).astype(np.int64), number - 1)
-    total = np.bincount(place, rest, number)
-    place += number * (cycle.astype(np.int64) & 1)
+    place, total = np.empty(phase.size, dtype=np.int64), np.zeros(number)
+    for first in range(0, phase.size, _fourier.CHUNK):
+        part = slice(first, first + _fourier.CHUNK)
+        shifted = phase[part] + 0.5 / number
+        cycle = np.floor(shifted)
+        rest = shifted - cycle
+        place[part] = np.minimum((rest * number).astype(np.int64), number - 1)
+        total += np.bincount(place[part], rest, number)
+        place[part] += number * (cycle.astype(np.int64) & 1)
     count = np.bincount(place, minlength=2 * number).reshape(2, number)
     return PhaseBins(place, count, total / np.maximum(count.sum(axis=0), 1) - 0.5 / number)
 

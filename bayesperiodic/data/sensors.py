@@ -69,7 +69,7 @@ def undetermined(used: Signals, fit: HarmonicFit, resolved: int) -> str:
     if order >= min(resolved, MOST_SHOWN):
         return ""
     for more in range(order + 1, min(resolved, MOST_SHOWN) + 1):
-        moments = _fourier.sums(np.ones((1, used.time.size)), fit.frequency * used.time, 2 * more)[0]
+        moments = _fourier.moments(fit.frequency * used.time, 2 * more)
         size = np.linalg.eigvalsh(toeplitz(moments))
         if not size[0] * LARGEST_SHOWN_CONDITION > size[-1]:
             break

@@ -137,14 +137,10 @@ def _windows_of(
     order = np.arange(2 * determined_harmonics(time, fundamental, highest)[0] + 1)
     harmonics = order[: order.size // 2 + 1]
     used = slice(edges[0], None)
-    wave, power = np.exp(-2j * np.pi * (fundamental * time[used] % 1.0)), np.ones(time[used].size, dtype=complex)
-    scaled = values[:, used] / values.std(axis=1)[:, None]
-    sums = np.zeros((order.size, len(values) + 1, count), dtype=complex)
-    for h in order:
-        for row, signal in zip(sums[h], [1.0, *(scaled if h < harmonics.size else ())], strict=False):
-            row[:] = np.add.reduceat(signal * power, edges - edges[0])
-            row[empty] = 0.0
-        power *= wave
+    scale = np.array([signal.std() for signal in values])
+    sums = _block_sums(fundamental * time[used], values[:, used], edges - edges[0], order.size, harmonics.size)
+    sums[:, 1:] /= scale[:, None]
+    sums[:, :, empty] = 0.0
     sums = np.lib.stride_tricks.sliding_window_view(sums, fine, axis=2).sum(axis=3)
     # Normal equations of each window, as in `fit_harmonics`; they are well conditioned where the samples are enough.
     moments = np.concatenate([np.conj(sums[:0:-1, 0]), sums[:, 0]])
@@ -166,9 +162,30 @@ def _windows_of(
     slip = jump = np.zeros(len(values))
     if enough.size and per_cycle(time, fundamental) >= SLOW:
         number = np.median(last[enough] - first[enough])
-        slip, jump = (size / number for size in _slip(scaled, edges[::fine] - edges[0]))
+        slip, jump = (size / number / scale for size in _slip(values[:, used], edges[::fine] - edges[0]))
     result = Windows(first[enough], last[enough], enough, fine, cycles, np.moveaxis(amplitudes, 1, 2), slip, jump)
     return result, enough.size / np.count_nonzero(some)
+
+
+def _block_sums(phase: np.ndarray, values: np.ndarray, edges: np.ndarray, orders: int, harmonics: int) -> np.ndarray:
+    """Return the sums of exp(−2πi h phase), h < orders, and with signals, h < harmonics, from each edge to the next.
+
+    The array (orders, channels + 1, edges) is that of some edges after the other, so that the waves need little memory.
+    """
+    sums = np.zeros((orders, len(values) + 1, edges.size), dtype=complex)
+    ends = np.append(edges[1:], phase.size)
+    first = 0
+    while first < edges.size:
+        stop = max(int(np.searchsorted(ends, edges[first] + _fourier.CHUNK, side="right")), first + 1)
+        part = slice(edges[first], max(ends[stop - 1], edges[stop - 1] + 1))
+        wave, place = np.exp(-2j * np.pi * (phase[part] % 1.0)), edges[first:stop] - edges[first]
+        power = np.ones(wave.size, dtype=complex)
+        for h in range(orders):
+            for row, signal in zip(sums[h], [1.0, *(values[:, part] if h < harmonics else ())], strict=False):
+                row[first:stop] = np.add.reduceat(signal * power, place)
+            power *= wave
+        first = stop
+    return sums
 
 
 def _slip(values: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -183,8 +200,10 @@ def _slip(values: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray
         return np.zeros(len(values)), np.zeros(len(values))
     largest, usual = np.empty(len(values)), np.empty(len(values))
     for i, v in enumerate(values):
-        bend = np.abs(np.diff(v, 2))
-        largest[i], usual[i] = np.median(np.maximum.reduceat(bend, edges)), np.median(bend)
+        bend = np.diff(np.diff(v))
+        np.abs(bend, out=bend)
+        largest[i] = np.median(np.maximum.reduceat(bend, edges))
+        usual[i] = np.median(bend, overwrite_input=True)
     return 2.0 * largest, 2.0 * np.maximum(largest - SMOOTH_OR_NOISE * usual, 0.0)
 
 

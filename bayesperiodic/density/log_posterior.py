@@ -1,7 +1,7 @@
 """The log-posterior density over sampling coordinates: prior, Jacobian, likelihood, and their derivatives."""
 
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -158,6 +158,18 @@ class SamplingCoordinates:
             noise[...] = self._noise
             noise[..., self.noise_columns] = np.exp(points[..., count:])
         return theta, noise
+
+    def natural_columns(self, column: Callable[[int], np.ndarray]) -> dict[str, Callable[[], np.ndarray | float]]:
+        """Return by name what returns the values of `to_natural`, from what returns those of a coordinate."""
+
+        def value(k: int) -> np.ndarray:
+            logarithmic = k >= self.logarithmic.size or self.logarithmic[k]
+            with np.errstate(over="ignore"):
+                return np.asarray(np.exp(column(k)) if logarithmic else column(k))
+
+        fixed = dict(zip(self.problem.noise_names, self._noise, strict=True))
+        columns: dict[str, Callable[[], np.ndarray | float]] = {name: partial(float, v) for name, v in fixed.items()}
+        return columns | {label: partial(value, k) for k, label in enumerate(self.labels)}
 
     def from_natural(self, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return coordinates (…, dimension) from θ (…, names) and all noise parameters (…, noise_names)."""

@@ -6,7 +6,7 @@ A parameter local to an experiment is called ``theta16[run 7]``; its draws are o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -221,20 +221,23 @@ def full_name(variable: str, place: Sequence[str]) -> str:
 
 
 def pack(
-    columns: Mapping[str, np.ndarray], dims: Mapping[str, Sequence[str]], coords: Mapping[str, Sequence[str]]
+    shape: tuple[int, ...],
+    columns: Mapping[str, Callable[[], np.ndarray | float]],
+    dims: Mapping[str, Sequence[str]],
+    coords: Mapping[str, Sequence[str]],
 ) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
-    """Return variables, dims and values (chain, draw, …), made of columns (chain, draw) by full name.
+    """Return variables, dims and values (chain, draw, …), made of what returns the columns (chain, draw) by full name.
 
     `dims` are those of each variable after chain and draw, `coords` the names along each. Values without a column are
     NaN.
     """
-    shape = next(iter(columns.values())).shape
     packed = {}
     for variable, further in dims.items():
         places = list(product(*(coords[dim] for dim in further)))
         values = np.full((*shape, len(places)), np.nan)
         for i, place in enumerate(places):
-            values[..., i] = columns.get(full_name(variable, place), np.nan)
+            if (name := full_name(variable, place)) in columns:
+                values[..., i] = columns[name]()
         sizes = [len(coords[dim]) for dim in further]
         packed[variable] = (CHAIN, DRAW, *further), values.reshape(*shape, *sizes)
     return packed

@@ -102,10 +102,15 @@ def quantile_spread(chains: np.ndarray) -> np.ndarray:
     It is that of the fractions of draws up to the pooled quantiles, over the normal density there: between two modes a
     quantile is nowhere certain, but the fraction is.
     """
-    pooled = np.quantile(chains.reshape(-1, chains.shape[-1]), QUANTILE_LEVELS, axis=0)
-    below = np.stack([np.mean(chains <= quantile, axis=(1, 2)) for quantile in pooled])
     density = np.exp(-0.5 * ndtri(QUANTILE_LEVELS) ** 2) / np.sqrt(2.0 * np.pi)
-    return np.max(np.ptp(below, axis=1) / density[:, None], axis=0)
+
+    def spread(values: np.ndarray) -> float:
+        pooled = np.quantile(values, QUANTILE_LEVELS)
+        below = np.stack([np.mean(values <= quantile, axis=(1, 2)) for quantile in pooled])
+        return float(np.max(np.ptp(below, axis=1) / density))
+
+    # One after the other: each takes as much memory as its draws.
+    return np.array([spread(chains[..., i]) for i in range(chains.shape[-1])])
 
 
 def pareto_k(log_weights: np.ndarray) -> float:
@@ -185,7 +190,7 @@ def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: 
         unmet.append(f"quantiles of the ensembles {spread:.2f} sd apart")
     if not unmet and (alone := _furthest(kept, tau)) > STUCK_DISTANCE:
         unmet.append(f"walkers that stay apart, by {alone:.0f} standard errors")
-    if not unmet and (worst := max(map(rhat, np.moveaxis(as_chains(kept), -1, 0)))) > RHAT:
+    if not unmet and (worst := max(rhat(as_chains(kept[..., i])) for i in range(kept.shape[-1]))) > RHAT:
         unmet.append(f"R-hat {worst:.3f}")
     return unmet
 
@@ -193,4 +198,5 @@ def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: 
 def _furthest(kept: np.ndarray, tau: np.ndarray) -> float:
     """Return the largest distance of a walker's mean from the mean of all, in standard errors of such a mean."""
     off = np.abs(kept.mean(axis=1) - kept.mean(axis=(0, 1, 2)))
-    return float(np.max(off / (kept.std(axis=(0, 1, 2)) * np.sqrt(tau / kept.shape[1]))))
+    sd = np.array([kept[..., i].std() for i in range(kept.shape[-1])])
+    return float(np.max(off / (sd * np.sqrt(tau / kept.shape[1]))))

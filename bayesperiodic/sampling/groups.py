@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +26,7 @@ REPLICATES = 100
 MODE = "mode"
 INPUT_NOISE, EXPECTED, LOADINGS, CAUSED = "input_noise", "expected errors", "loadings", "caused"
 # Draws at which the terms of the log-likelihood are stored, and the most numbers that these may take.
-TERM_DRAWS, MOST_TERMS = (500, 2000), 10_000_000
+TERM_DRAWS, MOST_TERMS, DRAWS_TOGETHER = (500, 2000), 10_000_000, 256
 
 
 def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, seed: int) -> xr.Dataset:
@@ -79,10 +80,13 @@ def log_likelihood_terms(density: LogPosterior, posterior: xr.Dataset) -> xr.Dat
     likelihood = density.problem.likelihood
     most = min(max(MOST_TERMS // len(likelihood.observations), TERM_DRAWS[0]), TERM_DRAWS[1])
     chosen, theta, noise = _some(density.problem, posterior, most)
-    simulation = density.solver.solve(theta, whole=True)
-    terms = likelihood.terms(density.comparisons.residuals(simulation, None), noise)
-    terms[simulation.status != CONVERGED] = np.nan
-    shaped = terms.reshape(chosen.sizes[CHAIN], chosen.sizes[DRAW], -1)
+    parts = []
+    for k in range(0, len(theta), DRAWS_TOGETHER):
+        simulation = density.solver.solve(theta[k : k + DRAWS_TOGETHER], whole=True)
+        terms = likelihood.terms(density.comparisons.residuals(simulation, None), noise[k : k + DRAWS_TOGETHER])
+        terms[simulation.status != CONVERGED] = np.nan
+        parts.append(terms)
+    shaped = np.concatenate(parts).reshape(chosen.sizes[CHAIN], chosen.sizes[DRAW], -1)
     coords = {name: chosen.coords[name] for name in (CHAIN, DRAW, STEP, WALKER)}
     group = xr.Dataset({"data": ((CHAIN, DRAW, OBSERVATION), shaped)}, coords=coords)
     labels = {name: (OBSERVATION, values) for name, values in likelihood.labels.items()}
@@ -110,13 +114,14 @@ def tree(
 
     problem, lp = density.problem, convergence.as_chains(log_density)
     steps, walkers = log_density.shape[1:]
-    moved = np.full(log_density.shape, np.nan)
-    moved[:, 1:] = np.any(np.diff(kept[..., : len(problem.names)], axis=1) != 0.0, axis=-1)
-    theta, noise = density.to_natural(convergence.as_chains(kept))
-    best = theta.reshape(-1, theta.shape[-1])[np.argmax(lp)]
+    moved, same = np.full(log_density.shape, np.nan), np.ones(log_density[:, 1:].shape, dtype=bool)
+    for i in range(len(problem.names)):
+        same &= kept[:, 1:, :, i] == kept[:, :-1, :, i]
+    moved[:, 1:] = ~same
+    best, _ = density.to_natural(kept[np.unravel_index(np.argmax(log_density), log_density.shape)])
     step, walker = (convergence.as_chains(index[None])[0] for index in np.indices((steps, walkers)))
     coords = {CHAIN: np.arange(len(lp)), DRAW: np.arange(lp.shape[1]), STEP: (DRAW, step), WALKER: (DRAW, walker)}
-    posterior = _variables(problem, theta, noise).assign_coords(coords)
+    posterior = _variables(density, kept, lp.shape).assign_coords(coords)
     status = np.where(np.isfinite(lp), CONVERGED, NOT_FINITE).astype(np.int8)
     flags = " ".join(s.replace(" ", "_") for s in STATUSES)
     meanings = {"flag_values": list(range(len(STATUSES))), "flag_meanings": flags}
@@ -150,27 +155,26 @@ def tree(
     return result
 
 
-def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr.Dataset:
-    """Return θ (chains, draws, names) and noise parameters (chains, draws, noise_names) as labelled variables."""
+def _variables(density: LogPosterior, kept: np.ndarray, shape: tuple[int, ...]) -> xr.Dataset:
+    """Return θ and noise parameters of draws as labelled variables (chains, draws, …), one after the other."""
     import xarray as xr
 
-    columns = {name: theta[..., i] for i, name in enumerate(problem.names)}
-    columns |= _fixed_locals(problem, theta.shape[:-1])
-    columns |= {name: noise[..., i] for i, name in enumerate(problem.noise_names)}
+    problem = density.problem
+    columns = density.natural_columns(lambda k: convergence.as_chains(kept[..., k])) | _fixed_locals(problem)
     dims = {plain: (EXPERIMENT,) * (plain != name) for name, plain in problem.plain_names.items()}
     dims |= {name.partition("[")[0]: _noise_dims(problem, name) for name in problem.noise_names}
     channels = [*problem.channels, *problem.quantities, *filter(None, [problem.noise.pooled])]
     coords = {CHANNEL: channels, EXPERIMENT: [e.name for e in problem.experiments]}
     noises = {name.partition("[")[0] for name in problem.noise_names}
     attributes = {v: _noise_attributes(problem, v) if v in noises else _attributes(problem, v) for v in dims}
-    packed = pack(columns, dims, coords)
+    packed = pack(shape, columns, dims, coords)
     return xr.Dataset({v: (*values, attributes[v]) for v, values in packed.items()}, coords=coords)
 
 
-def _fixed_locals(problem: Description, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
-    """Return the values of local parameters in the experiments where they are fixed."""
+def _fixed_locals(problem: Description) -> dict[str, Callable[[], float]]:
+    """Return what returns the values of local parameters in the experiments where they are fixed."""
     return {
-        full_name(plain, (run,)): np.full(shape, parameter_map.fixed[plain])
+        full_name(plain, (run,)): partial(float, parameter_map.fixed[plain])
         for plain in {plain for name, plain in problem.plain_names.items() if plain != name}
         for run, parameter_map in problem.parameter_maps.items()
         if plain in parameter_map.fixed

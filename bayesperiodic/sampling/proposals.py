@@ -19,6 +19,8 @@ WIDER_WEIGHT, WIDER_FACTOR = 0.1, 2.0
 # Most draws used in a fit, and draws needed per coordinate and component.
 MOST_FITTED_DRAWS, PER_COMPONENT = 6000, 20
 REGULAR = 1e-6
+# Points whose densities are computed together.
+TOGETHER = 8192
 # Iterations of a fit, and the gain in mean log-density at which it ends.
 FIT_ITERATIONS, ENOUGH_GAIN = 100, 1e-2
 # Most coordinates whose products describe curvature, and ridge of that regression, relative to the mean square.
@@ -77,7 +79,8 @@ class StudentMixture:
 
     def log_density(self, points: np.ndarray) -> np.ndarray:
         """Return the log-density at points (points, dimension)."""
-        return np.asarray(logsumexp(self.log_components(points), axis=1))
+        parts = [points[k : k + TOGETHER] for k in range(0, max(len(points), 1), TOGETHER)]
+        return np.concatenate([logsumexp(self.log_components(part), axis=1) for part in parts])
 
     def draw(self, count: int, random: np.random.RandomState | np.random.Generator) -> np.ndarray:
         """Return draws (count, dimension)."""
@@ -104,8 +107,12 @@ def expected_time(mixture: StudentMixture, points: np.ndarray, log_density: np.n
     later = inverse.sum() - np.cumsum(inverse)
     accepted[order] = (np.arange(1, len(order) + 1) * inverse + later) / inverse.sum()
     leaving = fraction * accepted + (1.0 - fraction) * 2.0 / (4.0 * points.shape[1] + 1.0)
-    squared = (points - points.mean(axis=0)) ** 2
-    return float(np.max((2.0 / leaving - 1.0) @ squared / squared.sum(axis=0)))
+    middle, times, total = points.mean(axis=0), np.zeros(points.shape[1]), np.zeros(points.shape[1])
+    for k in range(0, len(points), TOGETHER):
+        squared = (points[k : k + TOGETHER] - middle) ** 2
+        times += (2.0 / leaving[k : k + TOGETHER] - 1.0) @ squared
+        total += squared.sum(axis=0)
+    return float(np.max(times / total))
 
 
 def fit_mixture(draws: np.ndarray, candidates: Sequence[StudentMixture] = ()) -> StudentMixture:
@@ -256,7 +263,9 @@ class AffineTransform:
 
     def unwhiten(self, u: np.ndarray) -> np.ndarray:
         """Return x (…, dimension)."""
-        return self.origin + u @ self.axes.T
+        x = np.asarray(u @ self.axes.T)
+        x += self.origin
+        return x
 
     def whiten(self, x: np.ndarray) -> np.ndarray:
         """Return u (…, dimension)."""

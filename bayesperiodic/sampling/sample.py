@@ -505,7 +505,8 @@ class _EnsembleRun:
         return self.transform.unwhiten(self._chains(self._first_kept))
 
     def posterior(self) -> Posterior:
-        """Return the draws, with draws of the variances that were integrated out."""
+        """Return the draws, with draws of the variances that were integrated out; the run is over then."""
+        import emcee
         import xarray as xr
 
         kept, first = self._kept(), self._first_kept
@@ -514,6 +515,9 @@ class _EnsembleRun:
         if self.density.collapsed:
             moments = self._by_ensemble(self.backend.get_blobs(discard=first)).reshape(*kept.shape[:-1], -1)
             kept, log_density = self.density.with_variances(kept, log_density, moments, self.redraws)
+        acceptance = float(np.mean(self.backend.accepted / self.backend.iteration))
+        if type(self.backend) is emcee.backends.Backend:  # no checkpoint
+            self.backend.reset(*self.walk.coords.shape)  # as the kept draws are copies
         posterior = gather(
             self.density.with_settings(variances=SAMPLED),
             kept,
@@ -522,7 +526,7 @@ class _EnsembleRun:
             modes=modes,
             converged=self.state["converged"],
             reason=self.state["reason"],
-            acceptance=float(np.mean(self.backend.accepted / self.backend.iteration)),
+            acceptance=acceptance,
             seed=self.seed,
         )
         add_robust(posterior.tree, self.fit, len(posterior.modes))

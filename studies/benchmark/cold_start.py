@@ -38,6 +38,17 @@ TARGETS = {
     f"fold, {large.FOLD_TARGET[0]:,}": large.FOLD_TARGET[1],
     f"orbits, {large.ORBIT_TARGET[0]:,}": large.ORBIT_TARGET[1],
 }
+# What the first command took before its cost was to be halved and after, and folding of the largest recording of
+# `large`: each measured side by side on one machine, whose speed is that of ten million additions, see `additions`.
+COMPARED = {
+    "first command": {
+        "processor s": {"before": {"empty": 127.7, "full": 93.5}, "after": {"empty": 76.9, "full": 52.0}},
+        "target ratio": 0.5,
+    },
+    "fold": {"GB": {"before": 0.89, "after": 0.53}, "target GB": large.FOLD_TARGET[2]},
+    "ten million additions [s]": 0.41,
+}
+ADDITIONS = 10_000_000
 DATA = """
 import json, time
 start = time.perf_counter()
@@ -138,6 +149,7 @@ def run(options: argparse.Namespace) -> None:
     watch, repeats = common.Stopwatch(), QUICK_REPEATS if options.quick else REPEATS
     found: dict[str, Any] = {"cores": len(os.sched_getaffinity(0)), "python": platform.python_version()}
     found["load_average_before"] = [*os.getloadavg()]
+    found |= {"ten million additions [s]": additions(), "compared": COMPARED}
     folder = Path(tempfile.mkdtemp(prefix="cold-start-"))
     try:
         # First, because the tests compare the numbers of the documentation with the stored results.
@@ -165,6 +177,14 @@ def run(options: argparse.Namespace) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def additions() -> float:
+    """Return the processor seconds of ten million additions in a loop of pure Python: the speed of the machine."""
+    begin, total = time.process_time(), 0
+    for _ in range(ADDITIONS):
+        total += 1
+    return time.process_time() - begin
+
+
 def _write(path: Path, found: dict[str, Any], watch: common.Stopwatch) -> None:
     """Print and write what was measured so far."""
     found["targets"] = _targets(found)
@@ -186,24 +206,32 @@ def _environment(folder: Path, packages: list[str]) -> tuple[Path, dict[str, Any
     return python, {"s": seconds, "MB": size / 1e6, "packages": len(list(site.glob("*.dist-info")))}
 
 
-def _timed(command: list[str], cache: Path) -> tuple[float, str]:
-    """Return the seconds of a command with a kernel cache, and what it printed."""
-    begin = time.perf_counter()
+def _timed(command: list[str], cache: Path) -> tuple[float, float, str]:
+    """Return the seconds and processor seconds of a command with a kernel cache, and what it printed."""
+    begin, before = time.perf_counter(), _of_processes()
     done = subprocess.run(
         command, cwd=ROOT, env=os.environ | {"BAYESPERIODIC_CACHE": str(cache)}, capture_output=True, text=True
     )
     if done.returncode:
         raise RuntimeError(f"{' '.join(command[:4])} ended with {done.returncode}: {done.stderr[-2000:]}")
-    return time.perf_counter() - begin, done.stdout
+    return time.perf_counter() - begin, _of_processes() - before, done.stdout
+
+
+def _of_processes() -> float:
+    """Return the processor seconds of all processes that this one has started and that have ended."""
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def _both_ways(command: list[str], folder: Path, repeats: int) -> dict[str, list[float]]:
-    """Return the seconds of a command with an empty kernel cache, and again with what it left."""
-    seconds: dict[str, list[float]] = {"empty": [], "full": []}
+    """Return seconds and processor seconds of a command with an empty kernel cache, and again with what it left."""
+    seconds: dict[str, list[float]] = {"empty": [], "full": [], "empty, processor": [], "full, processor": []}
     for number in range(repeats):
         cache = folder / f"cache-{len(list(folder.iterdir()))}-{number}"
-        for way in seconds:
-            seconds[way].append(_timed(command, cache)[0])
+        for way in ("empty", "full"):
+            wall, processor, _ = _timed(command, cache)
+            seconds[way].append(wall)
+            seconds[f"{way}, processor"].append(processor)
     return seconds
 
 
@@ -215,7 +243,7 @@ def _first_results(python: Path, folder: Path, repeats: int) -> dict[str, dict[s
         known = OURS.replace("MODEL", "bp.models.duffing")
         new = OURS.replace("MODEL", NEW.replace("NUMBER", f"0.00{number + 1}"))
         for kind, code in zip(measured, (known, known, new), strict=True):
-            measured[kind].append(json.loads(_timed([str(python), "-c", code], cache)[1].splitlines()[-1]))
+            measured[kind].append(json.loads(_timed([str(python), "-c", code], cache)[-1].splitlines()[-1]))
     return {kind: _medians(rows) for kind, rows in measured.items()}
 
 
@@ -223,7 +251,7 @@ def _peer(folder: Path, package: str, code: str, repeats: int) -> dict[str, Any]
     """Return what the installation of a package took, and the seconds of its first steps; an error as text."""
     try:
         python, installed = _environment(folder, [package])
-        rows = [json.loads(_timed([str(python), "-c", code], folder)[1].splitlines()[-1]) for _ in range(repeats)]
+        rows = [json.loads(_timed([str(python), "-c", code], folder)[-1].splitlines()[-1]) for _ in range(repeats)]
     except (subprocess.CalledProcessError, RuntimeError, ValueError) as error:
         return {"error": re.sub(r"\s+", " ", str(error))[-300:]}
     return {f"installation {key}": value for key, value in installed.items()} | _medians(rows)

@@ -7,13 +7,13 @@ import tempfile
 import tracemalloc
 from collections.abc import Callable
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import bayesperiodic as bp
 from studies import common
+from studies.benchmark.large import peak as peak
 from studies.gear import GEAR, NOISE, gear_problem
 from studies.timing import Action, interleaved, slope
 
@@ -114,16 +114,6 @@ def start() -> dict[str, float]:
             "from_cache_s": min(run(third) for _ in range(3)),
             "peak_mb": _run(MEMORY, dict(os.environ)),
         }
-
-
-def peak() -> float:
-    """Return the peak memory of this process [MB], NaN if the system does not report it.
-
-    A process started from a large one inherits its ``ru_maxrss``.
-    """
-    status = Path("/proc/self/status")
-    lines = status.read_text().splitlines() if status.is_file() else []
-    return next((float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), float("nan"))
 
 
 def _run(text: str, environment: dict[str, str]) -> float:

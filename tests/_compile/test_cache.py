@@ -112,7 +112,7 @@ def test_callers_of_declared_kernels_are_compiled_for_processes_that_have_the_ke
     cache.load(CALLERS, shared=cache.declare(KERNELS))
     program = f"""
 from bayesperiodic._compile import cache, expectations
-cache._announce = lambda: None
+cache._announce = lambda source: None
 expectations.internals_expected()
 cache._build = None
 print(cache.load({CALLERS!r}, shared=cache.load({KERNELS!r})).combined(2.0))
@@ -343,7 +343,7 @@ def test_full_disk_is_one_warning_that_advises_to_free_space(folder, monkeypatch
 
     built = []
     original = cache._announce
-    monkeypatch.setattr(cache, "_announce", lambda: built.append(original()))
+    monkeypatch.setattr(cache, "_announce", lambda source: built.append(original(source)))
     monkeypatch.setattr(Path, "write_text", full)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -387,8 +387,24 @@ print(cache.load(SMALL).four_times(1.5))
     processes = [subprocess.Popen(command, **pipes) for _ in range(4)]
     found = [process.communicate() for process in processes]
     assert [output for output, _ in found] == ["6.0\n"] * 4
-    assert sorted(announced for _, announced in found) == ["", "", "", "compiling kernels (once per machine) …\n"]
+    assert sorted(announced for _, announced in found) == ["", "", "", "compiling 2 kernels (once per machine) …\n"]
     assert len([*folder.iterdir()]) == 1
+
+
+def test_a_terminal_shows_how_many_kernels_are_to_come(folder, monkeypatch, capsys):
+    monkeypatch.setattr(cache, "NOTABLE", 0.0)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setattr("bayesperiodic._printing.OFTEN", 0.0)
+    assert cache.load(SMALL).four_times(1.5) == 6.0
+    shown = capsys.readouterr().err
+    places = [shown.index(f"| {done}/2 [") for done in range(3)]
+    assert places == sorted(places) and "compiling kernels (once per machine): " in shown and "\n" not in shown
+
+
+def test_texts_that_others_compile_are_not_announced(folder, capsys):
+    """Those of models, which take no time."""
+    cache.load("def f(x):\n    return x", run=lambda source, path, module: None)
+    assert len([*folder.iterdir()]) == 1 and capsys.readouterr().err == ""
 
 
 def test_a_process_that_waits_too_long_builds_the_entry_too(folder, monkeypatch):

@@ -1,4 +1,5 @@
 import re
+import tracemalloc
 import warnings
 
 import numpy as np
@@ -430,7 +431,9 @@ def test_lines_between_harmonics_are_those_of_the_fourier_transform(cycles, poin
     time = np.arange(cycles * points) / points
     sampling = lines.Sampling.of(time, 1.0, 1, cycles)
     assert sampling.points == 4 * points
-    found = np.abs(sampling.between(sampling.on_grid(signal.ravel()))) ** 2 * signal.size**2
+    beside, each = sampling.lines(signal.ravel(), 3)
+    np.testing.assert_allclose(each, np.fft.rfft(signal, axis=1)[:, :3] / points, atol=1e-12)
+    found = np.abs(beside) ** 2 * signal.size**2
     for side in range(1, len(found) + 1):
         np.testing.assert_allclose(found[side - 1, :points], power[side::cycles], rtol=1e-9)
 
@@ -501,6 +504,21 @@ def test_work_is_linear_in_the_length_of_a_recording(monkeypatch):
         measured = driven(cycles, 0.1, 0, per_cycle=20)
         measured.fold(64)
         assert sum(sizes) < 30_000 + 5 * measured.time.size
+
+
+@pytest.mark.parametrize("frequency", [FREQUENCY, None])
+def test_folding_takes_the_memory_of_few_copies_of_a_channel(frequency):
+    """Growth of the peak with the samples of two channels: 7 arrays of one channel's size, not 17 with all terms."""
+    peaks, sizes = [], (300_000, 900_000)
+    for size in sizes:
+        long = recording(cycles=size / 800, per_cycle=800)
+        tracemalloc.start()
+        try:
+            long.fold(64, frequency=frequency)
+            peaks.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
+    assert np.diff(peaks) < 10 * 8 * np.diff(sizes)
 
 
 def test_standard_error_of_the_frequency_under_white_noise_is_that_of_cramer_and_rao_or_up_to_twice_as_large():

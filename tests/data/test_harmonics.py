@@ -69,11 +69,16 @@ def test_significant_harmonics_have_ten_times_the_power_of_the_noise():
 
 
 def test_information_is_that_left_by_a_regression_on_the_harmonics():
+    """Of the slopes t·dy/dφ, with the time t from its mean."""
     time, values = noisy(4.7)
-    basis = design(2.0 * time, 2)
-    rest = values.T - basis @ np.linalg.lstsq(basis, values.T, rcond=None)[0]
-    expected = 3.0 * np.sum(rest[:, 0] ** 2) + 0.5 * np.sum(rest[:, 1] ** 2)
-    assert harmonics._information(2.0 * time, values, np.array([3.0, 0.5]), 2) == pytest.approx(expected)
+    basis, weights = design(2.0 * time, 2), np.array([3.0, 0.5])
+    clear = np.array([[0.0, 1.0, 0.3j], [0.0, 0.5 - 0.2j, 0.0]])
+    waves = np.exp(2j * np.pi * np.outer([0, 1, 2], 2.0 * time))
+    slopes = np.real((2j * np.pi * clear * [0, 1, 2]) @ waves) * (time - time.mean())
+    rest = slopes.T - basis @ np.linalg.lstsq(basis, slopes.T, rcond=None)[0]
+    gradient, information = harmonics._slopes(time, harmonics.HarmonicFit(2.0, clear, values), clear, weights)
+    assert gradient == pytest.approx(weights @ np.sum(slopes * values, axis=1))
+    assert information == pytest.approx(weights @ np.sum(rest**2, axis=0))
 
 
 @pytest.mark.parametrize(("cycles", "orders"), [(40, 10), (100, 16), (20, 5), (12, 4), (5, 2)])
