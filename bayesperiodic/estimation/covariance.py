@@ -88,7 +88,7 @@ def residual_variances(
 
     `changes` (parameters, size) and residuals (size,) are whitened, `information` is that of all blocks and priors.
     """
-    units, known = likelihood.whitened([np.ones(b.size) for b in likelihood.blocks], noise), []
+    units, known = likelihood.whitened_apart([np.ones(b.size) for b in likelihood.blocks], noise), []
     for block, s, r, unit, least in zip(
         likelihood.blocks, changes, residuals, units, _caused_variances(likelihood, noise), strict=True
     ):

@@ -537,6 +537,15 @@ class Likelihood:
 
     def whitened(self, vectors: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
         """Return vectors (…, size), one a block, in units of the noise: their squares sum to −2 log-likelihood."""
+        result, spectra = self.whitened_apart(vectors, values), self._spectra(values)
+        for one in self.shared:
+            joint = one.whitened([result[b] for b in one.members], self._precisions(one.members, spectra))
+            for b, part in zip(one.members, joint, strict=True):
+                result[b] = part
+        return result
+
+    def whitened_apart(self, vectors: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
+        """Return vectors (…, size), one a block, in units of the block's own noise, without errors of the inputs."""
         result, spectra = list(vectors), self._spectra(values)
         for b in self._group_of:
             (precisions,) = self._precisions([b], spectra)
@@ -545,10 +554,6 @@ class Likelihood:
             block, (root, _) = self.blocks[b], self._root(b, values)
             white = solve_triangular(root, vectors[b].reshape(-1, block.size).T, lower=True)
             result[b] = np.sqrt(block.weight) * white.T.reshape(vectors[b].shape)
-        for one in self.shared:
-            joint = one.whitened([result[b] for b in one.members], self._precisions(one.members, spectra))
-            for b, part in zip(one.members, joint, strict=True):
-                result[b] = part
         return result
 
     def simulate(self, values: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:
