@@ -96,9 +96,9 @@ class Optimum:
     def with_problem(self, problem: Problem, names: tuple[str, ...]) -> "Optimum | None":
         """Return the optimum of a problem with other terms; None if there is none.
 
-        The search begins here. A parameter that the data determine sharply together with others, as the frequency of a
-        cycle does, leaves a narrow curved ridge, along which steps are short. If the search does not end, it is repeated
-        from the medians of the priors, off the ridge.
+        The search begins here. Data that determine a combination of parameters sharply, as the frequency of a cycle
+        does, leave a narrow curved ridge, along which steps are short. If the search does not end, it is repeated from
+        the medians of the priors, off the ridge.
         """
         known = dict(zip(self.problem.names, self.iterate.theta.tolist(), strict=True))
         known |= {n: float(problem.settings["priors"][n].quantile(0.5)) for n in problem.names if n not in known}

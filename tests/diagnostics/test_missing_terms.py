@@ -369,9 +369,8 @@ def test_stiffness_of_a_cycle_is_found_although_its_frequency_is_sharp():
     given = bp.Model("symmetric", parameters=parameters, equations=[equation], **settings)
     right = bp.Model("asymmetric", parameters=[*parameters, "q"], equations=[f"{equation} + q*x**2"], **settings)
     truth = {"a": 2.2, "b": 120.0, "omega": 19.5, "q": 18_000.0}
-    run = bp.simulate(
-        right, truth, frequency=2.9, duration=30, sampling_rate=200, start={"x": 0.005}, noise={"velocity": 2e-3}, seed=1
-    )
+    test = {"frequency": 2.9, "duration": 30, "sampling_rate": 200, "start": {"x": 0.005}, "seed": 1}
+    run = bp.simulate(right, truth, noise={"velocity": 2e-3}, **test)
     cycle = run.between(5, 30).fold(100, origin="crossing")
     priors = {"a": bp.LogNormal(1, 1), "b": bp.LogNormal(100, 1), "omega": bp.LogNormal(19, 0.5)}
     problem = bp.Problem(given, [cycle], priors=priors, scheme="central4")
