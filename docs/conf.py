@@ -34,7 +34,7 @@ myst_enable_extensions, myst_heading_anchors = ["attrs_block", "dollarmath"], 3
 
 html_theme, html_title = "furo", f"bayesperiodic {release}"
 html_static_path, html_css_files = ["_static"], ["cards.css"]
-html_show_sourcelink = html_copy_source = False
+html_show_sourcelink = html_copy_source = html_show_copyright = False
 html_math_renderer = "mathml"
 # On file systems without case these names equal those of classes.
 autosummary_filename_map = {f"bayesperiodic.{n}": f"bayesperiodic.{n}_function" for n in ("profile", "structure")}
