@@ -41,6 +41,9 @@ except ImportError:
     global_compiler_lock = threading.RLock()  # type: ignore[assignment]
 
 SOURCE, MANIFEST, BUILDING = "kernels.py", "manifest.json", "building-"
+# Number of the way in which a text is executed: another one gives the same text other byte code, which Numba would add
+# to the entry.
+EXECUTION = 2
 # Age in seconds after which an unfinished entry is that of a killed process.
 ABANDONED = 3600.0
 # Seconds for which a process waits for another one that builds the same entry, before it builds it too.
@@ -148,8 +151,8 @@ def _stored(source: str, entry: Path, execute: Callable[..., types.ModuleType]) 
         reason = str(problem)
     except Exception as problem:  # any error that a damaged compiled file causes in the loader
         reason = f"{type(problem).__name__}: {problem}"
+    _remove(entry)  # before the warning, which may be an error
     warnings.warn(f"A damaged entry of the kernel cache is built again ({reason}).", RuntimeWarning, stacklevel=3)
-    _remove(entry)
     return None
 
 
@@ -166,7 +169,7 @@ def _header() -> str:
     features = settings.CPU_FEATURES or llvmlite.binding.get_host_cpu_features().flatten()
     machine = f"{platform.machine()} {llvmlite.binding.get_process_triple()} {name} {features}"
     versions = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, python {platform.python_version()}"
-    return f"# {versions}, {machine}\n"
+    return f"# {versions}, execution {EXECUTION}, {machine}\n"
 
 
 def _private_folder() -> Path:
@@ -249,7 +252,10 @@ def _digests(entry: Path) -> dict[str, str]:
 
 
 def _run(source: str, path: Path, module: types.ModuleType) -> None:
-    """Execute a text one statement after the other, with a progress bar in a terminal if that takes long."""
+    """Execute a text one statement after the other, with a progress bar in a terminal if that takes long.
+
+    Compiled as a whole, calls of imported modules would have other byte code.
+    """
     settings = {"desc": COMPILING, "unit": "kernel", "delay": NOTABLE, "leave": False}
     with progress_bar(total=len(KERNEL.findall(source)), disable=not sys.stderr.isatty(), **settings) as bar:
         for statement in ast.parse(source, str(path)).body:

@@ -94,15 +94,20 @@ class Optimum:
         return np.linalg.eigvalsh(scaled(hessian, scale)), scale
 
     def with_problem(self, problem: Problem, names: tuple[str, ...]) -> "Optimum | None":
-        """Return the optimum of a problem with other terms, from here on; None if there is none."""
+        """Return the optimum of a problem with other terms; None if there is none.
+
+        The search begins here. Data that determine a combination of parameters sharply, as the frequency of a cycle
+        does, leave a narrow curved ridge, along which steps are short. If the search does not end, it is repeated from
+        the medians of the priors, off the ridge.
+        """
         known = dict(zip(self.problem.names, self.iterate.theta.tolist(), strict=True))
         known |= {n: float(problem.settings["priors"][n].quantile(0.5)) for n in problem.names if n not in known}
-        orbits = {e.name: self.orbits[e.name] for e in problem.experiments}
-        theta = np.array([known[name] for name in problem.names])
-        nearest = nearest_optimum(problem, theta, guesses_of(problem.settings["model"], orbits))
-        if nearest is None or nearest[1].status not in ENDED:
-            return None
-        return Optimum(problem, nearest[0], nearest[1].iterate, names)
+        orbits = guesses_of(problem.settings["model"], {e.name: self.orbits[e.name] for e in problem.experiments})
+        for theta in (np.array([known[name] for name in problem.names]), problem.median()):
+            nearest = nearest_optimum(problem, theta, orbits)
+            if nearest is not None and nearest[1].status in ENDED:
+                return Optimum(problem, nearest[0], nearest[1].iterate, names)
+        return None
 
 
 def distinct(one: Optimum, other: Optimum) -> bool:

@@ -41,6 +41,8 @@ from bayesperiodic.problem.fingerprint import check_results
 # Part of a residual that noise of inputs taken as exact may cause, and changes [sds] by the grid and by what is not
 # linear in the errors of the inputs, above which there is a warning.
 LARGEST_INPUT_SHARE, LARGEST_SHIFT, LARGEST_NONLINEARITY = 0.1, 0.1, 0.3
+# Standard deviations that twice as many points would move an estimate, from which on the grid may look like a misfit.
+SHIFT_OF_MISFIT = 1.0
 MOST_DIRECTIONS = 3
 
 
@@ -149,7 +151,18 @@ def checked(objective: Objective, estimate: Iterate, uncertain: Uncertainty, fit
         undetermined=undetermined(uncertain.information, estimate.theta, names, problem.logarithmic, change),
         robust_covariance=robust_table,
         # The prior must not count as misfit of the model, which is tested where the data alone are fitted best.
-        misfit=misfit_at(problem, alone if conflict.text else estimate, len(fit.starts)),
+        misfit=_of_grid(misfit_at(problem, alone if conflict.text else estimate, len(fit.starts)), names, shift),
+    )
+
+
+def _of_grid(misfit: str, names: Sequence[str], shift: np.ndarray) -> str:
+    """Return a misfit in words, with a sentence on the error of the grid if this may be the cause of it."""
+    largest = int(np.argmax(np.abs(np.nan_to_num(shift))))
+    if not misfit or not abs(shift[largest]) > SHIFT_OF_MISFIT:
+        return misfit
+    return (
+        f"{misfit}. The error of the grid may be the cause: twice as many points would move {names[largest]!r} by "
+        f"{shift[largest]:.2g} of its standard deviation; first take more samples, or a scheme of higher order"
     )
 
 

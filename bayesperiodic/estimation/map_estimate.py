@@ -121,7 +121,8 @@ def map_estimate(
         First guess of every free parameter; those that the problem adds by itself may be left out, see
         `Problem.completed`. By default the medians of the priors.
     starts : int, optional
-        Number of starts; those after the first are draws from the priors, solved from the orbits of the first. By
+        Number of starts; those after the first are draws from the priors, solved from the orbits of the first. Where
+        the density is not finite at the first, a given number begins at the first draw where it is. By
         default one if `start` is given, and otherwise up to eight, with at most 16 000 unknowns of all periodic solves
         together: eight for 2000 (states × points × experiments) or fewer, one for more than 8000; of condensed models
         up to eight while the tests of `predict` reject the model at the best end. Their draws are solved from rest.
@@ -141,7 +142,7 @@ def map_estimate(
     Raises
     ------
     ValueError
-        If the log-posterior is not finite at the start, or a name is unknown.
+        If the log-posterior is not finite at the start, nor at the draws of a given `starts`, or a name is unknown.
 
     Warns
     -----
@@ -177,6 +178,8 @@ def map_estimate(
     near = in_wide_tables(problem, theta, draws[: fewest - 1], progress) if start is None else []
     first = first_iterate(problem, near[0]) if near else None
     first = first or first_iterate(problem, theta)
+    if first is None and starts is not None:
+        first = next(filter(None, (first_iterate(problem, draw) for draw in draws)), None)
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
     objective = objective_near(problem, first.here)
@@ -416,7 +419,8 @@ def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
         return text
     failed = ", ".join(f"{name!r} ({status})" for name, status in near.statuses.items() if status != "converged")
     ended = f"without the orbit of {failed}" if failed else "well, but the outputs or the noise are not finite"
-    cures = "start={…}, or priors with other medians, at which problem.solve(theta) converges."
+    cures = "start={…}, or priors with other medians, at which problem.solve(theta) converges, or try draws of the "
+    cures += "priors by starts=8."
     if term := singular_start(problem, theta, near.statuses):
         ended += f", because the equations contain {term}"
         cures = "guess={…} in fold, with states at which they are finite, or start={…}."

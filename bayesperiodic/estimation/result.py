@@ -345,7 +345,7 @@ class MapEstimate(Result):
         of its value; without `joint` there are none.
         """
         result = {}
-        for name, (low, high) in self.supports.items() if self.joint is not None else ():
+        for name, (low, high) in self.supports.items() if self.joint and self.joint_mode else ():
             if (low, high) == (0.0, np.inf) and self.theta[name] > 0.0:
                 other, variance = self.joint_mode[name], self.joint_covariance.loc[name, name]
                 if np.log(other / self.theta[name]) ** 2 > SAME_VALUE**2 * variance:

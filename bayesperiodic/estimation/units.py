@@ -72,7 +72,11 @@ def not_isolated(problem: Problem, theta: np.ndarray, statuses: Mapping[str, str
             equations, parameters = problem.equations[e.name], problem.parameters(theta[None], e.name)[0]
             given = None if isinstance(e.guess, str) else e.guess
             if is_one_of_many(equations, parameters, given or "static"):
-                return f"model: must have isolated cycles, got {problem.model.name!r}: {MANY_CYCLES}"
+                return (
+                    f"model: must have isolated cycles, got {problem.model.name!r}: {MANY_CYCLES} If the model "
+                    "has them, but they are zero at this start, as a damping with a prior about zero, give start={…} "
+                    "where they are not, or priors with other medians."
+                )
     return ""
 
 

@@ -304,7 +304,10 @@ class Orbits(Result):
 
     def __repr__(self) -> str:
         if not self.orbits:
-            return f"Orbits(none, {len(self.rejected)} rejected)"
+            return (
+                f"Orbits(none, {len(self.rejected)} rejected): try more periods, sections at several phases, steps=3 "
+                "where neighbours separate fast, or a longer recording"
+            )
         counts = [(p, sum(o.period == p for o in self.orbits)) for p in sorted({o.period for o in self.orbits})]
         table, empty = self.table, ["rejected"] + ["remark"] * (not any(orbit.remark for orbit in self.orbits))
         listed = ", ".join(f"{count} of period {period}" for period, count in counts)

@@ -126,6 +126,11 @@ def checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tupl
             "dataclasses.replace(experiment, name=…)."
         )
     for e in result:
+        if model.inputs and not e.inputs:
+            raise ValueError(
+                f"inputs of experiment {e.name!r}: must be {', '.join(map(repr, model.inputs))}, got none. Give "
+                "them to the recording; the orbits of a chaotic one have them by find_orbits(…, waveforms=True)."
+            )
         _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
         if not e.channels and not isinstance(e.condition, Fold):
             raise ValueError(f"outputs of experiment {e.name!r}: must have at least one channel, got {{}}.")
@@ -138,7 +143,9 @@ def checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tupl
             )
         if e.guess == DATA and model.autonomous:
             raise ValueError(
-                f"guess of experiment {e.name!r}: must be states for {model.name!r}, which is autonomous, got {DATA!r}."
+                f"guess of experiment {e.name!r}: must be states for {model.name!r}, which is autonomous, got "
+                f"{DATA!r}. If an output measures the state x, less its mean if the sensor adds one, take "
+                "dataclasses.replace(experiment, guess={'x': experiment.outputs[…]})."
             )
         if isinstance(model, CondensedModel):
             _check_condensed(e, model)

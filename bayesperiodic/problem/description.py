@@ -280,7 +280,7 @@ class Description(Printed):
                     f"priors: an unknown {group[0]!r} with the {self.noise.prior_text} must have more than {needed} "
                     f"independent values for {len(acting)} free parameters ({names}), got only {count:.0f}. {shared} "
                     f"parameters or {group[0]!r}, give it a proper prior (noise.Independent(prior=…)), keep more "
-                    "harmonics, or add experiments."
+                    "harmonics by fold(…, harmonics={…}), or add experiments."
                 )
 
     @property

@@ -364,6 +364,9 @@ def test_drifts_in_words():
     assert "of y drifts steadily against u, by -36° " in below.text and "30 ± 2 ppm below" in below.text
     assert (changing.kind, changing.channel, changing.severity) == ("drift", "x", SERIOUS)
     assert changing.text.startswith("the phase of x against u changes by 7.2° over the cycles used (30 of 40), but not")
+    (free,) = clocks.drift_findings([Drift(1, 0.0157, 5e-4, 0.4, True)], CHANNELS, (2.0, 12.0), 30, 40)
+    assert free.text.endswith(", or a response that does not follow the drive, such as a chaotic one")
+    assert "bp.find_orbits" in free.cure and "bp.find_orbits" not in above.cure
     assert all(
         one.times.tolist() == [[2.0, 12.0]] and (one.count, one.share) == (30, 1.0) and np.isnan(one.bias)
         for one in (above, below, changing)

@@ -359,3 +359,26 @@ def test_generated_absolute_values_have_no_offset():
         assert float(expressions["abs(dx)"].subs(at)) == pytest.approx(abs(other), rel=0.01)
         assert float(expressions["dx*abs(dx)"].subs(at)) == pytest.approx(other * abs(other), rel=0.01)
         assert float(expressions["dx*abs(x)"].subs(at)) == pytest.approx(other * abs(value), rel=0.01)
+
+
+def test_stiffness_of_a_cycle_is_found_although_its_frequency_is_sharp():
+    """The frequency of an asymmetric cycle ties `omega` to the coefficient, on a ridge that is curved and narrow."""
+    parameters = ["a", "b", "omega"]
+    equation = "ddx - (a - b*dx**2)*dx + omega**2*x"
+    settings = {"states": ["x"], "inputs": [], "outputs": {"velocity": "dx"}}
+    given = bp.Model("symmetric", parameters=parameters, equations=[equation], **settings)
+    right = bp.Model("asymmetric", parameters=[*parameters, "q"], equations=[f"{equation} + q*x**2"], **settings)
+    truth = {"a": 2.2, "b": 120.0, "omega": 19.5, "q": 18_000.0}
+    test = {"frequency": 2.9, "duration": 30, "sampling_rate": 200, "start": {"x": 0.005}, "seed": 1}
+    run = bp.simulate(right, truth, noise={"velocity": 2e-3}, **test)
+    cycle = run.between(5, 30).fold(100, origin="crossing")
+    priors = {"a": bp.LogNormal(1, 1), "b": bp.LogNormal(100, 1), "omega": bp.LogNormal(19, 0.5)}
+    problem = bp.Problem(given, [cycle], priors=priors, scheme="central4")
+    fit = bp.map_estimate(problem, progress=False)
+    found = bp.missing_terms(problem, fit, outputs=False, max_terms=1)
+    (step,) = found.steps
+    assert (step.term, step.verdict) == ("x**2", "adequate")
+    estimate = found.fit()
+    for name, value in (truth | {step.name: truth["q"]}).items():
+        if name != "q":
+            assert abs(estimate.theta[name] - value) < 4.0 * estimate.sd[name], name

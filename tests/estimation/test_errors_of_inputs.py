@@ -1,6 +1,7 @@
 """Errors of inputs given an estimate, by conditioning a normal distribution; models that are linear in the input."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic.estimation import covariance, map_estimate
 from bayesperiodic.estimation.check import at_estimate
-from tests.estimation.test_changes_with_variances import MODEL, POINTS, PRIORS, run_of
+from tests.estimation.test_changes_with_variances import MODEL, POINTS, PRIORS, SPECTRA, run_of
 from tests.known import formula_model, grid
 
 KEPT = {"y": 4, "z": 2}
@@ -97,6 +98,26 @@ def test_errors_that_change_nothing_are_left_out():
     seen = covariance.estimated_inputs(problem, peak)
     assert seen.errors == {}
     assert seen.sd["run"]["x"] == pytest.approx(np.sqrt(np.sum(waves_of(1e-8) ** 2, axis=0)), rel=1e-6)
+
+
+def in_unit(factor, p, u, s):
+    return {"y": p.a * u.x + p.b * u.dx, "z": factor * p.b * u.x}
+
+
+@pytest.mark.parametrize("unit", [1e-5, 1e3])
+def test_robust_sds_do_not_depend_on_the_units_of_outputs(unit):
+    """Of two outputs that share the errors of an input, with unknown variances; one output in another unit."""
+    priors = {name: bp.Normal(0.0, 10.0) for name in "ab"}
+    sds = []
+    for factor in (1.0, unit):
+        model, run = formula_model("static", ["a", "b"], partial(in_unit, factor)), run_of(cycles=1)
+        outputs = {"y": run.outputs["y"], "z": factor * run.outputs["z"]}
+        spectra = SPECTRA | {"z": factor**2 * SPECTRA["z"]}
+        runs = [replace(run, outputs=outputs, amplitude_variance=spectra)]
+        problem = bp.Problem(model, runs, priors=priors, scheme="fourier", input_noise={"x": SD})
+        fit = bp.map_estimate(problem, starts=1, progress=False)
+        sds.append([*fit.robust_sd.values(), *fit.sd.values()])
+    assert sds[1] == pytest.approx(sds[0], rel=1e-3)
 
 
 @pytest.mark.parametrize("factor", [1.0, 3.0])

@@ -273,3 +273,13 @@ def test_channels_of_rounding_errors_are_without_noise_if_their_variance_is_unkn
     assert MapEstimate.without_noise.fget(fit) == ("y", "z")
     fit.independent = {"relative": 18.0}  # of all channels
     assert MapEstimate.without_noise.fget(fit) == ("y", "z", "w")
+
+
+@pytest.mark.parametrize("shift, named", [(-7.66, True), (1.01, True), (0.99, False), (np.nan, False)])
+def test_a_misfit_names_the_grid_where_this_moves_the_estimate(shift, named):
+    wrong = "The model is misspecified (x)"
+    text = check._of_grid(wrong, ["a", "b"], np.array([0.1, shift]))
+    assert (text != wrong) == named and check._of_grid("", ["a", "b"], np.array([0.1, shift])) == ""
+    if named:
+        assert text.startswith(f"{wrong}. The error of the grid may be the cause: twice as many points would move 'b' ")
+        assert f"by {shift:.2g} of its standard deviation; first take more samples" in text

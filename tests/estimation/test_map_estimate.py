@@ -282,3 +282,30 @@ def test_failed_start_compares_measured_and_modelled_sizes():
     size = abs(1 / (2 + 2j * np.pi))
     with pytest.raises(ValueError, match=f"frequency .Hz. 1 against 0.318, amplitude of 'x' 1 against {size:.3g}"):
         bp.map_estimate(problem, progress=False)
+
+
+def test_draws_of_the_priors_replace_a_start_without_a_cycle():
+    """Only for μ > 0 the model oscillates, with the amplitude 2√μ and, to first order, the frequency ω/2π."""
+    model = bp.Model(
+        "growing", states=["x"], inputs=[], parameters=["mu", "omega"],
+        equations=["ddx - (mu - x**2)*dx + omega**2*x"], outputs={"x": "x"},
+    )  # fmt: skip
+    truth, test = {"mu": 0.5, "omega": 6.0}, {"frequency": 0.95, "duration": 80, "sampling_rate": 40, "seed": 1}
+    run = bp.simulate(model, truth, start={"x": 1.0}, noise={"x": 0.02}, **test).between(40, 80)
+    cycle = run.fold(64, origin="crossing")
+    priors = {"mu": bp.Normal(-0.3, 0.6), "omega": bp.LogNormal(6, 0.1)}
+    problem = bp.Problem(model, [cycle], priors=priors, scheme="fourier")
+    with pytest.raises(ValueError, match="mu = -0.3, .* or try draws of the priors by starts=8"):
+        bp.map_estimate(problem, progress=False)
+    fit = bp.map_estimate(problem, starts=8, progress=False)
+    for name, value in truth.items():
+        assert abs(fit.theta[name] - value) < 4.0 * fit.sd[name], name
+
+
+def test_an_estimate_without_a_joint_mode_is_printed():
+    fit = bp.map_estimate(
+        bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS | {"k": bp.LogNormal(800, 0.1)}),
+        progress=False,
+    )
+    lost = replace(fit, joint=replace(fit.joint, mode={}))
+    assert lost.over_logarithm == {} and "k" in str(lost)

@@ -33,6 +33,10 @@ def test_the_first_solve_starts_from_the_solution_or_from_the_measured_cycle(pol
     assert unpolished.winding == 4 and unpolished.guess["phi"] == pytest.approx(run.guess["phi"])
 
 
+def test_a_search_without_orbits_says_what_to_try():
+    assert repr(bp.Orbits(())).startswith("Orbits(none, 0 rejected): try more periods, sections at several phases")
+
+
 def test_the_residual_of_exact_points_vanishes():
     """With exact points the log-likelihood at scale 1 is that of no residual, whatever the turns of the angle."""
     exact = measured(GENTLE[2], noise=1e-9)

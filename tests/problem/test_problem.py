@@ -132,6 +132,8 @@ def test_experiments_must_fit_the_model(experiment):
     tau = grid(40)
     with pytest.raises(ValueError, match="inputs of experiment 'run': must be 'x', got 'y'"):
         bp.Problem(LINEAR, [bp.Experiment("run", 2.0, {"force": tau}, {"y": tau}, samples=40)], priors=PRIORS)
+    with pytest.raises(ValueError, match=r"^inputs of experiment 'run': must be 'x', got none. .*waveforms=True"):
+        bp.Problem(LINEAR, [bp.Experiment("run", 2.0, {"force": tau}, {}, samples=40)], priors=PRIORS)
     with pytest.raises(ValueError, match="outputs of experiment 'run': must be 'force', got 'torque'"):
         bp.Problem(LINEAR, [bp.Experiment("run", 2.0, {"torque": tau}, {"x": tau}, samples=40)], priors=PRIORS)
     with pytest.raises(ValueError, match="experiments: names must differ, got"):
