@@ -142,7 +142,7 @@ def steps_of(
 def _usual_nearby(jump: np.ndarray, side: int, steady: np.ndarray | None) -> np.ndarray:
     """Return the usual steps near each window outside of the steady ones, zero for these.
 
-    It is the larger one of those before and after it: both are small beside lost samples, and the earlier ones are large
+    It is the larger one of those before and after it: both are small beside lost samples, and the earlier ones large
     in a transient. It is infinite without windows on a side, which may be the transient.
     """
     usual = np.zeros(jump.size)
