@@ -31,8 +31,6 @@ TURN_BY_AMPLITUDE, HARMLESS_TURN, CURVED = 2.0, 0.05, 0.1
 FEW, FEW_TO_SD, MEDIAN_TO_SD = 0.15, 0.189, 1.4826
 # Least part of a drift that changes of the drive's frequency leave.
 LEAST_DETERMINED = 0.1
-# Difference of two clocks [ppm], ten times that of usual quartzes, from which on the response may be free of the drive.
-LARGEST_OF_CLOCKS = 1000.0
 CLOCK = "clock"
 
 
@@ -144,8 +142,8 @@ def steps_of(
 def _usual_nearby(jump: np.ndarray, side: int, steady: np.ndarray | None) -> np.ndarray:
     """Return the usual steps near each window outside of the steady ones, zero for these.
 
-    It is the larger one of those before and after it: both are small beside lost samples, and those before are large in
-    a transient. It is infinite without windows on a side, which may be the transient.
+    It is the larger one of those before and after it: both are small beside lost samples, and the earlier ones large
+    in a transient. It is infinite without windows on a side, which may be the transient.
     """
     usual = np.zeros(jump.size)
     for k in [] if steady is None else np.flatnonzero(~steady[side:-side]):
@@ -315,14 +313,12 @@ def drift_findings(
             )  # fmt: skip
             continue
         ppm, se, above = 1e6 * abs(drift.rate), 1e6 * drift.se, "above" if drift.rate > 0.0 else "below"
-        free = ppm > LARGEST_OF_CLOCKS
         # Of two clocks, a drift that is found biases the mean phase by eight of its standard errors or more.
         yield Finding(
             CLOCK, channel, RUINOUS, np.array([span]), cycles, 1.0, np.nan,
             f"the phase of {channel} drifts steadily against {channels[0]}, by {angle:.3g}° over the cycles used "
             f"({cycles} of {total}), as if its frequency were {ppm:.4g} ± {se:.2g} ppm {above}: two clocks, or a "
-            "system that changes" + ", or a response that does not follow the drive, such as a chaotic one" * free,
+            "system that changes",
             f"fold(clocks={{'second': [{channel!r}]}}) or fold(clocks='auto') folds each clock at its own frequency; "
-            "if there was one clock, say so by fold(clocks='one'), or select a shorter part with recording.between"
-            + "; a chaotic response is not folded: bp.PoincareSection and bp.find_orbits" * free,
+            "if there was one clock, say so by fold(clocks='one'), or select a shorter part with recording.between",
         )  # fmt: skip
