@@ -46,11 +46,8 @@ ABANDONED = 3600.0
 # Seconds for which a process waits for another one that builds the same entry, before it builds it too.
 LONGEST_WAIT = 600.0
 # Decorated functions of a text, and seconds from which their compilation is shown.
-KERNEL, NOTABLE, COMPILING = (
-    re.compile(r"^@(?:.*\n(?!def ))*.*\ndef (\w+)", re.MULTILINE),
-    1.0,
-    "compiling kernels (once per machine)",
-)
+KERNEL, NOTABLE = re.compile(r"^@(?:.*\n(?!def ))*.*\ndef (\w+)", re.MULTILINE), 1.0
+COMPILING = "compiling kernels (once per machine)"
 # Folders in which no entry could be built; this process does not try again.
 _UNUSABLE: set[Path] = set()
 
