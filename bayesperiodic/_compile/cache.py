@@ -6,7 +6,6 @@ must equal the expected one, and every compiled file must have the digest record
 is removed, with a warning, and built again; if the folder cannot be used, the kernels are compiled in memory.
 """
 
-import ast
 import errno
 import gc
 import hashlib
@@ -31,6 +30,7 @@ from typing import Any
 import llvmlite.binding
 import numba
 import platformdirs
+from tqdm import tqdm
 
 from bayesperiodic._files import locked
 from bayesperiodic._printing import progress_bar
@@ -41,15 +41,13 @@ except ImportError:
     global_compiler_lock = threading.RLock()  # type: ignore[assignment]
 
 SOURCE, MANIFEST, BUILDING = "kernels.py", "manifest.json", "building-"
-# Number of the way in which a text is executed: another one gives the same text other byte code, which Numba would add
-# to the entry.
-EXECUTION = 2
 # Age in seconds after which an unfinished entry is that of a killed process.
 ABANDONED = 3600.0
 # Seconds for which a process waits for another one that builds the same entry, before it builds it too.
 LONGEST_WAIT = 600.0
 # Decorated functions of a text, and seconds from which their compilation is shown.
-KERNEL, NOTABLE, COMPILING = re.compile(r"^@", re.MULTILINE), 1.0, "compiling kernels (once per machine)"
+KERNEL, SHOWN_AFTER = re.compile(r"^@(?:.*\n(?!def ))*.*\ndef (\w+)", re.MULTILINE), 1.0
+COMPILING = "compiling kernels (once per machine)"
 # Folders in which no entry could be built; this process does not try again.
 _UNUSABLE: set[Path] = set()
 
@@ -169,7 +167,7 @@ def _header() -> str:
     features = settings.CPU_FEATURES or llvmlite.binding.get_host_cpu_features().flatten()
     machine = f"{platform.machine()} {llvmlite.binding.get_process_triple()} {name} {features}"
     versions = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, python {platform.python_version()}"
-    return f"# {versions}, execution {EXECUTION}, {machine}\n"
+    return f"# {versions}, {machine}\n"
 
 
 def _private_folder() -> Path:
@@ -193,7 +191,7 @@ def _announce(source: str) -> None:
     """Tell how many kernels are compiled, where no progress bar can be updated; functions of models take no time."""
     count = len(KERNEL.findall(source))
     if count and not sys.stderr.isatty():
-        print(f"compiling {count} kernels (once per machine) …", file=sys.stderr, flush=True)
+        print(f"compiling {count} kernel{'s'[: count > 1]} (once per machine) …", file=sys.stderr, flush=True)
 
 
 def _build(source: str, entry: Path, execute: Callable[..., types.ModuleType]) -> types.ModuleType:
@@ -251,16 +249,23 @@ def _digests(entry: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def _run(source: str, path: Path, module: types.ModuleType) -> None:
-    """Execute a text one statement after the other, with a progress bar in a terminal if that takes long.
+class _Names(dict[str, Any]):
+    """The names of a module that is executed, which advance a progress bar by each kernel that is defined."""
 
-    Compiled as a whole, calls of imported modules would have other byte code.
-    """
-    settings = {"desc": COMPILING, "unit": "kernel", "delay": NOTABLE, "leave": False}
+    def __init__(self, module: types.ModuleType, source: str, bar: tqdm):
+        super().__init__()
+        self._module, self._kernels, self._bar = module, set(KERNEL.findall(source)), bar
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self._module.__dict__[name] = value
+        self._bar.update(name in self._kernels)
+
+
+def _run(source: str, path: Path, module: types.ModuleType) -> None:
+    """Execute a text, with a progress bar of its functions in a terminal if that takes long."""
+    settings = {"desc": COMPILING, "unit": "kernel", "delay": SHOWN_AFTER, "leave": False}
     with progress_bar(total=len(KERNEL.findall(source)), disable=not sys.stderr.isatty(), **settings) as bar:
-        for statement in ast.parse(source, str(path)).body:
-            exec(compile(ast.Module([statement], []), str(path), "exec"), module.__dict__)
-            bar.update(isinstance(statement, ast.FunctionDef) and len(statement.decorator_list))
+        exec(compile(source, str(path), "exec"), module.__dict__, _Names(module, source, bar))
 
 
 def _execute(

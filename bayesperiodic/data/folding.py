@@ -79,8 +79,7 @@ def fold_signals(
     fit, pace, parts, name = seen.fit, seen.pace, seen.parts, groups[0].name
     inputs = [channel for group in groups for channel in group.channels[: group.inputs]]
     parts, fit = _at_phases(parts, fit, pace, periods, given, seen.limits)
-    drift = dict(zip(seen.channels, _drift(seen.sizes), strict=True))
-    seen = replace(seen, fit=None)  # whose residuals are not those of the fit at a given frequency
+    drift, seen = dict(zip(seen.channels, _drift(seen.sizes), strict=True)), replace(seen, fit=None)  # with residuals
     _refuse_drift(name, drift, largest_drift)
     findings = _with_stated_clock(seen.findings, clocks)
     refuse(name, findings)

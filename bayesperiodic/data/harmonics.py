@@ -69,6 +69,11 @@ class Pace:
     wander: float = 0.0  # range of slow irregular phase deviations [cycles], 0 if not above those of the amplitude
     diffusion: float = 0.0  # variance of the phase's random step in a cycle [cycles²], 0 without evidence of any
 
+    @property
+    def varies(self) -> bool:
+        """Whether the frequency is not constant."""
+        return self.drifts or self.wander > 0.0
+
     def differs(self, difference: float, duration: float, error: float = 0.0) -> bool:
         """Return whether a frequency with a standard error differs significantly, and by a phase that matters."""
         spread = np.hypot(self.se, error)

@@ -103,13 +103,11 @@ def inspect(
     sound = [_sound(*each, tracked, points) for each in zip(groups, calm, faults, moving, strict=True)]
     whole = all(these.size == group.time.size for these, group in zip(sound, groups, strict=True))
     sound = [_inside(these, part) for these, part in zip(sound, span, strict=True)]
-    counted = first.time
+    counted, refined = first.time, frequency is None
     del calm, first  # their values can be copies
     some = [_selected(group, these) for group, these in zip(groups, sound, strict=True)]
-    refined = frequency is None
-    times = some[0].time
     every, steady, tracked = _steady_of(some, tracked, points, refined, refined and not whole, other)
-    del some
+    times, some = some[0].time, []
     if steady is None or np.abs(steady.change).max(initial=0.0) > LARGEST_CHANGE:
         return stopped(_unsteady(groups, every.all, tracked), tracked, total)
     used = [
@@ -137,8 +135,7 @@ def inspect(
     if frequency is None:
         lead = parts[leading(groups)]
         seen += sampling_findings(lead.time, lead.values, fit.frequency, counted, behind)
-    varies = pace.drifts or pace.wander > 0.0
-    of_clocks, drifts = _clock_findings(groups, every, times, used[0], fit.frequency, total, varies)
+    of_clocks, drifts = _clock_findings(groups, every, times, used[0], fit.frequency, total, pace.varies)
     sizes = every.all.apart().sizes
     return Inspection(
         groups, faults, _worst_first(seen + of_clocks), total, steady, used, sizes, fit, pace, limits, inflation, drifts

@@ -80,13 +80,13 @@ def log_likelihood_terms(density: LogPosterior, posterior: xr.Dataset) -> xr.Dat
     likelihood = density.problem.likelihood
     most = min(max(MOST_TERMS // len(likelihood.observations), TERM_DRAWS[0]), TERM_DRAWS[1])
     chosen, theta, noise = _some(density.problem, posterior, most)
-    parts = []
+    terms = np.empty((len(theta), len(likelihood.observations)))
     for k in range(0, len(theta), DRAWS_TOGETHER):
-        simulation = density.solver.solve(theta[k : k + DRAWS_TOGETHER], whole=True)
-        terms = likelihood.terms(density.comparisons.residuals(simulation, None), noise[k : k + DRAWS_TOGETHER])
-        terms[simulation.status != CONVERGED] = np.nan
-        parts.append(terms)
-    shaped = np.concatenate(parts).reshape(chosen.sizes[CHAIN], chosen.sizes[DRAW], -1)
+        part = slice(k, k + DRAWS_TOGETHER)
+        simulation = density.solver.solve(theta[part], whole=True)
+        terms[part] = likelihood.terms(density.comparisons.residuals(simulation, None), noise[part])
+        terms[part][simulation.status != CONVERGED] = np.nan
+    shaped = terms.reshape(chosen.sizes[CHAIN], chosen.sizes[DRAW], -1)
     coords = {name: chosen.coords[name] for name in (CHAIN, DRAW, STEP, WALKER)}
     group = xr.Dataset({"data": ((CHAIN, DRAW, OBSERVATION), shaped)}, coords=coords)
     labels = {name: (OBSERVATION, values) for name, values in likelihood.labels.items()}

@@ -20,7 +20,7 @@ WIDER_WEIGHT, WIDER_FACTOR = 0.1, 2.0
 MOST_FITTED_DRAWS, PER_COMPONENT = 6000, 20
 REGULAR = 1e-6
 # Points whose densities are computed together.
-TOGETHER = 8192
+POINTS_TOGETHER = 8192
 # Iterations of a fit, and the gain in mean log-density at which it ends.
 FIT_ITERATIONS, ENOUGH_GAIN = 100, 1e-2
 # Most coordinates whose products describe curvature, and ridge of that regression, relative to the mean square.
@@ -79,7 +79,7 @@ class StudentMixture:
 
     def log_density(self, points: np.ndarray) -> np.ndarray:
         """Return the log-density at points (points, dimension)."""
-        parts = [points[k : k + TOGETHER] for k in range(0, max(len(points), 1), TOGETHER)]
+        parts = [points[k : k + POINTS_TOGETHER] for k in range(0, max(len(points), 1), POINTS_TOGETHER)]
         return np.concatenate([logsumexp(self.log_components(part), axis=1) for part in parts])
 
     def draw(self, count: int, random: np.random.RandomState | np.random.Generator) -> np.ndarray:
@@ -108,9 +108,9 @@ def expected_time(mixture: StudentMixture, points: np.ndarray, log_density: np.n
     accepted[order] = (np.arange(1, len(order) + 1) * inverse + later) / inverse.sum()
     leaving = fraction * accepted + (1.0 - fraction) * 2.0 / (4.0 * points.shape[1] + 1.0)
     middle, times, total = points.mean(axis=0), np.zeros(points.shape[1]), np.zeros(points.shape[1])
-    for k in range(0, len(points), TOGETHER):
-        squared = (points[k : k + TOGETHER] - middle) ** 2
-        times += (2.0 / leaving[k : k + TOGETHER] - 1.0) @ squared
+    for k in range(0, len(points), POINTS_TOGETHER):
+        squared = (points[k : k + POINTS_TOGETHER] - middle) ** 2
+        times += (2.0 / leaving[k : k + POINTS_TOGETHER] - 1.0) @ squared
         total += squared.sum(axis=0)
     return float(np.max(times / total))
 
