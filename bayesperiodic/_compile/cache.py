@@ -46,7 +46,7 @@ ABANDONED = 3600.0
 # Seconds for which a process waits for another one that builds the same entry, before it builds it too.
 LONGEST_WAIT = 600.0
 # Decorated functions of a text, and seconds from which their compilation is shown.
-KERNEL, SHOWN_AFTER = re.compile(r"^@(?:.*\n(?!def ))*.*\ndef (\w+)", re.MULTILINE), 1.0
+KERNEL, BAR_AFTER = re.compile(r"^@(?:.*\n(?!def ))*.*\ndef (\w+)", re.MULTILINE), 1.0
 COMPILING = "compiling kernels (once per machine)"
 # Folders in which no entry could be built; this process does not try again.
 _UNUSABLE: set[Path] = set()
@@ -263,7 +263,7 @@ class _Names(dict[str, Any]):
 
 def _run(source: str, path: Path, module: types.ModuleType) -> None:
     """Execute a text, with a progress bar of its functions in a terminal if that takes long."""
-    settings = {"desc": COMPILING, "unit": "kernel", "delay": SHOWN_AFTER, "leave": False}
+    settings = {"desc": COMPILING, "unit": "kernel", "delay": BAR_AFTER, "leave": False}
     with progress_bar(total=len(KERNEL.findall(source)), disable=not sys.stderr.isatty(), **settings) as bar:
         exec(compile(source, str(path), "exec"), module.__dict__, _Names(module, source, bar))
 

@@ -392,7 +392,7 @@ print(cache.load(SMALL).four_times(1.5))
 
 
 def test_a_terminal_shows_how_many_kernels_are_to_come(folder, monkeypatch, capsys):
-    monkeypatch.setattr(cache, "SHOWN_AFTER", 0.0)
+    monkeypatch.setattr(cache, "BAR_AFTER", 0.0)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setattr("bayesperiodic._printing.OFTEN", 0.0)
     assert cache.load(SMALL).four_times(1.5) == 6.0
