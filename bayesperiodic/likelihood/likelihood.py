@@ -537,7 +537,17 @@ class Likelihood:
 
     def whitened(self, vectors: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
         """Return vectors (…, size), one a block, in units of the noise: their squares sum to −2 log-likelihood."""
-        result, spectra = list(vectors), self._spectra(values)
+        spectra = self._spectra(values)
+        result = self._whitened_alone(vectors, values, spectra)
+        for one in self.shared:
+            joint = one.whitened([result[b] for b in one.members], self._precisions(one.members, spectra))
+            for b, part in zip(one.members, joint, strict=True):
+                result[b] = part
+        return result
+
+    def _whitened_alone(self, vectors: Sequence[np.ndarray], values: np.ndarray, spectra: Any) -> list[np.ndarray]:
+        """Return vectors (…, size), one a block, in units of the noise of the block without errors of the inputs."""
+        result = list(vectors)
         for b in self._group_of:
             (precisions,) = self._precisions([b], spectra)
             result[b] = vectors[b] * np.sqrt(precisions)
@@ -545,24 +555,23 @@ class Likelihood:
             block, (root, _) = self.blocks[b], self._root(b, values)
             white = solve_triangular(root, vectors[b].reshape(-1, block.size).T, lower=True)
             result[b] = np.sqrt(block.weight) * white.T.reshape(vectors[b].shape)
-        for one in self.shared:
-            joint = one.whitened([result[b] for b in one.members], self._precisions(one.members, spectra))
-            for b, part in zip(one.members, joint, strict=True):
-                result[b] = part
         return result
 
     def units(self, values: np.ndarray) -> list[np.ndarray]:
         """Return the sd of whitened components by white noise of variance one in a block alone, (size,) by block.
 
-        Blocks that share errors of inputs are whitened together: each component is a mixture of all of the group, whose
-        channels may have other units.
+        Components of correlated noise, and of blocks that share errors of inputs, are mixtures: the latter of all of
+        the group, whose channels may have other units.
         """
-        result = self.whitened([np.ones(block.size) for block in self.blocks], values)
-        for b in (b for one in self.shared for b in one.members):
-            each = [np.zeros((self.blocks[b].size, block.size)) for block in self.blocks]
-            each[b] = np.eye(self.blocks[b].size)
-            result[b] = np.linalg.norm(self.whitened(each, values)[b], axis=0)
-        return result
+        spectra, mixed = self._spectra(values), {b for one in self.shared for b in one.members} | set(self._dense)
+        unit = [np.eye(block.size) if b in mixed else np.ones((1, block.size)) for b, block in enumerate(self.blocks)]
+        result = self._whitened_alone(unit, values, spectra)
+        for one in self.shared:
+            precisions, alone = self._precisions(one.members, spectra), [result[b] for b in one.members]
+            for k, b in enumerate(one.members):
+                parts = [part if j == k else np.zeros((len(alone[k]), part.shape[1])) for j, part in enumerate(alone)]
+                result[b] = one.whitened(parts, precisions)[k]
+        return [np.linalg.norm(white, axis=0) for white in result]
 
     def simulate(self, values: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:
         """Return noise at values (draws, names): components (draws, size), one array a block."""
