@@ -73,6 +73,17 @@ def test_the_likelihood_is_that_of_a_normal_distribution_with_the_dense_covarian
     assert white @ white == pytest.approx(joined @ solved, rel=1e-10)
 
 
+def test_units_are_the_sds_that_white_noise_of_one_block_causes(case):
+    """Of the rows of a root W of the precision, W·C·Wᵀ = 1 with the dense covariance C."""
+    likelihood, _, values, loadings = case
+    ends = np.cumsum([b.size for b in BLOCKS])
+    root = np.concatenate(likelihood.whitened(np.split(np.eye(16), ends[:-1], axis=1), values), axis=1).T
+    assert root @ dense(likelihood, values, loadings) @ root.T == pytest.approx(np.eye(16), abs=1e-9)
+    for b, unit in zip(BLOCKS, likelihood.units(values), strict=True):
+        place = slice(ends[BLOCKS.index(b)] - b.size, ends[BLOCKS.index(b)])
+        assert unit == pytest.approx(np.sqrt(np.sum(root[place, place] ** 2, axis=1)), rel=1e-9)
+
+
 def test_the_likelihood_is_exact_where_errors_explain_all_and_the_variance_vanishes():
     """As many errors as components: for V → 0 it tends to that of the errors alone, from every side."""
     random = np.random.default_rng(4)

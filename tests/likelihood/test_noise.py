@@ -123,6 +123,17 @@ def test_circulant_noise_at_masked_points_is_the_marginal(kernel, samples):
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
+def test_unit_of_correlated_components_is_the_sd_that_white_noise_causes(kernel):
+    """Of the rows of the inverse of Cholesky's factor of the covariance; not the sums of the rows."""
+    mask = np.random.default_rng(2).random(40) < 0.4
+    problem = bp.Problem(LINEAR, [run(40, mask=mask)], priors=PRIORS, noise=noise.Circulant(kernel=kernel))
+    values = {"variance[force]": 7.0} | {f"{name}[force]": value for name, value in SHAPES[kernel].items()}
+    (unit,) = problem.likelihood.units(np.array([values[name] for name in problem.likelihood.names]))
+    root = np.linalg.inv(np.linalg.cholesky(circulant_covariance(kernel, 40, 7.0)[np.ix_(mask, mask)]))
+    assert unit == pytest.approx(np.sqrt(np.sum(root**2, axis=1)), rel=1e-6)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("changes", [{}, {"harmonics": {"force": 6}}, {"mask": np.arange(40) % 3 == 0}])
 def test_circulant_noise_without_correlation_is_independent_noise(kernel, changes):
     experiment = run(40, **changes)
