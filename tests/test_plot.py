@@ -333,7 +333,7 @@ def test_a_comparison_shows_marginals_quantiles_and_coverage(solved):
     assert len(curves) == 3 and [t.get_text() for t in quantiles.get_legend().get_texts()] == ["fine"]
     for line in curves:
         x, y = line.get_data()
-        assert y[2:-2] == pytest.approx(x[2:-2], abs=0.25)
+        assert y[4:-4] == pytest.approx(x[4:-4], abs=0.25)
     line = next(line for line in coverage.lines if line.get_label() == "MCMC")
     assert np.array_equal(line.get_xydata(), np.stack([found.probabilities, found.shares], axis=-1))
     assert coverage.lines[-1].get_ydata() == pytest.approx([found.joint[f"share_{level}"] for level in (50, 90, 95)])

@@ -14,8 +14,9 @@ from bayesperiodic.data.steadiness import SMALL_RANGE, Windows
 SHORTEST_SIDE, SIDES, SIGNIFICANT_STEP = 3, 20, 8.0
 # Size of a step in standard deviations of what remains beside it: a transient is curved.
 SHARP = 5.0
-# Sides on which a step outside of the steady part is compared with the usual differences: a transient beats.
-NEIGHBOURS = 4
+# Sides on which a step outside of the steady part is compared with the usual differences, as a transient beats, and by
+# how much it must exceed these where it has such a side alone.
+NEIGHBOURS, SIDE_ALONE = 4, 4.0
 # Windows that may be missing at a step, and most steps that are searched for.
 MISSING_WINDOWS, MOST_PHASE_STEPS = 4, 50
 # Windows, like those of the steady part in amplitude: largest distance in robust standard deviations.
@@ -31,6 +32,8 @@ TURN_BY_AMPLITUDE, HARMLESS_TURN, CURVED = 2.0, 0.05, 0.1
 FEW, FEW_TO_SD, MEDIAN_TO_SD = 0.15, 0.189, 1.4826
 # Least part of a drift that changes of the drive's frequency leave.
 LEAST_DETERMINED = 0.1
+# Difference of two clocks [ppm], ten times that of usual quartzes, from which on the response may be free of the drive.
+LARGEST_OF_CLOCKS = 1000.0
 CLOCK = "clock"
 
 
@@ -143,16 +146,13 @@ def _usual_nearby(jump: np.ndarray, side: int, steady: np.ndarray | None) -> np.
     """Return the usual steps near each window outside of the steady ones, zero for these.
 
     It is the larger one of those before and after it: both are small beside lost samples, and the earlier ones large
-    in a transient. It is infinite without windows on a side, which may be the transient.
+    in a transient. Without windows on a side, where the transient may be, it is several times that of the other one.
     """
     usual = np.zeros(jump.size)
     for k in [] if steady is None else np.flatnonzero(~steady[side:-side]):
-        before, after = (
-            jump[max(k - NEIGHBOURS * side, 0) : max(k - side, 0)],
-            jump[k + side + 1 :][: NEIGHBOURS * side],
-        )
-        each = [float(np.median(np.abs(part))) if part.size else np.inf for part in (before, after)]
-        usual[k] = MEDIAN_TO_SD * max(each)
+        parts = jump[max(k - NEIGHBOURS * side, 0) : max(k - side, 0)], jump[k + side + 1 :][: NEIGHBOURS * side]
+        each = [float(np.median(np.abs(part))) for part in parts if part.size]
+        usual[k] = MEDIAN_TO_SD * (max(each) if len(each) == 2 else SIDE_ALONE * sum(each))
     return usual
 
 
@@ -313,12 +313,14 @@ def drift_findings(
             )  # fmt: skip
             continue
         ppm, se, above = 1e6 * abs(drift.rate), 1e6 * drift.se, "above" if drift.rate > 0.0 else "below"
+        free = ppm > LARGEST_OF_CLOCKS
         # Of two clocks, a drift that is found biases the mean phase by eight of its standard errors or more.
         yield Finding(
             CLOCK, channel, RUINOUS, np.array([span]), cycles, 1.0, np.nan,
             f"the phase of {channel} drifts steadily against {channels[0]}, by {angle:.3g}° over the cycles used "
             f"({cycles} of {total}), as if its frequency were {ppm:.4g} ± {se:.2g} ppm {above}: two clocks, or a "
-            "system that changes",
+            "system that changes" + ", or a response that does not follow the drive, such as a chaotic one" * free,
             f"fold(clocks={{'second': [{channel!r}]}}) or fold(clocks='auto') folds each clock at its own frequency; "
-            "if there was one clock, say so by fold(clocks='one'), or select a shorter part with recording.between",
+            "if there was one clock, say so by fold(clocks='one'), or select a shorter part with recording.between"
+            + "; a chaotic response is not folded: bp.PoincareSection and bp.find_orbits" * free,
         )  # fmt: skip

@@ -18,7 +18,7 @@ from tests.known import LINEAR, grid, linear_experiment, linear_regressors, norm
 TRUTH, SD = np.array([900.0, 40.0, 0.0]), 3.0
 MEAN, SPREAD = np.array([900.0, 40.0, 0.0]), np.array([300.0, 40.0, 10.0])
 NAMES = ("k", "c", "coulomb")
-SIZES = {"long": 160, "short": 20, "other": 24}
+SIZES = {"long": 320, "short": 20, "other": 24}
 RUNS = [linear_experiment(TRUTH, SD, i, n, name=name) for i, (name, n) in enumerate(SIZES.items())]
 
 
@@ -64,7 +64,7 @@ def held_out(name, free):
 
 
 def test_held_out_experiments_have_the_log_density_of_the_closed_form(compared):
-    """The long run has k̂ near 1 − 44/204 = 0.78, and draws without it are made; the others are left out by weights.
+    """The long run has k̂ near 1 − 44/364 = 0.88, and draws without it are made; the others are left out by weights.
 
     Allowed are four Monte Carlo errors, six values: false alarms 0.04 %.
     """
@@ -232,7 +232,7 @@ def test_what_would_tell_comes_from_the_predictions_at_half_once_and_twice_the_d
     values = np.concatenate([e.outputs["force"] for e in RUNS])
     mean, covariance = normal_posterior(design, values, SD**2, MEAN[:2], np.diag(SPREAD[:2] ** 2))
     for scale in (1.0, 2.0):
-        rows = linear_regressors(0.05 * scale, 2.0, grid(160))[:, :2]
+        rows = linear_regressors(0.05 * scale, 2.0, grid(SIZES["long"]))[:, :2]
         found, variance, noise = comparison._predicted(problem, posterior, "long", scale)["force"]
         exact = np.einsum("ij,jk,ik->i", rows, covariance, rows)
         assert np.all(np.abs(found - rows @ mean) < 4 * np.sqrt(exact / 50) + 1e-3)

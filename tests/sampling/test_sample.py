@@ -265,6 +265,7 @@ def test_burn_in_starts_again_if_slow_moves_are_expected_at_the_draws_kept(known
         return 10.0 if len(asked) == slow else 2.0
 
     monkeypatch.setattr(sample_module, "expected_time", stated)
+    monkeypatch.setattr(sample_module, "PASSES", 100)
     posterior = bp.sample(*known_variance, seed=1, **(SHORT | {"max_steps": 350}))
     assert posterior.tree["proposal"].attrs["burn_in"] == burn_in
     assert posterior.by_step(posterior.draws("k")).shape[1] == 350 - max(burn_in, 350 // 5)
