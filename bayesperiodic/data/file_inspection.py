@@ -309,7 +309,7 @@ def _unused_units(whole: Contents, columns: Mapping[str, Any]) -> dict[str, tupl
 
 
 def _target(unit: str) -> str:
-    """Return the SI unit of a unit; that of frequencies is left as it is, as cycles and radians are told apart."""
+    """Return the SI unit of a unit; units of frequencies stay, because Hz and rad/s differ by a factor."""
     if unit in DERIVED or kind_of(unit) == KIND_OF_HERTZ:
         return unit
     return unit[1:] if unit[1:] in DERIVED else in_si(unit).replace(" ", "")
