@@ -149,14 +149,14 @@ class SamplingCoordinates:
         """Number of sampling coordinates."""
         return len(self.labels)
 
+    @np.errstate(over="ignore")
     def to_natural(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return θ (…, names) and all noise parameters (…, noise_names) of points; integrated variances are 1."""
         count = len(self.problem.names)
         theta, noise = np.array(points[..., :count]), np.empty((*points.shape[:-1], self._noise.size))
-        with np.errstate(over="ignore"):
-            np.exp(theta, out=theta, where=self.logarithmic)
-            noise[...] = self._noise
-            noise[..., self.noise_columns] = np.exp(points[..., count:])
+        np.exp(theta, out=theta, where=self.logarithmic)
+        noise[...] = self._noise
+        noise[..., self.noise_columns] = np.exp(points[..., count:])
         return theta, noise
 
     def natural_columns(self, column: Callable[[int], np.ndarray]) -> dict[str, Callable[[], np.ndarray | float]]:
@@ -225,14 +225,15 @@ class LogPosterior(SamplingCoordinates):
             comparisons=self.comparisons,
         )
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def log_prior(self, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the log-prior density over the coordinates (…,) at θ (…, names) and noise parameters."""
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            prior = self.problem.joint_prior.log_prob(theta) + self.problem.likelihood.log_prior(noise)
-            if self._logarithms.size:
-                prior = prior + np.log(theta[..., self._logarithms]).sum(axis=-1)
+        prior = self.problem.joint_prior.log_prob(theta) + self.problem.likelihood.log_prior(noise)
+        if self._logarithms.size:
+            prior = prior + np.log(theta[..., self._logarithms]).sum(axis=-1)
         return np.asarray(prior)
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def add_prior(
         self, theta: np.ndarray, gradient: np.ndarray, curvature: np.ndarray | None = None
     ) -> tuple[np.ndarray, Any]:
@@ -241,13 +242,13 @@ class LogPosterior(SamplingCoordinates):
         They are the gradient (names,) and, if it is given, minus the Hessian (names, names).
         """
         logs, prior = self._logarithms, self.problem.joint_prior
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # callers check that both are finite
-            gradient = gradient + prior.gradient(theta)
-            if logs.size:
-                gradient[logs] += 1.0 / theta[logs]
-            if curvature is not None:
-                curvature = curvature + prior.curvature(theta)
-                curvature[logs, logs] += theta[logs] ** -2
+        # Callers check that both are finite.
+        gradient = gradient + prior.gradient(theta)
+        if logs.size:
+            gradient[logs] += 1.0 / theta[logs]
+        if curvature is not None:
+            curvature = curvature + prior.curvature(theta)
+            curvature[logs, logs] += theta[logs] ** -2
         return gradient, curvature
 
     def log_likelihood(self, theta: np.ndarray, noise: np.ndarray, threads: int | None = None) -> Evaluation:

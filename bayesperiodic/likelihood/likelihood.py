@@ -297,6 +297,7 @@ class Likelihood:
             if kind in self.model.shape_priors or not self.model.constant_prior
         ]
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def __call__(
         self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray = 1.0
     ) -> np.ndarray:
@@ -306,10 +307,9 @@ class Likelihood:
         bias correction of eq. (7), see `gauss_newton.bias_correction`.
         """
         factors, residuals = np.full(len(self.blocks), log_variance_factor), Residuals.of(residuals)
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            total = self._independent(residuals, values, self._spectra(values), factors)
-            for b in self._dense:
-                total = total + self._dense_values(b, residuals[b], values, factors[b])
+        total = self._independent(residuals, values, self._spectra(values), factors)
+        for b in self._dense:
+            total = total + self._dense_values(b, residuals[b], values, factors[b])
         return np.where(np.isfinite(total), total, -np.inf)
 
     @cached_property
@@ -470,6 +470,7 @@ class Likelihood:
             result[at] = -0.5 * self.blocks[b].weight * (2 * factor * np.sum(np.log(np.diag(root))) + half @ half)
         return result
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def value_and_gradients(
         self,
         residuals: Sequence[np.ndarray],
@@ -483,29 +484,28 @@ class Likelihood:
         The gradients are those of log-likelihood plus `log_prior` of φ by each block's residual and by ln φ (names,).
         """
         factors, residuals = np.full(len(self.blocks), log_variance_factor), Residuals.of(residuals)
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            spectra, by_value = self._spectra(values), self._prior_slopes(values, of_total)
-            total = self._independent(residuals, values, spectra, factors)
-            by_residual = self._even_gradients(residuals, spectra, factors, by_value)
-            if self._uneven or self._dense or self.shared:
-                by_residual = list(by_residual)
-            for group, (variances, slopes) in zip(self._uneven, spectra[len(self._starts) :], strict=True):
-                stack, factor = np.stack([residuals[b] for b in group.members]), factors[group.members[0]]
-                for b, r in zip(group.members, stack, strict=True):
-                    by_residual[b] = -group.weight * r / variances
-                by_logarithm = 0.5 * group.weight * np.add.reduce(stack**2 / variances - factor, axis=0)
-                by_value[group.columns] += np.add.reduce(by_logarithm[:, None] * slopes, axis=0)
-            for b in self._dense:
-                value, by_residual[b], by_phi = self._dense_gradients(b, residuals[b], values, factors[b])
-                total = total + value
-                by_value[self._columns[b]] += by_phi
-            for one in self.shared:
-                parts, precisions = [residuals[b] for b in one.members], self._precisions(one.members, spectra)
-                gradients = one.gradients(parts, precisions, one.mean(factors))
-                for b, more, by_precision in zip(one.members, *gradients, strict=True):
-                    by_residual[b] = by_residual[b] + more
-                    slopes = spectra[self._group_of[b]][1]
-                    by_value[self._columns[b]] -= np.add.reduce(by_precision[:, None] * slopes, axis=0)
+        spectra, by_value = self._spectra(values), self._prior_slopes(values, of_total)
+        total = self._independent(residuals, values, spectra, factors)
+        by_residual = self._even_gradients(residuals, spectra, factors, by_value)
+        if self._uneven or self._dense or self.shared:
+            by_residual = list(by_residual)
+        for group, (variances, slopes) in zip(self._uneven, spectra[len(self._starts) :], strict=True):
+            stack, factor = np.stack([residuals[b] for b in group.members]), factors[group.members[0]]
+            for b, r in zip(group.members, stack, strict=True):
+                by_residual[b] = -group.weight * r / variances
+            by_logarithm = 0.5 * group.weight * np.add.reduce(stack**2 / variances - factor, axis=0)
+            by_value[group.columns] += np.add.reduce(by_logarithm[:, None] * slopes, axis=0)
+        for b in self._dense:
+            value, by_residual[b], by_phi = self._dense_gradients(b, residuals[b], values, factors[b])
+            total = total + value
+            by_value[self._columns[b]] += by_phi
+        for one in self.shared:
+            parts, precisions = [residuals[b] for b in one.members], self._precisions(one.members, spectra)
+            gradients = one.gradients(parts, precisions, one.mean(factors))
+            for b, more, by_precision in zip(one.members, *gradients, strict=True):
+                by_residual[b] = by_residual[b] + more
+                slopes = spectra[self._group_of[b]][1]
+                by_value[self._columns[b]] -= np.add.reduce(by_precision[:, None] * slopes, axis=0)
         return float(total) if np.isfinite(total) else -np.inf, by_residual, by_value
 
     def _even_gradients(self, residuals: Residuals, spectra: Spectra, factors: np.ndarray, by_value: np.ndarray) -> Any:

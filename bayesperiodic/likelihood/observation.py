@@ -502,16 +502,16 @@ class Comparisons:
                 stacks = blocks.stop
         self._places = [place for name in order for place in places[name]]
 
+    @np.errstate(over="ignore", invalid="ignore")
     def residuals(self, simulation: Simulation, threads: int | None = 1) -> Residuals:
         """Return the residual components at all θ, (solves, size) a block; None means one thread per core."""
         solves = simulation.status.size
         small = solves == 1 or max(group.outputs.size for group in simulation.groups) < SMALLEST_SHARED
         parts = 1 if small else min(threads or available_cores(), solves)
-        with np.errstate(over="ignore", invalid="ignore"):
-            if parts <= 1:
-                return Residuals(self._stacks(simulation), self._places)
-            slices = [slice(solves * k // parts, solves * (k + 1) // parts) for k in range(parts)]
-            stacks = in_threads(lambda part: self._stacks(simulation.at(part)), slices, parts)
+        if parts <= 1:
+            return Residuals(self._stacks(simulation), self._places)
+        slices = [slice(solves * k // parts, solves * (k + 1) // parts) for k in range(parts)]
+        stacks = in_threads(lambda part: self._stacks(simulation.at(part)), slices, parts)
         return Residuals([np.concatenate(stack, axis=1) for stack in zip(*stacks, strict=True)], self._places)
 
     def _stacks(self, simulation: Simulation) -> list[np.ndarray]:

@@ -113,22 +113,22 @@ class Univariate(Prior, ABC):
         """Return independent draws."""
         return self.quantile(generator.uniform(size=size))
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def _where_inside(self, function: Callable[[np.ndarray], Any], x: np.ndarray, outside: float) -> np.ndarray:
         low, high = self.support
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            if np.ndim(x) == 0:
-                # Not as an array without axes, with which everything takes several times as long.
-                number: Any = np.float64(x)
-                number = np.float64(function(number) if low < number < high else outside)
-                return number
-            x = np.ascontiguousarray(x, dtype=float)
-            inside = (x > low) & (x < high)
-            if np.count_nonzero(inside) == x.size:
-                result = np.empty(x.shape)
-                result[...] = function(x)
-                return result
-            result = np.full(x.shape, outside)
-            result[inside] = function(x[inside])
+        if np.ndim(x) == 0:
+            # Not as an array without axes, with which everything takes several times as long.
+            number: Any = np.float64(x)
+            number = np.float64(function(number) if low < number < high else outside)
+            return number
+        x = np.ascontiguousarray(x, dtype=float)
+        inside = (x > low) & (x < high)
+        if np.count_nonzero(inside) == x.size:
+            result = np.empty(x.shape)
+            result[...] = function(x)
+            return result
+        result = np.full(x.shape, outside)
+        result[inside] = function(x[inside])
         return result
 
     # Squares are products in the formulas: x**2 of a number and of an array may differ in the last bit.
