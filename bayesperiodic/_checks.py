@@ -246,3 +246,11 @@ def _listed(names: Iterable[str]) -> str:
 def shortened(value: Any) -> str:
     """Return the representation of a value on one line, without the middle part if it is long."""
     return " ".join(reprlib.repr(value).split())
+
+
+def checked_units(units: Mapping[str, str], names: Iterable[str]) -> dict[str, str]:
+    """Return units by name; raise a ValueError for other names and for what is no text."""
+    for name, unit in units.items():
+        one_of("units", name, names)
+        text(f"units[{name!r}]", unit)
+    return dict(units)

@@ -1,7 +1,7 @@
 """Channels and the times at which they were sampled."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -21,6 +21,7 @@ class Channels(Result):
     inputs: dict[str, np.ndarray]
     name: str = "recording"
     synthetic: bool = False
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _checks.text("name", self.name)
@@ -42,6 +43,7 @@ class Channels(Result):
                 for name, values in getattr(self, kind).items()
             }
             object.__setattr__(self, kind, channels)
+        object.__setattr__(self, "units", _checks.checked_units(self.units, times))
 
     @property
     def times(self) -> dict[str, np.ndarray]:

@@ -111,6 +111,8 @@ class Experiment(Result):
         be a parameter of a `Problem`.
     synthetic : bool
         True if the data were simulated.
+    units : mapping of str to str, optional
+        Units of channels, as far as they are known, see `Recording`.
     measurements : sequence of Measurement, optional
         What instruments tell of channels without a time history, see `bp.measurements`: amplitudes, phases,
         peak-to-peak and rms values. Then `outputs` may be empty.
@@ -182,6 +184,7 @@ class Experiment(Result):
     findings: tuple[Finding, ...] = field(default=(), kw_only=True)
     clocks: Mapping[str, tuple[str, ...]] = field(default_factory=dict, kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
+    units: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     measurements: Sequence[Measurement] = field(default=(), kw_only=True)
     sweep: Sweep | None = field(default=None, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
@@ -231,6 +234,7 @@ class Experiment(Result):
             for channel in slopes:
                 _checks.one_of(f"error_slopes[{name!r}]", channel, self.outputs)
         object.__setattr__(self, "measurements", kinds.checked(self.measurements, self.outputs))
+        object.__setattr__(self, "units", _checks.checked_units(self.units, (*self.inputs, *self.channels)))
         if self.measurements and self.mask is not None:
             raise ValueError(
                 "mask: must be left out of an experiment with measurements of amplitudes, phases or sizes."

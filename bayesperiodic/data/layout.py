@@ -10,7 +10,7 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic.data.formats.contents import Clock, Contents, Key, StoredChannel
 from bayesperiodic.data.times import between, dates, seconds
-from bayesperiodic.data.units import Units, from_file, is_duration
+from bayesperiodic.data.units import Units, from_file, is_duration, unit_of
 
 DROP, INTERPOLATE = "drop", "interpolate"
 # Successive samples that may be interpolated.
@@ -68,8 +68,10 @@ def recordings(cls: Any, layout: Layout, contents: Contents, split: Key | None, 
     given = None if layout.time is None else _time_column(layout, contents)
     columns = {channel: _Column.of(layout, contents, key) for channel, key in layout.sources.items()}
     times = _times(layout, contents, columns) if given is None else given
+    every = {key: unit_of(layout.units.get(key), column.stored.unit) for key, column in columns.items()}
+    units = {key: unit for key, unit in every.items() if unit}
     if split is None:
-        return cls(*_signals(layout, columns, times), name)
+        return cls(*_signals(layout, columns, times), name, units=units)
     label = _label(layout, contents, split, columns, times)
     edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), label.size]
     return [
@@ -80,6 +82,7 @@ def recordings(cls: Any, layout: Layout, contents: Contents, split: Key | None, 
                 times[first:last] if isinstance(times, np.ndarray) else {k: t[first:last] for k, t in times.items()},
             ),
             f"{name} {i}: {split} {label[first]}",
+            units=units,
         )
         for i, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True), 1)
     ]

@@ -33,6 +33,9 @@ class Recording(FromFile):
     name : str
     synthetic : bool
         True if the recording was simulated.
+    units : dict of str to str, optional
+        Units of channels, as far as they are known, such as those of a file. A `Problem` refuses a channel whose unit
+        is known to differ from that in its model's ``units``.
 
     Raises
     ------
@@ -154,7 +157,8 @@ class Recording(FromFile):
         outputs = {channel: values for one in recordings for channel, values in one.outputs.items()}
         inputs = {channel: values for one in recordings for channel, values in one.inputs.items()}
         times = {channel: time for one in recordings for channel, time in one.times.items()}
-        return cls(times, outputs, inputs, name or recordings[0].name, any(one.synthetic for one in recordings))
+        units = {channel: unit for one in recordings for channel, unit in one.units.items()}
+        return cls(times, outputs, inputs, name or recordings[0].name, any(one.synthetic for one in recordings), units)
 
     def between(self, start: float, stop: float) -> "Recording":
         """Return the part with start ≤ time ≤ stop.
@@ -491,9 +495,8 @@ class Recording(FromFile):
             ) from None
         for kind, channels in (("outputs", self.outputs), ("inputs", self.inputs)):
             folded[kind] = {channel: folded[kind][channel] for channel in channels}
-        return Experiment(
-            name or self.name, synthetic=self.synthetic, period_test=evidence, guess=guess or {}, **folded
-        )
+        more: dict[str, Any] = {"synthetic": self.synthetic, "units": self.units, "guess": guess or {}}
+        return Experiment(name or self.name, period_test=evidence, **more, **folded)
 
 
 def _between(time: np.ndarray, first: float, stop: float) -> slice:

@@ -172,6 +172,9 @@ def response_table(
     }  # fmt: skip
     numbers = [at, *drive.values(), *(sizes for each in read.values() for sizes in each.size.values())]
     of_table = Sweep(_table_name(label, amplitudes, inputs, numbers), sweep, resolution)
+    first_columns = {name: columns[min(columns)] for name, columns in amplitudes.items()}
+    known = {name: source.unit(name, key) for name, key in {**first_columns, **inputs}.items()}
+    known |= {name: reader.unit(name, known) for name in amplitudes}
     samples = samples or max(
         FEWEST_TABLE_POINTS, POINTS_A_HARMONIC * max(h for each in amplitudes.values() for h in each)
     )
@@ -182,7 +185,7 @@ def response_table(
                 {channel: [0.0, level[k]] for channel, level in drive.items()}, samples=samples,
             ),
             measurements=[one for each in read.values() if not each.whole for one in each.measurements(k)],
-            sweep=of_table,
+            sweep=of_table, units={channel: unit for channel, unit in known.items() if unit},
         )
         for k, name in enumerate(_names(at))
     ]  # fmt: skip
@@ -283,6 +286,14 @@ class _Reader:
                     else self.source.phase_deviations(name, phase_sd, self.radian, rows)
                 )  # fmt: skip
         return _Output(name, kind, sizes, angles, errors, spread, one.to or next(iter(self.drive), ""))
+
+    def unit(self, name: str, known: Mapping[str, str]) -> str:
+        """Return the unit of an output, from those of the columns; empty if it is not known."""
+        unit, order = known[name], self.orders.get(name, 0)
+        if not unit or (self.per and not known[self.per]):
+            return ""
+        unit = f"({unit})*({known[self.per]})" if self.per else unit
+        return f"({unit})*s**{order}" if order else unit
 
     def _angles(self, name: str, values: np.ndarray, phase: Key | None) -> np.ndarray | None:
         """Return the phases [rad] of one harmonic, those of a column or of complex amplitudes; None without any."""

@@ -13,7 +13,7 @@ from bayesperiodic.data import objects
 from bayesperiodic.data.formats import recognise
 from bayesperiodic.data.formats.contents import Contents, Key, StoredChannel
 from bayesperiodic.data.layout import numbers
-from bayesperiodic.data.units import Units, from_file, kind_of
+from bayesperiodic.data.units import Units, from_file, kind_of, unit_of
 
 # Degrees beyond which a phase is none.
 LARGEST_PHASE = 720.0
@@ -87,6 +87,12 @@ class TableColumns:
         stored, values = self.column(value)  # type: ignore[arg-type]
         values = from_file(name, self.sized(f"inputs[{name!r}]", values, rows), self.units.get(name), stored.unit)
         return self.amplitudes(f"inputs[{name!r}]", values)
+
+    def unit(self, name: str, value: float | Key) -> str:
+        """Return the unit of a channel's amplitudes as they are returned, empty if it is not known."""
+        if is_number(value):
+            return ""
+        return unit_of(self.units.get(name), self.contents.find(self.label, value).unit)  # type: ignore[arg-type]
 
     def angles(self, key: Key, radian: float) -> np.ndarray:
         """Return phases [rad]; a unit of the file counts."""

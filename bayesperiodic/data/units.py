@@ -72,6 +72,8 @@ CERTAIN |= {name + plural for name in NAMES for plural in ("", "s")}
 WORD = re.compile(rf"[^\W\d_{SUPERSCRIPT_DIGITS}][^\W{SUPERSCRIPT_DIGITS}]*|[°%]\w*")
 # Moments, as they are written without a sign between newton and metre.
 MOMENT = re.compile(r"(?<!\w)((?:[nuµμmcdkM]|da)?N)([mc]?m)(?!\w)")
+# Relative difference of factors below which units are the same.
+SAME_UNIT = 1e-6
 # Metres per second, or inverse milliseconds.
 MS_TO_A_POWER = re.compile(r"(?<!\w)ms\s*(?:(?:\*\*|\^)?\s*-[1-4]|⁻)")
 # A unit with an exponent that has no sign of its own, such as m/s2, and those of netCDF, such as m s-2.
@@ -111,6 +113,30 @@ def from_file(name: str, values: np.ndarray, unit: float | str | Sequence[str] |
             "file is wrong."
         )
     return convert(name, values, unit)
+
+
+def unit_of(unit: float | str | Sequence[str] | None, stored: str) -> str:
+    """Return the unit of the values that `from_file` returns, empty if it is not known, as after a factor."""
+    if isinstance(unit, int | float | np.number):
+        return ""
+    if unit is None:
+        return in_si(stored) if stored.strip() and is_known(stored) else ""
+    return unit if isinstance(unit, str) else unit[1]
+
+
+def difference(one: str, other: str) -> str:
+    """Return in words how one unit differs from another; empty if it does not, or if one of them is not certain."""
+    spelled = [_spelled(text.replace("·", "*")) for text in (one, other)]
+    if not all(text and not _doubt(text) and is_known(text) for text in spelled):
+        return ""
+    registry = _registry()
+    first, second = map(registry.Unit, spelled)
+    if not first.is_compatible_with(second):
+        return "a unit of another quantity"
+    zero, step = (registry.Quantity(value, first).to(second).magnitude for value in (0.0, 1.0))
+    if abs(zero) > SAME_UNIT:
+        return "which has another zero"
+    return f"which is {step:.6g} of it" if abs(step - 1.0) > SAME_UNIT else ""
 
 
 def _doubt(text: str) -> str:

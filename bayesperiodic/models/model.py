@@ -23,7 +23,6 @@ from bayesperiodic.models.names import (
     as_expression,
     called,
     check_derivative_names,
-    checked_units,
     with_derivatives,
 )
 from bayesperiodic.models.structure import MatrixStructure
@@ -131,7 +130,7 @@ class Model(Printed):
         for angle in self.angles:
             _checks.one_of("angles", angle, (*self.states, *self.outputs))
         units = {**(parameters if isinstance(parameters, Mapping) else {}), **(units or {})}
-        self.units = checked_units(units, (*self.states, *self.inputs, *self.outputs, *self.parameters))
+        self.units = _checks.checked_units(units, (*self.states, *self.inputs, *self.outputs, *self.parameters))
         self.orders = {state: self._order(state) for state in self.states}
 
     def _set_names(self, name: str, states: Iterable[str], inputs: Iterable[str], parameters: Iterable[str]) -> None:
@@ -490,7 +489,7 @@ class CondensedModel(Model):
         # Functions cannot be pickled; what they returned is kept.
         self.structure = replace(structure, elements=())
         self.angles, self.orders = (), dict.fromkeys(self.states, 2)
-        self.units = checked_units(units or {}, (*self.states, *self.inputs, *self.outputs, *self.parameters))
+        self.units = _checks.checked_units(units or {}, (*self.states, *self.inputs, *self.outputs, *self.parameters))
 
     def refusal(self) -> ValueError:
         """Return the error for what needs symbolic equations."""

@@ -1,7 +1,7 @@
 """Symbols of states, inputs and parameters by name, and expressions of them as texts."""
 
 import inspect
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import sympy as sp
@@ -33,14 +33,6 @@ class Names:
     def __getitem__(self, name: str) -> sp.Symbol:
         _checks.one_of(self._kind, name, self._symbols)
         return self._symbols[name]
-
-
-def checked_units(units: Mapping[str, str], names: Sequence[str]) -> dict[str, str]:
-    """Return units by name; raise a ValueError for other names and for what is no text."""
-    for name, unit in units.items():
-        _checks.one_of("units", name, names)
-        _checks.text(f"units[{name!r}]", unit)
-    return dict(units)
 
 
 def with_derivatives(space: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]:

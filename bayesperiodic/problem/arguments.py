@@ -9,6 +9,7 @@ from bayesperiodic import _checks
 from bayesperiodic.data.experiment import DATA, Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.data.special_points import Fold, PhaseLag
+from bayesperiodic.data.units import difference
 from bayesperiodic.models.model import CondensedModel, Model
 from bayesperiodic.models.sensed import SHIFT
 
@@ -57,6 +58,21 @@ def refuse_special_points(experiments: Iterable[Experiment], purpose: str) -> No
             f"problem: must be without jumps and resonance points for {purpose}, got {special}; leave them out by "
             "problem.with_experiments."
         )
+
+
+def check_units(model: Model, experiments: Iterable[Experiment], sensors: Mapping[str, Any]) -> None:
+    """Raise a ValueError if values are known to be in other units than the model's; a gain may convert them."""
+    for e in experiments:
+        for channel, unit in e.units.items():
+            needed = model.units.get(channel, "")
+            if (channel in sensors and sensors[channel].gain != 1.0) or not (how := difference(unit, needed)):
+                continue
+            kind = "inputs" if channel in e.inputs else "outputs"
+            raise ValueError(
+                f"{kind}[{channel!r}] of experiment {e.name!r}: must be in {needed!r}, its unit in {model.name!r}, got "
+                f"values in {unit!r}, {how}. Take another channel of the file or units={{{channel!r}: …}} where it is "
+                "read, or state another unit of the model."
+            )
 
 
 def checked_local(

@@ -90,6 +90,7 @@ class Description(Printed):
             plain = self._settings["model"].parameters
             local = (*local,) + tuple(name for name in model.parameters if name not in plain)
         self.sensors = Sensors(sensors, model, self.experiments, joint=self.input_noise == JOINT)
+        arguments.check_units(self.sensors.plain_model, self.experiments, self.sensors.given)
         self.model = model = self.sensors.model
         self.scheme = scheme or default_scheme(model, tables=all(e.sweep is not None for e in self.experiments))
         find_scheme(self.scheme)

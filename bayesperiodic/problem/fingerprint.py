@@ -14,7 +14,7 @@ from bayesperiodic.problem.description import Description
 # What makes or computes each kind of result again.
 RESULTS = {"MapEstimate": "map_estimate(problem)", "Posterior": "sample(problem, fit)"}
 # Fields of experiments that no density depends on, and those that are left out where they are empty.
-LABELS, LATER_FIELDS = ("synthetic", "left_out"), ("middle", "phase_diffusion", "condition")
+LABELS, LATER_FIELDS = ("synthetic", "left_out", "units"), ("middle", "phase_diffusion", "condition")
 
 
 def fingerprint(problem: Description) -> str:

@@ -22,7 +22,10 @@ def read(*channels, split=None, outputs=None, name="run", **given):
     """Return the signals of a file of channels, or of each of its parts."""
     arguments = {"inputs": {}, "time": None, "sampling_rate": None, "units": {}, "missing": None} | given
     made = layout.Layout("run.x", outputs or {"x": "x"}, *arguments.values())
-    kind = lambda times, outputs, inputs, name: SimpleNamespace(time=times, outputs=outputs, inputs=inputs, name=name)  # noqa: E731
+
+    def kind(times, outputs, inputs, name, units):
+        return SimpleNamespace(time=times, outputs=outputs, inputs=inputs, name=name, units=units)
+
     return layout.recordings(kind, made, Contents("a file", channels), split, name)
 
 
