@@ -82,7 +82,7 @@ def recording(recording: Recording, check: RecordingCheck | None = None, *, figu
             axes.axvspan(check.start, check.stop, label="part used", zorder=0.5, **USED_STYLE)
         axes.plot(*_drawn(times[channel], values, gaps), color=COLOURS["measured"], lw=0.7)
         _mark(axes, shown, times[channel], values, check)
-        axes.set_ylabel(wrapped_label(channel, "", CHANNEL_LENGTH))
+        axes.set_ylabel(wrapped_label(channel, recording.units.get(channel, ""), CHANNEL_LENGTH))
         axes.margins(x=0.0)
         axes.locator_params(axis="y", nbins=5)
     panels[-1].set_xlabel("time [s]")
