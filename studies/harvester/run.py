@@ -37,6 +37,7 @@ class Chosen(NamedTuple):
 
     degree: int
     estimate: bp.OrbitsEstimate
+    alone: dict[str, dict[str, float]]  # see `alone_of`, by orbit and channel
     predicted: bp.AttractorPrediction  # Of the part of the recording from which the orbits are
 
 
@@ -65,6 +66,9 @@ def run(options: argparse.Namespace) -> None:
         tried = [one for degree in (DEGREES[:2] if options.quick else DEGREES)
                  if (one := fit_of(degree, used, runs, sections[0], options.seed)) is not None]  # fmt: skip
     best = simplest(tried)
+    with watch.part("missing terms", "terms that this model, and that of the degree before, lack"):
+        lack = {one.degree: lacking(one) for one in tried if best.degree - 2 <= one.degree <= best.degree}
+    print(f"  missing: {lack}")
     problem, fit = best.estimate.problem, best.estimate.fit
     print(f"{best.estimate}\n  the force of degree {best.degree} is used")
     with watch.part("posterior", "sampling the posterior with emcee"):
@@ -88,7 +92,7 @@ def run(options: argparse.Namespace) -> None:
         "orbits": [orbit_row(orbit, orbit in used) for orbit in orbits],
         "delays": {"seconds": delays._asdict(), "sd": errors._asdict()},
         "models": [model_row(one) for one in tried],
-        "degree": best.degree,
+        "degree": best.degree, "missing": lack,
         "estimates": {n: [fit.theta[n], fit.robust_sd[n], fit.sd[n]] for n in fit.theta},
         "dropped": best.estimate.dropped,
         "multipliers": {n: str(m) for n, m in best.estimate.table["multiplier"].items()},
@@ -216,16 +220,64 @@ def fit_of(
     except (ValueError, RuntimeError) as error:
         print(f"  degree {degree}: {error}")
         return None
+    alone = alone_of(estimate)
     left = {name: f"{value:.2%}" for name, value in estimate.fit.fvu.items()}
     print(f"  degree {degree}: {len(estimate.problem.experiments)} of {len(runs)} orbits, unexplained {left}, "
-          f"{predicted.left} of {predicted.runs} runs leave, {predicted.settled} settle")  # fmt: skip
-    return Chosen(degree, estimate, predicted)
+          f"{np.mean(unexplained(alone)):.2%} if left out, {predicted.left} of {predicted.runs} leave")  # fmt: skip
+    return Chosen(degree, estimate, alone, predicted)
+
+
+def alone_of(estimate: bp.OrbitsEstimate) -> dict[str, dict[str, float]]:
+    """Return the unexplained variance of each orbit by the estimate from the others; 1 if there is no such orbit."""
+    shares = {}
+    for one in estimate.problem.experiments:
+        explained: dict[str, np.ndarray] = {}
+        try:
+            others = estimate.problem.with_experiments([e for e in estimate.problem.experiments if e is not one])
+            fit = bp.map_estimate(others, start=estimate.fit.theta, checks=False, progress=False)
+            solution = estimate.problem.solve(fit.theta)[one.name]
+            if fit.converged and solution.status == "converged":
+                explained = solution.outputs
+        except ValueError as error:  # too few others
+            print(f"  without {one.name}: {error}")
+        shares[one.name] = {
+            name: float(np.mean((values - explained.get(name, values.mean())) ** 2) / np.var(values))
+            for name, values in one.outputs.items()
+        }
+    return shares
+
+
+def lacking(one: Chosen) -> list[str]:
+    """Return the terms that a model lacks, of further powers, and products with velocity and voltage."""
+    powers = [f"x**{k}" for k in range(one.degree + 1, max(DEGREES) + 1)]
+    candidates = {"equation of x": [*powers, "dx*x", "dx*x**2", "abs(dx)*dx", "v*x", "v*x**2", "v**3"],
+                  "equation of v": ["dx*x**5", "dx*x**6", "abs(dx)*dx", "v*x", "v*x**2", "v**3"]}  # fmt: skip
+    try:
+        search = bp.missing_terms(one.estimate.problem, one.estimate.fit, candidates, equations=False, outputs=False,
+                                  max_terms=1)  # fmt: skip
+    except ValueError as error:
+        print(f"  degree {one.degree}: {error}")
+        return []
+    return [f"{step.term} in {step.place}" for step in search.steps]
+
+
+def unexplained(alone: dict[str, dict[str, float]]) -> np.ndarray:
+    """Return the unexplained variance of orbits that were left out, the mean of the channels, (orbits,)."""
+    return np.array([np.mean([*by_channel.values()]) for by_channel in alone.values()])
 
 
 def simplest(tried: list[Chosen]) -> Chosen:
-    """Return the lowest degree with the fewest runs that leave or settle, but for chance: two standard deviations."""
-    wrong = [one.predicted.left + one.predicted.settled for one in tried]
-    return next(one for one, count in zip(tried, wrong, strict=True) if count <= min(wrong) + 2.0 * (min(wrong) ** 0.5))
+    """Return the lowest degree that predicts orbits it was not fitted to as well as the best, within a standard error.
+
+    It is that of the mean difference over the orbits that both have.
+    """
+    best = min(tried, key=lambda one: float(np.mean(unexplained(one.alone))))
+    for one in tried:
+        both = [name for name in one.alone if name in best.alone]
+        here, there = (unexplained({name: each.alone[name] for name in both}) for each in (one, best))
+        if np.mean(here - there) <= np.std(here - there) / max(len(both) - 1, 1) ** 0.5:
+            return one
+    return best
 
 
 def orbit_row(orbit: bp.Orbit, used: bool) -> dict[str, Any]:
@@ -242,7 +294,7 @@ def model_row(one: Chosen) -> dict[str, Any]:
     """Return a row of the results."""
     return {
         "degree": one.degree, "orbits": len(one.estimate.problem.experiments), "dropped": one.estimate.dropped,
-        "unexplained": dict(one.estimate.fit.fvu), **prediction_row(one.predicted),
+        "unexplained": dict(one.estimate.fit.fvu), "alone": one.alone, **prediction_row(one.predicted),
     }  # fmt: skip
 
 

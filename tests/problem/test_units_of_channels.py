@@ -64,7 +64,9 @@ def test_an_acceleration_is_refused_for_a_displacement():
 
 def test_kilonewtons_of_the_model_are_not_the_newtons_of_the_file():
     run = recorded({"F": "N", "y": "m"})
-    with pytest.raises(ValueError, match=r"inputs\['F'\] .* must be in 'kN', .* got values in 'N', which is 0\.001 of it"):
+    with pytest.raises(
+        ValueError, match=r"inputs\['F'\] .* must be in 'kN', .* got values in 'N', which is 0\.001 of it"
+    ):
         problem(run, oscillator(F="kN"))
 
 

@@ -6,9 +6,11 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import binom
 
+import bayesperiodic as bp
 from studies import shooting
 from studies.__main__ import main
 from studies.harvester import beam, multiple_shooting, recording, synthetic
+from studies.harvester.run import Chosen, alone_of, simplest
 
 OMEGA = 2.0 * np.pi * recording.FREQUENCY
 
@@ -189,6 +191,45 @@ def test_orbits_of_the_flow_close_and_have_the_contraction_of_the_flow():
     states = np.tile(orbit.states, (3, 1))[None]
     assert synthetic.close_returns(known, states, np.ones(3)) >= 4
     assert synthetic.close_returns(known, states + 0.2, np.full(3, 0.5)) == 0
+
+
+def test_an_orbit_of_another_system_is_predicted_badly_by_the_others():
+    """Linear oscillators: three of one stiffness, one of 1.5 times that, by closed forms."""
+    model = bp.Model(
+        "linear", states=["x"], inputs=["F"], parameters=["c", "k"], equations=["ddx + c*dx + k*x - F"],
+        outputs={"x": "x"},
+    )  # fmt: skip
+    phase, generator = 2.0 * np.pi * np.arange(32) / 32, np.random.default_rng(2)
+    runs = []
+    for name, f, k in (("a", 0.2, 4.0), ("b", 0.3, 4.0), ("c", 0.4, 4.0), ("other", 0.25, 6.0)):
+        w = 2.0 * np.pi * f
+        x = (np.exp(1j * phase) / (k - w**2 + 0.3j * w)).real + 1e-3 * generator.standard_normal(32)
+        runs.append(bp.Experiment(name, f, {"x": x}, {"F": np.cos(phase)}, samples=32))
+    priors = {"c": bp.LogNormal(0.3, 0.5), "k": bp.LogNormal(4.0, 0.5)}
+    problem = bp.Problem(model, runs, priors=priors)
+    fit = bp.map_estimate(problem, checks=False, progress=False)
+    shares = alone_of(bp.OrbitsEstimate(problem, fit, {}))
+    w = 2.0 * np.pi * 0.25
+    expected = abs(1.0 - (6.0 - w**2 + 0.3j * w) / (4.0 - w**2 + 0.3j * w)) ** 2
+    assert shares["other"]["x"] == pytest.approx(expected, rel=0.05)
+    alike = bp.OrbitsEstimate(problem.with_experiments(runs[:3]), fit, {})
+    assert max(share["x"] for share in alone_of(alike).values()) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("shares", "degree"),
+    [
+        ([[0.30, 0.20, 0.25], [0.021, 0.010, 0.031], [0.020, 0.011, 0.030]], 5),
+        ([[0.30, 0.20, 0.25], [0.030, 0.020, 0.041], [0.020, 0.011, 0.030]], 7),
+        ([[0.02, 0.01, 0.03], [0.020, 0.010, 0.031], [0.025, 0.016, 0.035]], 3),
+    ],
+)
+def test_the_lowest_degree_is_taken_that_predicts_as_well_as_the_best(shares, degree):
+    tried = [
+        Chosen(d, None, {f"orbit {k}": {"v": s, "u": s} for k, s in enumerate(row)}, None)
+        for d, row in zip((3, 5, 7), shares, strict=True)
+    ]
+    assert simplest(tried).degree == degree
 
 
 @pytest.mark.slow
