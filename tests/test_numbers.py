@@ -987,8 +987,12 @@ def measured_chaos():
         yield f"{name} {1e3 * delays['seconds'][name]:.2f} ± {1e3 * delays['sd'][name]:.2f} ms"
     for one in given["models"]:
         left = [f"{100 * one['unexplained'][name]:.2f} %" for name in ("velocity", "voltage")]
-        ran = f"{one['left']} of {one['runs']}"
+        alone = np.mean([np.mean([*shares.values()]) for shares in one["alone"].values()])
+        ran = f"{100 * alone:.2f} % | {one['left']} of {one['runs']}"
         yield f"| {one['degree']} | {one['orbits']} of {len(used)} | {left[0]} | {left[1]} | {ran} |"
+    for degree, terms in given["missing"].items():
+        for term, _, place in (text.partition(" in ") for text in terms):
+            yield f"model of degree {degree} it names `{term}` in the {place}"
     for orbit in used:
         if orbit["name"] in given["multipliers"] and orbit["sections"] > 2:
             model = float(given["multipliers"][orbit["name"]])
