@@ -1,5 +1,6 @@
 """find_orbits: unstable periodic orbits of a chaotic section, without a model."""
 
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -19,6 +20,7 @@ from bayesperiodic.orbits.return_map import (
     KERNEL_REACH,
     Atlas,
     ReturnMap,
+    change_in_time,
     check_chaos,
     estimate_noise,
     prediction_error,
@@ -37,6 +39,8 @@ WIDTH_OF_ONE, WIDEST_OF_ONE = 20.0, 0.018
 LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
+# False-alarm rate of the test for a return map that changes.
+CHANGE_LEVEL = 1e-3
 # Delays tried for a coordinate to add, in forcing periods, or in mean returns.
 DELAYS_TRIED = (-0.25, -0.5)
 # Standard deviations from which a determinant is impossible.
@@ -108,6 +112,11 @@ def find_orbits(
         names which, and a delayed coordinate to add), for an unknown method, for periods that are not whole numbers,
         and for several sections that differ in more than their phase.
 
+    Warns
+    -----
+    UserWarning
+        If the return map of the first section has a trend in time, by a test whose false-alarm rate is 0.1 %.
+
     Examples
     --------
     `henon_section`: 1,900 points of the Hénon map x' = 1 − 1.4 x² + y, y' = 0.3 x. Its attractor contains one orbit of
@@ -117,7 +126,9 @@ def find_orbits(
     [1, 2]
     """
     if isinstance(section, PoincareSection):
-        return _of_section(section, periods, method, neighbours, box, steps, waveforms)
+        orbits = _of_section(section, periods, method, neighbours, box, steps, waveforms)
+        _warn_of_change(section)
+        return orbits
     _checks.instance("section", section, (list, tuple))
     for one in section:
         _checks.instance("section", one, PoincareSection)
@@ -126,6 +137,7 @@ def find_orbits(
     late, wanted = phases_of(section), list(periods)
     each = [_of_section(one, wanted, method, neighbours, box, steps, waveforms=True) for one in section]
     maps, size, _ = _scaled(section[0], neighbours)
+    _warn_of_change(section[0])
     orbits = with_late_partners(_finished(merged([one.orbits for one in each], late), maps, size))
     worst = max((one.prediction_error for one in each), key=lambda error: error[0])
     return Orbits(orbits, values=section[0].values, method=method, prediction_error=worst)
@@ -180,6 +192,15 @@ def _periods(periods: Iterable[int], section: PoincareSection) -> list[int]:
 
 def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.ndarray, tuple[float, float]]:
     """Return the return map in units of the attractor's size, that size (d,), and errors of predictions."""
+    maps, size = _return_map(section)
+    prediction = check_chaos(maps, lambda: _remedy(section, maps))
+    if section.noise is None:
+        maps.noise = estimate_noise(maps, neighbours)
+    return maps, size, prediction
+
+
+def _return_map(section: PoincareSection) -> tuple[ReturnMap, np.ndarray]:
+    """Return the return map in units of the attractor's size, and that size (d,)."""
     size = np.ptp(section.points, axis=0)
     if not np.all(size > 0.0):
         raise ValueError(
@@ -191,10 +212,20 @@ def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.nd
         section.points / size, section.increments / size, turn, section.winds, noise, section.stretches,
         noises=None if section.noises is None else section.noises / size,
     )  # fmt: skip
-    prediction = check_chaos(maps, lambda: _remedy(section, maps))
-    if section.noise is None:
-        maps.noise = estimate_noise(maps, neighbours)
-    return maps, size, prediction
+    return maps, size
+
+
+def _warn_of_change(section: PoincareSection) -> None:
+    """Warn if the return map has a trend in time."""
+    p = change_in_time(_return_map(section)[0])
+    if p < CHANGE_LEVEL:
+        warnings.warn(
+            f"section: the return map changes during the recording (p = {p:.1g}), as with parameters that drift, a "
+            "transient or a sensor that drifts. Orbits and their errors are those of a mean over time. Use shorter "
+            "parts, recording.between(start, end), and compare their orbits.",
+            UserWarning,
+            stacklevel=4,
+        )
 
 
 def _remedy(section: PoincareSection, maps: ReturnMap) -> str:

@@ -9,11 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import gammaincc
 
 from bayesperiodic.orbits.normal_equations import (
     NormalEquations,
     deconvoluted,
     inverse_of,
+    monomials,
     products,
     terms_of,
     with_last,
@@ -399,6 +401,9 @@ NORMAL_MEDIAN = 0.6745
 DIVERGED, DIVERGING_STEPS = 2.5, 6
 DIVERGING_PROBES = 400
 NEIGHBOUR = 8
+# Points of a cell of the test for a trend in time, as a multiple of the number of terms; relative size of columns that
+# depend on others.
+CELL, DEPENDENT = 15, 1e-9
 # Fewest points from which as many returns as needed are in their stretch.
 FEWEST_FOLLOWED = 100
 
@@ -476,6 +481,58 @@ def prediction_error(maps: ReturnMap) -> tuple[float, float]:
         expected = NORMAL_MEDIAN * np.median(np.sqrt(variance.max(1)))
         results.append((float(np.median(error) / random), float(expected / random)))
     return min(results)
+
+
+def change_in_time(maps: ReturnMap) -> float:
+    """Return the p-value of a test of maps of one step for a trend in time, which drifting parameters cause.
+
+    The arguments are divided into cells. In each, time is a further regressor of the images beside a quadratic
+    polynomial. The fraction of its variance that goes with the residuals has a beta distribution without a trend; the
+    sum over all cells is compared with a gamma distribution of its mean and variance. Points of a cell are distant in
+    time from each other. A map that is not quadratic in the cells leaves residuals, but none that go with time.
+    """
+    powers = monomials(maps.points.shape[1], 2)
+    total = mean = variance = 0.0
+    for cell in _cells(maps.wrap_points(maps.arguments), 2 * CELL * len(powers)):
+        time = maps.positions[cell]
+        kept = [0]
+        for k in range(1, time.size):
+            if time[k] - time[kept[-1]] > DIVERGING_STEPS:
+                kept.append(k)
+        members, time = cell[None, kept], time[kept]
+        away = maps._away(maps.arguments[members[0, :1]], members)
+        image = maps._images(away, members)[0][0]
+        near = away[0] - away[0].mean(axis=0)
+        near /= np.maximum(np.abs(near).max(axis=0), np.finfo(float).tiny)
+        terms = _orthonormal(np.stack([np.prod(near**power, axis=1) for power in powers], axis=1))
+        late = time - terms @ (terms.T @ time)
+        residual = _orthonormal(image - terms @ (terms.T @ image))
+        free, count = time.size - terms.shape[1], residual.shape[1]
+        if free <= count + 2 or not count:
+            continue
+        total += free * float(np.sum((residual.T @ late) ** 2) / np.sum(late**2))
+        mean, variance = mean + count, variance + 2.0 * count * (free - count) / (free + 2.0)
+    return float(gammaincc(mean**2 / variance, total * mean / variance)) if variance else 1.0
+
+
+def _cells(points: np.ndarray, most: int) -> list[np.ndarray]:
+    """Return the positions of points (n, d) in cells of less than so many, halved along the widest coordinate."""
+    done, waiting = [], [np.arange(len(points))]
+    while waiting:
+        cell = waiting.pop()
+        if cell.size < most:
+            done.append(np.sort(cell))
+            continue
+        inside = points[cell]
+        order = np.argsort(inside[:, np.argmax(np.ptp(inside, axis=0))], kind="stable")
+        waiting += [cell[order[: cell.size // 2]], cell[order[cell.size // 2 :]]]
+    return done
+
+
+def _orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis of columns (n, k), those that depend on others left out."""
+    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return basis[:, sizes > DEPENDENT * sizes[0]]
 
 
 def _neighbours(maps: ReturnMap, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
