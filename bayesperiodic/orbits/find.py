@@ -43,6 +43,8 @@ LARGEST_LOGARITHM_SD = 0.5
 CHANGE_LEVEL = 1e-3
 # Delays tried for a coordinate to add, in forcing periods, or in mean returns.
 DELAYS_TRIED = (-0.25, -0.5)
+# A coordinate to add reduces the errors of predictions to this fraction or less.
+REDUCED = 0.9
 # Standard deviations from which a determinant is impossible.
 IMPOSSIBLE = 3.0
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
@@ -193,7 +195,7 @@ def _periods(periods: Iterable[int], section: PoincareSection) -> list[int]:
 def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.ndarray, tuple[float, float]]:
     """Return the return map in units of the attractor's size, that size (d,), and errors of predictions."""
     maps, size = _return_map(section)
-    prediction = check_chaos(maps, lambda: _remedy(section, maps))
+    prediction = check_chaos(maps, lambda error: _change(maps) + _remedy(section, maps, error))
     if section.noise is None:
         maps.noise = estimate_noise(maps, neighbours)
     return maps, size, prediction
@@ -217,19 +219,24 @@ def _return_map(section: PoincareSection) -> tuple[ReturnMap, np.ndarray]:
 
 def _warn_of_change(section: PoincareSection) -> None:
     """Warn if the return map has a trend in time."""
-    p = change_in_time(_return_map(section)[0])
-    if p < CHANGE_LEVEL:
-        warnings.warn(
-            f"section: the return map changes during the recording (p = {p:.1g}), as with parameters that drift, a "
-            "transient or a sensor that drifts. Orbits and their errors are those of a mean over time. Use shorter "
-            "parts, recording.between(start, end), and compare their orbits.",
-            UserWarning,
-            stacklevel=4,
-        )
+    if text := _change(_return_map(section)[0]):
+        text += "Orbits and their errors are those of a mean over time; compare those of the parts."
+        warnings.warn(f"section: {text[0].lower()}{text[1:]}", UserWarning, stacklevel=4)
 
 
-def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
-    """Return which delayed coordinate would let local maps predict best, in the units of the maps."""
+def _change(maps: ReturnMap) -> str:
+    """Return that the return map has a trend in time, and what to do, as text; empty if no trend is seen."""
+    p = change_in_time(maps)
+    if p > CHANGE_LEVEL:
+        return ""
+    return (
+        f"The return map changes during the recording (p = {p:.1g}), as with parameters that drift, a transient or a "
+        "sensor that drifts. Use shorter parts, recording.between(start, end). "
+    )
+
+
+def _remedy(section: PoincareSection, maps: ReturnMap, error: float) -> str:
+    """Return what to do where local maps predict with an error: which delayed coordinate to add, or more points."""
     errors, size = {}, np.ptp(section.points, axis=0)
     channels = dict.fromkeys([*channels_of(section.coordinates), *filter(None, [section.crossed])])
     # For crossings, fractions of the mean return.
@@ -244,10 +251,16 @@ def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
         points, added = np.hstack([maps.points, column]), np.hstack([section.increments / size, increments])
         turn, noise = np.append(maps.turn, np.inf), np.append(maps.noise, 0.0)
         errors[name] = prediction_error(ReturnMap(points, added, turn, maps.winds, noise, maps.stretches))[0]
+    more = "If the system has more states than coordinates, add one: another output"
     if not errors:
-        return "another output"
+        return f"{more}."
     best = min(errors, key=errors.__getitem__)
-    return f"another output or a delayed one, with {best!r} errors are {errors[best]:.1%}"
+    if errors[best] > REDUCED * error:
+        return (
+            f"{more}; delayed ones do not help, with {best!r} errors are {errors[best]:.1%}. {len(section)} points may "
+            "be too few for local maps: record longer."
+        )
+    return f"{more} or a delayed one, with {best!r} errors are {errors[best]:.1%}."
 
 
 def _separate(section: PoincareSection, coordinate: str) -> bool:

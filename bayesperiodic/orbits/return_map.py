@@ -408,7 +408,7 @@ CELL, DEPENDENT = 15, 1e-9
 FEWEST_FOLLOWED = 100
 
 
-def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, float]:
+def check_chaos(maps: ReturnMap, remedy: Callable[[float], str]) -> tuple[float, float]:
     """Raise a ValueError, which names the kind of motion, unless the points show a chaotic return map.
 
     Returns the error of predictions by local maps and the part of noise in it, as fractions of the distance of random
@@ -425,23 +425,29 @@ def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, floa
     one, other = generator.integers(len(section), size=(2, 4 * DIVERGING_PROBES))
     apart = maps.distance(section[one], section[other])
     # Half of the distances of a motion of period 2 are zero, so that their median may be.
-    same = max(SAME_POINT * max(np.median(apart), np.mean(apart)), SAME_NOISE * float(maps.noise.max()))
+    coincide = SAME_POINT * max(np.median(apart), np.mean(apart))
+    same = max(coincide, SAME_NOISE * float(maps.noise.max()))
     for period in range(1, min(LONGEST_PERIOD, len(section) // 10) + 1):
         back = maps.followed(period)
         if back.size < FEWEST_FOLLOWED:
             break
-        if np.median(maps.distance(section[back + period], section[back])) < same:
+        if (away := np.median(maps.distance(section[back + period], section[back]))) < same:
+            noisy, choose = "", ""
+            if away > coincide:
+                noisy = ", or points that differ by little more than their noise"
+                choose = ", or coordinates that vary more, by other delays or another level"
             raise ValueError(
-                f"section: must be of a chaotic motion, got one of period {period}. Use recording.fold with "
-                f"periods={period} instead."
+                f"section: must be of a chaotic motion, got one of period {period}{noisy}. Use recording.fold with "
+                f"periods={period} instead{choose}."
             )
     probes = min(DIVERGING_PROBES, len(section) // 4, starts.size)
     centre, neighbour = _neighbours(maps, starts[generator.choice(starts.size, probes, replace=False)])
     now = np.median(maps.distance(section[centre], section[neighbour]))
     error, from_noise = prediction_error(maps)
     if error > UNPREDICTED:
-        advice = f"If the system has more states than coordinates, add one: {remedy()}. Otherwise check for a wrong "
-        advice += "frequency or level, and for noise as large as the motion."
+        advice = (
+            f"{remedy(error)} Otherwise check for a wrong frequency or level, and for noise as large as the motion."
+        )
         if from_noise > NOISE_EXPLAINS * error:
             advice = "The noise is too large: sample faster, record with less noise, or choose coordinates with less."
         raise ValueError(

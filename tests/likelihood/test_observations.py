@@ -158,7 +158,7 @@ def test_section_values_with_their_covariance_are_a_normal_density():
 
 
 def test_covariance_is_in_the_order_of_the_outputs_whatever_the_order_of_the_model():
-    """Three values of two outputs that are given in the other order than the model has them, against SciPy's density."""
+    """Three values of two outputs, given in another order than the model has them, against a normal density."""
     root = np.random.default_rng(4).normal(size=(7, 7))
     covariance, mask = 1e-3 * root @ root.T, np.isin(np.arange(SAMPLES), [3, 70, 150])
     run, truth = section_run(mask=mask, covariance=covariance), rotation()

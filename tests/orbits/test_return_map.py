@@ -1,9 +1,13 @@
+import warnings
+
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.stats import binom
 
+import bayesperiodic as bp
 from bayesperiodic.orbits.cycles import _bandwidths
-from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, ReturnMap, change_in_time
+from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, ReturnMap, change_in_time, check_chaos
 
 OPEN = np.array([np.inf, np.inf])
 
@@ -196,3 +200,48 @@ def test_a_trend_of_the_map_in_time_is_seen_and_none_is_seen_without():
 
 def test_too_few_points_show_no_trend():
     assert change_in_time(logistic(12, 0, drift=0.04)) == 1.0
+
+
+def test_noise_as_large_as_the_motion_is_not_called_periodic_without_doubt():
+    with pytest.raises(ValueError, match="of period 1, or points that differ by little more than their noise. Use"):
+        check_chaos(logistic(600, 0, noise=0.3), lambda error: "")
+
+
+def test_more_points_are_asked_for_where_no_delayed_coordinate_helps():
+    """Noise, which no coordinates determine."""
+    x, y = np.random.default_rng(3).uniform(size=(2, 3200))
+    recording = bp.Recording(np.arange(x.size) / 8.0, {"x": x, "y": y}, {})
+    section = bp.PoincareSection.from_recording(recording, ("x", "y"), frequency=1.0)
+    with pytest.raises(ValueError, match=r"delayed ones do not help, .* points may be too few for local maps: record"):
+        bp.find_orbits(section, periods=[1])
+
+
+def test_the_refusal_names_a_map_that_changes():
+    """Two logistic maps whose parameters are 3.6 in the first half and 4 in the second one."""
+    now, points = np.array([0.3, 0.4]), []
+    for k in range(1200):
+        now = (3.6 if k < 600 else 4.0) * now * (1.0 - now)
+        points.append(now)
+    section = bp.PoincareSection.from_points(np.array(points), ("x", "y"), frequency=1.0)
+    with pytest.raises(ValueError, match="The return map changes during the recording"):
+        bp.find_orbits(section, periods=[1])
+
+
+def test_a_recording_whose_parameters_drift_is_warned_of():
+    """One channel of the Roessler system, by SciPy, whose a drifts by 10 %; a constant one raises no warning."""
+    for end, seen in ((0.22, True), (0.2, False)):
+        times = np.arange(0.0, 3000.0, 0.1)
+
+        def rates(t, state, end=end):
+            x, y, z = state
+            return [-y - z, x + (0.2 + (end - 0.2) * t / 3000.0) * y, 0.2 + z * (x - 5.7)]
+
+        x = solve_ivp(rates, (0.0, 3000.0), [3.0, 0.0, 0.1], "DOP853", times, rtol=1e-7, atol=1e-7).y[0]
+        noisy = x + 0.05 * np.random.default_rng(1).standard_normal(x.size)
+        section = bp.PoincareSection.from_crossings(
+            bp.Recording(times, {"x": noisy}, {}), ["x[1.5 s]"], channel="x", level=0.0
+        )
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            bp.find_orbits(section, periods=[1])
+        assert any("the return map changes during the recording (p = " in str(one.message) for one in caught) == seen
