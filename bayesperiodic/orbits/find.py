@@ -44,7 +44,7 @@ CHANGE_LEVEL = 1e-3
 # Delays tried for a coordinate to add, in forcing periods, or in mean returns.
 DELAYS_TRIED = (-0.25, -0.5)
 # A coordinate to add reduces the errors of predictions to this fraction or less.
-REDUCED = 0.9
+REDUCED = 0.75
 # Standard deviations from which a determinant is impossible.
 IMPOSSIBLE = 3.0
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
