@@ -41,7 +41,9 @@ def main(arguments: list[str] | None = None) -> int:
         "--populations", action="store_true", help="landing-gear: gears and theta16 as populations, only"
     )
     parser.add_argument(
-        "--part", choices=("orbits", "shooting"), help="harvester: known orbits, or multiple shooting, only that"
+        "--part",
+        choices=("orbits", "parameters", "shooting"),
+        help="harvester: known orbits, known parameters, or multiple shooting, only that",
     )
     parser.add_argument("--scaling", action="store_true", help="calibration, population: measure the cost, only that")
     parser.add_argument("--guard", action="store_true", help="benchmark: a quick run's ratios against those kept")

@@ -1,5 +1,6 @@
 """find_orbits: unstable periodic orbits of a chaotic section, without a model."""
 
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -19,6 +20,7 @@ from bayesperiodic.orbits.return_map import (
     KERNEL_REACH,
     Atlas,
     ReturnMap,
+    change_in_time,
     check_chaos,
     estimate_noise,
     prediction_error,
@@ -37,8 +39,12 @@ WIDTH_OF_ONE, WIDEST_OF_ONE = 20.0, 0.018
 LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
+# False-alarm rate of the test for a return map that changes.
+CHANGE_LEVEL = 1e-3
 # Delays tried for a coordinate to add, in forcing periods, or in mean returns.
 DELAYS_TRIED = (-0.25, -0.5)
+# A coordinate to add reduces the errors of predictions to this fraction or less.
+REDUCED = 0.75
 # Standard deviations from which a determinant is impossible.
 IMPOSSIBLE = 3.0
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
@@ -108,6 +114,11 @@ def find_orbits(
         names which, and a delayed coordinate to add), for an unknown method, for periods that are not whole numbers,
         and for several sections that differ in more than their phase.
 
+    Warns
+    -----
+    UserWarning
+        If the return map of the first section has a trend in time, by a test whose false-alarm rate is 0.1 %.
+
     Examples
     --------
     `henon_section`: 1,900 points of the Hénon map x' = 1 − 1.4 x² + y, y' = 0.3 x. Its attractor contains one orbit of
@@ -117,7 +128,9 @@ def find_orbits(
     [1, 2]
     """
     if isinstance(section, PoincareSection):
-        return _of_section(section, periods, method, neighbours, box, steps, waveforms)
+        orbits = _of_section(section, periods, method, neighbours, box, steps, waveforms)
+        _warn_of_change(section)
+        return orbits
     _checks.instance("section", section, (list, tuple))
     for one in section:
         _checks.instance("section", one, PoincareSection)
@@ -126,6 +139,7 @@ def find_orbits(
     late, wanted = phases_of(section), list(periods)
     each = [_of_section(one, wanted, method, neighbours, box, steps, waveforms=True) for one in section]
     maps, size, _ = _scaled(section[0], neighbours)
+    _warn_of_change(section[0])
     orbits = with_late_partners(_finished(merged([one.orbits for one in each], late), maps, size))
     worst = max((one.prediction_error for one in each), key=lambda error: error[0])
     return Orbits(orbits, values=section[0].values, method=method, prediction_error=worst)
@@ -180,6 +194,15 @@ def _periods(periods: Iterable[int], section: PoincareSection) -> list[int]:
 
 def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.ndarray, tuple[float, float]]:
     """Return the return map in units of the attractor's size, that size (d,), and errors of predictions."""
+    maps, size = _return_map(section)
+    prediction = check_chaos(maps, lambda error: _change(maps) + _remedy(section, maps, error))
+    if section.noise is None:
+        maps.noise = estimate_noise(maps, neighbours)
+    return maps, size, prediction
+
+
+def _return_map(section: PoincareSection) -> tuple[ReturnMap, np.ndarray]:
+    """Return the return map in units of the attractor's size, and that size (d,)."""
     size = np.ptp(section.points, axis=0)
     if not np.all(size > 0.0):
         raise ValueError(
@@ -191,14 +214,29 @@ def _scaled(section: PoincareSection, neighbours: int) -> tuple[ReturnMap, np.nd
         section.points / size, section.increments / size, turn, section.winds, noise, section.stretches,
         noises=None if section.noises is None else section.noises / size,
     )  # fmt: skip
-    prediction = check_chaos(maps, lambda: _remedy(section, maps))
-    if section.noise is None:
-        maps.noise = estimate_noise(maps, neighbours)
-    return maps, size, prediction
+    return maps, size
 
 
-def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
-    """Return which delayed coordinate would let local maps predict best, in the units of the maps."""
+def _warn_of_change(section: PoincareSection) -> None:
+    """Warn if the return map has a trend in time."""
+    if text := _change(_return_map(section)[0]):
+        text += "Orbits and their errors are those of a mean over time; compare those of the parts."
+        warnings.warn(f"section: {text[0].lower()}{text[1:]}", UserWarning, stacklevel=4)
+
+
+def _change(maps: ReturnMap) -> str:
+    """Return that the return map has a trend in time, and what to do, as text; empty if no trend is seen."""
+    p = change_in_time(maps)
+    if p > CHANGE_LEVEL:
+        return ""
+    return (
+        f"The return map changes during the recording (p = {p:.1g}), as with parameters that drift, a transient or a "
+        "sensor that drifts. Use shorter parts, recording.between(start, end). "
+    )
+
+
+def _remedy(section: PoincareSection, maps: ReturnMap, error: float) -> str:
+    """Return what to do where local maps predict with an error: which delayed coordinate to add, or more points."""
     errors, size = {}, np.ptp(section.points, axis=0)
     channels = dict.fromkeys([*channels_of(section.coordinates), *filter(None, [section.crossed])])
     # For crossings, fractions of the mean return.
@@ -213,10 +251,16 @@ def _remedy(section: PoincareSection, maps: ReturnMap) -> str:
         points, added = np.hstack([maps.points, column]), np.hstack([section.increments / size, increments])
         turn, noise = np.append(maps.turn, np.inf), np.append(maps.noise, 0.0)
         errors[name] = prediction_error(ReturnMap(points, added, turn, maps.winds, noise, maps.stretches))[0]
+    more = "If the system has more states than coordinates, add one: another output"
     if not errors:
-        return "another output"
+        return f"{more}."
     best = min(errors, key=errors.__getitem__)
-    return f"another output or a delayed one, with {best!r} errors are {errors[best]:.1%}"
+    if errors[best] > REDUCED * error:
+        return (
+            f"{more}; delayed ones do not help, with {best!r} errors are {errors[best]:.1%}. {len(section)} points may "
+            "be too few for local maps: record longer."
+        )
+    return f"{more} or a delayed one, with {best!r} errors are {errors[best]:.1%}."
 
 
 def _separate(section: PoincareSection, coordinate: str) -> bool:

@@ -9,11 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import gammaincc
 
 from bayesperiodic.orbits.normal_equations import (
     NormalEquations,
     deconvoluted,
     inverse_of,
+    monomials,
     products,
     terms_of,
     with_last,
@@ -399,11 +401,14 @@ NORMAL_MEDIAN = 0.6745
 DIVERGED, DIVERGING_STEPS = 2.5, 6
 DIVERGING_PROBES = 400
 NEIGHBOUR = 8
+# Points of a cell of the test for a trend in time, as a multiple of the number of terms; relative size of columns that
+# depend on others.
+CELL, DEPENDENT = 15, 1e-9
 # Fewest points from which as many returns as needed are in their stretch.
 FEWEST_FOLLOWED = 100
 
 
-def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, float]:
+def check_chaos(maps: ReturnMap, remedy: Callable[[float], str]) -> tuple[float, float]:
     """Raise a ValueError, which names the kind of motion, unless the points show a chaotic return map.
 
     Returns the error of predictions by local maps and the part of noise in it, as fractions of the distance of random
@@ -420,23 +425,29 @@ def check_chaos(maps: ReturnMap, remedy: Callable[[], str]) -> tuple[float, floa
     one, other = generator.integers(len(section), size=(2, 4 * DIVERGING_PROBES))
     apart = maps.distance(section[one], section[other])
     # Half of the distances of a motion of period 2 are zero, so that their median may be.
-    same = max(SAME_POINT * max(np.median(apart), np.mean(apart)), SAME_NOISE * float(maps.noise.max()))
+    coincide = SAME_POINT * max(np.median(apart), np.mean(apart))
+    same = max(coincide, SAME_NOISE * float(maps.noise.max()))
     for period in range(1, min(LONGEST_PERIOD, len(section) // 10) + 1):
         back = maps.followed(period)
         if back.size < FEWEST_FOLLOWED:
             break
-        if np.median(maps.distance(section[back + period], section[back])) < same:
+        if (away := np.median(maps.distance(section[back + period], section[back]))) < same:
+            noisy, choose = "", ""
+            if away > coincide:
+                noisy = ", or points that differ by little more than their noise"
+                choose = ", or coordinates that vary more, by other delays or another level"
             raise ValueError(
-                f"section: must be of a chaotic motion, got one of period {period}. Use recording.fold with "
-                f"periods={period} instead."
+                f"section: must be of a chaotic motion, got one of period {period}{noisy}. Use recording.fold with "
+                f"periods={period} instead{choose}."
             )
     probes = min(DIVERGING_PROBES, len(section) // 4, starts.size)
     centre, neighbour = _neighbours(maps, starts[generator.choice(starts.size, probes, replace=False)])
     now = np.median(maps.distance(section[centre], section[neighbour]))
     error, from_noise = prediction_error(maps)
     if error > UNPREDICTED:
-        advice = f"If the system has more states than coordinates, add one: {remedy()}. Otherwise check for a wrong "
-        advice += "frequency or level, and for noise as large as the motion."
+        advice = (
+            f"{remedy(error)} Otherwise check for a wrong frequency or level, and for noise as large as the motion."
+        )
         if from_noise > NOISE_EXPLAINS * error:
             advice = "The noise is too large: sample faster, record with less noise, or choose coordinates with less."
         raise ValueError(
@@ -476,6 +487,58 @@ def prediction_error(maps: ReturnMap) -> tuple[float, float]:
         expected = NORMAL_MEDIAN * np.median(np.sqrt(variance.max(1)))
         results.append((float(np.median(error) / random), float(expected / random)))
     return min(results)
+
+
+def change_in_time(maps: ReturnMap) -> float:
+    """Return the p-value of a test of maps of one step for a trend in time, which drifting parameters cause.
+
+    The arguments are divided into cells. In each, time is a further regressor of the images beside a quadratic
+    polynomial. The fraction of its variance that goes with the residuals has a beta distribution without a trend; the
+    sum over all cells is compared with a gamma distribution of its mean and variance. Points of a cell are distant in
+    time from each other. A map that is not quadratic in the cells leaves residuals, but none that go with time.
+    """
+    powers = monomials(maps.points.shape[1], 2)
+    total = mean = variance = 0.0
+    for cell in _cells(maps.wrap_points(maps.arguments), 2 * CELL * len(powers)):
+        time = maps.positions[cell]
+        kept = [0]
+        for k in range(1, time.size):
+            if time[k] - time[kept[-1]] > DIVERGING_STEPS:
+                kept.append(k)
+        members, time = cell[None, kept], time[kept]
+        away = maps._away(maps.arguments[members[0, :1]], members)
+        image = maps._images(away, members)[0][0]
+        near = away[0] - away[0].mean(axis=0)
+        near /= np.maximum(np.abs(near).max(axis=0), np.finfo(float).tiny)
+        terms = _orthonormal(np.stack([np.prod(near**power, axis=1) for power in powers], axis=1))
+        late = time - terms @ (terms.T @ time)
+        residual = _orthonormal(image - terms @ (terms.T @ image))
+        free, count = time.size - terms.shape[1], residual.shape[1]
+        if free <= count + 2 or not count:
+            continue
+        total += free * float(np.sum((residual.T @ late) ** 2) / np.sum(late**2))
+        mean, variance = mean + count, variance + 2.0 * count * (free - count) / (free + 2.0)
+    return float(gammaincc(mean**2 / variance, total * mean / variance)) if variance else 1.0
+
+
+def _cells(points: np.ndarray, most: int) -> list[np.ndarray]:
+    """Return the positions of points (n, d) in cells of less than so many, halved along the widest coordinate."""
+    done, waiting = [], [np.arange(len(points))]
+    while waiting:
+        cell = waiting.pop()
+        if cell.size < most:
+            done.append(np.sort(cell))
+            continue
+        inside = points[cell]
+        order = np.argsort(inside[:, np.argmax(np.ptp(inside, axis=0))], kind="stable")
+        waiting += [cell[order[: cell.size // 2]], cell[order[cell.size // 2 :]]]
+    return done
+
+
+def _orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis of columns (n, k), those that depend on others left out."""
+    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return basis[:, sizes > DEPENDENT * sizes[0]]
 
 
 def _neighbours(maps: ReturnMap, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

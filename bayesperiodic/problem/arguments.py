@@ -1,6 +1,7 @@
 """Checked arguments of a problem: experiments, local and fixed parameters, and values by name."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -173,4 +174,17 @@ def checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tupl
                 "autonomous, so that its measured frequency is data. Fold without `frequency`, which is then "
                 "estimated with its error, or set Experiment(…, frequency_se=…)."
             )
-    return result
+    return tuple(_in_order(e, model) for e in result)
+
+
+def _in_order(experiment: Experiment, model: Model) -> Experiment:
+    """Return an experiment whose outputs, to which its covariance refers, are in the order of the model."""
+    given, covariance = [*experiment.outputs], experiment.covariance
+    names = [name for name in model.outputs if name in experiment.outputs]
+    if covariance is None or names == given:
+        return experiment
+    values = np.count_nonzero(experiment.measured_points) * len(names)
+    rows = np.arange(values).reshape(-1, len(names))[:, [given.index(name) for name in names]].ravel()
+    rows = np.append(rows, np.arange(values, len(covariance)))
+    outputs = {name: experiment.outputs[name] for name in names}
+    return replace(experiment, outputs=outputs, covariance=covariance[np.ix_(rows, rows)])

@@ -191,6 +191,13 @@ def priors_about(start: Start) -> dict[str, Any]:
     return priors
 
 
+def error_of(orbit: bp.Orbit) -> float:
+    """Return the largest standard error of a channel, rms over the period, as a fraction of its standard deviation."""
+    assert orbit.waveform is not None
+    values, sd = orbit.waveform.values, orbit.waveform.sd
+    return max(float(np.sqrt(np.mean(sd[n] ** 2)) / np.std(values[n])) for n in orbit.waveform.outputs)
+
+
 def experiment(orbit: bp.Orbit) -> bp.Experiment:
     """Return the orbit as an experiment, by the Fourier components of its waveform."""
     return orbit.experiment(samples=SAMPLES, whole=True, model_error=True)

@@ -2,8 +2,9 @@
 
 Velocity, voltage and the drive are measured in pieces, the displacement is not. Orbits are found without a model in
 the first two thirds; restoring force, coupling and damping are estimated from their waveforms, one orbit after the
-other, and sampled with emcee. The last third of the recording judges free runs of the model. `--part` has two
-comparisons: orbits of a simulated recording with those that are there, and multiple shooting of the measured one.
+other, and sampled with emcee. The last third of the recording judges free runs of the model. `--part` has three
+comparisons: orbits of a simulated recording with those that are there, parameters from several of them with the truth,
+and multiple shooting of the measured one.
 """
 
 import argparse
@@ -44,7 +45,7 @@ class Chosen(NamedTuple):
 def run(options: argparse.Namespace) -> None:
     """Run the study, or with ``--part`` only that."""
     if options.part:
-        {"orbits": orbits_part, "shooting": shooting_part}[options.part](options)
+        {"orbits": orbits_part, "parameters": parameters_part, "shooting": shooting_part}[options.part](options)
         return
     watch = common.Stopwatch()
     with watch.part("recording", "the recording"):
@@ -113,6 +114,16 @@ def orbits_part(options: argparse.Namespace) -> None:
                   synthetic=True)  # fmt: skip
 
 
+def parameters_part(options: argparse.Namespace) -> None:
+    """Estimate the parameters of several simulated recordings, and compare them with the truth."""
+    watch = common.Stopwatch()
+    with watch.part("parameters", "orbits and parameters of simulated recordings"):
+        results = synthetic.coverage(PHASES, options.seed, quick=options.quick)
+    print(synthetic.coverage_table(results))
+    common.finish(options.out / "parameters", {"seed": options.seed, "quick": options.quick} | results, watch,
+                  synthetic=True)  # fmt: skip
+
+
 def shooting_part(options: argparse.Namespace) -> None:
     """Estimate the parameters by multiple shooting, from the study's estimate, and judge them like that."""
     watch, stored = common.Stopwatch(), options.out / "results.json"
@@ -168,16 +179,9 @@ def found_orbits(recordings: list[bp.Recording], quick: bool) -> bp.Orbits:
     return bp.find_orbits(sections, periods=range(1, 4 if quick else 6), steps=STEPS)
 
 
-def error_of(orbit: bp.Orbit) -> float:
-    """Return the largest standard error of a channel, rms over the period, as a fraction of its standard deviation."""
-    assert orbit.waveform is not None
-    values, sd = orbit.waveform.values, orbit.waveform.sd
-    return max(float(np.sqrt(np.mean(sd[n] ** 2)) / np.std(values[n])) for n in orbit.waveform.outputs)
-
-
 def reliable(orbits: bp.Orbits, largest: float) -> list[bp.Orbit]:
     """Return the orbits that are used, by period and multiplier; raise a ValueError if there is none."""
-    used = [one for one in orbits if error_of(one) < largest]
+    used = [one for one in orbits if beam.error_of(one) < largest]
     if not used:
         raise ValueError(
             f"--data: must be a recording with orbits whose errors are below {largest:.0%}, got none of "
@@ -286,7 +290,7 @@ def orbit_row(orbit: bp.Orbit, used: bool) -> dict[str, Any]:
     return {
         "name": orbit.name, "period": orbit.period, "eigenvalue": [large.real, large.imag],
         "eigenvalue_sd": float(orbit.eigenvalue_sd[0]), "returns": orbit.returns, "sections": orbit.sections,
-        "error": error_of(orbit), "used": used,
+        "error": beam.error_of(orbit), "used": used,
     }  # fmt: skip
 
 

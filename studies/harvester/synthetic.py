@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from scipy.integrate import odeint
-from scipy.stats import binom
+from scipy.stats import binom, chi2, norm
 
 import bayesperiodic as bp
 from studies import shooting
+from studies.harvester.beam import error_of
 from studies.harvester.recording import FREQUENCY
 
 # x'' = f1 x − f3 x³ − damping x' − back v − drive_gain a, v' = −decay v + coupling x'; a is the base's acceleration.
@@ -44,6 +45,9 @@ POINTS = 64
 # An orbit is found if all coordinates of its points are within this distance, in ranges of the coordinates; half width
 # of 90 % error bars in standard deviations, and the probability of the band of the number that they cover.
 TOLERANCE, HALF_WIDTH, BAND = 0.02, 1.6448536, 0.99
+# Of the estimates: recordings, grid points a period, largest error of a waveform as a fraction of it; standard deviation
+# of the logarithms of the priors' medians about the truth, that of the priors, and probabilities of the intervals.
+RECORDINGS, SAMPLES, LARGEST_ERROR, MISTAKE, SPREAD, LEVELS = 16, 128, 0.05, 0.18, 0.3, (0.5, 0.9)
 # Guesses nearer to each other, and orbits nearer to each other than this are the same.
 ALIKE, SAME = 0.02, 1e-5
 
@@ -211,13 +215,72 @@ def compared(
     return rows
 
 
-def campaign(phases: int, seed: int, *, quick: bool) -> dict[str, Any]:
-    """Return what a search finds of the orbits of the flow, and how many true values the error bars contain."""
-    pieces, states = recordings(seed)
-    sections = [
+def estimate(phases: int, seed: int, *, quick: bool) -> dict[str, Any]:
+    """Return the estimate from the orbits of one recording, with priors whose medians are off at random."""
+    pieces, _ = recordings(seed)
+    orbits = bp.find_orbits(sections_of(pieces, phases), periods=PERIODS[: 2 if quick else 3], steps=STEPS)
+    used = [orbit for orbit in orbits if error_of(orbit) < LARGEST_ERROR]
+    generator = np.random.default_rng([seed, 2])
+    priors = {n: bp.LogNormal(v * np.exp(MISTAKE * generator.standard_normal()), SPREAD) for n, v in TRUTH.items()}
+    runs = [orbit.experiment(samples=SAMPLES, whole=True) for orbit in used]
+    problem = bp.Problem(MODEL, runs, priors=priors, fixed={"scale": 1.0})
+    try:
+        result = bp.estimate_orbits(problem, progress=False)
+    except ValueError as error:
+        return {"seed": seed, "orbits": len(used), "error": str(error)}
+    fit, names = result.fit, [*TRUTH]
+    away = np.array([fit.theta[name] - TRUTH[name] for name in names])
+    covariance = fit.robust_covariance.loc[names, names].to_numpy()
+    return {
+        "seed": seed, "orbits": len(used), "dropped": len(result.dropped),
+        "medians": {name: prior.median / TRUTH[name] for name, prior in priors.items()},
+        "theta": dict(fit.theta), "robust_sd": dict(fit.robust_sd),
+        "in_sd": {name: (fit.theta[name] - TRUTH[name]) / fit.robust_sd[name] for name in names},
+        "distance": float(away @ np.linalg.solve(covariance, away)),
+    }  # fmt: skip
+
+
+def coverage(phases: int, seed: int, *, quick: bool) -> dict[str, Any]:
+    """Return the estimates of several recordings, and how many intervals and joint regions contain the truth."""
+    rows = [estimate(phases, seed + k, quick=quick) for k in range(2 if quick else RECORDINGS)]
+    there = [row for row in rows if "error" not in row]
+    in_sd = np.array([[*row["in_sd"].values()] for row in there]).reshape(len(there), len(TRUTH))
+    distances = np.array([row["distance"] for row in there])
+    counts = []
+    for level in LEVELS:
+        inside = np.abs(in_sd) < norm.ppf(0.5 + 0.5 * level)
+        for kind, hits in (("each", inside.ravel()), ("joint", distances < chi2.ppf(level, len(TRUTH)))):
+            band = [int(end) for end in binom.interval(BAND, hits.size, level)]
+            counts.append({"level": level, "kind": kind, "count": int(hits.sum()), "of": hits.size, "band": band})
+    rms = dict(zip(TRUTH, np.sqrt(np.mean(in_sd**2, axis=0)).tolist(), strict=True))
+    return {"truth": TRUTH, "recordings": rows, "estimated": len(there), "rms_in_sd": rms, "counts": counts}
+
+
+def coverage_table(results: dict[str, Any]) -> str:
+    """Return the errors of all estimates in standard deviations, and the numbers inside intervals, as text."""
+    rows = [{"seed": r["seed"], "orbits": r["orbits"]} | r.get("in_sd", {}) for r in results["recordings"]]
+    lines = [
+        "Errors in robust standard deviations",
+        pd.DataFrame(rows).to_string(index=False, float_format="{:.2f}".format),
+    ]
+    lines.append(f"{results['estimated']} of {len(rows)} recordings give an estimate")
+    for c in results["counts"]:
+        lines.append(f"{c['level']:.0%} {c['kind']}: {c['count']} of {c['of']}, 99 % band {c['band']}")
+    return "\n".join(lines)
+
+
+def sections_of(pieces: list[bp.Recording], phases: int) -> list[bp.PoincareSection]:
+    """Return the sections at several phases of the drive."""
+    return [
         bp.PoincareSection.from_recordings(pieces, COORDINATES, frequency=FREQUENCY, origin=k / (phases * FREQUENCY))
         for k in range(phases)
     ]
+
+
+def campaign(phases: int, seed: int, *, quick: bool) -> dict[str, Any]:
+    """Return what a search finds of the orbits of the flow, and how many true values the error bars contain."""
+    pieces, states = recordings(seed)
+    sections = sections_of(pieces, phases)
     wanted = PERIODS[:2] if quick else PERIODS
     orbits = bp.find_orbits(sections, periods=wanted, steps=STEPS)
     rows = compared([pair for pair in counted_orbits(states) if pair[0].period in wanted], orbits, sections)

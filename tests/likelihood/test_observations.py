@@ -157,6 +157,25 @@ def test_section_values_with_their_covariance_are_a_normal_density():
     assert problem.log_likelihood(UNSTABLE, {"scale": 4.0}) == pytest.approx(scaled, abs=1e-6)
 
 
+def test_covariance_is_in_the_order_of_the_outputs_whatever_the_order_of_the_model():
+    """Three values of two outputs, given in another order than the model has them, against a normal density."""
+    root = np.random.default_rng(4).normal(size=(7, 7))
+    covariance, mask = 1e-3 * root @ root.T, np.isin(np.arange(SAMPLES), [3, 70, 150])
+    run, truth = section_run(mask=mask, covariance=covariance), rotation()
+    run = replace(run, outputs={name: run.outputs[name] for name in ("rate", "angle")})
+    problem = pendulum_problem([run], fixed={n: v for n, v in truth.parameters.items() if n not in UNSTABLE})
+    away = np.stack([run.outputs[name][mask] - truth.outputs[name][mask] for name in ("rate", "angle")], axis=1)
+    away[:, 1] = (away[:, 1] + np.pi) % (2 * np.pi) - np.pi
+    away = np.append(away.ravel(), np.log(1.05))
+    expected = -0.5 * away @ np.linalg.solve(covariance, away)
+    theta = {name: truth.parameters[name] for name in UNSTABLE}
+    assert problem.log_likelihood(theta, {"scale": 1.0}) == pytest.approx(expected, rel=1e-6)
+    assert tuple(problem.experiments[0].outputs) == ("angle", "rate")
+    # Outputs in the model's order later on keep their errors.
+    again = replace(problem.experiments[0], outputs={n: run.outputs[n] for n in ("angle", "rate")})
+    assert problem.with_experiments([again]).log_likelihood(theta, {"scale": 1.0}) == pytest.approx(expected, rel=1e-6)
+
+
 def test_measured_multipliers_add_the_expected_information_on_friction():
     """The information of log|μ|, known to 1 %, on k3 is that of its derivative."""
     mask, covariance = np.arange(SAMPLES) == 0, np.diag([1e-4, 4e-3])

@@ -1,8 +1,14 @@
+import warnings
+
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.interpolate import PchipInterpolator
+from scipy.stats import binom
 
+import bayesperiodic as bp
 from bayesperiodic.orbits.cycles import _bandwidths
-from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, ReturnMap
+from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, ReturnMap, change_in_time, check_chaos
 
 OPEN = np.array([np.inf, np.inf])
 
@@ -167,3 +173,79 @@ def test_fits_about_the_points_agree_with_the_atlas(atlas):
 
 def test_an_atlas_is_undefined_far_from_the_data(atlas):
     assert np.isinf(atlas.at(np.array([[3.0, 3.0]]), np.zeros(1))[2]).all()
+
+
+def logistic(count, seed, drift=0.0, noise=1e-3):
+    """Return the maps of x' = a x (1 − x) with noise, whose a moves from 3.8 by `drift` over the recording."""
+    generator = np.random.default_rng(seed)
+    points, x = np.empty(count), generator.uniform(0.2, 0.8)
+    for k in range(-50, count):
+        x = (3.8 + drift * max(k, 0) / count) * x * (1.0 - x)
+        if k >= 0:
+            points[k] = x
+    points = (points + noise * generator.standard_normal(count))[:, None]
+    return ReturnMap(points, np.diff(points, axis=0), np.array([np.inf]), True, np.array([noise]))
+
+
+def test_a_trend_of_the_map_in_time_is_seen_and_none_is_seen_without():
+    """P-values of 200 recordings are uniform: 99.9 % bands of the numbers below 0.05 and 0.3; all of a drift are small.
+
+    The drift by 1 % changes images by a standard deviation of 0.002, with noise of 0.002 in them.
+    """
+    without = np.array([change_in_time(logistic(600, seed)) for seed in range(200)])
+    for level in (0.05, 0.3):
+        low, high = binom.interval(0.999, without.size, level)
+        assert low <= np.sum(without < level) <= high
+    assert max(change_in_time(logistic(600, seed, drift=0.038)) for seed in range(20)) < 1e-3
+
+
+def test_too_few_points_show_no_trend():
+    assert change_in_time(logistic(12, 0, drift=0.04)) == 1.0
+
+
+def test_noise_as_large_as_the_motion_is_not_called_periodic_without_doubt():
+    with pytest.raises(ValueError, match="of period 1, or points that differ by little more than their noise. Use"):
+        check_chaos(logistic(600, 0, noise=0.3), lambda error: "")
+
+
+def test_more_points_are_asked_for_where_no_delayed_coordinate_helps():
+    """Smooth curves through random values once a period, which no coordinates determine."""
+    values = np.random.default_rng(3).uniform(size=(2, 401))
+    time = np.arange(400 * 32) / 32.0
+    x, y = PchipInterpolator(np.arange(401), values, axis=1)(time)
+    recording = bp.Recording(time, {"x": x, "y": y}, {})
+    section = bp.PoincareSection.from_recording(recording, ("x", "y"), frequency=1.0)
+    with pytest.raises(ValueError, match=r"delayed ones do not help, .* points may be too few for local maps: record"):
+        bp.find_orbits(section, periods=[1])
+
+
+def test_the_refusal_names_a_map_that_changes():
+    """Two logistic maps, whose images are mirrored in the second half."""
+    now, points = np.array([0.3, 0.4]), []
+    for k in range(1200):
+        now = 3.99 * now * (1.0 - now)
+        now = now if k < 600 else 1.0 - now
+        points.append(now)
+    section = bp.PoincareSection.from_points(np.array(points), ("x", "y"), frequency=1.0)
+    with pytest.raises(ValueError, match="The return map changes during the recording"):
+        bp.find_orbits(section, periods=[1])
+
+
+def test_a_recording_whose_parameters_drift_is_warned_of():
+    """One channel of the Roessler system, by SciPy, whose a drifts by 10 %; a constant one raises no warning."""
+    for end, seen in ((0.22, True), (0.2, False)):
+        times = np.arange(0.0, 2000.0, 0.1)
+
+        def rates(t, state, end=end):
+            x, y, z = state
+            return [-y - z, x + (0.2 + (end - 0.2) * t / 2000.0) * y, 0.2 + z * (x - 5.7)]
+
+        x = solve_ivp(rates, (0.0, 2000.0), [3.0, 0.0, 0.1], "DOP853", times, rtol=1e-7, atol=1e-7).y[0]
+        noisy = x + 0.05 * np.random.default_rng(1).standard_normal(x.size)
+        section = bp.PoincareSection.from_crossings(
+            bp.Recording(times, {"x": noisy}, {}), ["x[1.5 s]"], channel="x", level=0.0
+        )
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            bp.find_orbits(section, periods=[1])
+        assert any("the return map changes during the recording (p = " in str(one.message) for one in caught) == seen
