@@ -1,7 +1,7 @@
 """PoincareSection: points of a motion, once a forcing period or where it crosses a plane."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,14 +19,17 @@ from bayesperiodic.orbits.coordinates import (
     coordinate_values,
     delays_of,
     given_recordings,
+    integrand_of,
     longest_window,
     longest_window_of_crossings,
     other_channels,
     unwrapped,
+    with_integrals,
     with_others,
     wrapped,
 )
 from bayesperiodic.orbits.crossings import Crossings, refined, upward_crossings
+from bayesperiodic.orbits.integrals import HALF_WINDOW, in_parts
 from bayesperiodic.orbits.stretches import (
     FEWEST_SAMPLES,
     Stretches,
@@ -117,6 +120,7 @@ class PoincareSection(Result):
     inputs: tuple[str, ...] = ()
     crossed: str | None = None
     noises: np.ndarray | None = None
+    drifts: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def from_recording(
@@ -236,12 +240,19 @@ class PoincareSection(Result):
                 "a period, use from_points."
             )
         delays = delays_of(names)
-        longest = longest_window(names, samples.sampling_rate / frequency)
-        instants, stretch, left_out = samples.instants(frequency, origin, (delays.min(), delays.max()))
+        longest, reach = longest_window(names, samples.sampling_rate / frequency), (delays.min(), delays.max())
+        summed, drifts = any(integrand_of(name) for name in channels_of(names)), dict[str, float]()
+        if summed:
+            samples = in_parts(samples, 1.0 / frequency)
+            reach = (min(reach[0], -HALF_WINDOW), max(reach[1], HALF_WINDOW))
+        instants, stretch, left_out = samples.instants(frequency, origin, reach)
+        longest *= float(np.median(np.diff(instants)))
+        if summed:
+            samples, drifts = with_integrals(samples, names, origin, frequency, longest)
         synthetic = any(recording.synthetic for recording in given)
         section = cls._of(
-            samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency,
-            longest * float(np.median(np.diff(instants))),
+            samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency, longest,
+            drifts=drifts,
         )  # fmt: skip
         extent = np.array([np.ptp(signal) for signal in samples.signals.T])[columns_of(names)]
         if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * extent):
@@ -404,18 +415,19 @@ class PoincareSection(Result):
     def _of(
         cls, samples: Stretches, names: tuple[str, ...], angles: tuple[str, ...], instants: np.ndarray,
         stretch: np.ndarray, left_out: int, synthetic: bool, others: tuple[str, ...], inputs: tuple[str, ...],
-        frequency: float, longest: float, crossed: str | None = None,
+        frequency: float, longest: float, crossed: str | None = None, drifts: Mapping[str, float] | None = None,
     ) -> "PoincareSection":  # fmt: skip
         """Return the section of signals at given instants, in windows no longer than `longest`."""
         _check_count(instants.size)
         time, unit = samples.time, 1.0 if crossed else 1.0 / frequency
-        values, noise = coordinate_values(samples, names, instants, stretch, unit, longest)
+        drifts = drifts or {}
+        values, noise = coordinate_values(samples, names, instants, stretch, unit, longest, drifts)
         points, increments = wrapped(values, np.isin(names, angles)), _within(np.diff(values, axis=0), stretch)
         broken = samples.starts.size > 1
         return cls(
             points, names, angles, frequency, increments, True, noise, instants, time, samples.signals,
             time.size * len(channels_of(names)), synthetic, stretch if broken else None,
-            samples.starts if broken else None, left_out, others, inputs, crossed,
+            samples.starts if broken else None, left_out, others, inputs, crossed, drifts=drifts,
         )  # fmt: skip
 
     def _with_errors_of(self, crossings: Crossings, error: float) -> "PoincareSection":
@@ -424,7 +436,7 @@ class PoincareSection(Result):
         samples, instants, stretch = self.measured
         apart = float(np.median(crossings.band / crossings.slopes))
         before, later = (
-            coordinate_values(samples, self.coordinates, instants + away, stretch, self.unit, 2.0 * apart)[0]
+            coordinate_values(samples, self.coordinates, instants + away, stretch, self.unit, 2.0 * apart, {})[0]
             for away in (-apart, apart)
         )
         noises = np.hypot(self.noise, error * (later - before) / (2.0 * apart * crossings.slopes[:, None]))
@@ -518,7 +530,7 @@ class PoincareSection(Result):
         each = np.broadcast_to(stretch[:, None], present.shape)[present]
         names = self.coordinates
         longest = longest_window(names, samples.sampling_rate / self.frequency, steps) * float(np.median(after)) / steps
-        values, noise = coordinate_values(samples, names, instants[present], each, self.unit, longest)
+        values, noise = coordinate_values(samples, names, instants[present], each, self.unit, longest, self.drifts)
         if noise is None:
             raise ValueError(f"steps: must be 1 for stretches too short to determine the noise, got {steps}.")
         signals = np.full((present.size, len(names)), np.nan)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from scipy.integrate import odeint
+from scipy.interpolate import CubicSpline
 from scipy.stats import binom
 
 import bayesperiodic as bp
@@ -97,7 +98,10 @@ def flow(start: float, end: float, state: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def recordings(seed: int) -> tuple[list[bp.Recording], np.ndarray]:
-    """Return the pieces with noise, and the true states at whole periods of the drive, (pieces, periods, 3)."""
+    """Return the pieces with noise, and the true states at whole periods of the drive, (pieces, periods, 3).
+
+    The states are those of the same run: another run from the same start, with other steps, diverges from it.
+    """
     time, states = states_of(PIECES * (LENGTH + PAUSE), RATE, seed)
     drive = AMPLITUDE * np.cos(2.0 * np.pi * FREQUENCY * time)
     generator = np.random.default_rng([seed, 1])
@@ -108,7 +112,8 @@ def recordings(seed: int) -> tuple[list[bp.Recording], np.ndarray]:
         inside = (time >= time[0] + first / FREQUENCY) & (time < time[0] + (first + LENGTH) / FREQUENCY)
         outputs = {name: noisy[name][inside] for name in ("velocity", "voltage")}
         pieces.append(bp.Recording(time[inside], outputs, {"drive": noisy["drive"][inside]}, synthetic=True))
-    every = states_of(PIECES * (LENGTH + PAUSE), FREQUENCY, seed)[1][: PIECES * (LENGTH + PAUSE)]
+    whole = np.ceil(time[0] * FREQUENCY) + np.arange(PIECES * (LENGTH + PAUSE))
+    every = CubicSpline(time, states)(np.minimum(whole / FREQUENCY, time[-1]))
     return pieces, every.reshape(PIECES, LENGTH + PAUSE, 3)[:, :LENGTH]
 
 
