@@ -7,7 +7,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic.data.recording import Recording
-from bayesperiodic.orbits.integrals import HALF_WINDOW, PHASES, View, high_passed, integrated, lines_of
+from bayesperiodic.orbits.integrals import HALF_WINDOW, LARGEST_DRIFT, PHASES, View, high_passed, integrated, lines_of
 from bayesperiodic.orbits.stretches import LONGEST_USUAL_STEP, SMALLEST_WINDOW, Stretches, smoothed, usual_step
 
 DEGREES = 180.0 / np.pi
@@ -30,6 +30,11 @@ def integrand_of(channel: str) -> str | None:
     """Return the channel of which this one is the integral, or None."""
     match = INTEGRATED.fullmatch(channel)
     return match[1] if match else None
+
+
+def is_output(coordinate: str) -> bool:
+    """Return whether a coordinate is neither delayed nor an integral."""
+    return not (DELAYED.fullmatch(coordinate) or INTEGRATED.fullmatch(coordinate))
 
 
 def channels_of(coordinates: Sequence[str]) -> tuple[str, ...]:
@@ -129,6 +134,12 @@ def with_integrals(
     lines = {name: lines_of(samples, k, views[name]) for name, k in columns.items()}
     for name, k in columns.items():
         samples = integrated(samples, k, lines[name])
+        error = lines[name].sd / float(np.std(samples.signals[:, k]))
+        if not error < LARGEST_DRIFT:
+            raise ValueError(
+                f"coordinates: must determine the drift of {name!r}, got errors of {error:.0%} of the standard "
+                "deviation. Add a delayed coordinate, or record with less drift and noise or in longer pieces."
+            )
     return samples, {name: one.sd for name, one in lines.items()}
 
 
@@ -163,6 +174,10 @@ def coordinate_names(
         _checks.one_of("angles", name, given)
     if len(angle_names) > 1:
         raise ValueError(f"angles: must name at most one coordinate, got {angle_names!r}.")
+    if not forced and any(integrand_of(channel_and_delay(name)[0]) for name in given):
+        raise ValueError(f"coordinates: must have no integrals for crossings, got {given!r}. Use delayed coordinates.")
+    if any(integrand_of(channel_and_delay(name)[0]) in angle_names for name in given):
+        raise ValueError(f"coordinates: must have no integral of an angle, got {given!r}. Integrate another channel.")
     if any(channel_and_delay(name)[0] in delayed for name in angle_names):
         raise ValueError(f"coordinates: must have no delays of an angle, got {given!r}. Delay another channel.")
     return tuple(given), angle_names

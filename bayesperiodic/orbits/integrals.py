@@ -1,10 +1,10 @@
 """Integrals of channels, whose drift in each stretch is determined by the motion itself.
 
-An integral over a stretch has an unknown constant, and an offset of the channel adds a line in time. The difference of an
-integral and its mean over one forcing period about an instant has neither: it is a sum of samples with odd weights, and
-a function of the state. With the other coordinates it determines the state, so that the whole integral is a function of
-them too, the same one in all stretches. Constants and slopes are those for which local polynomials of that function, each
-from neighbours in other stretches, agree best.
+An integral over a stretch has an unknown constant, and an offset of the channel adds a line in time. The difference of
+an integral and its mean over one forcing period about an instant has neither: it is a sum of samples with odd weights,
+and a function of the state. With the other coordinates it determines the state, so that the whole integral is a
+function of them too, the same one in all stretches. Constants and slopes are those for which local polynomials of that
+function, each from neighbours in other stretches, agree best.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,18 +15,22 @@ from scipy import sparse
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
+from bayesperiodic.data.faults import FAR, MEDIAN_TO_SD
 from bayesperiodic.orbits.stretches import Stretches, noise_variance
 
-# Half the window of the mean, and the longest parts of stretches with a line each, in forcing periods; fewest points of a
-# stretch that determine a line.
-HALF_WINDOW, LONGEST_PART, FEWEST_OF_LINE = 0.5, 30, 6
+# Half the window of the mean, and shortest and longest parts with a line each, in forcing periods. Parts of long
+# recordings are longer, so that they are not many more than this number.
+HALF_WINDOW, SHORTEST_PART, LONGEST_PART, MANY_PARTS = 0.5, 10, 30, 200
+# A sample minus the value there of the polynomial through three on either side.
+SPIKE_KERNEL = np.array([-1.0, 6.0, -15.0, 20.0, -15.0, 6.0, -1.0]) / 20.0
 # Phases a period at which integrals are compared.
 PHASES = 4
 # Neighbours of a local polynomial as a multiple of its terms; smallest singular value and eigenvalue that count.
 NEIGHBOURS_PER_TERM, SMALLEST_SINGULAR, SMALLEST_EIGENVALUE = 4, 1e-4, 1e-10
 # Rounds of the robust regression, and residuals from which weights are smaller, in standard deviations.
 ROBUST_ROUNDS, ROBUST_LIMIT = 8, 2.0
-MEDIAN_TO_SD = 1.4826
+# Residuals count up to this many standard deviations in the covariance of successive ones.
+LARGEST_RESIDUAL = 5.0
 # Largest error of an integral, as a fraction of its standard deviation.
 LARGEST_DRIFT = 0.1
 # Variance of a random walk about its line, for one of unit variance at the end.
@@ -50,22 +54,49 @@ class Lines(NamedTuple):
 
 
 def in_parts(samples: Stretches, period: float) -> Stretches:
-    """Return the samples with long stretches divided into parts of equal length."""
-    starts = []
+    """Return the samples in parts that have a line each: long stretches divided equally, short ones left out.
+
+    Raises a ValueError if all are short.
+    """
+    kept, starts, count, longest = [], [], 0, 0.0
+    most = max(LONGEST_PART, samples.time.size / samples.sampling_rate / period / MANY_PARTS)
     for first, stop in zip(samples.starts, samples.stops, strict=True):
-        lasting = samples.time[stop - 1] - samples.time[first]
-        count = max(1, int(np.ceil(lasting / (LONGEST_PART * period))))
-        ends = samples.time[first] + lasting * np.arange(count) / count
-        starts.append(first + np.searchsorted(samples.time[first:stop], ends))
-    return samples._replace(starts=np.concatenate(starts))
+        time = samples.time[first:stop]
+        lasting = float(time[-1] - time[0]) / period
+        longest = max(longest, lasting)
+        if lasting >= SHORTEST_PART:
+            parts = int(np.ceil(lasting / most))
+            ends = time[0] + (time[-1] - time[0]) * np.arange(parts) / parts
+            starts.append(count + np.searchsorted(time, ends))
+            kept.append(np.arange(first, stop))
+            count += time.size
+    if not kept:
+        raise ValueError(
+            f"recordings: must have {SHORTEST_PART} forcing periods or more without a break for the integral of a "
+            f"channel, got {longest:.3g} at most. Record longer pieces, or use delayed coordinates."
+        )
+    index = np.concatenate(kept)
+    return Stretches(samples.time[index], samples.signals[index], np.concatenate(starts))
+
+
+def spikes_of(values: np.ndarray) -> np.ndarray:
+    """Return which samples (bool) are far from the polynomial through three on either side, or beside one."""
+    away = np.abs(np.convolve(values, SPIKE_KERNEL, mode="valid"))
+    scale = MEDIAN_TO_SD * float(np.median(away)) if away.size else 0.0
+    result = np.zeros(values.size, dtype=bool)
+    if scale > 0.0:
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(away, 3), away.size)
+        far = 3 + np.flatnonzero((away > FAR * scale) & (away >= around.max(axis=0)))
+        result[np.add.outer(far, [-1, 0, 1])] = True
+    return result
 
 
 def splines(samples: Stretches, column: int) -> Iterator[tuple[int, slice, CubicSpline]]:
-    """Yield each stretch and its channel as a function of the time from its middle."""
+    """Yield each stretch and its channel, without spikes, as a function of the time from its middle."""
     for number, (first, stop) in enumerate(zip(samples.starts, samples.stops, strict=True)):
         span = slice(int(first), int(stop))
-        if stop - first > 3:
-            yield number, span, CubicSpline(_centred(samples.time[span]), samples.signals[span, column])
+        kept = ~spikes_of(samples.signals[span, column])
+        yield number, span, CubicSpline(_centred(samples.time[span])[kept], samples.signals[span, column][kept])
 
 
 def high_passed(
@@ -86,8 +117,9 @@ def high_passed(
 def lines_of(samples: Stretches, column: int, views: Sequence[View]) -> Lines:
     """Return the lines for which the integrals of each view are one function of its coordinates of the state.
 
-    Their error is that of least squares, or what the lines from every other view differ by, if that is larger. To it the
-    integral of the channel's white noise is added.
+    The error is that of least squares, or what the lines from every other view differ by, if that is larger. What
+    remains of a drift is not a line: the residuals of successive points are then alike, and their covariance is added,
+    or the variance of the integral of the channel's white noise, if that is larger.
     """
     at, stretch = (np.concatenate(every) for every in zip(*((one.at, one.stretch) for one in views), strict=True))
     middles = 0.5 * (samples.time[samples.starts] + samples.time[samples.stops - 1])
@@ -102,10 +134,18 @@ def lines_of(samples: Stretches, column: int, views: Sequence[View]) -> Lines:
     every -= every.mean(axis=0)  # The constant of all is not determined.
     variance = np.mean(np.sum((every @ covariance) * every, axis=1))
     variance = max(float(variance), float(np.var(every @ (one - other))) / 4.0)
-    lasting = samples.time[samples.stops - 1] - samples.time[samples.starts]
     white = float(noise_variance(samples, at, stretch)[column]) / samples.sampling_rate
-    walk = white * float(np.mean(lasting[stretch])) * ABOUT_LINE
-    return Lines(lines.reshape(2, -1).T / [1.0, scale], float(np.sqrt(variance + walk)))
+    walk = white * float(np.mean(samples.time[samples.stops - 1] - samples.time[samples.starts])) * ABOUT_LINE
+    away = [target - design @ lines for target, design in zip(targets, designs, strict=True)]
+    limit = LARGEST_RESIDUAL * MEDIAN_TO_SD * float(np.median(np.abs(np.concatenate(away))))
+    products = np.concatenate(
+        [
+            (clipped[1:] * clipped[:-1])[np.diff(one.stretch) == 0]
+            for one, clipped in zip(views, (np.clip(rest, -limit, limit) for rest in away), strict=True)
+        ]
+    )
+    drift = max(walk, float(products.mean()))
+    return Lines(lines.reshape(2, -1).T / [1.0, scale], float(np.sqrt(variance + drift)))
 
 
 def _basis(time: np.ndarray, stretch: np.ndarray, count: int) -> sparse.csr_array:
@@ -150,7 +190,8 @@ def _unpredicted(view: View) -> sparse.csr_array:
     distance, index = cKDTree(places).query(places, min(n, count + int(np.bincount(stretch).max())))
     # Neighbours in other stretches, the nearest ones.
     order = np.argsort(np.where(stretch[index] == stretch[:, None], np.inf, distance), axis=1)[:, :count]
-    index, distance = np.take_along_axis(index, order, 1), np.take_along_axis(distance, order, 1)
+    every = np.arange(n)[:, None]
+    index, distance = index[every, order], np.asarray(distance)[every, order]
     away = (places[index] - places[:, None]) / distance[:, -1:, None]
     one, other = np.triu_indices(d)
     terms = np.concatenate([np.ones((*away.shape[:2], 1)), away, away[..., one] * away[..., other]], axis=2)

@@ -30,12 +30,7 @@ from bayesperiodic.orbits.coordinates import (
 )
 from bayesperiodic.orbits.crossings import Crossings, refined, upward_crossings
 from bayesperiodic.orbits.integrals import HALF_WINDOW, in_parts
-from bayesperiodic.orbits.stretches import (
-    FEWEST_SAMPLES,
-    Stretches,
-    joined,
-    local_fit,
-)
+from bayesperiodic.orbits.stretches import FEWEST_SAMPLES, Stretches, joined, local_fit
 
 FEWEST_POINTS, CYCLE_SAMPLES = 200, 64
 # Points coincide if their standard deviations are below this many of the noise, or this fraction of the motion's range.
@@ -53,7 +48,8 @@ class PoincareSection(Result):
     coordinates, angles : tuple of str
         The coordinates, and those of them that are angles, one at most. A delayed one is a channel and, in brackets,
         the forcing periods after the phase of the section: ``"voltage[-0.25]"`` is the voltage a quarter period before.
-        For crossings the delay is in seconds: ``"voltage[-0.1 s]"``.
+        For crossings the delay is in seconds: ``"voltage[-0.1 s]"``. ``"integral(velocity)"`` is the integral of a
+        channel over time, of mean zero.
     frequency : float
         Forcing frequency [Hz]; for crossings of a plane, returns per second.
     increments : array (count − 1, d)
@@ -87,6 +83,8 @@ class PoincareSection(Result):
     noises : array (count, d) or None
         Standard deviation of each point's errors, for crossings, of which the instants have errors; `noise` is their
         root mean square.
+    drifts : mapping of str to float
+        Standard deviation of the errors of each integral, which are part of `noise`. They change slowly.
 
     Examples
     --------
@@ -146,8 +144,8 @@ class PoincareSection(Result):
         coordinates : sequence of str
             Two or more outputs that determine the next point, as many as the system has states, or more, such as
             ``("angle", "rate")``. What is not measured is replaced by delayed coordinates, such as
-            ``("velocity", "voltage", "voltage[-0.25]")`` with the voltage a quarter of the forcing period before; see
-            Notes.
+            ``("velocity", "voltage", "voltage[-0.25]")`` with the voltage a quarter of the forcing period before, or
+            by integrals, such as ``("velocity", "voltage", "integral(velocity)")`` with the displacement; see Notes.
         frequency : float
             Of the forcing [Hz].
         origin : float
@@ -162,8 +160,8 @@ class PoincareSection(Result):
         Raises
         ------
         ValueError
-            For an unknown coordinate, too few samples or periods, an angle that does not seem to be in radians, or
-            delays of one channel that are too close modulo a period.
+            For an unknown coordinate, too few samples or periods, an angle that does not seem to be in radians,
+            delays of one channel that are too close modulo a period, or an integral whose drift is not determined.
 
         Notes
         -----
@@ -172,6 +170,12 @@ class PoincareSection(Result):
         no longer than the time between them, and delays of one channel must not be closer, modulo a period (with
         `steps` of `find_orbits`, modulo a step), than the 8 samples of the smallest window. For noise with a longer
         memory, standard deviations are too small.
+
+        *Integrals* have a line in time in each stretch that is not known. Where the other coordinates and the integral
+        minus its mean over one forcing period determine the state, the integral is a function of them, and the lines
+        follow from all stretches together. Their errors, and those of a faster drift, are estimated and are part of
+        `noise`; above a tenth of the standard deviation they are refused. Stretches below 10 forcing periods are left
+        out, those above 30, or a 200th of the recording, are divided, and spikes are not integrated.
         """
         if not isinstance(recording, Recording):
             raise ValueError(
@@ -241,8 +245,8 @@ class PoincareSection(Result):
             )
         delays = delays_of(names)
         longest, reach = longest_window(names, samples.sampling_rate / frequency), (delays.min(), delays.max())
-        summed, drifts = any(integrand_of(name) for name in channels_of(names)), dict[str, float]()
-        if summed:
+        drifts: dict[str, float] = {}
+        if summed := any(map(integrand_of, channels_of(names))):
             samples = in_parts(samples, 1.0 / frequency)
             reach = (min(reach[0], -HALF_WINDOW), max(reach[1], HALF_WINDOW))
         instants, stretch, left_out = samples.instants(frequency, origin, reach)
@@ -252,8 +256,7 @@ class PoincareSection(Result):
         synthetic = any(recording.synthetic for recording in given)
         section = cls._of(
             samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency, longest,
-            drifts=drifts,
-        )  # fmt: skip
+            drifts=drifts)  # fmt: skip
         extent = np.array([np.ptp(signal) for signal in samples.signals.T])[columns_of(names)]
         if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * extent):
             raise ValueError(
