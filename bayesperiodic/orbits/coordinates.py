@@ -7,6 +7,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic.data.recording import Recording
+from bayesperiodic.orbits.integrals import HALF_WINDOW, LARGEST_DRIFT, PHASES, View, high_passed, integrated, lines_of
 from bayesperiodic.orbits.stretches import LONGEST_USUAL_STEP, SMALLEST_WINDOW, Stretches, smoothed, usual_step
 
 DEGREES = 180.0 / np.pi
@@ -15,12 +16,25 @@ SHORT_RETURN = 0.01
 # A delayed coordinate: a channel, and in brackets the time after the instant of the section, in forcing periods or, for
 # crossings, in seconds, with the unit s.
 DELAYED = re.compile(r"(.*)\[([^\[\]]*?)( ?s)?\]", re.DOTALL)
+# The integral of a channel over time.
+INTEGRATED = re.compile(r"integral\((.*)\)", re.DOTALL)
 
 
 def channel_and_delay(coordinate: str) -> tuple[str, float]:
     """Return the channel of a coordinate and its delay, in forcing periods or in seconds, as its section has it."""
     match = DELAYED.fullmatch(coordinate)
     return (match[1], float(match[2])) if match else (coordinate, 0.0)
+
+
+def integrand_of(channel: str) -> str | None:
+    """Return the channel of which this one is the integral, or None."""
+    match = INTEGRATED.fullmatch(channel)
+    return match[1] if match else None
+
+
+def is_output(coordinate: str) -> bool:
+    """Return whether a coordinate is neither delayed nor an integral."""
+    return not (DELAYED.fullmatch(coordinate) or INTEGRATED.fullmatch(coordinate))
 
 
 def channels_of(coordinates: Sequence[str]) -> tuple[str, ...]:
@@ -78,11 +92,12 @@ def longest_window_of_crossings(names: Sequence[str], channel: str, rate: float,
 
 
 def coordinate_values(
-    samples: Stretches, names: Sequence[str], instants: np.ndarray, stretch: np.ndarray, unit: float, longest: float
-) -> tuple[np.ndarray, np.ndarray | None]:
+    samples: Stretches, names: Sequence[str], instants: np.ndarray, stretch: np.ndarray, unit: float, longest: float,
+    drifts: Mapping[str, float],
+) -> tuple[np.ndarray, np.ndarray | None]:  # fmt: skip
     """Return the coordinates (instants, d) at given instants, and the standard deviation (d,) of their errors.
 
-    The unit of delays and the longest window are in seconds.
+    The unit of delays and the longest window are in seconds. `drifts` are the errors of integrated channels.
     """
     values, noise = np.empty((instants.size, len(names))), np.empty(len(names))
     delays, columns = delays_of(names), columns_of(names)
@@ -92,7 +107,40 @@ def coordinate_values(
         part = samples._replace(signals=samples.signals[:, columns[here]])
         at = np.clip(instants + delay * unit, first, last)
         values[:, here], noise[here] = smoothed(part, at, stretch, longest)
+    noise = np.hypot(noise, [drifts.get(channel_and_delay(name)[0], 0.0) for name in names])
     return values, None if np.isnan(noise).any() else noise
+
+
+def with_integrals(
+    samples: Stretches, names: Sequence[str], origin: float, frequency: float, longest: float
+) -> tuple[Stretches, dict[str, float]]:
+    """Return samples with the integrals of channels in their columns, and the standard deviations of their errors."""
+    channels, period = channels_of(names), 1.0 / frequency
+    columns = {name: k for k, name in enumerate(channels) if integrand_of(name)}
+    measured = [name for name in names if channel_and_delay(name)[0] not in columns]
+    summed = [channel_and_delay(name) for name in names if name not in measured]
+    of_sums = [delay for _, delay in summed]
+    delays = np.array([0.0, *delays_of(measured), *np.add.outer(of_sums, [-HALF_WINDOW, HALF_WINDOW]).ravel()])
+    part = samples._replace(signals=samples.signals[:, [channels.index(name) for name in channels_of(measured)]])
+    views: dict[str, list[View]] = {name: [] for name in columns}
+    for phase in range(PHASES):
+        at, stretch, _ = samples.instants(frequency, origin + phase * period / PHASES, (delays.min(), delays.max()))
+        known = [high_passed(samples, columns[name], at + d * period, stretch, period)[1] for name, d in summed]
+        if measured:
+            known += [*coordinate_values(part, measured, at, stretch, period, longest, {})[0].T]
+        for name, k in columns.items():
+            whole = high_passed(samples, k, at, stretch, period)[0]
+            views[name].append(View(at, stretch, whole, np.stack(known, axis=1)))
+    lines = {name: lines_of(samples, k, views[name]) for name, k in columns.items()}
+    for name, k in columns.items():
+        samples = integrated(samples, k, lines[name])
+        error = lines[name].sd / float(np.std(samples.signals[:, k]))
+        if not error < LARGEST_DRIFT:
+            raise ValueError(
+                f"coordinates: must determine the drift of {name!r}, got errors of {error:.0%} of the standard "
+                "deviation. Add a delayed coordinate, or record with less drift and noise or in longer pieces."
+            )
+    return samples, {name: one.sd for name, one in lines.items()}
 
 
 def coordinate_names(
@@ -105,7 +153,7 @@ def coordinate_names(
     for name in given:
         match = DELAYED.fullmatch(name) if isinstance(name, str) else None
         if match is None:
-            names.append(name)
+            names.append(name if not isinstance(name, str) else integrand_of(name) or name)
             continue
         try:
             _checks.finite_number("delay", float(match[2] if (match[3] is None) == forced else ""))
@@ -114,7 +162,7 @@ def coordinate_names(
                 f"coordinates: must have a number in brackets, the delay in {unit}, such as "
                 f"{match[1] + f'[{example}]'!r}, got {name!r}."
             ) from None
-        names.append(match[1])
+        names.append(integrand_of(match[1]) or match[1])
         delayed.add(match[1])
     _checks.identifiers("coordinates", dict.fromkeys(names))
     if len(names) < (2 if forced else 1):
@@ -126,6 +174,10 @@ def coordinate_names(
         _checks.one_of("angles", name, given)
     if len(angle_names) > 1:
         raise ValueError(f"angles: must name at most one coordinate, got {angle_names!r}.")
+    if not forced and any(integrand_of(channel_and_delay(name)[0]) for name in given):
+        raise ValueError(f"coordinates: must have no integrals for crossings, got {given!r}. Use delayed coordinates.")
+    if any(integrand_of(channel_and_delay(name)[0]) in angle_names for name in given):
+        raise ValueError(f"coordinates: must have no integral of an angle, got {given!r}. Integrate another channel.")
     if any(channel_and_delay(name)[0] in delayed for name in angle_names):
         raise ValueError(f"coordinates: must have no delays of an angle, got {given!r}. Delay another channel.")
     return tuple(given), angle_names
@@ -137,14 +189,15 @@ def coordinate_signals(
     """Return the names of the coordinates and of their angles, and values (samples, channels), angles unwrapped."""
     names, angle_names = coordinate_names(coordinates, angles, forced=forced)
     channels = channels_of(names)
-    for name in channels:
+    measured = [integrand_of(name) or name for name in channels]
+    for name in measured:
         _checks.one_of("coordinates", name, recording.outputs)
     if isinstance(recording.time, Mapping):
         raise ValueError(
             f"recording: must have the same times for all channels, got {recording!r}; leave other channels out, or "
             "record the coordinates together."
         )
-    signals = np.stack([recording.outputs[name] for name in channels], -1)
+    signals = np.stack([recording.outputs[name] for name in measured], -1)
     for name in angle_names:
         k = channels.index(name)
         _check_angle(name, signals[:, k])

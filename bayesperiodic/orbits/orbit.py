@@ -12,7 +12,7 @@ import numpy as np
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic.data.experiment import DATA, Experiment
-from bayesperiodic.orbits.coordinates import channel_and_delay, channels_of
+from bayesperiodic.orbits.coordinates import channels_of, integrand_of, is_output
 from bayesperiodic.orbits.waveform import INDEPENDENT, Waveform
 from bayesperiodic.periodic.solution import PeriodicSolution
 
@@ -152,11 +152,12 @@ class Orbit(Result):
 
     @property
     def _undelayed(self) -> tuple[list[str], np.ndarray]:
-        """The coordinates without delay, and whether each coordinate is one of them (d,)."""
-        present = np.array([name == channel_and_delay(name)[0] for name in self.coordinates])
+        """The coordinates that are outputs, without delay, and whether each coordinate is one of them (d,)."""
+        present = np.array([is_output(name) for name in self.coordinates])
         if not present.any():
             raise ValueError(
-                f"coordinates: must have one without delay, got {self.coordinates}. Add one to those of the section."
+                f"coordinates: must have an output without delay, got {self.coordinates}. Add one to the section's, or "
+                "compare whole waveforms."
             )
         return [name for name, kept in zip(self.coordinates, present, strict=True) if kept], present
 
@@ -173,7 +174,7 @@ class Orbit(Result):
 
         Their covariance is known up to one factor, the noise parameter "scale", common to all orbits of a problem. The
         inputs are those of the waveform, taken as exact. Delayed coordinates are left out, because all outputs of an
-        experiment are compared at the same tau.
+        experiment are compared at the same tau, and so are integrals, which are no outputs.
 
         For a section by crossings give ``whole=True``: the experiment, of an autonomous model, is the waveform over the
         orbit's own period. The frequency 1/`duration` with its standard error is data too; its covariance with the
@@ -208,9 +209,9 @@ class Orbit(Result):
         Raises
         ------
         ValueError
-            If all coordinates are delayed, if the orbit is not polished and `states` or the winding are not known, if
-            `whole` or `states` are given and there is neither waveform nor measured cycle, for the whole waveform
-            together with `multipliers`, or if `samples` is not a multiple of the phases compared.
+            If all coordinates are delayed or integrals, if the orbit is not polished and `states` or the winding are
+            not known, if `whole` or `states` are given and there is neither waveform nor measured cycle, for the whole
+            waveform together with `multipliers`, or if `samples` is not a multiple of the phases compared.
 
         Warns
         -----
@@ -426,7 +427,7 @@ def _measured_cycle(orbit: Orbit, samples: int) -> Mapping[str, np.ndarray]:
     measured = len(next(iter(orbit.cycle.values()))) // orbit.period
     if samples % measured:
         raise ValueError(f"samples: must be a multiple of the cycle's {measured} a forcing period, got {samples}.")
-    return orbit.cycle
+    return {name: values for name, values in orbit.cycle.items() if not integrand_of(name)}
 
 
 def _guess(

@@ -9,7 +9,7 @@ import numpy as np
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.models.model import Model
-from bayesperiodic.orbits.coordinates import channel_and_delay, wrapped
+from bayesperiodic.orbits.coordinates import is_output, wrapped
 from bayesperiodic.orbits.cycles import shift_between
 from bayesperiodic.orbits.orbit import TURN, Orbit, Orbits, counted_turns, resampled_cycle
 from bayesperiodic.orbits.waveform import mean_of_repeats
@@ -147,9 +147,9 @@ class _Polisher:
         for orbit in orbits:
             if orbit.return_times is not None:
                 raise ValueError(f"orbits: must be of a section with a forcing, got {orbit.name!r} between crossings.")
-            if any(channel_and_delay(name)[0] != name for name in orbit.coordinates):
+            if not all(map(is_output, orbit.coordinates)):
                 raise ValueError(
-                    f"orbits: must be of a section without delayed coordinates, got {orbit.coordinates}. Use the "
+                    f"orbits: must be of a section without delays and integrals, got {orbit.coordinates}. Use the "
                     "experiments of the orbits, orbit.experiment(states=…), in a Problem."
                 )
             for name in orbit.coordinates:

@@ -1,7 +1,7 @@
 """PoincareSection: points of a motion, once a forcing period or where it crosses a plane."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,20 +19,18 @@ from bayesperiodic.orbits.coordinates import (
     coordinate_values,
     delays_of,
     given_recordings,
+    integrand_of,
     longest_window,
     longest_window_of_crossings,
     other_channels,
     unwrapped,
+    with_integrals,
     with_others,
     wrapped,
 )
 from bayesperiodic.orbits.crossings import Crossings, refined, upward_crossings
-from bayesperiodic.orbits.stretches import (
-    FEWEST_SAMPLES,
-    Stretches,
-    joined,
-    local_fit,
-)
+from bayesperiodic.orbits.integrals import HALF_WINDOW, in_parts
+from bayesperiodic.orbits.stretches import FEWEST_SAMPLES, Stretches, joined, local_fit
 
 FEWEST_POINTS, CYCLE_SAMPLES = 200, 64
 # Points coincide if their standard deviations are below this many of the noise, or this fraction of the motion's range.
@@ -50,7 +48,8 @@ class PoincareSection(Result):
     coordinates, angles : tuple of str
         The coordinates, and those of them that are angles, one at most. A delayed one is a channel and, in brackets,
         the forcing periods after the phase of the section: ``"voltage[-0.25]"`` is the voltage a quarter period before.
-        For crossings the delay is in seconds: ``"voltage[-0.1 s]"``.
+        For crossings the delay is in seconds: ``"voltage[-0.1 s]"``. ``"integral(velocity)"`` is the integral of a
+        channel over time, of mean zero.
     frequency : float
         Forcing frequency [Hz]; for crossings of a plane, returns per second.
     increments : array (count − 1, d)
@@ -84,6 +83,8 @@ class PoincareSection(Result):
     noises : array (count, d) or None
         Standard deviation of each point's errors, for crossings, of which the instants have errors; `noise` is their
         root mean square.
+    drifts : mapping of str to float
+        Standard deviation of the errors of each integral, which are part of `noise`. They change slowly.
 
     Examples
     --------
@@ -117,6 +118,7 @@ class PoincareSection(Result):
     inputs: tuple[str, ...] = ()
     crossed: str | None = None
     noises: np.ndarray | None = None
+    drifts: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def from_recording(
@@ -142,8 +144,8 @@ class PoincareSection(Result):
         coordinates : sequence of str
             Two or more outputs that determine the next point, as many as the system has states, or more, such as
             ``("angle", "rate")``. What is not measured is replaced by delayed coordinates, such as
-            ``("velocity", "voltage", "voltage[-0.25]")`` with the voltage a quarter of the forcing period before; see
-            Notes.
+            ``("velocity", "voltage", "voltage[-0.25]")`` with the voltage a quarter of the forcing period before, or
+            by integrals, such as ``("velocity", "voltage", "integral(velocity)")`` with the displacement; see Notes.
         frequency : float
             Of the forcing [Hz].
         origin : float
@@ -158,8 +160,8 @@ class PoincareSection(Result):
         Raises
         ------
         ValueError
-            For an unknown coordinate, too few samples or periods, an angle that does not seem to be in radians, or
-            delays of one channel that are too close modulo a period.
+            For an unknown coordinate, too few samples or periods, an angle that does not seem to be in radians,
+            delays of one channel that are too close modulo a period, or an integral whose drift is not determined.
 
         Notes
         -----
@@ -168,6 +170,12 @@ class PoincareSection(Result):
         no longer than the time between them, and delays of one channel must not be closer, modulo a period (with
         `steps` of `find_orbits`, modulo a step), than the 8 samples of the smallest window. For noise with a longer
         memory, standard deviations are too small.
+
+        *Integrals* have a line in time in each stretch that is not known. Where the other coordinates and the integral
+        minus its mean over one forcing period determine the state, the integral is a function of them, and the lines
+        follow from all stretches together. Their errors, and those of a faster drift, are estimated and are part of
+        `noise`; above a tenth of the standard deviation they are refused. Stretches below 10 forcing periods are left
+        out, those above 30, or a 200th of the recording, are divided, and spikes are not integrated.
         """
         if not isinstance(recording, Recording):
             raise ValueError(
@@ -236,13 +244,19 @@ class PoincareSection(Result):
                 "a period, use from_points."
             )
         delays = delays_of(names)
-        longest = longest_window(names, samples.sampling_rate / frequency)
-        instants, stretch, left_out = samples.instants(frequency, origin, (delays.min(), delays.max()))
+        longest, reach = longest_window(names, samples.sampling_rate / frequency), (delays.min(), delays.max())
+        drifts: dict[str, float] = {}
+        if summed := any(map(integrand_of, channels_of(names))):
+            samples = in_parts(samples, 1.0 / frequency)
+            reach = (min(reach[0], -HALF_WINDOW), max(reach[1], HALF_WINDOW))
+        instants, stretch, left_out = samples.instants(frequency, origin, reach)
+        longest *= float(np.median(np.diff(instants)))
+        if summed:
+            samples, drifts = with_integrals(samples, names, origin, frequency, longest)
         synthetic = any(recording.synthetic for recording in given)
         section = cls._of(
-            samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency,
-            longest * float(np.median(np.diff(instants))),
-        )  # fmt: skip
+            samples, names, angle_names, instants, stretch, left_out, synthetic, others, inputs, frequency, longest,
+            drifts=drifts)  # fmt: skip
         extent = np.array([np.ptp(signal) for signal in samples.signals.T])[columns_of(names)]
         if np.all(np.ptp(np.nancumsum(section.increments, axis=0), axis=0) < 1e-2 * extent):
             raise ValueError(
@@ -404,18 +418,19 @@ class PoincareSection(Result):
     def _of(
         cls, samples: Stretches, names: tuple[str, ...], angles: tuple[str, ...], instants: np.ndarray,
         stretch: np.ndarray, left_out: int, synthetic: bool, others: tuple[str, ...], inputs: tuple[str, ...],
-        frequency: float, longest: float, crossed: str | None = None,
+        frequency: float, longest: float, crossed: str | None = None, drifts: Mapping[str, float] | None = None,
     ) -> "PoincareSection":  # fmt: skip
         """Return the section of signals at given instants, in windows no longer than `longest`."""
         _check_count(instants.size)
         time, unit = samples.time, 1.0 if crossed else 1.0 / frequency
-        values, noise = coordinate_values(samples, names, instants, stretch, unit, longest)
+        drifts = drifts or {}
+        values, noise = coordinate_values(samples, names, instants, stretch, unit, longest, drifts)
         points, increments = wrapped(values, np.isin(names, angles)), _within(np.diff(values, axis=0), stretch)
         broken = samples.starts.size > 1
         return cls(
             points, names, angles, frequency, increments, True, noise, instants, time, samples.signals,
             time.size * len(channels_of(names)), synthetic, stretch if broken else None,
-            samples.starts if broken else None, left_out, others, inputs, crossed,
+            samples.starts if broken else None, left_out, others, inputs, crossed, drifts=drifts,
         )  # fmt: skip
 
     def _with_errors_of(self, crossings: Crossings, error: float) -> "PoincareSection":
@@ -424,7 +439,7 @@ class PoincareSection(Result):
         samples, instants, stretch = self.measured
         apart = float(np.median(crossings.band / crossings.slopes))
         before, later = (
-            coordinate_values(samples, self.coordinates, instants + away, stretch, self.unit, 2.0 * apart)[0]
+            coordinate_values(samples, self.coordinates, instants + away, stretch, self.unit, 2.0 * apart, {})[0]
             for away in (-apart, apart)
         )
         noises = np.hypot(self.noise, error * (later - before) / (2.0 * apart * crossings.slopes[:, None]))
@@ -518,7 +533,7 @@ class PoincareSection(Result):
         each = np.broadcast_to(stretch[:, None], present.shape)[present]
         names = self.coordinates
         longest = longest_window(names, samples.sampling_rate / self.frequency, steps) * float(np.median(after)) / steps
-        values, noise = coordinate_values(samples, names, instants[present], each, self.unit, longest)
+        values, noise = coordinate_values(samples, names, instants[present], each, self.unit, longest, self.drifts)
         if noise is None:
             raise ValueError(f"steps: must be 1 for stretches too short to determine the noise, got {steps}.")
         signals = np.full((present.size, len(names)), np.nan)

@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Storable
-from bayesperiodic.orbits.coordinates import SHORT_RETURN, columns_of
+from bayesperiodic.orbits.coordinates import SHORT_RETURN, columns_of, integrand_of
 from bayesperiodic.orbits.cycles import REFINING_DEGREE, VALUE_GROWTH, WIDENED, Estimate, errors_by_run
 from bayesperiodic.orbits.return_map import ReturnMap
 from bayesperiodic.orbits.return_times import ReturnTimes
@@ -84,8 +84,8 @@ class Waveform(Storable):
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """The channels that are outputs."""
-        return tuple(name for name in self.values if name not in self.inputs)
+        """The channels that are outputs, without integrals of them."""
+        return tuple(name for name in self.values if name not in self.inputs and not integrand_of(name))
 
     @property
     def sd(self) -> dict[str, np.ndarray]:

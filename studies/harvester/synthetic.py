@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from scipy.integrate import odeint
+from scipy.interpolate import CubicSpline
 from scipy.stats import binom, chi2, norm
 
 import bayesperiodic as bp
@@ -33,8 +34,12 @@ AMPLITUDE = 4.6  # m/s²
 # Pieces, their periods, periods between them, of the long simulation, and at its start, which are left out.
 PIECES, LENGTH, PAUSE, LONG, SETTLING = 120, 26, 4, 10_000, 200
 RATE = 2048.0  # Hz
-# Coordinates of the sections, as many as states, and local maps a period.
-COORDINATES, STEPS = ("voltage", "voltage[-0.4]", "voltage[-0.8]"), 3
+# Coordinates of the sections, as many as states, of which the integral is nearly the displacement; others to compare
+# with; and local maps a period.
+COORDINATES, STEPS = ("voltage", "integral(voltage)[-0.3]", "integral(voltage)"), 3
+DELAYED = ("voltage", "voltage[-0.4]", "voltage[-0.8]")
+# Recordings that are searched, each with its seed.
+SEARCHED = 3
 NOISE = {"velocity": 0.02, "voltage": 2e-6, "drive": 2e-3}
 # True orbits: periods, largest multiplier, and fewest close returns in the recording, all points of which are within
 # this distance of the orbit, in ranges of the states.
@@ -45,8 +50,8 @@ POINTS = 64
 # An orbit is found if all coordinates of its points are within this distance, in ranges of the coordinates; half width
 # of 90 % error bars in standard deviations, and the probability of the band of the number that they cover.
 TOLERANCE, HALF_WIDTH, BAND = 0.02, 1.6448536, 0.99
-# Of the estimates: recordings, grid points a period, largest error of a waveform as a fraction of it; standard deviation
-# of the logarithms of the priors' medians about the truth, that of the priors, and probabilities of the intervals.
+# Of the estimates: recordings, grid points a period, largest error of a waveform as a fraction of it; standard
+# deviation of the logarithms of the priors' medians about the truth, that of the priors, and the intervals' levels.
 RECORDINGS, SAMPLES, LARGEST_ERROR, MISTAKE, SPREAD, LEVELS = 16, 128, 0.05, 0.18, 0.3, (0.5, 0.9)
 # Guesses nearer to each other, and orbits nearer to each other than this are the same.
 ALIKE, SAME = 0.02, 1e-5
@@ -100,8 +105,16 @@ def flow(start: float, end: float, state: np.ndarray) -> tuple[np.ndarray, np.nd
     return end_values[:3], end_values[3:].reshape(3, 3)
 
 
+def first_whole(time: float) -> int:
+    """Return the number of the first drive period that starts at this time [s] or later."""
+    return int(np.ceil(time * FREQUENCY - 1e-9))
+
+
 def recordings(seed: int) -> tuple[list[bp.Recording], np.ndarray]:
-    """Return the pieces with noise, and the true states at whole periods of the drive, (pieces, periods, 3)."""
+    """Return the pieces with noise, and the true states at whole periods of the drive, (pieces, periods, 3).
+
+    The states are those of the same run: another run from the same start, with other steps, diverges from it.
+    """
     time, states = states_of(PIECES * (LENGTH + PAUSE), RATE, seed)
     drive = AMPLITUDE * np.cos(2.0 * np.pi * FREQUENCY * time)
     generator = np.random.default_rng([seed, 1])
@@ -112,7 +125,8 @@ def recordings(seed: int) -> tuple[list[bp.Recording], np.ndarray]:
         inside = (time >= time[0] + first / FREQUENCY) & (time < time[0] + (first + LENGTH) / FREQUENCY)
         outputs = {name: noisy[name][inside] for name in ("velocity", "voltage")}
         pieces.append(bp.Recording(time[inside], outputs, {"drive": noisy["drive"][inside]}, synthetic=True))
-    every = states_of(PIECES * (LENGTH + PAUSE), FREQUENCY, seed)[1][: PIECES * (LENGTH + PAUSE)]
+    whole = first_whole(time[0]) + np.arange(PIECES * (LENGTH + PAUSE))
+    every = CubicSpline(time, states)(np.minimum(whole / FREQUENCY, time[-1]))
     return pieces, every.reshape(PIECES, LENGTH + PAUSE, 3)[:, :LENGTH]
 
 
@@ -163,18 +177,33 @@ def close_returns(orbit: TrueOrbit, states: np.ndarray, size: np.ndarray) -> int
     return count
 
 
-def voltage_of(orbit: TrueOrbit, at: np.ndarray) -> np.ndarray:
-    """Return the voltage of an orbit at times in drive periods, by the Fourier series of its points."""
+def states_at(orbit: TrueOrbit, at: np.ndarray) -> np.ndarray:
+    """Return the states (…, 3) of an orbit at times in drive periods, by the Fourier series of its points."""
     course = []
     for k, state in enumerate(orbit.states):
         here = state
         for j in range(POINTS):
-            course.append(here[2])
+            course.append(here)
             here = flow(k + j / POINTS, k + (j + 1) / POINTS, here)[0]
-    amplitudes = np.fft.rfft(course) / len(course)
+    amplitudes = np.fft.rfft(course, axis=0) / len(course)
     amplitudes[1:] *= 2.0
-    turns = 2j * np.pi * np.arange(amplitudes.size) / orbit.period
+    turns = 2j * np.pi * np.arange(len(amplitudes)) / orbit.period
     return (np.exp(np.multiply.outer(at, turns)) @ amplitudes).real
+
+
+def integral_of_voltage(states: np.ndarray) -> np.ndarray:
+    """Return the integral of the voltage over time (…,) but for a constant, by the second equation."""
+    return (TRUTH["coupling"] * states[..., 0] - states[..., 2]) / TRUTH["decay"]
+
+
+def constant_of(section: bp.PoincareSection, states: np.ndarray, first: int) -> float:
+    """Return the constant of the integral of the voltage in a section, from the true states after `first` periods."""
+    if COORDINATES[-1] not in section.coordinates:
+        return 0.0
+    assert section.instants is not None
+    number = np.round(section.instants * FREQUENCY - first).astype(int)
+    true = integral_of_voltage(states)[number // (LENGTH + PAUSE), number % (LENGTH + PAUSE)]
+    return float(np.mean(section.points[:, section.coordinates.index(COORDINATES[-1])] - true))
 
 
 def counted_orbits(states: np.ndarray) -> list[tuple[TrueOrbit, int]]:
@@ -184,14 +213,18 @@ def counted_orbits(states: np.ndarray) -> list[tuple[TrueOrbit, int]]:
     return [(o, count) for o, count in every if abs(o.multipliers[0]) < LARGEST and count >= FEWEST]
 
 
-def points_of(orbit: TrueOrbit, coordinates: Sequence[str]) -> np.ndarray:
-    """Return the points (period, d) of an orbit in the voltage and delayed ones, at phase zero."""
-    delays = [float(name.partition("[")[2].rstrip("]") or 0.0) for name in coordinates]
-    return voltage_of(orbit, np.arange(orbit.period)[:, None] + np.array(delays))
+def points_of(orbit: TrueOrbit, coordinates: Sequence[str], constant: float) -> np.ndarray:
+    """Return the points (period, d) of an orbit at phase zero in coordinates, with the constant of the integral."""
+    columns = []
+    for name in coordinates:
+        channel, _, delay = name.partition("[")
+        states = states_at(orbit, np.arange(orbit.period) + float(delay.rstrip("]") or 0.0))
+        columns.append(states[:, 2] if channel == "voltage" else integral_of_voltage(states) + constant)
+    return np.stack(columns, axis=1)
 
 
 def compared(
-    true: list[tuple[TrueOrbit, int]], orbits: bp.Orbits, sections: list[bp.PoincareSection]
+    true: list[tuple[TrueOrbit, int]], orbits: bp.Orbits, sections: list[bp.PoincareSection], constant: float
 ) -> list[dict[str, Any]]:
     """Return a row for each true orbit: whether it is found, and how many of its points are within their error bars."""
     rows, size = [], np.ptp(sections[0].points, axis=0)
@@ -199,7 +232,7 @@ def compared(
         row: dict[str, Any] = {
             "period": orbit.period, "multiplier": float(orbit.multipliers[0].real), "returns": returns, "found": False
         }  # fmt: skip
-        points, closest = points_of(orbit, sections[0].coordinates), TOLERANCE
+        points, closest = points_of(orbit, sections[0].coordinates, constant), TOLERANCE
         for one in orbits:
             for k in range(orbit.period if one.period == orbit.period else 0):
                 away = np.roll(points, -k, axis=0) - one.points
@@ -218,7 +251,7 @@ def compared(
 def estimate(phases: int, seed: int, *, quick: bool) -> dict[str, Any]:
     """Return the estimate from the orbits of one recording, with priors whose medians are off at random."""
     pieces, _ = recordings(seed)
-    orbits = bp.find_orbits(sections_of(pieces, phases), periods=PERIODS[: 2 if quick else 3], steps=STEPS)
+    orbits = bp.find_orbits(sections_of(pieces, DELAYED, phases), periods=PERIODS[: 2 if quick else 3], steps=STEPS)
     used = [orbit for orbit in orbits if error_of(orbit) < LARGEST_ERROR]
     generator = np.random.default_rng([seed, 2])
     priors = {n: bp.LogNormal(v * np.exp(MISTAKE * generator.standard_normal()), SPREAD) for n, v in TRUTH.items()}
@@ -269,36 +302,52 @@ def coverage_table(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def sections_of(pieces: list[bp.Recording], phases: int) -> list[bp.PoincareSection]:
+def sections_of(pieces: list[bp.Recording], coordinates: tuple[str, ...], phases: int) -> list[bp.PoincareSection]:
     """Return the sections at several phases of the drive."""
     return [
-        bp.PoincareSection.from_recordings(pieces, COORDINATES, frequency=FREQUENCY, origin=k / (phases * FREQUENCY))
+        bp.PoincareSection.from_recordings(pieces, coordinates, frequency=FREQUENCY, origin=k / (phases * FREQUENCY))
         for k in range(phases)
     ]
 
 
 def campaign(phases: int, seed: int, *, quick: bool) -> dict[str, Any]:
-    """Return what a search finds of the orbits of the flow, and how many true values the error bars contain."""
-    pieces, states = recordings(seed)
-    sections = sections_of(pieces, phases)
-    wanted = PERIODS[:2] if quick else PERIODS
-    orbits = bp.find_orbits(sections, periods=wanted, steps=STEPS)
-    rows = compared([pair for pair in counted_orbits(states) if pair[0].period in wanted], orbits, sections)
-    there = [row for row in rows if row["found"]]
-    result: dict[str, Any] = {"truth": TRUTH, "orbits": rows, "all_found": len(orbits), "found": len(there)}
-    for name, of in (("covered", "points"), ("values_covered", "values")):
-        count = sum(row[of] for row in there)
-        result[name] = {
-            "count": sum(row[name] for row in there), "of": count,
-            "band": [int(end) for end in binom.interval(BAND, count, 0.9)],
-        }  # fmt: skip
+    """Return what searches find of the orbits of the flow, and how many true values the error bars contain."""
+    result: dict[str, Any] = {"truth": TRUTH}
+    given = [recordings(seed + k) for k in range(1 if quick else SEARCHED)]
+    for name, coordinates in (("integrated", COORDINATES), ("delayed", DELAYED)):
+        each = [_searched(*one, coordinates, phases, PERIODS[:2] if quick else PERIODS) for one in given]
+        rows = [row for one in each for row in one["orbits"]]
+        there = [row for row in rows if row["found"]]
+        result[name] = {"coordinates": coordinates, "recordings": each, "found": len(there), "of": len(rows)}
+        for kind, of in (("covered", "points"), ("values_covered", "values")):
+            count = sum(row[of] for row in there)
+            result[name][kind] = {
+                "count": sum(row[kind] for row in there), "of": count,
+                "band": [int(end) for end in binom.interval(BAND, count, 0.9)],
+            }  # fmt: skip
     return result
+
+
+def _searched(
+    pieces: list[bp.Recording], states: np.ndarray, coordinates: tuple[str, ...], phases: int, wanted: Sequence[int]
+) -> dict[str, Any]:
+    """Return the rows of the orbits of one recording, and the number of all orbits that a search returns."""
+    sections = sections_of(pieces, coordinates, phases)
+    orbits = bp.find_orbits(sections, periods=wanted, steps=STEPS)
+    true = [pair for pair in counted_orbits(states) if pair[0].period in wanted]
+    rows = compared(true, orbits, sections, constant_of(sections[0], states, first_whole(pieces[0].time[0])))
+    return {"orbits": rows, "found": sum(row["found"] for row in rows), "all_found": len(orbits)}
 
 
 def table(results: dict[str, Any]) -> str:
     """Return the rows of the orbits, and the numbers found and covered, as text."""
-    lines = [pd.DataFrame(results["orbits"]).to_string(float_format="{:.4g}".format, na_rep="-")]
-    lines.append(f"{results['found']} of {len(results['orbits'])} orbits are found")
-    for name in ("covered", "values_covered"):
-        lines.append(f"{name}: {results[name]['count']} of {results[name]['of']}, 99 % band {results[name]['band']}")
+    lines = []
+    for name in ("integrated", "delayed"):
+        part = results[name]
+        lines.append(f"{name}: {', '.join(part['coordinates'])}")
+        for one in part["recordings"]:
+            lines.append(pd.DataFrame(one["orbits"]).to_string(float_format="{:.4g}".format, na_rep="-"))
+        lines.append(f"{part['found']} of {part['of']} orbits are found")
+        for kind in ("covered", "values_covered"):
+            lines.append(f"{kind}: {part[kind]['count']} of {part[kind]['of']}, 99 % band {part[kind]['band']}")
     return "\n".join(lines)

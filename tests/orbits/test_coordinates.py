@@ -287,7 +287,7 @@ def test_experiments_leave_delayed_coordinates_out():
     np.testing.assert_array_equal(experiment.outputs["v"][experiment.mask], orbit.points[:, 0])
     kept = [0, 2, 3, 5]
     np.testing.assert_array_equal(experiment.covariance, orbit.covariance[np.ix_(kept, kept)])
-    with pytest.raises(ValueError, match="orbits: must be of a section without delayed coordinates"):
+    with pytest.raises(ValueError, match="orbits: must be of a section without delays and integrals"):
         bp.polish_orbits(bp.models.pendulum, [orbit], dict.fromkeys(bp.models.pendulum.parameters, 1.0))
 
 
