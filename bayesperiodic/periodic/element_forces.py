@@ -82,10 +82,10 @@ class Preconditioner:
     def _factors(self) -> tuple[np.ndarray, np.ndarray]:
         return factors(self.matrix)
 
-    @property
-    def inverse(self) -> np.ndarray:
-        """Inverse for the low harmonics, real parts of harmonics and elements before the imaginary ones."""
-        return np.linalg.inv(self.matrix)
+    @cached_property
+    def transposed_inverse(self) -> np.ndarray:
+        """Transposed inverse for the low harmonics, real parts of harmonics and elements before the imaginary ones."""
+        return np.ascontiguousarray(np.linalg.inv(self.matrix).T)
 
     @staticmethod
     def strongly_coupled(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> int:
@@ -155,7 +155,7 @@ def _of_units(memory: Memory, rates: np.ndarray, low: int) -> list[np.ndarray]:
 
 
 def newton_step(
-    forces: Forces, rates: np.ndarray, d_f: np.ndarray, residual: np.ndarray, known: Preconditioner | None = None
+    forces: Forces, rates: np.ndarray, d_f: np.ndarray, residual: np.ndarray, known: Preconditioner
 ) -> tuple[np.ndarray, Preconditioner]:
     """Return Newton's step, and its preconditioner; with internal states the step is corrected.
 
@@ -163,9 +163,8 @@ def newton_step(
     small with it.
     """
     if forces.memory is None:
-        inverse = Preconditioner(forces, rates, d_f)
-        return inverse(residual), inverse
-    if known is not None and known.low <= len(rates):
+        return known(residual), known
+    if known.low <= len(rates):
         step = _swept(known, forces, rates, d_f, residual, MOST_STEP_SWEEPS, LAST_STEP_SWEEP)
         if step is not None:
             return step, known
