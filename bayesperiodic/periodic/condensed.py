@@ -53,6 +53,9 @@ LINEAR_MODES = 16
 # Points up to which a solve that fails is repeated, and their ratio.
 MOST_STARTING_POINTS, STARTING_RATIO = 512, 4
 MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40, 9, 1e-10, 1e-13
+# Residual of rounding errors, in units of its largest term, with internal states; those of an element that sticks hardly
+# forget, and errors add up over the periods that they remember.
+ROUNDING_OF_MEMORY = 1e-8
 # Residual, in units of its largest term, below which corrections with a fixed matrix are tried before Newton's step.
 NEAR_SOLUTION = 0.1
 # Steps of the load along the branch, in units of the load and of the linear response; corrections, their largest ratio,
@@ -309,7 +312,8 @@ class CondensedEquations(PeriodicEquations):
                     break
                 share *= 0.5
             else:
-                if before <= LAST_NEWTON_STEP * size:  # at rounding level
+                rounded = LAST_NEWTON_STEP if forces.memory is None else ROUNDING_OF_MEMORY
+                if before <= rounded * size:
                     return d, CONVERGED, np.array(history).reshape(-1, 3)
                 return d, STALLED, np.array(history).reshape(-1, 3)
             d, forces = there, new_forces

@@ -18,6 +18,9 @@ WEAK_COUPLING_OF_MEMORY, MOST_STEP_SWEEPS, LAST_STEP_SWEEP = 0.0125, 20, 1e-4
 # Points of the internal states per low harmonic in Newton's matrix.
 LEAST_PRECONDITIONER_POINTS = 8
 MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR = 200, 1e-13
+# Relative size below which corrections that do not become smaller are rounding errors. While an element sticks, its
+# internal state hardly forgets, and errors add up over the periods that it remembers.
+ROUNDED_SWEEP = 1e-8
 
 
 class Forces(NamedTuple):
@@ -187,13 +190,14 @@ def _swept(
     last: float,
 ) -> np.ndarray | None:  # fmt: skip
     """Return x of the linearised equations, corrected until the last correction is small; None if it is not."""
-    x = inverse(right)
+    x, before = inverse(right), np.inf
     for _ in range(most):
         step = inverse(right - x - times(d_f, linearised(forces, rates, x)))
         x = x + step
-        size = float(np.linalg.norm(x))
+        size, length = float(np.linalg.norm(x)), float(np.linalg.norm(step))
         if not np.isfinite(size):
             return None
-        if np.linalg.norm(step) <= last * size:
+        if length <= last * size or before <= length <= ROUNDED_SWEEP * size:
             return x
+        before = length
     return None
