@@ -108,6 +108,21 @@ class ResponseSolver:
                 anchors[name] = _placed(self.problem, name, theta, orbit.guess, here, known)
         return ResponseSolver(self.problem, anchors)
 
+    def carried(self, problem: Description, theta: np.ndarray) -> "ResponseSolver":
+        """Return the solver of a problem with inputs close to these, solved at θ (names,) from orbits near it.
+
+        They are the anchors of experiments of a condensed model, of others the solutions at θ.
+        """
+        if isinstance(problem.model, CondensedModel) and not (self._specials or self._sheets):
+            anchors = {}
+            for name, orbit in self.anchors.items():
+                assert isinstance(orbit.anchor, Anchor)
+                near = problem.equations[name], orbit.anchor.z
+                anchors[name] = _initial_orbit(problem, name, theta, orbit.guess, near)
+            return ResponseSolver(problem, anchors)
+        guesses = {name: one.states for name, one in self.solutions(theta, sensitivities=False).items()}
+        return ResponseSolver.start(problem, theta, guesses)
+
     def _derivatives(self, simulation: Simulation) -> dict[str, tuple[np.ndarray, Sensitivities | None]]:
         """Return indices of parameters and the derivatives by them, of the experiments that are solved by a `Batch`.
 
@@ -341,13 +356,17 @@ class ResponseSolver:
     def solutions(self, theta: np.ndarray, *, sensitivities: bool = True) -> dict[str, PeriodicSolution]:
         """Return the periodic solution of every experiment at one θ (names,), with its sensitivities or without.
 
-        Inputs and outputs are those of the model, without the sensors.
+        Inputs and outputs are those of the model, without the sensors. Without sensitivities, condensed solutions have
+        no multipliers either.
         """
         simulation, solutions = self.solve(theta[None], keep=True, polish=True), {}
         for e in self.problem.experiments:
             (here, z), code = self._solved(simulation, e.name), int(simulation.statuses(e.name)[0])
             here, parameters = without_sensors(self.problem, here, self._at_scale(e, simulation), theta)
-            solutions[e.name] = described(here, parameters, Solved(z, code, NO_HISTORY), sensitivities=sensitivities)
+            solved = Solved(z, code, NO_HISTORY)
+            solutions[e.name] = described(
+                here, parameters, solved, sensitivities=sensitivities, multipliers=sensitivities
+            )
         return solutions
 
     def _at_scale(self, experiment: Experiment, simulation: Simulation) -> Experiment:

@@ -86,6 +86,17 @@ def early_jumps(problem: Description, theta: np.ndarray, sheets: Mapping[str, in
     return result
 
 
+def without_folds(problem: Description, theta: np.ndarray) -> list[str]:
+    """Return the points of the tables through which no branch at θ has a fold."""
+    result: list[str] = []
+    for table in tables(problem).values():
+        with np.errstate(all="ignore"):
+            branches = _branches(problem, theta, table)
+        if branches and not any(p.is_fold for branch in branches for p in branch):
+            result += [e.name for e in table]
+    return result
+
+
 def _all_choices(problem: Description, theta: np.ndarray, table: Sequence[Experiment]) -> list[list[Place]]:
     """Return the choices of every point of a table."""
     with np.errstate(all="ignore"):

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ from bayesperiodic.models.model import CondensedModel
 
 # Choices of the sheets of tables' branches that are tried after the first.
 MOST_SHEET_CHANGES = 5
+# Factor of the errors of condensed solves in climbs that lead to the neighbourhood of an optimum.
+COARSENESS = 100.0
 # Halvings of a step from a draw of a condensed model; solves that fail cost most.
 HALVINGS_FROM_DRAWS = 3
 # Standard deviation of a phase of which nothing is known [rad].
@@ -39,6 +42,46 @@ RANDOM_PHASE = np.pi / np.sqrt(3.0)
 def objective_near(problem: Problem, near: Linearisation) -> Objective:
     """Return the objective whose solves start from a linearisation."""
     return Objective(LogPosterior(problem, near.solver, coordinates=NATURAL), of_total=True)
+
+
+def of_problem(problem: Problem, iterate: Iterate) -> tuple[Objective, Iterate | None]:
+    """Return objective and iterate, solved from the same orbits, of a problem with other errors of the inputs."""
+    if iterate.here.solver.problem is problem:
+        return objective_near(problem, iterate.here), iterate
+    near = LogPosterior(problem, iterate.here.solver.carried(problem, iterate.theta)).linearise(iterate.theta)
+    objective = objective_near(problem, near)
+    return objective, objective.iterate(near, iterate.noise)
+
+
+def on_fewer_points(problem: Problem) -> Problem | None:
+    """Return the problem of a condensed model with internal states whose solves have larger errors; None for others."""
+    if not (isinstance(problem.model, CondensedModel) and problem.model.state_owners) or tables(problem):
+        return None
+    coarse = problem.replace(input_errors=problem.input_errors or None, anchors=problem.anchors or None)
+    equations: Mapping[str, Any] = problem.equations
+    vars(coarse)["equations"] = {n: replace(e, coarseness=COARSENESS) for n, e in equations.items()}
+    return coarse
+
+
+def coarsely(
+    problem: Problem, coarse: Problem | None, theta: np.ndarray, progress: bool, ends: Sequence[End] = (),
+    halvings: int = MAX_STEP_HALVINGS,
+) -> Iterate | None:  # fmt: skip
+    """Return the iterate where a climb ends whose solves have larger errors; None if it does not begin.
+
+    Friction and contact need many points, and such climbs end close to an optimum. One that comes close to one of the
+    ends returns the iterate of that.
+    """
+    first = coarse and first_iterate(coarse, theta)
+    if not (coarse and first):
+        return None
+    end = climbed(objective_near(coarse, first.here), first, progress, MAX_STEPS, ends, halvings, SEPARATE_SDS)
+    return end.iterate if any(end is one for one in ends) else of_problem(problem, end.iterate)[1]
+
+
+def rough(iterate: Iterate) -> End:
+    """Return the end of a climb with larger errors, from which to climb on."""
+    return End(iterate, "iterations", np.array([iterate.objective]))
 
 
 def first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:
@@ -93,9 +136,12 @@ def in_wide_tables(problem: Problem, theta: np.ndarray, draws: np.ndarray, progr
 
 
 def from_draws(
-    objective: Objective, starting: Sequence[np.ndarray], end: End, fewest: int, progress: bool
-) -> list[End | None]:
+    objective: Objective, starting: Sequence[np.ndarray], end: End, fewest: int, progress: bool,
+    coarse: Problem | None = None,
+) -> list[End | None]:  # fmt: skip
     """Return the ends of the iterations from θ in turn, draws of the prior behind the first; the first end is given.
+
+    Those of a `coarse` problem are not yet optima.
 
     After `fewest` starts, the others follow only as long as tests reject the model at the best end.
     """
@@ -105,11 +151,13 @@ def from_draws(
         reached = [one for one in ends if one]
         if len(ends) >= fewest and not misfit_at(problem, max(reached, key=preference).iterate, len(ends)):
             break
-        ends.append(end if draw is starting[0] else _from_draw(objective, reached, draw, progress))
+        ends.append(end if draw is starting[0] else _from_draw(objective, reached, draw, progress, coarse))
     return ends
 
 
-def _from_draw(objective: Objective, ends: Sequence[End], theta: np.ndarray, progress: bool) -> End | None:
+def _from_draw(
+    objective: Objective, ends: Sequence[End], theta: np.ndarray, progress: bool, coarse: Problem | None = None
+) -> End | None:
     """Return the end of the iteration from a draw of the prior; None if there is no orbit or no finite density.
 
     It is solved from the orbits of the first end, condensed models from rest, and is one of the ends where it comes
@@ -121,6 +169,11 @@ def _from_draw(objective: Objective, ends: Sequence[End], theta: np.ndarray, pro
         warnings.simplefilter("ignore")
         if isinstance(problem.model, CondensedModel):
             halvings = HALVINGS_FROM_DRAWS
+            other = coarsely(problem, coarse, theta, progress, ends, halvings)
+            if other is not None and (known := [end for end in ends if end.iterate is other]):
+                return known[0]
+            if other is not None:
+                return rough(other)
             other = objective.iterate(linearised(problem, theta, None), problem.likelihood.guess())
         else:
             other = objective.at(theta, first.here, problem.likelihood.guess())
@@ -130,9 +183,12 @@ def _from_draw(objective: Objective, ends: Sequence[End], theta: np.ndarray, pro
 
 def climbed(
     objective: Objective, first: Iterate, progress: bool, most: int = MAX_STEPS, ends: Sequence[End] = (),
-    halvings: int = MAX_STEP_HALVINGS,
+    halvings: int = MAX_STEP_HALVINGS, least: float = 0.0,
 ) -> End:  # fmt: skip
-    """Climb with a progress bar; where an iterate comes close to one of the ends, that is returned."""
+    """Climb with a progress bar, until a step is below the least [standard deviations].
+
+    Where an iterate comes close to one of the ends, that is returned.
+    """
     reached: list[End] = []
     with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress, delay=SHOWN_AFTER) as bar:
 
@@ -141,7 +197,7 @@ def climbed(
             bar.update()
             known = optimum_of(objective, iterate, ends) if size < SEPARATE_SDS else None
             reached.extend([known] if known else [])
-            return known is not None
+            return known is not None or size < least
 
         end = climb(objective, first, report=report, most=most, halvings=halvings)
     return reached[0] if reached else end

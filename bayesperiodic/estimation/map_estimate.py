@@ -17,15 +17,19 @@ from bayesperiodic.density.responses import ResponseSolver
 from bayesperiodic.estimation.check import check_warnings, checked
 from bayesperiodic.estimation.climbs import (
     climbed,
+    coarsely,
     first_iterate,
     fractions_left,
     from_draws,
     in_wide_tables,
     linearised,
     objective_near,
+    of_problem,
     on_best_sheets,
+    on_fewer_points,
     on_measured_orbits,
     pooled,
+    rough,
 )
 from bayesperiodic.estimation.covariance import (
     degrees_of_freedom,
@@ -37,7 +41,6 @@ from bayesperiodic.estimation.frequencies import updated_frequencies
 from bayesperiodic.estimation.gauss_newton import (
     MAX_STEPS,
     End,
-    Iterate,
     Objective,
     at_ends,
     climb,
@@ -177,17 +180,22 @@ def map_estimate(
     draws = problem.joint_prior.sample(most - 1, np.random.default_rng(_checks.integer("seed", seed, 0)))
     near = in_wide_tables(problem, theta, draws[: fewest - 1], progress) if start is None else []
     first = first_iterate(problem, near[0]) if near else None
-    first = first or first_iterate(problem, theta)
+    coarse = None if first else on_fewer_points(problem)
+    near_optimum = coarsely(problem, coarse, theta, progress)
+    first = first or near_optimum or first_iterate(problem, theta)
     if first is None and starts is not None:
         first = next(filter(None, (first_iterate(problem, draw) for draw in draws)), None)
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
     objective = objective_near(problem, first.here)
-    end = on_best_sheets(problem, climbed(objective, first, progress), progress)
+    end = rough(first) if near_optimum else on_best_sheets(problem, climbed(objective, first, progress), progress)
     end = on_measured_orbits(problem, theta, end, progress)
     starting = [*(near or [theta, *draws[: fewest - 1]]), *draws[fewest - 1 :]]
-    ends = from_draws(objective, starting, end, fewest, progress)
+    ends = from_draws(objective, starting, end, fewest, progress, coarse if near_optimum else None)
     best = max((end for end in ends if end), key=preference)
+    if near_optimum:
+        top = climbed(objective_near(problem, best.iterate.here), best.iterate, progress)
+        ends, best = [top if end is best else end for end in ends], top
     noisy, moved = _with_noisy_inputs(problem, best, progress)
     if noisy is not problem:
         objective = objective_near(noisy, moved.iterate.here)
@@ -233,7 +241,7 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
         loadings = input_loadings(problem, now.theta, orbits, problem.input_noise)
         errors = estimated_inputs(problem, now, loadings).errors
         problem = problem.with_input_errors(errors)
-        objective, first = _of_problem(problem, now)
+        objective, first = of_problem(problem, now)
         if first is None:
             break
         end = climbed(objective, first, progress, STEPS_BETWEEN)
@@ -260,24 +268,13 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
 
 def _moved(problem: Problem, end: End | None) -> End | None:
     """Return an end as one of a problem with other errors of the inputs; None if that is not finite."""
-    iterate = end and _of_problem(problem, end.iterate)[1]
+    iterate = end and of_problem(problem, end.iterate)[1]
     return End(iterate, end.status, end.history) if end and iterate else None
 
 
 def _restated(objective: Objective, end: End, least: float) -> End | None:
     """Return an end with another objective, climbed on to where it is not below the least and may be a mode."""
     return resumed(objective, end, most=MAX_STEPS if end.iterate.objective >= least else 0)
-
-
-def _of_problem(problem: Problem, iterate: Iterate) -> tuple[Objective, Iterate | None]:
-    """Return objective and iterate, solved from the same orbits, of a problem with other errors of the inputs."""
-    if iterate.here.solver.problem is problem:
-        return objective_near(problem, iterate.here), iterate
-    orbits = iterate.here.solver.solutions(iterate.theta, sensitivities=False)
-    guesses = {name: solution.states for name, solution in orbits.items()}
-    near = LogPosterior(problem, ResponseSolver.start(problem, iterate.theta, guesses)).linearise(iterate.theta)
-    objective = objective_near(problem, near)
-    return objective, objective.iterate(near, iterate.noise)
 
 
 def _describe(

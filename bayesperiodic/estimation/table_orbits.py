@@ -4,8 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bayesperiodic.density.sweeps import early_jumps, places, tables
+from bayesperiodic.density.sweeps import early_jumps, places, tables, without_folds
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.models.model import CondensedModel
 from bayesperiodic.periodic.solution import PeriodicSolution, as_guess
 from bayesperiodic.problem.description import Description
 
@@ -40,6 +41,10 @@ def table_warnings(problem: Description, fit: MapEstimate) -> Iterator[str]:
                     "disturbance ended it early."
                 )
     close = [e.name for e, s in points if e.name not in unstable and s.frequency == e.frequency and _is_near_fold(s)]
+    if close and isinstance(problem.model, CondensedModel) and problem.model.state_owners:
+        # An element that sticks remembers where it does so, and its multiplier is close to 1 as well.
+        smooth = without_folds(problem, problem.vector(fit.theta))
+        close = [name for name in close if name not in smooth]
     if close:
         yield (
             f"{len(close)} points of response tables are close to a fold of the model at the estimate: "

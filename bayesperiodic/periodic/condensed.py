@@ -52,7 +52,12 @@ LARGEST_OUTPUT_CHANGE, LEAST_HARMONIC = 1e-2, 1e-12
 LINEAR_MODES = 16
 # Points up to which a solve that fails is repeated, and their ratio.
 MOST_STARTING_POINTS, STARTING_RATIO = 512, 4
-MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40, 10, 1e-10, 1e-13
+MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40, 9, 1e-10, 1e-13
+# Residual of rounding errors, in units of its largest term, with internal states; those of an element that sticks hardly
+# forget, and errors add up over the periods that they remember.
+ROUNDING_OF_MEMORY = 1e-8
+# Residual, in units of its largest term, below which corrections with a fixed matrix are tried before Newton's step.
+NEAR_SOLUTION = 0.1
 # Steps of the load along the branch, in units of the load and of the linear response; corrections, their largest ratio,
 # the last one, and the smallest cosine between two tangents.
 FIRST_LOAD_STEP, SMALLEST_LOAD_STEP, LARGEST_LOAD_STEP = 0.05, 1e-6, 0.1
@@ -64,6 +69,8 @@ class CondensedEquations(PeriodicEquations):
     """d + H_df f(d, ḋ, θ) - H_du u = 0 for one set of inputs; z are the displacements d (points, elements)."""
 
     model: CondensedModel
+    # Factor of the errors of the outputs, by the number of points, with which they are resolved.
+    coarseness: float = 1.0
 
     @classmethod
     def build(
@@ -259,13 +266,18 @@ class CondensedEquations(PeriodicEquations):
         return kernels.evaluate(name, states, np.empty((points, 0)), parameters, np.zeros(points), self.frequency)
 
     @unwarned
-    def solve(self, parameters: np.ndarray, guess: np.ndarray, *_: Any) -> Solved:
-        """Run Newton's iteration from a guess (points, elements) on its grid."""
-        d, code, history = self._newton(parameters, harmonics(guess), 1.0, None)
+    def solve(self, parameters: np.ndarray, guess: np.ndarray, *_: Any, halvings: int = MOST_STEP_HALVINGS) -> Solved:
+        """Run Newton's iteration from a guess (points, elements) on its grid, each step halved so often at most."""
+        d, code, history = self._newton(parameters, harmonics(guess), 1.0, None, halvings)
         return Solved(on_grid(d, len(guess)), code, history)
 
     def _newton(
-        self, parameters: np.ndarray, d: np.ndarray, load: float, given: ResponseMatrices | None
+        self,
+        parameters: np.ndarray,
+        d: np.ndarray,
+        load: float,
+        given: ResponseMatrices | None,
+        halvings: int = MOST_STEP_HALVINGS,
     ) -> tuple[np.ndarray, int, np.ndarray]:
         points = 2 * len(d)
         matrices = given or self.matrices(parameters, points)[0]
@@ -279,11 +291,19 @@ class CondensedEquations(PeriodicEquations):
                 return d, NOT_FINITE, np.array(history).reshape(-1, 3)
             before = float(np.linalg.norm(residual))
             try:
+                if known is None or forces.memory is None:
+                    known = Preconditioner(forces, rates, matrices.d_f)
+                near = None
+                if before <= NEAR_SOLUTION * size:
+                    near = self._corrected(parameters, d, forces, matrices.d_f, free, known)
+                if near is not None:
+                    history.append((before / size, float(np.linalg.norm(near - d)) / size, 1.0))
+                    return near, CONVERGED, np.array(history)
                 step, known = newton_step(forces, rates, matrices.d_f, residual, known)
             except np.linalg.LinAlgError:
                 return d, SINGULAR, np.array(history).reshape(-1, 3)
             share = 1.0
-            for _ in range(MOST_STEP_HALVINGS):
+            for _ in range(halvings + 1):
                 there = d - share * step
                 new_forces = self.forces(there, parameters, forces)
                 residual, size = residual_of(there, new_forces, matrices, free)
@@ -292,7 +312,8 @@ class CondensedEquations(PeriodicEquations):
                     break
                 share *= 0.5
             else:
-                if before <= LAST_NEWTON_STEP * size:  # at rounding level
+                rounded = LAST_NEWTON_STEP if forces.memory is None else ROUNDING_OF_MEMORY
+                if before <= rounded * size:
                     return d, CONVERGED, np.array(history).reshape(-1, 3)
                 return d, STALLED, np.array(history).reshape(-1, 3)
             d, forces = there, new_forces
@@ -300,6 +321,35 @@ class CondensedEquations(PeriodicEquations):
             if share == 1.0 and (after <= NEWTON_ROUNDING * size or np.linalg.norm(step) <= LAST_NEWTON_STEP * size):
                 return d, CONVERGED, np.array(history)
         return d, STALLED, np.array(history)
+
+    def _corrected(
+        self,
+        parameters: np.ndarray,
+        d: np.ndarray,
+        forces: Forces,
+        d_f: np.ndarray,
+        free: np.ndarray,
+        known: Preconditioner,
+    ) -> np.ndarray | None:
+        """Return the solution by corrections with a fixed matrix; None if they do not become small fast."""
+        kernels, blocks = self.model.element_kernels, np.array(self.model.state_blocks, dtype=np.int64)
+        result, f, points = d[None, None].copy(), np.empty((1, 1, *d.shape), dtype=complex), 2 * len(d)
+        lost, steps = np.zeros((2, 1, 1), dtype=np.int64)
+        states = np.zeros((points, 3 * (self.count + blocks.sum()))) if forces.memory is None else forces.memory.states
+        fewer = np.empty((1, 1, points // 4 if blocks.size else 0, self.count), dtype=complex)
+        address = (kernels.residual_jacobian if blocks.size else kernels.residual).address if self.count else 0
+        compiled().correct_many(
+            address, np.ascontiguousarray(d_f)[None, None], free[None, None], known.transposed_inverse[None], known.low,
+            parameters[None, None], np.array([2 * np.pi * self.frequency]), float(self.grid.periods),
+            *transform_tables(points), blocks, True, 0, 1, np.full((1, 1), np.inf), result, f, lost, steps,
+            states[None], fewer,
+        )  # fmt: skip
+        return None if lost[0, 0] else result[0, 0]
+
+    @property
+    def resolved_share(self) -> float:
+        """Bound of the error of the outputs, see `unresolved`, above which points are doubled."""
+        return self.coarseness * RESOLVED_SHARE
 
     @unwarned
     def find(self, parameters: np.ndarray, guess: np.ndarray | None) -> tuple[Solved, str]:
@@ -334,7 +384,7 @@ class CondensedEquations(PeriodicEquations):
         history, change = np.empty((0, 3)), np.nan
         before, share = self._outputs(d, parameters)
         enough = RESOLVED_CHANGE_OF_MEMORY if self.model.state_owners else RESOLVED_CHANGE
-        while not (change <= enough and share <= RESOLVED_SHARE):
+        while not (change <= self.coarseness * enough and share <= self.resolved_share):
             if 2 * len(d) >= MOST_ELEMENT_POINTS:
                 worst = np.fmax(change, share)
                 return d, CONVERGED if worst <= LARGEST_OUTPUT_CHANGE else NOT_RESOLVED, history

@@ -7,10 +7,7 @@ import numpy as np
 from bayesperiodic._linalg import unwarned
 from bayesperiodic.periodic.batch import Anchor, in_blocks
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STALLED, BatchSolution
-from bayesperiodic.periodic.condensed import (
-    RESOLVED_SHARE,
-    CondensedEquations,
-)
+from bayesperiodic.periodic.condensed import CondensedEquations
 from bayesperiodic.periodic.element_forces import Forces, Preconditioner, ResponseMatrices
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, transform_tables
 from bayesperiodic.periodic.memory import error_of_fewer
@@ -21,7 +18,7 @@ FEWEST_CONDENSED_SOLVES = 4
 MOST_RESPONSE_NUMBERS = 2**20
 # Parts of the way from an anchor in which a solution is followed, and largest correction in units of the predicted
 # change or, where a contact begins, of this part of the solution.
-LARGEST_PATH_PART, SMALLEST_PATH_PART, STRAIGHT_PATH, LEAST_PATH_CHANGE = 0.25, 1.0 / 256.0, 0.5, 0.01
+LARGEST_PATH_PART, SMALLEST_PATH_PART, STRAIGHT_PATH, LEAST_PATH_CHANGE = 1.0, 1.0 / 256.0, 0.5, 0.01
 # Part of the points on which it is followed at first, and the fewest; the smallest part of the way on all points, where
 # that fails.
 PATH_POINTS_RATIO, FEWEST_PATH_POINTS, RETRIED_PATH_PART = 8, 64, 1.0 / 16.0
@@ -70,7 +67,7 @@ class CondensedBatch:
         size = 2 * low * self._d.shape[-1]
         for known, part in zip(self._known, given, strict=True):
             if known:
-                inverses.append(np.ascontiguousarray(Preconditioner(*part, low).inverse.T))
+                inverses.append(Preconditioner(*part, low).transposed_inverse)
             else:
                 inverses.append(np.zeros((size, size)))
         return np.stack(inverses), low
@@ -171,7 +168,7 @@ class CondensedBatch:
                 by_memory[e][b] = self._sets[e].error_of_memory(d[e, b], f[e, b], every_y[e][b], every[e, b])
             shares = np.maximum(shares, by_memory)
         finer = {}
-        for e, b in np.argwhere((status == CONVERGED) & ~(shares <= RESOLVED_SHARE)):
+        for e, b in np.argwhere((status == CONVERGED) & ~(shares <= first.resolved_share)):
             equations, theta = self._sets[e], every[e, b]
             finer[e, b], status[e, b], history = equations.doubled(theta, d[e, b])
             outputs[e, b] = equations.outputs(on_grid(finer[e, b], 2 * len(finer[e, b])), theta)
@@ -201,10 +198,10 @@ class CondensedBatch:
             d, code, used = self._stepped(e, parameters, fewer)
             if code == CONVERGED:
                 start = resized(d, self._points)
-                solved = equations.solve(parameters, on_grid(start, self._points))
+                solved = equations.solve(parameters, on_grid(start, self._points), halvings=0)
                 d, used = harmonics(solved.z), used + len(solved.history)
                 small = np.linalg.norm(d - start) <= LEAST_PATH_CHANGE * np.linalg.norm(d)
-                if solved.code == CONVERGED and small and np.all(solved.history[:, 2] == 1.0):
+                if solved.code == CONVERGED and small:
                     return d, CONVERGED, used
         smallest = RETRIED_PATH_PART if fewer < self._points else SMALLEST_PATH_PART
         d, code, more = self._stepped(e, parameters, self._points, smallest)
@@ -222,10 +219,10 @@ class CondensedBatch:
         while done < 1.0:
             there = anchor.parameters + (done + step) * change
             predicted = here + step * ahead
-            solved = equations.solve(there, on_grid(predicted, points))
+            solved = equations.solve(there, on_grid(predicted, points), halvings=0)
             used, d = used + len(solved.history), harmonics(solved.z)
             size = max(float(np.linalg.norm(step * ahead)), LEAST_PATH_CHANGE * float(np.linalg.norm(d)))
-            straight = np.linalg.norm(d - predicted) <= STRAIGHT_PATH * size and np.all(solved.history[:, 2] == 1.0)
+            straight = np.linalg.norm(d - predicted) <= STRAIGHT_PATH * size
             if solved.code != CONVERGED or not straight:
                 step *= 0.5
                 if step < smallest:

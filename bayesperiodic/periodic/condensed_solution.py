@@ -90,9 +90,17 @@ class CondensedSolution(PeriodicSolution):
 
 @unwarned
 def described(
-    equations: PeriodicEquations, theta: np.ndarray, solved: Solved, found_by: str = NEWTON, sensitivities: bool = True
+    equations: PeriodicEquations,
+    theta: np.ndarray,
+    solved: Solved,
+    found_by: str = NEWTON,
+    sensitivities: bool = True,
+    multipliers: bool = True,
 ) -> PeriodicSolution:
-    """Return the result of a solve, condensed or not, as `solution.describe` does."""
+    """Return the result of a solve, condensed or not, as `solution.describe` does.
+
+    Without `multipliers` those of a condensed one, which take most of the time, are left out.
+    """
     if not isinstance(equations, CondensedEquations):
         return describe(equations, theta, solved, found_by, sensitivities)
     model, grid, code, z = equations.model, equations.grid, solved.code, solved.z
@@ -108,7 +116,9 @@ def described(
     outputs, residual = equations.outputs_and_residual(z, theta)
     states, coarse = equations.displacements(z, theta)
     changes = np.abs(coarse - states).max(axis=0).tolist()
-    multipliers, error = modal_multipliers(equations, theta, z) if code == CONVERGED else (np.empty(0, complex), np.nan)
+    of_modes, error = np.empty(0, complex), np.nan
+    if code == CONVERGED and multipliers:
+        of_modes, error = modal_multipliers(equations, theta, z)
     return CondensedSolution(
         model=model.name,
         autonomous=False,
@@ -133,7 +143,7 @@ def described(
         iterations=len(solved.history),
         residual=residual,
         history=solved.history,
-        of_modes=multipliers,
+        of_modes=of_modes,
         multiplier_error=error,
         changes=dict(zip(model.states, changes if code == CONVERGED else [np.nan] * len(changes), strict=True)),
     )

@@ -18,6 +18,9 @@ WEAK_COUPLING_OF_MEMORY, MOST_STEP_SWEEPS, LAST_STEP_SWEEP = 0.0125, 20, 1e-4
 # Points of the internal states per low harmonic in Newton's matrix.
 LEAST_PRECONDITIONER_POINTS = 8
 MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR = 200, 1e-13
+# Relative size below which corrections that do not become smaller are rounding errors. While an element sticks, its
+# internal state hardly forgets, and errors add up over the periods that it remembers.
+ROUNDED_SWEEP = 1e-8
 
 
 class Forces(NamedTuple):
@@ -82,10 +85,10 @@ class Preconditioner:
     def _factors(self) -> tuple[np.ndarray, np.ndarray]:
         return factors(self.matrix)
 
-    @property
-    def inverse(self) -> np.ndarray:
-        """Inverse for the low harmonics, real parts of harmonics and elements before the imaginary ones."""
-        return np.linalg.inv(self.matrix)
+    @cached_property
+    def transposed_inverse(self) -> np.ndarray:
+        """Transposed inverse for the low harmonics, real parts of harmonics and elements before the imaginary ones."""
+        return np.ascontiguousarray(np.linalg.inv(self.matrix).T)
 
     @staticmethod
     def strongly_coupled(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> int:
@@ -155,7 +158,7 @@ def _of_units(memory: Memory, rates: np.ndarray, low: int) -> list[np.ndarray]:
 
 
 def newton_step(
-    forces: Forces, rates: np.ndarray, d_f: np.ndarray, residual: np.ndarray, known: Preconditioner | None = None
+    forces: Forces, rates: np.ndarray, d_f: np.ndarray, residual: np.ndarray, known: Preconditioner
 ) -> tuple[np.ndarray, Preconditioner]:
     """Return Newton's step, and its preconditioner; with internal states the step is corrected.
 
@@ -163,9 +166,8 @@ def newton_step(
     small with it.
     """
     if forces.memory is None:
-        inverse = Preconditioner(forces, rates, d_f)
-        return inverse(residual), inverse
-    if known is not None and known.low <= len(rates):
+        return known(residual), known
+    if known.low <= len(rates):
         step = _swept(known, forces, rates, d_f, residual, MOST_STEP_SWEEPS, LAST_STEP_SWEEP)
         if step is not None:
             return step, known
@@ -188,13 +190,14 @@ def _swept(
     last: float,
 ) -> np.ndarray | None:  # fmt: skip
     """Return x of the linearised equations, corrected until the last correction is small; None if it is not."""
-    x = inverse(right)
+    x, before = inverse(right), np.inf
     for _ in range(most):
         step = inverse(right - x - times(d_f, linearised(forces, rates, x)))
         x = x + step
-        size = float(np.linalg.norm(x))
+        size, length = float(np.linalg.norm(x)), float(np.linalg.norm(step))
         if not np.isfinite(size):
             return None
-        if np.linalg.norm(step) <= last * size:
+        if length <= last * size or before <= length <= ROUNDED_SWEEP * size:
             return x
+        before = length
     return None

@@ -1,5 +1,7 @@
 """Complex harmonics of periodic values on grids of any number of points."""
 
+from functools import lru_cache
+
 import numpy as np
 
 
@@ -22,6 +24,7 @@ def resized(amplitudes: np.ndarray, points: int) -> np.ndarray:
     return result
 
 
+@lru_cache(maxsize=16)
 def transform_tables(points: int) -> tuple[np.ndarray, np.ndarray]:
     """Return exp(−2πi k/points) for half of the points, a power of two, and all bit-reversed numbers."""
     if points < 1 or points & (points - 1):  # the kernels would write outside of their arrays

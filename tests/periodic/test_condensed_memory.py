@@ -470,3 +470,28 @@ def test_estimate_with_noisy_force_on_400_points_is_that_of_the_symbolic_model()
     for name, sd in symbolic.sd.items():
         assert abs(other.theta[name] - symbolic.theta[name]) < 0.1 * sd
         assert other.sd[name] == pytest.approx(sd, rel=0.03)
+
+
+@pytest.mark.parametrize("limit", [1.0, 100.0])
+@pytest.mark.parametrize("frequency", [0.05, 0.09])
+def test_derivatives_exist_while_a_joint_sticks_and_are_those_of_a_spring(frequency, limit):
+    """The joint hardly forgets then, and corrections of the derivatives end in its rounding errors.
+
+    Closed form: a spring in place of the joint, whose force is at most a twentieth of its limit.
+    """
+    wave, w = 0.01 * np.cos(2 * np.pi * np.arange(SAMPLES) / SAMPLES), 2 * np.pi * frequency
+    values = LINEAR | {"joint_stiffness": 0.5, "joint_limit": limit}
+    solved = bp.solve_periodic(model(3, "jenkins"), values, {"force": wave}, frequency=frequency, samples=SAMPLES)
+    assert solved.converged
+
+    def amplitude(stiffness):
+        springs = LINEAR["k"] * chain(3)
+        damping = LINEAR["alpha"] * np.eye(3) + LINEAR["beta"] * chain(3)
+        springs[2, 2] += stiffness
+        return np.linalg.solve(springs + 1j * w * damping - w**2 * np.eye(3), [0, 0, 0.01])[2]
+
+    step = 1e-4
+    slope = (amplitude(0.5 + step) - amplitude(0.5 - step)) / (2 * step)
+    ours = solved.sensitivities["x"]["joint_stiffness"]
+    exact = (slope * np.exp(2j * np.pi * np.arange(SAMPLES) / SAMPLES)).real
+    np.testing.assert_allclose(ours - ours.mean(), exact, atol=1e-3 * np.abs(exact).max())
