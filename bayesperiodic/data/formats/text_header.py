@@ -142,7 +142,7 @@ def _by_names(file: Text, wanted: list[str], separator: str | None) -> Head:
         try:
             headers.append(_line_of_names(file, wanted, candidate))
         except csv.Error:  # a long line is one field for another separator than its own
-            if not headers and candidate == candidates[-1]:
+            if separator:
                 raise
             continue
         if headers[-1].even and {*wanted} <= {*headers[-1].names}:

@@ -245,3 +245,10 @@ def test_percent_in_a_row_of_units_is_one_of_them(write, head):
     path = write(head + DATA[","])
     for wanted in ([], ["a", "x"]):
         assert [one.unit for one in text.contents(path, wanted).channels] == ["%", "mm", "N"]
+
+
+def test_a_field_without_end_is_refused_for_the_separator_that_was_given(write):
+    """Longer than the 131072 characters that Python's module csv takes; for other separators it may be several."""
+    path = write("a,b\n" + "1" * 140_000 + ",2\n")
+    with pytest.raises(ValueError, match="path: must be a CSV file with a header line, got .*run.csv.*field larger"):
+        text.contents(path, ["a"], separator=",")
