@@ -1,67 +1,108 @@
 """Mutation testing of a random sample of mutants: ``python -m tests.mutants --count 100 --seed 1``.
 
-mutmut writes the mutants of the modules in `pyproject.toml` and records the tests that call each function. A mutant is
-tested by the folder of `tests/` that mirrors its own: the tests that call the mutated function, the quickest first, and
-the others of their files, as many as take `BUDGET` seconds. It survives if they pass. Results are in `mutants.md`.
+mutmut writes the mutants of the modules in `pyproject.toml`. A mutant is tested in a process forked from one that has
+collected the tests but run none, by the folder of `tests/` that mirrors its own: first the files that name its function,
+then those that name its module, then the others, until a test fails or `BUDGET` seconds of processor time have passed.
+Results are in `mutants.md`.
 """
 
 import argparse
 import json
+import os
 import random
-import subprocess
+import resource
 import sys
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
-from resource import RUSAGE_CHILDREN, getrusage
 
-BUDGET = 40.0
-STATISTICS = Path("mutants/mutmut-stats.json")
-KILLED = ("killed", "timeout")
-NOT_RUN = 255  # of an error before the tests, which mutmut calls a timeout
+import pytest
 
-
-def chosen_tests(mutant: str, statistics: dict) -> tuple[list[str], float]:
-    """Return the tests of a mutant, each with all its parameters, and how long they take [s]."""
-    folder, function = f"tests/{mutant.split('.')[1]}/", mutant.rpartition("__mutmut_")[0]
-    # pytest does not find some parameters again by their text, and then runs no test at all.
-    calling = {test.partition("[")[0] for test in statistics["tests_by_mangled_function_name"].get(function, [])}
-    # A result that several tests share is computed in the first of them only, so the others in its file follow.
-    files = {test.partition("::")[0] for test in calling if test.startswith(folder)}
-    seconds: dict[str, float] = {}
-    for test, time in statistics["duration_by_test"].items():
-        if test.partition("::")[0] in files:
-            name = test.partition("[")[0]
-            seconds[name] = seconds.get(name, 0.0) + time
-    chosen, total = [], 0.0
-    for test in sorted(seconds, key=lambda test: (test not in calling, seconds[test])):
-        if chosen and total + seconds[test] > BUDGET:
-            break
-        chosen.append(test)
-        total += seconds[test]
-    return chosen, total
+BUDGET, LONGEST = 40.0, 150  # [s] of processor time; a test that has no end is stopped by the longer one
+SURVIVED, KILLED = 0, 1
 
 
-def run(names: list[str]) -> dict[str, str]:
-    """Return the status of each mutant, tested in a process forked from one that has imported the tests."""
-    from mutmut.stats import status_by_exit_code
-    from mutmut.utils.file_utils import setup_source_paths
-    from mutmut.workers.isolation import get_mutant_runner
+def write_mutants() -> list[str]:
+    """Write the mutants of files that have changed, and return the names of all."""
+    from mutmut import __main__ as mutmut
 
-    setup_source_paths()
-    statistics = json.loads(STATISTICS.read_text())
-    runner, statuses = get_mutant_runner(1), {}
-    runner.startup()
-    for number, name in enumerate(names, 1):
-        tests, seconds = chosen_tests(name, statistics)
-        statuses[name] = "no tests"
-        if tests:
-            # The limits are wide, so that no mutant is killed because the machine is busy.
-            runner.submit(name, tests, int(8 * seconds + 240), seconds)
-            code = runner.wait_for_result().exit_code
-            statuses[name] = "not run" if code == NOT_RUN else status_by_exit_code[code]
-        print(f"{number} {statuses[name]}: {name}", flush=True)
-    runner.signal_work_complete()
-    runner.shutdown()
-    return statuses
+    mutmut.set_mutant_under_test("mutant_generation")
+    Path("mutants").mkdir(exist_ok=True)
+    mutmut.copy_src_dir()
+    mutmut.copy_also_copy_files()
+    mutmut.create_mutants(1)
+    metadata = [json.loads(path.read_text()) for path in Path("mutants").rglob("*.meta")]
+    return sorted(name for one in metadata for name in one["exit_code_by_key"])
+
+
+def folder_of(mutant: str) -> str:
+    """Return the folder of the tests of a mutant."""
+    return f"tests/{mutant.split('.')[1]}"
+
+
+def ordered(mutant: str, items: list[pytest.Item]) -> list[pytest.Item]:
+    """Return the tests of a mutant, those that are most likely to find it first."""
+    module, _, function = mutant.rpartition("__mutmut_")[0].rpartition(".")
+    module, function = module.rpartition(".")[2], function.removeprefix("x_").rpartition("ǁ")[2]
+
+    def rank(item: pytest.Item) -> tuple[bool, bool, bool]:
+        return function not in texts[item.path], module not in item.path.name, module not in texts[item.path]
+
+    mine = [item for item in items if item.nodeid.startswith(folder_of(mutant) + "/")]
+    texts = {path: path.read_text() for path in {item.path for item in mine}}
+    return sorted(mine, key=rank)
+
+
+class Tests:
+    """Plugin of pytest that tests mutants in place of the code."""
+
+    def __init__(self, mutants: list[str]):
+        self.mutants, self.statuses, self._failed = mutants, dict[str, int](), False
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self._failed |= report.failed
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        assert not session.testsfailed
+        for number, mutant in enumerate(self.mutants, 1):
+            tests = ordered(mutant, session.items)
+            child = os.fork()
+            if not child:
+                os._exit(self._status(mutant, tests))
+            _, status, usage = os.wait4(child, 0)
+            self.statuses[mutant] = os.waitstatus_to_exitcode(status)
+            text = "survived" if self.statuses[mutant] == SURVIVED else "killed"
+            print(f"\n{number} {text}: {mutant} ({usage.ru_utime:.1f} s)", flush=True)
+        return True
+
+    def _status(self, mutant: str, tests: list[pytest.Item]) -> int:
+        """Return whether a test fails; in the process of the mutant."""
+        os.environ["MUTANT_UNDER_TEST"] = mutant
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        resource.setrlimit(resource.RLIMIT_CPU, (LONGEST, LONGEST))
+        start = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+        for item, following in zip(tests, [*tests[1:], None], strict=True):
+            item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+            if self._failed:
+                return KILLED
+            if resource.getrusage(resource.RUSAGE_SELF).ru_utime - start > BUDGET:
+                break
+        return SURVIVED
+
+
+def run(mutants: list[str]) -> dict[str, int]:
+    """Return the status of each mutant."""
+    settings = tomllib.loads(Path("pyproject.toml").read_text())["tool"]["mutmut"]
+    os.environ["MUTANT_UNDER_TEST"] = ""
+    os.chdir("mutants")
+    # Its package and its tests take the place of those beside it.
+    sys.path.insert(0, os.getcwd())
+    sys.modules.pop("tests", None)
+    tests = Tests(mutants)
+    arguments = ["-q", "-s", *settings["pytest_add_cli_args"], *sorted({folder_of(mutant) for mutant in mutants})]
+    pytest.main(arguments, plugins=[tests])
+    return tests.statuses
 
 
 def wilson(killed: int, count: int) -> tuple[float, float]:
@@ -71,26 +112,24 @@ def wilson(killed: int, count: int) -> tuple[float, float]:
     return (centre - half) / (1 + z**2 / count), (centre + half) / (1 + z**2 / count)
 
 
+def drawn(known: list[str], count: int, seed: int) -> Iterator[str]:
+    """Yield a random sample of the mutants."""
+    yield from random.Random(seed).sample(known, count)
+
+
 def main() -> None:
     """Print the mutants that survive, and the rate of those killed."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--count", type=int, default=100, help="mutants to draw")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("names", nargs="*", help="mutants to test instead")
+    parser.add_argument("names", nargs="*", help="mutants to test instead, of those that are written")
     options = parser.parse_args()
-    # Writes the mutants and records the calls, or those that have changed, and tests one mutant.
-    mutmut = Path(sys.executable).with_name("mutmut")
-    subprocess.run([mutmut, "run", "--max-children", "1", "bayesperiodic.data.folding.x_parts__mutmut_1"])
-    metadata = [json.loads(path.read_text()) for path in Path("mutants").rglob("*.meta")]
-    known = sorted(name for one in metadata for name in one["exit_code_by_key"])
-    statuses = run(options.names or random.Random(options.seed).sample(known, options.count))
-    print("Not killed:", *(f"{status}: {name}" for name, status in statuses.items() if status not in KILLED), sep="\n")
-    killed, count = sum(status in KILLED for status in statuses.values()), len(statuses)
+    statuses = run(options.names or [*drawn(write_mutants(), options.count, options.seed)])
+    print("Not killed:", *(name for name, status in statuses.items() if status == SURVIVED), sep="\n")
+    killed, count = sum(status != SURVIVED for status in statuses.values()), len(statuses)
     low, high = wilson(killed, count)
-    print(
-        f"{killed} of {count} killed: {killed / count:.1%} (95 % interval {low:.1%} to {high:.1%}), drawn from "
-        f"{len(known)}; {getrusage(RUSAGE_CHILDREN).ru_utime / 60:.0f} min of processor time"
-    )
+    minutes = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime / 60
+    print(f"{killed} of {count} killed: {killed / count:.1%} (95 % interval {low:.1%} to {high:.1%}); {minutes:.0f} min")
 
 
 if __name__ == "__main__":

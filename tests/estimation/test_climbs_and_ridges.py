@@ -303,3 +303,34 @@ def test_profiles_cross_a_level_where_their_roots_do(level):
     # Of several crossings the last one counts.
     twice = np.where(values > 3.0, 0.1, roots)
     assert profile._crossing(values, twice, level, 3.5) == np.inf
+
+
+@pytest.mark.parametrize("progress", [True, False])
+def test_starts_in_wide_tables_are_the_ends_the_best_first_and_then_the_draws_without_one(monkeypatch, progress):
+    """Of four starts, the objective of whose ends is their value, the third has no orbit."""
+    seen = []
+
+    def climbed(objective, first, shown):
+        seen.append((objective, shown))
+        return End(iterate(first.theta, first.theta[0]), "converged", None)
+
+    def on_best_sheets(problem, end, shown):
+        seen.append((problem, shown))
+        return end
+
+    def from_draw(objective, ends, draw, shown):
+        seen.append((objective, shown))
+        assert [float(end.iterate.theta[0]) for end in ends] == [one for one in (0.0, 1.0, 3.0) if one < draw[0]]
+        return None if draw[0] == 2.0 else climbed(objective, iterate(draw), shown)
+
+    for name, stand_in in {
+        "widened": lambda problem: "wide", "first_iterate": lambda problem, theta: iterate(theta),
+        "objective_near": lambda problem, near: "objective", "climbed": climbed, "on_best_sheets": on_best_sheets,
+        "_from_draw": from_draw,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(climbs, name, stand_in)
+    starts = climbs.in_wide_tables(None, np.zeros(1), np.array([[1.0], [2.0], [3.0]]), progress)
+    assert [float(theta[0]) for theta in starts] == [3.0, 1.0, 0.0, 2.0]
+    assert {shown for _, shown in seen} == {progress} and seen[1] == ("wide", progress)
+    monkeypatch.setattr(climbs, "first_iterate", lambda problem, theta: None)
+    assert climbs.in_wide_tables(None, np.zeros(1), np.array([[1.0]]), progress) == []

@@ -5,7 +5,7 @@ import importlib
 import logging
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +86,6 @@ class Contents:
     word: str = "channel"
     suggested_time: str = ""
     numbered: bool = True  # whether a channel is also found by its number; else numbers are names
-    options: dict[str, Any] = field(default_factory=dict)  # arguments of `from_file` by which it was read so
 
     def find(self, file: str, key: Key) -> StoredChannel:
         """Return the channel of a name, a number from 1, or a pair of group and name; the error names those there."""

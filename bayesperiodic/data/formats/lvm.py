@@ -54,8 +54,7 @@ def contents(file: Path, wanted: list[Key], *, encoding: str | None = None, deci
         for channel in _channels(whole, whole[k], rows, f"segment {k + 1}" if len(segments) > 1 else "", separator)
     ]
     remarks = (f"in {used}", *((f"{len(segments)} segments, with times of their own",) if len(segments) > 1 else ()))
-    options = {key: value for key, value in (("encoding", encoding), ("decimal", decimal)) if value is not None}
-    return Contents("LabVIEW measurement file", tuple(channels), remarks, options=options)
+    return Contents("LabVIEW measurement file", tuple(channels), remarks)
 
 
 def _decoded(content: bytes, encoding: str | None) -> tuple[str, str]:

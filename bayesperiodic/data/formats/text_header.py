@@ -142,7 +142,7 @@ def _by_names(file: Text, wanted: list[str], separator: str | None) -> Head:
         try:
             headers.append(_line_of_names(file, wanted, candidate))
         except csv.Error:  # a long line is one field for another separator than its own
-            if not headers and candidate == candidates[-1]:
+            if separator:
                 raise
             continue
         if headers[-1].even and {*wanted} <= {*headers[-1].names}:
@@ -235,7 +235,7 @@ def _units_above(file: Text, best: Head, following: list[str]) -> list[str]:
                 break
             cells = row[0].split() if row and best.separator == BLANKS else row
             upper = [cell.strip() for cell in cells] if any(map(str.strip, cells)) else upper
-    upper = _as_row(upper, len(best.names), best.separator)
+    upper = _unmarked(upper, len(best.names), best.separator)
     units = _units_of(upper, following, len(best.names), best.separator) if upper else None
     if units and len(_filled(upper)) >= len(_filled(best.names)) and any(map(is_evident, units)):
         return units
@@ -244,11 +244,8 @@ def _units_above(file: Text, best: Head, following: list[str]) -> list[str]:
 
 def _units_of(row: list[str], following: list[str], count: int, separator: str) -> list[str] | None:
     """Return the units in a row below names and above numbers."""
-    if row and row[0][:1] in ("#", "%") and len(row[0]) > 1:
-        row = [COMMENT_MARK.sub("", row[0]), *row[1:]]
-    elif row and row[0] == "#":
-        row = row[1:] if len(row) > count or separator == BLANKS else ["", *row[1:]]
-    if len([cell for cell in row if cell]) > count or len(row) < (count if separator != BLANKS else count):
+    row = _unmarked(row, count, separator)
+    if len(_filled(row)) > count or len(row) < count:
         return None
     if any(USABLE.fullmatch(cell) for cell in row if cell) or not any(map(USABLE.fullmatch, following)):
         return None
@@ -353,7 +350,7 @@ def _by_evidence(file: Text, separator: str | None, line: int | None) -> Head | 
             f"path: must be a CSV file with one table, got {file!r}, which has rows of {best.width} fields after "
             "rows of numbers with other ones; save each table as a file of its own."
         )
-    names, names_line, units = _names_above(best, line)
+    names, units = _names_above(best, line)
     _refuse_lost(best, bool(names), line)
     data = best.rows[best.first :]
     real = max((k + 1 for _, row in data for k, cell in enumerate(row[: best.width]) if cell), default=best.width)
@@ -367,11 +364,13 @@ def _by_evidence(file: Text, separator: str | None, line: int | None) -> Head | 
             f"header: must be given for {file.path.name!r}, in which the line above the data has {len(names)} "
             f"fields for {real} columns; give the number of the line of names, or header=0 for none."
         )
+    last = best.rows[best.first - 1][0] if best.first else 0
     if len(names) != real:
-        previous = best.rows[best.first - 1][0] if best.first else 0
         names = [f"column {k + 1}" for k in range(real)]
-        return Head(names, previous, best.width - real, best.separator, [], False, [row for _, row in data])
-    return Head(names, names_line, best.width - real, best.separator, units, True, [row for _, row in data])
+        return Head(names, last, best.width - real, best.separator, [], False, [row for _, row in data])
+    return Head(
+        names, last or best.rows[0][0], best.width - real, best.separator, units, True, [row for _, row in data]
+    )
 
 
 def _refuse_lost(block: _Block, titled: bool, line: int | None) -> None:
@@ -406,10 +405,10 @@ def _one_or_several(file: Text, best: _Block, blocks: list[_Block], line: int | 
     for other in blocks:
         if other.width == 1 or len(other.columns) != other.width:
             continue
-        names, _, _ = _names_above(other, line)
+        names, _ = _names_above(other, line)
         if len(names) == other.width:
             return other
-        single, _, _ = _names_above(best, line)
+        single, _ = _names_above(best, line)
         if not single or line == 0:
             cell = best.rows[best.first][1][0]
             raise ValueError(
@@ -419,18 +418,17 @@ def _one_or_several(file: Text, best: _Block, blocks: list[_Block], line: int | 
     return best
 
 
-def _names_above(block: _Block, line: int | None) -> tuple[list[str], int, list[str]]:
-    """Return the names above the data of a block, the last line of the header, and the units below the names."""
+def _names_above(block: _Block, line: int | None) -> tuple[list[str], list[str]]:
+    """Return the names above the data of a block, and the units below the names."""
     if line == 0:
-        return [], 0, []
+        return [], []
     above = block.rows[: block.first]
     following = block.rows[block.first][1]
     if line is None and not above:
         numbers = [str(k) for k in range(block.width + 1)]
         if block.width > 1 and following in (numbers[:-1], numbers[1:]) and len(block.rows) > 1:
-            return following, block.rows[0][0], []
-        return [], 0, []
-    last = above[-1][0] if above else 0
+            return following, []
+        return [], []
     below: list[tuple[int, list[str]]] = []
     if line:
         below = [(number, row) for number, row in above if number > line]
@@ -467,8 +465,8 @@ def _names_above(block: _Block, line: int | None) -> tuple[list[str], int, list[
                 f"header: must be given, got None, as line {above[-1][0]} has neither names nor only numbers, "
                 f"{_checks.shortened(above[-1][1])}; give the number of the line of names, or header=0 for none."
             )
-        return [], 0, []
-    return names, last, units
+        return [], []
+    return names, units
 
 
 def _units_around(block: _Block, above: Rows, below: Rows, line: int | None) -> list[str]:
@@ -483,7 +481,7 @@ def _units_around(block: _Block, above: Rows, below: Rows, line: int | None) -> 
             f"{below[-1][0]} is {_checks.shortened(below[-1][1])}, which are neither numbers nor known units."
         )
     names = above[-1][1]
-    upper = _as_row(above[-2][1], width, block.separator) if len(above) > 1 else []
+    upper = _unmarked(above[-2][1], width, block.separator) if len(above) > 1 else []
     full = len(_filled(upper)) >= len(_filled(names)) > 0
     if full and (units := _units_of(upper, following, width, block.separator)):
         third = len(above) > 2 and len(_filled(above[-3][1])) >= len(_filled(upper))
@@ -512,11 +510,14 @@ def _filled(row: list[str]) -> list[str]:
     return [cell for cell in row if cell]
 
 
-def _as_row(row: list[str], count: int, separator: str) -> list[str]:
-    """Return the fields of a row without a mark of comments."""
-    if row and row[0] == "#" and len(row) > 1 and (separator == BLANKS or len(row) > count):
+def _unmarked(row: list[str], count: int, separator: str) -> list[str]:
+    """Return the fields of a row without a mark of comments, which may be one of them; "%" may be a unit instead."""
+    if not row or row[0][:1] not in ("#", "%"):
+        return row
+    text = COMMENT_MARK.sub("", row[0])
+    if not text and (len(row) > count or (separator == BLANKS and row[0] != "%")):
         return row[1:]
-    return [COMMENT_MARK.sub("", row[0]), *row[1:]] if row and row[0][:1] in ("#", "%") else row
+    return row if row[0] == "%" else [text, *row[1:]]
 
 
 def _trimmed(row: list[str]) -> list[str]:

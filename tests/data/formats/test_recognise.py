@@ -263,3 +263,10 @@ def test_arrays_of_an_npz_file_have_the_sizes_of_their_headers(tmp_path):
     with pytest.raises(ValueError, match="it is a table with named columns"):
         npz.contents(path, []).channels[0].values()
     assert npz.contents(path, []).channels[0].samples == 0
+
+
+def test_a_damaged_archive_is_no_file_of_measurements(tmp_path):
+    path = tmp_path / "run.zip"
+    path.write_bytes(b"PK\x03\x04 and no directory")
+    with pytest.raises(ValueError, match="^path: must be a file of measurements, got '.*run.zip' .BadZipFile: "):
+        recognise.contents(path, None, [], {})

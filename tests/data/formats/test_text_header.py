@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.data.formats import text_header
+from bayesperiodic.data.formats import text, text_header
 from bayesperiodic.data.formats.text_header import Head, numbered
 
 
@@ -220,3 +220,35 @@ def test_missing_name_is_asked_for_with_those_that_are_there(write):
         bp.Recording.from_file(path, time="t", outputs={"x": "z"})
     with pytest.raises(ValueError, match="column of run.csv: must be a number from 1 to 3, got 4"):
         bp.Recording.from_file(path, time="t", outputs={"x": 4})
+
+
+MARKED = {
+    "two marked lines": ("% s mm N\n% t x y\n", " "), "marked names": ("# t x y\n# s mm N\n", " "),
+    "percent below": ("% t x y\n% s mm N\n", " "), "doubled marks": ("## s mm N\n## t x y\n", " "),
+    "a mark without a blank": ("%s mm N\n%t x y\n", " "), "commas": ("#s,mm,N\n#t,x,y\n", ","),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", MARKED)
+def test_marks_of_comments_do_not_shift_the_units(write, case):
+    """The marks # of Gnuplot and % of MATLAB stand before the first field, with a blank or without."""
+    head, mark = MARKED[case]
+    path = write(head + DATA[mark])
+    run = bp.Recording.from_file(path, time="t", outputs={"x": "x", "y": "y"})
+    assert run.outputs["x"] == pytest.approx(1e-3 * np.array([1.5, 2.5, 3.5]), rel=1e-12)
+    assert run.outputs["y"].tolist() == [2, 3, 4] and run.time.tolist() == [0.5, 1.5, 2.5]
+    assert [one.unit for one in bp.inspect(path).channels] == ["s", "mm", "N"]
+
+
+@pytest.mark.parametrize("head", ["%,mm,N\na,x,y\n", "a,x,y\n%,mm,N\n"])
+def test_percent_in_a_row_of_units_is_one_of_them(write, head):
+    path = write(head + DATA[","])
+    for wanted in ([], ["a", "x"]):
+        assert [one.unit for one in text.contents(path, wanted).channels] == ["%", "mm", "N"]
+
+
+def test_a_field_without_end_is_refused_for_the_separator_that_was_given(write):
+    """Longer than the 131072 characters that Python's module csv takes; for other separators it may be several."""
+    path = write("a,b\n" + "1" * 140_000 + ",2\n")
+    with pytest.raises(ValueError, match="path: must be a CSV file with a header line, got .*run.csv.*field larger"):
+        text.contents(path, ["a"], separator=",")

@@ -180,3 +180,39 @@ def test_logical_values_are_remarked_and_read_as_ones_and_zeros(write):
     path = write("t,x\n0,True\n1,False\n2,True\n")
     assert bp.inspect(path).channels[1].remarks == ("logical values, 1 for True and 0 for False",)
     assert np.array_equal(bp.Recording.from_csv(path, time="t", outputs={"x": "x"}).outputs["x"], [1.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("limit", [1, 10**9])
+@pytest.mark.parametrize(
+    "third, number",
+    [
+        ("5,6,7", None), ("5,6,7,", None), (" , , ", None), ("5,,7", None), ("5,6,", None), ("5,6", 3), ("5", 3),
+        ("5,6,7,8", 3), ("5,6,7,,", 3), ("5,6,7, ,9", 3), ("5,6,7,,,,", 3),
+    ],
+)  # fmt: skip
+def test_rows_have_as_many_fields_as_there_are_names_in_wide_files_too(write, monkeypatch, limit, third, number):
+    """One more field that is empty is none; a row of blanks, or an empty cell, is a missing sample."""
+    monkeypatch.setattr(text, "NARROW_COLUMNS", limit)
+    path = write(f"a,b,c\n1,2,3\n3,4,5\n{third}\n7,8,9\n")
+    if number:
+        with pytest.raises(ValueError, match=f"3 fields in each row, .* in data row {number} of '.*run.csv'"):
+            text.contents(path, ["b"])
+    else:
+        values = text.contents(path, ["b"]).channels[1].values()
+        cell = third.split(",")[1].strip()
+        assert values[[0, 1, 3]].tolist() == [2, 4, 8]
+        assert np.isnan(values[2]) if not cell else values[2] == float(cell)
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
+def test_parts_of_different_kinds_are_read_below_a_preamble(write, monkeypatch, separator):
+    """The first rows of a column are numbers, the last are texts; those of the others are all read."""
+    monkeypatch.setattr(text, "PART_ROWS", 3)
+    monkeypatch.setattr(text, "PART_CELLS", 3)
+    rows = [[f"{k}.5", f"{10 + k}", f"{k}" if k < 8 else "bad"] for k in range(12)]
+    table = "\n".join(separator.join(row) for row in [["time", "x", "b"], *rows])
+    channels = text.contents(write(f"Recorded\n\n{table}\n"), []).channels
+    assert [channel.name for channel in channels] == ["time", "x", "b"]
+    assert channels[0].values().tolist() == [k + 0.5 for k in range(12)]
+    assert channels[1].values().tolist() == [10 + k for k in range(12)]
+    assert [str(value) for value in channels[2].values()] == [row[2] for row in rows]
