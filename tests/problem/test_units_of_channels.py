@@ -33,7 +33,7 @@ def recorded(units, *, asked=None, split=None, **given):
 
 
 def problem(recording, model, **more):
-    return bp.Problem(model, [recording.fold(32, frequency=FREQUENCY)], priors=PRIORS, **more)
+    return bp.Problem(model, [recording.fold(32, frequency=FREQUENCY)], priors=PRIORS, scheme="fourier", **more)
 
 
 def test_units_stay_with_parts_joined_and_folded_recordings():
