@@ -1,9 +1,9 @@
 """Mutation testing of a random sample of mutants: ``python -m tests.mutants --count 100 --seed 1``.
 
 mutmut writes the mutants of the modules in `pyproject.toml`. A mutant is tested in a process forked from one that has
-collected the tests but run none, by the folder of `tests/` that mirrors its own: first the files that name its function,
-then those that name its module, then the others, until a test fails or `BUDGET` seconds of processor time have passed.
-Results are in `mutants.md`.
+collected the tests but run none, by the folder of `tests/` that mirrors its own: first the files that name its
+function, then those that name its module, then the others, until a test fails or `BUDGET` seconds of processor time
+have passed. Results are in `mutants.md`.
 """
 
 import argparse
@@ -13,7 +13,6 @@ import random
 import resource
 import sys
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -60,11 +59,12 @@ class Tests:
         self.mutants, self.statuses, self._failed = mutants, dict[str, int](), False
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note that a test of this process has failed."""
         self._failed |= report.failed
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        assert not session.testsfailed
+        """Test each mutant in a process of its own, in place of the tests themselves."""
         for number, mutant in enumerate(self.mutants, 1):
             tests = ordered(mutant, session.items)
             child = os.fork()
@@ -112,11 +112,6 @@ def wilson(killed: int, count: int) -> tuple[float, float]:
     return (centre - half) / (1 + z**2 / count), (centre + half) / (1 + z**2 / count)
 
 
-def drawn(known: list[str], count: int, seed: int) -> Iterator[str]:
-    """Yield a random sample of the mutants."""
-    yield from random.Random(seed).sample(known, count)
-
-
 def main() -> None:
     """Print the mutants that survive, and the rate of those killed."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -124,12 +119,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("names", nargs="*", help="mutants to test instead, of those that are written")
     options = parser.parse_args()
-    statuses = run(options.names or [*drawn(write_mutants(), options.count, options.seed)])
+    statuses = run(options.names or random.Random(options.seed).sample(write_mutants(), options.count))
     print("Not killed:", *(name for name, status in statuses.items() if status == SURVIVED), sep="\n")
     killed, count = sum(status != SURVIVED for status in statuses.values()), len(statuses)
     low, high = wilson(killed, count)
-    minutes = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime / 60
-    print(f"{killed} of {count} killed: {killed / count:.1%} (95 % interval {low:.1%} to {high:.1%}); {minutes:.0f} min")
+    print(f"{killed} of {count} killed: {killed / count:.1%} (95 % interval {low:.1%} to {high:.1%})")
 
 
 if __name__ == "__main__":

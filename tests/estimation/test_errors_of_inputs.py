@@ -172,6 +172,15 @@ def test_linear_models_have_no_nonlinearity_and_fine_grids_no_shift():
     assert covariance.input_nonlinearity(exact, at, other.solutions, spread).tolist() == [0.0, 0.0]
 
 
+def test_nonlinearity_is_not_known_where_a_solve_fails(monkeypatch):
+    problem, peak, fit = solved([run_of(cycles=1)], {"x": SD})
+    spread = np.linalg.inv(covariance.uncertainty(problem, peak, 1.0).information)
+    monkeypatch.setattr(covariance, "_solved", lambda *_: None)
+    assert covariance.input_nonlinearity(problem, peak, fit.solutions, spread).tolist() == pytest.approx(
+        [np.nan, np.nan], nan_ok=True
+    )
+
+
 def test_shifts_are_gauss_newton_steps_in_standard_deviations():
     """C Jᵀ S⁻¹ Δ over the root of the diagonal of C, with errors of the inputs in S."""
     problem, peak, _ = solved([run_of(cycles=1)], {"x": SD})

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.data.formats import text, text_header
+from bayesperiodic.data.formats import header_units, text, text_header
 from bayesperiodic.data.formats.text_header import Head, numbered
 
 
@@ -252,3 +252,16 @@ def test_a_field_without_end_is_refused_for_the_separator_that_was_given(write):
     path = write("a,b\n" + "1" * 140_000 + ",2\n")
     with pytest.raises(ValueError, match="path: must be a CSV file with a header line, got .*run.csv.*field larger"):
         text.contents(path, ["a"], separator=",")
+
+
+@pytest.mark.parametrize(
+    "names, units",
+    [
+        (["x [mm]", "y [smoot]"], ["mm", "smoot"]), (["x (mm)", "y (smoot)"], ["mm", ""]),
+        (["x [a]b", "y [smoot]"], ["", ""]), (["x [1]", "y [mm]"], ["", "mm"]), (["x [1]", "y [2]"], ["", ""]),
+        (["x (1)", "y (mm)"], ["", "mm"]),
+    ],
+)  # fmt: skip
+def test_what_stands_in_square_brackets_beside_a_known_unit_is_one_that_the_user_must_explain(names, units):
+    """In round brackets it may be an argument; a number is an index."""
+    assert header_units.in_names(names, guessed=False) == (units, {})
