@@ -47,7 +47,7 @@ class OrbitsEstimate(Printed):
     >>> given = bp.Problem(bp.models.pendulum, runs, priors={"l": bp.LogNormal(0.27, 0.3)}, fixed=known)
     >>> estimate = bp.estimate_orbits(given, progress=False)
     >>> len(estimate.problem.experiments), list(estimate.table.columns)
-    (2, ['periods', 'multiplier', 'rms[angle]', 'rms[rate]'])
+    (2, ['periods', 'multiplier', 'rms[angle]', 'rms[rate]', 'rms/sd'])
     """
 
     problem: Problem
@@ -56,7 +56,10 @@ class OrbitsEstimate(Printed):
 
     @property
     def table(self) -> "pd.DataFrame":
-        """One row per orbit included: periods, largest multiplier by the model as text, rms of each residual."""
+        """One row per orbit included: periods, largest multiplier by the model as text, rms of each residual.
+
+        For orbits with a covariance also ``rms/sd``, the root mean square of their residuals in standard errors.
+        """
         import pandas as pd
 
         rows = {}
@@ -67,6 +70,8 @@ class OrbitsEstimate(Printed):
             rows[one.name] = {"periods": one.periods, "multiplier": shown} | {
                 f"rms[{channel}]": float(np.sqrt(np.mean(r[values] ** 2))) for channel, r in residuals.items()
             }
+            if one.covariance is not None:
+                rows[one.name]["rms/sd"] = _in_standard_errors(one, residuals)
         return pd.DataFrame.from_dict(rows, orient="index")
 
     def __repr__(self) -> str:
@@ -80,6 +85,10 @@ def estimate_orbits(
     problem: Problem, *, start: Mapping[str, float] | None = None, progress: bool = True
 ) -> OrbitsEstimate:
     """Estimate parameters from many orbits, which are included one after the other.
+
+    Where orbits have covariances, a first estimate has an unknown variance per channel in their place, and the second
+    one starts from it. Errors that are strongly correlated, as those of waveforms, leave combinations of the values
+    nearly without error, which would need accurate start values.
 
     Strongly unstable orbits exist only near the parameters at which they were measured: from a distant start, one of
     many turns into another orbit or is lost, and with it the estimate. With one orbit more at a time, each is solved at
@@ -249,6 +258,13 @@ def _compared(experiment: Experiment) -> np.ndarray:
     """Return at which points of the grid outputs are compared, (samples·periods,)."""
     points = experiment.samples * experiment.periods
     return np.ones(points, dtype=bool) if experiment.mask is None else experiment.mask
+
+
+def _in_standard_errors(experiment: Experiment, residuals: Mapping[str, np.ndarray]) -> float:
+    """Return the root mean square of the residuals, whitened by the covariance."""
+    values = np.stack([residuals[name][_compared(experiment)] for name in experiment.outputs], axis=-1).ravel()
+    covariance = np.asarray(experiment.covariance)[: values.size, : values.size]
+    return float(np.sqrt(values @ np.linalg.solve(covariance, values) / values.size))
 
 
 def _unexplained(experiment: Experiment, fit: MapEstimate) -> float:

@@ -128,9 +128,9 @@ def find_orbits(
     [1, 2]
     """
     if isinstance(section, PoincareSection):
-        orbits = _of_section(section, periods, method, neighbours, box, steps, waveforms)
+        of_one = _of_section(section, periods, method, neighbours, box, steps, waveforms)
         _warn_of_change(section)
-        return orbits
+        return of_one
     _checks.instance("section", section, (list, tuple))
     for one in section:
         _checks.instance("section", one, PoincareSection)

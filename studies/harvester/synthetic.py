@@ -52,7 +52,7 @@ POINTS = 64
 TOLERANCE, HALF_WIDTH, BAND = 0.02, 1.6448536, 0.99
 # Of the estimates: recordings, grid points a period, largest error of a waveform as a fraction of it; standard
 # deviation of the logarithms of the priors' medians about the truth, that of the priors, and the intervals' levels.
-RECORDINGS, SAMPLES, LARGEST_ERROR, MISTAKE, SPREAD, LEVELS = 16, 128, 0.05, 0.18, 0.3, (0.5, 0.9)
+RECORDINGS, SAMPLES, LARGEST_ERROR, MISTAKE, SPREAD, LEVELS = 10, 128, 0.05, 0.18, 0.3, (0.5, 0.9)
 # Guesses nearer to each other, and orbits nearer to each other than this are the same.
 ALIKE, SAME = 0.02, 1e-5
 
@@ -256,7 +256,7 @@ def estimate(phases: int, seed: int, *, quick: bool) -> dict[str, Any]:
     generator = np.random.default_rng([seed, 2])
     priors = {n: bp.LogNormal(v * np.exp(MISTAKE * generator.standard_normal()), SPREAD) for n, v in TRUTH.items()}
     runs = [orbit.experiment(samples=SAMPLES, whole=True) for orbit in used]
-    problem = bp.Problem(MODEL, runs, priors=priors, fixed={"scale": 1.0})
+    problem = bp.Problem(MODEL, runs, priors=priors, noise=bp.noise.Independent(per="experiment"))
     try:
         result = bp.estimate_orbits(problem, progress=False)
     except ValueError as error:

@@ -144,4 +144,7 @@ def test_correlated_errors_and_a_hidden_state_need_no_accurate_start(seed):
     assert estimate.problem.fixed == given.fixed and estimate.problem.noise_names == ("scale",)
     away = np.array([estimate.fit.theta[name] - value for name, value in synthetic.TRUTH.items()])
     names = [*synthetic.TRUTH]
+    # Mean squares of 64 residuals, less what the seven parameters explain of 256.
+    squares = estimate.table["rms/sd"] ** 2
+    assert all(chi2.ppf(1e-5, 57) < 64.0 * one < chi2.isf(1e-5, 64) for one in squares)
     assert away @ np.linalg.solve(estimate.fit.covariance.loc[names, names], away) < chi2.isf(2e-3, 7)

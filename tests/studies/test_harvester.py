@@ -256,6 +256,17 @@ def test_orbits_of_a_simulated_recording_are_found_with_error_bars_that_cover(tm
     assert count["count"] >= binom.ppf(1e-3, count["of"], 0.9)
 
 
+@pytest.mark.slow
+def test_parameters_of_simulated_recordings_are_found(tmp_path):
+    """Two recordings, orbits of periods 1 and 2; all parameters within five robust sd: false alarms below 0.01 %."""
+    assert main(["harvester", "--part", "parameters", "--quick", "--out", str(tmp_path)]) == 0
+    results = json.loads((tmp_path / "parameters" / "results.json").read_text("utf-8"))
+    assert results["estimated"] == len(results["recordings"]) == 2
+    for one in results["recordings"]:
+        assert all(abs(away) < 5.0 for away in one["in_sd"].values())
+        assert all(sd < 0.01 * results["truth"][name] for name, sd in one["robust_sd"].items())
+
+
 def test_multiple_shooting_needs_the_results_of_the_study(tmp_path, capsys):
     assert main(["harvester", "--part", "shooting", "--out", str(tmp_path)]) == 1
     assert "Run it without --part first" in capsys.readouterr().err
