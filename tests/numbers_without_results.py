@@ -273,12 +273,10 @@ WITHOUT_RESULTS = {
     "docs/studies/harvester.md": {
         SETTING: (
             "in 120 pieces of 4 s", "errors below 4 % of", "free runs over 30 periods", "The force of degree 7 is",
-            "of three states in 120 pieces", "Of those of periods 1 to 4 whose multiplier is below 100",
+            "of three states in 120 pieces", "those of periods 1 to 4 whose multiplier is below 100",
             "within 8 % of their range", "The 90 % error bars",
         ),
-        UNSTORED: (
-            "gave 0.028, with 19 runs that leave, and 0.004", "which is not measured, all 14 are found",
-        ),
+        UNSTORED: ("gave 0.028, with 19 runs that leave, and 0.004",),
         ELSEWHERE: ("Cunha Jr, 2025", "CC BY-NC-ND 4.0"),
     },
     "docs/studies/structure.md": {
