@@ -1014,14 +1014,20 @@ def measured_chaos():
 @on("docs/studies/harvester.md")
 def known_orbits():
     given = results("harvester/orbits")
-    yield f"{given['found']} of {len(given['orbits'])} are found by the"
-    for one in given["orbits"]:
-        if not one["found"]:
-            yield f"| {one['period']} | {one['returns']} | {one['multiplier']:.1f} |"
-    covered = given["covered"]
-    low, high = covered["band"]
+    new, old = given["integrated"], given["delayed"]
+    for k, (one, other) in enumerate(zip(new["recordings"], old["recordings"], strict=True)):
+        yield f"| {k + 1} | {len(one['orbits'])} | {one['found']} ({other['found']}) |"
+    yield f"| all | {new['of']} | {new['found']} ({old['found']}) |"
+    missed = [row for one in new["recordings"] for row in one["orbits"] if not row["found"]]
+    (period,) = {row["period"] for row in missed}
+    multipliers = " and ".join(f"{row['multiplier']:.1f}" for row in missed)
+    returns = " and ".join(f"{row['returns']}" for row in missed)
+    yield f"have period {period}, multipliers of {multipliers}, and {returns} close returns"
+    covered, delayed = new["covered"], old["covered"]
     inside = f"contain {covered['count']} of {covered['of']} true values of the voltage at the points"
+    low, high = covered["band"]
     yield f"{inside} (99 % band {low} to {high}"
+    yield f"with delays {delayed['count']} of {delayed['of']} ({delayed['band'][0]} to {delayed['band'][1]})"
 
 
 @on("docs/studies/harvester.md")

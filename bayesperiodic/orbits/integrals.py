@@ -26,7 +26,7 @@ SPIKE_KERNEL = np.array([-1.0, 6.0, -15.0, 20.0, -15.0, 6.0, -1.0]) / 20.0
 # Phases a period at which integrals are compared.
 PHASES = 4
 # Neighbours of a local polynomial as a multiple of its terms; smallest singular value and eigenvalue that count.
-NEIGHBOURS_PER_TERM, SMALLEST_SINGULAR, SMALLEST_EIGENVALUE = 4, 1e-4, 1e-10
+NEIGHBOURS_PER_TERM, SMALLEST_SINGULAR, SMALLEST_OF_LINES = 4, 1e-4, 1e-10
 # Rounds of the robust regression, and residuals from which weights are smaller, in standard deviations.
 ROBUST_ROUNDS, ROBUST_LIMIT = 8, 2.0
 # Residuals count up to this many standard deviations in the covariance of successive ones.
@@ -46,8 +46,8 @@ class View(NamedTuple):
     known: np.ndarray  # (n, d)
 
 
-class Lines(NamedTuple):
-    """Drift of the integral of a channel, and the standard deviation of its error."""
+class StretchLines(NamedTuple):
+    """StretchLines of the integral of a channel, and the standard deviation of its error."""
 
     coefficients: np.ndarray  # (stretches, 2), of one and of the time from the middle of the stretch
     sd: float
@@ -114,7 +114,7 @@ def high_passed(
     return whole, local
 
 
-def lines_of(samples: Stretches, column: int, views: Sequence[View]) -> Lines:
+def lines_of(samples: Stretches, column: int, views: Sequence[View]) -> StretchLines:
     """Return the lines for which the integrals of each view are one function of its coordinates of the state.
 
     The error is that of least squares, or what the lines from every other view differ by, if that is larger. What
@@ -145,7 +145,7 @@ def lines_of(samples: Stretches, column: int, views: Sequence[View]) -> Lines:
         ]
     )
     drift = max(walk, float(products.mean()))
-    return Lines(lines.reshape(2, -1).T / [1.0, scale], float(np.sqrt(variance + drift)))
+    return StretchLines(lines.reshape(2, -1).T / [1.0, scale], float(np.sqrt(variance + drift)))
 
 
 def _basis(time: np.ndarray, stretch: np.ndarray, count: int) -> sparse.csr_array:
@@ -162,16 +162,16 @@ def _agreeing(designs: Sequence[np.ndarray], targets: Sequence[np.ndarray]) -> t
     trust = np.ones(target.size)
     for _ in range(ROBUST_ROUNDS):
         weighted = design.T * trust
-        result = np.linalg.pinv(weighted @ design, rcond=SMALLEST_EIGENVALUE, hermitian=True) @ (weighted @ target)
+        result = np.linalg.pinv(weighted @ design, rcond=SMALLEST_OF_LINES, hermitian=True) @ (weighted @ target)
         away = np.abs(target - design @ result)
         limit = ROBUST_LIMIT * MEDIAN_TO_SD * float(np.median(away))
         trust = np.minimum(1.0, limit / np.maximum(away, np.finfo(float).tiny))
     clipped, free = np.minimum(away, limit), max(target.size - result.size, 1)
     variance = float(np.sum(clipped**2)) / free / float(np.mean(away <= limit)) ** 2
-    return result, variance * np.linalg.pinv(design.T @ design, rcond=SMALLEST_EIGENVALUE, hermitian=True)
+    return result, variance * np.linalg.pinv(design.T @ design, rcond=SMALLEST_OF_LINES, hermitian=True)
 
 
-def integrated(samples: Stretches, column: int, lines: Lines) -> Stretches:
+def integrated(samples: Stretches, column: int, lines: StretchLines) -> Stretches:
     """Return samples with a channel replaced by its integral with the drift removed, of mean zero."""
     values = np.zeros(samples.time.size)
     for number, span, spline in splines(samples, column):
@@ -187,11 +187,11 @@ def _unpredicted(view: View) -> sparse.csr_array:
     places, stretch = view.known / np.ptp(view.known, axis=0), view.stretch
     n, d = places.shape
     count = NEIGHBOURS_PER_TERM * (d + 1) * (d + 2) // 2
-    distance, index = cKDTree(places).query(places, min(n, count + int(np.bincount(stretch).max())))
+    distance, index = map(np.asarray, cKDTree(places).query(places, min(n, count + int(np.bincount(stretch).max()))))
     # Neighbours in other stretches, the nearest ones.
     order = np.argsort(np.where(stretch[index] == stretch[:, None], np.inf, distance), axis=1)[:, :count]
     every = np.arange(n)[:, None]
-    index, distance = index[every, order], np.asarray(distance)[every, order]
+    index, distance = index[every, order], distance[every, order]
     away = (places[index] - places[:, None]) / distance[:, -1:, None]
     one, other = np.triu_indices(d)
     terms = np.concatenate([np.ones((*away.shape[:2], 1)), away, away[..., one] * away[..., other]], axis=2)

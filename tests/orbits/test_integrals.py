@@ -110,8 +110,9 @@ def test_a_delayed_integral_is_the_displacement_at_that_time_and_gaps_are_left_o
 
 
 def test_orbits_are_those_of_the_flow_and_experiments_leave_integrals_out(tmp_path):
-    """Of the known orbits of periods 1 and 2 with five close returns nine tenths; the 90 % bars of v and its delay
-    contain true values with a false-alarm rate of 0.5 %, as if independent.
+    """Nine tenths of those of periods 1 and 2 with five close returns.
+
+    The 90 % bars of v and its delay contain the true values; false-alarm rate 0.5 %, as if independent.
     """
     section = section_of(pieces())
     orbits = bp.find_orbits(section, periods=[1, 2], steps=3, waveforms=True)
