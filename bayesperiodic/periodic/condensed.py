@@ -53,8 +53,8 @@ LINEAR_MODES = 16
 # Points up to which a solve that fails is repeated, and their ratio.
 MOST_STARTING_POINTS, STARTING_RATIO = 512, 4
 MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40, 9, 1e-10, 1e-13
-# Residual of rounding errors, in units of its largest term, with internal states; those of an element that sticks hardly
-# forget, and errors add up over the periods that they remember.
+# Residual of rounding errors, in units of its largest term, with internal states; while an element sticks they hardly
+# forget, and errors add up over the periods that are remembered.
 ROUNDING_OF_MEMORY = 1e-8
 # Residual, in units of its largest term, below which corrections with a fixed matrix are tried before Newton's step.
 NEAR_SOLUTION = 0.1
