@@ -974,6 +974,14 @@ def beam_with_joint_and_stop():
         f"Estimate and posterior take {given['processor_seconds']:.0f} s of processor time, and the study "
         f"{given['memory_GB']:.1f} GB of memory."
     )
+    chains = results("structure/scaling")["chains"]
+    yield f"| degrees of freedom | {' | '.join(chains)} |"
+    for label, name in (
+        ("two first solves, with multipliers [s]", "two first solves, with multipliers [s]"),
+        ("estimate [s]", "estimate [s]"),
+        ("log-likelihood of a parameter vector [ms]", "a log-likelihood [ms]"),
+    ):
+        yield f"| {label} | " + " | ".join(f"{chain[name]:.1f}" for chain in chains.values()) + " |"
 
 
 @on("docs/studies/harvester.md")

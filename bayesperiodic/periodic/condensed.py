@@ -27,6 +27,7 @@ from bayesperiodic.periodic.element_forces import (
     Forces,
     Preconditioner,
     ResponseMatrices,
+    corrected,
     linear_solve,
     linearised,
     newton_step,
@@ -53,8 +54,8 @@ LINEAR_MODES = 16
 # Points up to which a solve that fails is repeated, and their ratio.
 MOST_STARTING_POINTS, STARTING_RATIO = 512, 4
 MOST_CONDENSED_STEPS, MOST_STEP_HALVINGS, LAST_NEWTON_STEP, NEWTON_ROUNDING = 40, 9, 1e-10, 1e-13
-# Residual of rounding errors, in units of its largest term, with internal states; those of an element that sticks hardly
-# forget, and errors add up over the periods that they remember.
+# Residual of rounding errors, in units of its largest term, with internal states; while an element sticks they hardly
+# forget, and errors add up over the periods that are remembered.
 ROUNDING_OF_MEMORY = 1e-8
 # Residual, in units of its largest term, below which corrections with a fixed matrix are tried before Newton's step.
 NEAR_SOLUTION = 0.1
@@ -272,13 +273,9 @@ class CondensedEquations(PeriodicEquations):
         return Solved(on_grid(d, len(guess)), code, history)
 
     def _newton(
-        self,
-        parameters: np.ndarray,
-        d: np.ndarray,
-        load: float,
-        given: ResponseMatrices | None,
+        self, parameters: np.ndarray, d: np.ndarray, load: float, given: ResponseMatrices | None,
         halvings: int = MOST_STEP_HALVINGS,
-    ) -> tuple[np.ndarray, int, np.ndarray]:
+    ) -> tuple[np.ndarray, int, np.ndarray]:  # fmt: skip
         points = 2 * len(d)
         matrices = given or self.matrices(parameters, points)[0]
         free = load * times(matrices.d_u, self.input_harmonics(points))
@@ -295,7 +292,7 @@ class CondensedEquations(PeriodicEquations):
                     known = Preconditioner(forces, rates, matrices.d_f)
                 near = None
                 if before <= NEAR_SOLUTION * size:
-                    near = self._corrected(parameters, d, forces, matrices.d_f, free, known)
+                    near = corrected(self, parameters, d, forces, matrices.d_f, free, known)
                 if near is not None:
                     history.append((before / size, float(np.linalg.norm(near - d)) / size, 1.0))
                     return near, CONVERGED, np.array(history)
@@ -321,30 +318,6 @@ class CondensedEquations(PeriodicEquations):
             if share == 1.0 and (after <= NEWTON_ROUNDING * size or np.linalg.norm(step) <= LAST_NEWTON_STEP * size):
                 return d, CONVERGED, np.array(history)
         return d, STALLED, np.array(history)
-
-    def _corrected(
-        self,
-        parameters: np.ndarray,
-        d: np.ndarray,
-        forces: Forces,
-        d_f: np.ndarray,
-        free: np.ndarray,
-        known: Preconditioner,
-    ) -> np.ndarray | None:
-        """Return the solution by corrections with a fixed matrix; None if they do not become small fast."""
-        kernels, blocks = self.model.element_kernels, np.array(self.model.state_blocks, dtype=np.int64)
-        result, f, points = d[None, None].copy(), np.empty((1, 1, *d.shape), dtype=complex), 2 * len(d)
-        lost, steps = np.zeros((2, 1, 1), dtype=np.int64)
-        states = np.zeros((points, 3 * (self.count + blocks.sum()))) if forces.memory is None else forces.memory.states
-        fewer = np.empty((1, 1, points // 4 if blocks.size else 0, self.count), dtype=complex)
-        address = (kernels.residual_jacobian if blocks.size else kernels.residual).address if self.count else 0
-        compiled().correct_many(
-            address, np.ascontiguousarray(d_f)[None, None], free[None, None], known.transposed_inverse[None], known.low,
-            parameters[None, None], np.array([2 * np.pi * self.frequency]), float(self.grid.periods),
-            *transform_tables(points), blocks, True, 0, 1, np.full((1, 1), np.inf), result, f, lost, steps,
-            states[None], fewer,
-        )  # fmt: skip
-        return None if lost[0, 0] else result[0, 0]
 
     @property
     def resolved_share(self) -> float:

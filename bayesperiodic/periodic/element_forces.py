@@ -1,14 +1,15 @@
 """Forces of the elements of a condensed model, linearised, and the solves of its linearised equations in harmonics."""
 
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
 
 from bayesperiodic._linalg import factors
-from bayesperiodic.periodic.harmonics import harmonics, on_grid
+from bayesperiodic.periodic.harmonics import harmonics, on_grid, transform_tables
 from bayesperiodic.periodic.memory import Memory
+from bayesperiodic.periodic.receptance import compiled
 
 # Share of a step that is left by harmonics whose coupling by the elements is neglected in Newton's matrix.
 WEAK_COUPLING = 0.05
@@ -174,6 +175,29 @@ def newton_step(
     inverse = Preconditioner(forces, rates, d_f)
     step = _swept(inverse, forces, rates, d_f, residual, MOST_STEP_SWEEPS, LAST_STEP_SWEEP)
     return (inverse(residual) if step is None else step), inverse
+
+
+def corrected(
+    equations: Any, parameters: np.ndarray, d: np.ndarray, forces: Forces, d_f: np.ndarray, free: np.ndarray,
+    known: Preconditioner,
+) -> np.ndarray | None:  # fmt: skip
+    """Return the solution near harmonics d by corrections with a fixed matrix; None if they do not become small fast.
+
+    `free` (harmonics, elements) are the displacements without the forces of the elements.
+    """
+    kernels, blocks = equations.model.element_kernels, np.array(equations.model.state_blocks, dtype=np.int64)
+    (count, elements), result = d.shape, d[None, None].copy()
+    lost, steps = np.zeros((2, 1, 1), dtype=np.int64)
+    states = np.zeros((2 * count, 3 * (elements + blocks.sum()))) if forces.memory is None else forces.memory.states
+    fewer = np.empty((1, 1, count // 2 if blocks.size else 0, elements), dtype=complex)
+    address = (kernels.residual_jacobian if blocks.size else kernels.residual).address if elements else 0
+    compiled().correct_many(
+        address, np.ascontiguousarray(d_f)[None, None], free[None, None], known.transposed_inverse[None], known.low,
+        parameters[None, None], np.array([2 * np.pi * equations.frequency]), float(equations.grid.periods),
+        *transform_tables(2 * count), blocks, True, 0, 1, np.full((1, 1), np.inf), result, np.empty_like(result), lost,
+        steps, states[None], fewer,
+    )  # fmt: skip
+    return None if lost[0, 0] else np.asarray(result[0, 0])
 
 
 def linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.ndarray) -> np.ndarray | None:

@@ -14,7 +14,7 @@ VALUES = {
     "joint_stiffness": 1.0,
     "joint_limit": 0.1,
     "stop_k": 1.0,
-    "stop_clearance": 0.5,
+    "stop_clearance": 0.15,
 }
 FREQUENCIES = (0.045, 0.06)
 

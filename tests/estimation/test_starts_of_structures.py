@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.estimation import climbs
 
 COUNT, SAMPLES, FREQUENCY, NOISE = 130, 64, 0.03, 0.01
 TRUTH = {"alpha": 0.05, "stop_k": 0.5, "stop_clearance": 0.5}
@@ -49,3 +50,25 @@ def test_draws_are_starts_while_the_model_is_rejected(problem):
 def test_a_model_that_is_not_rejected_has_one_start(problem):
     near = problem.replace(priors=dict(problem.priors) | {"stop_clearance": bp.Uniform(0.1, 1.0)})
     assert len(bp.map_estimate(near, progress=False).starts) == 1
+
+
+def test_climbs_on_fewer_points_end_at_the_same_optimum(monkeypatch):
+    """With a joint that sticks and slides, the optimum is that of climbs whose solves are precise from the start."""
+    springs, wave = 2.0 * np.eye(3) - np.eye(3, k=1) - np.eye(3, k=-1), np.cos(2.0 * np.pi * np.arange(64) / 64)
+    model = bp.Model.from_matrices(
+        "chain", mass=np.eye(3), stiffness=springs, damping={"alpha": np.eye(3)}, forces={"force": 0},
+        outputs={"end": (2, "displacement")}, condensed=True,
+        elements=[bp.elements.Element("joint", bp.elements.jenkins, 2, {"width": 0.1})],
+    )  # fmt: skip
+    truth, how = {"alpha": 0.1, "joint_stiffness": 0.5, "joint_limit": 0.05}, {"frequency": 0.11, "samples": 64}
+    end = bp.solve_periodic(model, truth, {"force": 0.2 * wave}, **how).outputs["end"]
+    noisy = end + 0.01 * end.std() * np.random.default_rng(2).standard_normal(64)
+    run = bp.Experiment("run", 0.11, {"end": noisy}, {"force": 0.2 * wave}, samples=64)
+    problem = bp.Problem(model, [run], priors={n: bp.LogNormal(1.2 * value, 0.5) for n, value in truth.items()})
+    fit = bp.map_estimate(problem, starts=1, checks=False, progress=False)
+    monkeypatch.setattr(climbs, "COARSENESS", 1.0)
+    precise = bp.map_estimate(problem, starts=1, checks=False, progress=False)
+    assert fit.status == precise.status == "converged"
+    for name, value in truth.items():
+        assert abs(fit.theta[name] - precise.theta[name]) < 0.02 * precise.sd[name]
+        assert abs(fit.theta[name] - value) < 4.0 * fit.sd[name]
