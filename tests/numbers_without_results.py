@@ -77,7 +77,8 @@ WITHOUT_RESULTS = {
         DEFINITION: ("A 90 % interval should", "(above 1: intervals too narrow)", "coverage at 50, 80, 90 and 95 %"),
     },
     "docs/how_to/chaotic_recordings.md": {
-        SETTING: ("a recording of 3,000 drive periods",), DEFINITION: ("a false-alarm rate of 1 %", "false-alarm rate 0.1 %"),
+        SETTING: ("a recording of 3,000 drive periods",),
+        DEFINITION: ("a false-alarm rate of 1 %", "false-alarm rate 0.1 %"),
         UNSTORED: (
             "The orbits of periods 1 to 4 of a simulated beam, with 5,100 points in three coordinates, take 0.5 to 1.1",
             "and 1.4 to 2.2 s with three",
