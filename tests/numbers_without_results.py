@@ -78,7 +78,7 @@ WITHOUT_RESULTS = {
     },
     "docs/how_to/chaotic_recordings.md": {
         SETTING: ("a recording of 3,000 drive periods",),
-        DEFINITION: ("a false-alarm rate of 1 %", "stretches need 10 forcing periods"),
+        DEFINITION: ("a false-alarm rate of 1 %", "stretches need 10 forcing periods", "false-alarm rate 0.1 %"),
         UNSTORED: (
             "The orbits of periods 1 to 4 of a simulated beam, with 5,100 points in three coordinates, take 0.5 to 1.1",
             "and 1.4 to 2.2 s with three",
@@ -221,8 +221,7 @@ WITHOUT_RESULTS = {
     "docs/reference/still_wrong.md": {
         UNSTORED: (
             "rounded below 0.05", "comes out as -1.48 ± 0.01, the model has -1.34 with this friction and -1.52 without",
-            "rises from 0.19 to 0.21", "local maps is 0.053, of which noise explains 0.041",
-            "without the drift 0.052 and 0.050",
+            "and the recording has 1,000 returns",
             "on 400 points takes 0.26 ms, a posterior of three parameters 10 s of processor time",
             "four such units 58 s", "which takes 0.18 ms there",
         ),

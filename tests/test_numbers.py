@@ -1039,6 +1039,16 @@ def known_orbits():
 
 
 @on("docs/studies/harvester.md")
+def known_parameters():
+    given = results("harvester/parameters")
+    yield f"{given['estimated']} of {len(given['recordings'])} recordings"
+    for one in given["counts"]:
+        kind = {"each": "intervals", "joint": "regions"}[one["kind"]]
+        low, high = one["band"]
+        yield f"| {kind} of {100 * one['level']:.0f} % | {one['count']} of {one['of']} | {low} to {high} |"
+
+
+@on("docs/studies/harvester.md")
 def multiple_shooting():
     orbits = results("harvester")
     rows = {f"{one['periods']:g} periods": one for one in results("harvester/shooting")["lengths"]}

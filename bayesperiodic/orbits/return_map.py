@@ -403,7 +403,7 @@ DIVERGING_PROBES = 400
 NEIGHBOUR = 8
 # Points of a cell of the test for a trend in time, as a multiple of the number of terms; relative size of columns that
 # depend on others.
-CELL, DEPENDENT = 15, 1e-9
+POINTS_OF_TREND, DEPENDENT = 15, 1e-9
 # Fewest points from which as many returns as needed are in their stretch.
 FEWEST_FOLLOWED = 100
 
@@ -499,7 +499,7 @@ def change_in_time(maps: ReturnMap) -> float:
     """
     powers = monomials(maps.points.shape[1], 2)
     total = mean = variance = 0.0
-    for cell in _cells(maps.wrap_points(maps.arguments), 2 * CELL * len(powers)):
+    for cell in _cells(maps.wrap_points(maps.arguments), 2 * POINTS_OF_TREND * len(powers)):
         time = maps.positions[cell]
         kept = [0]
         for k in range(1, time.size):

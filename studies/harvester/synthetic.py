@@ -50,8 +50,8 @@ POINTS = 64
 # An orbit is found if all coordinates of its points are within this distance, in ranges of the coordinates; half width
 # of 90 % error bars in standard deviations, and the probability of the band of the number that they cover.
 TOLERANCE, HALF_WIDTH, BAND = 0.02, 1.6448536, 0.99
-# Of the estimates: recordings, grid points a period, largest error of a waveform as a fraction of it; standard
-# deviation of the logarithms of the priors' medians about the truth, that of the priors, and the intervals' levels.
+# Of the estimates: recordings, points a period, largest error of a waveform as a fraction of it; standard deviation
+# of the logarithms of the priors' medians about the truth, that of the priors, and probabilities of the intervals.
 RECORDINGS, SAMPLES, LARGEST_ERROR, MISTAKE, SPREAD, LEVELS = 10, 128, 0.05, 0.18, 0.3, (0.5, 0.9)
 # Guesses nearer to each other, and orbits nearer to each other than this are the same.
 ALIKE, SAME = 0.02, 1e-5
