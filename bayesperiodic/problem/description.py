@@ -69,8 +69,7 @@ class Description(Printed):
         input_errors: Mapping[str, InputErrors] | None = None,
         anchors: Mapping[str, Any] | None = None,
     ):
-        if not isinstance(model, Model):
-            raise ValueError(f"model: must be a Model, got {_checks.shortened(model)}.")
+        _checks.instance("model", model, Model)
         if not isinstance(priors, Mapping):
             raise ValueError(f"priors: must be a mapping of names to priors, got {priors!r}.")
         self.noise, self.experiments = as_noise(noise), arguments.checked_experiments(model, experiments)
