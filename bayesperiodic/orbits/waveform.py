@@ -55,8 +55,7 @@ class Waveform(Storable):
         The channels that are inputs.
     errors : array (errors, channels, samples·period)
         Errors that the channels and phases have in common, each one standard deviation, independent of each other: of
-        the closed points, propagated by the slopes of the regression, of the regression, and the estimated course of
-        its bias in each output after each point, with its products with polynomials of degree two.
+        the closed points, propagated by the slopes of the regression, and of the regression.
     bias : array (channels, parts)
         Root mean square of the estimated bias after each point: a part is a forcing period, or a step of `find_orbits`.
     noise : array (channels, samples·period)
@@ -64,9 +63,8 @@ class Waveform(Storable):
 
     Notes
     -----
-    The bias is estimated from the difference to wider neighbourhoods. It is not subtracted: errors of its size in each
-    channel, after each point, may be any polynomial of degree two, or have its course, which is that of a spike where
-    the motion has one.
+    The bias is estimated from the difference to wider neighbourhoods. It is not subtracted, and its course over the
+    phases is not used: errors of its size in each channel, after each point, may be any polynomial of degree two.
 
     Examples
     --------
@@ -236,7 +234,7 @@ class _MotionPart(NamedTuple):
 
     values: np.ndarray  # (samples, channels)
     errors: np.ndarray  # of each run of neighbours, (runs, samples, channels)
-    bias: np.ndarray  # (samples, channels)
+    bias: np.ndarray  # modulus, (samples, channels)
     gain: np.ndarray  # variance of the values for independent errors of unit variance, (channels,)
 
 
@@ -262,7 +260,6 @@ def waveform_of(
     if times is not None:
         errors += _moved(motion, times, order, [phases[j] for j in order])
     common, rest = _common(errors.transpose(0, 2, 1), np.std(motion, axis=0), 2 * estimate.points.size)
-    common = np.concatenate([common, _courses([part.bias for part in parts], following.outputs.stop)])
     gains = np.concatenate([np.tile(part.gain[:, None], len(part.values)) for part in parts], axis=1)
     noise = np.sqrt(np.maximum(rest[:, None], following.variance[:, None] * gains))
     squares = np.concatenate([part.bias**2 for part in parts]).reshape(order.size, following.count, -1)
@@ -306,7 +303,7 @@ def _parts(
         if columns == following.outputs:
             away = _without_turns(away, following)
         values, errors = fit.value.reshape(away.shape), errors.reshape(len(errors), *away.shape)
-        parts.append(_MotionPart(values, errors, away / growth, np.full(away.shape[1], fit.gain)))
+        parts.append(_MotionPart(values, errors, np.abs(away) / growth, np.full(away.shape[1], fit.gain)))
     return parts
 
 
@@ -325,20 +322,6 @@ def _continuous(parts: list[np.ndarray], following: Following) -> np.ndarray:
         motion[:, column] = np.unwrap(motion[:, column])
         motion[:, column] -= TURN * np.ceil((motion[0, column] - np.pi) / TURN)
     return motion
-
-
-def _courses(biases: list[np.ndarray], outputs: int) -> np.ndarray:
-    """Return errors (n, channels, samples): the bias (samples, channels) of each output after each point alone.
-
-    The bias may be larger on one side of its part than estimated: its products with polynomials are errors too.
-    """
-    ends = np.cumsum([0, *(len(bias) for bias in biases)])
-    result = np.zeros((BIAS_DEGREE + 1, outputs, len(biases), biases[0].shape[1], ends[-1]))
-    for j, bias in enumerate(biases):
-        shapes = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, len(bias)), BIAS_DEGREE).T
-        for c in range(outputs):
-            result[:, c, j, c, ends[j] : ends[j + 1]] = shapes * bias[:, c]
-    return result.reshape(-1, *result.shape[-2:])
 
 
 def _common(errors: np.ndarray, size: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
