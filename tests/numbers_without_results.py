@@ -272,6 +272,7 @@ WITHOUT_RESULTS = {
     "docs/studies/harvester.md": {
         SETTING: (
             "in 120 pieces of 4 s", "errors below 4 % of", "free runs over 30 periods", "The force of degree 7 is",
+            "The posterior of degree 7,",
             "of three states in 120 pieces", "those of periods 1 to 4 whose multiplier is below 100",
             "within 8 % of their range", "The 90 % error bars",
         ),
