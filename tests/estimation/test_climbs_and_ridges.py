@@ -110,7 +110,7 @@ def test_more_starts_follow_as_long_as_the_model_is_rejected(monkeypatch, counts
         asked.append((float(best.theta[0]), starts))
         return "" if starts >= accepted else "rejected"
 
-    def reached(objective, ends, draw, progress):
+    def reached(objective, ends, draw, progress, coarse):
         return None if draw[0] == 2.0 else End(iterate(draw, -abs(draw[0] - 3.0)), "converged", None)
 
     monkeypatch.setattr(climbs, "misfit_at", misfit_at)

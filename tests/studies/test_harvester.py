@@ -249,9 +249,10 @@ def test_study_runs_on_simulated_data(tmp_path, monkeypatch):
 def test_orbits_of_a_simulated_recording_are_found_with_error_bars_that_cover(tmp_path):
     """Periods 1 and 2 in 120 pieces, all found. False alarms with independent normal errors: 0.1 % and 0.04 %."""
     assert main(["harvester", "--part", "orbits", "--quick", "--out", str(tmp_path)]) == 0
-    results = json.loads((tmp_path / "orbits" / "results.json").read_text("utf-8"))
-    assert len(results["orbits"]) >= 6 and results["found"] == len(results["orbits"])
-    assert all(abs(one["estimate"] - one["multiplier"]) < 4.0 * one["estimate_sd"] for one in results["orbits"])
+    results = json.loads((tmp_path / "orbits" / "results.json").read_text("utf-8"))["integrated"]
+    (orbits,) = (one["orbits"] for one in results["recordings"])
+    assert len(orbits) >= 6 and results["found"] == results["of"] == len(orbits)
+    assert all(abs(one["estimate"] - one["multiplier"]) < 4.0 * one["estimate_sd"] for one in orbits)
     count = results["covered"]
     assert count["count"] >= binom.ppf(1e-3, count["of"], 0.9)
 
