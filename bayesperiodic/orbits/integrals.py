@@ -47,7 +47,7 @@ class View(NamedTuple):
 
 
 class StretchLines(NamedTuple):
-    """StretchLines of the integral of a channel, and the standard deviation of its error."""
+    """Lines of the integral of a channel, one a stretch, and the standard deviation of its error."""
 
     coefficients: np.ndarray  # (stretches, 2), of one and of the time from the middle of the stretch
     sd: float
