@@ -250,7 +250,7 @@ def shortened(value: Any) -> str:
 
 def checked_units(units: Mapping[str, str], names: Iterable[str]) -> dict[str, str]:
     """Return units by name; raise a ValueError for other names and for what is no text."""
-    for name, unit in units.items():
+    for name, unit in mapping("units", units, "{'force': 'N'}").items():
         one_of("units", name, names)
         text(f"units[{name!r}]", unit)
     return dict(units)

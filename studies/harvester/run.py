@@ -45,7 +45,7 @@ class Chosen(NamedTuple):
 def run(options: argparse.Namespace) -> None:
     """Run the study, or with ``--part`` only that."""
     if options.part:
-        {"orbits": orbits_part, "parameters": parameters_part, "shooting": shooting_part}[options.part](options)
+        (shooting_part if options.part == "shooting" else simulated_part)(options)
         return
     watch = common.Stopwatch()
     with watch.part("recording", "the recording"):
@@ -104,23 +104,17 @@ def run(options: argparse.Namespace) -> None:
     common.finish(options.out, results, watch, paths, synthetic=about["synthetic"])
 
 
-def orbits_part(options: argparse.Namespace) -> None:
-    """Search for the orbits of simulated recordings, and compare them with those that are there."""
+def simulated_part(options: argparse.Namespace) -> None:
+    """Compare the orbits, or the parameters, that simulated recordings give with those that are there."""
+    compared, table, what = {
+        "orbits": (synthetic.campaign, synthetic.table, "orbits of the flow, and those found in recordings of it"),
+        "parameters": (synthetic.coverage, synthetic.coverage_table, "orbits and parameters of simulated recordings"),
+    }[options.part]
     watch = common.Stopwatch()
-    with watch.part("orbits", "orbits of the flow, and those found in recordings of it"):
-        results = synthetic.campaign(PHASES, options.seed, quick=options.quick)
-    print(synthetic.table(results))
-    common.finish(options.out / "orbits", {"seed": options.seed, "quick": options.quick} | results, watch,
-                  synthetic=True)  # fmt: skip
-
-
-def parameters_part(options: argparse.Namespace) -> None:
-    """Estimate the parameters of several simulated recordings, and compare them with the truth."""
-    watch = common.Stopwatch()
-    with watch.part("parameters", "orbits and parameters of simulated recordings"):
-        results = synthetic.coverage(PHASES, options.seed, quick=options.quick)
-    print(synthetic.coverage_table(results))
-    common.finish(options.out / "parameters", {"seed": options.seed, "quick": options.quick} | results, watch,
+    with watch.part(options.part, what):
+        results = compared(PHASES, options.seed, quick=options.quick)
+    print(table(results))
+    common.finish(options.out / options.part, {"seed": options.seed, "quick": options.quick} | results, watch,
                   synthetic=True)  # fmt: skip
 
 

@@ -121,7 +121,7 @@ def test_tables_of_other_quantities_are_refused():
         response({"y": "m"}, of_model="km")
 
 
-@pytest.mark.parametrize("units", [{"F": "m"}, {"y": ""}, {"x": 3}])
+@pytest.mark.parametrize("units", [{"F": "m"}, {"y": ""}, {"x": 3}, "m"])
 def test_units_of_other_channels_and_no_texts_are_refused(units):
     t = np.arange(0.0, 10.0, 0.1)
     with pytest.raises(ValueError, match="^units"):
