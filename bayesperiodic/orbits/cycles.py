@@ -63,12 +63,50 @@ class Estimate(NamedTuple):
     fits: "CycleFits | None" = None  # those at the points; None for "boxes"
 
 
-class CycleFits(NamedTuple):
-    """The local fits that close a refined cycle, and the cycle that wider ones close."""
+class ClosingFits(NamedTuple):
+    """A cycle, and the local fits at its points that close it."""
 
+    points: np.ndarray  # (p, d)
     bandwidths: np.ndarray  # (p,)
-    narrow: LocalFit
-    wide_points: np.ndarray  # of the cycle of fits WIDENED times as wide, (p, d)
+    fit: LocalFit
+
+
+class CycleFits(NamedTuple):
+    """A refined cycle, and that of fits WIDENED times as wide; errors of both are summed over the same runs."""
+
+    narrow: ClosingFits
+    wide: ClosingFits
+
+    def runs(self, maps: ReturnMap) -> "Runs":
+        """Return the runs of pairs of points in all fits."""
+        return Runs.of(maps, self.narrow.fit, self.wide.fit)
+
+
+class Runs(NamedTuple):
+    """Pairs of points in some fits, and the run of each.
+
+    Consecutive pairs share the noise of a point. Errors are summed over runs of consecutive pairs, and are independent
+    between runs.
+    """
+
+    pairs: np.ndarray  # positions, (n,)
+    run: np.ndarray  # (n,)
+
+    @classmethod
+    def of(cls, maps: ReturnMap, *fits: LocalFit) -> "Runs":
+        """Return the runs in fits."""
+        pairs = np.unique(np.concatenate([maps.positions[fit.neighbours].ravel() for fit in fits]))
+        return cls(pairs, np.concatenate([[0], np.cumsum(np.diff(pairs) > 1)]))
+
+    def pair(self, maps: ReturnMap, neighbours: np.ndarray) -> np.ndarray:
+        """Return which pairs start at neighbours (n,) among the arguments of the map."""
+        return np.searchsorted(self.pairs, maps.positions[neighbours])
+
+    def sums(self, maps: ReturnMap, neighbours: np.ndarray, errors: np.ndarray) -> np.ndarray:
+        """Return the sums (runs, …) of contributions (n, …) of neighbours (n,) to errors."""
+        result = np.zeros((self.run[-1] + 1, *errors.shape[1:]))
+        np.add.at(result, self.run[self.pair(maps, neighbours)], errors)
+        return result
 
 
 def newton_step(defect: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
@@ -239,38 +277,36 @@ def refine(maps: ReturnMap, points: np.ndarray, neighbours: int) -> Estimate | N
     """
     bandwidths = _bandwidths(maps, points, neighbours)
     narrow = _close(maps, points, bandwidths)
-    wide = _close(maps, points, WIDENED * bandwidths, influence=False) if narrow is not None else None
+    wide = _close(maps, points, WIDENED * bandwidths) if narrow is not None else None
     if narrow is None or wide is None:
         return None
-    cycle, fit = narrow
-    values, wide_values = eigenvalues(fit.jacobian), eigenvalues(wide[1].jacobian)
+    cycle, _, fit = narrow
+    values, wide_values = eigenvalues(fit.jacobian), eigenvalues(wide.fit.jacobian)
     slope_bias = (np.log(np.abs(wide_values)) - np.log(np.abs(values))) / SLOPE_GROWTH
-    point_bias = maps.wrap(wide[0] - cycle).ravel() / VALUE_GROWTH
+    point_bias = maps.wrap(wide.points - cycle).ravel() / VALUE_GROWTH
     turns = _turns(maps, np.sum(fit.value - cycle, axis=0))
     covariance = _joint_covariance(maps, fit)
-    fits = CycleFits(bandwidths, fit, wide[0])
-    return Estimate(maps.wrap(cycle), values, covariance, np.append(point_bias, slope_bias), turns, fits)
+    bias = np.append(point_bias, slope_bias)
+    return Estimate(maps.wrap(cycle), values, covariance, bias, turns, CycleFits(narrow, wide))
 
 
 def _turns(maps: ReturnMap, run: np.ndarray) -> float:
     return float(np.sum(run / maps.turn))
 
 
-def _close(
-    maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray, *, influence: bool = True
-) -> tuple[np.ndarray, LocalFit] | None:
+def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> ClosingFits | None:
     """Return the points at which the chained fits close, and the fits; None without convergence."""
     cycle, last, refined = points.copy(), np.inf, max(REFINED, REFINED_NOISE * float(maps.noise.max()))
     for step in range(REFINING_STEPS):
         final = last < refined or step == REFINING_STEPS - 1
         phases = maps.phases(np.arange(len(cycle)))
-        fit = maps.fit_within(cycle, phases, bandwidths, REFINING_DEGREE, influence=final and influence)
+        fit = maps.fit_within(cycle, phases, bandwidths, REFINING_DEGREE, influence=final)
         (moved,), (size,) = _moved(maps, cycle[None], fit.value[None], fit.jacobian[None])
         if not np.isfinite(size) or np.abs(maps.wrap(cycle - points)).max() > 0.1:
             return None
         if final:
             # Neighbours change as the centre moves, which leaves steps far below the errors.
-            return (cycle, fit) if size < 1e-3 else None
+            return ClosingFits(cycle, bandwidths, fit) if size < 1e-3 else None
         cycle, last = moved, size
     return None
 
@@ -319,17 +355,13 @@ def _eigenvectors(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _joint_covariance(maps: ReturnMap, fit: LocalFit) -> np.ndarray:
     """Return the joint covariance of the points of a cycle and of log|eigenvalue|, by the delta method."""
-    errors = errors_by_run(maps, fit)[2]
+    errors = errors_by_run(maps, fit, Runs.of(maps, fit))
     return errors.T @ errors
 
 
-def errors_by_run(maps: ReturnMap, fit: LocalFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pairs of points in the fits of a cycle, the run of each, and errors of runs (runs, d·p + d).
-
-    The errors are those of the cycle's points and of log|eigenvalue|. Consecutive pairs share the noise of a point, so
-    errors are summed over runs of consecutive pairs, and are independent between runs.
-    """
-    jacobian, (p, d) = fit.jacobian, fit.value.shape
+def errors_by_run(maps: ReturnMap, fit: LocalFit, runs: Runs) -> np.ndarray:
+    """Return the errors (runs, d·p + d) of the points of a cycle and of log|eigenvalue|."""
+    jacobian, d = fit.jacobian, fit.value.shape[1]
     by_value = -np.linalg.inv(_closing_matrix(jacobian[None])[0])
     right, left = _eigenvectors(jacobian)
     slope = np.einsum("kpi,pij,kpj->kp", left, jacobian, right)
@@ -340,11 +372,7 @@ def errors_by_run(maps: ReturnMap, fit: LocalFit) -> tuple[np.ndarray, np.ndarra
         points = influence[:, 0] @ by_value[:, d * j : d * (j + 1)].T
         slopes = np.einsum("kil,nli->nk", by_slope[:, j], influence[:, 1 : 1 + d])
         rows.append(np.concatenate([points, slopes + points @ by_point.reshape(d, -1).T], axis=1))
-    pairs, owner = np.unique(maps.positions[fit.neighbours.ravel()], return_inverse=True)
-    runs = np.concatenate([[0], np.cumsum(np.diff(pairs) > 1)])
-    errors = np.zeros((runs[-1] + 1, d * (p + 1)))
-    np.add.at(errors, runs[owner], np.concatenate(rows))
-    return pairs, runs, errors
+    return runs.sums(maps, fit.neighbours.ravel(), np.concatenate(rows))
 
 
 def box_orbits(maps: ReturnMap, period: int, neighbours: int, box: float) -> list[tuple[MapCycle, Estimate]]:

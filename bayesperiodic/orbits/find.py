@@ -366,7 +366,7 @@ def _orbit(
         still = bool(np.all(np.ptp(np.stack(list(cycle.values())), axis=1) < limit))
     times, waveform = return_times_of(section, maps, estimate, candidate.closest), None
     if following is not None and estimate.fits is not None:
-        waveform = waveform_of(following, maps, estimate, candidate.shift, times)
+        waveform = waveform_of(following, maps, estimate.fits, candidate.shift, times)
     return Orbit(
         name="", coordinates=section.coordinates, angles=section.angles,
         frequency=section.frequency if times is None else period / float(times.each.sum()), period=period,

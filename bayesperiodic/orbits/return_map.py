@@ -79,7 +79,7 @@ class Regression(NamedTuple):
     slopes: np.ndarray  # by the coordinates, (d, values)
     neighbours: np.ndarray  # positions among the arguments, (n,)
     influence: np.ndarray  # contribution of each neighbour to the error of `value`, (n, values)
-    gain: float  # variance of `value` for independent errors of unit variance
+    weights: np.ndarray  # of each neighbour in `value`, (n,)
 
 
 class ReturnMap:
@@ -273,7 +273,7 @@ class ReturnMap:
             errors = np.empty((0, values))
             if influence:
                 errors = system.influence(target, solution, np.ones((values, 1)), np.eye(values))[0].T
-            results.append(Regression(value, slopes, index[0], errors, float(np.sum(weights**2))))
+            results.append(Regression(value, slopes, index[0], errors, weights))
         return results
 
     def _away(self, centres: np.ndarray, index: np.ndarray) -> np.ndarray:

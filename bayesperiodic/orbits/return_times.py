@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesperiodic.orbits.cycles import REFINING_DEGREE, VALUE_GROWTH, WIDENED, Estimate, errors_by_run
+from bayesperiodic.orbits.cycles import REFINING_DEGREE, VALUE_GROWTH, Estimate, errors_by_run
 from bayesperiodic.orbits.return_map import ReturnMap
 from bayesperiodic.orbits.section import PoincareSection
 
@@ -41,14 +41,18 @@ def return_times_of(section: PoincareSection, maps: ReturnMap, estimate: Estimat
         return returns[index, None]
 
     narrow, wide = (
-        maps.regress(estimate.points, phases, widths, REFINING_DEGREE, signals)
-        for widths in (fits.bandwidths, WIDENED * fits.bandwidths)
+        maps.regress(estimate.points, phases, one.bandwidths, REFINING_DEGREE, signals)
+        for one in (fits.narrow, fits.wide)
     )
-    pairs, runs, by_run = errors_by_run(maps, fits.narrow)
-    d, errors = estimate.points.shape[1], np.empty((len(by_run), count))
-    for j, fit in enumerate(narrow):
-        errors[:, j] = by_run[:, d * j : d * (j + 1)] @ fit.slopes[:, 0]
-        np.add.at(errors[:, j], runs[np.searchsorted(pairs, maps.positions[fit.neighbours])], fit.influence[:, 0])
+    runs = fits.runs(maps)
+    by_run, d = errors_by_run(maps, fits.narrow.fit, runs), estimate.points.shape[1]
+    errors = np.stack(
+        [
+            by_run[:, d * j : d * (j + 1)] @ fit.slopes[:, 0] + runs.sums(maps, fit.neighbours, fit.influence[:, 0])
+            for j, fit in enumerate(narrow)
+        ],
+        axis=1,
+    )
     each, others = (np.array([float(fit.value[0]) for fit in some]) for some in (narrow, wide))
-    moved = np.sum([fit.slopes[:, 0] for fit in narrow] * maps.wrap(fits.wide_points - estimate.points))
+    moved = np.sum([fit.slopes[:, 0] for fit in narrow] * maps.wrap(fits.wide.points - estimate.points))
     return ReturnTimes(each, errors, float(np.hypot(np.sum(others - each), moved)) / VALUE_GROWTH)

@@ -16,7 +16,7 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic._io import Storable
 from bayesperiodic.orbits.coordinates import SHORT_RETURN, columns_of, integrand_of
-from bayesperiodic.orbits.cycles import REFINING_DEGREE, VALUE_GROWTH, WIDENED, Estimate, errors_by_run
+from bayesperiodic.orbits.cycles import REFINING_DEGREE, WIDENED, CycleFits, errors_by_run
 from bayesperiodic.orbits.return_map import ReturnMap
 from bayesperiodic.orbits.return_times import ReturnTimes
 from bayesperiodic.orbits.section import CYCLE_SAMPLES, PoincareSection
@@ -30,11 +30,23 @@ from bayesperiodic.orbits.stretches import (
     windowed,
 )
 
+
+class _Polynomials(NamedTuple):
+    """Degree of polynomials, and what their bias is to the difference to wider neighbourhoods."""
+
+    degree: int
+    subtracted: float
+    remaining: float
+
+
 # Values a return whose windows do not overlap, so that the noise of their samples is independent.
 INDEPENDENT = 16
-# Inputs depend little on the motion, and are taken as exact in fits: linear polynomials have less noise. The bias of
-# their values is proportional to the second power of the bandwidth.
-INPUT_DEGREE, INPUT_GROWTH = 1, WIDENED**2 - 1.0
+# A fraction of the difference to wider neighbourhoods is subtracted, and the bias that remains is a fraction of it.
+# The bias of cubic polynomials is proportional to the fourth power of the bandwidth; a third or fifth power leaves 0.21
+# or 0.12 of the difference. Inputs depend little on the motion, and are taken as exact in fits: linear polynomials have
+# less noise, and nothing is subtracted; their bias is proportional to the second power.
+OUTPUTS = _Polynomials(REFINING_DEGREE, 1.0 / (WIDENED ** (REFINING_DEGREE + 1) - 1.0), 0.2)
+INPUTS = _Polynomials(1, 0.0, 1.0 / (WIDENED**2 - 1.0))
 # Degree of polynomials of errors of the size of the bias, over a part of the period.
 BIAS_DEGREE = 2
 TURN = 2.0 * np.pi
@@ -234,22 +246,23 @@ class _MotionPart(NamedTuple):
 
     values: np.ndarray  # (samples, channels)
     errors: np.ndarray  # of each run of neighbours, (runs, samples, channels)
-    bias: np.ndarray  # modulus, (samples, channels)
+    bias: np.ndarray  # modulus of what may remain, (samples, channels)
     gain: np.ndarray  # variance of the values for independent errors of unit variance, (channels,)
 
 
 def waveform_of(
-    following: Following, maps: ReturnMap, estimate: Estimate, shift: int, times: ReturnTimes | None
+    following: Following, maps: ReturnMap, fits: CycleFits, shift: int, times: ReturnTimes | None
 ) -> Waveform:
     """Return the waveform of a refined cycle from its point `shift` returns after the first one on.
 
     Samples are equally spaced in time, also where the `times` between the points differ.
     """
-    order = (np.arange(len(estimate.points)) + maps.steps * shift) % len(estimate.points)
+    points = fits.narrow.points
+    order = (np.arange(len(points)) + maps.steps * shift) % len(points)
     phases = following.phases(times, order)
-    parts = _parts(following, maps, estimate, phases, following.outputs, REFINING_DEGREE, VALUE_GROWTH)
+    parts = _parts(following, maps, fits, phases, following.outputs, OUTPUTS)
     if following.inputs:
-        inputs = _parts(following, maps, estimate, phases, following.driven, INPUT_DEGREE, INPUT_GROWTH)
+        inputs = _parts(following, maps, fits, phases, following.driven, INPUTS)
         parts = [
             _MotionPart(*(np.concatenate(two, axis=-1) for two in zip(*both, strict=True)))
             for both in zip(parts, inputs, strict=True)
@@ -259,7 +272,7 @@ def waveform_of(
     errors = np.concatenate([part.errors for part in parts], axis=1)
     if times is not None:
         errors += _moved(motion, times, order, [phases[j] for j in order])
-    common, rest = _common(errors.transpose(0, 2, 1), np.std(motion, axis=0), 2 * estimate.points.size)
+    common, rest = _common(errors.transpose(0, 2, 1), np.std(motion, axis=0), 2 * points.size)
     gains = np.concatenate([np.tile(part.gain[:, None], len(part.values)) for part in parts], axis=1)
     noise = np.sqrt(np.maximum(rest[:, None], following.variance[:, None] * gains))
     squares = np.concatenate([part.bias**2 for part in parts]).reshape(order.size, following.count, -1)
@@ -279,31 +292,32 @@ def _moved(motion: np.ndarray, times: ReturnTimes, order: np.ndarray, phases: li
 
 
 def _parts(
-    following: Following, maps: ReturnMap, estimate: Estimate, at: list[np.ndarray], columns: slice, degree: int,
-    growth: float,
-) -> list[_MotionPart]:  # fmt: skip
-    """Return the motion of some channels at phases after each point, by polynomials of some degree.
-
-    The bias is the difference to wider neighbourhoods over `growth`.
-    """
-    fits = estimate.fits
-    assert fits is not None
-    phases = maps.phases(np.arange(len(estimate.points)))
-    pairs, runs, by_run = errors_by_run(maps, fits.narrow)
-    d, parts = estimate.points.shape[1], []
+    following: Following, maps: ReturnMap, fits: CycleFits, at: list[np.ndarray], columns: slice, how: _Polynomials
+) -> list[_MotionPart]:
+    """Return the motion of some channels at phases after each point, by polynomials in both neighbourhoods."""
+    phases, runs, parts = maps.phases(np.arange(len(at))), fits.runs(maps), []
+    d, away = fits.narrow.points.shape[1], how.subtracted
+    by_run = [errors_by_run(maps, cycle.fit, runs) for cycle in fits]
     for j, places in enumerate(at):
         signals, one = partial(following.signals, columns=columns, phases=places), slice(j, j + 1)
-        (fit,) = maps.regress(estimate.points[one], phases[one], fits.bandwidths[one], degree, signals)
-        (other,) = maps.regress(
-            fits.wide_points[one], phases[one], WIDENED * fits.bandwidths[one], degree, signals, influence=False
-        )
-        errors = by_run[:, d * j : d * (j + 1)] @ fit.slopes
-        np.add.at(errors, runs[np.searchsorted(pairs, maps.positions[fit.neighbours])], fit.influence)
-        away = (other.value - fit.value).reshape(places.size, -1)
+        values, errors, weights = [], [], []
+        for cycle, of_points in zip(fits, by_run, strict=True):
+            (fit,) = maps.regress(cycle.points[one], phases[one], cycle.bandwidths[one], how.degree, signals)
+            values.append(fit.value.reshape(places.size, -1))
+            moved = of_points[:, d * j : d * (j + 1)] @ fit.slopes
+            errors.append(moved + runs.sums(maps, fit.neighbours, fit.influence))
+            weights.append(np.bincount(runs.pair(maps, fit.neighbours), fit.weights, runs.pairs.size))
+        difference = values[1] - values[0]
         if columns == following.outputs:
-            away = _without_turns(away, following)
-        values, errors = fit.value.reshape(away.shape), errors.reshape(len(errors), *away.shape)
-        parts.append(_MotionPart(values, errors, np.abs(away) / growth, np.full(away.shape[1], fit.gain)))
+            difference = _without_turns(difference, following)
+        error = (1.0 + away) * errors[0] - away * errors[1]
+        gain = np.sum(((1.0 + away) * weights[0] - away * weights[1]) ** 2)
+        parts.append(
+            _MotionPart(
+                values[0] - away * difference, error.reshape(-1, *difference.shape), how.remaining * np.abs(difference),
+                np.full(difference.shape[1], gain),
+            )
+        )  # fmt: skip
     return parts
 
 

@@ -11,10 +11,10 @@ from scipy.stats import chi2
 
 import bayesperiodic as bp
 from bayesperiodic.orbits import find, waveform
-from bayesperiodic.orbits.cycles import REFINING_DEGREE, errors_by_run
+from bayesperiodic.orbits.cycles import errors_by_run
 from bayesperiodic.orbits.return_map import Atlas, ReturnMap
 from bayesperiodic.orbits.stretches import windowed
-from bayesperiodic.orbits.waveform import INDEPENDENT, Following, _parts, mean_of_repeats
+from bayesperiodic.orbits.waveform import INDEPENDENT, OUTPUTS, Following, _parts, mean_of_repeats
 from tests.orbits import chaos, wells
 from tests.orbits.test_find import coupled, map_section
 
@@ -202,8 +202,10 @@ def test_errors_of_the_motion_until_the_next_point_are_the_errors_of_that_point(
     start = [np.zeros(1)] * 2
     checked = 0
     for _, estimate in find._chained(maps, Atlas(maps, find._search_count(maps, 32)), 2, 32):
-        _, _, errors = errors_by_run(maps, estimate.fits.narrow)
-        parts = _parts(images, maps, estimate, start, images.outputs, REFINING_DEGREE, 1.0)
+        fits = estimate.fits
+        narrow, wide = (errors_by_run(maps, fit.fit, fits.runs(maps)) for fit in fits)
+        errors = narrow + OUTPUTS.subtracted * (narrow - wide)
+        parts = _parts(images, maps, fits, start, images.outputs, OUTPUTS)
         for k, part in enumerate(parts):
             following = errors[:, 2 * ((k + 1) % 2) :][:, :2]
             scale = np.abs(following).max()
