@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import label
 
-from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, LocalFit, ReturnMap, for_coordinates
+from bayesperiodic.orbits.return_map import KERNEL_REACH, Atlas, LocalFit, Regression, ReturnMap, for_coordinates
 
 # Search: a return this close starts a chain; chains in one cell are searched once.
 CLOSE, CELL = 0.08, 0.01
@@ -72,14 +72,10 @@ class ClosingFits(NamedTuple):
 
 
 class CycleFits(NamedTuple):
-    """A refined cycle, and that of fits WIDENED times as wide; errors of both are summed over the same runs."""
+    """A refined cycle, and that of fits WIDENED times as wide."""
 
     narrow: ClosingFits
     wide: ClosingFits
-
-    def runs(self, maps: ReturnMap) -> "Runs":
-        """Return the runs of pairs of points in all fits."""
-        return Runs.of(maps, self.narrow.fit, self.wide.fit)
 
 
 class Runs(NamedTuple):
@@ -93,7 +89,7 @@ class Runs(NamedTuple):
     run: np.ndarray  # (n,)
 
     @classmethod
-    def of(cls, maps: ReturnMap, *fits: LocalFit) -> "Runs":
+    def of(cls, maps: ReturnMap, *fits: LocalFit | Regression) -> "Runs":
         """Return the runs in fits."""
         pairs = np.unique(np.concatenate([maps.positions[fit.neighbours].ravel() for fit in fits]))
         return cls(pairs, np.concatenate([[0], np.cumsum(np.diff(pairs) > 1)]))

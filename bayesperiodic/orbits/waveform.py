@@ -12,11 +12,12 @@ from math import lcm
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Storable
 from bayesperiodic.orbits.coordinates import SHORT_RETURN, columns_of, integrand_of
-from bayesperiodic.orbits.cycles import REFINING_DEGREE, WIDENED, CycleFits, errors_by_run
+from bayesperiodic.orbits.cycles import REFINING_DEGREE, WIDENED, CycleFits, Runs, errors_by_run
 from bayesperiodic.orbits.return_map import ReturnMap
 from bayesperiodic.orbits.return_times import ReturnTimes
 from bayesperiodic.orbits.section import CYCLE_SAMPLES, PoincareSection
@@ -47,6 +48,8 @@ INDEPENDENT = 16
 # less noise, and nothing is subtracted; their bias is proportional to the second power.
 OUTPUTS = _Polynomials(REFINING_DEGREE, 1.0 / (WIDENED ** (REFINING_DEGREE + 1) - 1.0), 0.2)
 INPUTS = _Polynomials(1, 0.0, 1.0 / (WIDENED**2 - 1.0))
+# Probability that the squared differences of inputs of two neighbourhoods are larger by noise.
+INPUTS_DIFFER = 1e-3
 # Degree of polynomials of errors of the size of the bias, over a part of the period.
 BIAS_DEGREE = 2
 TURN = 2.0 * np.pi
@@ -241,15 +244,6 @@ class Following:
         return self._motion[index]
 
 
-class _MotionPart(NamedTuple):
-    """Motion from a point of a cycle to the next one."""
-
-    values: np.ndarray  # (samples, channels)
-    errors: np.ndarray  # of each run of neighbours, (runs, samples, channels)
-    bias: np.ndarray  # modulus of what may remain, (samples, channels)
-    gain: np.ndarray  # variance of the values for independent errors of unit variance, (channels,)
-
-
 def waveform_of(
     following: Following, maps: ReturnMap, fits: CycleFits, shift: int, times: ReturnTimes | None
 ) -> Waveform:
@@ -257,27 +251,76 @@ def waveform_of(
 
     Samples are equally spaced in time, also where the `times` between the points differ.
     """
-    points = fits.narrow.points
-    order = (np.arange(len(points)) + maps.steps * shift) % len(points)
+    count = len(fits.narrow.points)
+    order = (np.arange(count) + maps.steps * shift) % count
     phases = following.phases(times, order)
-    parts = _parts(following, maps, fits, phases, following.outputs, OUTPUTS)
+    groups = [_group(following, maps, fits, phases, order, times, following.outputs, OUTPUTS)]
     if following.inputs:
-        inputs = _parts(following, maps, fits, phases, following.driven, INPUTS)
-        parts = [
-            _MotionPart(*(np.concatenate(two, axis=-1) for two in zip(*both, strict=True)))
-            for both in zip(parts, inputs, strict=True)
-        ]
-    parts = [parts[j] for j in order]
-    motion = _continuous([part.values for part in parts], following)
+        of_inputs = _widest(following, maps, fits, phases)
+        groups.append(_group(following, maps, of_inputs, phases, order, None, following.driven, INPUTS))
+    motion, bias, noise = (np.concatenate(some) for some in list(zip(*groups, strict=True))[:3])
+    errors = np.zeros((sum(len(one.errors) for one in groups), *motion.shape))
+    row = column = 0
+    for one in groups:
+        height, width = one.errors.shape[:2]
+        errors[row : row + height, column : column + width] = one.errors
+        row, column = row + height, column + width
+    return Waveform(dict(zip(following.channels, motion, strict=True)), following.inputs, errors, bias, noise)
+
+
+class _Group(NamedTuple):
+    """Waveforms of some channels."""
+
+    motion: np.ndarray  # (channels, samples)
+    bias: np.ndarray  # root mean square after each point, (channels, points)
+    noise: np.ndarray  # (channels, samples)
+    errors: np.ndarray  # in common, (n, channels, samples)
+
+
+def _group(
+    following: Following, maps: ReturnMap, fits: CycleFits, phases: list[np.ndarray], order: np.ndarray,
+    times: ReturnTimes | None, columns: slice, how: _Polynomials,
+) -> _Group:  # fmt: skip
+    every = _parts(following, maps, fits, phases, columns, how)
+    parts = [every[j] for j in order]
+    motion = np.concatenate([part.values for part in parts])
+    if columns == following.outputs:
+        motion = _continuous(motion, following)
     errors = np.concatenate([part.errors for part in parts], axis=1)
     if times is not None:
         errors += _moved(motion, times, order, [phases[j] for j in order])
-    common, rest = _common(errors.transpose(0, 2, 1), np.std(motion, axis=0), 2 * points.size)
-    gains = np.concatenate([np.tile(part.gain[:, None], len(part.values)) for part in parts], axis=1)
-    noise = np.sqrt(np.maximum(rest[:, None], following.variance[:, None] * gains))
+    common, rest = _common(errors.transpose(0, 2, 1), np.std(motion, axis=0), 2 * fits.narrow.points.size)
+    gains = np.concatenate([np.full(len(part.values), part.gain) for part in parts])
+    noise = np.sqrt(np.maximum(rest[:, None], following.variance[columns, None] * gains))
     squares = np.concatenate([part.bias**2 for part in parts]).reshape(order.size, following.count, -1)
-    bias = np.sqrt(squares.mean(axis=1)).T
-    return Waveform(dict(zip(following.channels, motion.T, strict=True)), following.inputs, common, bias, noise)
+    return _Group(motion.T, np.sqrt(squares.mean(axis=1)).T, noise, common)
+
+
+def _widest(following: Following, maps: ReturnMap, fits: CycleFits, at: list[np.ndarray]) -> CycleFits:
+    """Return the cycle with neighbourhoods for inputs.
+
+    They are one step narrower than the widest whose inputs agree with those of all narrower ones: inputs depend little
+    on the motion, so that more neighbours have less noise and no more bias.
+    """
+    points, bandwidths = fits.narrow.points, fits.narrow.bandwidths.copy()
+    phases, variance = maps.phases(np.arange(len(points))), following.variance[following.driven]
+    for j, places in enumerate(at):
+        signals, width = partial(following.signals, columns=following.driven, phases=places), bandwidths[j]
+        tried: list[tuple[np.ndarray, float]] = []
+        each = max(1, places.size * maps.steps // INDEPENDENT)
+        while True:
+            one = slice(j, j + 1)
+            (fit,) = maps.regress(points[one], phases[one], width[None], INPUTS.degree, signals, influence=False)
+            value, gain = fit.value.reshape(places.size, -1)[::each], np.sum(fit.weights**2)
+            limit = chdtri(value.size, INPUTS_DIFFER)
+            if any(np.sum((value - v) ** 2 / (variance * g)) > limit for v, g in tried):
+                break
+            tried.append((value, float(gain)))
+            if fit.neighbours.size == maps.count:
+                break
+            width = width * WIDENED
+        bandwidths[j] *= WIDENED ** max(len(tried) - 2, 0)
+    return CycleFits(fits.narrow._replace(bandwidths=bandwidths), fits.narrow._replace(bandwidths=WIDENED * bandwidths))
 
 
 def _moved(motion: np.ndarray, times: ReturnTimes, order: np.ndarray, phases: list[np.ndarray]) -> np.ndarray:
@@ -291,33 +334,45 @@ def _moved(motion: np.ndarray, times: ReturnTimes, order: np.ndarray, phases: li
     return early[:, :, None] * rates
 
 
+class _MotionPart(NamedTuple):
+    """Motion from a point of a cycle to the next one."""
+
+    values: np.ndarray  # (samples, channels)
+    errors: np.ndarray  # of each run of neighbours, (runs, samples, channels)
+    bias: np.ndarray  # modulus of what may remain, (samples, channels)
+    gain: float  # variance of the values for independent errors of unit variance
+
+
 def _parts(
     following: Following, maps: ReturnMap, fits: CycleFits, at: list[np.ndarray], columns: slice, how: _Polynomials
 ) -> list[_MotionPart]:
     """Return the motion of some channels at phases after each point, by polynomials in both neighbourhoods."""
-    phases, runs, parts = maps.phases(np.arange(len(at))), fits.runs(maps), []
-    d, away = fits.narrow.points.shape[1], how.subtracted
-    by_run = [errors_by_run(maps, cycle.fit, runs) for cycle in fits]
+    phases, d, away = maps.phases(np.arange(len(at))), fits.narrow.points.shape[1], how.subtracted
+    regressions = []
     for j, places in enumerate(at):
         signals, one = partial(following.signals, columns=columns, phases=places), slice(j, j + 1)
-        values, errors, weights = [], [], []
-        for cycle, of_points in zip(fits, by_run, strict=True):
-            (fit,) = maps.regress(cycle.points[one], phases[one], cycle.bandwidths[one], how.degree, signals)
-            values.append(fit.value.reshape(places.size, -1))
-            moved = of_points[:, d * j : d * (j + 1)] @ fit.slopes
-            errors.append(moved + runs.sums(maps, fit.neighbours, fit.influence))
-            weights.append(np.bincount(runs.pair(maps, fit.neighbours), fit.weights, runs.pairs.size))
+        regressions.append(
+            [
+                maps.regress(cycle.points[one], phases[one], cycle.bandwidths[one], how.degree, signals)[0]
+                for cycle in fits
+            ]
+        )
+    runs = Runs.of(maps, *(cycle.fit for cycle in fits), *(fit for both in regressions for fit in both))
+    by_run, parts = [errors_by_run(maps, cycle.fit, runs) for cycle in fits], []
+    for j, (places, both) in enumerate(zip(at, regressions, strict=True)):
+        values = [fit.value.reshape(places.size, -1) for fit in both]
+        errors = [
+            of_points[:, d * j : d * (j + 1)] @ fit.slopes + runs.sums(maps, fit.neighbours, fit.influence)
+            for of_points, fit in zip(by_run, both, strict=True)
+        ]
+        weights = [np.bincount(runs.pair(maps, fit.neighbours), fit.weights, runs.pairs.size) for fit in both]
         difference = values[1] - values[0]
         if columns == following.outputs:
             difference = _without_turns(difference, following)
-        error = (1.0 + away) * errors[0] - away * errors[1]
-        gain = np.sum(((1.0 + away) * weights[0] - away * weights[1]) ** 2)
-        parts.append(
-            _MotionPart(
-                values[0] - away * difference, error.reshape(-1, *difference.shape), how.remaining * np.abs(difference),
-                np.full(difference.shape[1], gain),
-            )
-        )  # fmt: skip
+        error = errors[0] + away * (errors[0] - errors[1])
+        gain = float(np.sum((weights[0] + away * (weights[0] - weights[1])) ** 2))
+        value, bias = values[0] - away * difference, how.remaining * np.abs(difference)
+        parts.append(_MotionPart(value, error.reshape(-1, *value.shape), bias, gain))
     return parts
 
 
@@ -329,9 +384,8 @@ def _without_turns(difference: np.ndarray, following: Following) -> np.ndarray:
     return result
 
 
-def _continuous(parts: list[np.ndarray], following: Following) -> np.ndarray:
-    """Return parts (samples, channels) of a motion as one, angles continuous from (−π, π] on."""
-    motion = np.concatenate(parts)
+def _continuous(motion: np.ndarray, following: Following) -> np.ndarray:
+    """Return a motion (samples, channels) with angles continuous from (−π, π] on."""
     for _, column in following.angles:
         motion[:, column] = np.unwrap(motion[:, column])
         motion[:, column] -= TURN * np.ceil((motion[0, column] - np.pi) / TURN)
