@@ -272,8 +272,8 @@ def refine(maps: ReturnMap, points: np.ndarray, neighbours: int) -> Estimate | N
     the difference to the wider neighbourhood.
     """
     bandwidths = _bandwidths(maps, points, neighbours)
-    narrow = _close(maps, points, bandwidths)
-    wide = _close(maps, points, WIDENED * bandwidths) if narrow is not None else None
+    narrow = close(maps, points, bandwidths)
+    wide = close(maps, points, WIDENED * bandwidths) if narrow is not None else None
     if narrow is None or wide is None:
         return None
     cycle, _, fit = narrow
@@ -290,7 +290,7 @@ def _turns(maps: ReturnMap, run: np.ndarray) -> float:
     return float(np.sum(run / maps.turn))
 
 
-def _close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> ClosingFits | None:
+def close(maps: ReturnMap, points: np.ndarray, bandwidths: np.ndarray) -> ClosingFits | None:
     """Return the points at which the chained fits close, and the fits; None without convergence."""
     cycle, last, refined = points.copy(), np.inf, max(REFINED, REFINED_NOISE * float(maps.noise.max()))
     for step in range(REFINING_STEPS):

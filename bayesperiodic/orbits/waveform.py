@@ -17,8 +17,8 @@ from scipy.special import chdtri
 from bayesperiodic import _checks
 from bayesperiodic._io import Storable
 from bayesperiodic.orbits.coordinates import SHORT_RETURN, columns_of, integrand_of
-from bayesperiodic.orbits.cycles import REFINING_DEGREE, WIDENED, CycleFits, Runs, errors_by_run
-from bayesperiodic.orbits.return_map import ReturnMap
+from bayesperiodic.orbits.cycles import REFINING_DEGREE, WIDENED, ClosingFits, CycleFits, Runs, close, errors_by_run
+from bayesperiodic.orbits.return_map import Regression, ReturnMap
 from bayesperiodic.orbits.return_times import ReturnTimes
 from bayesperiodic.orbits.section import CYCLE_SAMPLES, PoincareSection
 from bayesperiodic.orbits.stretches import (
@@ -347,33 +347,73 @@ def _parts(
     following: Following, maps: ReturnMap, fits: CycleFits, at: list[np.ndarray], columns: slice, how: _Polynomials
 ) -> list[_MotionPart]:
     """Return the motion of some channels at phases after each point, by polynomials in both neighbourhoods."""
-    phases, d, away = maps.phases(np.arange(len(at))), fits.narrow.points.shape[1], how.subtracted
-    regressions = []
-    for j, places in enumerate(at):
-        signals, one = partial(following.signals, columns=columns, phases=places), slice(j, j + 1)
-        regressions.append(
-            [
-                maps.regress(cycle.points[one], phases[one], cycle.bandwidths[one], how.degree, signals)[0]
-                for cycle in fits
-            ]
-        )
-    runs = Runs.of(maps, *(cycle.fit for cycle in fits), *(fit for both in regressions for fit in both))
-    by_run, parts = [errors_by_run(maps, cycle.fit, runs) for cycle in fits], []
-    for j, (places, both) in enumerate(zip(at, regressions, strict=True)):
-        values = [fit.value.reshape(places.size, -1) for fit in both]
+    narrow, wide = (_regressions(following, maps, cycle, at, columns, how) for cycle in fits)
+    runs = Runs.of(maps, *(cycle.fit for cycle in fits), *narrow, *wide)
+    by_run, d, parts = [errors_by_run(maps, cycle.fit, runs) for cycle in fits], fits.narrow.points.shape[1], []
+    differences = _differences(narrow, wide, following, columns)
+    away = _subtracted(following, maps, fits, at, columns, how, narrow, differences)
+    for j, both in enumerate(zip(narrow, wide, strict=True)):
         errors = [
             of_points[:, d * j : d * (j + 1)] @ fit.slopes + runs.sums(maps, fit.neighbours, fit.influence)
             for of_points, fit in zip(by_run, both, strict=True)
         ]
         weights = [np.bincount(runs.pair(maps, fit.neighbours), fit.weights, runs.pairs.size) for fit in both]
-        difference = values[1] - values[0]
-        if columns == following.outputs:
-            difference = _without_turns(difference, following)
+        difference = differences[j]
         error = errors[0] + away * (errors[0] - errors[1])
         gain = float(np.sum((weights[0] + away * (weights[0] - weights[1])) ** 2))
-        value, bias = values[0] - away * difference, how.remaining * np.abs(difference)
+        value = narrow[j].value.reshape(difference.shape) - away * difference
+        bias = how.remaining * np.abs(difference)
         parts.append(_MotionPart(value, error.reshape(-1, *value.shape), bias, gain))
     return parts
+
+
+def _regressions(
+    following: Following, maps: ReturnMap, cycle: ClosingFits, at: list[np.ndarray], columns: slice, how: _Polynomials,
+    *, influence: bool = True,
+) -> list[Regression]:  # fmt: skip
+    """Return the fits of the motion of some channels at phases after each point of a cycle."""
+    phases, result = maps.phases(np.arange(len(at))), []
+    for j, places in enumerate(at):
+        signals, one = partial(following.signals, columns=columns, phases=places), slice(j, j + 1)
+        result += maps.regress(
+            cycle.points[one], phases[one], cycle.bandwidths[one], how.degree, signals, influence=influence
+        )
+    return result
+
+
+def _subtracted(
+    following: Following, maps: ReturnMap, fits: CycleFits, at: list[np.ndarray], columns: slice, how: _Polynomials,
+    narrow: list[Regression], differences: list[np.ndarray],
+) -> float:  # fmt: skip
+    """Return the fraction of the differences to wider neighbourhoods that is subtracted.
+
+    If the bias is proportional to a power of the bandwidth, the differences to wider and to narrower neighbourhoods
+    have the ratio q, and the bias is 1/(q − 1) of the former. Noise makes the estimate of q larger.
+    """
+    if not how.subtracted:
+        return 0.0
+    narrower = close(maps, fits.narrow.points, fits.narrow.bandwidths / WIDENED)
+    if narrower is None:
+        return 0.0
+    others = _regressions(following, maps, narrower, at, columns, how, influence=False)
+    inner = _differences(others, narrow, following, columns)
+    size = np.std(
+        np.concatenate([fit.value.reshape(d.shape) for fit, d in zip(narrow, differences, strict=True)]), axis=0
+    )
+    one, other = (np.concatenate(some) / np.where(size > 0.0, size, 1.0) for some in (differences, inner))
+    square, product = float(np.sum(one**2)), float(np.sum(one * other))
+    if product <= 0.0:
+        return 0.0
+    return min(how.subtracted, product / (square - product)) if product < square else how.subtracted
+
+
+def _differences(
+    ones: list[Regression], others: list[Regression], following: Following, columns: slice
+) -> list[np.ndarray]:
+    """Return the motion by other fits less that by some fits, (samples, channels) after each point."""
+    channels = len(range(len(following.channels))[columns])
+    result = [(other.value - one.value).reshape(-1, channels) for one, other in zip(ones, others, strict=True)]
+    return [_without_turns(one, following) for one in result] if columns == following.outputs else result
 
 
 def _without_turns(difference: np.ndarray, following: Following) -> np.ndarray:
