@@ -281,7 +281,7 @@ def _group(
     following: Following, maps: ReturnMap, fits: CycleFits, phases: list[np.ndarray], order: np.ndarray,
     times: ReturnTimes | None, columns: slice, how: _Polynomials,
 ) -> _Group:  # fmt: skip
-    every = _parts(following, maps, fits, phases, columns, how)
+    every = _Regressions(following, maps, phases, columns, how).parts(fits)
     parts = [every[j] for j in order]
     motion = np.concatenate([part.values for part in parts])
     if columns == following.outputs:
@@ -302,23 +302,21 @@ def _widest(following: Following, maps: ReturnMap, fits: CycleFits, at: list[np.
     They are one step narrower than the widest whose inputs agree with those of all narrower ones: inputs depend little
     on the motion, so that more neighbours have less noise and no more bias.
     """
-    points, bandwidths = fits.narrow.points, fits.narrow.bandwidths.copy()
-    phases, variance = maps.phases(np.arange(len(points))), following.variance[following.driven]
+    regressions = _Regressions(following, maps, at, following.driven, INPUTS)
+    bandwidths, variance = fits.narrow.bandwidths.copy(), following.variance[following.driven]
     for j, places in enumerate(at):
-        signals, width = partial(following.signals, columns=following.driven, phases=places), bandwidths[j]
         tried: list[tuple[np.ndarray, float]] = []
-        each = max(1, places.size * maps.steps // INDEPENDENT)
+        width, each = bandwidths[j], max(1, places.size * maps.steps // INDEPENDENT)
         while True:
-            one = slice(j, j + 1)
-            (fit,) = maps.regress(points[one], phases[one], width[None], INPUTS.degree, signals, influence=False)
-            value, gain = fit.value.reshape(places.size, -1)[::each], np.sum(fit.weights**2)
+            fit = regressions.fit(fits.narrow.points[j], j, width, influence=False)
+            value, gain = fit.value.reshape(places.size, -1)[::each], float(np.sum(fit.weights**2))
             limit = chdtri(value.size, INPUTS_DIFFER)
             if any(np.sum((value - v) ** 2 / (variance * g)) > limit for v, g in tried):
                 break
-            tried.append((value, float(gain)))
+            tried.append((value, gain))
             if fit.neighbours.size == maps.count:
                 break
-            width = width * WIDENED
+            width *= WIDENED
         bandwidths[j] *= WIDENED ** max(len(tried) - 2, 0)
     return CycleFits(fits.narrow._replace(bandwidths=bandwidths), fits.narrow._replace(bandwidths=WIDENED * bandwidths))
 
@@ -343,77 +341,75 @@ class _MotionPart(NamedTuple):
     gain: float  # variance of the values for independent errors of unit variance
 
 
-def _parts(
-    following: Following, maps: ReturnMap, fits: CycleFits, at: list[np.ndarray], columns: slice, how: _Polynomials
-) -> list[_MotionPart]:
-    """Return the motion of some channels at phases after each point, by polynomials in both neighbourhoods."""
-    narrow, wide = (_regressions(following, maps, cycle, at, columns, how) for cycle in fits)
-    runs = Runs.of(maps, *(cycle.fit for cycle in fits), *narrow, *wide)
-    by_run, d, parts = [errors_by_run(maps, cycle.fit, runs) for cycle in fits], fits.narrow.points.shape[1], []
-    differences = _differences(narrow, wide, following, columns)
-    away = _subtracted(following, maps, fits, at, columns, how, narrow, differences)
-    for j, both in enumerate(zip(narrow, wide, strict=True)):
-        errors = [
-            of_points[:, d * j : d * (j + 1)] @ fit.slopes + runs.sums(maps, fit.neighbours, fit.influence)
-            for of_points, fit in zip(by_run, both, strict=True)
+@dataclass(frozen=True)
+class _Regressions:
+    """Polynomials of the motion of some channels at phases after each point of a cycle."""
+
+    following: Following
+    maps: ReturnMap
+    at: list[np.ndarray]
+    columns: slice
+    how: _Polynomials
+
+    def parts(self, fits: CycleFits) -> list[_MotionPart]:
+        """Return the motion from each point to the next one."""
+        narrow, wide = (self.fits(cycle) for cycle in fits)
+        runs = Runs.of(self.maps, *(cycle.fit for cycle in fits), *narrow, *wide)
+        by_run, d = [errors_by_run(self.maps, cycle.fit, runs) for cycle in fits], fits.narrow.points.shape[1]
+        differences, parts = self.differences(wide, narrow), []
+        away = self.subtracted(fits, narrow, differences)
+        for j, both in enumerate(zip(narrow, wide, strict=True)):
+            errors = [
+                of_points[:, d * j : d * (j + 1)] @ fit.slopes + runs.sums(self.maps, fit.neighbours, fit.influence)
+                for of_points, fit in zip(by_run, both, strict=True)
+            ]
+            weights = [np.bincount(runs.pair(self.maps, fit.neighbours), fit.weights, runs.pairs.size) for fit in both]
+            error = errors[0] + away * (errors[0] - errors[1])
+            gain = float(np.sum((weights[0] + away * (weights[0] - weights[1])) ** 2))
+            value = both[0].value.reshape(differences[j].shape) - away * differences[j]
+            bias = self.how.remaining * np.abs(differences[j])
+            parts.append(_MotionPart(value, error.reshape(-1, *value.shape), bias, gain))
+        return parts
+
+    def fits(self, cycle: ClosingFits, *, influence: bool = True) -> list[Regression]:
+        """Return the fits at the points of a cycle with its bandwidths."""
+        return [self.fit(cycle.points[j], j, cycle.bandwidths[j], influence=influence) for j in range(len(self.at))]
+
+    def fit(self, point: np.ndarray, j: int, bandwidth: float, *, influence: bool) -> Regression:
+        """Return the fit at a point (d,), the one number j of its cycle."""
+        signals = partial(self.following.signals, columns=self.columns, phases=self.at[j])
+        phase, width = self.maps.phases(np.array([j])), np.array([bandwidth])
+        return self.maps.regress(point[None], phase, width, self.how.degree, signals, influence=influence)[0]
+
+    def differences(self, ones: list[Regression], others: list[Regression]) -> list[np.ndarray]:
+        """Return the motion by some fits less that by others, (samples, channels) after each point."""
+        result = [
+            (one.value - other.value).reshape(places.size, -1)
+            for one, other, places in zip(ones, others, self.at, strict=True)
         ]
-        weights = [np.bincount(runs.pair(maps, fit.neighbours), fit.weights, runs.pairs.size) for fit in both]
-        difference = differences[j]
-        error = errors[0] + away * (errors[0] - errors[1])
-        gain = float(np.sum((weights[0] + away * (weights[0] - weights[1])) ** 2))
-        value = narrow[j].value.reshape(difference.shape) - away * difference
-        bias = how.remaining * np.abs(difference)
-        parts.append(_MotionPart(value, error.reshape(-1, *value.shape), bias, gain))
-    return parts
+        if self.columns != self.following.outputs:
+            return result
+        return [_without_turns(difference, self.following) for difference in result]
 
+    def subtracted(self, fits: CycleFits, narrow: list[Regression], differences: list[np.ndarray]) -> float:
+        """Return the fraction of the differences to wider neighbourhoods that is subtracted.
 
-def _regressions(
-    following: Following, maps: ReturnMap, cycle: ClosingFits, at: list[np.ndarray], columns: slice, how: _Polynomials,
-    *, influence: bool = True,
-) -> list[Regression]:  # fmt: skip
-    """Return the fits of the motion of some channels at phases after each point of a cycle."""
-    phases, result = maps.phases(np.arange(len(at))), []
-    for j, places in enumerate(at):
-        signals, one = partial(following.signals, columns=columns, phases=places), slice(j, j + 1)
-        result += maps.regress(
-            cycle.points[one], phases[one], cycle.bandwidths[one], how.degree, signals, influence=influence
+        Where the bias is proportional to a power of the bandwidth, the differences to wider and to narrower
+        neighbourhoods have a ratio q, and the bias is 1/(q − 1) of the former. Noise makes the estimate of q larger.
+        """
+        most = self.how.subtracted
+        narrower = close(self.maps, fits.narrow.points, fits.narrow.bandwidths / WIDENED) if most else None
+        if narrower is None:
+            return 0.0
+        inner = self.differences(narrow, self.fits(narrower, influence=False))
+        size = np.std(
+            np.concatenate([fit.value.reshape(d.shape) for fit, d in zip(narrow, inner, strict=True)]), axis=0
         )
-    return result
-
-
-def _subtracted(
-    following: Following, maps: ReturnMap, fits: CycleFits, at: list[np.ndarray], columns: slice, how: _Polynomials,
-    narrow: list[Regression], differences: list[np.ndarray],
-) -> float:  # fmt: skip
-    """Return the fraction of the differences to wider neighbourhoods that is subtracted.
-
-    If the bias is proportional to a power of the bandwidth, the differences to wider and to narrower neighbourhoods
-    have the ratio q, and the bias is 1/(q − 1) of the former. Noise makes the estimate of q larger.
-    """
-    if not how.subtracted:
-        return 0.0
-    narrower = close(maps, fits.narrow.points, fits.narrow.bandwidths / WIDENED)
-    if narrower is None:
-        return 0.0
-    others = _regressions(following, maps, narrower, at, columns, how, influence=False)
-    inner = _differences(others, narrow, following, columns)
-    size = np.std(
-        np.concatenate([fit.value.reshape(d.shape) for fit, d in zip(narrow, differences, strict=True)]), axis=0
-    )
-    one, other = (np.concatenate(some) / np.where(size > 0.0, size, 1.0) for some in (differences, inner))
-    square, product = float(np.sum(one**2)), float(np.sum(one * other))
-    if product <= 0.0:
-        return 0.0
-    return min(how.subtracted, product / (square - product)) if product < square else how.subtracted
-
-
-def _differences(
-    ones: list[Regression], others: list[Regression], following: Following, columns: slice
-) -> list[np.ndarray]:
-    """Return the motion by other fits less that by some fits, (samples, channels) after each point."""
-    channels = len(range(len(following.channels))[columns])
-    result = [(other.value - one.value).reshape(-1, channels) for one, other in zip(ones, others, strict=True)]
-    return [_without_turns(one, following) for one in result] if columns == following.outputs else result
+        one, other = (np.concatenate(some) / np.where(size > 0.0, size, 1.0) for some in (differences, inner))
+        square, product = float(np.sum(one**2)), float(np.sum(one * other))
+        if product <= 0.0:
+            return 0.0
+        return min(most, product / (square - product)) if product < square else most
 
 
 def _without_turns(difference: np.ndarray, following: Following) -> np.ndarray:

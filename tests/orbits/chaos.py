@@ -33,18 +33,38 @@ def _runge_kutta(angle, rate, drive, periods, steps, kept, step, c1, c2, c3, wid
     return path
 
 
+def _motion(start, periods, steps, kept):
+    """Return (φ, φ') at `kept` instants of each of some forcing periods."""
+    drive = PENDULUM["g"] + PENDULUM["lift"] * OMEGA**2 * np.cos(np.pi * np.arange(2 * steps) / steps)
+    constants = [PENDULUM[name] for name in ("c1", "c2", "c3", "width", "length")]
+    return _runge_kutta(*start, drive, periods, steps, kept, 1.0 / (FREQUENCY * steps), *constants)
+
+
+def closed(guess: np.ndarray, period: int) -> np.ndarray:
+    """Return the points (period, 2) of the orbit near a point, by Newton's method."""
+    point = np.array(guess)
+
+    def end(start):
+        return _motion(start, period, 400, 1)[-1]
+
+    for _ in range(20):
+        missed = end(point) - point
+        missed[0] -= 2.0 * np.pi * np.round(missed[0] / (2.0 * np.pi))
+        slopes = [(end(point + by) - end(point - by)) / 2e-6 for by in 1e-6 * np.eye(2)]
+        point = point - np.linalg.solve(np.stack(slopes, axis=1) - np.eye(2), missed)
+    assert np.abs(missed).max() < 1e-9
+    return _motion(point, period, 400, 1)[:-1]
+
+
 @cache
 def path(periods: int, samples: int, start: int = 0, steps: int = 400) -> np.ndarray:
     """Return (φ, φ') at `samples` instants a forcing period, on the attractor, from the random start number `start`."""
     generator = np.random.default_rng([start, 7])
     angle, rate = generator.uniform([-3.0, -10.0], [3.0, 10.0])
     steps = samples * -(-steps // samples)
-    drive = PENDULUM["g"] + PENDULUM["lift"] * OMEGA**2 * np.cos(np.pi * np.arange(2 * steps) / steps)
-    constants = [PENDULUM[name] for name in ("c1", "c2", "c3", "width", "length")]
-    step = 1.0 / (FREQUENCY * steps)
-    settled = _runge_kutta(angle, rate, drive, TRANSIENT, steps, 1, step, *constants)[-1]
+    settled = _motion((angle, rate), TRANSIENT, steps, 1)[-1]
     angle = (settled[0] + np.pi) % (2.0 * np.pi) - np.pi
-    result = _runge_kutta(angle, settled[1], drive, periods, steps, samples, step, *constants)
+    result = _motion((angle, settled[1]), periods, steps, samples)
     result.flags.writeable = False
     return result
 

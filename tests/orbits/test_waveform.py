@@ -14,7 +14,7 @@ from bayesperiodic.orbits import find, waveform
 from bayesperiodic.orbits.cycles import Runs, errors_by_run
 from bayesperiodic.orbits.return_map import Atlas, ReturnMap
 from bayesperiodic.orbits.stretches import windowed
-from bayesperiodic.orbits.waveform import INDEPENDENT, OUTPUTS, Following, _parts, mean_of_repeats
+from bayesperiodic.orbits.waveform import INDEPENDENT, OUTPUTS, Following, _Regressions, mean_of_repeats
 from tests.orbits import chaos, wells
 from tests.orbits.test_find import coupled, map_section
 
@@ -192,29 +192,54 @@ def test_the_regression_of_the_images_is_the_fit_of_the_return_map(coordinates):
         np.testing.assert_allclose(one.influence.T @ one.influence, fit.influence[k, :, 0].T @ fit.influence[k, :, 0])
 
 
-def test_errors_of_the_motion_until_the_next_point_are_the_errors_of_that_point():
+@pytest.mark.parametrize("subtracted", [0.0, 0.3])
+def test_errors_of_the_motion_until_the_next_point_are_the_errors_of_that_point(monkeypatch, subtracted):
     """The motion is the image: its error is that of the regression and of the closed point, times the slopes."""
     maps, _, _ = find._scaled(map_section(coupled, 4000, 0.001), 32)
     increments = maps.increments
     images = SimpleNamespace(
         signals=lambda index, near, columns, phases: near + increments[index], angles=[], outputs=slice(None)
     )
-    start = [np.zeros(1)] * 2
+    monkeypatch.setattr(_Regressions, "subtracted", lambda *given: subtracted)
+    regressions = _Regressions(images, maps, [np.zeros(1)] * 2, images.outputs, OUTPUTS)
     checked = 0
     for _, estimate in find._chained(maps, Atlas(maps, find._search_count(maps, 32)), 2, 32):
         fits = estimate.fits
         runs = Runs.of(maps, *(fit.fit for fit in fits))
         narrow, wide = (errors_by_run(maps, fit.fit, runs) for fit in fits)
-        errors = narrow + OUTPUTS.subtracted * (narrow - wide)
-        points = fits.narrow.points + OUTPUTS.subtracted * (fits.narrow.points - fits.wide.points)
-        parts = _parts(images, maps, fits, start, images.outputs, OUTPUTS)
-        for k, part in enumerate(parts):
+        errors = narrow + subtracted * (narrow - wide)
+        points = fits.narrow.points + subtracted * (fits.narrow.points - fits.wide.points)
+        for k, part in enumerate(regressions.parts(fits)):
             following = errors[:, 2 * ((k + 1) % 2) :][:, :2]
             scale = np.abs(following).max()
             np.testing.assert_allclose(part.errors[:, 0], following, atol=1e-2 * scale)
             assert np.abs(part.values[0] - points[(k + 1) % 2]).max() < 1e-5
             checked += 1
     assert checked >= 2
+
+
+def test_bias_that_wider_and_narrower_neighbourhoods_show_is_subtracted():
+    """Two orbits of period two near a saddle have a bias of 0.04 rad; those of all channels are within their errors."""
+    section = bp.PoincareSection.from_recording(
+        chaos.recording(3000, 40, 0.0005), ("angle", "rate"), frequency=chaos.FREQUENCY, angles=("angle",)
+    )
+    errors, sds, of_points = [], [], []
+    for orbit in bp.find_orbits(section, periods=[1, 2], waveforms=True):
+        truth = chaos.closed(orbit.points[0], orbit.period)[:, 0]
+        values, sd = orbit.waveform.values["angle"], orbit.waveform.sd["angle"]
+        each = values.size // orbit.period
+        errors += list(_wrapped(values[::each] - truth))
+        of_points += list(_wrapped(orbit.points[:, 0] - truth))
+        sds += list(sd[::each])
+    errors, of_points, sds = np.abs(errors), np.abs(of_points), np.array(sds)
+    assert errors.size >= 8 and np.all(errors < 4.0 * sds)
+    biased = of_points > 0.03
+    assert np.count_nonzero(biased) == 2 and np.all(errors[biased] < 0.5 * of_points[biased])
+
+
+def _wrapped(angle):
+    """Return angles between −π and π."""
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def test_the_angle_of_a_waveform_is_the_integral_of_its_rate():
@@ -236,9 +261,6 @@ def test_the_angle_of_a_waveform_is_the_integral_of_its_rate():
         periodic = np.fft.irfft(amplitudes, angle.size)
         assert np.abs(np.mean(rate) - mean) < 0.01 * chaos.OMEGA
         assert np.all(np.abs(integral - periodic) < 5.0 * orbit.waveform.sd["angle"])
-        each = angle.size // orbit.period
-        apart = angle[::each] - orbit.points[:, 0]
-        np.testing.assert_allclose(apart - 2.0 * np.pi * np.round(apart / (2.0 * np.pi)), 0.0, atol=0.01)
         turning += orbit.winding != 0
     assert turning >= 2
 
