@@ -38,17 +38,18 @@ def return_times_of(section: PoincareSection, maps: ReturnMap, estimate: Estimat
     phases = maps.phases(np.arange(count))
 
     def signals(index: np.ndarray, _: np.ndarray) -> np.ndarray:
-        return returns[index, None]
+        return returns[index, None, None]
 
+    size = np.array([np.ptp(returns)])
     narrow, wide = (
-        maps.regress(estimate.points, phases, widths, REFINING_DEGREE, signals)
+        maps.regress(estimate.points, phases, widths, REFINING_DEGREE, signals, size)
         for widths in (fits.bandwidths, WIDENED * fits.bandwidths)
     )
     pairs, runs, by_run = errors_by_run(maps, fits.narrow)
     d, errors = estimate.points.shape[1], np.empty((len(by_run), count))
     for j, fit in enumerate(narrow):
-        errors[:, j] = by_run[:, d * j : d * (j + 1)] @ fit.slopes[:, 0]
-        np.add.at(errors[:, j], runs[np.searchsorted(pairs, maps.positions[fit.neighbours])], fit.influence[:, 0])
-    each, others = (np.array([float(fit.value[0]) for fit in some]) for some in (narrow, wide))
-    moved = np.sum([fit.slopes[:, 0] for fit in narrow] * maps.wrap(fits.wide_points - estimate.points))
+        errors[:, j] = by_run[:, d * j : d * (j + 1)] @ fit.slopes[:, 0, 0]
+        np.add.at(errors[:, j], runs[np.searchsorted(pairs, maps.positions[fit.neighbours])], fit.influence[:, 0, 0])
+    each, others = (np.array([float(fit.value[0, 0]) for fit in some]) for some in (narrow, wide))
+    moved = np.sum([fit.slopes[:, 0, 0] for fit in narrow] * maps.wrap(fits.wide_points - estimate.points))
     return ReturnTimes(each, errors, float(np.hypot(np.sum(others - each), moved)) / VALUE_GROWTH)

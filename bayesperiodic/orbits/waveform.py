@@ -166,6 +166,10 @@ class Following:
             for k, (name, column) in enumerate(zip(section.coordinates, columns_of(section.coordinates), strict=True))
             if name in section.angles
         ]
+        extents = np.ptp(self._samples.signals, axis=0)
+        turning = [column for _, column in self.angles]
+        extents[turning] = np.minimum(extents[turning], TURN)
+        self.sizes = np.where(extents > 0.0, extents, 1.0)  # of the channels
         self._halves, self.variance = self._windows(maps.steps)
         self._phases = np.empty(0)  # at which the motion is in memory, for the arguments that are not NaN there
         self._motion = np.empty(0)
@@ -205,12 +209,12 @@ class Following:
         return result
 
     def signals(self, index: np.ndarray, near: np.ndarray, columns: slice, phases: np.ndarray) -> np.ndarray:
-        """Return channels (n, phases·channels) after arguments (n,), whose angles are as in the points (n, d)."""
+        """Return channels (n, phases, channels) after arguments (n,), whose angles are as in the points (n, d)."""
         values = self._after(index, phases)
         for k, column in self.angles:
             away = near[:, k] * self._size[k] - values[:, 0, column]
             values[:, :, column] += TURN * np.round(away / TURN)[:, None]
-        return values[:, 1:, columns].reshape(len(index), -1)
+        return values[:, 1:, columns]
 
     def _after(self, index: np.ndarray, phases: np.ndarray) -> np.ndarray:
         """Return the channels (n, 1 + phases, channels) at and after arguments (n,).
@@ -293,17 +297,17 @@ def _parts(
     d, parts = estimate.points.shape[1], []
     for j, places in enumerate(at):
         signals, one = partial(following.signals, columns=columns, phases=places), slice(j, j + 1)
-        (fit,) = maps.regress(estimate.points[one], phases[one], fits.bandwidths[one], degree, signals)
+        sizes = following.sizes[columns]
+        (fit,) = maps.regress(estimate.points[one], phases[one], fits.bandwidths[one], degree, signals, sizes)
         (other,) = maps.regress(
-            fits.wide_points[one], phases[one], WIDENED * fits.bandwidths[one], degree, signals, influence=False
+            fits.wide_points[one], phases[one], WIDENED * fits.bandwidths[one], degree, signals, sizes, influence=False
         )
-        errors = by_run[:, d * j : d * (j + 1)] @ fit.slopes
+        errors = np.tensordot(by_run[:, d * j : d * (j + 1)], fit.slopes, 1)
         np.add.at(errors, runs[np.searchsorted(pairs, maps.positions[fit.neighbours])], fit.influence)
-        away = (other.value - fit.value).reshape(places.size, -1)
+        away = other.value - fit.value
         if columns == following.outputs:
             away = _without_turns(away, following)
-        values, errors = fit.value.reshape(away.shape), errors.reshape(len(errors), *away.shape)
-        parts.append(_MotionPart(values, errors, np.abs(away) / growth, np.full(away.shape[1], fit.gain)))
+        parts.append(_MotionPart(fit.value, errors, np.abs(away) / growth, fit.gain))
     return parts
 
 
