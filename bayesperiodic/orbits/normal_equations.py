@@ -12,9 +12,8 @@ from scipy.special import factorial
 MOST_LEVERAGE = 0.9
 # Eigenvalues of normal equations below this fraction of the largest one are left out.
 NEARLY_SINGULAR = 1e-10
-# Prior standard deviation of slopes, and the distance over which a slope changes by it, in more than two coordinates:
-# there the attractor is thin in some directions, and does not determine all coefficients.
-STEEPEST_SLOPE, CURVATURE_LENGTH = 10.0, 0.1
+# Distance over which a slope changes by its prior standard deviation, in more than two coordinates.
+CURVATURE_LENGTH = 0.1
 
 
 @cache
@@ -78,10 +77,11 @@ class NormalEquations(NamedTuple):
         scale = (terms.factorials / bandwidth[:, None] ** terms.powers.sum(1))[..., None]
         return cls(regressors, rows, by_coordinate[-1], terms, normal, inverse_of(normal), scale, effective)
 
-    def shrunk(self, target: np.ndarray, bandwidth: np.ndarray) -> "NormalEquations":
+    def shrunk(self, target: np.ndarray, bandwidth: np.ndarray, steepest: float) -> "NormalEquations":
         """Return the same with the shrinkage that the residuals of targets (m, n, values) ask for.
 
-        Targets are in units of their size. With one or two coordinates there is none.
+        Targets are in units of their size, and `steepest` is the prior standard deviation of slopes. With one or two
+        coordinates there is no shrinkage.
         """
         orders, weight = self.terms.powers.sum(1), self.regressors[:, 0]
         if self.terms.powers.shape[1] <= 2:
@@ -90,7 +90,7 @@ class NormalEquations(NamedTuple):
         rest = np.einsum("mn,mnc->mc", weight, target**2) - (self.inverse @ sums * sums).sum(1)
         free = np.maximum(self.effective - len(orders), 1.0) / self.effective
         variance = np.maximum(rest, 0.0).max(1) / weight.sum(1) / free
-        prior = STEEPEST_SLOPE * bandwidth[:, None] * (bandwidth[:, None] / CURVATURE_LENGTH) ** (orders - 1.0)
+        prior = steepest * bandwidth[:, None] * (bandwidth[:, None] / CURVATURE_LENGTH) ** (orders - 1.0)
         shrinkage = np.where(orders > 0, variance[:, None] / prior**2, 0.0)
         return self._replace(inverse=inverse_of(self.normal + shrinkage[:, :, None] * np.eye(len(orders))))
 

@@ -24,6 +24,10 @@ FEWEST_FITTED = 30
 KERNEL_REACH = 3.0
 # Largest noise as a fraction of the bandwidth; deconvolution needs less than one.
 MOST_NOISE = 0.75
+# Prior standard deviation of slopes, in more than two coordinates: there the attractor is thin in some directions, and
+# does not determine all coefficients. From so many coordinates on, that of a map over a part of a return is the root:
+# it stretches less, and the motion needs no steep slopes where coordinates are redundant. Three delays do need them.
+STEEPEST_SLOPE, REDUNDANT = 10.0, 4
 # Largest distance from the nearest centre of an atlas, in bandwidths, with up to two coordinates and with more.
 FARTHEST_FROM_CENTRE = {2: 1.0, 3: 2.0}
 # Distance of two phases in a search tree, in units of the attractor's size.
@@ -107,6 +111,7 @@ class ReturnMap:
         stretches: np.ndarray | None = None, steps: int = 1, noises: np.ndarray | None = None,
     ):  # fmt: skip
         self.steps = steps
+        self._steepest = STEEPEST_SLOPE ** (1.0 / steps if len(turn) >= REDUNDANT else 1.0)
         self.points = points  # in the order of time, (count, d)
         # Number of each point's unbroken stretch, (count,).
         self.stretches = np.zeros(len(points), dtype=np.int64) if stretches is None else stretches
@@ -246,7 +251,7 @@ class ReturnMap:
         away = self._away(centres, index)
         image, reference = self._images(away, index)
         system = self._system(away, bandwidth, index, inside, degree)
-        system = system.shrunk(image, bandwidth) if shrunk else system
+        system = system.shrunk(image, bandwidth, self._steepest) if shrunk else system
         solution, d = system.solve(image), away.shape[2]
         influence = np.empty((len(centres), 0, 1 + d, d))
         if wants_influence:
@@ -277,7 +282,8 @@ class ReturnMap:
             parts = []
             for channel, size in zip(np.moveaxis(motion, -1, 0), sizes, strict=True):
                 reference, target = channel[0], (channel - channel[0])[None]
-                parts.append(_regression(system.shrunk(target / size, bandwidth), reference, target, influence))
+                part = system.shrunk(target / size, bandwidth, STEEPEST_SLOPE)
+                parts.append(_regression(part, reference, target, influence))
             results.append(Regression(*(np.stack(each, axis=-1) for each in zip(*parts, strict=True)), index[0]))
         return results
 
