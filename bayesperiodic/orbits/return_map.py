@@ -268,9 +268,9 @@ class ReturnMap:
     ) -> list["Regression"]:  # fmt: skip
         """Fit what follows the neighbours, as `fit_within` fits their images: the same neighbours and weights.
 
-        `signals` returns it, (n, times, channels), for positions (n,) among the arguments and these points (n, d) near a
-        centre. Residuals of each channel, in units of its size (channels,), determine its shrinkage, because a channel
-        may have much more noise than the images. Faster without `influence`.
+        `signals` returns it, (n, times, channels), for positions (n,) among the arguments and these points (n, d) near
+        a centre. Residuals of each channel, in units of its size (channels,), determine its shrinkage, because a
+        channel may have much more noise than the images. Faster without `influence`.
         """
         results = []
         for centre, phase, width in zip(centres[:, None], phases[:, None], bandwidths[:, None], strict=True):

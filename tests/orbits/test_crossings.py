@@ -233,6 +233,20 @@ def test_a_coordinate_that_does_not_determine_the_next_point_is_refused_with_the
         bp.find_orbits(more, periods=[1])
 
 
+def test_a_coordinate_that_nearly_determines_the_next_point_is_warned_of_with_the_delay_to_add():
+    """The maximum of y predicts the next one with 2.5 %, and orbits found with it alone have wrong periods."""
+    recording = roessler.recording(60_000, 0.15, 0.002, channels="y")
+    section = bp.PoincareSection.from_crossings(recording, ["y[1.46 s]"], channel="y")
+    with pytest.warns(UserWarning, match=r"must determine the next point.*with 'y\[-1.5 s\]'") as warned:
+        alone = bp.find_orbits(section, periods=[1])
+    assert warned[0].filename == __file__
+    more = bp.PoincareSection.from_crossings(recording, ["y[1.46 s]", "y[-1.5 s]"], channel="y")
+    both = bp.find_orbits(more, periods=[1])
+    (known,) = roessler.known_orbits(1)
+    assert np.abs(alone[0].duration - sum(known.times)) > 0.005
+    assert np.abs(both[0].duration - sum(known.times)) < min(0.002, 4.0 * both[0].duration_sd)
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.1])
 def test_periodic_recordings_are_refused(noise):
     time = np.arange(60_000) * 0.05
