@@ -118,9 +118,9 @@ def find_orbits(
     Warns
     -----
     UserWarning
-        If the return map of the first section has a trend in time, by a test whose false-alarm rate is 0.1 %; and if the
-        coordinates of crossings do not determine the next point, because a delayed one reduces errors of predictions
-        that noise does not explain.
+        If the return map of the first section has a trend in time, by a test whose false-alarm rate is 0.1 %; and if
+        the coordinates of crossings do not determine the next point, because a delayed one reduces errors of
+        predictions that noise does not explain.
 
     Examples
     --------
@@ -268,7 +268,7 @@ def _remedy(section: PoincareSection, maps: ReturnMap, error: float) -> str:
 
 
 def _best_delayed(section: PoincareSection, maps: ReturnMap) -> tuple[str, float]:
-    """Return the delayed coordinate with which local maps predict best, and their error; an empty name if none can be."""
+    """Return the delayed coordinate with which local maps predict best, and their error; an empty name if none."""
     errors, size = {}, np.ptp(section.points, axis=0)
     channels = dict.fromkeys([*channels_of(section.coordinates), *filter(None, [section.crossed])])
     # For crossings, fractions of the mean return.
