@@ -284,7 +284,8 @@ class ReturnMap:
                 reference, target = channel[0], (channel - channel[0])[None]
                 part = system.shrunk(target / size, bandwidth, STEEPEST_SLOPE)
                 parts.append(_regression(part, reference, target, influence))
-            results.append(Regression(*(np.stack(each, axis=-1) for each in zip(*parts, strict=True)), index[0]))
+            value, slopes, errors, gain = (np.stack(each, axis=-1) for each in zip(*parts, strict=True))
+            results.append(Regression(value, slopes, errors, gain, index[0]))
         return results
 
     def _away(self, centres: np.ndarray, index: np.ndarray) -> np.ndarray:
