@@ -345,7 +345,7 @@ class PoincareSection(Result):
         if not crossings.instants.size:
             raise ValueError(
                 f"level: must be crossed by {channel!r}, got no crossing of {level:.6g} by {crossings.band:.3g} on "
-                f"both sides. Take another one, such as {0.5 * (values.min() + values.max()):.3g}, or channel, or sample faster."
+                f"both sides. Take another one, such as {0.5 * (values.min() + values.max()):.3g}, or sample faster."
             )
         crossings = crossings.within(samples, delays.min(), delays.max())
         _check_count(crossings.instants.size)
