@@ -137,8 +137,13 @@ WITHOUT_TIME = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 def find_data(given: Path | None, relative: str) -> tuple[Path, str] | None:
     """Return a measured file and the name to report for it, None if it is missing.
 
-    Searched: the path given, then the folder named by BAYESPERIODIC_DATA, then ``data/``.
+    Searched: the path given, a file or a folder with the file in it, then the folder named by BAYESPERIODIC_DATA, then
+    ``data/``.
     """
+    if given is not None and given.is_dir():
+        given = next(
+            (one for one in (given / relative, given / Path(relative).name) if one.is_file()), given / relative
+        )
     if given is not None:
         if not given.is_file():
             raise FileNotFoundError(f"--data: must be an existing file, got {str(given)!r}.")

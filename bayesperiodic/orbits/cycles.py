@@ -94,14 +94,16 @@ class Runs(NamedTuple):
         pairs = np.unique(np.concatenate([maps.positions[fit.neighbours].ravel() for fit in fits]))
         return cls(pairs, np.concatenate([[0], np.cumsum(np.diff(pairs) > 1)]))
 
-    def pair(self, maps: ReturnMap, neighbours: np.ndarray) -> np.ndarray:
-        """Return which pairs start at neighbours (n,) among the arguments of the map."""
-        return np.searchsorted(self.pairs, maps.positions[neighbours])
+    def by_pair(self, maps: ReturnMap, neighbours: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return values (n, …) of neighbours (n,) among the arguments of the map, by pair."""
+        result = np.zeros((self.pairs.size, *values.shape[1:]))
+        np.add.at(result, np.searchsorted(self.pairs, maps.positions[neighbours]), values)
+        return result
 
     def sums(self, maps: ReturnMap, neighbours: np.ndarray, errors: np.ndarray) -> np.ndarray:
         """Return the sums (runs, …) of contributions (n, …) of neighbours (n,) to errors."""
         result = np.zeros((self.run[-1] + 1, *errors.shape[1:]))
-        np.add.at(result, self.run[self.pair(maps, neighbours)], errors)
+        np.add.at(result, self.run[np.searchsorted(self.pairs, maps.positions[neighbours])], errors)
         return result
 
 

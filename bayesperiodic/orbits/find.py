@@ -18,6 +18,7 @@ from bayesperiodic.orbits.phases import merged, phases_of, with_late_partners
 from bayesperiodic.orbits.return_map import (
     FEWEST_FOLLOWED,
     KERNEL_REACH,
+    NOISE_EXPLAINS,
     Atlas,
     ReturnMap,
     change_in_time,
@@ -43,8 +44,8 @@ LARGEST_LOGARITHM_SD = 0.5
 CHANGE_LEVEL = 1e-3
 # Delays tried for a coordinate to add, in forcing periods, or in mean returns.
 DELAYS_TRIED = (-0.25, -0.5)
-# A coordinate to add reduces the errors of predictions to this fraction or less.
-REDUCED = 0.75
+# A coordinate to add reduces the errors of predictions to this fraction or less; smaller ones are not looked at.
+REDUCED, LEAST_ERROR = 0.8, 0.01
 # Standard deviations from which a determinant is impossible.
 IMPOSSIBLE = 3.0
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
@@ -117,7 +118,9 @@ def find_orbits(
     Warns
     -----
     UserWarning
-        If the return map of the first section has a trend in time, by a test whose false-alarm rate is 0.1 %.
+        If the return map of the first section has a trend in time, by a test whose false-alarm rate is 0.1 %; and if
+        the coordinates of crossings do not determine the next point, because a delayed one reduces errors of
+        predictions that noise does not explain.
 
     Examples
     --------
@@ -130,6 +133,7 @@ def find_orbits(
     if isinstance(section, PoincareSection):
         of_one = _of_section(section, periods, method, neighbours, box, steps, waveforms)
         _warn_of_change(section)
+        _warn_of_coordinates(section, *of_one.prediction_error)
         return of_one
     _checks.instance("section", section, (list, tuple))
     for one in section:
@@ -224,6 +228,20 @@ def _warn_of_change(section: PoincareSection) -> None:
         warnings.warn(f"section: {text[0].lower()}{text[1:]}", UserWarning, stacklevel=4)
 
 
+def _warn_of_coordinates(section: PoincareSection, error: float, from_noise: float) -> None:
+    """Warn if a delayed coordinate reduces errors of predictions of crossings that noise does not explain."""
+    if section.crossed is None or error < LEAST_ERROR or from_noise > NOISE_EXPLAINS * error:
+        return
+    name, least = _best_delayed(section, _return_map(section)[0])
+    if least < REDUCED * error:
+        warnings.warn(
+            f"section: coordinates must determine the next point, got errors of predictions of {error:.1%}, "
+            f"{from_noise:.1%} from known noise, and {least:.1%} with {name!r}. Orbits and their errors may be wrong: "
+            "add this coordinate.",
+            UserWarning, stacklevel=4,
+        )  # fmt: skip
+
+
 def _change(maps: ReturnMap) -> str:
     """Return that the return map has a trend in time, and what to do, as text; empty if no trend is seen."""
     p = change_in_time(maps)
@@ -237,6 +255,20 @@ def _change(maps: ReturnMap) -> str:
 
 def _remedy(section: PoincareSection, maps: ReturnMap, error: float) -> str:
     """Return what to do where local maps predict with an error: which delayed coordinate to add, or more points."""
+    name, least = _best_delayed(section, maps)
+    more = "If the system has more states than coordinates, add one: another output"
+    if not name:
+        return f"{more}."
+    if least > REDUCED * error:
+        return (
+            f"{more}; delayed ones do not help, with {name!r} errors are {least:.1%}. {len(section)} points may "
+            "be too few for local maps: record longer."
+        )
+    return f"{more} or a delayed one, with {name!r} errors are {least:.1%}."
+
+
+def _best_delayed(section: PoincareSection, maps: ReturnMap) -> tuple[str, float]:
+    """Return the delayed coordinate with which local maps predict best, and their error; an empty name if none."""
     errors, size = {}, np.ptp(section.points, axis=0)
     channels = dict.fromkeys([*channels_of(section.coordinates), *filter(None, [section.crossed])])
     # For crossings, fractions of the mean return.
@@ -251,16 +283,7 @@ def _remedy(section: PoincareSection, maps: ReturnMap, error: float) -> str:
         points, added = np.hstack([maps.points, column]), np.hstack([section.increments / size, increments])
         turn, noise = np.append(maps.turn, np.inf), np.append(maps.noise, 0.0)
         errors[name] = prediction_error(ReturnMap(points, added, turn, maps.winds, noise, maps.stretches))[0]
-    more = "If the system has more states than coordinates, add one: another output"
-    if not errors:
-        return f"{more}."
-    best = min(errors, key=errors.__getitem__)
-    if errors[best] > REDUCED * error:
-        return (
-            f"{more}; delayed ones do not help, with {best!r} errors are {errors[best]:.1%}. {len(section)} points may "
-            "be too few for local maps: record longer."
-        )
-    return f"{more} or a delayed one, with {best!r} errors are {errors[best]:.1%}."
+    return min(errors.items(), key=lambda item: item[1], default=("", np.inf))
 
 
 def _separate(section: PoincareSection, coordinate: str) -> bool:

@@ -12,6 +12,8 @@ from scipy.special import factorial
 MOST_LEVERAGE = 0.9
 # Eigenvalues of normal equations below this fraction of the largest one are left out.
 NEARLY_SINGULAR = 1e-10
+# Distance over which a slope changes by its prior standard deviation, in more than two coordinates.
+CURVATURE_LENGTH = 0.1
 
 
 @cache
@@ -56,9 +58,41 @@ class NormalEquations(NamedTuple):
     rows: np.ndarray  # monomials of all coordinates but the last up to twice the degree, (m, rows, n)
     last: np.ndarray  # powers of the last coordinate, (m, powers, n)
     terms: Terms
-    inverse: np.ndarray  # (m, terms, terms)
+    normal: np.ndarray  # (m, terms, terms)
+    inverse: np.ndarray  # of the same, or with shrinkage
     scale: np.ndarray  # derivatives over coefficients, (m, terms, 1)
     effective: np.ndarray  # effective number of neighbours, (m,)
+
+    @classmethod
+    def of(cls, by_coordinate: list[np.ndarray], bandwidth: np.ndarray, degree: int) -> "NormalEquations":
+        """Return those of `deconvoluted` powers of each coordinate, in units of the bandwidths (m,)."""
+        d, weight = len(by_coordinate), by_coordinate[0][:, 0]
+        terms = terms_of(d, degree)
+        rows = products(by_coordinate[:-1], 2 * degree) if d > 1 else np.ones((1, 1, weight.shape[1]))
+        regressors = with_last(rows, by_coordinate, degree)
+        # The sums of products by powers of the last coordinate: one matrix product.
+        table = rows @ by_coordinate[-1].mT
+        normal = table[:, terms.row, terms.column]
+        effective = weight.sum(1) ** 2 / (weight**2).sum(1)
+        scale = (terms.factorials / bandwidth[:, None] ** terms.powers.sum(1))[..., None]
+        return cls(regressors, rows, by_coordinate[-1], terms, normal, inverse_of(normal), scale, effective)
+
+    def shrunk(self, target: np.ndarray, bandwidth: np.ndarray, steepest: float) -> "NormalEquations":
+        """Return the same with the shrinkage that the residuals of targets (m, n, values) ask for.
+
+        Targets are in units of their size, and `steepest` is the prior standard deviation of slopes. With one or two
+        coordinates there is no shrinkage.
+        """
+        orders, weight = self.terms.powers.sum(1), self.regressors[:, 0]
+        if self.terms.powers.shape[1] <= 2:
+            return self
+        sums = self.regressors @ target
+        rest = np.einsum("mn,mnc->mc", weight, target**2) - (self.inverse @ sums * sums).sum(1)
+        free = np.maximum(self.effective - len(orders), 1.0) / self.effective
+        variance = np.maximum(rest, 0.0).max(1) / weight.sum(1) / free
+        prior = steepest * bandwidth[:, None] * (bandwidth[:, None] / CURVATURE_LENGTH) ** (orders - 1.0)
+        shrinkage = np.where(orders > 0, variance[:, None] / prior**2, 0.0)
+        return self._replace(inverse=inverse_of(self.normal + shrinkage[:, :, None] * np.eye(len(orders))))
 
     def solve(self, target: np.ndarray) -> np.ndarray:
         """Return the coefficients (m, terms, values) of polynomials through targets (m, n, values)."""

@@ -14,11 +14,8 @@ from scipy.special import gammaincc
 from bayesperiodic.orbits.normal_equations import (
     NormalEquations,
     deconvoluted,
-    inverse_of,
     monomials,
-    products,
     terms_of,
-    with_last,
 )
 
 # Fewest neighbours of a fit of given bandwidth.
@@ -27,9 +24,10 @@ FEWEST_FITTED = 30
 KERNEL_REACH = 3.0
 # Largest noise as a fraction of the bandwidth; deconvolution needs less than one.
 MOST_NOISE = 0.75
-# Prior standard deviation of slopes, and the distance over which a slope changes by it, in more than two coordinates:
-# there the attractor is thin in some directions, and does not determine all coefficients.
-STEEPEST_SLOPE, CURVATURE_LENGTH = 10.0, 0.1
+# Prior standard deviation of slopes, in more than two coordinates: there the attractor is thin in some directions, and
+# does not determine all coefficients. From so many coordinates on, that of a map over a part of a return is the root:
+# it stretches less, and the motion needs no steep slopes where coordinates are redundant. Three delays do need them.
+STEEPEST_SLOPE, REDUNDANT = 10.0, 4
 # Largest distance from the nearest centre of an atlas, in bandwidths, with up to two coordinates and with more.
 FARTHEST_FROM_CENTRE = {2: 1.0, 3: 2.0}
 # Distance of two phases in a search tree, in units of the attractor's size.
@@ -73,13 +71,26 @@ class LocalFit(NamedTuple):
 
 
 class Regression(NamedTuple):
-    """Values that follow a point, fitted to what follows its n neighbours, in d coordinates."""
+    """Channels that follow a point, fitted to what follows its n neighbours, in d coordinates."""
 
-    value: np.ndarray  # (values,)
-    slopes: np.ndarray  # by the coordinates, (d, values)
+    value: np.ndarray  # (times, channels)
+    slopes: np.ndarray  # by the coordinates, (d, times, channels)
+    influence: np.ndarray  # contribution of each neighbour to the error of `value`, (n, times, channels)
+    weights: np.ndarray  # of each neighbour in `value`, (n, channels)
     neighbours: np.ndarray  # positions among the arguments, (n,)
-    influence: np.ndarray  # contribution of each neighbour to the error of `value`, (n, values)
-    weights: np.ndarray  # of each neighbour in `value`, (n,)
+
+
+def _regression(
+    system: NormalEquations, reference: np.ndarray, target: np.ndarray, influence: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return value, slopes, influence and weights of a channel, targets (1, n, times) less a reference (times,)."""
+    solution, times, d = system.solve(target), target.shape[2], system.terms.powers.shape[1]
+    derivatives = (solution * system.scale)[0]
+    weights = (system.inverse @ system.regressors)[0, 0]
+    errors = np.empty((0, times))
+    if influence:
+        errors = system.influence(target, solution, np.ones((times, 1)), np.eye(times))[0].T
+    return reference + derivatives[0], derivatives[1 : 1 + d], errors, weights
 
 
 class ReturnMap:
@@ -100,6 +111,7 @@ class ReturnMap:
         stretches: np.ndarray | None = None, steps: int = 1, noises: np.ndarray | None = None,
     ):  # fmt: skip
         self.steps = steps
+        self._steepest = STEEPEST_SLOPE ** (1.0 / steps if len(turn) >= REDUNDANT else 1.0)
         self.points = points  # in the order of time, (count, d)
         # Number of each point's unbroken stretch, (count,).
         self.stretches = np.zeros(len(points), dtype=np.int64) if stretches is None else stretches
@@ -238,7 +250,8 @@ class ReturnMap:
         bandwidth = np.maximum(bandwidth, np.max(self.noise) / MOST_NOISE)
         away = self._away(centres, index)
         image, reference = self._images(away, index)
-        system = self._system(away, bandwidth, index, inside, degree, image if shrunk else None)
+        system = self._system(away, bandwidth, index, inside, degree)
+        system = system.shrunk(image, bandwidth, self._steepest) if shrunk else system
         solution, d = system.solve(image), away.shape[2]
         influence = np.empty((len(centres), 0, 1 + d, d))
         if wants_influence:
@@ -251,29 +264,28 @@ class ReturnMap:
 
     def regress(
         self, centres: np.ndarray, phases: np.ndarray, bandwidths: np.ndarray, degree: int, signals: Signals,
-        *, influence: bool = True,
+        sizes: np.ndarray, *, influence: bool = True,
     ) -> list["Regression"]:  # fmt: skip
         """Fit what follows the neighbours, as `fit_within` fits their images: the same neighbours and weights.
 
-        `signals` returns it, (n, values), for positions (n,) among the arguments and these points (n, d) near a centre.
-        Faster without `influence`.
+        `signals` returns it, (n, times, channels), for positions (n,) among the arguments and these points (n, d) near
+        a centre. Residuals of each channel, in units of its size (channels,), determine its shrinkage, because a
+        channel may have much more noise than the images. Faster without `influence`.
         """
         results = []
         for centre, phase, width in zip(centres[:, None], phases[:, None], bandwidths[:, None], strict=True):
             index, inside, bandwidth = self._within(centre, phase, width, degree)
             index, inside = index[:, inside[0]], inside[:, inside[0]]
             away = self._away(centre, index)
-            system = self._system(away, bandwidth, index, inside, degree, self._images(away, index)[0])
-            target = signals(index[0], centre + away[0])
-            reference, target = target[:1], (target - target[:1])[None]
-            solution = system.solve(target)
-            derivatives = (solution * system.scale)[0]
-            weights = (system.inverse @ system.regressors)[0, 0]
-            value, slopes, values = reference[0] + derivatives[0], derivatives[1 : 1 + len(self.turn)], target.shape[2]
-            errors = np.empty((0, values))
-            if influence:
-                errors = system.influence(target, solution, np.ones((values, 1)), np.eye(values))[0].T
-            results.append(Regression(value, slopes, index[0], errors, weights))
+            system = self._system(away, bandwidth, index, inside, degree)
+            motion = signals(index[0], centre + away[0])
+            parts = []
+            for channel, size in zip(np.moveaxis(motion, -1, 0), sizes, strict=True):
+                reference, target = channel[0], (channel - channel[0])[None]
+                part = system.shrunk(target / size, bandwidth, STEEPEST_SLOPE)
+                parts.append(_regression(part, reference, target, influence))
+            value, slopes, errors, weights = (np.stack(each, axis=-1) for each in zip(*parts, strict=True))
+            results.append(Regression(value, slopes, errors, weights, index[0]))
         return results
 
     def _away(self, centres: np.ndarray, index: np.ndarray) -> np.ndarray:
@@ -289,34 +301,14 @@ class ReturnMap:
         return image if self.winds else self.wrap(image), reference[:, 0]
 
     def _system(
-        self, away: np.ndarray, bandwidth: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int,
-        shrinking: np.ndarray | None,
-    ) -> NormalEquations:  # fmt: skip
-        """Return the normal equations of fits; the residuals of the images `shrinking` determine their shrinkage."""
+        self, away: np.ndarray, bandwidth: np.ndarray, index: np.ndarray, inside: np.ndarray, degree: int
+    ) -> NormalEquations:
+        """Return the normal equations of fits."""
         width = bandwidth[:, None, None]
         noise = self.noise if self._noises is None else np.minimum(self._noises[index], MOST_NOISE * width)
         by_coordinate = deconvoluted(away / width, noise / width, 2 * degree)
         by_coordinate[0] *= inside[:, None]
-        d, weight = len(by_coordinate), by_coordinate[0][:, 0]
-        terms = terms_of(d, degree)
-        orders = terms.powers.sum(1)
-        rows = products(by_coordinate[:-1], 2 * degree) if d > 1 else np.ones((1, 1, weight.shape[1]))
-        regressors = with_last(rows, by_coordinate, degree)
-        # The sums of products by powers of the last coordinate: one matrix product.
-        table = rows @ by_coordinate[-1].mT
-        normal = table[:, terms.row, terms.column]
-        inverse = inverse_of(normal)
-        effective = weight.sum(1) ** 2 / (weight**2).sum(1)
-        if d > 2 and shrinking is not None:
-            target = regressors @ shrinking
-            rest = np.einsum("mn,mnc->mc", weight, shrinking**2) - (inverse @ target * target).sum(1)
-            free = np.maximum(effective - len(orders), 1.0) / effective
-            variance = np.maximum(rest, 0.0).max(1) / weight.sum(1) / free
-            prior = STEEPEST_SLOPE * bandwidth[:, None] * (bandwidth[:, None] / CURVATURE_LENGTH) ** (orders - 1.0)
-            shrinkage = np.where(orders > 0, variance[:, None] / prior**2, 0.0)
-            inverse = inverse_of(normal + shrinkage[:, :, None] * np.eye(len(orders)))
-        scale = (terms.factorials / bandwidth[:, None] ** orders)[..., None]
-        return NormalEquations(regressors, rows, by_coordinate[-1], terms, inverse, scale, effective)
+        return NormalEquations.of(by_coordinate, bandwidth, degree)
 
 
 class Atlas:

@@ -38,21 +38,23 @@ def return_times_of(section: PoincareSection, maps: ReturnMap, estimate: Estimat
     phases = maps.phases(np.arange(count))
 
     def signals(index: np.ndarray, _: np.ndarray) -> np.ndarray:
-        return returns[index, None]
+        return returns[index, None, None]
 
+    size = np.array([np.ptp(returns)])
     narrow, wide = (
-        maps.regress(estimate.points, phases, one.bandwidths, REFINING_DEGREE, signals)
+        maps.regress(estimate.points, phases, one.bandwidths, REFINING_DEGREE, signals, size)
         for one in (fits.narrow, fits.wide)
     )
     runs = Runs.of(maps, fits.narrow.fit, fits.wide.fit)
     by_run, d = errors_by_run(maps, fits.narrow.fit, runs), estimate.points.shape[1]
     errors = np.stack(
         [
-            by_run[:, d * j : d * (j + 1)] @ fit.slopes[:, 0] + runs.sums(maps, fit.neighbours, fit.influence[:, 0])
+            by_run[:, d * j : d * (j + 1)] @ fit.slopes[:, 0, 0]
+            + runs.sums(maps, fit.neighbours, fit.influence[:, 0, 0])
             for j, fit in enumerate(narrow)
         ],
         axis=1,
     )
-    each, others = (np.array([float(fit.value[0]) for fit in some]) for some in (narrow, wide))
-    moved = np.sum([fit.slopes[:, 0] for fit in narrow] * maps.wrap(fits.wide.points - estimate.points))
+    each, others = (np.array([float(fit.value[0, 0]) for fit in some]) for some in (narrow, wide))
+    moved = np.sum([fit.slopes[:, 0, 0] for fit in narrow] * maps.wrap(fits.wide.points - estimate.points))
     return ReturnTimes(each, errors, float(np.hypot(np.sum(others - each), moved)) / VALUE_GROWTH)

@@ -293,7 +293,7 @@ class PoincareSection(Result):
         channel : str
             Output whose crossings define the section; a coordinate only with delays.
         level : float, optional
-            By default the channel's median. It should be crossed steeply, once an oscillation.
+            By default the channel's median. It should be crossed steeply, once an oscillation; not the foot of spikes.
         direction : {1, -1}
             Upwards or downwards.
         angles
@@ -344,8 +344,8 @@ class PoincareSection(Result):
         crossings = upward_crossings(height, samples.time.size // (2 * FEWEST_POINTS))
         if not crossings.instants.size:
             raise ValueError(
-                f"level: must be crossed by {channel!r}, got no crossing of {level:.6g} by more than noise, "
-                f"{crossings.band:.3g}. Choose another level or channel, or sample faster."
+                f"level: must be crossed by {channel!r}, got no crossing of {level:.6g} by {crossings.band:.3g} on "
+                f"both sides. Take another one, such as {0.5 * (values.min() + values.max()):.3g}, or sample faster."
             )
         crossings = crossings.within(samples, delays.min(), delays.max())
         _check_count(crossings.instants.size)

@@ -181,6 +181,10 @@ class Following:
             for k, (name, column) in enumerate(zip(section.coordinates, columns_of(section.coordinates), strict=True))
             if name in section.angles
         ]
+        extents = np.ptp(self._samples.signals, axis=0)
+        turning = [column for _, column in self.angles]
+        extents[turning] = np.minimum(extents[turning], TURN)
+        self.sizes = np.where(extents > 0.0, extents, 1.0)  # of the channels
         self._halves, self.variance = self._windows(maps.steps)
         self._phases = np.empty(0)  # at which the motion is in memory, for the arguments that are not NaN there
         self._motion = np.empty(0)
@@ -220,12 +224,12 @@ class Following:
         return result
 
     def signals(self, index: np.ndarray, near: np.ndarray, columns: slice, phases: np.ndarray) -> np.ndarray:
-        """Return channels (n, phases·channels) after arguments (n,), whose angles are as in the points (n, d)."""
+        """Return channels (n, phases, channels) after arguments (n,), whose angles are as in the points (n, d)."""
         values = self._after(index, phases)
         for k, column in self.angles:
             away = near[:, k] * self._size[k] - values[:, 0, column]
             values[:, :, column] += TURN * np.round(away / TURN)[:, None]
-        return values[:, 1:, columns].reshape(len(index), -1)
+        return values[:, 1:, columns]
 
     def _after(self, index: np.ndarray, phases: np.ndarray) -> np.ndarray:
         """Return the channels (n, 1 + phases, channels) at and after arguments (n,).
@@ -290,7 +294,7 @@ def _group(
     if times is not None:
         errors += _moved(motion, times, order, [phases[j] for j in order])
     common, rest = _common(errors.transpose(0, 2, 1), np.std(motion, axis=0), 2 * fits.narrow.points.size)
-    gains = np.concatenate([np.full(len(part.values), part.gain) for part in parts])
+    gains = np.concatenate([np.tile(part.gain[:, None], len(part.values)) for part in parts], axis=1)
     noise = np.sqrt(np.maximum(rest[:, None], following.variance[columns, None] * gains))
     squares = np.concatenate([part.bias**2 for part in parts]).reshape(order.size, following.count, -1)
     return _Group(motion.T, np.sqrt(squares.mean(axis=1)).T, noise, common)
@@ -305,11 +309,11 @@ def _widest(following: Following, maps: ReturnMap, fits: CycleFits, at: list[np.
     regressions = _Regressions(following, maps, at, following.driven, INPUTS)
     bandwidths, variance = fits.narrow.bandwidths.copy(), following.variance[following.driven]
     for j, places in enumerate(at):
-        tried: list[tuple[np.ndarray, float]] = []
+        tried: list[tuple[np.ndarray, np.ndarray]] = []
         width, each = bandwidths[j], max(1, places.size * maps.steps // INDEPENDENT)
         while True:
             fit = regressions.fit(fits.narrow.points[j], j, width, influence=False)
-            value, gain = fit.value.reshape(places.size, -1)[::each], float(np.sum(fit.weights**2))
+            value, gain = fit.value[::each], np.sum(fit.weights**2, axis=0)
             limit = chdtri(value.size, INPUTS_DIFFER)
             if any(np.sum((value - v) ** 2 / (variance * g)) > limit for v, g in tried):
                 break
@@ -338,7 +342,7 @@ class _MotionPart(NamedTuple):
     values: np.ndarray  # (samples, channels)
     errors: np.ndarray  # of each run of neighbours, (runs, samples, channels)
     bias: np.ndarray  # modulus of what may remain, (samples, channels)
-    gain: float  # variance of the values for independent errors of unit variance
+    gain: np.ndarray  # variance of the values for independent errors of unit variance, (channels,)
 
 
 @dataclass(frozen=True)
@@ -360,15 +364,16 @@ class _Regressions:
         away = self.subtracted(fits, narrow, differences)
         for j, both in enumerate(zip(narrow, wide, strict=True)):
             errors = [
-                of_points[:, d * j : d * (j + 1)] @ fit.slopes + runs.sums(self.maps, fit.neighbours, fit.influence)
+                np.tensordot(of_points[:, d * j : d * (j + 1)], fit.slopes, 1)
+                + runs.sums(self.maps, fit.neighbours, fit.influence)
                 for of_points, fit in zip(by_run, both, strict=True)
             ]
-            weights = [np.bincount(runs.pair(self.maps, fit.neighbours), fit.weights, runs.pairs.size) for fit in both]
+            weights = [runs.by_pair(self.maps, fit.neighbours, fit.weights) for fit in both]
             error = errors[0] + away * (errors[0] - errors[1])
-            gain = float(np.sum((weights[0] + away * (weights[0] - weights[1])) ** 2))
-            value = both[0].value.reshape(differences[j].shape) - away * differences[j]
+            gain = np.sum((weights[0] + away * (weights[0] - weights[1])) ** 2, axis=0)
+            value = both[0].value - away * differences[j]
             bias = self.how.remaining * np.abs(differences[j])
-            parts.append(_MotionPart(value, error.reshape(-1, *value.shape), bias, gain))
+            parts.append(_MotionPart(value, error, bias, gain))
         return parts
 
     def fits(self, cycle: ClosingFits, *, influence: bool = True) -> list[Regression]:
@@ -379,14 +384,13 @@ class _Regressions:
         """Return the fit at a point (d,), the one number j of its cycle."""
         signals = partial(self.following.signals, columns=self.columns, phases=self.at[j])
         phase, width = self.maps.phases(np.array([j])), np.array([bandwidth])
-        return self.maps.regress(point[None], phase, width, self.how.degree, signals, influence=influence)[0]
+        sizes = self.following.sizes[self.columns]
+        (fit,) = self.maps.regress(point[None], phase, width, self.how.degree, signals, sizes, influence=influence)
+        return fit
 
     def differences(self, ones: list[Regression], others: list[Regression]) -> list[np.ndarray]:
         """Return the motion by some fits less that by others, (samples, channels) after each point."""
-        result = [
-            (one.value - other.value).reshape(places.size, -1)
-            for one, other, places in zip(ones, others, self.at, strict=True)
-        ]
+        result = [one.value - other.value for one, other in zip(ones, others, strict=True)]
         if self.columns != self.following.outputs:
             return result
         return [_without_turns(difference, self.following) for difference in result]

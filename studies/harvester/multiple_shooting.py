@@ -8,7 +8,6 @@ from scipy.optimize import least_squares
 
 import bayesperiodic as bp
 from studies.harvester import beam
-from studies.harvester.recording import FREQUENCY
 
 DEGREE, COUPLING = 7, 4
 # Drive periods in a segment.
@@ -48,10 +47,10 @@ class Shot(NamedTuple):
     evaluations: int
 
 
-def segments_of(recordings: list[bp.Recording], periods: float) -> Segments:
-    """Return consecutive segments of so many drive periods."""
+def segments_of(recordings: list[bp.Recording], periods: float, frequency: float) -> Segments:
+    """Return consecutive segments of so many drive periods, of a drive of some frequency [Hz]."""
     steps = round(STEPS * periods)
-    step = 1.0 / (FREQUENCY * STEPS)
+    step = 1.0 / (frequency * STEPS)
     parts: list[list[np.ndarray]] = [[], [], [], []]
     for one in recordings:
         count = int((one.time[-1] - one.time[0]) / (steps * step))

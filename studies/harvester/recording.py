@@ -13,7 +13,9 @@ from studies.harvester.beam import SYNTHETIC, model, parameters
 
 RELATIVE = "harvester/harvester_pieces.npz"
 ADDRESS = "github.com/americocunhajr/BistableX, DataExperimental/poincare_analysis/chaos_symmetric, files 1 to 120"
-FREQUENCY, GRAVITY = 6.5, 9.80665  # Hz, m/s²
+GRAVITY = 9.80665  # m/s²
+DIGITS = 5  # of the frequency in Hz: in 480 s the phase is right within 0.003 periods
+FREQUENCY = 6.5  # of simulated recordings [Hz]
 # Corner of the filter without which the integral of the acceleration drifts [Hz], and its order.
 CORNER, ORDER = 2.0, 4
 # Of the simulated recording: drive periods, samples a period, amplitude of the base [m/s²], noise by channel.
@@ -44,6 +46,12 @@ def read(path: Path) -> tuple[list[bp.Recording], dict[str, Any]]:
         recordings.append(_recording(time, {name: values[pieces].ravel() for name, values in channels.items()}))
     about = {"synthetic": False, "file": path.name, "sha256": common.sha256(path), "pieces": int(numbers.size)}
     return recordings, about
+
+
+def frequency_of(recordings: list[bp.Recording]) -> float:
+    """Return the frequency of the drive [Hz], by its periods in the longest recording."""
+    longest = max(recordings, key=lambda one: one.time.size)
+    return round(bp.Recording(longest.time, {"drive": longest.inputs["drive"]}, {}).fold().frequency, DIGITS)
 
 
 def simulated(seed: int) -> tuple[list[bp.Recording], dict[str, Any]]:

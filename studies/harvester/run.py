@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 import bayesperiodic as bp
 from studies import common
 from studies.harvester import beam, multiple_shooting, recording, synthetic
-from studies.harvester.recording import FREQUENCY, Delays
+from studies.harvester.recording import Delays
 
 COORDINATES = ("voltage", "voltage[-0.2]", "voltage[-0.4]", "voltage[-0.6]", "voltage[-0.8]")
 SECTION = ("velocity", "voltage")
@@ -51,10 +51,12 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("recording", "the recording"):
         given = common.find_data(options.data, recording.RELATIVE)
         whole, about = recording.read(given[0]) if given else recording.simulated(options.seed)
+        frequency = recording.frequency_of(whole)
         fitted, left_out = recording.divided(whole, SHARE)
-    print(f"  {'SYNTHETIC' if about['synthetic'] else 'measured'}, {sum(one.time.size for one in whole)} samples")
+    kind, count = "SYNTHETIC" if about["synthetic"] else "measured", sum(one.time.size for one in whole)
+    print(f"  {kind}, {count} samples, drive {frequency:g} Hz")
     with watch.part("orbits", "finding orbits without a model, at several phases"):
-        orbits = found_orbits(fitted, options.quick)
+        orbits = found_orbits(fitted, frequency, options.quick)
         used = reliable(orbits, QUICK_LARGEST_ERROR if options.quick else LARGEST_ERROR)
     print(f"{orbits}\n  {len(used)} are used")
     with watch.part("delays", "delays of the channels against the drive"):
@@ -62,7 +64,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"  velocity {1e3 * delays.velocity:.2f} ± {1e3 * errors.velocity:.2f} ms, voltage "
           f"{1e3 * delays.voltage:.2f} ± {1e3 * errors.voltage:.2f} ms later than the drive")  # fmt: skip
     runs = [beam.shifted(beam.experiment(orbit), *delays) for orbit in used]
-    sections = [section_of([recording.aligned(one, delays) for one in part]) for part in (fitted, left_out)]
+    sections = [section_of([recording.aligned(one, delays) for one in part], frequency) for part in (fitted, left_out)]
     with watch.part("models", "models of several degrees, from the orbits one after the other"):
         tried = [one for degree in (DEGREES[:2] if options.quick else DEGREES)
                  if (one := fit_of(degree, used, runs, sections[0], options.seed)) is not None]  # fmt: skip
@@ -89,7 +91,7 @@ def run(options: argparse.Namespace) -> None:
         }
         paths = common.save_figures(options.out, drawn)
     results = {
-        "recording": about, "seed": options.seed, "quick": options.quick,
+        "recording": about | {"frequency": frequency}, "seed": options.seed, "quick": options.quick,
         "orbits": [orbit_row(orbit, orbit in used) for orbit in orbits],
         "delays": {"seconds": delays._asdict(), "sd": errors._asdict()},
         "models": [model_row(one) for one in tried],
@@ -130,11 +132,12 @@ def shooting_part(options: argparse.Namespace) -> None:
     given = common.find_data(options.data, recording.RELATIVE)
     whole, about = recording.read(given[0]) if given else recording.simulated(options.seed)
     delays, parts = Delays(**study["delays"]["seconds"]), recording.divided(whole, SHARE)
+    frequency = recording.frequency_of(whole)
     fitted, left_out = ([recording.aligned(one, delays) for one in part] for part in parts)
     theta, scale = ({name: row[k] for name, row in study["estimates"].items()} for k in (0, 1))
     with watch.part("problem", "a problem with the model, from an orbit"):
         orbits = bp.find_orbits(
-            bp.PoincareSection.from_recordings(parts[0], COORDINATES, frequency=FREQUENCY), periods=[3, 4],
+            bp.PoincareSection.from_recordings(parts[0], COORDINATES, frequency=frequency), periods=[3, 4],
             steps=STEPS, waveforms=True,
         )  # fmt: skip
         start = beam.Start(theta, *delays, left=(0.0, 0.0), reach=REACH)
@@ -147,13 +150,14 @@ def shooting_part(options: argparse.Namespace) -> None:
             priors=beam.priors_about(start),
         )
         fit = bp.map_estimate(problem, start=theta, progress=False, checks=False)
-    rows = []
+    rows, section = [], section_of(left_out, frequency)
     for periods in multiple_shooting.LENGTHS_OF_SEGMENTS[: 1 if options.quick else None]:
         with watch.part(f"{periods:g}", f"segments of {periods:g} periods"):
-            shot = multiple_shooting.estimate(multiple_shooting.segments_of(fitted, periods), theta, scale, REACH)
+            segments = multiple_shooting.segments_of(fitted, periods, frequency)
+            shot = multiple_shooting.estimate(segments, theta, scale, REACH)
             covariance = pd.DataFrame(shot.covariance, [*shot.theta], [*shot.theta]).loc[[*fit.theta], [*fit.theta]]
             shooting = replace(fit, theta={name: shot.theta[name] for name in fit.theta}, covariance=covariance)
-            predicted = bp.predict_attractor(problem, shooting, section_of(left_out), runs=RUNS, periods=RETURNS,
+            predicted = bp.predict_attractor(problem, shooting, section, runs=RUNS, periods=RETURNS,
                                              seed=options.seed, progress=False)  # fmt: skip
         print(f"  {periods:g} periods: {shot.unexplained}, {shot.evaluations} evaluations\n{predicted}")
         rows.append({"periods": periods, **shot._asdict(), "covariance": shot.covariance.tolist(),
@@ -162,11 +166,11 @@ def shooting_part(options: argparse.Namespace) -> None:
                   synthetic=about["synthetic"])  # fmt: skip
 
 
-def found_orbits(recordings: list[bp.Recording], quick: bool) -> bp.Orbits:
+def found_orbits(recordings: list[bp.Recording], frequency: float, quick: bool) -> bp.Orbits:
     """Return the orbits of sections at several phases of the drive."""
     sections = [
         bp.PoincareSection.from_recordings(
-            recordings, COORDINATES, frequency=FREQUENCY, origin=k / (PHASES * FREQUENCY)
+            recordings, COORDINATES, frequency=frequency, origin=k / (PHASES * frequency)
         )
         for k in range(PHASES)
     ]
@@ -184,9 +188,9 @@ def reliable(orbits: bp.Orbits, largest: float) -> list[bp.Orbit]:
     return used
 
 
-def section_of(recordings: list[bp.Recording]) -> bp.PoincareSection:
+def section_of(recordings: list[bp.Recording], frequency: float) -> bp.PoincareSection:
     """Return the section of the measured channels once a period."""
-    return bp.PoincareSection.from_recordings(recordings, SECTION, frequency=FREQUENCY)
+    return bp.PoincareSection.from_recordings(recordings, SECTION, frequency=frequency)
 
 
 def delays_of(orbits: list[bp.Orbit], seed: int) -> tuple[Delays, Delays]:

@@ -230,6 +230,32 @@ def test_a_coordinate_that_does_not_determine_the_next_point_is_refused_with_the
         bp.find_orbits(more, periods=[1])
 
 
+def test_a_coordinate_that_nearly_determines_the_next_point_is_warned_of_with_the_delay_to_add():
+    """The maximum of y predicts the next one with 2.5 %, and orbits found with it alone have wrong periods."""
+    recording = roessler.recording(60_000, 0.15, 0.002, channels="y")
+    section = bp.PoincareSection.from_crossings(recording, ["y[1.46 s]"], channel="y")
+    with pytest.warns(UserWarning, match=r"must determine the next point.*with 'y\[-1.5 s\]'") as warned:
+        alone = bp.find_orbits(section, periods=[1])
+    assert warned[0].filename == __file__
+    more = bp.PoincareSection.from_crossings(recording, ["y[1.46 s]", "y[-1.5 s]"], channel="y")
+    both = bp.find_orbits(more, periods=[1])
+    (known,) = roessler.known_orbits(1)
+    assert np.abs(alone[0].duration - sum(known.times)) > 0.005
+    assert np.abs(both[0].duration - sum(known.times)) < min(0.002, 4.0 * both[0].duration_sd)
+
+
+def test_the_median_of_a_channel_with_spikes_is_refused_with_a_level_that_works():
+    """The median of z is near its minimum."""
+    recording = roessler.recording(30_000, STEP, 0.001, channels="yz")
+    with pytest.raises(ValueError, match="level: must be crossed by 'z', .* such as") as refused:
+        bp.PoincareSection.from_crossings(recording, ["y"], channel="z")
+    level = float(str(refused.value).split("such as ")[1].split(",")[0])
+    z = recording.outputs["z"]
+    assert z.min() < level < z.max()
+    section = bp.PoincareSection.from_crossings(recording, ["y"], channel="z", level=level)
+    assert np.all(np.interp(section.instants, recording.time, z) > 0.5 * level)
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.1])
 def test_periodic_recordings_are_refused(noise):
     time = np.arange(60_000) * 0.05
@@ -273,7 +299,7 @@ def test_coloured_noise_is_refused(names, seed):
 def test_white_noise_and_noise_as_large_as_the_motion_are_refused():
     generator = np.random.default_rng(0)
     recording = bp.Recording(np.arange(60_000) * 0.05, {"x": generator.standard_normal(60_000)}, {})
-    with pytest.raises(ValueError, match="must be crossed by 'x', got no crossing of .* by more than noise"):
+    with pytest.raises(ValueError, match="must be crossed by 'x', got no crossing of .* on both sides"):
         bp.PoincareSection.from_crossings(recording, [MAXIMUM], channel="x")
     section = bp.PoincareSection.from_crossings(roessler.recording(100_000, STEP, 0.03), ["y"], channel="x", level=0.0)
     with pytest.raises(ValueError, match="The noise is too large: sample faster"):

@@ -9,7 +9,7 @@ import bayesperiodic as bp
 from bayesperiodic.orbits import find
 from bayesperiodic.orbits.cycles import refine
 from studies.shooting import UNSTABLE
-from tests.orbits import chaos
+from tests.orbits import chaos, harvester
 from tests.shooting import pendulum_orbit
 
 KNOWN = [k for k in UNSTABLE if k.omega == chaos.OMEGA]
@@ -317,3 +317,13 @@ def test_invalid_arguments_raise():
         bp.find_orbits(section, periods=[30])
     with pytest.raises(ValueError, match="neighbours: must be .*got 3"):
         bp.find_orbits(section, periods=[1], neighbours=3)
+
+
+@harvester.needed
+def test_redundant_delays_and_parts_of_a_period_find_the_orbits_that_a_fitted_model_has():
+    """Five delays of a system of three states, in measured data. Multipliers are those of the study's model."""
+    delays = ("voltage", *(f"voltage[{-0.2 * k:.1f}]" for k in range(1, 5)))
+    section = bp.PoincareSection.from_recordings(harvester.pieces()[:80], delays, frequency=6.5)
+    orbits = bp.find_orbits(section, periods=[3], steps=7)
+    for known in (14.3, 20.8, -27.6):
+        assert any(abs(orbit.eigenvalues[0] / known - 1.0) < 0.25 for orbit in orbits)

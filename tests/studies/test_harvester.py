@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.stats import binom
 
 import bayesperiodic as bp
-from studies import shooting
+from studies import common, shooting
 from studies.__main__ import main
 from studies.harvester import beam, multiple_shooting, recording, synthetic
 from studies.harvester.run import Chosen, alone_of, simplest
@@ -47,6 +47,26 @@ def test_pieces_that_follow_each_other_are_one_recording(tmp_path):
     np.testing.assert_array_equal(whole[0].outputs["velocity"], np.concatenate(channels["velocity"][1:]))
     assert whole[1].time[0] == pytest.approx(3 * 512 / 2048)
     np.testing.assert_allclose(whole[1].inputs["drive"], 9.80665 * channels["acceleration_g"][0])
+
+
+def test_the_frequency_of_the_drive_is_that_of_the_recording():
+    """Another one than that of the study's own recording, with noise and a third harmonic."""
+    time, generator = np.arange(60_000) / 2048.0, np.random.default_rng(3)
+    angle = 2.0 * np.pi * 7.2345 * time
+    drive = 4.0 * np.cos(angle) + 0.5 * np.cos(3.0 * angle) + 0.02 * generator.standard_normal(time.size)
+    channels = {"velocity": np.sin(0.37 * time), "voltage": np.cos(0.9 * time), "drive": drive}
+    short = recording._recording(time[:4000] + 40.0, {name: values[:4000] for name, values in channels.items()})
+    assert recording.frequency_of([short, recording._recording(time, channels)]) == pytest.approx(7.2345, abs=2e-5)
+
+
+def test_data_may_be_a_folder_with_the_file(tmp_path):
+    (tmp_path / "harvester").mkdir()
+    file = tmp_path / recording.RELATIVE
+    with pytest.raises(FileNotFoundError, match="--data: must be an existing file, got '.*harvester_pieces.npz'"):
+        common.find_data(tmp_path, recording.RELATIVE)
+    file.touch()
+    assert common.find_data(tmp_path, recording.RELATIVE) == (file, str(file))
+    assert common.find_data(tmp_path / "harvester", recording.RELATIVE) == (file, str(file))
 
 
 def rates_of_the_beam(z, drive):
