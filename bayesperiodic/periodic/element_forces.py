@@ -161,17 +161,16 @@ def _of_units(memory: Memory, rates: np.ndarray, low: int) -> list[np.ndarray]:
 def newton_step(
     forces: Forces, rates: np.ndarray, d_f: np.ndarray, residual: np.ndarray, known: Preconditioner
 ) -> tuple[np.ndarray, Preconditioner]:
-    """Return Newton's step, and its preconditioner; with internal states the step is corrected.
+    """Return Newton's step, corrected for the higher harmonics, and its preconditioner.
 
-    Then the higher harmonics count too, and one that is `known` from a step before serves if the corrections become
-    small with it.
+    With internal states one that is `known` from a step before serves if the corrections become small with it.
     """
-    if forces.memory is None:
-        return known(residual), known
     if known.low <= len(rates):
         step = _swept(known, forces, rates, d_f, residual, MOST_STEP_SWEEPS, LAST_STEP_SWEEP)
         if step is not None:
             return step, known
+    if forces.memory is None:
+        return known(residual), known
     inverse = Preconditioner(forces, rates, d_f)
     step = _swept(inverse, forces, rates, d_f, residual, MOST_STEP_SWEEPS, LAST_STEP_SWEEP)
     return (inverse(residual) if step is None else step), inverse
