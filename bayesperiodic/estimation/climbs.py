@@ -28,11 +28,14 @@ from bayesperiodic.estimation.gauss_newton import (
 from bayesperiodic.estimation.modes import SEPARATE_SDS, SHOWN_AFTER, optimum_of
 from bayesperiodic.estimation.wide_tables import widened
 from bayesperiodic.models.model import CondensedModel
+from bayesperiodic.periodic.batch import Anchor
 
 # Choices of the sheets of tables' branches that are tried after the first.
 MOST_SHEET_CHANGES = 5
 # Factor of the errors of condensed solves in climbs that lead to the neighbourhood of an optimum.
 COARSENESS = 100.0
+# Points from which on solves without internal states are worth such climbs.
+MANY_POINTS = 256
 # Halvings of a step from a draw of a condensed model; solves that fail cost most.
 HALVINGS_FROM_DRAWS = 3
 # Standard deviation of a phase of which nothing is known [rad].
@@ -54,8 +57,8 @@ def of_problem(problem: Problem, iterate: Iterate) -> tuple[Objective, Iterate |
 
 
 def on_fewer_points(problem: Problem) -> Problem | None:
-    """Return the problem of a condensed model with internal states whose solves have larger errors; None for others."""
-    if not (isinstance(problem.model, CondensedModel) and problem.model.state_owners) or tables(problem):
+    """Return the problem of a condensed model whose solves have larger errors; None for others."""
+    if not isinstance(problem.model, CondensedModel) or tables(problem):
         return None
     coarse = problem.replace(input_errors=problem.input_errors or None, anchors=problem.anchors or None)
     equations: Mapping[str, Any] = problem.equations
@@ -69,14 +72,21 @@ def coarsely(
 ) -> Iterate | None:  # fmt: skip
     """Return the iterate where a climb ends whose solves have larger errors; None if it does not begin.
 
-    Friction and contact need many points, and such climbs end close to an optimum. One that comes close to one of the
-    ends returns the iterate of that.
+    Friction and contact need many points, and such climbs end close to an optimum; solves on few points do not need
+    them. One that comes close to one of the ends returns the iterate of that.
     """
     first = coarse and first_iterate(coarse, theta)
-    if not (coarse and first):
+    if not (coarse and first and _costly(coarse, first)):
         return None
     end = climbed(objective_near(coarse, first.here), first, progress, MAX_STEPS, ends, halvings, SEPARATE_SDS)
     return end.iterate if any(end is one for one in ends) else of_problem(problem, end.iterate)[1]
+
+
+def _costly(coarse: Problem, first: Iterate) -> bool:
+    """Return whether solves need internal states, or many points even with larger errors."""
+    orbits = [orbit.anchor for orbit in first.here.solver.anchors.values()]
+    most = max((len(anchor.z) for anchor in orbits if isinstance(anchor, Anchor)), default=0)
+    return bool(getattr(coarse.model, "state_owners", ())) or most >= MANY_POINTS
 
 
 def rough(iterate: Iterate) -> End:
