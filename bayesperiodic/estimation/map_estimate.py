@@ -182,6 +182,8 @@ def map_estimate(
     first = first_iterate(problem, near[0]) if near else None
     coarse = None if first else on_fewer_points(problem)
     near_optimum = coarsely(problem, coarse, theta, progress)
+    if near_optimum and starts is None and not problem.model.state_owners:
+        fewest = 1
     first = first or near_optimum or first_iterate(problem, theta)
     if first is None and starts is not None:
         first = next(filter(None, (first_iterate(problem, draw) for draw in draws)), None)

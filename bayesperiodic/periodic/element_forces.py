@@ -20,6 +20,8 @@ WEAK_COUPLING_OF_MEMORY, MOST_STEP_SWEEPS, LAST_STEP_SWEEP = 0.0125, 20, 1e-4
 LEAST_PRECONDITIONER_POINTS = 8
 # Numbers of points and elements with steep forces that may be treated apart, and the solves for which one matrix counts.
 STEEP_POINTS, COUNTED_SOLVES = (0, 8, 16, 32, 64, 128, 256, 512), 1000.0
+# Size of a matrix beyond which its factors serve for few corrections, these, and their largest ratio.
+LARGEST_INVERSE, MOST_FACTOR_CORRECTIONS, FACTOR_CORRECTION_RATE = 400, 12, 0.3
 MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR = 200, 1e-13
 # Relative size below which corrections that do not become smaller are rounding errors. While an element sticks, its
 # internal state hardly forgets, and errors add up over the periods that it remembers.
@@ -273,6 +275,8 @@ def corrected(
 
     `free` (harmonics, elements) are the displacements without the forces of the elements.
     """
+    if forces.memory is None and len(known.matrix) > LARGEST_INVERSE:
+        return _corrected_by_factors(equations, parameters, d, d_f, free, known)
     kernels, blocks = equations.model.element_kernels, np.array(equations.model.state_blocks, dtype=np.int64)
     (count, elements), result = d.shape, d[None, None].copy()
     lost, steps = np.zeros((2, 1, 1), dtype=np.int64)
@@ -286,6 +290,24 @@ def corrected(
         steps, states[None], fewer,
     )  # fmt: skip
     return None if lost[0, 0] else np.asarray(result[0, 0])
+
+
+def _corrected_by_factors(
+    equations: Any, parameters: np.ndarray, d: np.ndarray, d_f: np.ndarray, free: np.ndarray, known: Preconditioner
+) -> np.ndarray | None:
+    """Do what `corrected` does without the inverse of a large matrix."""
+    before = np.inf
+    for _ in range(MOST_FACTOR_CORRECTIONS):
+        forces = equations.forces(d, parameters)
+        step = known(d + times(d_f, harmonics(forces.values)) - free)
+        d = d - step
+        length, size = float(np.linalg.norm(step)), float(np.linalg.norm(d))
+        if length <= LINEAR_SWEEP_ERROR * size:
+            return d
+        if not length < FACTOR_CORRECTION_RATE * before:
+            return d if length <= ROUNDED_SWEEP * LAST_STEP_SWEEP * size else None
+        before = length
+    return None
 
 
 def linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.ndarray) -> np.ndarray | None:
