@@ -182,14 +182,14 @@ def map_estimate(
     first = first_iterate(problem, near[0]) if near else None
     coarse = None if first else on_fewer_points(problem)
     near_optimum = coarsely(problem, coarse, theta, progress)
-    if near_optimum and starts is None and not problem.model.state_owners:
-        fewest = 1
     first = first or near_optimum or first_iterate(problem, theta)
     if first is None and starts is not None:
         first = next(filter(None, (first_iterate(problem, draw) for draw in draws)), None)
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
     objective = objective_near(problem, first.here)
+    if near_optimum and starts is None and not problem.model.state_owners:
+        fewest, near_optimum = 1, None  # the tests that decide on more starts are of an optimum
     end = rough(first) if near_optimum else on_best_sheets(problem, climbed(objective, first, progress), progress)
     end = on_measured_orbits(problem, theta, end, progress)
     starting = [*(near or [theta, *draws[: fewest - 1]]), *draws[fewest - 1 :]]
