@@ -188,7 +188,7 @@ def map_estimate(
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
     objective = objective_near(problem, first.here)
-    if near_optimum and starts is None and not problem.model.state_owners:
+    if near_optimum and starts is None and not getattr(problem.model, "state_owners", ()):
         fewest, near_optimum = 1, None  # the tests that decide on more starts are of an optimum
     end = rough(first) if near_optimum else on_best_sheets(problem, climbed(objective, first, progress), progress)
     end = on_measured_orbits(problem, theta, end, progress)

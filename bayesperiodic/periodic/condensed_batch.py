@@ -145,8 +145,9 @@ class CondensedBatch:
 
         def part(block: tuple[int, int]) -> None:
             compiled().correct_many(
-                address, d_f, free, self._inverse, self._steep, self._low, every, self._rates, float(first.grid.periods),
-                *self._transform, blocks, polish, *block, moved, d, f, lost, steps, self._states, fewer,
+                address, d_f, free, self._inverse, self._steep, self._low, every, self._rates,
+                float(first.grid.periods), *self._transform, blocks, polish, *block, moved, d, f, lost, steps,
+                self._states, fewer,
             )  # fmt: skip
 
         in_blocks(part, lost.size, FEWEST_CONDENSED_SOLVES, threads)

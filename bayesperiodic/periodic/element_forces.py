@@ -18,7 +18,7 @@ WEAK_COUPLING = 0.05
 WEAK_COUPLING_OF_MEMORY, MOST_STEP_SWEEPS, LAST_STEP_SWEEP = 0.0125, 20, 1e-4
 # Points of the internal states per low harmonic in Newton's matrix.
 LEAST_PRECONDITIONER_POINTS = 8
-# Numbers of points and elements with steep forces that may be treated apart, and the solves for which one matrix counts.
+# Numbers of points and elements with steep forces that may be treated apart, and solves for which one matrix counts.
 STEEP_POINTS, COUNTED_SOLVES = (0, 8, 16, 32, 64, 128, 256, 512), 1000.0
 # Size of a matrix beyond which its factors serve for few corrections, these, and their largest ratio.
 LARGEST_INVERSE, MOST_FACTOR_CORRECTIONS, FACTOR_CORRECTION_RATE = 400, 12, 0.3
@@ -285,9 +285,9 @@ def corrected(
     address = (kernels.residual_jacobian if blocks.size else kernels.residual).address if elements else 0
     compiled().correct_many(
         address, np.ascontiguousarray(d_f)[None, None], free[None, None], known.transposed_inverse[None],
-        known.of_steep[None], known.low, parameters[None, None], np.array([2 * np.pi * equations.frequency]), float(equations.grid.periods),
-        *transform_tables(2 * count), blocks, True, 0, 1, np.full((1, 1), np.inf), result, np.empty_like(result), lost,
-        steps, states[None], fewer,
+        known.of_steep[None], known.low, parameters[None, None], np.array([2 * np.pi * equations.frequency]),
+        float(equations.grid.periods), *transform_tables(2 * count), blocks, True, 0, 1, np.full((1, 1), np.inf),
+        result, np.empty_like(result), lost, steps, states[None], fewer,
     )  # fmt: skip
     return None if lost[0, 0] else np.asarray(result[0, 0])
 

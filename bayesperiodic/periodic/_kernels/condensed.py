@@ -132,14 +132,14 @@ def subtract_steep(steep, step):
 
 @njit(
     "void(int64, complex128[:,:,:,:,::1], complex128[:,:,:,::1], float64[:,:,::1], float64[:,:,:,::1], int64,"
-    "float64[:,:,::1], float64[::1], float64, complex128[::1], int64[::1], int64[::1], boolean, int64, int64, float64[:,::1],"
-    "complex128[:,:,:,::1], complex128[:,:,:,::1], int64[:,::1], int64[:,::1], float64[:,:,::1],"
+    "float64[:,:,::1], float64[::1], float64, complex128[::1], int64[::1], int64[::1], boolean, int64, int64,"
+    "float64[:,::1], complex128[:,:,:,::1], complex128[:,:,:,::1], int64[:,::1], int64[:,::1], float64[:,:,::1],"
     "complex128[:,:,:,::1])",
     **CONDENSED_OPTIONS,
 )
 def correct_many(
-    address, d_f, free, inverse, steep, low, parameters, rate, periods, turns, place, blocks, polish, start, stop, moved, d, f,
-    lost, steps, known, fewer,
+    address, d_f, free, inverse, steep, low, parameters, rate, periods, turns, place, blocks, polish, start, stop,
+    moved, d, f, lost, steps, known, fewer,
 ):  # fmt: skip
     """Correct predicted harmonics d (sets, solves, harmonics, elements) in place, and fill those of the forces, f.
 

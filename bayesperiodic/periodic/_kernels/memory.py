@@ -82,6 +82,17 @@ def explicit_part(a, before, flow, variables, first, size, place, step):
             a[size + r, place + c] = flow[r, c] + step / 6.0 * total
 
 
+@njit(f"boolean({ROWS}, int64, int64, float64)", **MEMORY_OPTIONS)
+def hardly_forgets(out, variables, at, flow):
+    """Return whether a state forgets a change, but so little of it in a period that this is not precise."""
+    if not abs(1.0 - flow) <= HARDLY_FORGOTTEN:
+        return False
+    for i in range(out.shape[0]):
+        if out[i, variables + at * 3 * variables + at] != 0.0:
+            return True
+    return False
+
+
 @njit("float64(float64[:], float64[:])", **MEMORY_OPTIONS)
 def centre(values, rates):
     """Return the mean of periodic values at the points where the state turns; of all at rest.
@@ -198,7 +209,7 @@ def march(address, states, out, theta, rate, step, sizes):
                 level = max(level, scale[first + r])
             if not error < np.inf:
                 return False
-            if moving[b] and size == 1 and abs(1.0 - flow[b, 0, 0]) <= HARDLY_FORGOTTEN:
+            if moving[b] and size == 1 and hardly_forgets(out, variables, offset + first, flow[b, 0, 0]):
                 middle = centre(states[:, offset + first], out[:, offset + first])
                 if error > 10.0 * (HARDLY_FORGOTTEN + points * STATE_ROUNDING) * level:
                     return False
@@ -321,7 +332,7 @@ def periodic_changes(out, changes, step, sizes, held):
                 a[r, c], flows[0, r, c] = one - flows[0, r, c], one
             for c in range(columns):
                 a[r, size + c], changes[0, first + r, c] = total[r, c], 0.0
-        held[first] = size == 1 and abs(a[0, 0]) <= HARDLY_FORGOTTEN
+        held[first] = size == 1 and hardly_forgets(out, variables, at, 1.0 - a[0, 0])
         if held[first]:
             rates = out[:, at]
             level = centre(flows[:, 0, 0], rates)
