@@ -56,14 +56,24 @@ def of_problem(problem: Problem, iterate: Iterate) -> tuple[Objective, Iterate |
     return objective, objective.iterate(near, iterate.noise)
 
 
-def on_fewer_points(problem: Problem) -> Problem | None:
-    """Return the problem of a condensed model whose solves have larger errors; None for others."""
-    if not isinstance(problem.model, CondensedModel) or tables(problem):
-        return None
+def on_fewer_points(problem: Problem, theta: np.ndarray) -> tuple[Problem | None, Iterate | None]:
+    """Return the problem of a condensed model whose solves have larger errors, and the precise iterate at the start.
+
+    The first is None for others, and where solves without internal states take few points. With such states the second
+    is None.
+    """
+    model, first = problem.model, None
+    if not isinstance(model, CondensedModel) or tables(problem):
+        return None, None
+    if not model.state_owners:
+        first = first_iterate(problem, theta)
+        orbits = [orbit.anchor for orbit in first.here.solver.anchors.values()] if first else []
+        if first and max((len(a.z) for a in orbits if isinstance(a, Anchor)), default=0) < MANY_POINTS:
+            return None, first
     coarse = problem.replace(input_errors=problem.input_errors or None, anchors=problem.anchors or None)
     equations: Mapping[str, Any] = problem.equations
     vars(coarse)["equations"] = {n: replace(e, coarseness=COARSENESS) for n, e in equations.items()}
-    return coarse
+    return coarse, first
 
 
 def coarsely(
@@ -72,21 +82,14 @@ def coarsely(
 ) -> Iterate | None:  # fmt: skip
     """Return the iterate where a climb ends whose solves have larger errors; None if it does not begin.
 
-    Friction and contact need many points, and such climbs end close to an optimum; solves on few points do not need
-    them. One that comes close to one of the ends returns the iterate of that.
+    Friction and contact need many points, and such climbs end close to an optimum. One that comes close to one of the
+    ends returns the iterate of that.
     """
     first = coarse and first_iterate(coarse, theta)
-    if not (coarse and first and _costly(coarse, first)):
+    if not (coarse and first):
         return None
     end = climbed(objective_near(coarse, first.here), first, progress, MAX_STEPS, ends, halvings, SEPARATE_SDS)
     return end.iterate if any(end is one for one in ends) else of_problem(problem, end.iterate)[1]
-
-
-def _costly(coarse: Problem, first: Iterate) -> bool:
-    """Return whether solves need internal states, or many points even with larger errors."""
-    orbits = [orbit.anchor for orbit in first.here.solver.anchors.values()]
-    most = max((len(anchor.z) for anchor in orbits if isinstance(anchor, Anchor)), default=0)
-    return bool(getattr(coarse.model, "state_owners", ())) or most >= MANY_POINTS
 
 
 def rough(iterate: Iterate) -> End:

@@ -88,7 +88,7 @@ def steep_points(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> Steep:
 
     def cost(steep: Steep) -> float:
         low = Preconditioner.strongly_coupled(steep.rest(forces), rates, d_f)
-        matrix, apart, every = 2 * low * d_f.shape[-1], len(steep.points), 2 * d_f[..., 0].size
+        matrix, apart, every = 2 * low * d_f.shape[-1], len(steep.points), 2 * len(d_f) * d_f.shape[-1]
         once = matrix**3 + apart * (matrix**2 + apart**2 + apart * every)
         return float(once + COUNTED_SOLVES * (matrix**2 + 2 * apart * every))
 
