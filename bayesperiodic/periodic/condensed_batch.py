@@ -48,7 +48,7 @@ class CondensedBatch:
         self._rates = np.array([2 * np.pi * e.frequency for e in sets])
         self._known = np.array([a.sensitivities is not None for a in anchors])
         at_anchors = [e.forces(d, a.parameters) for e, d, a in zip(sets, self._d, anchors, strict=True)]
-        self._inverse, self._steep, self._low = self._preconditioners(at_anchors)
+        self._inverse = self._preconditioners(at_anchors)
         self._transform, self._blocks = transform_tables(points), np.array(first.model.state_blocks, dtype=np.int64)
         self._states = np.zeros((len(sets), points, 3 * (first.count + self._blocks.sum())))
         for states, forces in zip(self._states, at_anchors, strict=True):
@@ -145,9 +145,8 @@ class CondensedBatch:
 
         def part(block: tuple[int, int]) -> None:
             compiled().correct_many(
-                address, d_f, free, self._inverse, self._steep, self._low, every, self._rates,
-                float(first.grid.periods), *self._transform, blocks, polish, *block, moved, d, f, lost, steps,
-                self._states, fewer,
+                address, d_f, free, *self._inverse, every, self._rates, float(first.grid.periods), *self._transform,
+                blocks, polish, *block, moved, d, f, lost, steps, self._states, fewer,
             )  # fmt: skip
 
         in_blocks(part, lost.size, FEWEST_CONDENSED_SOLVES, threads)

@@ -20,6 +20,8 @@ WEAK_COUPLING_OF_MEMORY, MOST_STEP_SWEEPS, LAST_STEP_SWEEP = 0.0125, 20, 1e-4
 LEAST_PRECONDITIONER_POINTS = 8
 # Numbers of points and elements with steep forces that may be treated apart, and solves for which one matrix counts.
 STEEP_POINTS, COUNTED_SOLVES = (0, 8, 16, 32, 64, 128, 256, 512), 1000.0
+# Size of a matrix up to which no point is treated apart.
+SMALL_MATRIX = 64
 # Size of a matrix beyond which its factors serve for few corrections, these, and their largest ratio.
 LARGEST_INVERSE, MOST_FACTOR_CORRECTIONS, FACTOR_CORRECTION_RATE = 400, 12, 0.3
 MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR = 200, 1e-13
@@ -76,6 +78,11 @@ def steep_points(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> Steep:
     A force that changes within few points, as friction does at a reversal, couples all harmonics. With internal states
     there are none.
     """
+    none = np.zeros(0, dtype=int)
+    if forces.memory is not None or (
+        2 * d_f.shape[-1] * Preconditioner.strongly_coupled(forces, rates, d_f) <= SMALL_MATRIX
+    ):
+        return Steep(none, none, *np.zeros((2, 0)))
     slopes = [part - np.median(part, axis=0) for part in forces[1:3]]
     size = np.sqrt(np.sum(np.abs(d_f) ** 2, axis=1))
     gains = [factor.max(axis=0) for factor in (size, rates[:, None] * size)]
@@ -92,8 +99,7 @@ def steep_points(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> Steep:
         once = matrix**3 + apart * (matrix**2 + apart**2 + apart * every)
         return float(once + COUNTED_SOLVES * (matrix**2 + 2 * apart * every))
 
-    numbers = [number for number in STEEP_POINTS if number <= points.size // 2]
-    return first(0) if forces.memory is not None else min(map(first, numbers), key=cost)
+    return min((first(number) for number in STEEP_POINTS if number <= points.size // 2), key=cost)
 
 
 class Preconditioner:
