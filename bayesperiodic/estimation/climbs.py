@@ -28,11 +28,14 @@ from bayesperiodic.estimation.gauss_newton import (
 from bayesperiodic.estimation.modes import SEPARATE_SDS, SHOWN_AFTER, optimum_of
 from bayesperiodic.estimation.wide_tables import widened
 from bayesperiodic.models.model import CondensedModel
+from bayesperiodic.periodic.batch import Anchor
 
 # Choices of the sheets of tables' branches that are tried after the first.
 MOST_SHEET_CHANGES = 5
 # Factor of the errors of condensed solves in climbs that lead to the neighbourhood of an optimum.
 COARSENESS = 100.0
+# Points from which on solves without internal states are worth such climbs.
+MANY_POINTS = 256
 # Halvings of a step from a draw of a condensed model; solves that fail cost most.
 HALVINGS_FROM_DRAWS = 3
 # Standard deviation of a phase of which nothing is known [rad].
@@ -53,14 +56,24 @@ def of_problem(problem: Problem, iterate: Iterate) -> tuple[Objective, Iterate |
     return objective, objective.iterate(near, iterate.noise)
 
 
-def on_fewer_points(problem: Problem) -> Problem | None:
-    """Return the problem of a condensed model with internal states whose solves have larger errors; None for others."""
-    if not (isinstance(problem.model, CondensedModel) and problem.model.state_owners) or tables(problem):
-        return None
+def on_fewer_points(problem: Problem, theta: np.ndarray) -> tuple[Problem | None, Iterate | None]:
+    """Return the problem of a condensed model whose solves have larger errors, and the precise iterate at the start.
+
+    The first is None for others, and where solves without internal states take few points. With such states the second
+    is None.
+    """
+    model, first = problem.model, None
+    if not isinstance(model, CondensedModel) or tables(problem):
+        return None, None
+    if not model.state_owners:
+        first = first_iterate(problem, theta)
+        orbits = [orbit.anchor for orbit in first.here.solver.anchors.values()] if first else []
+        if first and max((len(a.z) for a in orbits if isinstance(a, Anchor)), default=0) < MANY_POINTS:
+            return None, first
     coarse = problem.replace(input_errors=problem.input_errors or None, anchors=problem.anchors or None)
     equations: Mapping[str, Any] = problem.equations
     vars(coarse)["equations"] = {n: replace(e, coarseness=COARSENESS) for n, e in equations.items()}
-    return coarse
+    return coarse, first
 
 
 def coarsely(

@@ -180,15 +180,21 @@ def map_estimate(
     draws = problem.joint_prior.sample(most - 1, np.random.default_rng(_checks.integer("seed", seed, 0)))
     near = in_wide_tables(problem, theta, draws[: fewest - 1], progress) if start is None else []
     first = first_iterate(problem, near[0]) if near else None
-    coarse = None if first else on_fewer_points(problem)
+    coarse, precise = (None, None) if first else on_fewer_points(problem, theta)
     near_optimum = coarsely(problem, coarse, theta, progress)
-    first = first or near_optimum or first_iterate(problem, theta)
+    first = first or near_optimum or precise or first_iterate(problem, theta)
     if first is None and starts is not None:
         first = next(filter(None, (first_iterate(problem, draw) for draw in draws)), None)
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
     objective = objective_near(problem, first.here)
-    end = rough(first) if near_optimum else on_best_sheets(problem, climbed(objective, first, progress), progress)
+    fewest = 1 if near_optimum and precise and starts is None else fewest
+    # Where tests decide on more starts, they are of an optimum.
+    end = (
+        rough(first)
+        if near_optimum and fewest > 1
+        else on_best_sheets(problem, climbed(objective, first, progress), progress)
+    )
     end = on_measured_orbits(problem, theta, end, progress)
     starting = [*(near or [theta, *draws[: fewest - 1]]), *draws[fewest - 1 :]]
     ends = from_draws(objective, starting, end, fewest, progress, coarse if near_optimum else None)

@@ -8,7 +8,7 @@ from bayesperiodic._linalg import unwarned
 from bayesperiodic.periodic.batch import Anchor, in_blocks
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STALLED, BatchSolution
 from bayesperiodic.periodic.condensed import CondensedEquations
-from bayesperiodic.periodic.element_forces import Forces, Preconditioner, ResponseMatrices
+from bayesperiodic.periodic.element_forces import Forces, Preconditioner, ResponseMatrices, steep_points
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, transform_tables
 from bayesperiodic.periodic.memory import error_of_fewer
 from bayesperiodic.periodic.receptance import compiled, unresolved
@@ -48,29 +48,32 @@ class CondensedBatch:
         self._rates = np.array([2 * np.pi * e.frequency for e in sets])
         self._known = np.array([a.sensitivities is not None for a in anchors])
         at_anchors = [e.forces(d, a.parameters) for e, d, a in zip(sets, self._d, anchors, strict=True)]
-        self._inverse, self._low = self._preconditioners(at_anchors)
+        self._inverse = self._preconditioners(at_anchors)
         self._transform, self._blocks = transform_tables(points), np.array(first.model.state_blocks, dtype=np.int64)
         self._states = np.zeros((len(sets), points, 3 * (first.count + self._blocks.sum())))
         for states, forces in zip(self._states, at_anchors, strict=True):
             if forces.memory is not None:
                 states[:] = forces.memory.states
 
-    def _preconditioners(self, at_anchors: Sequence[Forces]) -> tuple[np.ndarray, int]:
-        """Return the transposed inverses of the sets, all of the largest number of low harmonics, and that number."""
+    def _preconditioners(self, at_anchors: Sequence[Forces]) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return transposed inverses of the sets, what steep points change, and the number of low harmonics of all."""
         given = []
         for e, forces, matrices in zip(self._sets, at_anchors, self._matrices, strict=True):
             given.append((forces, e.rates(self._points), matrices.d_f))
-        low, inverses = 1, []
-        for known, part in zip(self._known, given, strict=True):
-            if known:
-                low = max(low, Preconditioner.strongly_coupled(*part))
-        size = 2 * low * self._d.shape[-1]
-        for known, part in zip(self._known, given, strict=True):
-            if known:
-                inverses.append(Preconditioner(*part, low).transposed_inverse)
-            else:
-                inverses.append(np.zeros((size, size)))
-        return np.stack(inverses), low
+        steep = [steep_points(*p) if k else None for k, p in zip(self._known, given, strict=True)]
+        low = 1
+        for one, (forces, *linear) in zip(steep, given, strict=True):
+            if one:
+                low = max(low, Preconditioner.strongly_coupled(one.rest(forces), *linear))
+        size, pairs = 2 * low * self._d.shape[-1], max((len(one.points) for one in steep if one), default=0)
+        inverses = np.zeros((len(steep), size, size))
+        changes = np.zeros((len(steep), 2, pairs, 2 * self._d[0].size))
+        for number, (one, part) in enumerate(zip(steep, given, strict=True)):
+            if one:
+                inverse = Preconditioner(*part, low, one)
+                inverses[number] = inverse.transposed_inverse
+                changes[number, :, : len(one.points)] = inverse.of_steep
+        return inverses, changes, low
 
     def _responses(self, parameters: np.ndarray) -> list[ResponseMatrices]:
         """Return the frequency responses of each set, (1 or solves, harmonics, rows, columns)."""
@@ -142,8 +145,8 @@ class CondensedBatch:
 
         def part(block: tuple[int, int]) -> None:
             compiled().correct_many(
-                address, d_f, free, self._inverse, self._low, every, self._rates, float(first.grid.periods),
-                *self._transform, blocks, polish, *block, moved, d, f, lost, steps, self._states, fewer,
+                address, d_f, free, *self._inverse, every, self._rates, float(first.grid.periods), *self._transform,
+                blocks, polish, *block, moved, d, f, lost, steps, self._states, fewer,
             )  # fmt: skip
 
         in_blocks(part, lost.size, FEWEST_CONDENSED_SOLVES, threads)

@@ -42,9 +42,8 @@ class _Bordered:
         times_low: int,
     ):
         (forces, rates, matrices), points = given, len(row)
-        inverse = Preconditioner(forces, rates, matrices.d_f)
-        if times_low > 1:
-            inverse = Preconditioner(forces, rates, matrices.d_f, min(times_low * inverse.low, points // 2))
+        low = Preconditioner.strongly_coupled(forces, rates, matrices.d_f)
+        inverse = Preconditioner(forces, rates, matrices.d_f, min(times_low * low, points // 2))
         self._low, self._slope = inverse.low, slope
         self._row = harmonics(row) * np.where(np.arange(points // 2) == 0, points, 2 * points)[:, None]
         size = len(inverse.matrix)

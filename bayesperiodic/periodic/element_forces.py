@@ -18,6 +18,12 @@ WEAK_COUPLING = 0.05
 WEAK_COUPLING_OF_MEMORY, MOST_STEP_SWEEPS, LAST_STEP_SWEEP = 0.0125, 20, 1e-4
 # Points of the internal states per low harmonic in Newton's matrix.
 LEAST_PRECONDITIONER_POINTS = 8
+# Numbers of points and elements with steep forces that may be treated apart, and solves for which one matrix counts.
+STEEP_POINTS, COUNTED_SOLVES = (0, 8, 16, 32, 64, 128, 256, 512), 1000.0
+# Size of a matrix up to which no point is treated apart.
+SMALL_MATRIX = 64
+# Size of a matrix beyond which its factors serve for few corrections, these, and their largest ratio.
+LARGEST_INVERSE, MOST_FACTOR_CORRECTIONS, FACTOR_CORRECTION_RATE = 400, 12, 0.3
 MOST_LINEAR_SWEEPS, LINEAR_SWEEP_ERROR = 200, 1e-13
 # Relative size below which corrections that do not become smaller are rounding errors. While an element sticks, its
 # internal state hardly forgets, and errors add up over the periods that it remembers.
@@ -50,15 +56,66 @@ class ResponseMatrices(NamedTuple):
         return np.asarray(np.abs(self.y_f).max(axis=-3))
 
 
-class Preconditioner:
-    """Inverse of the derivative of the residual by the harmonics of d, exact for the low ones.
+class Steep(NamedTuple):
+    """Points and elements at which forces are steep, with what their slopes exceed the median ones by, all (pairs,)."""
 
-    The higher ones, which the elements couple only weakly, are treated as uncoupled. Solves raise a LinAlgError where
-    the derivative is singular.
+    points: np.ndarray
+    elements: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+
+    def rest(self, forces: Forces) -> Forces:
+        """Return the forces with the median slopes there."""
+        stiffness, damping = forces.stiffness.copy(), forces.damping.copy()
+        stiffness[self.points, self.elements] -= self.stiffness
+        damping[self.points, self.elements] -= self.damping
+        return forces._replace(stiffness=stiffness, damping=damping)
+
+
+def steep_points(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> Steep:
+    """Return the points and elements that leave the matrix of the low harmonics small if they are treated apart.
+
+    A force that changes within few points, as friction does at a reversal, couples all harmonics. With internal states
+    there are none.
+    """
+    none = np.zeros(0, dtype=int)
+    if forces.memory is not None or (
+        2 * d_f.shape[-1] * Preconditioner.strongly_coupled(forces, rates, d_f) <= SMALL_MATRIX
+    ):
+        return Steep(none, none, *np.zeros((2, 0)))
+    slopes = [part - np.median(part, axis=0) for part in forces[1:3]]
+    size = np.sqrt(np.sum(np.abs(d_f) ** 2, axis=1))
+    gains = [factor.max(axis=0) for factor in (size, rates[:, None] * size)]
+    steepest = sum(np.abs(slope) * gain for slope, gain in zip(slopes, gains, strict=True))
+    points, elements = np.unravel_index(np.argsort(-np.ravel(steepest)), forces.values.shape)
+
+    def first(number: int) -> Steep:
+        chosen = points[:number], elements[:number]
+        return Steep(*chosen, *(slope[chosen] for slope in slopes))
+
+    def cost(steep: Steep) -> float:
+        low = Preconditioner.strongly_coupled(steep.rest(forces), rates, d_f)
+        matrix, apart, every = 2 * low * d_f.shape[-1], len(steep.points), 2 * len(d_f) * d_f.shape[-1]
+        once = matrix**3 + apart * (matrix**2 + apart**2 + apart * every)
+        return float(once + COUNTED_SOLVES * (matrix**2 + 2 * apart * every))
+
+    return min((first(number) for number in STEEP_POINTS if number <= points.size // 2), key=cost)
+
+
+class Preconditioner:
+    """Inverse of the derivative of the residual by the harmonics of d, exact for the low ones and at steep points.
+
+    The higher ones, which the elements couple only weakly, are treated as uncoupled. What `steep` points add is of low
+    rank, and is inverted by the formula of Woodbury. Without a number of low harmonics both are chosen. Solves raise a
+    LinAlgError where the derivative is singular.
     """
 
-    def __init__(self, forces: Forces, rates: np.ndarray, d_f: np.ndarray, low: int = 0):
+    def __init__(self, forces: Forces, rates: np.ndarray, d_f: np.ndarray, low: int = 0, steep: Steep | None = None):
         points, self.elements = forces.values.shape
+        if not low and self.elements:
+            steep = steep_points(forces, rates, d_f)
+        self._steep, self._rates, self._d_f = steep, rates, d_f
+        forces = steep.rest(forces) if steep else forces
         self.low = low = low or self.strongly_coupled(forces, rates, d_f)
         numbers = np.arange(low)
         stiffness, damping = (np.fft.fft(part, axis=0).T / points for part in forces[1:3])
@@ -88,8 +145,34 @@ class Preconditioner:
 
     @cached_property
     def transposed_inverse(self) -> np.ndarray:
-        """Transposed inverse for the low harmonics, real parts of harmonics and elements before the imaginary ones."""
+        """Transposed inverse for the low harmonics without steep points.
+
+        Real parts of harmonics and elements are before the imaginary ones.
+        """
         return np.ascontiguousarray(np.linalg.inv(self.matrix).T)
+
+    @cached_property
+    def of_steep(self) -> np.ndarray:
+        """What steep points change, (2, pairs, 2·harmonics·elements).
+
+        The second part by a vector, without steep points, gives the factors of the vectors in the first, which are
+        subtracted from it. Real parts of harmonics and elements are before the imaginary ones.
+        """
+        count = len(self._rates)
+        if not (self._steep and len(self._steep.points)):
+            return np.zeros((2, 0, 2 * count * self.elements))
+        at, element, stiffness, damping = self._steep
+        numbers, points, each = np.arange(count), 2 * count, np.arange(len(at))
+        turns = np.exp(2j * np.pi * (np.outer(at, numbers) % points) / points)
+        moved = self._without_steep(self._d_f[:, :, element].transpose(2, 0, 1) * turns.conj()[..., None] / points)
+        # Twice the real part of the sum over harmonics, of which the mean counts once.
+        slopes = 2.0 * turns * (stiffness[:, None] + 1j * self._rates * damping[:, None])
+        slopes[:, 0] *= 0.5
+        seen = np.zeros((len(at), 2, count, self.elements))
+        seen[each, 0, :, element], seen[each, 1, :, element] = slopes.real, -slopes.imag
+        left, right = _parts_of(moved), seen.reshape(len(at), -1)
+        closed = np.eye(len(at)) + right @ left.T
+        return np.stack([left, scipy.linalg.lu_solve(factors(closed), right, check_finite=False)])
 
     @staticmethod
     def strongly_coupled(forces: Forces, rates: np.ndarray, d_f: np.ndarray) -> int:
@@ -103,6 +186,14 @@ class Preconditioner:
 
     def __call__(self, right: np.ndarray) -> np.ndarray:
         """Return the approximate solution (…, harmonics, elements) for a right-hand side of that shape."""
+        result = self._without_steep(right)
+        if not (self._steep and len(self._steep.points)):
+            return result
+        left, seen = self.of_steep
+        real, imaginary = np.split(_parts_of(result) @ seen.T @ left, 2, axis=-1)
+        return result - (real + 1j * imaginary).reshape(result.shape)
+
+    def _without_steep(self, right: np.ndarray) -> np.ndarray:
         result, low = right.copy(), right[..., : self.low, :]
         if not self.elements:
             return result
@@ -112,6 +203,12 @@ class Preconditioner:
         real, imaginary = np.split(solved, 2, axis=-1)
         result[..., : self.low, :] = (real + 1j * imaginary).reshape(low.shape)
         return result
+
+
+def _parts_of(values: np.ndarray) -> np.ndarray:
+    """Return real and imaginary parts side by side, (…, 2·harmonics·elements)."""
+    flat = values.reshape(*values.shape[:-2], -1)
+    return np.concatenate([flat.real, flat.imag], axis=-1)
 
 
 def times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -161,17 +258,16 @@ def _of_units(memory: Memory, rates: np.ndarray, low: int) -> list[np.ndarray]:
 def newton_step(
     forces: Forces, rates: np.ndarray, d_f: np.ndarray, residual: np.ndarray, known: Preconditioner
 ) -> tuple[np.ndarray, Preconditioner]:
-    """Return Newton's step, and its preconditioner; with internal states the step is corrected.
+    """Return Newton's step, corrected for the higher harmonics, and its preconditioner.
 
-    Then the higher harmonics count too, and one that is `known` from a step before serves if the corrections become
-    small with it.
+    With internal states one that is `known` from a step before serves if the corrections become small with it.
     """
-    if forces.memory is None:
-        return known(residual), known
     if known.low <= len(rates):
         step = _swept(known, forces, rates, d_f, residual, MOST_STEP_SWEEPS, LAST_STEP_SWEEP)
         if step is not None:
             return step, known
+    if forces.memory is None:
+        return known(residual), known
     inverse = Preconditioner(forces, rates, d_f)
     step = _swept(inverse, forces, rates, d_f, residual, MOST_STEP_SWEEPS, LAST_STEP_SWEEP)
     return (inverse(residual) if step is None else step), inverse
@@ -185,6 +281,8 @@ def corrected(
 
     `free` (harmonics, elements) are the displacements without the forces of the elements.
     """
+    if forces.memory is None and len(known.matrix) > LARGEST_INVERSE:
+        return _corrected_by_factors(equations, parameters, d, d_f, free, known)
     kernels, blocks = equations.model.element_kernels, np.array(equations.model.state_blocks, dtype=np.int64)
     (count, elements), result = d.shape, d[None, None].copy()
     lost, steps = np.zeros((2, 1, 1), dtype=np.int64)
@@ -192,12 +290,30 @@ def corrected(
     fewer = np.empty((1, 1, count // 2 if blocks.size else 0, elements), dtype=complex)
     address = (kernels.residual_jacobian if blocks.size else kernels.residual).address if elements else 0
     compiled().correct_many(
-        address, np.ascontiguousarray(d_f)[None, None], free[None, None], known.transposed_inverse[None], known.low,
-        parameters[None, None], np.array([2 * np.pi * equations.frequency]), float(equations.grid.periods),
-        *transform_tables(2 * count), blocks, True, 0, 1, np.full((1, 1), np.inf), result, np.empty_like(result), lost,
-        steps, states[None], fewer,
+        address, np.ascontiguousarray(d_f)[None, None], free[None, None], known.transposed_inverse[None],
+        known.of_steep[None], known.low, parameters[None, None], np.array([2 * np.pi * equations.frequency]),
+        float(equations.grid.periods), *transform_tables(2 * count), blocks, True, 0, 1, np.full((1, 1), np.inf),
+        result, np.empty_like(result), lost, steps, states[None], fewer,
     )  # fmt: skip
     return None if lost[0, 0] else np.asarray(result[0, 0])
+
+
+def _corrected_by_factors(
+    equations: Any, parameters: np.ndarray, d: np.ndarray, d_f: np.ndarray, free: np.ndarray, known: Preconditioner
+) -> np.ndarray | None:
+    """Do what `corrected` does without the inverse of a large matrix."""
+    before = np.inf
+    for _ in range(MOST_FACTOR_CORRECTIONS):
+        forces = equations.forces(d, parameters)
+        step = known(d + times(d_f, harmonics(forces.values)) - free)
+        d = d - step
+        length, size = float(np.linalg.norm(step)), float(np.linalg.norm(d))
+        if length <= LINEAR_SWEEP_ERROR * size:
+            return d
+        if not length < FACTOR_CORRECTION_RATE * before:
+            return d if length <= ROUNDED_SWEEP * LAST_STEP_SWEEP * size else None
+        before = length
+    return None
 
 
 def linear_solve(forces: Forces, rates: np.ndarray, d_f: np.ndarray, right: np.ndarray) -> np.ndarray | None:

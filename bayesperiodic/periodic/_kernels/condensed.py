@@ -114,22 +114,39 @@ def forces_on_fewer(address, parameters, rate, periods, turns, place, blocks, st
         f[:] = np.nan
 
 
+@njit(f"void(float64[:,:,::1], {COMPLEX_ROWS})", **CONDENSED_OPTIONS)
+def subtract_steep(steep, step):
+    """Correct a step (harmonics, elements) for what steep points change, see `correct_many`."""
+    pairs, elements, half = steep.shape[1], step.shape[1], step.size
+    factor = np.zeros(pairs)
+    for pair in range(pairs):
+        total = 0.0
+        for at in range(half):
+            value = step[at // elements, at % elements]
+            total += steep[1, pair, at] * value.real + steep[1, pair, half + at] * value.imag
+        factor[pair] = total
+    for pair in range(pairs):
+        for at in range(half):
+            step[at // elements, at % elements] -= factor[pair] * complex(steep[0, pair, at], steep[0, pair, half + at])
+
+
 @njit(
-    "void(int64, complex128[:,:,:,:,::1], complex128[:,:,:,::1], float64[:,:,::1], int64, float64[:,:,::1],"
-    "float64[::1], float64, complex128[::1], int64[::1], int64[::1], boolean, int64, int64, float64[:,::1],"
-    "complex128[:,:,:,::1], complex128[:,:,:,::1], int64[:,::1], int64[:,::1], float64[:,:,::1],"
+    "void(int64, complex128[:,:,:,:,::1], complex128[:,:,:,::1], float64[:,:,::1], float64[:,:,:,::1], int64,"
+    "float64[:,:,::1], float64[::1], float64, complex128[::1], int64[::1], int64[::1], boolean, int64, int64,"
+    "float64[:,::1], complex128[:,:,:,::1], complex128[:,:,:,::1], int64[:,::1], int64[:,::1], float64[:,:,::1],"
     "complex128[:,:,:,::1])",
     **CONDENSED_OPTIONS,
 )
 def correct_many(
-    address, d_f, free, inverse, low, parameters, rate, periods, turns, place, blocks, polish, start, stop, moved, d, f,
-    lost, steps, known, fewer,
+    address, d_f, free, inverse, steep, low, parameters, rate, periods, turns, place, blocks, polish, start, stop,
+    moved, d, f, lost, steps, known, fewer,
 ):  # fmt: skip
     """Correct predicted harmonics d (sets, solves, harmonics, elements) in place, and fill those of the forces, f.
 
     `d_f` (sets, 1 or solves, harmonics, elements, elements) is the frequency response between the elements, `free` (…,
     harmonics, elements) the displacements without their forces, `inverse` (sets, size, size) the transposed inverse of
-    the derivative of the residual by the `low` lowest harmonics at the anchors, `moved` (sets, solves) the predicted
+    the derivative of the residual by the `low` lowest harmonics at the anchors, `steep` what steep points change, see
+    `element_forces.Preconditioner.of_steep`, `moved` (sets, solves) the predicted
     change. `lost` becomes 1 where the steps do not become small at the rate `CORRECTION_RATE`, or the first is
     not below `FIRST_CORRECTION` of the predicted change: the solution may be another one. Internal states, if any,
     start at those of the anchors in `known` (sets, points, 3·variables), and `fewer` becomes f on half of the points.
@@ -175,10 +192,14 @@ def correct_many(
                     column = inverse[e, size + at]
                     for row in range(2 * size):
                         step[row] += column[row] * imaginary
-            for k in range(count):
+            for k in range(low):
                 for i in range(elements):
                     at = k * elements + i
-                    change = complex(step[at], step[size + at]) if k < low else residual[k, i]
+                    residual[k, i] = complex(step[at], step[size + at])
+            subtract_steep(steep[e], residual)
+            for k in range(count):
+                for i in range(elements):
+                    change = residual[k, i]
                     x[k, i] -= change
                     length += change.real**2 + change.imag**2
                     square += x[k, i].real ** 2 + x[k, i].imag ** 2

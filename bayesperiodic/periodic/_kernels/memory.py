@@ -16,6 +16,9 @@ MOST_MARCHED_PERIODS, MOST_STATE_STEPS, WHOLE_STATE_STEPS, LAST_STATE_STEP, LAST
     1e-12,
 )
 STATE_ROUNDING = 1e-16
+# Part of a change that is forgotten in a period below which the mean of a state, any of which is nearly periodic, is
+# chosen, see `centre`.
+HARDLY_FORGOTTEN = 1e-7
 # Newton's steps over a whole period, and the last one, after which forces are corrected linearly.
 MOST_PERIOD_STEPS, LAST_PERIOD_STEP = 8, 1e-6
 REALS, ROWS, STACKED_ROWS = "float64[::1]", "float64[:,::1]", "float64[:,:,::1]"
@@ -77,6 +80,31 @@ def explicit_part(a, before, flow, variables, first, size, place, step):
                 total += before[at + k] * flow[k, c]
             a[r, place + c] = flow[r, c] + 5.0 / 24.0 * step * total
             a[size + r, place + c] = flow[r, c] + step / 6.0 * total
+
+
+@njit(f"boolean({ROWS}, int64, int64, float64)", **MEMORY_OPTIONS)
+def hardly_forgets(out, variables, at, flow):
+    """Return whether a state forgets a change, but so little of it in a period that this is not precise."""
+    if not abs(1.0 - flow) <= HARDLY_FORGOTTEN:
+        return False
+    for i in range(out.shape[0]):
+        if out[i, variables + at * 3 * variables + at] != 0.0:
+            return True
+    return False
+
+
+@njit("float64(float64[:], float64[:])", **MEMORY_OPTIONS)
+def centre(values, rates):
+    """Return the mean of periodic values at the points where the state turns; of all at rest.
+
+    Where a joint does not slide, its force is elastic, and the slip of its ideal law leaves the mean at the middle of
+    the two ends of the motion.
+    """
+    points, total, count = values.size, 0.0, 0
+    for i in range(points):
+        if (rates[i] > 0.0) != (rates[i - 1] > 0.0):
+            total, count = total + 0.5 * (values[i] + values[i - 1]), count + 1
+    return total / count if count > 0 else values.mean()
 
 
 @njit(
@@ -181,7 +209,14 @@ def march(address, states, out, theta, rate, step, sizes):
                 level = max(level, scale[first + r])
             if not error < np.inf:
                 return False
-            if moving[b]:
+            if moving[b] and size == 1 and hardly_forgets(out, variables, offset + first, flow[b, 0, 0]):
+                middle = centre(states[:, offset + first], out[:, offset + first])
+                if error > 10.0 * (HARDLY_FORGOTTEN + points * STATE_ROUNDING) * level:
+                    return False
+                if abs(middle) > LAST_START_CORRECTION * level:
+                    done = False
+                    begin[first] -= middle
+            elif moving[b]:
                 for r in range(size):
                     for c in range(size):
                         a[r, c] = (1.0 if r == c else 0.0) - flow[b, r, c]
@@ -264,12 +299,13 @@ def sweep(out, changes, step, variables, at, first, size, flows, total, a):
     return True
 
 
-@njit(f"float64({ROWS}, {STACKED_ROWS}, float64, int64[::1])", **MEMORY_OPTIONS)
-def periodic_changes(out, changes, step, sizes):
+@njit(f"float64({ROWS}, {STACKED_ROWS}, float64, int64[::1], boolean[::1])", **MEMORY_OPTIONS)
+def periodic_changes(out, changes, step, sizes, held):
     """Replace right-hand sides (points, internal states, columns) of the formula of `march` by the periodic changes.
 
     The first row is that of the end of the period. `out`, `step` and `sizes` are those of `march`. Return the smallest
-    pivot of the closing of the period; where it is 0, as at rest, any mean is periodic, and it does not change.
+    pivot of the closing of the period; where it is 0, as at rest, any mean is periodic, and it does not change. States
+    of their own that hardly forget become `held`: their centre does not change.
     """
     points, inner, columns = changes.shape
     variables, smallest, first, largest = 0, np.inf, 0, 0
@@ -296,7 +332,13 @@ def periodic_changes(out, changes, step, sizes):
                 a[r, c], flows[0, r, c] = one - flows[0, r, c], one
             for c in range(columns):
                 a[r, size + c], changes[0, first + r, c] = total[r, c], 0.0
-        if eliminate(a, size, columns):
+        held[first] = size == 1 and hardly_forgets(out, variables, at, 1.0 - a[0, 0])
+        if held[first]:
+            rates = out[:, at]
+            level = centre(flows[:, 0, 0], rates)
+            for c in range(columns):
+                total[0, c] = -centre(changes[:, first, c], rates) / level
+        elif eliminate(a, size, columns):
             for r in range(size):
                 smallest = min(smallest, abs(a[r, r]))
                 for c in range(columns):
@@ -333,7 +375,7 @@ def tangent(out, changes, step, sizes):
                 changes[i + 1, k, c] = step / 24.0 * (5.0 * e0 + 8.0 * e1 - e2)
                 changes[last, k, c] = step / 6.0 * (e0 + 4.0 * e1 + e2)
                 e0 = e2
-    periodic_changes(out, changes, step, sizes)
+    periodic_changes(out, changes, step, sizes, np.zeros(inner, dtype=np.bool_))
 
 
 @njit(f"boolean(int64, {ROWS}, {ROWS}, {REALS}, float64, float64, int64[::1])", **MEMORY_OPTIONS)
@@ -349,6 +391,7 @@ def correct_states(address, states, out, theta, rate, step, sizes):
         inner += s
     offset, width = variables - inner, 3 * variables
     empty, tau, changes = np.empty((points, 0)), np.zeros(points), np.empty((points, inner, 1))
+    held = np.zeros(inner, dtype=np.bool_)
     for _ in range(MOST_PERIOD_STEPS):
         grid_function_at(address)(states, empty, theta, tau, rate, out)
         length = 0.0
@@ -359,10 +402,12 @@ def correct_states(address, states, out, theta, rate, step, sizes):
                 x, h0, h1, h2 = states[i, at], out[i, at], out[middle, at], out[last, at]
                 changes[middle, k, 0] = x + step / 24.0 * (5.0 * h0 + 8.0 * h1 - h2) - states[middle, at]
                 changes[last, k, 0] = x + step / 6.0 * (h0 + 4.0 * h1 + h2) - states[last, at]
-        if not periodic_changes(out, changes, step, sizes) > points * STATE_ROUNDING:
+        if not periodic_changes(out, changes, step, sizes, held) > points * STATE_ROUNDING:
             return False
         for k in range(inner):
             at, scale, largest = offset + k, 0.0, 0.0
+            if held[k]:
+                changes[:, k, 0] -= centre(states[:, at], out[:, at])
             for i in range(points):
                 scale = max(scale, abs(states[i, at]) + step * abs(out[i, at]))
                 change = abs(changes[i, k, 0])
