@@ -79,6 +79,15 @@ def test_a_counter_that_overflows_wraps_at_a_power_of_two_of_its_steps(bits):
     assert places.tolist() == (np.flatnonzero(np.diff(counts // 2**bits)) + 1).tolist()
 
 
+def test_a_counter_with_nearly_the_range_of_an_angle_wraps_at_its_own():
+    """Of 5.8 V; a turn of 2π within the same tenth has no jumps of its size."""
+    counts = np.round(2**10 * (0.3 + 0.13 * TIME + 0.05 * np.sin(PHASE)))
+    values = 5.8 / 2**10 * (counts % 2**10)
+    found, places = faults.wrap_of(values, 5.8 / 2**10)
+    assert found == pytest.approx(5.8)
+    assert places.tolist() == (np.flatnonzero(np.diff(counts // 2**10)) + 1).tolist()
+
+
 @pytest.mark.parametrize("per_cycle", [20, 50, 200])
 @pytest.mark.parametrize("turn", [2 * np.pi, 360.0, 1.0, 2.0])
 def test_sawtooth_drives_are_no_wraps_unless_their_range_is_a_turn(per_cycle, turn):

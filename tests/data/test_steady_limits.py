@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
+from bayesperiodic import _fourier
 from bayesperiodic.data import steadiness
 from bayesperiodic.data.steadiness import Windows
 
@@ -186,6 +187,20 @@ def test_jumps_make_windows_differ_by_a_sample():
     slip, jump = steadiness._slip(noise, np.arange(0, 10_000, 100))
     assert slip[0] == pytest.approx(2 * 6**0.5 * 2.6, rel=0.1) and jump[0] == 0.0
     assert steadiness._slip(np.zeros((2, 2)), np.array([0]))[0].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 50, 1000])
+def test_sums_over_blocks_do_not_depend_on_what_is_computed_at_once(monkeypatch, chunk):
+    """Σ exp(−2πi h φ), and with two signals, from each edge to the next, some of them longer than a part."""
+    generator = np.random.default_rng(1)
+    phase, values = generator.uniform(0.0, 9.0, 200), generator.standard_normal((2, 200))
+    edges = np.array([0, 3, 5, 20, 21, 22, 60, 61, 90, 150, 199])
+    monkeypatch.setattr(_fourier, "CHUNK", chunk)
+    sums = steadiness._block_sums(phase, values, edges, 7, 4)
+    every = np.stack([np.ones(200), *values]) * np.exp(-2j * np.pi * np.arange(7)[:, None, None] * phase)
+    expected = np.array([part.sum(axis=2) for part in np.split(every, edges[1:], axis=2)]).transpose(1, 2, 0)
+    expected[4:, 1:] = 0.0
+    np.testing.assert_allclose(sums, expected, atol=1e-11)
 
 
 @pytest.mark.parametrize("driven", [True, False])
