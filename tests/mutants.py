@@ -2,14 +2,16 @@
 
 mutmut writes the mutants of the modules in `pyproject.toml`. A mutant is tested in a process forked from one that has
 collected the tests but run none, by the folder of `tests/` that mirrors its own: first the files that name its
-function, then those that name its module, then the others, until a test fails or `BUDGET` seconds of processor time
-have passed. Results are in `mutants.md`.
+function, then those that name its module, then the others, and of each file the tests that name the function first,
+until a test fails or `BUDGET` seconds of processor time have passed. Results are in `mutants.md`.
 """
 
 import argparse
+import functools
 import json
 import os
 import random
+import re
 import resource
 import sys
 import tomllib
@@ -42,14 +44,23 @@ def folder_of(mutant: str) -> str:
 def ordered(mutant: str, items: list[pytest.Item]) -> list[pytest.Item]:
     """Return the tests of a mutant, those that are most likely to find it first."""
     module, _, function = mutant.rpartition("__mutmut_")[0].rpartition(".")
-    module, function = module.rpartition(".")[2], function.removeprefix("x_").rpartition("ǁ")[2]
+    module, (*owner, name) = module.rpartition(".")[2], function.removeprefix("x_").removeprefix("xǁ").split("ǁ")
+    named = re.compile(owner[0] if name == "__init__" else rf"\.{name}\b" if owner else rf"\b{name}\b")
 
-    def rank(item: pytest.Item) -> tuple[bool, bool, bool]:
-        return function not in texts[item.path], module not in item.path.name, module not in texts[item.path]
+    @functools.cache
+    def rank(path: Path, test: str) -> tuple[bool, ...]:
+        text = path.read_text()
+        inside = re.search(rf"^def {test}\(.*?(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
+        return (
+            not named.search(text),
+            f"{(owner or [module])[0]}.{name}" not in text,
+            not (inside and named.search(inside[0])),
+            module not in path.name,
+            module not in text,
+        )
 
     mine = [item for item in items if item.nodeid.startswith(folder_of(mutant) + "/")]
-    texts = {path: path.read_text() for path in {item.path for item in mine}}
-    return sorted(mine, key=rank)
+    return sorted(mine, key=lambda item: rank(item.path, getattr(item, "originalname", item.name)))
 
 
 class Tests:
