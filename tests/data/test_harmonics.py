@@ -108,6 +108,27 @@ def test_pace_is_that_of_the_scores_of_single_cycles(cycles, orders):
     assert pace.drifts == (significant and np.ptp(bend) > 1 / 360)
 
 
+@pytest.mark.parametrize("cycles", [17, 60])
+@pytest.mark.parametrize("ratio, size", [(0.97, 1.0), (1.03, 1.0), (3.0, 0.97 / 360), (3.0, 1.03 / 360)])
+def test_phases_wander_by_more_than_the_amplitudes_and_a_degree(cycles, ratio, size):
+    """Sums of squares of orders from 3 on are compared by F at 1e-4; the range is that of these orders, in cycles."""
+    orders = min(max(cycles // 4, 4), 16)
+    basis = np.linalg.qr(np.vander(np.linspace(-1, 1, cycles), orders + 3, increasing=True))[0]
+    generator = np.random.default_rng(cycles)
+    phase, amplitude = basis[:, 3:] @ generator.standard_normal((2, orders)).T[:, :, None].transpose(1, 0, 2)
+    phase, amplitude = size * phase[:, 0] / np.ptp(phase), amplitude[:, 0] / np.linalg.norm(amplitude)
+    amplitude = amplitude * np.linalg.norm(phase) / np.sqrt(ratio * stats.f.isf(1e-4, orders, orders))
+    power = 1e8 * orders / np.sum(amplitude**2)
+    line = 0.3 + 0.1 * np.linspace(-1, 1, cycles) ** 2
+    pace = harmonics.pace_of(power * (phase + line), power * (amplitude + line), power, 1.0)
+    seen = ratio > 1.0 and size > 1 / 360
+    assert pace.wander == pytest.approx(size if seen else 0.0) and pace.varies == (pace.drifts or seen)
+    # White noise of the samples is the least for both.
+    power = ratio * stats.f.isf(1e-4, orders, orders) * orders / np.sum(phase**2)
+    least = harmonics.pace_of(power * phase, np.zeros(cycles), power, 1.0)
+    assert least.wander == pytest.approx(size if seen else 0.0)
+
+
 @pytest.mark.parametrize("change", [0.004, -0.004])
 def test_drift_of_a_chirp_is_its_change_of_frequency(change):
     time = np.arange(60 * 20) / 20.0
