@@ -186,6 +186,21 @@ def test_row_without_a_date_is_missing_and_those_after_it_are_not(write):
     assert read(write(rows), missing="drop") == ([0.0, 3600.0, 10_800.0, 14_400.0], [0.0, 1.0, 3.0, 4.0])
 
 
+@pytest.mark.parametrize("mac", [False, True])
+def test_dates_that_are_stored_as_texts_of_iso_8601_are_read(tmp_path, mac):
+    """Of all cells, or of some, among others that are numbers of days."""
+    start, path = datetime.datetime(2026, 3, 12, 10, 0, 0), tmp_path / "run.xlsx"
+    book = openpyxl.Workbook()
+    book.iso_dates, book.epoch = True, openpyxl.utils.datetime.CALENDAR_MAC_1904 if mac else book.epoch
+    sheet = book.active
+    for row in [["t", "x"], *([start + datetime.timedelta(seconds=0.5 * k * k), float(k)] for k in range(5))]:
+        sheet.append(row)
+    sheet["A3"] = (start + datetime.timedelta(seconds=0.5) - book.epoch) / datetime.timedelta(days=1)
+    sheet["A3"].number_format = "yyyy-mm-dd h:mm:ss"
+    book.save(path)
+    assert read(path) == ([0.0, 0.5, 2.0, 4.5, 8.0], [0.0, 1.0, 2.0, 3.0, 4.0])
+
+
 def test_row_of_the_names_may_be_given(write):
     rows = [["a", "b"], ["t", "x"], [0, 1.5], [1, 2.5]]
     assert read(write(rows), header=2) == ([0.0, 1.0], [1.5, 2.5])
