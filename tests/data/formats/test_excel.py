@@ -289,6 +289,23 @@ def test_rows_of_texts_that_may_be_units_are_refused(write, rows, line):
         bp.inspect(write([*rows, [0, 1, 2], [1, 2, 3]]), header=line)
 
 
+@pytest.mark.parametrize(
+    "names, suggested",
+    [
+        (["x", "t", "y"], "t"), (["x", "y", "z"], None), (["Time", "t", "x"], "Time"), (["x", "time (s)", "t"], "t"),
+        (["x", "note", "date"], "date"),
+    ],
+)  # fmt: skip
+def test_time_is_the_first_column_of_its_name_that_changes(write, names, suggested):
+    """The values of "time (s)" are all one, those of "note" texts."""
+    cell_of = {"time (s)": lambda k: 7, "note": lambda k: "ok"}
+    rows = [names, *([cell_of.get(name, lambda k: 2 * k)(k) for name in names] for k in range(6))]
+    code = bp.inspect(write(rows)).code
+    assert (f"time={suggested!r}" in code) if suggested else ("time=" not in code)
+    # Of two sheets with times of their own, none is that of all.
+    assert "time=" not in bp.inspect(write({"one": rows, "two": rows})).code
+
+
 @pytest.mark.parametrize("line", [None, 0, 1])
 def test_first_rows_with_a_text_among_numbers_are_no_preamble(write, line):
     rows = [["t", "x"], *([k, "OL"] for k in range(5)), *([k, k] for k in range(5, 40))]
