@@ -2,16 +2,20 @@
 
 mutmut writes the mutants of the modules in `pyproject.toml`. A mutant is tested in a process forked from one that has
 collected the tests but run none, by the folder of `tests/` that mirrors its own: first the files that name its
-function, then those that name its module, then the others, until a test fails or `BUDGET` seconds of processor time
-have passed. Results are in `mutants.md`.
+function, then those that name its module, then the others, and of each file the tests that name the function first,
+until a test fails or `BUDGET` seconds of processor time have passed. Results are in `mutants.md`.
 """
 
 import argparse
+import ast
+import functools
 import json
 import os
 import random
+import re
 import resource
 import sys
+import textwrap
 import tomllib
 from pathlib import Path
 
@@ -19,6 +23,9 @@ import pytest
 
 BUDGET, LONGEST = 40.0, 150  # [s] of processor time; a test that has no end is stopped by the longer one
 SURVIVED, KILLED = 0, 1
+# A function of mutmut's: indentation, name and what follows; a last argument `strict`, or the comma in its place.
+DEFINITION = re.compile(r"^( *)def (\S+__mutmut_\w+)\((.*?)(?=^\1[^\s)]|^[^\s)]|\Z)", re.MULTILINE | re.DOTALL)
+STRICTLY, STRICT = "strict=True", re.compile(r",\s*(?:strict=\w+,?\s*)?(?=\))")
 
 
 def write_mutants() -> list[str]:
@@ -30,8 +37,33 @@ def write_mutants() -> list[str]:
     mutmut.copy_src_dir()
     mutmut.copy_also_copy_files()
     mutmut.create_mutants(1)
-    metadata = [json.loads(path.read_text()) for path in Path("mutants").rglob("*.meta")]
-    return sorted(name for one in metadata for name in one["exit_code_by_key"])
+    names: list[str] = []
+    for path in Path("mutants").rglob("*.meta"):
+        equal = of_equal_lengths(path.with_suffix("").read_text())
+        every = json.loads(path.read_text())["exit_code_by_key"]
+        names += [name for name in every if name.rpartition(".")[2] not in equal]
+    return sorted(names)
+
+
+def of_equal_lengths(text: str) -> set[str]:
+    """Return the mutants in a text without `strict=True` of a `zip`, whose lengths are equal by construction."""
+
+    def without(body: str) -> str:
+        tree = ast.parse("def f(" + textwrap.dedent(body))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "zip":
+                node.keywords = [one for one in node.keywords if one.arg != "strict"]
+        return ast.dump(tree)
+
+    bodies = {match[2]: match[3] for match in DEFINITION.finditer(text)}
+    equal = set()
+    for name, body in bodies.items():
+        before = bodies[f"{name.rpartition('__mutmut_')[0]}__mutmut_orig"]
+        # Few texts are equal but for `strict=True`, and only these are parsed.
+        fewer = body.count(STRICTLY) < before.count(STRICTLY)
+        if fewer and STRICT.sub("", body) == STRICT.sub("", before) and without(body) == without(before):
+            equal.add(name)
+    return equal
 
 
 def folder_of(mutant: str) -> str:
@@ -42,14 +74,23 @@ def folder_of(mutant: str) -> str:
 def ordered(mutant: str, items: list[pytest.Item]) -> list[pytest.Item]:
     """Return the tests of a mutant, those that are most likely to find it first."""
     module, _, function = mutant.rpartition("__mutmut_")[0].rpartition(".")
-    module, function = module.rpartition(".")[2], function.removeprefix("x_").rpartition("ǁ")[2]
+    module, (*owner, name) = module.rpartition(".")[2], function.removeprefix("x_").removeprefix("xǁ").split("ǁ")
+    named = re.compile(owner[0] if name == "__init__" else rf"\.{name}\b" if owner else rf"\b{name}\b")
 
-    def rank(item: pytest.Item) -> tuple[bool, bool, bool]:
-        return function not in texts[item.path], module not in item.path.name, module not in texts[item.path]
+    @functools.cache
+    def rank(path: Path, test: str) -> tuple[bool, ...]:
+        text = path.read_text()
+        inside = re.search(rf"^def {test}\(.*?(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
+        return (
+            not named.search(text),
+            f"{(owner or [module])[0]}.{name}" not in text,
+            not (inside and named.search(inside[0])),
+            module not in path.name,
+            module not in text,
+        )
 
     mine = [item for item in items if item.nodeid.startswith(folder_of(mutant) + "/")]
-    texts = {path: path.read_text() for path in {item.path for item in mine}}
-    return sorted(mine, key=rank)
+    return sorted(mine, key=lambda item: rank(item.path, getattr(item, "originalname", item.name)))
 
 
 class Tests:

@@ -45,6 +45,7 @@ TAIL, RARE_IN_TAIL, FEWEST_IN_TAIL = 4.0, 1e-3, 3
 # Impulses of random size and sign: fewest, ratio of large sizes to small ones, the p-value from which they are not
 # one-sided, and standard errors of their correlation with the signal from which they replace it.
 FEWEST_IMPULSES, SPREAD_SIZES, BOTH_SIDES, REPLACED = 10, 2.5, 0.01, 3.0
+NO_SAMPLES = np.zeros(0, dtype=int)
 
 
 @dataclass
@@ -53,19 +54,19 @@ class ChannelFaults:
 
     step: float = 0.0  # of quantised values, 0 if they are not
     wrap: float = 0.0  # range at which the values wrap, 0 if they do not
-    wraps: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # first samples after jumps
+    wraps: np.ndarray = field(default_factory=NO_SAMPLES.copy)  # first samples after jumps
     stuck: list[slice] = field(default_factory=list)
-    low: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # clipped samples
-    high: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
-    beside: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # at the same phases as clipped ones
-    outliers: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
-    tails: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # as large as outliers, but noise
-    brief: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # of short runs of one value
+    low: np.ndarray = field(default_factory=NO_SAMPLES.copy)  # clipped samples
+    high: np.ndarray = field(default_factory=NO_SAMPLES.copy)
+    beside: np.ndarray = field(default_factory=NO_SAMPLES.copy)  # at the same phases as clipped ones
+    outliers: np.ndarray = field(default_factory=NO_SAMPLES.copy)
+    tails: np.ndarray = field(default_factory=NO_SAMPLES.copy)  # as large as outliers, but noise
+    brief: np.ndarray = field(default_factory=NO_SAMPLES.copy)  # of short runs of one value
     saturation: Saturation | None = None  # flat tops of the mean period
-    saturated: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # samples of the flat tops
+    saturated: np.ndarray = field(default_factory=NO_SAMPLES.copy)  # samples of the flat tops
     saturation_bias: float = 0.0  # if these are wrong [standard errors of all amplitudes]
     noisy: bool = True  # beside the clipped samples, so that no signal without noise rests there
-    held: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))  # that repeat the one before
+    held: np.ndarray = field(default_factory=NO_SAMPLES.copy)  # that repeat the one before
     repeats: int = 1  # samples of each value, of a slower logger
 
 
@@ -88,7 +89,7 @@ def wrap_of(values: np.ndarray, step: float) -> tuple[float, np.ndarray]:
         usual = np.quantile(np.abs(np.delete(steps, jumps)), 0.99)
         if smooth and np.median(np.abs(steps[jumps])) <= 3.0 * usual + step:
             return turn, jumps + 1
-    return 0.0, np.zeros(0, dtype=int)
+    return 0.0, NO_SAMPLES
 
 
 def runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -123,10 +124,10 @@ def brief_of(values: np.ndarray, step: float) -> np.ndarray:
     """
     first, length = runs(values)
     if length.size < 2 or length.max() < FEWEST_HELD:
-        return np.zeros(0, dtype=int)
+        return NO_SAMPLES
     noise, step = fast_noise(values), step or _spacing(values[first])
     if not noise > max(NO_NOISE * float(np.ptp(values)), 0.5 * step):
-        return np.zeros(0, dtype=int)
+        return NO_SAMPLES
     # Runs of two count as chance: a hold of two samples is not told from it.
     pairs = (np.count_nonzero(length == 2) + 1.0) / values.size
     same = min(max(float(erf(step / (np.sqrt(8.0) * noise))), pairs), 1.0 - 1e-12)
@@ -135,7 +136,7 @@ def brief_of(values: np.ndarray, step: float) -> np.ndarray:
     chance = values.size * same ** (size - 1.0)
     held = (chance < CHANCE_SHARE * count) & (pdtrc(count - 1, chance) < CHANCE_RUNS)
     if not held.any():
-        return np.zeros(0, dtype=int)
+        return NO_SAMPLES
     level = values[first]
     long = (length >= size[np.argmax(held)]) & (level != values.max()) & (level != values.min())
     return np.flatnonzero(np.repeat(long, length))
@@ -227,7 +228,7 @@ def clipped_of(values: np.ndarray, stuck: list[slice]) -> tuple[np.ndarray, np.n
     for sign in (-1.0, 1.0):
         signed = sign * inside
         top = place[signed == signed.max()] if signed.size else place
-        ends.append(top if _piles_up(sign * values, top, place) else np.zeros(0, dtype=int))
+        ends.append(top if _piles_up(sign * values, top, place) else NO_SAMPLES)
     return ends[0], ends[1]
 
 
@@ -262,10 +263,10 @@ def held_of(values: np.ndarray) -> tuple[int, np.ndarray]:
     usual = int(np.median(length))
     inner = length[1:-1]
     if usual < 2 or inner.size < FEWEST_VALUES or np.unique(values[first]).size < FEWEST_VALUES:
-        return 1, np.zeros(0, dtype=int)
+        return 1, NO_SAMPLES
     # Two equal values in a row are a run of twice the length.
     if np.mean(inner % usual == 0) < HELD:
-        return 1, np.zeros(0, dtype=int)
+        return 1, NO_SAMPLES
     return usual, np.flatnonzero((np.arange(values.size) - first[1]) % usual)
 
 
@@ -314,7 +315,7 @@ def _lone(far: np.ndarray, phase: np.ndarray, values: np.ndarray, step: float) -
     if value is not None:
         far = far | (values == value)
     if not far.any() or far.all() or np.ptp(values[~far]) == 0.0:
-        return np.zeros(0, dtype=int)
+        return NO_SAMPLES
     first, length = runs(far)
     flagged = far[first]
     first, length = first[flagged], length[flagged]

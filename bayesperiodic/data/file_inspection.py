@@ -1,5 +1,6 @@
 """What is in a file of measurements, and the call that reads it."""
 
+import collections
 import keyword
 import re
 from collections.abc import Mapping
@@ -289,8 +290,10 @@ def _with_times(whole: Contents) -> Contents:
     """Return contents with the channel that seems to hold the times by its name, where nothing else says them."""
     if whole.suggested_time or any(channel.clock for channel in whole.channels):
         return whole
+    names = collections.Counter(channel.name for channel in whole.channels)
     for channel in whole.channels:
-        if header_units.TIMES_NAME.fullmatch(channel.name) and not channel.refusal and channel.samples > 1:
+        named = names[channel.name] == 1 and header_units.TIMES_NAME.fullmatch(channel.name)
+        if named and not channel.refusal and channel.samples > 1:
             values = np.squeeze(np.asarray(channel.values()))
             if values.dtype.kind in "fiu" and values.ndim == 1 and (np.diff(values.astype(float)) > 0).all():
                 return replace(whole, suggested_time=channel.name)

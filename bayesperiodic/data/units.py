@@ -120,8 +120,8 @@ def unit_of(unit: float | str | Sequence[str] | None, stored: str) -> str:
     if isinstance(unit, int | float | np.number):
         return ""
     if unit is None:
-        si = in_si(stored) if stored.strip() and is_known(stored) else ""
-        return si if difference(stored, si) else stored.strip() or si  # N, not kg·m/s²
+        si = in_si(stored) if is_known(stored) else ""
+        return si if difference(stored, si) else stored.strip()  # N, not kg·m/s²
     return unit if isinstance(unit, str) else unit[1]
 
 

@@ -79,6 +79,60 @@ def test_a_counter_that_overflows_wraps_at_a_power_of_two_of_its_steps(bits):
     assert places.tolist() == (np.flatnonzero(np.diff(counts // 2**bits)) + 1).tolist()
 
 
+def test_a_counter_with_nearly_the_range_of_an_angle_wraps_at_its_own():
+    """Of 5.8 V; a turn of 2π within the same tenth has no jumps of its size."""
+    counts = np.round(2**10 * (0.3 + 0.13 * TIME + 0.05 * np.sin(PHASE)))
+    values = 5.8 / 2**10 * (counts % 2**10)
+    found, places = faults.wrap_of(values, 5.8 / 2**10)
+    assert found == pytest.approx(5.8)
+    assert places.tolist() == (np.flatnonzero(np.diff(counts // 2**10)) + 1).tolist()
+
+
+SIGNS = np.tile([1.0, -1.0], 10)
+SIZES = np.geomspace(10.0, 60.0, 20)
+
+
+@pytest.mark.parametrize(
+    "sizes, noise",
+    [
+        (SIGNS * SIZES, True), (SIGNS[:10] * SIZES[::2], True), (SIGNS[:9] * SIZES[::2][:9], False), (SIZES, False),
+        (-SIZES, False), (SIGNS * 30.0, False), (SIGNS * np.geomspace(10.0, 24.0, 20), False),
+        (SIGNS * np.geomspace(10.0, 40.0, 20), True),
+    ],
+)  # fmt: skip
+def test_impulses_of_random_size_and_sign_are_noise(sizes, noise):
+    """At least ten, of both signs, nine tenths of which differ by a factor of 2.5 at least; beside normal noise."""
+    residuals = np.clip(np.random.default_rng(2).standard_normal(4000), -3.5, 3.5)
+    places = np.arange(sizes.size) * 190 + 50
+    residuals[places] = sizes
+    predicted = np.cos(0.3 * np.arange(4000.0))
+    for offset in (0.0, 5.0):
+        assert faults.heavy_tails(residuals + offset, places, predicted).tolist() == [noise] * sizes.size
+    # Values that replace the signal, as zero does, follow it.
+    assert not faults.heavy_tails(residuals, places, np.where(np.isin(np.arange(4000), places), -residuals, 0.0)).any()
+
+
+def test_power_laws_are_noise_up_to_the_size_of_which_a_thousandth_is_expected():
+    """|x| of n samples exceeds x in n x⁻² of 4000; the sizes are the quantiles, so that the tail has an index of 2."""
+    count = 4000
+    sizes = np.sqrt(count / (np.arange(count) + 0.5))
+    signs = np.random.default_rng(3).choice([-1.0, 1.0], count)
+    residuals = np.random.default_rng(4).permutation(sizes * signs)
+    distance = np.abs(residuals - np.median(residuals))
+    scale = 1.4826 * np.median(distance)
+    far = np.flatnonzero(distance > 8.0 * scale)
+    assert faults.heavy_tails(residuals, far, residuals).all() and far.size > 5
+    beyond = distance[distance > 4.0 * scale] / (4.0 * scale)
+    largest = 4.0 * scale * (beyond.size / 1e-3) ** (np.median(np.log(beyond)) / np.log(2.0))
+    for factor, noise in ((0.9, True), (1.1, False)):
+        # The index is that of the median of the sizes beyond four standard deviations, one of which is changed.
+        other = residuals.copy()
+        other[far[0]] = np.median(residuals) + factor * largest
+        assert faults.heavy_tails(other, far[:1], other).tolist() == [noise]
+    assert faults.heavy_tails(residuals, far[:0], residuals).size == 0
+    assert not faults.heavy_tails(np.r_[np.zeros(50), 3.0], np.array([50]), np.ones(51)).any()
+
+
 @pytest.mark.parametrize("per_cycle", [20, 50, 200])
 @pytest.mark.parametrize("turn", [2 * np.pi, 360.0, 1.0, 2.0])
 def test_sawtooth_drives_are_no_wraps_unless_their_range_is_a_turn(per_cycle, turn):

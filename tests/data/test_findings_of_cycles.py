@@ -171,3 +171,13 @@ def test_a_vibration_is_named_with_its_period_and_decay():
     assert float(seen.text.split("decaying in ")[1].split()[0]) == pytest.approx(30.0, rel=0.2)
     beating = {"x": seen.severity}
     assert [*cycle_findings._changes(("x",), TIME, steady, beating)] == []
+
+
+def test_a_channel_at_rest_does_not_hide_the_vibration_of_the_next_one():
+    wave = 0.2 * np.cos(2 * np.pi * CYCLE / 5.5)
+    part = windows_of(np.column_stack([1.0 + NOISE[0], 2.0 * (1.0 + wave + NOISE[1])]))
+    shape = np.concatenate([part.amplitudes.real, part.amplitudes.imag[:, :, 1:]], axis=2).reshape(40, -1)
+    still = dict(samples=slice(0, 200), level=(0, 200), squares=np.zeros((2, 3)), change=np.zeros((2, 2)))
+    steady = Steady(part, **still, transient=0.0, changes=changes(shape, 0.6))
+    (seen,) = cycle_findings._changes(("u", "x"), TIME, steady, {})
+    assert seen.channel == "x" and "with a period of 5.5" in seen.text

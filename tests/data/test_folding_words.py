@@ -183,6 +183,11 @@ def test_errors_of_outputs_that_follow_those_of_inputs():
     assert folding._error_slopes(small, ["u"], kept, amplitudes) == {}
     least = noise | {"u": noise_of(1.1e-12 * u / np.abs(u).max())}
     assert [*folding._error_slopes(least, ["u"], kept, amplitudes)] == ["u"]
+    # An exact input, or one whose noise is in no output, does not hide the next one.
+    for other in (0.0 * u, draw()):
+        three = {"v": noise_of(other), **noise}
+        both = folding._error_slopes(three, ["v", "u"], kept | {"v": 5}, amplitudes | {"v": amplitudes["u"]})
+        assert [*both] == ["u"] and both["u"]["x"] == pytest.approx(slopes["u"]["x"])
 
 
 def test_harmonics_above_those_kept_are_left_out_with_their_variances():

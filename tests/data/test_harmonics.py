@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import special, stats
 
 from bayesperiodic import _fourier
 from bayesperiodic.data import coverage, harmonics
@@ -106,6 +106,61 @@ def test_pace_is_that_of_the_scores_of_single_cycles(cycles, orders):
     assert pace.drift == pytest.approx(drift, rel=0.05)
     significant = abs(phase[2]) > stats.t.isf(0.5e-4, rest.size) * np.sqrt(noise)
     assert pace.drifts == (significant and np.ptp(bend) > 1 / 360)
+
+
+@pytest.mark.parametrize("cycles", [17, 60])
+@pytest.mark.parametrize("ratio, size", [(0.97, 1.0), (1.03, 1.0), (3.0, 0.97 / 360), (3.0, 1.03 / 360)])
+def test_phases_wander_by_more_than_the_amplitudes_and_a_degree(cycles, ratio, size):
+    """Sums of squares of orders from 3 on are compared by F at 1e-4; the range is that of these orders, in cycles."""
+    orders = min(max(cycles // 4, 4), 16)
+    basis = np.linalg.qr(np.vander(np.linspace(-1, 1, cycles), orders + 3, increasing=True))[0]
+    generator = np.random.default_rng(cycles)
+    phase, amplitude = basis[:, 3:] @ generator.standard_normal((2, orders)).T[:, :, None].transpose(1, 0, 2)
+    phase, amplitude = size * phase[:, 0] / np.ptp(phase), amplitude[:, 0] / np.linalg.norm(amplitude)
+    amplitude = amplitude * np.linalg.norm(phase) / np.sqrt(ratio * stats.f.isf(1e-4, orders, orders))
+    power = 1e8 * orders / np.sum(amplitude**2)
+    line = 0.3 + 0.1 * np.linspace(-1, 1, cycles) ** 2
+    pace = harmonics.pace_of(power * (phase + line), power * (amplitude + line), power, 1.0)
+    seen = ratio > 1.0 and size > 1 / 360
+    assert pace.wander == pytest.approx(size if seen else 0.0) and pace.varies == (pace.drifts or seen)
+    # White noise of the samples is the least for both.
+    power = ratio * stats.f.isf(1e-4, orders, orders) * orders / np.sum(phase**2)
+    least = harmonics.pace_of(power * phase, np.zeros(cycles), power, 1.0)
+    assert least.wander == pytest.approx(size if seen else 0.0)
+
+
+def test_first_step_towards_a_wandering_phase_is_that_of_dense_equations(monkeypatch):
+    """Weighted least squares of what the series leaves, with the walk's differences of variance q f Δt as a prior."""
+    monkeypatch.setattr(harmonics, "PHASE_ITERATIONS", 1)
+    time, values = noisy(9.3)
+    time = time + 0.002 * np.random.default_rng(1).random(time.size)
+    fit, step = harmonics.fit_harmonics(time, values, 2.0, 2), 3e-4
+    orders = np.arange(3)
+    clear = np.where((np.abs(fit.amplitudes) > 0.1) & (orders > 0), fit.amplitudes, 0.0)
+    slope = np.real((2j * np.pi * orders * clear) @ np.exp(2j * np.pi * np.outer(orders, 2.0 * time)))
+    weights = 1.0 / fit.variances
+    information, pull = weights @ slope**2, weights @ (slope * fit.residuals)
+    change = np.diff(np.eye(time.size), axis=0)
+    prior = change.T @ np.diag(1.0 / (step * 2.0 * np.diff(time))) @ change
+    ahead = np.linalg.solve(np.diag(information) + prior, pull)
+    line, root = np.column_stack([np.ones(time.size), time]), np.sqrt(information)
+    ahead = ahead - line @ np.linalg.lstsq(line * root[:, None], ahead * root, rcond=None)[0]
+    found = harmonics.followed_phase(time, values, fit, step)
+    assert found == pytest.approx(ahead, rel=1e-6, abs=1e-6 * np.abs(ahead).max())
+
+
+def test_a_wandering_phase_is_followed_and_the_amplitude_is_not_smeared():
+    """A smooth phase of ±0.12 cycles without noise; an angle a over many periods leaves J₀(2π a) of the amplitude."""
+    time = np.arange(2000) / 20.0
+    phase = 0.12 * np.sin(2 * np.pi * time / 25.0)
+    values = np.cos(2 * np.pi * (time + phase))[None] + 0.3 * np.sin(4 * np.pi * (time + phase))
+    fit = harmonics.fit_harmonics(time, values, 1.0, 3)
+    assert abs(fit.amplitudes[0, 1]) == pytest.approx(special.j0(2 * np.pi * 0.12), abs=0.02)
+    ahead = harmonics.followed_phase(time, values, fit, 1e-2)
+    line = np.polynomial.polynomial.polyfit(time, phase, 1)
+    assert ahead == pytest.approx(phase - np.polynomial.polynomial.polyval(time, line), abs=0.01)
+    again = harmonics.fit_harmonics(time + ahead, values, 1.0, 3)
+    assert np.abs(again.amplitudes[0]) == pytest.approx([0.0, 1.0, 0.3, 0.0], abs=0.02)
 
 
 @pytest.mark.parametrize("change", [0.004, -0.004])

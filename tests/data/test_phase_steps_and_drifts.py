@@ -353,8 +353,8 @@ def test_windows_of_the_same_amplitude_show_a_drift_that_few_used_ones_do_not():
 
 def test_drifts_in_words():
     """0.05 cycles are 18 degrees."""
-    listed = [Drift(1, 2e-5, 1.5e-6, 0.05, True), Drift(2, -3e-5, 2e-6, -0.1, True), Drift(1, 1e-5, 1e-6, 0.02, False)]
-    above, below, changing = clocks.drift_findings(listed, CHANNELS, (2.0, 12.0), 30, 40)
+    listed = [Drift(1, 2e-5, 1.5e-6, 0.05, True), Drift(1, 1e-5, 1e-6, 0.02, False), Drift(2, -3e-5, 2e-6, -0.1, True)]
+    above, changing, below = clocks.drift_findings(listed, CHANNELS, (2.0, 12.0), 30, 40)
     assert (above.kind, above.channel, above.severity) == ("clock", "x", RUINOUS)
     assert above.text == (
         "the phase of x drifts steadily against u, by 18° over the cycles used (30 of 40), as if its frequency were "

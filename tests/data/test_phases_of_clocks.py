@@ -216,6 +216,20 @@ def test_drifts_that_amplitudes_explain_are_not_steady_and_small_ones_are_harmle
             assert [d.steady for d in clocks.drifts(given, every, [np.zeros(0, int)])] == steady
 
 
+def test_channels_without_a_drift_do_not_hide_that_of_a_later_one():
+    """Before it: nine windows without steps, a step in every second of 20 windows, no drift, a harmless one."""
+    cycle, every = np.arange(100.0), np.ones(100, dtype=bool)
+    noise = 1e-5 * np.random.default_rng(2).standard_normal((100, 3))
+    turns = np.zeros((100, 6))
+    turns[:, 3] = noise[:, 0]
+    turns[:, 4] = 0.04 / (2 * np.pi) * cycle / 100 + 1e-2 * noise[:, 1]
+    turns[:, 5] = 1e-3 * cycle + noise[:, 2]
+    sizes = np.zeros((100, 6))
+    sizes[:, 4] = 0.1 * cycle / 100
+    places = [np.arange(91), np.r_[np.arange(0, 20, 2), np.arange(20, 100)], *[np.zeros(0, dtype=int)] * 3]
+    assert [drift.row for drift in clocks.drifts(phases(turns, sizes), every, places)] == [5]
+
+
 def test_drift_over_all_windows_counts_if_few_are_used():
     cycle = np.arange(100.0)
     noise = 1e-3 * np.random.default_rng(2).standard_normal(100)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
+from bayesperiodic import _fourier
 from bayesperiodic.data import steadiness
 from bayesperiodic.data.steadiness import Windows
 
@@ -186,6 +187,52 @@ def test_jumps_make_windows_differ_by_a_sample():
     slip, jump = steadiness._slip(noise, np.arange(0, 10_000, 100))
     assert slip[0] == pytest.approx(2 * 6**0.5 * 2.6, rel=0.1) and jump[0] == 0.0
     assert steadiness._slip(np.zeros((2, 2)), np.array([0]))[0].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 50, 1000])
+def test_sums_over_blocks_do_not_depend_on_what_is_computed_at_once(monkeypatch, chunk):
+    """Σ exp(−2πi h φ), and with two signals, from each edge to the next, some of them longer than a part."""
+    generator = np.random.default_rng(1)
+    phase, values = generator.uniform(0.0, 9.0, 200), generator.standard_normal((2, 200))
+    edges = np.array([0, 3, 5, 20, 21, 22, 60, 61, 90, 150, 199])
+    monkeypatch.setattr(_fourier, "CHUNK", chunk)
+    sums = steadiness._block_sums(phase, values, edges, 7, 4)
+    every = np.stack([np.ones(200), *values]) * np.exp(-2j * np.pi * np.arange(7)[:, None, None] * phase)
+    expected = np.array([part.sum(axis=2) for part in np.split(every, edges[1:], axis=2)]).transpose(1, 2, 0)
+    expected[4:, 1:] = 0.0
+    np.testing.assert_allclose(sums, expected, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    "total, length, cycles, overlap, count",
+    [
+        (64, 1, 1, 8, 505), (65, 1, 1, 1, 65), (64, 3, 3, 8, 163), (511, 1, 1, 1, 511), (512, 1, 2, 1, 256),
+        (770, 1, 3, 1, 256), (770, 5, 5, 1, 154),
+    ],
+)  # fmt: skip
+def test_windows_are_of_whole_cycles_and_256_at_most(total, length, cycles, overlap, count):
+    """Up to 64 cycles they begin at eighths of a window; the last one ends with the recording."""
+    time = np.arange(total * 40) / 40.0
+    every = steadiness.windows(time, np.cos(2 * np.pi * time + 0.3)[None], 1.0, length)
+    assert (every.cycles, every.overlap, len(every.first)) == (cycles, overlap, count)
+    assert (
+        np.array_equal(np.diff(every.last), np.full(count - 1, 40 * cycles // overlap)) and every.last[-1] == 40 * total
+    )
+    assert np.array_equal((every.last - every.first)[1:], np.full(count - 1, 40 * cycles))
+    assert every.amplitudes[:, 0, 1] == pytest.approx(np.sqrt(2) * np.exp(0.3j), abs=1e-9)
+
+
+@pytest.mark.parametrize("holes", [0.2, 0.25, 0.3, 0.45])
+def test_windows_are_longer_where_a_quarter_of_them_have_too_few_samples(holes):
+    """A part of the cycles has a fifth of the samples; half of the median are enough. They are doubled until then."""
+    time = np.arange(400 * 40) / 40.0
+    thin = np.arange(400) % 20 < 20 * holes
+    kept = ~thin[(time + 1e-9).astype(int)] | (np.arange(time.size) % 5 == 0)
+    samples = np.bincount((time[kept] + 1e-9).astype(int))[::-1]
+    sums = {cycles: samples[: 400 // cycles * cycles].reshape(-1, cycles).sum(axis=1) for cycles in (1, 2, 4, 8)}
+    shares = {cycles: np.mean(each >= 0.5 * np.median(each)) for cycles, each in sums.items()}
+    every = steadiness.windows(time[kept], np.cos(2 * np.pi * time[kept])[None], 1.0)
+    assert every.cycles == next(cycles for cycles, share in shares.items() if share >= 0.75)
 
 
 @pytest.mark.parametrize("driven", [True, False])

@@ -1,6 +1,7 @@
 """Checks of an estimate: made by `map_estimate` or afterwards, and what an estimate without them says."""
 
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -9,8 +10,9 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic.estimation import check as checks_of
 from bayesperiodic.estimation import map_estimate as estimates
+from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.result import FitCheck
-from tests.known import LINEAR, linear_experiment
+from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 from tests.problems import DUFFING_PRIORS, duffing_run
 
 LINES = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}
@@ -109,3 +111,16 @@ def test_an_estimate_is_read_back_with_and_without_checks(tmp_path, made):
     fit.save(tmp_path / "fit.h5")
     again = bp.load(tmp_path / "fit.h5")
     assert again.theta == fit.theta and (again.checks is None) != made and str(again) == str(fit)
+
+
+def test_change_of_the_residuals_is_in_units_of_the_noise():
+    """Of a model that is linear in its parameters |X Δθ|/σ; infinite where a solve fails."""
+    run = linear_experiment(np.array([900.0, 40.0, 25.0]), 3.0, seed=1)
+    problem = bp.Problem(LINEAR, [run], priors=LINES, fixed={"variance[force]": 9.0})
+    theta, step = np.array([850.0, 30.0, 20.0]), np.array([-20.0, 3.0, 1.0])
+    here = problem.anchored(theta).density().linearise(theta)
+    design = linear_regressors(0.05, 2.0, grid(40))
+    change = checks_of._data_change(problem, Iterate(theta, here, np.array([9.0]), 0.0), theta + step)
+    assert change == pytest.approx(np.linalg.norm(design @ step) / 3.0, rel=1e-6)
+    failed = SimpleNamespace(here=SimpleNamespace(moved=lambda _: SimpleNamespace(converged=False)))
+    assert checks_of._data_change(problem, failed, theta) == np.inf

@@ -149,6 +149,9 @@ def test_freedom_of_a_measured_variance_is_that_of_its_harmonics_together():
     by_cycles = bp.Experiment("run", 1.0, amplitude_variance=variance, **given)
     assert measured_freedom(by_cycles, "x") == pytest.approx(18.0)
     assert measured_freedom(bp.Experiment("run", 1.0, scatter={"x": 0.1}, **given), "x") == 20
+    for cycles, expected in ((2, 4.5), (1, np.inf)):  # 9/(1/1 + 1/2 + 1/2) of two cycles
+        few = bp.Experiment("run", 1.0, amplitude_variance=variance, **given | {"cycles": cycles})
+        assert measured_freedom(few, "x") == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("behind", [4.0, 20.0])

@@ -186,6 +186,21 @@ def test_row_without_a_date_is_missing_and_those_after_it_are_not(write):
     assert read(write(rows), missing="drop") == ([0.0, 3600.0, 10_800.0, 14_400.0], [0.0, 1.0, 3.0, 4.0])
 
 
+@pytest.mark.parametrize("mac", [False, True])
+def test_dates_that_are_stored_as_texts_of_iso_8601_are_read(tmp_path, mac):
+    """Of all cells, or of some, among others that are numbers of days."""
+    start, path = datetime.datetime(2026, 3, 12, 10, 0, 0), tmp_path / "run.xlsx"
+    book = openpyxl.Workbook()
+    book.iso_dates, book.epoch = True, openpyxl.utils.datetime.CALENDAR_MAC_1904 if mac else book.epoch
+    sheet = book.active
+    for row in [["t", "x"], *([start + datetime.timedelta(seconds=0.5 * k * k), float(k)] for k in range(5))]:
+        sheet.append(row)
+    sheet["A3"] = (start + datetime.timedelta(seconds=0.5) - book.epoch) / datetime.timedelta(days=1)
+    sheet["A3"].number_format = "yyyy-mm-dd h:mm:ss"
+    book.save(path)
+    assert read(path) == ([0.0, 0.5, 2.0, 4.5, 8.0], [0.0, 1.0, 2.0, 3.0, 4.0])
+
+
 def test_row_of_the_names_may_be_given(write):
     rows = [["a", "b"], ["t", "x"], [0, 1.5], [1, 2.5]]
     assert read(write(rows), header=2) == ([0.0, 1.0], [1.5, 2.5])
@@ -272,6 +287,23 @@ def test_row_of_units_is_seen_wherever_it_stands(write, rows, line):
 def test_rows_of_texts_that_may_be_units_are_refused(write, rows, line):
     with pytest.raises(ValueError, match="header: must be"):
         bp.inspect(write([*rows, [0, 1, 2], [1, 2, 3]]), header=line)
+
+
+@pytest.mark.parametrize(
+    "names, suggested",
+    [
+        (["x", "t", "y"], "t"), (["x", "y", "z"], None), (["Time", "t", "x"], "Time"), (["x", "time (s)", "t"], "t"),
+        (["x", "note", "date"], "date"),
+    ],
+)  # fmt: skip
+def test_time_is_the_first_column_of_its_name_that_changes(write, names, suggested):
+    """The values of "time (s)" are all one, those of "note" texts."""
+    cell_of = {"time (s)": lambda k: 7, "note": lambda k: "ok"}
+    rows = [names, *([cell_of.get(name, lambda k: 2 * k)(k) for name in names] for k in range(6))]
+    code = bp.inspect(write(rows)).code
+    assert (f"time={suggested!r}" in code) if suggested else ("time=" not in code)
+    # Of two sheets with times of their own, none is that of all.
+    assert "time=" not in bp.inspect(write({"one": rows, "two": rows})).code
 
 
 @pytest.mark.parametrize("line", [None, 0, 1])

@@ -75,6 +75,9 @@ def test_columns_of_values_have_them_in_half_of_their_cells():
     assert excel._table(half, None).first == 1
     table = excel._table([("t", "x")] + [(float(k), "OL" if k % 3 else 1.0) for k in range(30)], None)
     assert table.names == ["t", "x"] and table.first == 1
+    # Notes are none, although a third of them are numbers: the first row is one of the table.
+    notes = [(float(k), *(("ok", "ok") if k % 3 else (1.0, 2.0))) for k in range(1, 31)]
+    assert excel._table([("t", "a", "b"), *notes], None).first == 1
 
 
 @pytest.mark.parametrize(

@@ -57,10 +57,10 @@ def test_tables_are_ten_times_as_long_as_wide_and_have_64_columns_at_most(make, 
 
 def test_fields_of_structures_are_columns(make):
     kind = [
+        ("name", "S3"),
         ("t", "f8"),
         ("x", "i4", (2,)),
         ("one", "f4", (1,)),
-        ("name", "S3"),
         ("wide", "f8", (65,)),
         ("cube", "f8", (2, 2)),
     ]

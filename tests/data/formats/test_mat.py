@@ -77,6 +77,63 @@ def test_fields_of_structures_of_version_7_3(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "kind, values, stored, reason",
+    [
+        ("double", np.arange(6.0).reshape(2, 3), {}, None), ("logical", np.array([[1, 0, 1]], dtype="u1"), {}, None),
+        ("int16", np.array([[1, -2]], dtype="i2"), {}, None), (None, np.arange(4.0)[None], {}, None),
+        ("double", np.array([0, 5], dtype="u8"), {"MATLAB_empty": np.uint8(1)}, "but double"),
+        ("char", np.array([[97, 98]], dtype="u2"), {"MATLAB_int_decode": 2}, "but char"),
+        ("cell", np.array([[1, 2]], dtype="u8"), {}, "but cell"),
+    ],
+)  # fmt: skip
+def test_variables_of_version_7_3_are_transposed_and_of_numbers(tmp_path, kind, values, stored, reason):
+    """HDF5 has the dimensions of MATLAB in reverse order; of an empty array it has the size in place of the values."""
+    with h5py.File(tmp_path / "run.mat", "w", userblock_size=512) as file:
+        file["a/x"], file["x"] = values, values
+        for one in (file["x"], file["a/x"]):
+            one.attrs.update(({"MATLAB_class": np.bytes_(kind)} if kind else {}) | stored)
+    channels = mat.contents(tmp_path / "run.mat", []).channels
+    assert [(one.name, one.samples) for one in channels if one.samples] == [("x", values.size), ("a.x", values.size)]
+    for one in channels:
+        if reason or one.name == "a":
+            with pytest.raises(ValueError, match=f"its variable 'x' is empty or no array of numbers, {reason}|'a'"):
+                one.values()
+        else:
+            assert np.array_equal(one.values(), values.T)
+
+
+@pytest.mark.parametrize("filled", [True, False])
+def test_sparse_matrices_of_version_7_3_are_those_of_scipy(tmp_path, filled):
+    """By columns: starts, rows and values, of which an empty matrix has the starts only."""
+    matrix = scipy.sparse.random(7, 5, 0.4 if filled else 0.0, "csc", random_state=1)
+    with h5py.File(tmp_path / "run.mat", "w", userblock_size=512) as file:
+        for path in ("A", "data/A"):
+            group = file.create_group(path)
+            group["jc"] = matrix.indptr.astype("u8")
+            if filled:
+                group["ir"], group["data"] = matrix.indices.astype("u8"), matrix.data
+            group.attrs.update({"MATLAB_class": np.bytes_("double"), "MATLAB_sparse": np.uint64(7)})
+        file["data/t"], file["z"] = TIME, TIME
+    channels = {one.name: one for one in mat.contents(tmp_path / "run.mat", []).channels if one.samples}
+    assert {name: one.samples for name, one in channels.items()} == {"A": 35, "data.A": 35, "data.t": 50, "z": 50}
+    for name in ("A", "data.A"):
+        assert np.array_equal(channels[name].values(), matrix.toarray())
+
+
+def test_an_empty_field_does_not_hide_those_after_it(tmp_path):
+    """Of a structure, an empty field is a matrix without content; also as the only member of a structure in it."""
+    matrix = lambda name, kind, parts: element(  # noqa: E731
+        14, element(6, struct.pack("<II", kind, 0)) + element(5, struct.pack("<ii", 1, 1)) + element(1, name) + parts
+    )
+    fields = element(5, struct.pack("<i", 2)) + element(1, b"a\0b\0")
+    inner = matrix(b"", 2, fields + element(14, b"") + matrix(b"", 6, element(9, struct.pack("<d", 2.5))))
+    content = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H2s", 0x0100, b"IM")
+    (tmp_path / "run.mat").write_bytes(content + matrix(b"s", 2, fields + element(14, b"") + inner))
+    _, value = mat.contents(tmp_path / "run.mat", []).channels
+    assert (value.name, value.samples, value.values().tolist()) == ("s.b.b", 1, [[2.5]])
+
+
+@pytest.mark.parametrize(
     "kind, typed",
     [
         ("table", "s = table2struct(T, 'ToScalar', true)"), ("timetable", "seconds(T.Properties.RowTimes"),

@@ -7,16 +7,19 @@ import zlib
 import numpy as np
 import pytest
 
-from bayesperiodic.data.formats import mdf_blocks
+from bayesperiodic.data.formats import mdf, mdf_blocks
 from tests.data.formats.test_mdf import (
     F8,
+    FLOAT,
     LINEAR,
     MASTER,
     TIME,
+    UNSIGNED,
     Blocks,
     X,
     channel,
     conversion,
+    group,
     header,
     read,
     refused,
@@ -254,3 +257,30 @@ def test_refusals_say_what_helps(tmp_path):
         tmp_path, bytes(content), r"it is not finalized: .* asammdf.MDF\(path\).save\(other\) writes a finalized one"
     )
     refused(tmp_path, version_3(order=">"), r"begin with the highest byte \(Motorola\), which asammdf does not read")
+
+
+@pytest.mark.parametrize(
+    "kind, converted, flags, kept",
+    [
+        (F8, False, 0, True), (F8, True, 0, False), (F8, False, 2, False), ((32, FLOAT), False, 0, False),
+        ((64, UNSIGNED), False, 0, False),
+    ],
+)  # fmt: skip
+def test_times_that_are_stored_as_they_are_are_read_with_a_channel(tmp_path, monkeypatch, kind, converted, flags, kept):
+    """And not once more, as that would take as long as a channel; other ones are converted when they are asked for."""
+    time = np.arange(200) if kind[1] == UNSIGNED else 1.0 + TIME
+    blocks, size = Blocks(), kind[0] // 8
+    scale = conversion(blocks, LINEAR, [0.0, 2.0]) if converted else 0
+    last = channel(blocks, 0, "x", "mm", F8, size)
+    first = channel(blocks, last, "t", "s", kind, 0, master=MASTER, sync=1, conversion=scale, flags=flags)
+    stored = time.astype({F8: "f8", (32, FLOAT): "f4", (64, UNSIGNED): "u8"}[kind])
+    table = np.rec.fromarrays([stored, X, np.zeros(200, "u1")], dtype=[("t", stored.dtype), ("x", "f8"), ("m", "u1")])
+    header(blocks, group(blocks, 0, first, size + 8, 200, table.tobytes(), invalid=1))
+    (tmp_path / "run.mf4").write_bytes(blocks.bytes())
+    (x,) = mdf.contents(tmp_path / "run.mf4", []).channels
+    assert np.array_equal(x.values(), X) and np.array_equal(x.values(), X)
+    read_again = []
+    values = mdf._values
+    monkeypatch.setattr(mdf, "_values", lambda *given: read_again.append(given) or values(*given))
+    assert np.array_equal(x.clock.times(200), stored * (2.0 if converted else 1.0))
+    assert bool(read_again) != kept

@@ -265,3 +265,28 @@ def test_a_field_without_end_is_refused_for_the_separator_that_was_given(write):
 def test_what_stands_in_square_brackets_beside_a_known_unit_is_one_that_the_user_must_explain(names, units):
     """In round brackets it may be an argument; a number is an index."""
     assert header_units.in_names(names, guessed=False) == (units, {})
+
+
+@pytest.mark.parametrize(
+    "name, unit, said",
+    [
+        ("x_mm", "", "mm"), ("v_mm_s", "", "mm/s"), ("a_mm_s2", "", "mm/s2"), ("v_mm_s", "m", ""), ("v_own_s", "", "s"),
+        ("x_one", "", ""), ("x" * 298 + "_mm", "", ""), ("x" * 297 + "_mm", "", "mm"), ("x_mm_kg", "", "kg"),
+    ],
+)  # fmt: skip
+def test_units_at_the_end_of_names_are_said_to_be_unused(name, unit, said):
+    """Of names up to 300 characters."""
+    assert header_units.unused(name, unit) == said
+    text = f"the name may say the unit {said!r}, which is not used; units= converts"
+    assert header_units.remarks(name, unit) == ((text,) if said else ())
+
+
+@pytest.mark.parametrize(
+    "cells, units",
+    [
+        (["N/A", "NaN", ""], None), (["N/A", "mm", ""], ["N/A", "mm", ""]), (["(s)", "[mm]"], ["s", "mm"]),
+        (["one", "two"], None), (["one", "two", "mm/s"], ["one", "two", "mm/s"]),
+    ],
+)  # fmt: skip
+def test_rows_of_units_have_known_ones_and_not_missing_values_alone(cells, units):
+    assert header_units.unit_row(cells) == units
