@@ -206,6 +206,22 @@ class Noise(ABC):
         """Whether `log_prior` of a variance is zero wherever it is."""
         return self.prior == JEFFREYS
 
+    def support(self, kind: str) -> tuple[float, float]:
+        """Return the ends of the prior's support of a noise parameter.
+
+        Parameters
+        ----------
+        kind : str
+            See `log_prior`.
+
+        Returns
+        -------
+        low, high : float
+        """
+        if kind not in self.shape_priors and not self.proper:
+            return 0.0, np.inf
+        return (self.shape_priors[kind] if kind in self.shape_priors else self._proper_prior).support
+
     def log_prior(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the log-density of noise parameters over their logarithms, and its derivative.
 

@@ -12,6 +12,8 @@ from bayesperiodic.likelihood.section_points import SCALE
 LOWEST_LOG_SCALE, HIGHEST_LOG_SCALE = 25.0, 8.0
 # The same for variances beside errors of the inputs, where smaller ones make the linearisation ill-conditioned.
 LOWEST_BESIDE_INPUTS = 14.0
+# Distance from the end of a prior's support, in logarithms.
+WITHIN = 1e-12
 # Difference of log-densities that is none.
 FLAT = 1e-11
 
@@ -88,7 +90,12 @@ def _maximise(
 
     middle = np.log(centre[free])
     lowest = LOWEST_BESIDE_INPUTS if part.shared else LOWEST_LOG_SCALE
-    bounds = [(c - lowest, c + HIGHEST_LOG_SCALE) for c in middle]
+    with np.errstate(divide="ignore"):
+        ends = np.log(part.supports[free])
+    # Rounding must not leave the support.
+    ends += np.where(np.isfinite(ends), [WITHIN, -WITHIN], 0.0)
+    middle = np.clip(middle, *ends.T)
+    bounds = list(np.clip(np.stack([middle - lowest, middle + HIGHEST_LOG_SCALE], axis=1), *ends.T[..., None]))
     here = np.clip(np.log(start[free]), *np.transpose(bounds))
     optimum = minimize(
         negative,

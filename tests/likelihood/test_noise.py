@@ -318,6 +318,20 @@ def test_the_scale_belongs_to_the_points_and_not_to_the_multipliers():
     assert four - one == pytest.approx(-0.5 * (3 * np.log(4.0) + square / 4.0 - square), rel=1e-9)
 
 
+@pytest.mark.parametrize("size, expected", [(1e-3, 0.5), (1.0, 1.0), (30.0, 2.0)])
+@pytest.mark.parametrize("prior", [bp.LogUniform(0.5, 2.0), stats.loguniform(0.5, 2.0)])
+@pytest.mark.parametrize("start", [1e-6, 1.0, 1e6])
+def test_a_variance_stays_within_the_support_of_its_prior(prior, size, expected, start):
+    """Residuals of one variance: the maximum of v^(−n/2)·exp(−n·s/(2v)) within the support is the nearest value to s."""
+    likelihood = Likelihood(noise.Independent(prior=prior), [block()], {})
+    residuals = [np.sqrt(size) * np.ones(likelihood.blocks[0].size)]
+    unbound = estimate_noise(Likelihood(noise.Independent(), [block()], {}), residuals, np.ones(1), 1.0)
+    residuals = [residuals[0] * np.sqrt(size / unbound[0])]
+    (variance,) = estimate_noise(likelihood, residuals, np.array([start]), 1.0)
+    assert variance == pytest.approx(expected, rel=1e-6)
+    assert np.isfinite(likelihood.log_prior(np.array([variance])))
+
+
 MODELS = [
     noise.Independent(prior="flat"),
     noise.Independent(prior=bp.InverseGamma(3.0, 2.0)),
