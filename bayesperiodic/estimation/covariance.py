@@ -262,7 +262,9 @@ def _worth(problem: Problem, estimate: Iterate, variance: str, one: float) -> fl
     if not noise.proper:
         return -one * noise.spare
     ends = estimate.noise[likelihood.names.index(variance)] * np.exp(np.array([-VARIANCE_STEP, VARIANCE_STEP]))
-    slopes = noise.log_prior_of_total(VARIANCE, ends, likelihood.measured[variance])[1]
+    density, slopes = noise.log_prior_of_total(VARIANCE, ends, likelihood.measured[variance])
+    if not np.all(np.isfinite(density)):
+        return np.inf  # the end of the support holds it
     return -float(slopes.sum() + (slopes[1] - slopes[0]) / VARIANCE_STEP)
 
 

@@ -149,6 +149,19 @@ def test_known_variances_leave_nothing_uncertain():
     assert (high - low) / 2 / fit.sd["a"] == pytest.approx(1.6449, rel=1e-4)
 
 
+@pytest.mark.parametrize("value", [1e-6, 1e4])
+def test_a_variance_at_the_end_of_its_support_is_known(value):
+    """The estimate is that with the variances fixed there."""
+    low, high = (1e-9, value) if value < 1.0 else (value, 1e9)
+    fit, _ = fitted(APART, experiment(APART, 6, (2, 9)), noise=noise.Independent(prior=bp.LogUniform(low, high)))
+    known, _ = fitted(APART, experiment(APART, 6, (2, 9)), fixed={"variance[A]": value, "variance[B]": value})
+    assert fit.noise == pytest.approx({"variance[A]": value, "variance[B]": value}, rel=1e-9)
+    assert np.all(np.isinf(list(fit.degrees_of_freedom.values())))
+    for name in "ab":
+        assert fit.theta[name] == pytest.approx(known.theta[name], rel=1e-7, abs=1e-12)
+        assert fit.sd[name] == pytest.approx(known.sd[name], rel=1e-5)
+
+
 def test_the_correction_has_settled():
     """At the estimate it is again that with which the estimate was found."""
     fit, problem = fitted(TOGETHER, experiment(TOGETHER, 7, (2, 6)))
