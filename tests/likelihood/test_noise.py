@@ -322,7 +322,7 @@ def test_the_scale_belongs_to_the_points_and_not_to_the_multipliers():
 @pytest.mark.parametrize("prior", [bp.LogUniform(0.5, 2.0), stats.loguniform(0.5, 2.0)])
 @pytest.mark.parametrize("start", [1e-6, 1.0, 1e6])
 def test_a_variance_stays_within_the_support_of_its_prior(prior, size, expected, start):
-    """Residuals of one variance: the maximum of v^(−n/2)·exp(−n·s/(2v)) within the support is the nearest value to s."""
+    """Residuals of one variance s: the maximum of v^(−n/2)·exp(−n·s/(2v)) within the support is nearest to s."""
     likelihood = Likelihood(noise.Independent(prior=prior), [block()], {})
     residuals = [np.sqrt(size) * np.ones(likelihood.blocks[0].size)]
     unbound = estimate_noise(Likelihood(noise.Independent(), [block()], {}), residuals, np.ones(1), 1.0)

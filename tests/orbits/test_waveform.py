@@ -46,12 +46,15 @@ def clean_motions():
 
 
 @cache
-def double_well_orbits(seed=0, steps=1):
-    """Return the orbits in recordings of displacement, rate and drive in pieces that do not follow each other."""
+def double_well_orbits(seed=0, steps=1, reaction=0.0):
+    """Return the orbits in recordings of displacement, rate and drive in pieces that do not follow each other.
+
+    The drive is measured with `reaction` times the square of the displacement.
+    """
     x, y, times = clean_motions()
     generator, pieces = np.random.default_rng([seed, 3]), []
     for k in range(PIECES):
-        signals = {"x": x[k], "y": y[k], "u": 0.3 * np.cos(OMEGA * times)}
+        signals = {"x": x[k], "y": y[k], "u": 0.3 * np.cos(OMEGA * times) + reaction * x[k] ** 2}
         noisy = {name: s + NOISE[name] * generator.standard_normal(s.size) for name, s in signals.items()}
         outputs = {"y": noisy["y"], "x": noisy["x"]}
         pieces.append(bp.Recording(times + k * (PIECE + 1) * PERIOD, outputs, {"u": noisy["u"]}))
@@ -136,6 +139,24 @@ def test_inputs_have_waveforms_at_the_same_phases():
         np.testing.assert_allclose(run.inputs["u"], 0.3 * np.cos(OMEGA * run.time), atol=largest)
         assert largest < 0.005
         np.testing.assert_allclose(run.guess["x"][:: 160 // 16], orbit.waveform.values["x"][::4], atol=0.02)
+
+
+@pytest.mark.parametrize("reaction", [0.0, 0.01])
+def test_inputs_have_as_little_noise_as_their_reaction_to_the_motion_allows(reaction):
+    """Without reaction the means of 2,560 periods in place of those of some 100 neighbours."""
+    squares, relative = [], []
+    for orbit in double_well_orbits(0, 2, reaction)[1]:
+        truth = true_orbit(orbit)
+        if truth is None or not np.abs(orbit.eigenvalues[0]) < 100:
+            continue
+        wave = orbit.waveform
+        phase = 2.0 * np.pi * np.arange(truth.shape[1]) * orbit.period / truth.shape[1]
+        error = wave.values["u"] - 0.3 * np.cos(phase) - reaction * truth[0] ** 2
+        squares.append(np.mean(error**2))
+        relative.append(np.mean((error / wave.sd["u"]) ** 2))
+    assert len(squares) >= 10
+    assert np.sqrt(np.mean(squares)) < (0.06 if reaction == 0.0 else 0.3) * NOISE["u"]
+    assert 0.4 < np.sqrt(np.mean(relative)) < 2.0
 
 
 def test_the_motion_after_a_point_is_evaluated_once(monkeypatch):
