@@ -2,7 +2,8 @@
 
 A closed point has neighbours in the section, and the motion of each until the next point is measured. A polynomial like
 that of the return map, with the same neighbours, weights and correction for noise, is fitted to this motion at many
-phases, a linear one for inputs; its value at the closed point is the orbit's waveform from there to its next point.
+phases; its value at the closed point is the orbit's waveform from there to its next point. Those of inputs are linear,
+with more neighbours.
 """
 
 from collections.abc import Iterable, Mapping
@@ -16,6 +17,7 @@ from scipy.special import chdtri
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Storable
+from bayesperiodic._linalg import TINY
 from bayesperiodic.orbits.coordinates import SHORT_RETURN, columns_of, integrand_of
 from bayesperiodic.orbits.cycles import REFINING_DEGREE, WIDENED, ClosingFits, CycleFits, Runs, close, errors_by_run
 from bayesperiodic.orbits.return_map import Regression, ReturnMap
@@ -72,14 +74,16 @@ class Waveform(Storable):
         Errors that the channels and phases have in common, each one standard deviation, independent of each other: of
         the closed points, propagated by the slopes of the regression, and of the regression.
     bias : array (channels, parts)
-        Root mean square of the estimated bias after each point: a part is a forcing period, or a step of `find_orbits`.
+        Root mean square of the bias that may remain after each point: a part is a forcing period, or a step of
+        `find_orbits`.
     noise : array (channels, samples·period)
         Standard deviation of further errors, which are independent at 16 phases a forcing period.
 
     Notes
     -----
-    The bias is estimated from the difference to wider neighbourhoods. It is not subtracted, and its course over the
-    phases is not used: errors of its size in each channel, after each point, may be any polynomial of degree two.
+    The bias of outputs is estimated from the differences to wider and to narrower neighbourhoods, and subtracted. What
+    remains may be any polynomial of degree two in each channel, after each point, of the size of `bias`, a fifth of the
+    difference to wider neighbourhoods.
 
     Examples
     --------
@@ -315,10 +319,11 @@ def _widest(following: Following, maps: ReturnMap, fits: CycleFits, at: list[np.
             fit = regressions.fit(fits.narrow.points[j], j, width, influence=False)
             value, gain = fit.value[::each], np.sum(fit.weights**2, axis=0)
             limit = chdtri(value.size, INPUTS_DIFFER)
-            if any(np.sum((value - v) ** 2 / (variance * g)) > limit for v, g in tried):
+            if any(np.sum((value - v) ** 2 / np.maximum(variance * g, TINY)) > limit for v, g in tried):
                 break
             tried.append((value, gain))
-            if fit.neighbours.size == maps.count:
+            # Those of a width of the size of the attractor are all.
+            if fit.neighbours.size >= maps.count or width > 1.0:
                 break
             width *= WIDENED
         bandwidths[j] *= WIDENED ** max(len(tried) - 2, 0)
