@@ -263,9 +263,8 @@ def _worth(problem: Problem, estimate: Iterate, variance: str, one: float) -> fl
         return -one * noise.spare
     ends = estimate.noise[likelihood.names.index(variance)] * np.exp(np.array([-VARIANCE_STEP, VARIANCE_STEP]))
     density, slopes = noise.log_prior_of_total(VARIANCE, ends, likelihood.measured[variance])
-    if not np.all(np.isfinite(density)):
-        return np.inf  # the end of the support holds it
-    return -float(slopes.sum() + (slopes[1] - slopes[0]) / VARIANCE_STEP)
+    inside = np.isfinite(density).all()  # the end of a support holds a variance
+    return -float(slopes.sum() + (slopes[1] - slopes[0]) / VARIANCE_STEP) if inside else np.inf
 
 
 # Values tried of the first parameter of a spectrum's shape and of any other, between these quantiles of their priors.

@@ -249,14 +249,6 @@ class Likelihood:
             total = total + 0.5 * np.log(np.add.reduce(share * share, axis=-1) / added.size)
         return total
 
-    @cached_property
-    def supports(self) -> np.ndarray:
-        """Ends of the priors' supports of the noise parameters, (names, 2); those of fixed ones are not read."""
-        result = np.tile([0.0, np.inf], (len(self.names), 1))
-        for kind, columns, _ in self._kinds:
-            result[columns] = self.model.support(kind)
-        return result
-
     def _mean_variance(self, b: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean variance (…,) of a block's components, and the part proportional to its parameter."""
         return self.blocks[b].mean_variance(self.model, values[..., self._columns[b]])

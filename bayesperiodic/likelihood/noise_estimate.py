@@ -90,8 +90,9 @@ def _maximise(
 
     middle = np.log(centre[free])
     lowest = LOWEST_BESIDE_INPUTS if part.shared else LOWEST_LOG_SCALE
+    kinds = [VARIANCE if name.startswith(SCALE) else name.partition("[")[0] for name in part.free]
     with np.errstate(divide="ignore"):
-        ends = np.log(part.supports[free])
+        ends = np.log([part.model.support(kind) for kind in kinds])
     # Rounding must not leave the support.
     ends += np.where(np.isfinite(ends), [WITHIN, -WITHIN], 0.0)
     middle = np.clip(middle, *ends.T)

@@ -78,7 +78,7 @@ class CycleFits(NamedTuple):
     wide: ClosingFits
 
 
-class Runs(NamedTuple):
+class PairRuns(NamedTuple):
     """Pairs of points in some fits, and the run of each.
 
     Consecutive pairs share the noise of a point. Errors are summed over runs of consecutive pairs, and are independent
@@ -89,7 +89,7 @@ class Runs(NamedTuple):
     run: np.ndarray  # (n,)
 
     @classmethod
-    def of(cls, maps: ReturnMap, *fits: LocalFit | Regression) -> "Runs":
+    def of(cls, maps: ReturnMap, *fits: LocalFit | Regression) -> "PairRuns":
         """Return the runs in fits."""
         pairs = np.unique(np.concatenate([maps.positions[fit.neighbours].ravel() for fit in fits]))
         return cls(pairs, np.concatenate([[0], np.cumsum(np.diff(pairs) > 1)]))
@@ -353,11 +353,11 @@ def _eigenvectors(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _joint_covariance(maps: ReturnMap, fit: LocalFit) -> np.ndarray:
     """Return the joint covariance of the points of a cycle and of log|eigenvalue|, by the delta method."""
-    errors = errors_by_run(maps, fit, Runs.of(maps, fit))
+    errors = errors_by_run(maps, fit, PairRuns.of(maps, fit))
     return errors.T @ errors
 
 
-def errors_by_run(maps: ReturnMap, fit: LocalFit, runs: Runs) -> np.ndarray:
+def errors_by_run(maps: ReturnMap, fit: LocalFit, runs: PairRuns) -> np.ndarray:
     """Return the errors (runs, d·p + d) of the points of a cycle and of log|eigenvalue|."""
     jacobian, d = fit.jacobian, fit.value.shape[1]
     by_value = -np.linalg.inv(_closing_matrix(jacobian[None])[0])

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesperiodic.orbits.cycles import REFINING_DEGREE, VALUE_GROWTH, Estimate, Runs, errors_by_run
+from bayesperiodic.orbits.cycles import REFINING_DEGREE, VALUE_GROWTH, Estimate, PairRuns, errors_by_run
 from bayesperiodic.orbits.return_map import ReturnMap
 from bayesperiodic.orbits.section import PoincareSection
 
@@ -45,7 +45,7 @@ def return_times_of(section: PoincareSection, maps: ReturnMap, estimate: Estimat
         maps.regress(estimate.points, phases, one.bandwidths, REFINING_DEGREE, signals, size)
         for one in (fits.narrow, fits.wide)
     )
-    runs = Runs.of(maps, fits.narrow.fit, fits.wide.fit)
+    runs = PairRuns.of(maps, fits.narrow.fit, fits.wide.fit)
     by_run, d = errors_by_run(maps, fits.narrow.fit, runs), estimate.points.shape[1]
     errors = np.stack(
         [

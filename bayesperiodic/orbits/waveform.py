@@ -19,7 +19,7 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Storable
 from bayesperiodic._linalg import TINY
 from bayesperiodic.orbits.coordinates import SHORT_RETURN, columns_of, integrand_of
-from bayesperiodic.orbits.cycles import REFINING_DEGREE, WIDENED, ClosingFits, CycleFits, Runs, close, errors_by_run
+from bayesperiodic.orbits.cycles import REFINING_DEGREE, WIDENED, ClosingFits, CycleFits, PairRuns, close, errors_by_run
 from bayesperiodic.orbits.return_map import Regression, ReturnMap
 from bayesperiodic.orbits.return_times import ReturnTimes
 from bayesperiodic.orbits.section import CYCLE_SAMPLES, PoincareSection
@@ -48,8 +48,8 @@ INDEPENDENT = 16
 # The bias of cubic polynomials is proportional to the fourth power of the bandwidth; a third or fifth power leaves 0.21
 # or 0.12 of the difference. Inputs depend little on the motion, and are taken as exact in fits: linear polynomials have
 # less noise, and nothing is subtracted; their bias is proportional to the second power.
-OUTPUTS = _Polynomials(REFINING_DEGREE, 1.0 / (WIDENED ** (REFINING_DEGREE + 1) - 1.0), 0.2)
-INPUTS = _Polynomials(1, 0.0, 1.0 / (WIDENED**2 - 1.0))
+OF_OUTPUTS = _Polynomials(REFINING_DEGREE, 1.0 / (WIDENED ** (REFINING_DEGREE + 1) - 1.0), 0.2)
+OF_INPUTS = _Polynomials(1, 0.0, 1.0 / (WIDENED**2 - 1.0))
 # Probability that the squared differences of inputs of two neighbourhoods are larger by noise.
 INPUTS_DIFFER = 1e-3
 # Degree of polynomials of errors of the size of the bias, over a part of the period.
@@ -262,10 +262,10 @@ def waveform_of(
     count = len(fits.narrow.points)
     order = (np.arange(count) + maps.steps * shift) % count
     phases = following.phases(times, order)
-    groups = [_group(following, maps, fits, phases, order, times, following.outputs, OUTPUTS)]
+    groups = [_group(following, maps, fits, phases, order, times, following.outputs, OF_OUTPUTS)]
     if following.inputs:
         of_inputs = _widest(following, maps, fits, phases)
-        groups.append(_group(following, maps, of_inputs, phases, order, None, following.driven, INPUTS))
+        groups.append(_group(following, maps, of_inputs, phases, order, None, following.driven, OF_INPUTS))
     motion, bias, noise = (np.concatenate(some) for some in list(zip(*groups, strict=True))[:3])
     errors = np.zeros((sum(len(one.errors) for one in groups), *motion.shape))
     row = column = 0
@@ -276,7 +276,7 @@ def waveform_of(
     return Waveform(dict(zip(following.channels, motion, strict=True)), following.inputs, errors, bias, noise)
 
 
-class _Group(NamedTuple):
+class _ChannelGroup(NamedTuple):
     """Waveforms of some channels."""
 
     motion: np.ndarray  # (channels, samples)
@@ -288,7 +288,7 @@ class _Group(NamedTuple):
 def _group(
     following: Following, maps: ReturnMap, fits: CycleFits, phases: list[np.ndarray], order: np.ndarray,
     times: ReturnTimes | None, columns: slice, how: _Polynomials,
-) -> _Group:  # fmt: skip
+) -> _ChannelGroup:  # fmt: skip
     every = _Regressions(following, maps, phases, columns, how).parts(fits)
     parts = [every[j] for j in order]
     motion = np.concatenate([part.values for part in parts])
@@ -301,7 +301,7 @@ def _group(
     gains = np.concatenate([np.tile(part.gain[:, None], len(part.values)) for part in parts], axis=1)
     noise = np.sqrt(np.maximum(rest[:, None], following.variance[columns, None] * gains))
     squares = np.concatenate([part.bias**2 for part in parts]).reshape(order.size, following.count, -1)
-    return _Group(motion.T, np.sqrt(squares.mean(axis=1)).T, noise, common)
+    return _ChannelGroup(motion.T, np.sqrt(squares.mean(axis=1)).T, noise, common)
 
 
 def _widest(following: Following, maps: ReturnMap, fits: CycleFits, at: list[np.ndarray]) -> CycleFits:
@@ -310,7 +310,7 @@ def _widest(following: Following, maps: ReturnMap, fits: CycleFits, at: list[np.
     They are one step narrower than the widest whose inputs agree with those of all narrower ones: inputs depend little
     on the motion, so that more neighbours have less noise and no more bias.
     """
-    regressions = _Regressions(following, maps, at, following.driven, INPUTS)
+    regressions = _Regressions(following, maps, at, following.driven, OF_INPUTS)
     bandwidths, variance = fits.narrow.bandwidths.copy(), following.variance[following.driven]
     for j, places in enumerate(at):
         tried: list[tuple[np.ndarray, np.ndarray]] = []
@@ -363,7 +363,7 @@ class _Regressions:
     def parts(self, fits: CycleFits) -> list[_MotionPart]:
         """Return the motion from each point to the next one."""
         narrow, wide = (self.fits(cycle) for cycle in fits)
-        runs = Runs.of(self.maps, *(cycle.fit for cycle in fits), *narrow, *wide)
+        runs = PairRuns.of(self.maps, *(cycle.fit for cycle in fits), *narrow, *wide)
         by_run, d = [errors_by_run(self.maps, cycle.fit, runs) for cycle in fits], fits.narrow.points.shape[1]
         differences, parts = self.differences(wide, narrow), []
         away = self.subtracted(fits, narrow, differences)

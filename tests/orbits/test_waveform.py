@@ -11,10 +11,10 @@ from scipy.stats import chi2
 
 import bayesperiodic as bp
 from bayesperiodic.orbits import find, waveform
-from bayesperiodic.orbits.cycles import Runs, errors_by_run
+from bayesperiodic.orbits.cycles import PairRuns, errors_by_run
 from bayesperiodic.orbits.return_map import Atlas, ReturnMap
 from bayesperiodic.orbits.stretches import windowed
-from bayesperiodic.orbits.waveform import INDEPENDENT, OUTPUTS, Following, _Regressions, mean_of_repeats
+from bayesperiodic.orbits.waveform import INDEPENDENT, OF_OUTPUTS, Following, _Regressions, mean_of_repeats
 from tests.orbits import chaos, wells
 from tests.orbits.test_find import coupled, map_section
 
@@ -251,11 +251,11 @@ def test_errors_of_the_motion_until_the_next_point_are_the_errors_of_that_point(
         angles=[], outputs=slice(None), sizes=np.ones(2),
     )  # fmt: skip
     monkeypatch.setattr(_Regressions, "subtracted", lambda *given: subtracted)
-    regressions = _Regressions(images, maps, [np.zeros(1)] * 2, images.outputs, OUTPUTS)
+    regressions = _Regressions(images, maps, [np.zeros(1)] * 2, images.outputs, OF_OUTPUTS)
     checked = 0
     for _, estimate in find._chained(maps, Atlas(maps, find._search_count(maps, 32)), 2, 32):
         fits = estimate.fits
-        runs = Runs.of(maps, *(fit.fit for fit in fits))
+        runs = PairRuns.of(maps, *(fit.fit for fit in fits))
         narrow, wide = (errors_by_run(maps, fit.fit, runs) for fit in fits)
         errors = narrow + subtracted * (narrow - wide)
         points = fits.narrow.points + subtracted * (fits.narrow.points - fits.wide.points)
