@@ -999,6 +999,8 @@ def measured_chaos():
         ran = f"{100 * alone:.2f} % | {one['left']} of {one['runs']}"
         yield f"| {one['degree']} | {one['orbits']} of {len(used)} | {left[0]} | {left[1]} | {ran} |"
     for degree, terms in given["missing"].items():
+        if not terms:
+            yield f"model of degree {degree} it names no term"
         for term, _, place in (text.partition(" in ") for text in terms):
             yield f"model of degree {degree} it names `{term}` in the {place}"
     for orbit in used:
