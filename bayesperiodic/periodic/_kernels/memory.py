@@ -93,18 +93,44 @@ def hardly_forgets(out, variables, at, flow):
     return False
 
 
+@njit("float64(float64[:], int64, float64)", **MEMORY_OPTIONS)
+def between(values, i, part):
+    """Return periodic values a part of a step after point i − 1, by the cubic polynomial through four points."""
+    points = values.size
+    v0, v1, v2, v3 = values[i - 2], values[i - 1], values[i], values[(i + 1) % points]
+    a, b, c = part + 1.0, part - 1.0, part - 2.0
+    return -v0 * part * b * c / 6.0 + v1 * a * b * c / 2.0 - v2 * a * part * c / 2.0 + v3 * a * part * b / 6.0
+
+
 @njit("float64(float64[:], float64[:])", **MEMORY_OPTIONS)
 def centre(values, rates):
-    """Return the mean of periodic values at the points where the state turns; of all at rest.
+    """Return a mean of periodic values at the points where a state with these rates turns; of all at rest.
 
-    Where a joint does not slide, its force is elastic, and the slip of its ideal law leaves the mean at the middle of
-    the two ends of the motion.
+    Where a joint does not slide, its force is elastic, and slips of its law in proportion to force times distance, as
+    Dahl's does, leave the state s with the mean c of which ∮ (s − c) |ds| = 0. It is the mean of the turning points
+    with the weights ±(s − c), and so are its changes.
     """
-    points, total, count = values.size, 0.0, 0
+    points, turns, here = rates.size, 0, 0.0
+    at, part, place = np.empty(points, dtype=np.int64), np.empty(points), np.empty(points)
     for i in range(points):
-        if (rates[i] > 0.0) != (rates[i - 1] > 0.0):
-            total, count = total + 0.5 * (values[i] + values[i - 1]), count + 1
-    return total / count if count > 0 else values.mean()
+        before, after = rates[i - 1], rates[i]
+        if (after > 0.0) != (before > 0.0):
+            f = before / (before - after)
+            f = min(1.0, max(0.0, f + between(rates, i, f) / (before - after)))
+            at[turns], part[turns], place[turns] = i, f, here + (before + 0.5 * (after - before) * f) * f
+            turns += 1
+        here += (13.0 * (before + after) - rates[i - 2] - rates[(i + 1) % points]) / 24.0
+    length = moment = 0.0
+    for k in range(turns):
+        last = place[(k + turns - 1) % turns]
+        length, moment = length + abs(place[k] - last), moment + 0.5 * (place[k] + last) * abs(place[k] - last)
+    if length == 0.0:
+        return values.mean()
+    total = weights = 0.0
+    for k in range(turns):
+        weight = (place[k] - moment / length) * (1.0 if rates[at[k] - 1] > 0.0 else -1.0)
+        total, weights = total + weight * between(values, at[k], part[k]), weights + weight
+    return total / weights
 
 
 @njit(
