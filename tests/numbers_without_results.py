@@ -227,7 +227,7 @@ WITHOUT_RESULTS = {
             "are about 1.5 times those stated: of 20 recordings",
             "the 90 % regions of three parameters, which are known to 0.01 %",
         ),
-        SETTING: ("the tests are to find 90 %", "of ten simulated beams the 90 % regions"),
+        SETTING: ("the tests are to find 90 %",),
     },
     "docs/start/limit_cycles.md": {SETTING: ("below 10 mm",)},
     "docs/reference/elements.md": {
