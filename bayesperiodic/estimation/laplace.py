@@ -13,6 +13,7 @@ from bayesperiodic._io import Storable
 from bayesperiodic._linalg import covariance_eigh, hessian_eigh, hessian_scale, scaled
 from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.estimation.gauss_newton import NO_CURVATURE, Iterate, Objective, climb
+from bayesperiodic.likelihood.noise_estimate import log_supports
 from bayesperiodic.problem.description import Description
 
 if TYPE_CHECKING:
@@ -66,16 +67,22 @@ def _hessian(objective: Objective, mode: Iterate, free: list[int]) -> np.ndarray
     slopes = np.where(logs, mode.theta, 1.0)
     hessian = np.zeros((count + len(free), count + len(free)))
     hessian[:count, :count] = scaled(by_theta, slopes) - np.diag(np.where(logs, gradient * mode.theta, 0.0))
+    supports = log_supports(problem.likelihood) if free else np.empty((0, 2))
     for row, column in enumerate(free):
-        changes = []
-        for sign in (1.0, -1.0):
+        changes, here = [], np.log(mode.noise[column])
+        # Both ends of a step are within the support.
+        steps = np.array([1.0, -1.0]) + (here - NOISE_STEP < supports[row, 0]) - (here + NOISE_STEP > supports[row, 1])
+        for step in steps:
             noise = mode.noise.copy()
-            noise[column] *= np.exp(sign * NOISE_STEP)
+            noise[column] *= np.exp(step * NOISE_STEP)
             _, by_residual, by_noise = problem.likelihood.value_and_gradients(mode.here.residuals, noise)
             total = sum(mode.here.vjp(by_residual, adjoint=False).values())
             changes.append(np.concatenate([total * slopes, by_noise[free]]))
         hessian[count + row] = -(changes[0] - changes[1]) / (2.0 * NOISE_STEP)
         hessian[:count, count + row] = hessian[count + row, :count]
+        if steps.sum():
+            # The density falls exponentially from the end of the support.
+            hessian[count + row, count + row] += changes[0][count + row] ** 2
     return 0.5 * (hessian + hessian.T)
 
 

@@ -64,6 +64,13 @@ def estimate_noise(
     return values
 
 
+def log_supports(likelihood: Likelihood) -> np.ndarray:
+    """Return the ends of the priors' supports of the logarithms of the free noise parameters, (free, 2)."""
+    kinds = [VARIANCE if name.startswith(SCALE) else name.partition("[")[0] for name in likelihood.free]
+    with np.errstate(divide="ignore"):
+        return np.log(np.reshape([likelihood.model.support(kind) for kind in kinds], (-1, 2)))
+
+
 def _maximise(
     part: Likelihood,
     residuals: Sequence[np.ndarray],
@@ -90,9 +97,7 @@ def _maximise(
 
     middle = np.log(centre[free])
     lowest = LOWEST_BESIDE_INPUTS if part.shared else LOWEST_LOG_SCALE
-    kinds = [VARIANCE if name.startswith(SCALE) else name.partition("[")[0] for name in part.free]
-    with np.errstate(divide="ignore"):
-        ends = np.log([part.model.support(kind) for kind in kinds])
+    ends = log_supports(part)
     # Rounding must not leave the support.
     ends += np.where(np.isfinite(ends), [WITHIN, -WITHIN], 0.0)
     middle = np.clip(middle, *ends.T)

@@ -411,9 +411,7 @@ class _Regressions:
         if narrower is None:
             return 0.0
         inner = self.differences(narrow, self.fits(narrower, influence=False))
-        size = np.std(
-            np.concatenate([fit.value.reshape(d.shape) for fit, d in zip(narrow, inner, strict=True)]), axis=0
-        )
+        size = np.std(np.concatenate([fit.value for fit in narrow]), axis=0)
         one, other = (np.concatenate(some) / np.where(size > 0.0, size, 1.0) for some in (differences, inner))
         square, product = float(np.sum(one**2)), float(np.sum(one * other))
         if product <= 0.0:

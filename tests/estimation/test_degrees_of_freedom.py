@@ -162,6 +162,22 @@ def test_a_variance_at_the_end_of_its_support_is_known(value):
         assert fit.sd[name] == pytest.approx(known.sd[name], rel=1e-5)
 
 
+def test_draws_of_variances_at_the_end_of_their_support():
+    """The marginal density of u = ln v is exp(−νu/2 − S exp(−u)/2) from the end on, with ν = n − 1."""
+    run, bounds = experiment(APART, 6, (2, 9)), bp.LogUniform(1.0, 1e9)
+    free, _ = fitted(APART, run)
+    fit, problem = fitted(APART, run, noise=noise.Independent(prior=bounds))
+    assert np.all(np.diag(fit.joint_covariance) > 0.0)
+    posterior = bp.sample(problem, fit, progress=False, seed=1)
+    for name, freedom in (("variance[A]", 4), ("variance[B]", 18)):
+        u = np.log(posterior.draws(name))
+        assert u.min() > 0.0
+        grid = np.linspace(0.0, 20.0, 20_001)
+        density = np.exp(-0.5 * freedom * (grid + free.noise[name] * np.exp(-grid)))
+        mean = np.sum(grid * density) / np.sum(density)
+        assert np.mean(u) == pytest.approx(mean, rel=0.1)
+
+
 def test_the_correction_has_settled():
     """At the estimate it is again that with which the estimate was found."""
     fit, problem = fitted(TOGETHER, experiment(TOGETHER, 7, (2, 6)))

@@ -122,9 +122,11 @@ def test_sparse_matrices_of_version_7_3_are_those_of_scipy(tmp_path, filled):
 
 def test_an_empty_field_does_not_hide_those_after_it(tmp_path):
     """Of a structure, an empty field is a matrix without content; also as the only member of a structure in it."""
-    matrix = lambda name, kind, parts: element(  # noqa: E731
-        14, element(6, struct.pack("<II", kind, 0)) + element(5, struct.pack("<ii", 1, 1)) + element(1, name) + parts
-    )
+
+    def matrix(name, kind, parts):
+        head = element(6, struct.pack("<II", kind, 0)) + element(5, struct.pack("<ii", 1, 1)) + element(1, name)
+        return element(14, head + parts)
+
     fields = element(5, struct.pack("<i", 2)) + element(1, b"a\0b\0")
     inner = matrix(b"", 2, fields + element(14, b"") + matrix(b"", 6, element(9, struct.pack("<d", 2.5))))
     content = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H2s", 0x0100, b"IM")
