@@ -17,6 +17,7 @@ import ast
 import dataclasses
 import doctest
 import inspect
+import itertools
 import re
 import textwrap
 from collections.abc import Iterator
@@ -228,3 +229,12 @@ def test_every_public_name_is_in_a_table_of_tasks():
     rows = " ".join(line for line in text.splitlines() if line.startswith("| "))
     named = set(re.findall(r"\w+", " ".join(re.findall(r"`[^`]*`", rows))))
     assert sorted(set(bp.__all__) - named) == []
+
+
+def test_rows_of_tables_have_as_many_cells_as_their_heads():
+    for page in [*findings.ROOT.glob("*.md"), *findings.ROOT.glob("docs/**/*.md")]:
+        lines = page.read_text("utf-8").splitlines()
+        for k in (k for k, line in enumerate(lines) if re.fullmatch(r"\|( *:?-+:? *\|)+", line.strip())):
+            rows = [lines[k - 1], *itertools.takewhile(lambda line: line.lstrip().startswith("|"), lines[k:])]
+            cells = [len(re.findall(r"(?<!\\)\|", row)) for row in rows]
+            assert set(cells) == {cells[1]}, f"{page.name}, line {k + 1}"
