@@ -387,8 +387,9 @@ class Likelihood:
         """Return the log-likelihood (…,) of all blocks but those whose components are correlated."""
         total = np.zeros(values.shape[:-1])
         if self._even.size:
-            precisions = self._even_precisions(spectra)
-            terms = factors[self._even] * self._even_counts * np.log(self._even_weights / precisions)
+            variances = self._even_variances(spectra)
+            precisions = self._even_weights / variances
+            terms = factors[self._even] * self._even_counts * np.log(variances)
             if not self.shared:
                 terms += precisions * residuals.squares.take(self._even, axis=-1)
             elif self._alone.any():
@@ -433,10 +434,10 @@ class Likelihood:
         """Return variances (…, size) or (…, 1) of the components of each group, and their slopes."""
         return [group.block.spectrum(self.model, values[..., group.columns]) for group in self._groups]
 
-    def _even_precisions(self, spectra: Spectra) -> np.ndarray:
-        """Return weights over variances (…, blocks) of the blocks with one variance."""
+    def _even_variances(self, spectra: Spectra) -> np.ndarray:
+        """Return the variances (…, blocks) of the blocks with one variance."""
         variances = np.concatenate([spectrum for spectrum, _ in spectra[: len(self._starts)]], axis=-1)
-        return self._even_weights / variances.take(self._even_groups, axis=-1)
+        return variances.take(self._even_groups, axis=-1)
 
     def precisions(self, members: Sequence[int], values: np.ndarray) -> list[np.ndarray]:
         """Return weights over variances of the components of some blocks, (…, size), or (…, 1) if they are the same."""
@@ -512,7 +513,7 @@ class Likelihood:
         """Return the gradients by the residuals of blocks with one variance, and add those by ln φ to `by_value`."""
         by_square = np.zeros(len(self.blocks))
         if self._even.size:
-            precisions = self._even_precisions(spectra)
+            precisions = self._even_weights / self._even_variances(spectra)
             by_square[self._even] = -precisions
             excess = precisions * residuals.squares[self._even] - factors[self._even] * self._even_counts
             slopes = np.concatenate([slope.ravel() for _, slope in spectra[: len(self._starts)]])

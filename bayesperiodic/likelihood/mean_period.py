@@ -16,7 +16,7 @@ from bayesperiodic.likelihood.sensing import NO_PLACE, ComplexFactors, Sensing
 from bayesperiodic.models.model import Model
 
 LARGEST_TRANSFORM = 16_384
-ROOT_TWO = math.sqrt(2.0)
+ROOT_HALF = math.sqrt(0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,13 +84,13 @@ class MeanPeriod(Timed):
 
     def _transform(self, signal: np.ndarray, result: np.ndarray) -> None:
         """Fill in the real Fourier components (…, count) of signals (…, points)."""
-        highest, factor = (self._count - 1) // 2, math.sqrt(0.5 * self.size)
-        amplitudes = _fourier.coefficients(signal, highest)
-        np.multiply(amplitudes.real, factor, out=result[..., : highest + 1])
-        np.multiply(amplitudes.imag[..., 1:], factor, out=result[..., highest + 1 : 2 * highest + 1])
-        result[..., 0] *= ROOT_TWO
+        highest, factor = (self._count - 1) // 2, math.sqrt(2.0 * self.size) / signal.shape[-1]
+        sums = np.fft.rfft(signal)
+        np.multiply(sums.real[..., : highest + 1], factor, out=result[..., : highest + 1])
+        np.multiply(sums.imag[..., 1 : highest + 1], factor, out=result[..., highest + 1 : 2 * highest + 1])
+        result[..., 0] *= ROOT_HALF
         if self._count % 2 == 0:
-            result[..., -1] = np.sum(signal * self._alternating, axis=-1) * math.sqrt(self.size)
+            result[..., -1] = np.add.reduce(signal * self._alternating, axis=-1) * math.sqrt(self.size)
 
     @cached_property
     def _waves(self) -> np.ndarray:

@@ -341,8 +341,8 @@ class JointPrior:
             # One point: operations on numbers take less time than those on arrays of one element.
             return np.asarray(self.log_prob(theta.reshape(-1))).reshape(theta.shape[:-1])
         total: Any = 0.0
-        for key in self._alone:
-            total = total + self._log_prob(key, theta)
+        for prior, columns in self._alone:
+            total = total + prior.log_prob(theta[..., columns])
         for prior, columns in self._alike:
             total = total + prior.log_prob(theta[..., columns]).sum(axis=-1)
         return total
@@ -357,10 +357,11 @@ class JointPrior:
         return [(prior, places) for prior, places in columns.items() if len(places) > 1]
 
     @cached_property
-    def _alone(self) -> list[str | tuple[str, ...]]:
-        """The blocks whose prior no other has."""
-        shared = {self.names[column] for _, columns in self._alike for column in columns}
-        return [key for key in self.blocks if isinstance(key, tuple) or key not in shared]
+    def _alone(self) -> list[tuple[Prior | MultivariateNormal, Any]]:
+        """The priors that no other block has, with where their parameters are on the last axis of θ."""
+        shared = {column for _, columns in self._alike for column in columns}
+        places = ((prior, self._columns[key]) for key, prior in self.blocks.items())
+        return [(prior, place) for prior, place in places if isinstance(place, list) or place not in shared]
 
     def gradient(self, theta: np.ndarray) -> np.ndarray:
         """Return ∂ log p / ∂θ at θ (…, names), shape (…, names)."""
