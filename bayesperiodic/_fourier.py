@@ -5,7 +5,7 @@ c[h] satisfy y(t) = Re Σ_h c[h] exp(2πi h t / period), so that |c[h]| is the a
 """
 
 from collections.abc import Iterable, Iterator
-from math import factorial
+from math import factorial, sqrt
 
 import numpy as np
 
@@ -52,11 +52,12 @@ def from_components(components: np.ndarray, points: int) -> np.ndarray:
     """
     size = components.shape[-1]
     highest = (size - 1) // 2
-    amplitudes = components[..., : highest + 1].astype(complex)
-    amplitudes.imag[..., 1:] = components[..., highest + 1 : 2 * highest + 1]
-    amplitudes *= np.sqrt(2.0 / size)
-    amplitudes[..., 0] *= np.sqrt(0.5)
-    signal = on_grid(amplitudes, points)
+    spectrum = np.zeros((*components.shape[:-1], points // 2 + 1), dtype=complex)
+    kept, factor = min(highest, highest_harmonic(points)), points / sqrt(2.0 * size)
+    np.multiply(components[..., : kept + 1], factor, out=spectrum.real[..., : kept + 1])
+    np.multiply(components[..., highest + 1 : highest + 1 + kept], factor, out=spectrum.imag[..., 1 : kept + 1])
+    spectrum[..., 0] *= sqrt(2.0)
+    signal = np.fft.irfft(spectrum, n=points)
     if size % 2 == 0:
         signal += components[..., -1:] / np.sqrt(size) * np.where(np.arange(points) % 2 == 0, 1.0, -1.0)
     return signal
