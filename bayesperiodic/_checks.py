@@ -61,13 +61,25 @@ def mapping(argument: str, value: Any, example: str) -> Mapping[str, Any]:
     return value
 
 
+def optional_mapping(argument: str, value: Any, example: str) -> dict[str, Any]:
+    """Return a mapping as a dictionary, an empty one for None; raise a ValueError unless it is a mapping."""
+    return dict(mapping(argument, {} if value is None else value, example))
+
+
+def several(argument: str, values: Any) -> tuple[Any, ...]:
+    """Return values as a tuple; raise a ValueError unless there can be several, as in a list."""
+    if not isinstance(values, Iterable):
+        raise ValueError(f"{argument}: must be a sequence, such as a list, got {shortened(values)}.")
+    return tuple(values)
+
+
 def identifiers(argument: str, names: Iterable[str], reserved: Iterable[str] = ()) -> tuple[str, ...]:
     """Return the names as a tuple; raise a ValueError unless they are different, unreserved identifiers.
 
     Names must be in Unicode's normal form NFKC, in which Python reads names in code: there K and the Kelvin sign, or
     µ (micro) and μ (mu), are the same name.
     """
-    result, taken = tuple(names), tuple(reserved)
+    result, taken = several(argument, names), tuple(reserved)
     for place, name in enumerate(result):
         if not isinstance(name, str) or not name.isidentifier() or name.startswith("_"):
             raise ValueError(
@@ -248,9 +260,10 @@ def shortened(value: Any) -> str:
     return " ".join(reprlib.repr(value).split())
 
 
-def checked_units(units: Mapping[str, str], names: Iterable[str]) -> dict[str, str]:
+def checked_units(units: Mapping[str, str] | None, names: Iterable[str]) -> dict[str, str]:
     """Return units by name; raise a ValueError for other names and for what is no text."""
-    for name, unit in mapping("units", units, "{'force': 'N'}").items():
+    result = optional_mapping("units", units, "{'force': 'N'}")
+    for name, unit in result.items():
         one_of("units", name, names)
         text(f"units[{name!r}]", unit)
-    return dict(units)
+    return result

@@ -84,13 +84,14 @@ def simulate(
     samples = int(_checks.positive("duration", duration) * _checks.positive("sampling_rate", sampling_rate)) + 1
     time = np.arange(samples) / sampling_rate
     system = _FirstOrder(model, parameters, inputs or {}, frequency)
-    for name in noise or {}:
+    noise = _checks.optional_mapping("noise", noise, "{'displacement': 0.01}")
+    for name in noise:
         _checks.one_of("noise", name, (*model.outputs, *model.inputs))
     integrate = _integrate_periodic if all(isinstance(s, _Periodic) for s in system.signals) else _integrate
-    channels = system.outputs(time, integrate(system, system.start(start or {}), time))
-    generator = np.random.default_rng(seed)
+    channels = system.outputs(time, integrate(system, system.start(start), time))
+    generator = np.random.default_rng(None if seed is None else _checks.integer("seed", seed, 0))
     measured_inputs = {name: signal(time)[0] for name, signal in zip(model.inputs, system.signals, strict=True)}
-    for name, sd in (noise or {}).items():
+    for name, sd in noise.items():
         target = channels if name in channels else measured_inputs
         target[name] = target[name] + _checks.finite_number(f"noise[{name!r}]", sd) * generator.standard_normal(samples)
     return Recording(time, channels, measured_inputs, name=f"synthetic {model.name}", synthetic=True)
@@ -107,9 +108,10 @@ class _FirstOrder:
         self.orders = np.array([model.orders[state] for state in model.states])
         self.second = np.flatnonzero(self.orders == 2)
 
-    def start(self, given: Mapping[str, float]) -> np.ndarray:
+    def start(self, given: Mapping[str, float] | None) -> np.ndarray:
         """Return y from the given states and rates; the others are zero."""
         names = [*self.model.states, *("d" + self.model.states[i] for i in self.second)]
+        given = _checks.optional_mapping("start", given, "{'x': 0.1}")
         for name in given:
             _checks.one_of("start", name, names)
         return np.array([_checks.finite_number(f"start[{n!r}]", given.get(n, 0.0)) for n in names])
@@ -241,7 +243,7 @@ def steady_cycle(
     """
     system = _FirstOrder(model, parameters, inputs, frequency)
     try:
-        y = system.start(start or {})
+        y = system.start(start)
         for _ in range(TRANSIENTS):
             y = _advanced(system, y, TRANSIENT_PERIODS)
             settled = _fixed_point(system, y)

@@ -214,22 +214,23 @@ class Experiment(Result):
         else:
             guess = {
                 key: _checks.finite_vector(f"guess[{key!r}]", values, points, MEANING)
-                for key, values in (self.guess or {}).items()
+                for key, values in _checks.optional_mapping("guess", self.guess, "{'x': values}").items()
             }
             object.__setattr__(self, "guess", guess)
-        if not (np.isfinite(self.frequency_se) and self.frequency_se >= 0.0):
+        if _checks.finite_number("frequency_se", self.frequency_se) < 0.0:
             raise ValueError(f"frequency_se: must be a finite number, at least 0 [Hz], got {self.frequency_se!r}.")
         for argument in CHANNEL_MAPPINGS:
-            given = dict(getattr(self, argument) or {})
+            given = _checks.optional_mapping(argument, getattr(self, argument), "{'displacement': …}")
             object.__setattr__(self, argument, given)
             for key in given:
                 _checks.one_of(argument, key, (*self.inputs, *self.outputs))
         self._check_sweep_and_variances()
-        object.__setattr__(self, "clocks", {name: tuple(channels) for name, channels in self.clocks.items()})
+        clocks = _checks.optional_mapping("clocks", self.clocks, "{'second': ['x']}").items()
+        object.__setattr__(self, "clocks", {name: _checks.several(f"clocks[{name!r}]", named) for name, named in clocks})
         for name, named in self.clocks.items():
             for channel in named:
                 _checks.one_of(f"clocks[{name!r}]", channel, (*self.inputs, *self.outputs))
-        for name, slopes in self.error_slopes.items():
+        for name, slopes in _checks.mapping("error_slopes", self.error_slopes, "{'force': {'x': slopes}}").items():
             _checks.one_of("error_slopes", name, self.inputs)
             for channel in slopes:
                 _checks.one_of(f"error_slopes[{name!r}]", channel, self.outputs)
@@ -265,7 +266,7 @@ class Experiment(Result):
     def _checked_unmeasured(self, points: int) -> dict[str, tuple[int, ...]]:
         """Store and return the harmonics that were not measured, by output, in ascending order."""
         checked = {}
-        for key, without in (self.unmeasured or {}).items():
+        for key, without in _checks.optional_mapping("unmeasured", self.unmeasured, "{'displacement': [0]}").items():
             _checks.one_of("unmeasured", key, self.outputs)
             highest = _fourier.highest_harmonic(points)
             highest = min(self.harmonics.get(key, highest), highest)

@@ -126,10 +126,11 @@ class Model(Printed):
             raise ValueError("outputs: must have at least one output, got none.")
 
         self._warn_of_unused((*self.equations, *self.output_expressions), self.parameters)
-        self.angles = tuple(angles)
+        self.angles = _checks.several("angles", angles)
         for angle in self.angles:
             _checks.one_of("angles", angle, (*self.states, *self.outputs))
-        units = {**(parameters if isinstance(parameters, Mapping) else {}), **(units or {})}
+        given = _checks.optional_mapping("units", units, "{'force': 'N'}")
+        units = {**(parameters if isinstance(parameters, Mapping) else {}), **given}
         self.units = _checks.checked_units(units, (*self.states, *self.inputs, *self.outputs, *self.parameters))
         self.orders = {state: self._order(state) for state in self.states}
 
@@ -489,7 +490,7 @@ class CondensedModel(Model):
         # Functions cannot be pickled; what they returned is kept.
         self.structure = replace(structure, elements=())
         self.angles, self.orders = (), dict.fromkeys(self.states, 2)
-        self.units = _checks.checked_units(units or {}, (*self.states, *self.inputs, *self.outputs, *self.parameters))
+        self.units = _checks.checked_units(units, (*self.states, *self.inputs, *self.outputs, *self.parameters))
 
     def refusal(self) -> ValueError:
         """Return the error for what needs symbolic equations."""

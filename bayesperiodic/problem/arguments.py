@@ -82,7 +82,7 @@ def checked_local(
     """Return the names of local parameters, the delay of all outputs included; raise a ValueError unless they fit."""
     if isinstance(local, str):
         raise ValueError(f"local: must be a sequence of names, got {local!r}. Give [{local!r}].")
-    names = tuple(local)
+    names = _checks.several("local", local)
     for name in names:
         _checks.one_of("local", name, every)
         if name in tied:
@@ -128,7 +128,7 @@ def checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tupl
         raise ValueError(
             f"experiments: must be a sequence, got {experiments.name!r}. Give a list of one, [experiment]."
         )
-    result = tuple(experiments)
+    result = _checks.several("experiments", experiments)
     for e in result:
         if isinstance(e, Recording):
             raise ValueError(f"experiments: must be experiments, got the recording {e.name!r}. Fold it, see fold().")

@@ -73,11 +73,13 @@ class Description(Printed):
         if not isinstance(priors, Mapping):
             raise ValueError(f"priors: must be a mapping of names to priors, got {priors!r}.")
         self.noise, self.experiments = as_noise(noise), arguments.checked_experiments(model, experiments)
-        local = local if isinstance(local, str) else tuple(local)
+        local = local if isinstance(local, str) else _checks.several("local", local)
+        fixed = _checks.optional_mapping("fixed", fixed, "{'m': 1.0}")
+        tied = _checks.optional_mapping("tied", tied, "{'k2': '2*k1'}")
         self.input_noise = checked(input_noise, model.inputs, self.experiments)
         self._settings: dict[str, Any] = {
-            "model": model, "experiments": self.experiments, "priors": dict(priors), "fixed": dict(fixed or {}),
-            "tied": dict(tied or {}), "local": local, "noise": noise, "scheme": scheme,
+            "model": model, "experiments": self.experiments, "priors": dict(priors), "fixed": fixed,
+            "tied": tied, "local": local, "noise": noise, "scheme": scheme,
             "input_noise": input_noise if isinstance(input_noise, str) else self.input_noise,
             "sensors": dict(sensors) if isinstance(sensors, Mapping) else sensors,
             "input_errors": dict(input_errors or {}), "anchors": dict(anchors or {}),
@@ -85,7 +87,7 @@ class Description(Printed):
         errors: dict[str, Any] = {}
         if self.input_noise == JOINT:
             model, errors, none = with_errors_as_parameters(model, self.experiments)
-            priors, fixed = {**priors, **errors}, {**(fixed or {}), **none}
+            priors, fixed = {**priors, **errors}, {**fixed, **none}
             plain = self._settings["model"].parameters
             local = (*local,) + tuple(name for name in model.parameters if name not in plain)
         self.sensors = Sensors(sensors, model, self.experiments, joint=self.input_noise == JOINT)
@@ -102,8 +104,8 @@ class Description(Printed):
             self.input_noise = EXACT if self.input_noise == FROM_CYCLES else self.input_noise
         self.channels = tuple(c for c in self.sensors.channels if any(c in e.outputs for e in self.experiments))
         runs = [e.name for e in self.experiments]
-        tied, every = dict(tied or {}), (*model.parameters, *self.sensors.names, SHIFT)
-        priors, fixed = self.sensors.with_entries(priors, fixed or {})
+        tied, every = dict(tied), (*model.parameters, *self.sensors.names, SHIFT)
+        priors, fixed = self.sensors.with_entries(priors, fixed)
         self.local = arguments.checked_local(local, every, priors, tied)
         self.fixed = {n: arguments.fixed_values(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
         phases = self._free_phases(priors, fixed, tied)
@@ -113,8 +115,8 @@ class Description(Printed):
         self.plain_names = plain_names(self.names, self.local, runs)
         added = {*phases, *errors}
         self.automatic = tuple(n for n, plain in self.plain_names.items() if {n, plain} & added)
-        self._check_widths()
         self._check_free(fixed)
+        self._check_widths()
         check_delays(self.experiments, (*self.names, *fixed, *tied, *self.sensors.known_delays))
         kinds = model.parameters, self.sensors.names, self.names
         self.parameter_maps = {run: ParameterMap.of(*kinds, run, self.fixed, tied) for run in runs}

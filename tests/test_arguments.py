@@ -1,0 +1,63 @@
+"""Arguments of another kind than a mapping or a sequence: one ValueError that begins with the argument's name."""
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+
+FORCE = np.sin(2 * np.pi * np.arange(16) / 16)
+MODEL = {
+    "name": "oscillator", "states": ["x"], "inputs": ["force"], "parameters": ["k"], "outputs": {"x": "x"},
+    "equations": ["ddx + 0.1*dx + k*x - force"],
+}  # fmt: skip
+EXPERIMENT = {"name": "run", "frequency": 1.0, "outputs": {"x": FORCE}, "inputs": {"force": FORCE}, "samples": 16}
+MAPPINGS = {
+    "model": ["units", "outputs"],
+    "experiment": [
+        "outputs", "inputs", "scatter", "independent", "harmonics", "unmeasured", "amplitude_variance",
+        "amplitude_freedom", "left_out", "error_slopes", "drift", "middle", "clocks", "guess", "units",
+    ],
+    "problem": ["priors", "fixed", "tied"],
+    "simulate": ["parameters", "inputs", "start", "noise"],
+    "solve_periodic": ["parameters", "inputs"],
+}  # fmt: skip
+SEQUENCES = {"model": ["states", "inputs", "parameters", "angles"], "problem": ["experiments", "local"]}
+NUMBERS = {"experiment": ["frequency", "frequency_se"], "simulate": ["frequency", "duration", "sampling_rate", "seed"]}
+
+
+def call(what, **changed):
+    model = bp.Model(**MODEL | (changed if what == "model" else {}))
+    experiment = bp.Experiment(**EXPERIMENT | (changed if what == "experiment" else {}))
+    if what == "problem":
+        given = {"model": model, "experiments": [experiment], "priors": {"k": bp.Normal(1.0, 0.1)}}
+        return bp.Problem(**given | changed)
+    periodic = {"model": model, "parameters": {"k": 1.0}, "inputs": {"force": FORCE}, "frequency": 1.0}
+    if what == "simulate":
+        return bp.simulate(**periodic | {"duration": 3.0, "sampling_rate": 10.0} | changed)
+    return bp.solve_periodic(**periodic | {"samples": 16} | changed) if what == "solve_periodic" else experiment
+
+
+@pytest.mark.parametrize("wrong", [3, -1.5, "text", ["x"], True, len], ids=str)
+@pytest.mark.parametrize("what, argument", [(what, name) for what, names in MAPPINGS.items() for name in names])
+def test_what_is_no_mapping_is_refused_by_name(what, argument, wrong):
+    with pytest.raises(ValueError, match=rf"^{argument}\b.*: must"):
+        call(what, **{argument: wrong})
+
+
+@pytest.mark.parametrize("wrong", [3, -1.5, True, len], ids=str)
+@pytest.mark.parametrize("what, argument", [(what, name) for what, names in SEQUENCES.items() for name in names])
+def test_what_is_no_sequence_is_refused_by_name(what, argument, wrong):
+    with pytest.raises(ValueError, match=f"^{argument}: must"):
+        call(what, **{argument: wrong})
+
+
+@pytest.mark.parametrize("wrong", ["text", ["x"], {"x": 1.0}, len, 1j, float("nan")], ids=str)
+@pytest.mark.parametrize("what, argument", [(what, name) for what, names in NUMBERS.items() for name in names])
+def test_what_is_no_number_is_refused_by_name(what, argument, wrong):
+    with pytest.raises(ValueError, match=f"^{argument}: must"):
+        call(what, **{argument: wrong})
+
+
+def test_a_problem_without_priors_is_refused():
+    with pytest.raises(ValueError, match="^priors: must have at least one free parameter"):
+        call("problem", priors={}, fixed={"k": 1.0})
