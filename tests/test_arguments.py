@@ -20,12 +20,41 @@ MAPPINGS = {
     "problem": ["priors", "fixed", "tied"],
     "simulate": ["parameters", "inputs", "start", "noise"],
     "solve_periodic": ["parameters", "inputs"],
+    "recording": ["outputs", "inputs", "units"],
+    "response_table": ["outputs", "inputs", "phases", "sd", "phase_sd", "against", "derivatives", "units"],
+    "from_matrices": ["forces", "base", "outputs", "units"],
 }  # fmt: skip
-SEQUENCES = {"model": ["states", "inputs", "parameters", "angles"], "problem": ["experiments", "local"]}
-NUMBERS = {"experiment": ["frequency", "frequency_se"], "simulate": ["frequency", "duration", "sampling_rate", "seed"]}
+SEQUENCES = {
+    "model": ["states", "inputs", "parameters", "angles"], "problem": ["experiments", "local"],
+    "from_matrices": ["elements"], "section": ["coordinates", "angles"],
+}  # fmt: skip
+NUMBERS = {
+    "experiment": ["frequency", "frequency_se"], "simulate": ["frequency", "duration", "sampling_rate", "seed"],
+    "continue_periodic": ["until", "step"], "section": ["frequency", "origin"],
+}  # fmt: skip
+TIME = 0.05 * np.arange(400)
+RECORDING = {"time": TIME, "outputs": {"x": np.sin(6.0 * TIME), "y": np.cos(6.0 * TIME)}, "inputs": {}}
+OTHERS = {
+    "recording": (bp.Recording, RECORDING),
+    "section": (
+        bp.PoincareSection.from_recording,
+        {"recording": bp.Recording(**RECORDING), "coordinates": ["x", "y"], "frequency": 1.0},
+    ),
+    "response_table": (
+        bp.response_table,
+        {"table": {"f": [0.5, 0.6], "a": [1.0, 1.1]}, "outputs": {"x": "a"}, "inputs": {"F": 1.0}, "frequency": "f"},
+    ),
+    "from_matrices": (
+        bp.Model.from_matrices,
+        {"name": "m", "mass": [[1.0]], "stiffness": [[1.0]], "outputs": {"x": (0, "displacement")}},
+    ),
+}  # fmt: skip
 
 
 def call(what, **changed):
+    if what in OTHERS:
+        function, given = OTHERS[what]
+        return function(**given | changed)
     model = bp.Model(**MODEL | (changed if what == "model" else {}))
     experiment = bp.Experiment(**EXPERIMENT | (changed if what == "experiment" else {}))
     if what == "problem":
@@ -34,7 +63,12 @@ def call(what, **changed):
     periodic = {"model": model, "parameters": {"k": 1.0}, "inputs": {"force": FORCE}, "frequency": 1.0}
     if what == "simulate":
         return bp.simulate(**periodic | {"duration": 3.0, "sampling_rate": 10.0} | changed)
-    return bp.solve_periodic(**periodic | {"samples": 16} | changed) if what == "solve_periodic" else experiment
+    if what == "solve_periodic":
+        return bp.solve_periodic(**periodic | {"samples": 16} | changed)
+    if what == "continue_periodic":
+        solution = bp.solve_periodic(**periodic, samples=16)
+        return bp.continue_periodic(model, solution, **{"vary": "k", "until": 1.1} | changed)
+    return experiment
 
 
 @pytest.mark.parametrize("wrong", [3, -1.5, "text", ["x"], True, len], ids=str)

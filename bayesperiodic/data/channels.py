@@ -25,7 +25,9 @@ class Channels(Result):
 
     def __post_init__(self) -> None:
         _checks.text("name", self.name)
-        if not self.outputs:
+        for kind in ("outputs", "inputs"):
+            _checks.mapping(kind, getattr(self, kind), "{'displacement': values}")
+        if not len(self.outputs):
             raise ValueError("outputs: must have at least one channel, got none.")
         _checks.identifiers("outputs and inputs", (*self.outputs, *self.inputs))
         if isinstance(self.time, Mapping):

@@ -225,15 +225,7 @@ class Experiment(Result):
             for key in given:
                 _checks.one_of(argument, key, (*self.inputs, *self.outputs))
         self._check_sweep_and_variances()
-        clocks = _checks.optional_mapping("clocks", self.clocks, "{'second': ['x']}").items()
-        object.__setattr__(self, "clocks", {name: _checks.several(f"clocks[{name!r}]", named) for name, named in clocks})
-        for name, named in self.clocks.items():
-            for channel in named:
-                _checks.one_of(f"clocks[{name!r}]", channel, (*self.inputs, *self.outputs))
-        for name, slopes in _checks.mapping("error_slopes", self.error_slopes, "{'force': {'x': slopes}}").items():
-            _checks.one_of("error_slopes", name, self.inputs)
-            for channel in slopes:
-                _checks.one_of(f"error_slopes[{name!r}]", channel, self.outputs)
+        self._check_clocks_and_slopes()
         object.__setattr__(self, "measurements", kinds.checked(self.measurements, self.outputs))
         object.__setattr__(self, "units", _checks.checked_units(self.units, (*self.inputs, *self.channels)))
         if self.measurements and self.mask is not None:
@@ -255,6 +247,19 @@ class Experiment(Result):
         self._check_covariance(measured * len(self.outputs))
         for member in fields(self):
             object.__setattr__(self, member.name, _checks.read_only(getattr(self, member.name)))
+
+    def _check_clocks_and_slopes(self) -> None:
+        clocks = _checks.optional_mapping("clocks", self.clocks, "{'second': ['x']}").items()
+        object.__setattr__(
+            self, "clocks", {name: _checks.several(f"clocks[{name!r}]", named) for name, named in clocks}
+        )
+        for name, named in self.clocks.items():
+            for channel in named:
+                _checks.one_of(f"clocks[{name!r}]", channel, (*self.inputs, *self.outputs))
+        for name, slopes in _checks.mapping("error_slopes", self.error_slopes, "{'force': {'x': slopes}}").items():
+            _checks.one_of("error_slopes", name, self.inputs)
+            for channel in slopes:
+                _checks.one_of(f"error_slopes[{name!r}]", channel, self.outputs)
 
     def _measured(self, kind: str, values: ArrayLike) -> ArrayLike:
         """Return the values of a channel, with zeros at points of an output that the mask excludes."""

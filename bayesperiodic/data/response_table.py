@@ -134,9 +134,16 @@ def response_table(
     >>> [one.label for one in runs[0].measurements]
     ['amplitude of displacement']
     """  # noqa: D301
-    _checks.mapping("outputs", outputs, EXAMPLE)
-    amplitudes, angles = ({n: _by_harmonic(one) for n, one in (given or {}).items()} for given in (outputs, phases))
+    if not len(_checks.mapping("outputs", outputs, EXAMPLE)):
+        raise ValueError(f"outputs: must have at least one, such as {EXAMPLE}, got none.")
     _checks.mapping("inputs", inputs, "{'force': 0.5}")
+    of_outputs = {"phases": phases, "sd": sd, "phase_sd": phase_sd, "against": against, "derivatives": derivatives}
+    given = {
+        argument: _checks.optional_mapping(argument, one, "{'displacement': …}")
+        for argument, one in (of_outputs | {"units": units}).items()
+    }
+    phases, sd, phase_sd, against, derivatives, units = given.values()
+    amplitudes, angles = ({n: _by_harmonic(one) for n, one in of_each.items()} for of_each in (outputs, phases))
     _checks.one_of("size", size, SIZE_KINDS)
     _checks.one_of("phase_unit", phase_unit, PHASE_UNITS)
     if sweep not in (None, UP, DOWN):
@@ -146,27 +153,23 @@ def response_table(
         )
     if per is not None:
         _checks.one_of("per", per, inputs)
-    for key in units or {}:
-        _checks.one_of("units", key, ("frequency", *outputs, *inputs))
-    given = {"phases": angles, "sd": sd, "phase_sd": phase_sd, "against": against, "derivatives": derivatives}
-    for argument, mapping in given.items():
-        for key in mapping or {}:
-            _checks.one_of(argument, key, outputs)
-    columns: list[Any] = [*inputs.values(), frequency, *(sd or {}).values(), *(phase_sd or {}).values()]
+    for argument, one in given.items():
+        for key in one:
+            _checks.one_of(argument, key, ("frequency", *outputs, *inputs) if argument == "units" else outputs)
+    columns: list[Any] = [*inputs.values(), frequency, *sd.values(), *phase_sd.values()]
     columns += [key for each in (*amplitudes.values(), *angles.values()) for key in each.values()]
     columns = [key for key in columns if isinstance(key, str | tuple) and not str(key).strip().endswith("%")]
     label, contents = contents_of(table, columns)
-    source = TableColumns(label, contents, units or {})
+    source = TableColumns(label, contents, units)
     first = [contents.find(label, key) for each in amplitudes.values() for key in each.values()]
     at, factor = source.frequencies(first, frequency), AMPLITUDES_IN[OF_SIGNAL.get(size, (None, size))[1]]
     drive = {name: source.drive(name, value, at.size) / factor for name, value in inputs.items()}
-    orders = {name: _checks.integer(f"derivatives[{name!r}]", order, 0) for name, order in (derivatives or {}).items()}
+    orders = {name: _checks.integer(f"derivatives[{name!r}]", order, 0) for name, order in derivatives.items()}
     reader = _Reader(source, at, drive, size, PHASE_UNITS[phase_unit], lag, per, orders)
-    errors = sd or {}, phase_sd or {}
     read = {
         name: reader.output(
-            _Output(name, to=(against or {}).get(name, "")), columns, angles.get(name, {}),
-            [each.get(name) for each in errors],
+            _Output(name, to=against.get(name, "")), columns, angles.get(name, {}),
+            [each.get(name) for each in (sd, phase_sd)],
         )
         for name, columns in amplitudes.items()
     }  # fmt: skip

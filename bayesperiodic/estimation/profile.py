@@ -420,7 +420,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
 def _checked_names(problem: Problem, names: Sequence[str] | None) -> tuple[str, ...]:
     if names is None:
         return problem.names
-    if isinstance(names, str) or not len(names):
+    if isinstance(names, str) or not _checks.several("names", names):
         raise ValueError(f"names: must be a sequence of names such as {problem.names!r}, got {names!r}.")
     for name in names:
         _checks.one_of("names", name, problem.names)

@@ -124,6 +124,8 @@ def structure(
     Places are degrees of freedom, or points whose displacements are `shapes` (points, n) times these.
     """
     parts = {kind: _parts(kind, given) for kind, given in matrices.items()}
+    if not parts["mass"]:
+        raise ValueError("mass: must be a square matrix, got none.")
     count = len(next(iter(parts["mass"].values())))
     for kind, named in parts.items():
         for matrix in named.values():
@@ -133,7 +135,7 @@ def structure(
         raise ValueError("mass: must be regular, got a singular matrix; eliminate the degrees of freedom without mass.")
     if isinstance(elements, Element):
         raise ValueError(f"elements: must be a list of elements, got {elements.name!r} alone; give [element].")
-    placed = tuple(elements)
+    placed = _checks.several("elements", elements)
     for element in placed:
         _checks.instance("elements", element, Element)
     _checks.identifiers("elements", [element.name for element in placed])

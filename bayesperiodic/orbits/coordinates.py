@@ -148,7 +148,7 @@ def coordinate_names(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of coordinates and of those that are angles; raise a ValueError unless they are valid."""
     unit, example = ("forcing periods", "-0.25") if forced else ("seconds with the unit", "-0.25 s")
-    given = [coordinates] if isinstance(coordinates, str) else list(coordinates)
+    given = [coordinates] if isinstance(coordinates, str) else list(_checks.several("coordinates", coordinates))
     names, delayed = [], set()
     for name in given:
         match = DELAYED.fullmatch(name) if isinstance(name, str) else None
@@ -169,7 +169,7 @@ def coordinate_names(
         raise ValueError(f"coordinates: must be {'two' if forced else 'one'} or more outputs, got {coordinates!r}.")
     if len(set(given)) < len(given):
         raise ValueError(f"coordinates: must differ, got {given!r}.")
-    angle_names = (angles,) if isinstance(angles, str) else tuple(angles)
+    angle_names = (angles,) if isinstance(angles, str) else _checks.several("angles", angles)
     for name in angle_names:
         _checks.one_of("angles", name, given)
     if len(angle_names) > 1:

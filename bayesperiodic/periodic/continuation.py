@@ -198,7 +198,7 @@ def continue_periodic(
     (True, 2, 0)
     """
     _checks.instance("model", model, Model)
-    points = []
+    until, points = _checks.finite_number("until", until), []
     with tqdm(desc=f"{model.name}: {vary} to {until:g}", unit=" points", disable=not progress, leave=False) as bar:
         for point in iterate_periodic(model, solution, vary, until=until, step=step):
             points.append(point)

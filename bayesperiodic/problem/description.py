@@ -70,16 +70,15 @@ class Description(Printed):
         anchors: Mapping[str, Any] | None = None,
     ):
         _checks.instance("model", model, Model)
-        if not isinstance(priors, Mapping):
-            raise ValueError(f"priors: must be a mapping of names to priors, got {priors!r}.")
+        _checks.mapping("priors", priors, "{'k': bp.LogNormal(1.0, 0.5)}")
         self.noise, self.experiments = as_noise(noise), arguments.checked_experiments(model, experiments)
         local = local if isinstance(local, str) else _checks.several("local", local)
-        fixed = _checks.optional_mapping("fixed", fixed, "{'m': 1.0}")
-        tied = _checks.optional_mapping("tied", tied, "{'k2': '2*k1'}")
+        given = {"fixed": fixed, "tied": tied}
+        fixed, tied = (_checks.optional_mapping(argument, one, "{'k2': …}") for argument, one in given.items())
         self.input_noise = checked(input_noise, model.inputs, self.experiments)
         self._settings: dict[str, Any] = {
-            "model": model, "experiments": self.experiments, "priors": dict(priors), "fixed": fixed,
-            "tied": tied, "local": local, "noise": noise, "scheme": scheme,
+            "model": model, "experiments": self.experiments, "priors": dict(priors), "fixed": fixed, "tied": tied,
+            "local": local, "noise": noise, "scheme": scheme,
             "input_noise": input_noise if isinstance(input_noise, str) else self.input_noise,
             "sensors": dict(sensors) if isinstance(sensors, Mapping) else sensors,
             "input_errors": dict(input_errors or {}), "anchors": dict(anchors or {}),
@@ -113,8 +112,7 @@ class Description(Printed):
         self.joint_prior = JointPrior.of(given, free_names(every[:-1], self.local, runs))
         self.names = self.joint_prior.names
         self.plain_names = plain_names(self.names, self.local, runs)
-        added = {*phases, *errors}
-        self.automatic = tuple(n for n, plain in self.plain_names.items() if {n, plain} & added)
+        self.automatic = tuple(n for n, plain in self.plain_names.items() if {n, plain} & {*phases, *errors})
         self._check_free(fixed)
         self._check_widths()
         check_delays(self.experiments, (*self.names, *fixed, *tied, *self.sensors.known_delays))

@@ -238,7 +238,7 @@ def test_error_names_the_prior_that_does_not_fit(experiment, priors, fixed, mess
 
 
 def test_priors_must_be_a_mapping(experiment):
-    with pytest.raises(ValueError, match=r"priors: must be a mapping of names to priors, got \['k'\]"):
+    with pytest.raises(ValueError, match=r"priors: must be a mapping, such as .*, got \['k'\]"):
         bp.Problem(LINEAR, [experiment], priors=["k"])
 
 
