@@ -294,10 +294,12 @@ def _group(
     motion = np.concatenate([part.values for part in parts])
     if columns == following.outputs:
         motion = _continuous(motion, following)
-    errors = np.concatenate([part.errors for part in parts], axis=1)
+    errors, at = np.concatenate([part.errors for part in parts], axis=1), [phases[j] for j in order]
     if times is not None:
-        errors += _moved(motion, times, order, [phases[j] for j in order])
-    common, rest = _common(errors.transpose(0, 2, 1), np.std(motion, axis=0), 2 * fits.narrow.points.size)
+        errors += _moved(motion, times, order, at)
+    directions = _directions(motion, [part.slopes for part in parts], at, crossed=times is not None)
+    independent = INDEPENDENT * len(motion) * motion.shape[1] // (following.count * maps.steps)
+    common, rest = _common(errors, directions, np.std(motion, axis=0), independent)
     gains = np.concatenate([np.tile(part.gain[:, None], len(part.values)) for part in parts], axis=1)
     noise = np.sqrt(np.maximum(rest[:, None], following.variance[columns, None] * gains))
     squares = np.concatenate([part.bias**2 for part in parts]).reshape(order.size, following.count, -1)
@@ -341,10 +343,29 @@ def _moved(motion: np.ndarray, times: ReturnTimes, order: np.ndarray, phases: li
     return early[:, :, None] * rates
 
 
+def _directions(motion: np.ndarray, slopes: list[np.ndarray], phases: list[np.ndarray], crossed: bool) -> np.ndarray:
+    """Return what errors of points and, of crossings, of instants make of a motion, (n, samples, channels).
+
+    After each point these are its slopes (d, samples, channels) by the coordinates, and the rates for errors of the
+    instants at which it begins and ends.
+    """
+    result, start = [], 0
+    rates = np.gradient(motion, axis=0)
+    for by_point, at in zip(slopes, phases, strict=True):
+        here = slice(start, start + at.size)
+        every = [*by_point, *((rates[here], at[:, None] * rates[here]) if crossed else ())]
+        for direction in every:
+            result.append(np.zeros(motion.shape))
+            result[-1][here] = direction
+        start = here.stop
+    return np.array(result)
+
+
 class _MotionPart(NamedTuple):
     """Motion from a point of a cycle to the next one."""
 
     values: np.ndarray  # (samples, channels)
+    slopes: np.ndarray  # by the coordinates of the point, (d, samples, channels)
     errors: np.ndarray  # of each run of neighbours, (runs, samples, channels)
     bias: np.ndarray  # modulus of what may remain, (samples, channels)
     gain: np.ndarray  # variance of the values for independent errors of unit variance, (channels,)
@@ -378,7 +399,7 @@ class _Regressions:
             gain = np.sum((weights[0] + away * (weights[0] - weights[1])) ** 2, axis=0)
             value = both[0].value - away * differences[j]
             bias = self.how.remaining * np.abs(differences[j])
-            parts.append(_MotionPart(value, error, bias, gain))
+            parts.append(_MotionPart(value, both[0].slopes, error, bias, gain))
         return parts
 
     def fits(self, cycle: ClosingFits, *, influence: bool = True) -> list[Regression]:
@@ -435,14 +456,19 @@ def _continuous(motion: np.ndarray, following: Following) -> np.ndarray:
     return motion
 
 
-def _common(errors: np.ndarray, size: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest principal components of errors (n, channels, samples), and the others' variance (channels,).
+def _common(
+    errors: np.ndarray, directions: np.ndarray, size: np.ndarray, independent: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the part of errors (runs, samples, channels) along directions, and the variance of the rest.
 
-    The errors of the closed points and those of the neighbours' points are propagated by the slopes of the regression:
-    they have as many components each as there are coordinates of all points. The rest is noise of single samples.
+    The former, (directions, channels, samples), has the same covariance; the latter, (channels,), is noise of single
+    samples, of which so many are independent.
     """
-    scale = np.where(size > 0.0, size, 1.0)[:, None]
-    _, values, axes = np.linalg.svd((errors / scale).reshape(len(errors), -1), full_matrices=False)
-    kept = (values[:most, None] * axes[:most]).reshape(-1, *errors.shape[1:]) * scale
-    rest = np.sum(errors**2, axis=0) - np.sum(kept**2, axis=0)
-    return kept, np.maximum(rest, 0.0).mean(axis=1)
+    scale = np.where(size > 0.0, size, 1.0)
+    axes = np.linalg.qr((directions / scale).reshape(len(directions), -1).T)[0].T
+    flat = (errors / scale).reshape(len(errors), -1)
+    along = flat @ axes.T
+    rest = np.sum((flat - along @ axes) ** 2, axis=0).reshape(errors.shape[1:]).mean(axis=0) * scale**2
+    rest *= independent / max(independent - len(axes), 1)
+    common = (np.linalg.qr(along, mode="r") @ axes).reshape(-1, *errors.shape[1:]) * scale
+    return common.transpose(0, 2, 1), rest
