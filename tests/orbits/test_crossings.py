@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 
 import bayesperiodic as bp
 from bayesperiodic.orbits.return_times import ReturnTimes
@@ -15,6 +15,10 @@ from tests.orbits import roessler
 STEP = roessler.RETURN / 40
 # The maximum of x follows a quarter of a return after its crossing.
 MAXIMUM = "x[1.5 s]"
+ROESSLER = bp.Model(
+    "roessler", states=["x", "y", "z"], inputs=[], parameters=["a", "b", "c"],
+    equations=["dx + y + z", "dy - x - a*y", "dz - b - z*(x - c)"], outputs={"x": "x", "y": "y", "z": "z"},
+)  # fmt: skip
 
 
 @cache
@@ -202,20 +206,33 @@ def test_errors_of_the_return_times_move_the_waveform():
 
 def test_parameters_follow_from_the_orbits_of_an_autonomous_model():
     """Three parameters within 5 standard errors and 0.1 %, from waveforms and measured frequencies."""
-    model = bp.Model(
-        "roessler", states=["x", "y", "z"], inputs=[], parameters=["a", "b", "c"],
-        equations=["dx + y + z", "dy - x - a*y", "dz - b - z*(x - c)"], outputs={"x": "x", "y": "y", "z": "z"},
-    )  # fmt: skip
     orbits = [orbit for orbit in found(0.001, density=100, waveforms=True)[1] if orbit.period < 3]
     runs = [orbit.experiment(whole=True, samples=256, states={name: name for name in "xyz"}) for orbit in orbits]
     for run, orbit in zip(runs, orbits, strict=True):
         assert run.periods == 1 and 1.0 / run.frequency == pytest.approx(orbit.duration)
         assert run.frequency_se / run.frequency == pytest.approx(orbit.duration_sd / orbit.duration)
     priors = {name: bp.LogNormal(centre, 0.5) for name, centre in {"a": 0.25, "b": 0.25, "c": 5.0}.items()}
-    problem = bp.Problem(model, runs, priors=priors, fixed={"scale": 1.0})
+    problem = bp.Problem(ROESSLER, runs, priors=priors, fixed={"scale": 1.0})
     fit = bp.map_estimate(problem, start={"a": 0.205, "b": 0.21, "c": 5.6}, progress=False)
     for name, truth in {"a": 0.2, "b": 0.2, "c": 5.7}.items():
         assert abs(fit.theta[name] - truth) < min(5.0 * fit.sd[name], 1e-3 * truth)
+
+
+@pytest.mark.slow
+def test_joint_errors_of_parameters_from_waveforms_are_those_stated():
+    """Squared distances of three parameters in eight recordings, chi-squared of 24; false-alarm rate 0.1 %."""
+    priors = {name: bp.LogNormal(centre, 0.5) for name, centre in {"a": 0.25, "b": 0.25, "c": 5.0}.items()}
+    truth, total = np.array([0.2, 0.2, 5.7]), 0.0
+    for seed in range(61, 69):
+        recording = roessler.recording(250_000, roessler.RETURN / 100, 0.003, seed, seed)
+        section = bp.PoincareSection.from_crossings(recording, ["y"], channel="x", level=0.0)
+        (orbit,) = bp.find_orbits(section, periods=[2], waveforms=True)
+        run = orbit.experiment(whole=True, samples=256, states={name: name for name in "xyz"})
+        problem = bp.Problem(ROESSLER, [run], priors=priors, fixed={"scale": 1.0})
+        fit = bp.map_estimate(problem, start={"a": 0.205, "b": 0.21, "c": 5.6}, checks=False, progress=False)
+        away = np.array([fit.theta[name] for name in "abc"]) - truth
+        total += away @ np.linalg.solve(fit.covariance.loc[list("abc"), list("abc")].to_numpy(), away)
+    assert total < chi2.ppf(0.999, 24)
 
 
 def test_a_coordinate_that_does_not_determine_the_next_point_is_refused_with_the_delay_to_add():

@@ -14,7 +14,7 @@ from bayesperiodic.orbits import find, waveform
 from bayesperiodic.orbits.cycles import PairRuns, errors_by_run
 from bayesperiodic.orbits.return_map import Atlas, ReturnMap
 from bayesperiodic.orbits.stretches import windowed
-from bayesperiodic.orbits.waveform import INDEPENDENT, OF_OUTPUTS, Following, _Regressions, mean_of_repeats
+from bayesperiodic.orbits.waveform import INDEPENDENT, OF_OUTPUTS, Following, _common, _Regressions, mean_of_repeats
 from tests.orbits import chaos, wells
 from tests.orbits.test_find import coupled, map_section
 
@@ -266,6 +266,20 @@ def test_errors_of_the_motion_until_the_next_point_are_the_errors_of_that_point(
             assert np.abs(part.values[0] - points[(k + 1) % 2]).max() < 1e-5
             checked += 1
     assert checked >= 2
+
+
+def test_small_errors_in_common_are_not_lost_among_the_noise_of_samples():
+    """Of 60 runs: the variance along a direction, and that of the rest, within 4 standard errors of the true ones."""
+    generator, time = np.random.default_rng(5), np.arange(32) / 32
+    direction = np.stack([np.cos(2 * np.pi * time), time], axis=-1)
+    size, noise = np.array([1.0, 3.0]), np.array([0.1, 0.3])
+    runs = generator.standard_normal((60, 1, 1)) * 0.1 * direction + noise * generator.standard_normal((60, 32, 2))
+    common, rest = _common(runs, direction[None], size, 64)
+    along = (direction / size).ravel() / np.linalg.norm(direction / size)
+    variance = np.sum((common.transpose(0, 2, 1) / size).reshape(1, -1) @ along) ** 2
+    expected = 60 * (0.1**2 * np.sum((direction / size) ** 2) + 0.1**2)
+    assert abs(variance / expected - 1.0) < 4.0 * np.sqrt(2.0 / 60)
+    np.testing.assert_allclose(rest, 60 * noise**2, rtol=4.0 * np.sqrt(2.0 / (60 * 31)))
 
 
 def test_bias_that_wider_and_narrower_neighbourhoods_show_is_subtracted():
