@@ -11,7 +11,7 @@ from scipy.special import chdtrc
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
-from bayesperiodic.orbits.coordinates import channels_of, longest_window_of_crossings, wrapped
+from bayesperiodic.orbits.coordinates import SHORT_RETURN, channels_of, longest_window_of_crossings, wrapped
 from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.phases import merged, phases_of, with_late_partners
@@ -36,7 +36,7 @@ QUALITY_DEGREE, FEWEST_NEIGHBOURS = 3, 32
 SEARCH_WIDTH = 4.0
 # Bandwidth with one coordinate: in standard deviations of the noise, and at most.
 WIDTH_OF_ONE, WIDEST_OF_ONE = 20.0, 0.018
-# Largest standard deviation of a point, in units of the attractor's size.
+# Largest standard deviation of a point, in units of the attractor's size, and of a period, in mean returns.
 LARGEST_SD = 0.02
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
@@ -46,6 +46,9 @@ CHANGE_LEVEL = 1e-3
 DELAYS_TRIED = (-0.25, -0.5)
 # A coordinate to add reduces the errors of predictions to this fraction or less; smaller ones are not looked at.
 REDUCED, LEAST_ERROR = 0.8, 0.01
+# Times between crossings jump by more than this fraction of the shortest one, and distance from a cycle within which
+# this is looked at.
+JUMP, BRANCH_REACH = 0.5, 0.3
 # Standard deviations from which a determinant is impossible.
 IMPOSSIBLE = 3.0
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
@@ -161,18 +164,21 @@ def _of_section(
     maps, size, prediction = _scaled(section, neighbours)
     neighbours = _wide_enough(maps, neighbours)
     if method == "boxes":
-        pairs = [pair for p in wanted for pair in cycles.box_orbits(maps, p, neighbours, box)]
+        triples = [(maps, *pair) for p in wanted for pair in cycles.box_orbits(maps, p, neighbours, box)]
     else:
         if steps > 1:
             maps = _with_steps(section, maps, size, steps)
         atlas = Atlas(maps, _search_count(maps, neighbours))
-        pairs = [pair for p in wanted for pair in _chained(maps, atlas, p, neighbours)]
+        triples = [one for p in wanted for one in _chained(section, maps, atlas, p, neighbours)]
     quality_count = _search_count(maps, FEWEST_NEIGHBOURS)
-    following = Following(section, maps, size) if waveforms and pairs and section.measured is not None else None
-    extent = _extent(section)
-    orbits = [
-        _orbit(section, maps, size, extent, *pair, _quality(maps, *pair, quality_count), following) for pair in pairs
-    ]
+    following = Following(section, maps, size) if waveforms and triples and section.measured is not None else None
+    extent, orbits = _extent(section), []
+    for branch, *pair in triples:
+        motion = following if following is None or branch is maps else Following(section, branch, size)
+        quality = _quality(branch, *pair, quality_count)
+        orbit = _orbit(section, branch, size, extent, *pair, quality, motion)
+        if not orbit.duration_sd > LARGEST_SD / section.frequency:
+            orbits.append(orbit)
     finished = with_late_partners(_finished(orbits, maps, size))
     return Orbits(finished, values=section.values, method=method, prediction_error=prediction)
 
@@ -329,22 +335,44 @@ def _search_count(maps: ReturnMap, neighbours: int) -> int:
     return count
 
 
-def _chained(maps: ReturnMap, atlas: Atlas, period: int, neighbours: int) -> list[tuple[MapCycle, Estimate]]:
-    pairs: list[tuple[MapCycle, Estimate]] = []
+def _chained(
+    section: PoincareSection, maps: ReturnMap, atlas: Atlas, period: int, neighbours: int
+) -> list[tuple[ReturnMap, MapCycle, Estimate]]:
+    """Return the orbits of a period, each with the return map to which it was fitted."""
+    triples: list[tuple[ReturnMap, MapCycle, Estimate]] = []
     before: list[np.ndarray] = []
     sds: list[float] = []
     for candidate in cycles.candidates(maps, atlas, period):
-        estimate = cycles.refine(maps, candidate.points, neighbours)
+        branch = _on_branches(section, maps, candidate)
+        estimate = cycles.refine(branch, candidate.points, neighbours)
         if estimate is None or not (sd := _largest_sd(estimate)) < LARGEST_SD:
             continue
         returns = estimate.points[:: maps.steps]
         repeats = cycles.has_shorter_period(returns, maps.wrap, max(2e-3, 3.0 * sd))
         distances, _ = cycles.shifts_between(returns, before, maps.wrap)
         if not repeats and np.all(distances >= np.maximum(1e-3, 2.0 * np.maximum(sd, sds))):
-            pairs.append((candidate, estimate))
+            triples.append((branch, candidate, estimate))
             before.append(returns)
             sds.append(sd)
-    return pairs
+    return triples
+
+
+def _on_branches(section: PoincareSection, maps: ReturnMap, candidate: MapCycle) -> ReturnMap:
+    """Return the return map without the points that return after another number of oscillations than the candidate.
+
+    Where a motion touches the level, or meets the stable manifold of a state of rest, the map of crossings jumps, and
+    so do the times between them. A polynomial across the jump is none of the map.
+    """
+    if section.crossed is None or section.instants is None:
+        return maps
+    returns, count = np.diff(section.instants), len(candidate.points)
+    of_cycle = np.roll(returns[candidate.closest + np.arange(count)], candidate.shift)
+    away = np.abs(maps.wrap(maps.arguments[:, None] - candidate.points)).max(axis=2)
+    nearest, known = away.argmin(axis=1), returns[maps.positions]
+    jumps = np.abs(known - of_cycle[nearest]) > JUMP * np.quantile(known, SHORT_RETURN)
+    if not np.any(jumps & (away.min(axis=1) < BRANCH_REACH)):
+        return maps
+    return maps.without(jumps)
 
 
 def _largest_sd(estimate: Estimate) -> float:

@@ -128,6 +128,18 @@ class ReturnMap:
         self.count = len(self.arguments) // steps  # of points of each phase
         self._tree = self.tree(self.arguments, self.phases(self.positions))
 
+    def without(self, left_out: np.ndarray) -> "ReturnMap":
+        """Return the map without some of the arguments (n,)."""
+        kept, noises = self.positions[~left_out], None
+        increments = np.full((len(self.points) - 1, self.points.shape[1]), np.nan)
+        increments[kept] = self.increments[~left_out]
+        if self._noises is not None:
+            noises = np.full(self.points.shape, np.nan)
+            noises[kept] = self._noises[~left_out]
+        return ReturnMap(
+            self.points, increments, self.turn, self.winds, self.noise, self.stretches, self.steps, noises
+        )
+
     def followed(self, steps: int) -> np.ndarray:
         """Return the positions of the points whose stretch contains the point `steps` later."""
         return np.flatnonzero(self.stretches[steps:] == self.stretches[:-steps])
