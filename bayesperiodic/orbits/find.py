@@ -11,7 +11,7 @@ from scipy.special import chdtrc
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
-from bayesperiodic.orbits.coordinates import SHORT_RETURN, channels_of, longest_window_of_crossings, wrapped
+from bayesperiodic.orbits.coordinates import SHORT_RETURN, channels_of, crossed_of, longest_window_of_crossings, wrapped
 from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.phases import merged, phases_of, with_late_partners
@@ -36,8 +36,10 @@ QUALITY_DEGREE, FEWEST_NEIGHBOURS = 3, 32
 SEARCH_WIDTH = 4.0
 # Bandwidth with one coordinate: in standard deviations of the noise, and at most.
 WIDTH_OF_ONE, WIDEST_OF_ONE = 20.0, 0.018
-# Largest standard deviation of a point, in units of the attractor's size, and of a period, in mean returns.
+# Largest standard deviation of a point, in units of the attractor's size.
 LARGEST_SD = 0.02
+# Crossings: largest standard deviation of a period, in mean returns, and smallest quality of an orbit.
+LARGEST_DURATION_SD, IMPLAUSIBLE = 0.01, 1e-3
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
 # False-alarm rate of the test for a return map that changes.
@@ -173,11 +175,12 @@ def _of_section(
     quality_count = _search_count(maps, FEWEST_NEIGHBOURS)
     following = Following(section, maps, size) if waveforms and triples and section.measured is not None else None
     extent, orbits = _extent(section), []
-    for branch, *pair in triples:
+    for branch, candidate, estimate in triples:
         motion = following if following is None or branch is maps else Following(section, branch, size)
-        quality = _quality(branch, *pair, quality_count)
-        orbit = _orbit(section, branch, size, extent, *pair, quality, motion)
-        if not orbit.duration_sd > LARGEST_SD / section.frequency:
+        quality = _quality(branch, candidate, estimate, quality_count)
+        orbit = _orbit(section, branch, size, extent, candidate, estimate, quality, motion)
+        doubtful = orbit.duration_sd > LARGEST_DURATION_SD / section.frequency or quality < IMPLAUSIBLE
+        if section.crossed is None or not doubtful:
             orbits.append(orbit)
     finished = with_late_partners(_finished(orbits, maps, size))
     return Orbits(finished, values=section.values, method=method, prediction_error=prediction)
@@ -270,16 +273,22 @@ def _remedy(section: PoincareSection, maps: ReturnMap, error: float) -> str:
             f"{more}; delayed ones do not help, with {name!r} errors are {least:.1%}. {len(section)} points may "
             "be too few for local maps: record longer."
         )
-    return f"{more} or a delayed one, with {name!r} errors are {least:.1%}."
+    kind = "the interval" if crossed_of(name) else "a delayed one"
+    return f"{more} or {kind}, with {name!r} errors are {least:.1%}."
 
 
 def _best_delayed(section: PoincareSection, maps: ReturnMap) -> tuple[str, float]:
-    """Return the delayed coordinate with which local maps predict best, and their error; an empty name if none."""
+    """Return the coordinate to add with which local maps predict best, and their error; an empty name if none.
+
+    It is a delayed one, or the interval between crossings where that is much better.
+    """
     errors, size = {}, np.ptp(section.points, axis=0)
     channels = dict.fromkeys([*channels_of(section.coordinates), *filter(None, [section.crossed])])
     # For crossings, fractions of the mean return.
     delays = [f"{d / section.frequency:.2g} s" if section.crossed else str(d) for d in DELAYS_TRIED]
-    for name in (f"{channel}[{d}]" for channel in channels if channel not in section.angles for d in delays):
+    names = [f"{channel}[{d}]" for channel in channels if channel not in section.angles for d in delays]
+    interval = f"interval({section.crossed})"
+    for name in [*names, interval] if section.crossed else names:
         values = None if name in section.coordinates or not _separate(section, name) else section.delayed(name)
         if values is None:
             continue
@@ -289,7 +298,9 @@ def _best_delayed(section: PoincareSection, maps: ReturnMap) -> tuple[str, float
         points, added = np.hstack([maps.points, column]), np.hstack([section.increments / size, increments])
         turn, noise = np.append(maps.turn, np.inf), np.append(maps.noise, 0.0)
         errors[name] = prediction_error(ReturnMap(points, added, turn, maps.winds, noise, maps.stretches))[0]
-    return min(errors.items(), key=lambda item: item[1], default=("", np.inf))
+    of_interval = errors.pop(interval, np.inf)
+    best = min(errors.items(), key=lambda item: item[1], default=("", np.inf))
+    return (interval, of_interval) if of_interval < REDUCED * best[1] else best
 
 
 def _separate(section: PoincareSection, coordinate: str) -> bool:

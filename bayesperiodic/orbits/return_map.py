@@ -136,9 +136,7 @@ class ReturnMap:
         if self._noises is not None:
             noises = np.full(self.points.shape, np.nan)
             noises[kept] = self._noises[~left_out]
-        return ReturnMap(
-            self.points, increments, self.turn, self.winds, self.noise, self.stretches, self.steps, noises
-        )
+        return ReturnMap(self.points, increments, self.turn, self.winds, self.noise, self.stretches, self.steps, noises)
 
     def followed(self, steps: int) -> np.ndarray:
         """Return the positions of the points whose stretch contains the point `steps` later."""
