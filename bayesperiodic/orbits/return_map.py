@@ -451,7 +451,10 @@ def check_chaos(maps: ReturnMap, remedy: Callable[[float], str]) -> tuple[float,
             f"{remedy(error)} Otherwise check for a wrong frequency or level, and for noise as large as the motion."
         )
         if from_noise > NOISE_EXPLAINS * error:
-            advice = "The noise is too large: sample faster, record with less noise, or choose coordinates with less."
+            advice = (
+                "The noise is too large: sample faster, record with less noise, or choose coordinates with less, such "
+                "as a delay at which the channel is near a maximum or, of crossings, the interval."
+            )
         raise ValueError(
             f"section: must show a return map, got images that local maps of {d} coordinate{'s' * (d > 1)} "
             f"predict with errors of {error:.0%} of the distance of random points, {from_noise:.1%} from known noise. "

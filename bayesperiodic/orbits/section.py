@@ -293,7 +293,7 @@ class PoincareSection(Result):
             ``"interval(current)"``, where the channel is "current", is the time since the crossing before, which has
             most of the information where spikes are alike.
         channel : str
-            Output whose crossings define the section; a coordinate only with delays.
+            Output whose crossings define the section; a coordinate only with delays, or its interval.
         level : float, optional
             By default the channel's median. It should be crossed steeply; not the foot of spikes. Some oscillations may
             miss it: orbits are fitted to points that return after as many oscillations as they do.
@@ -374,7 +374,7 @@ class PoincareSection(Result):
         ----------
         points : array (count, d), or sequence of such arrays
             All consecutive points in the order of time; angles [rad] with any number of turns. Several arrays are
-            unbroken stretches: the first point of one does not follow the last point of another.
+            unbroken stretches.
         coordinates, frequency, angles
             As for `from_recording`.
 
@@ -478,10 +478,9 @@ class PoincareSection(Result):
             return np.append(np.nan, np.diff(self.instants) + 0.0 * self.increments[:, 0])
         channels = self.channels if self.crossed else channels_of(self.coordinates)
         _checks.one_of("coordinate", channel, channels)
-        measured = self.measured
-        if measured is None:
+        if self.measured is None:
             return None
-        samples, instants, stretch = measured
+        samples, instants, stretch = self.measured
         at, column = instants + delay * self.unit, [channels.index(channel)]
         first, last = samples.time[samples.starts[stretch]], samples.time[samples.stops[stretch] - 1]
         values = local_fit(samples._replace(signals=samples.signals[:, column]), np.clip(at, first, last), stretch)[0]
@@ -569,11 +568,10 @@ class PoincareSection(Result):
         ValueError
             If the returns are not in one unbroken stretch.
         """
-        measured = self.measured
-        if measured is None:
+        if self.measured is None:
             return None
         inside = 0 <= index and index + period < len(self)
-        recorded, instants, stretch = measured
+        recorded, instants, stretch = self.measured
         if not inside or stretch[index] != stretch[index + period]:
             raise ValueError(
                 f"index, period: must be a point and a number of returns in one unbroken stretch, got {index!r} and "
