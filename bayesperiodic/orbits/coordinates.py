@@ -186,6 +186,8 @@ def coordinate_names(
         raise ValueError(f"coordinates: must have intervals for crossings only, got {given!r}. Use delayed ones.")
     if not forced and any(integrand_of(channel_and_delay(name)[0]) for name in given):
         raise ValueError(f"coordinates: must have no integrals for crossings, got {given!r}. Use delayed coordinates.")
+    if any(map(crossed_of, angle_names)):
+        raise ValueError(f"angles: must be coordinates that are no intervals, got {angle_names!r}.")
     if any(integrand_of(channel_and_delay(name)[0]) in angle_names for name in given):
         raise ValueError(f"coordinates: must have no integral of an angle, got {given!r}. Integrate another channel.")
     if any(channel_and_delay(name)[0] in delayed for name in angle_names):

@@ -71,7 +71,9 @@ def find_orbits(
     """Find the unstable periodic orbits in a section of a chaotic motion, without a model.
 
     Orbits of a section by crossings have their own period, `Orbit.duration`, with an error: the times between crossings
-    are fitted like the return map.
+    are fitted like the return map. Where some oscillations miss the level, the map jumps; an orbit is fitted to points
+    that return after as many oscillations as it does. Orbits with a standard error of the period above 1 % of a mean
+    return, or a quality below 0.001, are left out.
 
     "chained": points that nearly recur after p returns are near an orbit of period p. Local quadratic polynomials
     approximate the return map at the p points, and Newton's method moves all points together until the maps close the
@@ -371,8 +373,8 @@ def _chained(
 def _on_branches(section: PoincareSection, maps: ReturnMap, candidate: MapCycle) -> ReturnMap:
     """Return the return map without the points that return after another number of oscillations than the candidate.
 
-    Where a motion touches the level, or meets the stable manifold of a state of rest, the map of crossings jumps, and
-    so do the times between them. A polynomial across the jump is none of the map.
+    Where a motion touches the level, the map of crossings jumps, and so do the times between them. A polynomial across
+    the jump does not approximate the map.
     """
     if section.crossed is None or section.instants is None:
         return maps
