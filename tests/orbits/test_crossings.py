@@ -355,7 +355,6 @@ def test_sections_and_orbits_are_saved_printed_and_drawn(tmp_path):
     np.testing.assert_allclose(y[:-1], x[1:])
 
 
-@pytest.mark.parametrize("level", [2.0, 3.0])
 def z_from_crossings(known, level, samples):
     """Return z over an orbit, from each of its upward crossings of a level on, (crossings, samples)."""
     span = known.times.sum()
@@ -372,6 +371,7 @@ def z_from_crossings(known, level, samples):
     return [motion.sol(start + span * np.arange(samples) / samples)[2] for start in starts]
 
 
+@pytest.mark.parametrize("level", [2.0, 3.0])
 def test_orbits_of_spikes_are_right_where_some_oscillations_miss_the_level(level):
     """Of the Roessler system z alone, with noise; orbits of three oscillations whose spikes cross one to three times.
 
