@@ -50,7 +50,7 @@ DELAYS_TRIED = (-0.25, -0.5)
 REDUCED, LEAST_ERROR = 0.8, 0.01
 # Times between crossings jump by more than this fraction of the shortest one, and distance from a cycle within which
 # this is looked at.
-JUMP, BRANCH_REACH = 0.5, 0.3
+RETURN_JUMP, BRANCH_REACH = 0.5, 0.3
 # Standard deviations from which a determinant is impossible.
 IMPOSSIBLE = 3.0
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
@@ -382,7 +382,7 @@ def _on_branches(section: PoincareSection, maps: ReturnMap, candidate: MapCycle)
     of_cycle = np.roll(returns[candidate.closest + np.arange(count)], candidate.shift)
     away = np.abs(maps.wrap(maps.arguments[:, None] - candidate.points)).max(axis=2)
     nearest, known = away.argmin(axis=1), returns[maps.positions]
-    jumps = np.abs(known - of_cycle[nearest]) > JUMP * np.quantile(known, SHORT_RETURN)
+    jumps = np.abs(known - of_cycle[nearest]) > RETURN_JUMP * np.quantile(known, SHORT_RETURN)
     if not np.any(jumps & (away.min(axis=1) < BRANCH_REACH)):
         return maps
     return maps.without(jumps)
