@@ -335,8 +335,10 @@ def test_arguments_that_are_refused():
         orbits[0].experiment(states={"y": "y"})
     with pytest.raises(ValueError, match="orbits: must be of a section with a forcing"):
         bp.polish_orbits(bp.models.pendulum, orbits, dict.fromkeys(bp.models.pendulum.parameters, 1.0))
-    with pytest.raises(ValueError, match="must have two coordinates or more, got one"):
+    with pytest.raises(ValueError, match=r"must have two coordinates or more, .* got \('y',\)"):
         bp.plot.orbits(orbits)
+    with pytest.raises(ValueError, match="angles: must be coordinates that are no intervals"):
+        crossing("interval(x)", angles=["interval(x)"])
 
 
 def test_sections_and_orbits_are_saved_printed_and_drawn(tmp_path):
