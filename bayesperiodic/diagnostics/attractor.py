@@ -27,7 +27,7 @@ from bayesperiodic.diagnostics.free_runs import Recorded, Runner
 from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.adequacy import ADEQUACY_LEVEL, ALL, UNTESTED
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.orbits.coordinates import channels_of
+from bayesperiodic.orbits.coordinates import channels_of, integrand_of
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.section import PoincareSection
 from bayesperiodic.periodic.solution import PeriodicSolution
@@ -202,7 +202,7 @@ def predict_attractor(
         `covariance` or, if the model is misspecified, `robust_covariance`, within the supports of the priors.
     section : PoincareSection
         Of a recording of the forced system, which need not be part of the problem. Its coordinates must be outputs of
-        the model, delayed or not, and the model's inputs must be recorded.
+        the model, delayed or not, no integrals, and the model's inputs must be recorded.
     runs, periods : int
         Number of runs, at least 20, and their length in forcing periods, at least 20. The recording must contain at
         least 10 pieces of that length.
@@ -221,8 +221,8 @@ def predict_attractor(
     Raises
     ------
     ValueError
-        For too few runs or periods, a section of points alone or of crossings, one that is too short, coordinates or
-        inputs that do not belong to the model, and draws of another problem.
+        For too few runs or periods, a section of points alone, of crossings or with integrals, one that is too short,
+        coordinates or inputs that do not belong to the model, and draws of another problem.
     RuntimeError
         If the model has no motion from which runs could start, or fewer than 10 starts can be fitted.
 
@@ -309,6 +309,11 @@ def _recorded(problem: Problem, section: PoincareSection, periods: int) -> Recor
     returns = np.diff(section.measured[1]) * section.frequency
     if np.abs(returns - np.round(returns)).max() > 1e-6:
         raise ValueError("section: must be of a forced system, once a forcing period, got crossings of a plane.")
+    if any(map(integrand_of, channels_of(section.coordinates))):
+        raise ValueError(
+            f"section: must have no integrals, got {section.coordinates}, which are known but for a line in each "
+            "stretch. Make one of the same recordings with delayed coordinates, and give no orbits of the other."
+        )
     for name in channels_of(section.coordinates):
         _checks.one_of("section: coordinates", name, model.outputs)
     for name in model.inputs:

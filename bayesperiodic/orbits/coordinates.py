@@ -18,12 +18,20 @@ SHORT_RETURN = 0.01
 DELAYED = re.compile(r"(.*)\[([^\[\]]*?)( ?s)?\]", re.DOTALL)
 # The integral of a channel over time.
 INTEGRATED = re.compile(r"integral\((.*)\)", re.DOTALL)
+# The time since the channel crossed the level of the section before.
+INTERVAL = re.compile(r"interval\((.*)\)", re.DOTALL)
 
 
 def channel_and_delay(coordinate: str) -> tuple[str, float]:
     """Return the channel of a coordinate and its delay, in forcing periods or in seconds, as its section has it."""
     match = DELAYED.fullmatch(coordinate)
-    return (match[1], float(match[2])) if match else (coordinate, 0.0)
+    return (match[1], float(match[2])) if match else (crossed_of(coordinate) or coordinate, 0.0)
+
+
+def crossed_of(coordinate: str) -> str | None:
+    """Return the channel between whose crossings this coordinate is the time, or None."""
+    match = INTERVAL.fullmatch(coordinate)
+    return match[1] if match else None
 
 
 def integrand_of(channel: str) -> str | None:
@@ -33,8 +41,8 @@ def integrand_of(channel: str) -> str | None:
 
 
 def is_output(coordinate: str) -> bool:
-    """Return whether a coordinate is neither delayed nor an integral."""
-    return not (DELAYED.fullmatch(coordinate) or INTEGRATED.fullmatch(coordinate))
+    """Return whether a coordinate is neither delayed nor an integral or interval."""
+    return not any(form.fullmatch(coordinate) for form in (DELAYED, INTEGRATED, INTERVAL))
 
 
 def channels_of(coordinates: Sequence[str]) -> tuple[str, ...]:
@@ -77,7 +85,7 @@ def longest_window_of_crossings(names: Sequence[str], channel: str, rate: float,
     The names are those of the coordinates, the rate is that of the samples, and the times between the crossings of the
     channel are `returns` [s]. Raises a ValueError if windows of the fewest samples overlap.
     """
-    every = (channel, *names)
+    every = (channel, *(name for name in names if not crossed_of(name)))
     columns, delays = columns_of(every), delays_of(every)
     until_next, least = float(np.quantile(returns, SHORT_RETURN)), 2 * SMALLEST_WINDOW / rate
     places = [np.sort(delays[columns == column]) for column in np.unique(columns)]
@@ -153,7 +161,7 @@ def coordinate_names(
     for name in given:
         match = DELAYED.fullmatch(name) if isinstance(name, str) else None
         if match is None:
-            names.append(name if not isinstance(name, str) else integrand_of(name) or name)
+            names.append(name if not isinstance(name, str) else integrand_of(name) or crossed_of(name) or name)
             continue
         try:
             _checks.finite_number("delay", float(match[2] if (match[3] is None) == forced else ""))
@@ -174,8 +182,12 @@ def coordinate_names(
         _checks.one_of("angles", name, given)
     if len(angle_names) > 1:
         raise ValueError(f"angles: must name at most one coordinate, got {angle_names!r}.")
+    if forced and any(map(crossed_of, given)):
+        raise ValueError(f"coordinates: must have intervals for crossings only, got {given!r}. Use delayed ones.")
     if not forced and any(integrand_of(channel_and_delay(name)[0]) for name in given):
         raise ValueError(f"coordinates: must have no integrals for crossings, got {given!r}. Use delayed coordinates.")
+    if any(map(crossed_of, angle_names)):
+        raise ValueError(f"angles: must be coordinates that are no intervals, got {angle_names!r}.")
     if any(integrand_of(channel_and_delay(name)[0]) in angle_names for name in given):
         raise ValueError(f"coordinates: must have no integral of an angle, got {given!r}. Integrate another channel.")
     if any(channel_and_delay(name)[0] in delayed for name in angle_names):

@@ -1,11 +1,15 @@
 """Instants at which a measured channel crosses a level, found in the smoothed channel."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from bayesperiodic.orbits.coordinates import delays_of, longest_window_of_crossings
 from bayesperiodic.orbits.stretches import SMALLEST_WINDOW, WINDOW_INSTANTS, Stretches, chosen_windows, windowed
 
+# Fewest points of a section.
+FEWEST_POINTS = 200
 # A channel must go so far below the level and above it for a crossing, in standard deviations of the channel and in
 # standard deviations of the smoothed channel's errors, so that noise adds none.
 CROSSING_BAND, CROSSING_NOISE = 0.1, 5.0
@@ -28,11 +32,44 @@ class Crossings(NamedTuple):
         """Times between consecutive crossings of a stretch, (returns,) [s]."""
         return np.diff(self.instants)[np.diff(self.stretch) == 0]
 
+    def with_intervals(self, error: float) -> tuple["Crossings", np.ndarray, np.ndarray]:
+        """Return those with one before in the same stretch, the times since then, and their standard deviations.
+
+        `error` is the standard deviation of the signal's errors.
+        """
+        kept, variance = np.append(False, np.diff(self.stretch) == 0), (error / self.slopes) ** 2
+        since, sd = np.diff(self.instants, prepend=np.nan), np.sqrt(variance + np.roll(variance, 1))
+        return self.some(kept), since[kept], sd[kept]
+
     def within(self, samples: Stretches, earliest: float, latest: float) -> "Crossings":
         """Return those from which the delays [s] from the earliest to the latest one are in the same stretch."""
         first, last = samples.time[samples.starts], samples.time[samples.stops - 1]
-        kept = (self.instants + earliest >= first[self.stretch]) & (self.instants + latest <= last[self.stretch])
+        early, late = self.instants + earliest, self.instants + latest
+        return self.some((early >= first[self.stretch]) & (late <= last[self.stretch]))
+
+    def some(self, kept: np.ndarray) -> "Crossings":
+        """Return some of them."""
         return self._replace(instants=self.instants[kept], stretch=self.stretch[kept], slopes=self.slopes[kept])
+
+
+def crossings_for(
+    samples: Stretches, values: np.ndarray, level: float, direction: int, names: Sequence[str], channel: str
+) -> tuple[Crossings, float, float]:
+    """Return where the values (samples, 1) of a channel cross a level and the coordinates are known.
+
+    Also the sd of the values' errors there, and the longest window [s] of the coordinates, whose names are given.
+    """
+    height, delays = samples._replace(signals=direction * (values - level)), delays_of(names)
+    crossings = upward_crossings(height, samples.time.size // (2 * FEWEST_POINTS))
+    if not crossings.instants.size:
+        raise ValueError(
+            f"level: must be crossed by {channel!r}, got no crossing of {level:.6g} by {crossings.band:.3g} on both "
+            f"sides. Take another one, such as {0.5 * (values.min() + values.max()):.3g}, or sample faster."
+        )
+    crossings = crossings.within(samples, delays.min(), delays.max())
+    check_count(crossings.instants.size)
+    longest = longest_window_of_crossings(names, channel, samples.sampling_rate, crossings.returns)
+    return *refined(height, crossings, longest), longest
 
 
 def upward_crossings(samples: Stretches, widest: int) -> Crossings:
@@ -72,3 +109,11 @@ def refined(samples: Stretches, crossings: Crossings, longest: float) -> tuple[C
         values, gains = windowed(samples, at, stretch, halves)
         at = np.clip(at - values[:, 0] / slopes, crossings.instants - reach, crossings.instants + reach)
     return crossings._replace(instants=at), float(np.sqrt(variance[0] * gains.mean()))
+
+
+def check_count(count: int) -> None:
+    """Raise a ValueError unless there are enough points."""
+    if count < FEWEST_POINTS:
+        raise ValueError(
+            f"section: must have at least {FEWEST_POINTS} points, got {count}; thousands are better. Record longer."
+        )

@@ -11,7 +11,7 @@ from scipy.special import chdtrc
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.orbits import cycles
-from bayesperiodic.orbits.coordinates import channels_of, longest_window_of_crossings, wrapped
+from bayesperiodic.orbits.coordinates import SHORT_RETURN, channels_of, crossed_of, longest_window_of_crossings, wrapped
 from bayesperiodic.orbits.cycles import Estimate, MapCycle
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.phases import merged, phases_of, with_late_partners
@@ -38,6 +38,8 @@ SEARCH_WIDTH = 4.0
 WIDTH_OF_ONE, WIDEST_OF_ONE = 20.0, 0.018
 # Largest standard deviation of a point, in units of the attractor's size.
 LARGEST_SD = 0.02
+# Crossings: largest standard deviation of a period, in mean returns, and smallest quality of an orbit.
+LARGEST_DURATION_SD, IMPLAUSIBLE = 0.01, 1e-3
 # The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
 # False-alarm rate of the test for a return map that changes.
@@ -46,6 +48,9 @@ CHANGE_LEVEL = 1e-3
 DELAYS_TRIED = (-0.25, -0.5)
 # A coordinate to add reduces the errors of predictions to this fraction or less; smaller ones are not looked at.
 REDUCED, LEAST_ERROR = 0.8, 0.01
+# Times between crossings jump by more than this fraction of the shortest one, and distance from a cycle within which
+# this is looked at.
+RETURN_JUMP, BRANCH_REACH = 0.5, 0.3
 # Standard deviations from which a determinant is impossible.
 IMPOSSIBLE = 3.0
 # Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
@@ -66,7 +71,9 @@ def find_orbits(
     """Find the unstable periodic orbits in a section of a chaotic motion, without a model.
 
     Orbits of a section by crossings have their own period, `Orbit.duration`, with an error: the times between crossings
-    are fitted like the return map.
+    are fitted like the return map. Where some oscillations miss the level, the map jumps; an orbit is fitted to points
+    that return after as many oscillations as it does. Orbits with a standard error of the period above 1 % of a mean
+    return, or a quality below 0.001, are left out.
 
     "chained": points that nearly recur after p returns are near an orbit of period p. Local quadratic polynomials
     approximate the return map at the p points, and Newton's method moves all points together until the maps close the
@@ -161,18 +168,22 @@ def _of_section(
     maps, size, prediction = _scaled(section, neighbours)
     neighbours = _wide_enough(maps, neighbours)
     if method == "boxes":
-        pairs = [pair for p in wanted for pair in cycles.box_orbits(maps, p, neighbours, box)]
+        triples = [(maps, *pair) for p in wanted for pair in cycles.box_orbits(maps, p, neighbours, box)]
     else:
         if steps > 1:
             maps = _with_steps(section, maps, size, steps)
         atlas = Atlas(maps, _search_count(maps, neighbours))
-        pairs = [pair for p in wanted for pair in _chained(maps, atlas, p, neighbours)]
+        triples = [one for p in wanted for one in _chained(section, maps, atlas, p, neighbours)]
     quality_count = _search_count(maps, FEWEST_NEIGHBOURS)
-    following = Following(section, maps, size) if waveforms and pairs and section.measured is not None else None
-    extent = _extent(section)
-    orbits = [
-        _orbit(section, maps, size, extent, *pair, _quality(maps, *pair, quality_count), following) for pair in pairs
-    ]
+    following = Following(section, maps, size) if waveforms and triples and section.measured is not None else None
+    extent, orbits = _extent(section), []
+    for branch, candidate, estimate in triples:
+        motion = following if following is None or branch is maps else Following(section, branch, size)
+        quality = _quality(branch, candidate, estimate, quality_count)
+        orbit = _orbit(section, branch, size, extent, candidate, estimate, quality, motion)
+        doubtful = orbit.duration_sd > LARGEST_DURATION_SD / section.frequency or quality < IMPLAUSIBLE
+        if section.crossed is None or not doubtful:
+            orbits.append(orbit)
     finished = with_late_partners(_finished(orbits, maps, size))
     return Orbits(finished, values=section.values, method=method, prediction_error=prediction)
 
@@ -264,16 +275,22 @@ def _remedy(section: PoincareSection, maps: ReturnMap, error: float) -> str:
             f"{more}; delayed ones do not help, with {name!r} errors are {least:.1%}. {len(section)} points may "
             "be too few for local maps: record longer."
         )
-    return f"{more} or a delayed one, with {name!r} errors are {least:.1%}."
+    kind = "the interval" if crossed_of(name) else "a delayed one"
+    return f"{more} or {kind}, with {name!r} errors are {least:.1%}."
 
 
 def _best_delayed(section: PoincareSection, maps: ReturnMap) -> tuple[str, float]:
-    """Return the delayed coordinate with which local maps predict best, and their error; an empty name if none."""
+    """Return the coordinate to add with which local maps predict best, and their error; an empty name if none.
+
+    It is a delayed one, or the interval between crossings where that is much better.
+    """
     errors, size = {}, np.ptp(section.points, axis=0)
     channels = dict.fromkeys([*channels_of(section.coordinates), *filter(None, [section.crossed])])
     # For crossings, fractions of the mean return.
     delays = [f"{d / section.frequency:.2g} s" if section.crossed else str(d) for d in DELAYS_TRIED]
-    for name in (f"{channel}[{d}]" for channel in channels if channel not in section.angles for d in delays):
+    names = [f"{channel}[{d}]" for channel in channels if channel not in section.angles for d in delays]
+    interval = f"interval({section.crossed})"
+    for name in [*names, interval] if section.crossed else names:
         values = None if name in section.coordinates or not _separate(section, name) else section.delayed(name)
         if values is None:
             continue
@@ -283,7 +300,9 @@ def _best_delayed(section: PoincareSection, maps: ReturnMap) -> tuple[str, float
         points, added = np.hstack([maps.points, column]), np.hstack([section.increments / size, increments])
         turn, noise = np.append(maps.turn, np.inf), np.append(maps.noise, 0.0)
         errors[name] = prediction_error(ReturnMap(points, added, turn, maps.winds, noise, maps.stretches))[0]
-    return min(errors.items(), key=lambda item: item[1], default=("", np.inf))
+    of_interval = errors.pop(interval, np.inf)
+    best = min(errors.items(), key=lambda item: item[1], default=("", np.inf))
+    return (interval, of_interval) if of_interval < REDUCED * best[1] else best
 
 
 def _separate(section: PoincareSection, coordinate: str) -> bool:
@@ -329,22 +348,44 @@ def _search_count(maps: ReturnMap, neighbours: int) -> int:
     return count
 
 
-def _chained(maps: ReturnMap, atlas: Atlas, period: int, neighbours: int) -> list[tuple[MapCycle, Estimate]]:
-    pairs: list[tuple[MapCycle, Estimate]] = []
+def _chained(
+    section: PoincareSection, maps: ReturnMap, atlas: Atlas, period: int, neighbours: int
+) -> list[tuple[ReturnMap, MapCycle, Estimate]]:
+    """Return the orbits of a period, each with the return map to which it was fitted."""
+    triples: list[tuple[ReturnMap, MapCycle, Estimate]] = []
     before: list[np.ndarray] = []
     sds: list[float] = []
     for candidate in cycles.candidates(maps, atlas, period):
-        estimate = cycles.refine(maps, candidate.points, neighbours)
+        branch = _on_branches(section, maps, candidate)
+        estimate = cycles.refine(branch, candidate.points, neighbours)
         if estimate is None or not (sd := _largest_sd(estimate)) < LARGEST_SD:
             continue
         returns = estimate.points[:: maps.steps]
         repeats = cycles.has_shorter_period(returns, maps.wrap, max(2e-3, 3.0 * sd))
         distances, _ = cycles.shifts_between(returns, before, maps.wrap)
         if not repeats and np.all(distances >= np.maximum(1e-3, 2.0 * np.maximum(sd, sds))):
-            pairs.append((candidate, estimate))
+            triples.append((branch, candidate, estimate))
             before.append(returns)
             sds.append(sd)
-    return pairs
+    return triples
+
+
+def _on_branches(section: PoincareSection, maps: ReturnMap, candidate: MapCycle) -> ReturnMap:
+    """Return the return map without the points that return after another number of oscillations than the candidate.
+
+    Where a motion touches the level, the map of crossings jumps, and so do the times between them. A polynomial across
+    the jump does not approximate the map.
+    """
+    if section.crossed is None or section.instants is None:
+        return maps
+    returns, count = np.diff(section.instants), len(candidate.points)
+    of_cycle = np.roll(returns[candidate.closest + np.arange(count)], candidate.shift)
+    away = np.abs(maps.wrap(maps.arguments[:, None] - candidate.points)).max(axis=2)
+    nearest, known = away.argmin(axis=1), returns[maps.positions]
+    jumps = np.abs(known - of_cycle[nearest]) > RETURN_JUMP * np.quantile(known, SHORT_RETURN)
+    if not np.any(jumps & (away.min(axis=1) < BRANCH_REACH)):
+        return maps
+    return maps.without(jumps)
 
 
 def _largest_sd(estimate: Estimate) -> float:

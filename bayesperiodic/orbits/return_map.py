@@ -128,6 +128,16 @@ class ReturnMap:
         self.count = len(self.arguments) // steps  # of points of each phase
         self._tree = self.tree(self.arguments, self.phases(self.positions))
 
+    def without(self, left_out: np.ndarray) -> "ReturnMap":
+        """Return the map without some of the arguments (n,)."""
+        kept, noises = self.positions[~left_out], None
+        increments = np.full((len(self.points) - 1, self.points.shape[1]), np.nan)
+        increments[kept] = self.increments[~left_out]
+        if self._noises is not None:
+            noises = np.full(self.points.shape, np.nan)
+            noises[kept] = self._noises[~left_out]
+        return ReturnMap(self.points, increments, self.turn, self.winds, self.noise, self.stretches, self.steps, noises)
+
     def followed(self, steps: int) -> np.ndarray:
         """Return the positions of the points whose stretch contains the point `steps` later."""
         return np.flatnonzero(self.stretches[steps:] == self.stretches[:-steps])
@@ -441,7 +451,10 @@ def check_chaos(maps: ReturnMap, remedy: Callable[[float], str]) -> tuple[float,
             f"{remedy(error)} Otherwise check for a wrong frequency or level, and for noise as large as the motion."
         )
         if from_noise > NOISE_EXPLAINS * error:
-            advice = "The noise is too large: sample faster, record with less noise, or choose coordinates with less."
+            advice = (
+                "The noise is too large: sample faster, record with less noise, or choose coordinates with less, such "
+                "as a delay at which the channel is near a maximum or, of crossings, the interval."
+            )
         raise ValueError(
             f"section: must show a return map, got images that local maps of {d} coordinate{'s' * (d > 1)} "
             f"predict with errors of {error:.0%} of the distance of random points, {from_noise:.1%} from known noise. "

@@ -17,22 +17,22 @@ from bayesperiodic.orbits.coordinates import (
     coordinate_names,
     coordinate_signals,
     coordinate_values,
+    crossed_of,
     delays_of,
     given_recordings,
     integrand_of,
     longest_window,
-    longest_window_of_crossings,
     other_channels,
     unwrapped,
     with_integrals,
     with_others,
     wrapped,
 )
-from bayesperiodic.orbits.crossings import Crossings, refined, upward_crossings
+from bayesperiodic.orbits.crossings import Crossings, check_count, crossings_for
 from bayesperiodic.orbits.integrals import HALF_WINDOW, in_parts
 from bayesperiodic.orbits.stretches import FEWEST_SAMPLES, Stretches, joined, local_fit
 
-FEWEST_POINTS, CYCLE_SAMPLES = 200, 64
+CYCLE_SAMPLES = 64
 # Points coincide if their standard deviations are below this many of the noise, or this fraction of the motion's range.
 SCATTER, SMALLEST_SCATTER = 2.0, 2e-3
 
@@ -144,8 +144,8 @@ class PoincareSection(Result):
         coordinates : sequence of str
             Two or more outputs that determine the next point, as many as the system has states, or more, such as
             ``("angle", "rate")``. What is not measured is replaced by delayed coordinates, such as
-            ``("velocity", "voltage", "voltage[-0.25]")`` with the voltage a quarter of the forcing period before, or
-            by integrals, such as ``("velocity", "voltage", "integral(velocity)")`` with the displacement; see Notes.
+            ``("velocity", "voltage", "voltage[-0.25]")``, the voltage a quarter of the forcing period before, or by
+            integrals, such as ``("velocity", "voltage", "integral(velocity)")``, the displacement; see Notes.
         frequency : float
             Of the forcing [Hz].
         origin : float
@@ -290,10 +290,13 @@ class PoincareSection(Result):
             Outputs that determine the next crossing: one fewer than the system has states; or one, if the points are
             nearly on a curve, as for strong contraction. What is not measured is replaced by delays in seconds:
             ``"current[-0.1 s]"`` is the current 0.1 s before the crossing. They are within the shortest return.
+            ``"interval(current)"``, where the channel is "current", is the time since the crossing before, which has
+            most of the information where spikes are alike.
         channel : str
-            Output whose crossings define the section; a coordinate only with delays.
+            Output whose crossings define the section; a coordinate only with delays, or its interval.
         level : float, optional
-            By default the channel's median. It should be crossed steeply, once an oscillation; not the foot of spikes.
+            By default the channel's median. It should be crossed steeply; not the foot of spikes. Some oscillations may
+            miss it: orbits are fitted to points that return after as many oscillations as they do.
         direction : {1, -1}
             Upwards or downwards.
         angles
@@ -333,31 +336,26 @@ class PoincareSection(Result):
         others, inputs = other_channels(given, names)
         every = (*channels_of(names), *others)
         _checks.one_of("channel", channel, [c for c in every if c not in names and c not in inputs])
+        for name in filter(crossed_of, names):
+            _checks.one_of("coordinates", name, [f"interval({channel})"])
         if direction not in (1, -1):
             raise ValueError(f"direction: must be 1 (upwards) or -1 (downwards), got {direction!r}.")
         signals = [with_others(one, values, others) for one, (*_, values) in zip(given, parts, strict=True)]
         samples = unwrapped(joined(given, signals, None), np.isin(every, angle_names))
         values = samples.signals[:, [every.index(channel)]]
         level = float(np.median(values)) if level is None else _checks.finite_number("level", level)
-        height = samples._replace(signals=direction * (values - level))
-        delays = delays_of(names)
-        crossings = upward_crossings(height, samples.time.size // (2 * FEWEST_POINTS))
-        if not crossings.instants.size:
-            raise ValueError(
-                f"level: must be crossed by {channel!r}, got no crossing of {level:.6g} by {crossings.band:.3g} on "
-                f"both sides. Take another one, such as {0.5 * (values.min() + values.max()):.3g}, or sample faster."
-            )
-        crossings = crossings.within(samples, delays.min(), delays.max())
-        _check_count(crossings.instants.size)
-        longest = longest_window_of_crossings(names, channel, samples.sampling_rate, crossings.returns)
-        crossings, error = refined(height, crossings, longest)
-        synthetic = any(recording.synthetic for recording in given)
+        crossings, error, longest = crossings_for(samples, values, level, direction, names, channel)
+        if timed := any(map(crossed_of, names)):
+            crossings, since, since_sd = crossings.with_intervals(error)
         section = cls._of(
-            samples, names, angle_names, crossings.instants, crossings.stretch, 0, synthetic, others, inputs,
-            1.0 / float(crossings.returns.mean()), longest, channel,
+            samples, names, angle_names, crossings.instants, crossings.stretch, 0, any(one.synthetic for one in given),
+            others, inputs, 1.0 / float(crossings.returns.mean()), longest, channel,
         )  # fmt: skip
         section = section if section.noise is None else section._with_errors_of(crossings, error)
         extent = np.array([np.ptp(signal) for signal in samples.signals.T])[columns_of(names)]
+        if timed:
+            section = section._with_intervals(since, since_sd)
+            extent[[crossed_of(name) is not None for name in names]] = since.mean()
         least = 0.0 if section.noise is None else SCATTER * section.noise
         if np.all(section.points.std(axis=0) < np.maximum(least, SMALLEST_SCATTER * extent)):
             raise ValueError(
@@ -376,7 +374,7 @@ class PoincareSection(Result):
         ----------
         points : array (count, d), or sequence of such arrays
             All consecutive points in the order of time; angles [rad] with any number of turns. Several arrays are
-            unbroken stretches: the first point of one does not follow the last point of another.
+            unbroken stretches.
         coordinates, frequency, angles
             As for `from_recording`.
 
@@ -405,7 +403,7 @@ class PoincareSection(Result):
                     f"points[:, {k}] ({name}): must be an angle in radians, got a range of {extent:.4g}. It seems to "
                     "be in degrees: convert it with numpy.radians."
                 )
-        _check_count(len(values))
+        check_count(len(values))
         stretch = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         increments = _within(wrapped(np.diff(values, axis=0), turning), stretch)
         points = wrapped(values, turning)
@@ -421,7 +419,7 @@ class PoincareSection(Result):
         frequency: float, longest: float, crossed: str | None = None, drifts: Mapping[str, float] | None = None,
     ) -> "PoincareSection":  # fmt: skip
         """Return the section of signals at given instants, in windows no longer than `longest`."""
-        _check_count(instants.size)
+        check_count(instants.size)
         time, unit = samples.time, 1.0 if crossed else 1.0 / frequency
         drifts = drifts or {}
         values, noise = coordinate_values(samples, names, instants, stretch, unit, longest, drifts)
@@ -445,6 +443,15 @@ class PoincareSection(Result):
         noises = np.hypot(self.noise, error * (later - before) / (2.0 * apart * crossings.slopes[:, None]))
         return replace(self, noise=np.sqrt(np.mean(noises**2, axis=0)), noises=noises)
 
+    def _with_intervals(self, since: np.ndarray, sd: np.ndarray) -> "PoincareSection":
+        """Return the section with the times since the crossings before, and their standard deviations, (count,)."""
+        times = np.array([crossed_of(name) is not None for name in self.coordinates])
+        points = np.where(times, since[:, None], self.points)
+        increments = np.where(times, np.diff(since)[:, None] + 0.0 * self.increments, self.increments)
+        noises = None if self.noises is None else np.where(times, sd[:, None], self.noises)
+        noise = None if noises is None else np.sqrt(np.mean(noises**2, axis=0))
+        return replace(self, points=points, increments=increments, noise=noise, noises=noises)
+
     def __len__(self) -> int:
         return len(self.points)
 
@@ -467,12 +474,13 @@ class PoincareSection(Result):
             For an unknown channel.
         """
         channel, delay = channel_and_delay(coordinate)
+        if crossed_of(coordinate) and self.instants is not None:
+            return np.append(np.nan, np.diff(self.instants) + 0.0 * self.increments[:, 0])
         channels = self.channels if self.crossed else channels_of(self.coordinates)
         _checks.one_of("coordinate", channel, channels)
-        measured = self.measured
-        if measured is None:
+        if self.measured is None:
             return None
-        samples, instants, stretch = measured
+        samples, instants, stretch = self.measured
         at, column = instants + delay * self.unit, [channels.index(channel)]
         first, last = samples.time[samples.starts[stretch]], samples.time[samples.stops[stretch] - 1]
         values = local_fit(samples._replace(signals=samples.signals[:, column]), np.clip(at, first, last), stretch)[0]
@@ -560,11 +568,10 @@ class PoincareSection(Result):
         ValueError
             If the returns are not in one unbroken stretch.
         """
-        measured = self.measured
-        if measured is None:
+        if self.measured is None:
             return None
         inside = 0 <= index and index + period < len(self)
-        recorded, instants, stretch = measured
+        recorded, instants, stretch = self.measured
         if not inside or stretch[index] != stretch[index + period]:
             raise ValueError(
                 f"index, period: must be a point and a number of returns in one unbroken stretch, got {index!r} and "
@@ -591,10 +598,3 @@ class PoincareSection(Result):
 def _within(increments: np.ndarray, stretch: np.ndarray) -> np.ndarray:
     """Return increments (count − 1, d) with NaN where the next point (count,) is in another stretch."""
     return np.where((np.diff(stretch) == 0)[:, None], increments, np.nan)
-
-
-def _check_count(count: int) -> None:
-    if count < FEWEST_POINTS:
-        raise ValueError(
-            f"section: must have at least {FEWEST_POINTS} points, got {count}; thousands are better. Record longer."
-        )

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from bayesperiodic import _checks
 from bayesperiodic.diagnostics.branch_prediction import BranchPrediction
-from bayesperiodic.orbits.coordinates import channel_and_delay
+from bayesperiodic.orbits.coordinates import channel_and_delay, crossed_of
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.section import PoincareSection
 from bayesperiodic.periodic.continuation import FOLD, PERIOD_DOUBLING, Branch
@@ -268,7 +268,7 @@ def orbits(
     Raises
     ------
     ValueError
-        Without orbits, and for a section of one coordinate.
+        Without orbits, and for a section of one coordinate or with an interval among the first two.
 
     Examples
     --------
@@ -279,8 +279,11 @@ def orbits(
     _checks.instance("orbits", orbits, (Orbits, list, tuple))
     if not len(orbits):
         raise ValueError("orbits: must be at least one, got none.")
-    if len(orbits[0].coordinates) == 1:
-        raise ValueError("orbits: must have two coordinates or more, got one. Draw their points with plot.section.")
+    if len(shown := orbits[0].coordinates[:2]) == 1 or any(map(crossed_of, shown)):
+        raise ValueError(
+            f"orbits: must have two coordinates or more, the first two no intervals, got {shown}. Draw their points "
+            "with plot.section."
+        )
     rows = -(-len(orbits) // ORBITS_ACROSS)
     columns = -(-len(orbits) // rows)
     figure = figure or plt.figure(figsize=(1.9 * columns + 0.6, 1.85 * rows + 0.7), layout="constrained")
@@ -341,6 +344,7 @@ def _multiplier(orbit: Orbit) -> str:
 
 
 def _coordinate_labels(plane: PoincareSection | Orbit, units: Mapping[str, str] | None) -> list[str]:
-    known = dict.fromkeys(plane.angles, "rad") | dict(units or {})
+    known = dict.fromkeys(plane.angles, "rad") | dict.fromkeys(filter(crossed_of, plane.coordinates), "s")
+    known |= dict(units or {})
     labels = [axis_label(coordinate, known.get(coordinate, "")) for coordinate in plane.coordinates[:2]]
     return labels if len(labels) == 2 else [*labels, f"{labels[0]}, next"]

@@ -353,6 +353,9 @@ def test_what_cannot_be_compared_is_refused(fitted):
         bp.predict_attractor(problem, fit, section, runs=10)
     with pytest.raises(ValueError, match="periods: must be"):
         bp.predict_attractor(problem, fit, section, periods=10)
+    integrated = replace(section, coordinates=(section.coordinates[0], f"integral({section.coordinates[0]})"))
+    with pytest.raises(ValueError, match="section: must have no integrals, .* delayed coordinates"):
+        bp.predict_attractor(problem, fit, integrated)
     time = section.instants + 0.1 * np.arange(len(section)) % 0.3
     with pytest.raises(ValueError, match="once a forcing period, got crossings"):
         bp.predict_attractor(problem, fit, replace(section, instants=time))
