@@ -9,6 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.condensed_orbits import near_data
 from bayesperiodic.density.initial_orbits import InitialEstimate, measured_orbits, simultaneous_fit
 from bayesperiodic.density.log_posterior import NATURAL, Linearisation, LogPosterior
 from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
@@ -116,7 +117,7 @@ def first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:
 def linearised(problem: Problem, theta: np.ndarray, initial: InitialEstimate | None) -> Linearisation:
     """Return residuals and Jacobian where orbits and parameters fit together, or else at θ."""
     if initial is None or not initial.states:
-        return _on_sheets(problem, problem.density().linearise(theta))
+        return near_data(problem, theta) or _on_sheets(problem, problem.density().linearise(theta))
     return LogPosterior(problem, ResponseSolver.start(problem, initial.theta, initial.states)).linearise(initial.theta)
 
 
