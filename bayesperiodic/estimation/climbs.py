@@ -37,6 +37,9 @@ MOST_SHEET_CHANGES = 5
 COARSENESS = 100.0
 # Points from which on solves without internal states are worth such climbs.
 MANY_POINTS = 256
+# Gain of a step in units of the square of the least one [standard deviations] that ends such a climb: far from the data
+# Gauss-Newton's steps are too long, and the errors of the solves hide what is gained.
+SMALL_PART = 0.1
 # Halvings of a step from a draw of a condensed model; solves that fail cost most.
 HALVINGS_FROM_DRAWS = 3
 # Standard deviation of a phase of which nothing is known [rad].
@@ -199,11 +202,12 @@ def climbed(
     objective: Objective, first: Iterate, progress: bool, most: int = MAX_STEPS, ends: Sequence[End] = (),
     halvings: int = MAX_STEP_HALVINGS, least: float = 0.0,
 ) -> End:  # fmt: skip
-    """Climb with a progress bar, until a step is below the least [standard deviations].
+    """Climb with a progress bar, until a step is below the least [standard deviations] or gains as little.
 
     Where an iterate comes close to one of the ends, that is returned.
     """
     reached: list[End] = []
+    heights = [first.objective]
     with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress, delay=SHOWN_AFTER) as bar:
 
         def report(iterate: Iterate, size: float) -> bool:
@@ -211,7 +215,8 @@ def climbed(
             bar.update()
             known = optimum_of(objective, iterate, ends) if size < SEPARATE_SDS else None
             reached.extend([known] if known else [])
-            return known is not None or size < least
+            gain, heights[0] = iterate.objective - heights[0], iterate.objective
+            return known is not None or size < least or gain < SMALL_PART * least**2
 
         end = climb(objective, first, report=report, most=most, halvings=halvings)
     return reached[0] if reached else end
@@ -262,10 +267,14 @@ def _doubtful(problem: Problem, end: End) -> bool:
 def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> Iterator[Linearisation]:
     """Yield where to start again: near orbits that give the measured outputs, and where simultaneous fits of them end.
 
-    Orbits and parameters are looked for from the start and from the estimate.
+    Orbits and parameters are looked for from the start and from the estimate; of condensed models the orbits, at the
+    estimate.
     """
-    unable = problem.model.autonomous or isinstance(problem.model, CondensedModel)
-    if unable or not all(e.outputs for e in problem.experiments):
+    if isinstance(problem.model, CondensedModel):
+        near = near_data(problem, end.theta)
+        yield from [near] if near else []
+        return
+    if problem.model.autonomous or not all(e.outputs for e in problem.experiments):
         return
     orbits = end.here.solver.solutions(end.theta, sensitivities=False)
     solutions = {name: solution.states for name, solution in orbits.items()}

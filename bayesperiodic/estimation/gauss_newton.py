@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesperiodic._linalg import hessian_eigh, hessian_scale, scaled
-from bayesperiodic.density.condensed_orbits import near_data
 from bayesperiodic.density.log_posterior import Linearisation, LogPosterior
 from bayesperiodic.estimation.noise_changes import changes_by_variance
 from bayesperiodic.likelihood.noise_estimate import estimate_noise
@@ -75,16 +74,10 @@ class Objective:
     of_total: bool = False
 
     def at(self, theta: np.ndarray, near: Linearisation, noise: np.ndarray) -> Iterate | None:
-        """Return the iterate at θ, solved from the anchors of a near one; None if the log-posterior is not finite.
-
-        Where orbits of condensed models end on the way, it is solved from those that the data show.
-        """
+        """Return the iterate at θ, solved from the anchors of a near one; None if the log-posterior is not finite."""
         if not np.isfinite(self.density.problem.joint_prior.log_prob(theta)):
             return None
-        here = near.moved(theta)
-        if not here.converged:
-            here = near_data(self.density.problem, theta) or here
-        return self.iterate(here, noise)
+        return self.iterate(near.moved(theta), noise)
 
     def iterate(self, here: Linearisation, noise: np.ndarray) -> Iterate | None:
         """Return the iterate of solved residuals; None if the log-posterior is not finite."""
