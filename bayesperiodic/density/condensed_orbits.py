@@ -73,7 +73,9 @@ def shown_displacements(
     if not 0.0 < largest < np.inf:
         return None
     transposed = np.swapaxes(gains.conj(), -1, -2)
-    forces = np.linalg.solve(transposed @ gains + np.eye(equations.count) / largest**2, times(transposed, missing)[..., None])
+    forces = np.linalg.solve(
+        transposed @ gains + np.eye(equations.count) / largest**2, times(transposed, missing)[..., None]
+    )
     acting = resized(forces[..., 0], points)
     return on_grid(times(matrices.d_u, load) - times(matrices.d_f, acting), points)
 
