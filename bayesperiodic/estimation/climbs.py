@@ -177,8 +177,8 @@ def _from_draw(
 ) -> End | None:
     """Return the end of the iteration from a draw of the prior; None if there is no orbit or no finite density.
 
-    It is solved from the orbits of the first end, condensed models from those that the data show, and is one of the ends where it comes
-    close to that.
+    It is solved from the orbits of the first end, condensed models from those that the data show. It is one of the ends
+    where it comes close to that.
     """
     first, halvings = ends[0].iterate, MAX_STEP_HALVINGS
     problem: Any = objective.density.problem

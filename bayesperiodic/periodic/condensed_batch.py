@@ -203,8 +203,8 @@ class CondensedBatch:
     def _follow(self, e: int, parameters: np.ndarray, once: bool) -> tuple[np.ndarray, int, int]:
         """Follow a solution from the anchor in steps; return it, the status, and Newton's steps.
 
-        With `once` one step on all points is tried first. The steps are on fewer points at first, whose solution starts the one on all points, or where those do not
-        suffice, on all points.
+        With `once` one step on all points is tried first. Others are on fewer points at first, whose solution starts
+        the one on all points, or where those do not suffice, on all points.
         """
         equations, used = self._sets[e], 0
         if not self._known[e]:  # a guess, from which to solve
