@@ -68,7 +68,10 @@ def shown_displacements(
     rows = [equations.model.outputs.index(c) for c in channels]
     gains = matrices.y_f[:count, rows] * weights[..., None]
     missing = weights * (times(matrices.y_u[:, rows], load)[:count] - measured)
-    first = [np.linalg.lstsq(*pair, rcond=LEAST_SINGULAR)[0] for pair in zip(gains[:FIRST_HARMONICS], missing)]
+    first = [
+        np.linalg.lstsq(*pair, rcond=LEAST_SINGULAR)[0]
+        for pair in zip(gains[:FIRST_HARMONICS], missing[:FIRST_HARMONICS], strict=True)
+    ]
     largest = float(np.abs(first).max())
     if not 0.0 < largest < np.inf:
         return None

@@ -485,7 +485,8 @@ def initial_orbit(
 ) -> InitialOrbit:
     """Return the orbit at θ (names,): one that is solved, or solved from the guess with all fallbacks.
 
-    Of condensed models the former may be any displacements from which to solve. `known` are indices of parameters and the derivatives by them, if they are known.
+    Of condensed models the former may be displacements from which to solve. `known` are indices of parameters and the
+    derivatives by them, if they are known.
     """
     specials = _specials(problem)
     if experiment in specials:

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +42,7 @@ from bayesperiodic.estimation.frequencies import updated_frequencies
 from bayesperiodic.estimation.gauss_newton import (
     MAX_STEPS,
     End,
+    Iterate,
     Objective,
     at_ends,
     climb,
@@ -194,13 +196,7 @@ def map_estimate(
         raise ValueError(_not_finite(problem, theta, start is not None))
     objective = objective_near(problem, first.here)
     fewest = 1 if near_optimum and precise and starts is None else fewest
-    # Where tests decide on more starts, they are of the neighbourhood of an optimum.
-    least = SEPARATE_SDS if near_optimum else 0.0
-    end = (
-        rough(first)
-        if near_optimum and fewest > 1
-        else on_best_sheets(problem, climbed(objective, first, progress, least=least), progress)
-    )
+    end = _first_end(objective, first, near_optimum is not None, fewest, progress)
     end = on_measured_orbits(problem, theta, end, progress)
     starting = [*(near or [theta, *draws[: fewest - 1]]), *draws[fewest - 1 :]]
     ends = from_draws(objective, starting, end, fewest, progress, coarse if near_optimum else None)
@@ -243,6 +239,18 @@ def nearest_optimum(
     objective = objective_near(problem, near)
     first = objective.iterate(near, problem.likelihood.guess())
     return None if first is None else (objective, climb(objective, first))
+
+
+def _first_end(objective: Objective, first: Iterate, near_optimum: bool, fewest: int, progress: bool) -> End:
+    """Return the end of the climb from the first start, of condensed models `near_optimum`, where that is enough.
+
+    Where tests decide on more starts, they are of this neighbourhood; without such tests none is needed.
+    """
+    if near_optimum and fewest > 1:
+        return rough(first)
+    end = climbed(objective, first, progress, least=SEPARATE_SDS if near_optimum else 0.0)
+    problem: Any = objective.density.problem
+    return on_best_sheets(problem, end, progress)
 
 
 def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Problem, End]:

@@ -98,6 +98,16 @@ class CondensedBatch:
                 result.append(equations.many_matrices(parameters[e], self._points))
         return result
 
+    def _linear_parts(self, parameters: np.ndarray) -> tuple[list[ResponseMatrices], np.ndarray, np.ndarray]:
+        """Return the responses, that between the elements of all sets, and their displacements without forces."""
+        responses = self._responses(parameters)
+        vectors = max(len(r.d_f) for r in responses)
+        d_f = np.empty((len(responses), vectors, *responses[0].d_f.shape[1:]), dtype=complex)
+        free = np.empty(d_f.shape[:-1], dtype=complex)
+        for e, response in enumerate(responses):
+            d_f[e], free[e] = response.d_f, _unforced(response.d_u, self._load[e])
+        return responses, d_f, free
+
     @unwarned
     def solve(
         self,
@@ -141,16 +151,11 @@ class CondensedBatch:
         moved, f = np.sqrt(np.sum(np.abs(ahead) ** 2, axis=(2, 3))), np.full_like(d, np.nan)
         fewer = np.empty((count, solves, self._points // 4 if self._blocks.size else 0, first.count), dtype=complex)
         lost, steps = np.zeros((2, count, solves), dtype=np.int64)
-        lost[~self._known] = 1
+        once = polish and solves == 1 and self._size > LARGEST_INVERSE
+        lost[once | ~self._known] = 1
         if without is not None:
             lost[without] = 1
-        once = polish and solves == 1 and self._size > LARGEST_INVERSE
-        responses = self._responses(every)
-        vectors = max(len(r.d_f) for r in responses)
-        d_f = np.empty((count, vectors, *responses[0].d_f.shape[1:]), dtype=complex)
-        free = np.empty(d_f.shape[:-1], dtype=complex)
-        for e, response in enumerate(responses):
-            d_f[e], free[e] = response.d_f, _unforced(response.d_u, self._load[e])
+        responses, d_f, free = self._linear_parts(every)
         kernels, blocks, inverse = first.model.element_kernels, self._blocks, () if once else self._inverse
         address = (kernels.residual_jacobian if blocks.size else kernels.residual).address if first.count else 0
 
@@ -160,9 +165,7 @@ class CondensedBatch:
                 blocks, polish, *block, moved, d, f, lost, steps, self._states, fewer,
             )  # fmt: skip
 
-        if once:
-            lost[:] = 1
-        else:
+        if not once:
             in_blocks(part, lost.size, FEWEST_CONDENSED_SOLVES, threads)
         status = np.full(lost.shape, CONVERGED)
         for e, b in np.argwhere(lost):
