@@ -41,7 +41,8 @@ class Linearisation:
 
     def anchored(self) -> "Linearisation":
         """Return the same with the anchors at its θ."""
-        return Linearisation(self.theta, self.solver.anchored(self.theta), self._comparisons)
+        known = self._simulation if self._polish else None
+        return Linearisation(self.theta, self.solver.anchored(self.theta, known), self._comparisons)
 
     @property
     def status(self) -> int:

@@ -75,7 +75,7 @@ class ResponseSolver:
             if name in on_branch:
                 anchors[name] = _placed(problem, name, theta, guess or "static", on_branch[name])
             else:
-                anchors[name] = _initial_orbit(problem, name, theta, guess or "static")
+                anchors[name] = initial_orbit(problem, name, theta, guess or "static")
         return cls(problem, anchors)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -83,9 +83,12 @@ class ResponseSolver:
         kept = {key: value for key, value in self.__dict__.items() if key not in ("_batches", "_specials", "_sheets")}
         return kept | {"_changes": None}
 
-    def anchored(self, theta: np.ndarray) -> "ResponseSolver":
-        """Return the solver anchored at θ (names,), solved from the present anchors, else from the guesses."""
-        simulation, anchors = self.solve(theta[None], keep=True, polish=True), {}
+    def anchored(self, theta: np.ndarray, simulation: Simulation | None = None) -> "ResponseSolver":
+        """Return the solver anchored at θ (names,), solved from the present anchors, else from the guesses.
+
+        `simulation` is a polished one there with z, if it is known.
+        """
+        simulation, anchors = simulation or self.solve(theta[None], keep=True, polish=True), {}
         derivatives = self._derivatives(simulation)
         lost = [name for name, orbit in self.anchors.items() if simulation.statuses(name)[0] != CONVERGED]
         again = {}
@@ -101,7 +104,7 @@ class ResponseSolver:
             elif name in lost or orbit.sheet is None:
                 solved = None if name in lost else self._solved(simulation, name)
                 known = derivatives.get(name) if solved else None
-                anchors[name] = _initial_orbit(self.problem, name, theta, orbit.guess, solved, known)
+                anchors[name] = initial_orbit(self.problem, name, theta, orbit.guess, solved, known)
             else:
                 here = Place(orbit.sheet, *self._solved(simulation, name), not self._is_beyond(name, simulation))
                 known = derivatives.get(name)
@@ -118,7 +121,7 @@ class ResponseSolver:
             for name, orbit in self.anchors.items():
                 assert isinstance(orbit.anchor, Anchor)
                 near = problem.equations[name], orbit.anchor.z
-                anchors[name] = _initial_orbit(problem, name, theta, orbit.guess, near)
+                anchors[name] = initial_orbit(problem, name, theta, orbit.guess, near)
             return ResponseSolver(problem, anchors)
         guesses = {name: one.states for name, one in self.solutions(theta, sensitivities=False).items()}
         return ResponseSolver.start(problem, theta, guesses)
@@ -472,7 +475,7 @@ class ResponseSolver:
         return result
 
 
-def _initial_orbit(
+def initial_orbit(
     problem: Description,
     experiment: str,
     theta: np.ndarray,
@@ -482,7 +485,8 @@ def _initial_orbit(
 ) -> InitialOrbit:
     """Return the orbit at θ (names,): one that is solved, or solved from the guess with all fallbacks.
 
-    `known` are indices of parameters and the derivatives by them, if they are known.
+    Of condensed models the former may be displacements from which to solve. `known` are indices of parameters and the
+    derivatives by them, if they are known.
     """
     specials = _specials(problem)
     if experiment in specials:
@@ -493,14 +497,12 @@ def _initial_orbit(
             here, (z, code, *_), *_ = solve_free(equations, parameters, guess)
         else:
             here, (z, code, *_) = equations, solve_driven(equations, parameters, guess)[0]
-        if code != CONVERGED:
-            return InitialOrbit(guess, Anchor(parameters, z, equations.frequency), None)
-        solved = here, z
-    here, z = solved
-    if isinstance(here, CondensedEquations):  # on as many points as it takes there
-        z, code, *_ = here.find(parameters, z)[0]
-        if code != CONVERGED:
-            return InitialOrbit(guess, Anchor(parameters, z, equations.frequency), None)
+    else:
+        (here, z), code = solved, CONVERGED
+        if isinstance(here, CondensedEquations):  # on as many points as it takes there
+            z, code, *_ = here.find(parameters, z)[0]
+    if code != CONVERGED:
+        return InitialOrbit(guess, Anchor(parameters, z, equations.frequency), None)
     if known is None:
         parameter_map = problem.parameter_maps[experiment]
         moving = np.flatnonzero(parameter_map.slopes(theta)[: parameter_map.count].any(axis=1))
@@ -525,7 +527,7 @@ def _placed(
     """Return the orbit of a point of a table on its branch; without derivatives if the branch does not reach it."""
     if place.reached:
         solved = place.equations, place.z
-        return _initial_orbit(problem, experiment, theta, guess, solved, known)._replace(sheet=place.sheet)
+        return initial_orbit(problem, experiment, theta, guess, solved, known)._replace(sheet=place.sheet)
     parameters = problem.parameters(theta[None], experiment)[0]
     measured = problem.equations[experiment].frequency
     return InitialOrbit(guess, Anchor(parameters, place.z, measured), None, place.sheet)

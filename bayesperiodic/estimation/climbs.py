@@ -9,6 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.density.condensed_orbits import near_data
 from bayesperiodic.density.initial_orbits import InitialEstimate, measured_orbits, simultaneous_fit
 from bayesperiodic.density.log_posterior import NATURAL, Linearisation, LogPosterior
 from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
@@ -36,6 +37,9 @@ MOST_SHEET_CHANGES = 5
 COARSENESS = 100.0
 # Points from which on solves without internal states are worth such climbs.
 MANY_POINTS = 256
+# Gain of a step in units of the square of the least one [standard deviations] that ends such a climb: far from the data
+# Gauss-Newton's steps are too long, and the errors of the solves hide what is gained.
+SMALL_PART = 0.1
 # Halvings of a step from a draw of a condensed model; solves that fail cost most.
 HALVINGS_FROM_DRAWS = 3
 # Standard deviation of a phase of which nothing is known [rad].
@@ -116,7 +120,7 @@ def first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:
 def linearised(problem: Problem, theta: np.ndarray, initial: InitialEstimate | None) -> Linearisation:
     """Return residuals and Jacobian where orbits and parameters fit together, or else at θ."""
     if initial is None or not initial.states:
-        return _on_sheets(problem, problem.density().linearise(theta))
+        return near_data(problem, theta) or _on_sheets(problem, problem.density().linearise(theta))
     return LogPosterior(problem, ResponseSolver.start(problem, initial.theta, initial.states)).linearise(initial.theta)
 
 
@@ -173,8 +177,8 @@ def _from_draw(
 ) -> End | None:
     """Return the end of the iteration from a draw of the prior; None if there is no orbit or no finite density.
 
-    It is solved from the orbits of the first end, condensed models from rest, and is one of the ends where it comes
-    close to that.
+    It is solved from the orbits of the first end, condensed models from those that the data show. It is one of the ends
+    where it comes close to that.
     """
     first, halvings = ends[0].iterate, MAX_STEP_HALVINGS
     problem: Any = objective.density.problem
@@ -198,11 +202,12 @@ def climbed(
     objective: Objective, first: Iterate, progress: bool, most: int = MAX_STEPS, ends: Sequence[End] = (),
     halvings: int = MAX_STEP_HALVINGS, least: float = 0.0,
 ) -> End:  # fmt: skip
-    """Climb with a progress bar, until a step is below the least [standard deviations].
+    """Climb with a progress bar, until a step is below the least [standard deviations] or gains as little.
 
     Where an iterate comes close to one of the ends, that is returned.
     """
     reached: list[End] = []
+    heights = [first.objective]
     with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress, delay=SHOWN_AFTER) as bar:
 
         def report(iterate: Iterate, size: float) -> bool:
@@ -210,7 +215,8 @@ def climbed(
             bar.update()
             known = optimum_of(objective, iterate, ends) if size < SEPARATE_SDS else None
             reached.extend([known] if known else [])
-            return known is not None or size < least
+            gain, heights[0] = iterate.objective - heights[0], iterate.objective
+            return known is not None or size < least or gain < SMALL_PART * least**2
 
         end = climb(objective, first, report=report, most=most, halvings=halvings)
     return reached[0] if reached else end
@@ -261,10 +267,14 @@ def _doubtful(problem: Problem, end: End) -> bool:
 def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> Iterator[Linearisation]:
     """Yield where to start again: near orbits that give the measured outputs, and where simultaneous fits of them end.
 
-    Orbits and parameters are looked for from the start and from the estimate.
+    Orbits and parameters are looked for from the start and from the estimate; of condensed models the orbits, at the
+    estimate.
     """
-    unable = problem.model.autonomous or isinstance(problem.model, CondensedModel)
-    if unable or not all(e.outputs for e in problem.experiments):
+    if isinstance(problem.model, CondensedModel):
+        near = near_data(problem, end.theta)
+        yield from [near] if near else []
+        return
+    if problem.model.autonomous or not all(e.outputs for e in problem.experiments):
         return
     orbits = end.here.solver.solutions(end.theta, sensitivities=False)
     solutions = {name: solution.states for name, solution in orbits.items()}

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +42,7 @@ from bayesperiodic.estimation.frequencies import updated_frequencies
 from bayesperiodic.estimation.gauss_newton import (
     MAX_STEPS,
     End,
+    Iterate,
     Objective,
     at_ends,
     climb,
@@ -51,6 +53,7 @@ from bayesperiodic.estimation.gauss_newton import (
 from bayesperiodic.estimation.laplace import joint_laplace
 from bayesperiodic.estimation.modes import (
     LOWEST_OBJECTIVE,
+    SEPARATE_SDS,
     default_starts,
     notable,
     weighed,
@@ -105,6 +108,9 @@ def map_estimate(
     Where every experiment of a forced model has a guess of its orbit, orbits and parameters are first estimated
     together, from these guesses and `start`: the orbits need not exist at the start, and none is lost or exchanged.
 
+    Climbs of condensed models begin on the orbits that the measured outputs show: from these and the inputs follow the
+    forces of the elements by the frequency response of the linear structure, whatever their laws.
+
     Prime period, turns of angles and order of the forcing periods of every fitted orbit are compared with those of the
     recording. If they differ, the fit is repeated from orbits that the measured outputs show; if an orbit remains
     another one, the status is "other orbit".
@@ -128,7 +134,8 @@ def map_estimate(
         the density is not finite at the first, a given number begins at the first draw where it is. By
         default one if `start` is given, and otherwise up to eight, with at most 16 000 unknowns of all periodic solves
         together: eight for 2000 (states × points × experiments) or fewer, one for more than 8000; of condensed models
-        up to eight while the tests of `predict` reject the model at the best end. Their draws are solved from rest.
+        up to eight while the tests of `predict` reject the model at the best end. Their solves begin at the motion that
+        the measured outputs show, or at rest.
     seed : int
         Of these draws.
     checks : bool
@@ -189,12 +196,7 @@ def map_estimate(
         raise ValueError(_not_finite(problem, theta, start is not None))
     objective = objective_near(problem, first.here)
     fewest = 1 if near_optimum and precise and starts is None else fewest
-    # Where tests decide on more starts, they are of an optimum.
-    end = (
-        rough(first)
-        if near_optimum and fewest > 1
-        else on_best_sheets(problem, climbed(objective, first, progress), progress)
-    )
+    end = _first_end(objective, first, near_optimum is not None, fewest, progress)
     end = on_measured_orbits(problem, theta, end, progress)
     starting = [*(near or [theta, *draws[: fewest - 1]]), *draws[fewest - 1 :]]
     ends = from_draws(objective, starting, end, fewest, progress, coarse if near_optimum else None)
@@ -237,6 +239,18 @@ def nearest_optimum(
     objective = objective_near(problem, near)
     first = objective.iterate(near, problem.likelihood.guess())
     return None if first is None else (objective, climb(objective, first))
+
+
+def _first_end(objective: Objective, first: Iterate, near_optimum: bool, fewest: int, progress: bool) -> End:
+    """Return the end of the climb from the first start, of condensed models `near_optimum`, where that is enough.
+
+    Where tests decide on more starts, they are of this neighbourhood; without such tests none is needed.
+    """
+    if near_optimum and fewest > 1:
+        return rough(first)
+    end = climbed(objective, first, progress, least=SEPARATE_SDS if near_optimum else 0.0)
+    problem: Any = objective.density.problem
+    return on_best_sheets(problem, end, progress)
 
 
 def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Problem, End]:

@@ -1,6 +1,7 @@
 """Condensed solutions at many parameter vectors, predicted from the anchors of their input sets."""
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from bayesperiodic._linalg import unwarned
 from bayesperiodic.periodic.batch import Anchor, in_blocks
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STALLED, BatchSolution
 from bayesperiodic.periodic.condensed import CondensedEquations
-from bayesperiodic.periodic.element_forces import Forces, Preconditioner, ResponseMatrices, steep_points
+from bayesperiodic.periodic.element_forces import LARGEST_INVERSE, Preconditioner, ResponseMatrices, steep_points
 from bayesperiodic.periodic.harmonics import harmonics, on_grid, resized, transform_tables
 from bayesperiodic.periodic.memory import error_of_fewer
 from bayesperiodic.periodic.receptance import compiled, unresolved
@@ -48,32 +49,40 @@ class CondensedBatch:
         self._rates = np.array([2 * np.pi * e.frequency for e in sets])
         self._known = np.array([a.sensitivities is not None for a in anchors])
         at_anchors = [e.forces(d, a.parameters) for e, d, a in zip(sets, self._d, anchors, strict=True)]
-        self._inverse = self._preconditioners(at_anchors)
+        self._linear = [
+            (forces, e.rates(points), m.d_f) for e, forces, m in zip(sets, at_anchors, self._matrices, strict=True)
+        ]
+        self._steep = [steep_points(*p) if k else None for k, p in zip(self._known, self._linear, strict=True)]
+        coupled = (
+            Preconditioner.strongly_coupled(steep.rest(forces), *linear)
+            for steep, (forces, *linear) in zip(self._steep, self._linear, strict=True)
+            if steep
+        )
+        self._low = max(coupled, default=1)
         self._transform, self._blocks = transform_tables(points), np.array(first.model.state_blocks, dtype=np.int64)
         self._states = np.zeros((len(sets), points, 3 * (first.count + self._blocks.sum())))
         for states, forces in zip(self._states, at_anchors, strict=True):
             if forces.memory is not None:
                 states[:] = forces.memory.states
 
-    def _preconditioners(self, at_anchors: Sequence[Forces]) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return transposed inverses of the sets, what steep points change, and the number of low harmonics of all."""
-        given = []
-        for e, forces, matrices in zip(self._sets, at_anchors, self._matrices, strict=True):
-            given.append((forces, e.rates(self._points), matrices.d_f))
-        steep = [steep_points(*p) if k else None for k, p in zip(self._known, given, strict=True)]
-        low = 1
-        for one, (forces, *linear) in zip(steep, given, strict=True):
+    @cached_property
+    @unwarned
+    def _inverse(self) -> tuple[np.ndarray, np.ndarray, int]:
+        """Transposed inverses of the sets, what steep points change, and the number of low harmonics of all."""
+        size, pairs = self._size, max((len(one.points) for one in self._steep if one), default=0)
+        inverses = np.zeros((len(self._steep), size, size))
+        changes = np.zeros((len(self._steep), 2, pairs, 2 * self._d[0].size))
+        for number, (one, part) in enumerate(zip(self._steep, self._linear, strict=True)):
             if one:
-                low = max(low, Preconditioner.strongly_coupled(one.rest(forces), *linear))
-        size, pairs = 2 * low * self._d.shape[-1], max((len(one.points) for one in steep if one), default=0)
-        inverses = np.zeros((len(steep), size, size))
-        changes = np.zeros((len(steep), 2, pairs, 2 * self._d[0].size))
-        for number, (one, part) in enumerate(zip(steep, given, strict=True)):
-            if one:
-                inverse = Preconditioner(*part, low, one)
+                inverse = Preconditioner(*part, self._low, one)
                 inverses[number] = inverse.transposed_inverse
                 changes[number, :, : len(one.points)] = inverse.of_steep
-        return inverses, changes, low
+        return inverses, changes, self._low
+
+    @property
+    def _size(self) -> int:
+        """Rows of the matrix of the low harmonics."""
+        return int(2 * self._low * self._d.shape[-1])
 
     def _responses(self, parameters: np.ndarray) -> list[ResponseMatrices]:
         """Return the frequency responses of each set, (1 or solves, harmonics, rows, columns)."""
@@ -89,6 +98,16 @@ class CondensedBatch:
                 result.append(equations.many_matrices(parameters[e], self._points))
         return result
 
+    def _linear_parts(self, parameters: np.ndarray) -> tuple[list[ResponseMatrices], np.ndarray, np.ndarray]:
+        """Return the responses, that between the elements of all sets, and their displacements without forces."""
+        responses = self._responses(parameters)
+        vectors = max(len(r.d_f) for r in responses)
+        d_f = np.empty((len(responses), vectors, *responses[0].d_f.shape[1:]), dtype=complex)
+        free = np.empty(d_f.shape[:-1], dtype=complex)
+        for e, response in enumerate(responses):
+            d_f[e], free[e] = response.d_f, _unforced(response.d_u, self._load[e])
+        return responses, d_f, free
+
     @unwarned
     def solve(
         self,
@@ -102,7 +121,8 @@ class CondensedBatch:
         """Solve every input set for every parameter vector; arguments and result as those of `batch.Batch.solve`.
 
         Solutions are corrected from the linear prediction of the anchor, or else followed from it in steps, on the grid
-        of the anchor with the most points. Where that grid does not resolve the outputs, the points are doubled; if the
+        of the anchor with the most points. One polished solve with a large matrix takes a step of Newton's, which needs
+        no inverse. Where that grid does not resolve the outputs, the points are doubled; if the
         most points do not resolve them, the status is "not resolved". z has the grid of the most points.
         """
         every = np.empty((len(self._sets), *parameters.shape[-2:]))
@@ -131,31 +151,28 @@ class CondensedBatch:
         moved, f = np.sqrt(np.sum(np.abs(ahead) ** 2, axis=(2, 3))), np.full_like(d, np.nan)
         fewer = np.empty((count, solves, self._points // 4 if self._blocks.size else 0, first.count), dtype=complex)
         lost, steps = np.zeros((2, count, solves), dtype=np.int64)
-        lost[~self._known] = 1
+        once = polish and solves == 1 and self._size > LARGEST_INVERSE
+        lost[once | ~self._known] = 1
         if without is not None:
             lost[without] = 1
-        responses = self._responses(every)
-        vectors = max(len(r.d_f) for r in responses)
-        d_f = np.empty((count, vectors, *responses[0].d_f.shape[1:]), dtype=complex)
-        free = np.empty(d_f.shape[:-1], dtype=complex)
-        for e, response in enumerate(responses):
-            d_f[e], free[e] = response.d_f, _unforced(response.d_u, self._load[e])
-        kernels, blocks = first.model.element_kernels, self._blocks
+        responses, d_f, free = self._linear_parts(every)
+        kernels, blocks, inverse = first.model.element_kernels, self._blocks, () if once else self._inverse
         address = (kernels.residual_jacobian if blocks.size else kernels.residual).address if first.count else 0
 
         def part(block: tuple[int, int]) -> None:
             compiled().correct_many(
-                address, d_f, free, *self._inverse, every, self._rates, float(first.grid.periods), *self._transform,
+                address, d_f, free, *inverse, every, self._rates, float(first.grid.periods), *self._transform,
                 blocks, polish, *block, moved, d, f, lost, steps, self._states, fewer,
             )  # fmt: skip
 
-        in_blocks(part, lost.size, FEWEST_CONDENSED_SOLVES, threads)
+        if not once:
+            in_blocks(part, lost.size, FEWEST_CONDENSED_SOLVES, threads)
         status = np.full(lost.shape, CONVERGED)
         for e, b in np.argwhere(lost):
             if without is not None and without[e, b]:
                 status[e, b] = STALLED
                 continue
-            d[e, b], status[e, b], more = self._follow(e, every[e, b])
+            d[e, b], status[e, b], more = self._follow(e, every[e, b], once)
             f[e, b] = harmonics(self._sets[e].forces(d[e, b], every[e, b]).values)
             steps[e, b] += more
         every_y = [
@@ -186,19 +203,24 @@ class CondensedBatch:
         return BatchSolution(z, outputs, frequency, status, steps)
 
     @unwarned
-    def _follow(self, e: int, parameters: np.ndarray) -> tuple[np.ndarray, int, int]:
+    def _follow(self, e: int, parameters: np.ndarray, once: bool) -> tuple[np.ndarray, int, int]:
         """Follow a solution from the anchor in steps; return it, the status, and Newton's steps.
 
-        The steps are on fewer points at first, whose solution starts the one on all points, or where those do not
-        suffice, on all points.
+        With `once` one step on all points is tried first. Others are on fewer points at first, whose solution starts
+        the one on all points, or where those do not suffice, on all points.
         """
         equations, used = self._sets[e], 0
         if not self._known[e]:  # a guess, from which to solve
             solved = equations.solve(parameters, on_grid(self._d[e], self._points))
             return harmonics(solved.z), solved.code, len(solved.history)
+        if once:
+            d, code, used = self._stepped(e, parameters, self._points, LARGEST_PATH_PART)
+            if code == CONVERGED:
+                return d, CONVERGED, used
         fewer = max(self._points // PATH_POINTS_RATIO, FEWEST_PATH_POINTS)
         if fewer < self._points:
-            d, code, used = self._stepped(e, parameters, fewer)
+            d, code, more = self._stepped(e, parameters, fewer)
+            used += more
             if code == CONVERGED:
                 start = resized(d, self._points)
                 solved = equations.solve(parameters, on_grid(start, self._points), halvings=0)
@@ -217,6 +239,8 @@ class CondensedBatch:
         """Follow a solution on a number of points; return it, the status, and Newton's steps."""
         equations, anchor = self._sets[e], self._anchors[e]
         change = parameters - anchor.parameters
+        if not change.any() and len(anchor.z) == points:
+            return self._d[e], CONVERGED, 0
         here, done, step, used = resized(self._d[e], points), 0.0, LARGEST_PATH_PART, 0
         ahead = resized(np.tensordot(change, self._slopes[e], (0, 0)), points)
         while done < 1.0:
