@@ -290,6 +290,7 @@ def zigzag(count=600, **runs):
         ("k101", [-2.6], True), ("k101", [9.0, 9.2, 2.6], True), ("k101", [9.0, 9.2, 2.4], False),
         ("k101", [2.4, 9.2, 9.0], False), ("k0", [9.0, 2.6], True), ("k0", [9.0, 2.4], False), ("k598", [3.6, 9.0], True),
         ("k598", [3.4, 9.0], False), ("k0", [9.0], True), ("k599", [9.0], True),
+        ("k0", [9.0, 9.2], True), ("k598", [9.2, 9.0], True),
     ],
 )  # fmt: skip
 def test_outliers_jump_in_and_out_by_two_steps_of_the_others_and_one_of_the_resolution(first, some, lone):

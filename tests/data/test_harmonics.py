@@ -204,6 +204,12 @@ def test_signals_without_a_period_have_no_frequency():
     assert harmonics.guess_frequency(time, np.cos(2 * np.pi * 0.06 * time)[None]) is None
 
 
+@pytest.mark.parametrize("samples, seen", [(120, True), (119, False)])
+def test_a_frequency_is_guessed_of_three_cycles_or_more(samples, seen):
+    frequency = harmonics.guess_frequency(np.arange(samples) / 10.0, np.sin(np.pi * np.arange(samples) / 20 + 0.3)[None])
+    assert (frequency == pytest.approx(0.25, rel=0.02)) if seen else frequency is None
+
+
 @pytest.mark.parametrize("factor", [2, 3, 4, 5])
 def test_a_divisor_of_the_frequency_is_replaced_by_it(factor):
     time = np.arange(900) / 60.0

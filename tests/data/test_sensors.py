@@ -191,7 +191,7 @@ def test_harmonics_that_are_shown_and_not_determined_are_named_with_share_period
     assert sensors.undetermined(*example(2), 9) == "" == sensors.undetermined(*example(1), 9)
 
 
-PERIOD, BEFORE = 0.5, 70
+PERIOD, BEFORE = 0.5, 80
 PLACE = np.arange(3000) / 50.0  # in cycles, of a period of half a second
 LEVEL, ORDERS = 0.8, np.array([0.0, 1.0 + 0j, 0.0, 0.2j])
 
@@ -251,7 +251,7 @@ def test_clipped_samples_are_beside_noise_that_is_more_than_half_a_step_and_a_th
     clean = np.minimum(wave(), LEVEL)
     values = clean + np.where(clean < LEVEL, noise(5, size), 0.0)
     high = np.flatnonzero(wave() > LEVEL)
-    outside = np.array([BEFORE - 5])
+    outside = np.array([BEFORE - 75, BEFORE - 25])  # at phases of the lowest values, if counted from the end
     fault = ChannelFaults(step=step, high=high + BEFORE, low=outside)
     (fault,), used, fit = part_used(values, faults=[fault])
     sensors.describe([fault], used, fit, BEFORE)
