@@ -183,10 +183,16 @@ def test_wrong_decimal_sign_is_refused_and_changed_by_its_argument(tmp_path):
     assert_read(read(tmp_path, text, decimal=","))
 
 
-def test_text_in_place_of_a_number_is_refused(tmp_path):
-    lines = (head() + segment()).split("\n")
-    lines[-5] = lines[-5].replace("\t", "\tx", 1)
-    refused(tmp_path, "\n".join(lines), r"row 47 after line \d+ has 'x-?\d")
+@pytest.mark.parametrize("columns", ["No", "One", "Multi"])
+@pytest.mark.parametrize("channel", [0, 1])
+def test_text_in_place_of_a_number_is_refused(tmp_path, columns, channel):
+    lines = (head(columns) + segment(columns=columns)).split("\n")
+    cells = lines[-5].split("\t")
+    place = 1 + channel * (2 if columns == "Multi" else 1)
+    cells[place] = f"x{cells[place]}"
+    lines[-5] = "\t".join(cells)
+    reason = rf"row 47 after line \d+ has '{cells[place]}', no number with the decimal sign '.', which decimal= changes"
+    refused(tmp_path, "\n".join(lines), reason)
 
 
 def test_empty_cell_is_a_missing_sample(tmp_path):
