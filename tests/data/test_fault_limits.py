@@ -127,6 +127,20 @@ def test_counters_have_six_bits_at_least(steps, found):
     assert jumps.tolist() == (np.flatnonzero(np.diff(counts) < 0) + 1).tolist() * found
 
 
+def test_a_coarse_counter_with_nearly_the_range_of_an_angle_wraps_at_its_own():
+    """In 64 steps of 5.8 V it jumps by 45, 4.08 V: less than 65 % of 2π."""
+    counts = 19 * np.arange(500)
+    turn, places = faults.wrap_of(5.8 / 64 * (counts % 64), 5.8 / 64)
+    assert turn == pytest.approx(5.8) and places.tolist() == (np.flatnonzero(np.diff(counts // 64)) + 1).tolist()
+
+
+def test_values_that_are_not_smooth_when_they_are_unwrapped_do_not_wrap():
+    """White noise, whose steps have twice its variance, at both ends of the range; a slow motion there wraps."""
+    white = np.random.default_rng(1).uniform(-0.24, 0.24, 1000)
+    slow = 0.24 * np.sin(np.arange(1000) / 20)
+    assert faults.wrap_of(white % 1.0, 0.0)[0] == 0.0 and faults.wrap_of(slow % 1.0, 0.0)[0] == 1.0
+
+
 @pytest.mark.parametrize("count", [300, 30_000])
 @pytest.mark.parametrize("size", [0.01, 3.0])
 def test_noise_by_fourth_differences_is_its_standard_deviation(count, size):

@@ -430,6 +430,9 @@ def test_entries_of_the_header_may_be_missing(tmp_path):
         fewer = [line for line in whole if not line.startswith(f"{entry}\t")]
         assert len(fewer) < len(whole)
         assert_read(read(tmp_path, "".join(fewer)))
+    for separator in ("\t", ","):
+        rest = (head(separator=separator) + segment(separator=separator)).splitlines(keepends=True)
+        assert_read(read(tmp_path, "".join(line for line in rest if not line.startswith("Separator"))))
     unnamed = [line for line in whole if not line.startswith("Y_Unit_Label\t")]
     np.testing.assert_allclose(read(tmp_path, "".join(unnamed)).outputs["a"], A, atol=0.6e-6)
 
