@@ -250,8 +250,8 @@ def test_version_4_is_named_with_its_conversion(tmp_path, order):
     """Written after MathWorks' "MAT-File Format": type, rows, columns, real numbers, length of the name."""
     path = tmp_path / "run.mat"
     head = struct.pack(f"{order}5i", {"<": 0, ">": 1000}[order], 50, 1, 0, 2)
-    path.write_bytes(head + b"x\0" + SWING.astype(f"{order}f8").tobytes())
-    assert np.allclose(scipy.io.loadmat(path)["x"].ravel(), SWING)
+    path.write_bytes(head + b"x\0" + (SWING + np.pi).astype(f"{order}f8").tobytes())
+    assert np.allclose(scipy.io.loadmat(path)["x"].ravel(), SWING + np.pi)
     with pytest.raises(ValueError, match=r"got '.*run.mat', a MAT file of version 4; .*save\('run.mat', '-v7'\)"):
         bp.inspect(path)
 
