@@ -206,7 +206,9 @@ def test_signals_without_a_period_have_no_frequency():
 
 @pytest.mark.parametrize("samples, seen", [(120, True), (119, False)])
 def test_a_frequency_is_guessed_of_three_cycles_or_more(samples, seen):
-    frequency = harmonics.guess_frequency(np.arange(samples) / 10.0, np.sin(np.pi * np.arange(samples) / 20 + 0.3)[None])
+    frequency = harmonics.guess_frequency(
+        np.arange(samples) / 10.0, np.sin(np.pi * np.arange(samples) / 20 + 0.3)[None]
+    )
     assert (frequency == pytest.approx(0.25, rel=0.02)) if seen else frequency is None
 
 
@@ -255,9 +257,7 @@ def test_angles_are_reduced_to_half_a_turn(turns):
 def test_a_fit_that_moves_to_another_number_of_cycles_is_none(start, near):
     """Of eight cycles, from 1.16 Hz to 1 Hz by 1.3 cycles."""
     time = np.arange(160) / 20.0
-    values = sum(
-        size * np.cos(2 * np.pi * (k + 1) * time + k + 0.3) for k, size in enumerate((0.2, 0.5, 1.0))
-    )[None]
+    values = sum(size * np.cos(2 * np.pi * (k + 1) * time + k + 0.3) for k, size in enumerate((0.2, 0.5, 1.0)))[None]
     fit = harmonics.nearby_fit(time, values, start, 3)
     assert harmonics.refine_frequency(time, values, start, 3)[0].frequency == pytest.approx(1.0)
     assert (fit is not None) == near and (fit is None or fit.frequency == pytest.approx(1.0))

@@ -148,9 +148,12 @@ def test_power_in_one_harmonic_is_found_and_the_harmonic_named(harmonic):
 
 
 @pytest.mark.parametrize(
-    "white, draws, every", [(False, 1, 1), (False, 5, 1), (False, 39, 1), (False, 40, 2), (False, 65, 3), (True, 5, None)]
+    "white, draws, every",
+    [(False, 1, 1), (False, 5, 1), (False, 39, 1), (False, 40, 2), (False, 65, 3), (True, 5, None)],
 )
-def test_p_of_realised_residuals_are_means_over_about_twenty_draws_of_correlated_noise(monkeypatch, white, draws, every):
+def test_p_of_realised_residuals_are_means_over_about_twenty_draws_of_correlated_noise(
+    monkeypatch, white, draws, every
+):
     """Of white noise, whose size cancels, the medians of the variances are enough."""
     noise = np.random.default_rng(1).uniform(0.1, 0.9, (draws, 2))
 

@@ -162,7 +162,8 @@ def test_enumeration_has_texts_and_is_refused_as_numbers(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "code, encoding, ending", [(6, "latin-1", b"\0z"), (7, "utf-8", b"\0z"), (8, "utf-16-le", b""), (9, "utf-16-be", b"")]
+    "code, encoding, ending",
+    [(6, "latin-1", b"\0z"), (7, "utf-8", b"\0z"), (8, "utf-16-le", b""), (9, "utf-16-be", b"")],
 )
 def test_texts_of_version_4_are_in_the_encoding_of_their_type(tmp_path, code, encoding, ending):
     """They end with a zero; what follows it does not count. Those of conversions are in UTF-8."""
@@ -186,7 +187,9 @@ def test_texts_of_version_3_are_in_latin_1(tmp_path):
     content = version_3().replace(struct.pack("<HHHH", 128, 16, 0, 0)[:6], struct.pack("<HHH", 128, 16, 7))
     assert content != version_3()
     words = np.array(["µ", "é", "a"] * 66 + ["m", "s"])
-    rows = np.rec.fromarrays([TIME, X, np.char.encode(words, "latin-1")], dtype=[("t", "<f8"), ("x", "<f8"), ("c", "S2")])
+    rows = np.rec.fromarrays(
+        [TIME, X, np.char.encode(words, "latin-1")], dtype=[("t", "<f8"), ("x", "<f8"), ("c", "S2")]
+    )
     (tmp_path / "run.mdf").write_bytes(content[: -rows.nbytes] + rows.tobytes())
     _, seen = mdf.contents(tmp_path / "run.mdf", []).channels
     assert seen.values().tolist() == words.tolist()

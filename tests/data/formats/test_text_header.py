@@ -315,7 +315,16 @@ def test_units_are_evident_if_they_are_no_names_and_possible_if_they_have_one_me
 
 
 def test_brackets_around_units_and_titles_of_their_row_are_left_out():
-    given = {" [mm] ": "mm", "(s)": "s", "[mm)": "[mm)", " mm": "mm", "Unit:": "", "EINHEITEN": "", "()": "", "(m": "(m"}
+    given = {
+        " [mm] ": "mm",
+        "(s)": "s",
+        "[mm)": "[mm)",
+        " mm": "mm",
+        "Unit:": "",
+        "EINHEITEN": "",
+        "()": "",
+        "(m": "(m",
+    }
     assert {text: header_units.unbracketed(text) for text in given} == given
 
 
