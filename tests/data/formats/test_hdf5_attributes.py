@@ -262,10 +262,12 @@ def test_scales_of_no_convention_are_named_unless_they_change_nothing(stored, sa
 @pytest.mark.parametrize(
     "stored, kind, said",
     [
-        ({"range": 10}, "i2", "range = 10"), ({"range": 10}, "f4", ""), ({"Range": (-5.0, 5.0)}, "i2", "Range = (-5.0, 5.0)"),
+        ({"range": 10}, "i2", "range = 10"), ({"range": 10}, "f4", ""),
+        ({"Range": (-5.0, 5.0)}, "i2", "Range = (-5.0, 5.0)"),
         ({"range": (-32768, 32767)}, "i2", ""), ({"range": (-32767, 32768)}, "i2", ""), ({"range": 65_536}, "i2", ""),
         ({"range": 65_535}, "i2", "range = 65535"), ({"range": (0, 255)}, "u1", ""), ({"range": 256}, "u1", ""),
-        ({"range": "±10 V"}, "i2", "range = ±10 V"), ({"valid_range": 10}, "i2", ""), ({"adc_counts": 4096}, "i4", "adc_counts = 4096"),
+        ({"range": "±10 V"}, "i2", "range = ±10 V"), ({"valid_range": 10}, "i2", ""),
+        ({"adc_counts": 4096}, "i4", "adc_counts = 4096"),
         ({"range": 0, "name": "x", "fsr": 5}, "i2", "fsr = 5"),
     ],
 )  # fmt: skip

@@ -133,9 +133,11 @@ NUMBER = matrix(b"", 6, element(9, struct.pack("<d", 2.5)))
 @pytest.mark.parametrize(
     "content, reason",
     [
-        (matrix(b"s", 2, element(5, struct.pack("<i", 2)) + element(1, b"a\0a\0") + NUMBER + NUMBER), "has two fields of"),
+        (matrix(b"s", 2, element(5, struct.pack("<i", 2)) + element(1, b"a\0a\0") + NUMBER + NUMBER),
+         "has two fields of"),
         (matrix(b"s", 2, element(5, struct.pack("<i", 0)) + element(1, b"a\0") + NUMBER), "has names of 0 characters"),
-        (matrix(b"s", 2, element(5, struct.pack("<i", 2)) + element(1, b"a\0") + element(9, bytes(8))), "a field of type 9"),
+        (matrix(b"s", 2, element(5, struct.pack("<i", 2)) + element(1, b"a\0") + element(9, bytes(8))),
+         "a field of type 9"),
         (element(9, bytes(8)), "contains an element of type 9"),
         (matrix(b"x", 6, element(9, bytes(16))), "'x' has another size than its header says"),
         (matrix(b"x", 6, element(9, bytes(8)) * 2), "'x' has another size than its header says"),
