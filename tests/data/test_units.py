@@ -138,7 +138,7 @@ def test_values_of_a_file_are_in_si_or_in_the_unit_that_is_wanted(stored, unit, 
         ("ms-1", None, "must say what 'ms-1' in the file is"), ("ms⁻¹", None, "must say what 'ms⁻¹' in the file is"),
         ("mm", ("cm", "m"), r"must begin with the unit 'mm' of the file, got \('cm', 'm'\); give a factor"),
         ("C", ("F", "K"), "must begin with the unit 'C' of the file"), ("mm", "s", "must be two units of the same"),
-        ("mm", ("mm", "m", "m"), "must be a factor or a pair such as"), ("mm", ("mm",), "must be a factor or a pair such"),
+        ("mm", ("mm", "m", "m"), "must be a factor or a pair such as"), ("mm", ("mm",), "must be a factor or"),
         ("mm", 0.0, "must not be zero"),
     ],
 )  # fmt: skip
