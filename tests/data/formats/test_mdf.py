@@ -5,6 +5,7 @@ import logging
 import struct
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import asammdf
 import numpy as np
@@ -600,6 +601,7 @@ def test_instants_of_files_are_their_origin(tmp_path):
     ):  # fmt: skip
         path.write_bytes(simple().replace(struct.pack("<Q", 1_769_860_800 * 10**9), struct.pack("<Q", start)))
         assert {one.clock.origin for one in mdf.contents(path, []).channels} == {origin}
+    assert mdf._origin(SimpleNamespace(header=SimpleNamespace())) is None  # before version 3.20
 
 
 @pytest.mark.parametrize("content", [simple(kind=LINEAR, values=[0, 1.0]), invalidated(), version_3()])
