@@ -71,6 +71,13 @@ def folder_of(mutant: str) -> str:
     return f"tests/{mutant.split('.')[1]}"
 
 
+@functools.cache
+def tests_of(path: Path) -> tuple[str, dict[str, str]]:
+    """Return the text of a file, and those of its functions by name."""
+    text = path.read_text()
+    return text, {one[1]: one[0] for one in re.finditer(r"^def (\w+)\(.*?(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)}
+
+
 def ordered(mutant: str, items: list[pytest.Item]) -> list[pytest.Item]:
     """Return the tests of a mutant, those that are most likely to find it first."""
     module, _, function = mutant.rpartition("__mutmut_")[0].rpartition(".")
@@ -78,16 +85,14 @@ def ordered(mutant: str, items: list[pytest.Item]) -> list[pytest.Item]:
     named = re.compile(owner[0] if name == "__init__" else rf"\.{name}\b" if owner else rf"\b{name}\b")
 
     @functools.cache
+    def of_file(path: Path) -> tuple[bool, ...]:
+        text = tests_of(path)[0]
+        return not named.search(text), f"{(owner or [module])[0]}.{name}" not in text
+
     def rank(path: Path, test: str) -> tuple[bool, ...]:
-        text = path.read_text()
-        inside = re.search(rf"^def {test}\(.*?(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL)
-        return (
-            not named.search(text),
-            f"{(owner or [module])[0]}.{name}" not in text,
-            not (inside and named.search(inside[0])),
-            module not in path.name,
-            module not in text,
-        )
+        text, inside = tests_of(path)
+        last = module not in path.name, module not in text
+        return *of_file(path), not named.search(inside.get(test, "")), *last
 
     mine = [item for item in items if item.nodeid.startswith(folder_of(mutant) + "/")]
     return sorted(mine, key=lambda item: rank(item.path, getattr(item, "originalname", item.name)))

@@ -161,9 +161,9 @@ def courses(count: int, transient: float, longest: float) -> Courses:
                 every.append((course, kind, transient * part / decays.size / len(angles), decay, angle))
     rest = 1.0 - transient
     fading = len(every)
-    every.append((cycle / (count - 1) + 0j, DRIFT, rest * DRIFTING, 0.0, 0.0))
+    every.append((cycle / (count - 1), DRIFT, rest * DRIFTING, 0.0, 0.0))
     places = np.unique(np.linspace(FIRST_STEP, count - FIRST_STEP, STEP_PLACES).astype(int))
-    every += [((cycle >= k) + 0j, STEP, rest * STEPPING / places.size, float(k), 0.0) for k in places]
+    every += [((cycle >= k).astype(float), STEP, rest * STEPPING / places.size, float(k), 0.0) for k in places]
     # Lines beside the harmonics, as of a subharmonic, do not decay, and have no effect on the mean.
     tones = np.arange(1, 1 + min(count // 2, MOST_TONES)) * max(1.0, count / 2 / MOST_TONES)
     turns = 2.0 * np.pi * tones / count

@@ -201,7 +201,7 @@ def pace_of(score: np.ndarray, quadrature: np.ndarray, power: float, information
     basis = np.linalg.qr(np.polynomial.legendre.legvander(number, orders + 2))[0].T
     phase, amplitude = basis @ score / power, basis @ quadrature / power
     others = np.concatenate([phase[3:], amplitude[1:] if orders < 4 else []])
-    noise = max(float(np.sum(others**2)) / max(others.size, 1), 1.0 / power)
+    noise = max(float(np.mean(others**2)), 1.0 / power)
     irregular = float(np.ptp(phase[3:] @ basis[3:]))
     allowed = fdtri(orders, orders, 1.0 - PHASE_FALSE_ALARM) * max(float(np.sum(amplitude[3:] ** 2)), orders / power)
     wanders = orders >= 4 and irregular > NEGLIGIBLE_PHASE and float(np.sum(phase[3:] ** 2)) > allowed

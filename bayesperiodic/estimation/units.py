@@ -39,7 +39,7 @@ def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
         measured, modelled = {FREQUENCY: e.frequency}, {}
         with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
             rates = equations.linear_rates(parameters)
-            sizes = np.abs(rates[rates != 0.0]) / (2 * np.pi)
+            sizes = np.abs(rates) / (2 * np.pi)
             if sizes.size:
                 modelled[FREQUENCY] = float(sizes[np.argmin(np.abs(np.log(sizes / e.frequency)))])
             if not problem.model.autonomous and e.condition is None:

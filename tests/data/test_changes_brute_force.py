@@ -120,8 +120,8 @@ def test_courses_and_their_probabilities(transient, count, longest):
         turns = every.turn[these]
         assert np.array_equal(turns[-12:], np.linspace(0.0, np.pi, 13)[1:]) and turns[0] == 0.0
         near = turns[:-12]
-        assert all(angle == 0.0 or angle * decay in (pytest.approx(0.7), pytest.approx(1.5)) for angle in near)
-        assert near.max() < np.pi / 12 / 1.5 and probability[these][: near.size].sum() == pytest.approx(
+        slow = [0.0, *(angle for angle in (0.7 / decay, 1.5 / decay) if angle < np.pi / 12 / 1.5)]
+        assert near == pytest.approx(slow) and probability[these][: near.size].sum() == pytest.approx(
             0.7 * transient / 12
         )
         assert {*every.kind[these]} == {module.TRANSIENT if decay <= longest * count else module.DRIFT}

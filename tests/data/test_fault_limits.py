@@ -127,6 +127,20 @@ def test_counters_have_six_bits_at_least(steps, found):
     assert jumps.tolist() == (np.flatnonzero(np.diff(counts) < 0) + 1).tolist() * found
 
 
+def test_a_coarse_counter_with_nearly_the_range_of_an_angle_wraps_at_its_own():
+    """In 64 steps of 5.8 V it jumps by 45, 4.08 V: less than 65 % of 2π."""
+    counts = 19 * np.arange(500)
+    turn, places = faults.wrap_of(5.8 / 64 * (counts % 64), 5.8 / 64)
+    assert turn == pytest.approx(5.8) and places.tolist() == (np.flatnonzero(np.diff(counts // 64)) + 1).tolist()
+
+
+def test_values_that_are_not_smooth_when_they_are_unwrapped_do_not_wrap():
+    """White noise, whose steps have twice its variance, at both ends of the range; a slow motion there wraps."""
+    white = np.random.default_rng(1).uniform(-0.24, 0.24, 1000)
+    slow = 0.24 * np.sin(np.arange(1000) / 20)
+    assert faults.wrap_of(white % 1.0, 0.0)[0] == 0.0 and faults.wrap_of(slow % 1.0, 0.0)[0] == 1.0
+
+
 @pytest.mark.parametrize("count", [300, 30_000])
 @pytest.mark.parametrize("size", [0.01, 3.0])
 def test_noise_by_fourth_differences_is_its_standard_deviation(count, size):
@@ -271,3 +285,73 @@ def test_step_of_rounding_errors_is_none():
     exact = np.sin(np.arange(500))
     assert faults.resolution(np.float64(1e6) + np.float64(2.0) ** -33 * np.round(exact * 8)) > 0.0
     assert faults.resolution(exact) == 0.0
+
+
+def zigzag(count=600, **runs):
+    """Return values 0, 1, 0, 1, … with other ones from some samples on, which one marks of them as far."""
+    values, far = np.arange(count) % 2.0, np.zeros(count, dtype=bool)
+    for first, some in runs.items():
+        at = int(first[1:]) % count
+        values[at : at + len(some)] = some
+        far[at : at + len(some)] = True
+    return values, far
+
+
+@pytest.mark.parametrize(
+    "first, some, lone",
+    [
+        ("k101", [2.6], True), ("k101", [2.4], False), ("k100", [3.6], True), ("k100", [3.4], False),
+        ("k101", [-2.6], True), ("k101", [9.0, 9.2, 2.6], True), ("k101", [9.0, 9.2, 2.4], False),
+        ("k101", [2.4, 9.2, 9.0], False), ("k0", [9.0, 2.6], True), ("k0", [9.0, 2.4], False),
+        ("k598", [3.6, 9.0], True),
+        ("k598", [3.4, 9.0], False), ("k0", [9.0], True), ("k599", [9.0], True),
+        ("k0", [9.0, 9.2], True), ("k598", [9.2, 9.0], True),
+    ],
+)  # fmt: skip
+def test_outliers_jump_in_and_out_by_two_steps_of_the_others_and_one_of_the_resolution(first, some, lone):
+    """The others' steps are 1, of the resolution half a step: 2.5 before and after; none beyond an end."""
+    values, far = zigzag(**{first: some})
+    found = faults._lone(far, np.arange(600) / 50, values, 0.5)
+    assert found.tolist() == np.flatnonzero(far).tolist() * lone
+    inverse = faults._lone(far, 7.3 + np.arange(600) / 50, 3.0 - values, 0.5)
+    assert inverse.tolist() == found.tolist()
+
+
+def test_usual_steps_are_the_largest_but_a_hundredth_of_those_between_sound_samples():
+    """Of 1997 steps, 18 or 22 are of 4 and the others of 1; those beside what is far do not count."""
+    for peaks, lone in ((9, True), (11, False)):
+        values, far = zigzag(2000, k1001=[7.9])
+        values[3 : 3 + 40 * peaks : 40] = 4.0
+        assert faults._lone(far, np.arange(2000) / 50, values, 0.0).tolist() == [1001] * lone
+
+
+def test_without_sound_samples_that_vary_there_are_no_outliers():
+    values, far = zigzag(k101=[9.0])
+    phase = np.arange(600) / 50
+    for which, given in ((~far & far, values), (~far | far, values), (far, np.where(far, 9.0, 2.0))):
+        assert faults._lone(which, phase, given, 0.0).size == 0
+    # No two sound samples in a row: any jump is more than the usual one.
+    alternate = np.arange(600) % 2 == 1
+    assert faults._lone(alternate, phase, np.where(alternate, 9.0, np.arange(600) / 600), 0.0).size == 300
+
+
+@pytest.mark.parametrize("width, lone", [(9, False), (11, True)])
+def test_runs_of_each_cycle_are_of_the_signal_unless_they_are_a_fifth_of_it(width, lone):
+    """Of 50 samples a cycle."""
+    phase = np.arange(600) / 50
+    far = (np.arange(600) % 50 >= 20) & (np.arange(600) % 50 < 20 + width)
+    values = np.where(far, 30.0 + np.arange(600), np.arange(600) % 2)
+    assert faults._lone(far, phase, values, 0.0).tolist() == np.flatnonzero(far).tolist() * lone
+
+
+@pytest.mark.parametrize("apart, every", [(11, True), (9, False)])
+def test_all_samples_of_the_value_of_dropouts_are_lost_if_more_than_two_fifths_jump(apart, every):
+    """Of 25 samples of 0.48 in a triangle wave of steps of 0.04, so many are dropouts at its peaks; others cross it."""
+    place = np.arange(2000) / 100
+    values = 4.0 * np.abs(place % 1.0 - 0.5) + 1e-6 * np.arange(2000)
+    near = np.flatnonzero(np.abs(values - 0.48) < 0.01)[: 25 - apart]
+    peaks = np.flatnonzero(np.diff(np.sign(np.diff(values))) < 0)[:apart] + 1
+    values[near] = values[peaks] = 0.48
+    assert faults.dropped_value(values) == 0.48 and near.size == 25 - apart and peaks.size == apart
+    found = faults._lone(np.zeros(2000, dtype=bool), 0.618 * place, values, 0.0)
+    assert found.tolist() == np.sort(np.concatenate([peaks, near]) if every else peaks).tolist()

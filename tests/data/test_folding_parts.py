@@ -6,6 +6,7 @@ from scipy.integrate import quad
 
 from bayesperiodic import _fourier
 from bayesperiodic.data import folding, harmonics, lines
+from bayesperiodic.data.quantisation import repeated_variance
 from bayesperiodic.data.signals import Signals
 
 
@@ -201,3 +202,21 @@ def test_arguments_of_a_fold_are_checked(changes, message):
     given = {"samples": 20, "periods": 2, "given": (2.5, 0.0), "harmonics": None, "origin": 0.0, "largest_drift": None}
     with pytest.raises(ValueError, match=message):
         folding.fold_signals([Signals("record", time, ("y",), y[None], 0)], **(given | changes))
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_error_of_repeated_rounding_is_that_of_the_scatter_at_each_phase(again):
+    """Pooled over the phases, of n samples at each n − 1 count; none without samples that return to a phase."""
+    points, cycles = 16, 12 if again else 1
+    phase = np.arange(points * cycles) / points
+    noise = np.random.default_rng(5).normal(0.0, 0.05, phase.size)
+    values = 0.2 * np.round((np.cos(2 * np.pi * phase) + noise) / 0.2)
+    amplitudes = np.array([0.1, 1.0 + 0j, 0.0])
+    residuals = values - 0.1 - np.cos(2 * np.pi * phase)
+    found = folding._repeated_error(values, residuals, amplitudes, phase + 3.0, points)
+    by_phase = residuals.reshape(-1, points)
+    scatter = ((by_phase - by_phase.mean(axis=0)) ** 2).sum() / max((cycles - 1) * points, 1)
+    fitted = 0.1 + np.cos(2 * np.pi * np.arange(points) / points)
+    expected = repeated_variance(0.2, fitted, points, scatter=scatter) if again else 0.0
+    assert found == pytest.approx(expected, rel=1e-9) and (found > 0.0) == again
+    assert folding._repeated_error(values + noise, residuals, amplitudes, phase, points) == 0.0

@@ -204,6 +204,14 @@ def test_signals_without_a_period_have_no_frequency():
     assert harmonics.guess_frequency(time, np.cos(2 * np.pi * 0.06 * time)[None]) is None
 
 
+@pytest.mark.parametrize("samples, seen", [(120, True), (119, False)])
+def test_a_frequency_is_guessed_of_three_cycles_or_more(samples, seen):
+    frequency = harmonics.guess_frequency(
+        np.arange(samples) / 10.0, np.sin(np.pi * np.arange(samples) / 20 + 0.3)[None]
+    )
+    assert (frequency == pytest.approx(0.25, rel=0.02)) if seen else frequency is None
+
+
 @pytest.mark.parametrize("factor", [2, 3, 4, 5])
 def test_a_divisor_of_the_frequency_is_replaced_by_it(factor):
     time = np.arange(900) / 60.0
@@ -243,3 +251,13 @@ def test_angles_are_reduced_to_half_a_turn(turns):
     angles = np.array([-3.141, -0.5, -1e-9, 0.0, 0.25, 3.141])
     reduced = _fourier.within_half_turn(angles + 2 * np.pi * turns)
     assert reduced == pytest.approx(angles, rel=0, abs=abs(turns) * 2e-15)
+
+
+@pytest.mark.parametrize("start, near", [(1.02, True), (0.97, True), (1.16, False)])
+def test_a_fit_that_moves_to_another_number_of_cycles_is_none(start, near):
+    """Of eight cycles, from 1.16 Hz to 1 Hz by 1.3 cycles."""
+    time = np.arange(160) / 20.0
+    values = sum(size * np.cos(2 * np.pi * (k + 1) * time + k + 0.3) for k, size in enumerate((0.2, 0.5, 1.0)))[None]
+    fit = harmonics.nearby_fit(time, values, start, 3)
+    assert harmonics.refine_frequency(time, values, start, 3)[0].frequency == pytest.approx(1.0)
+    assert (fit is not None) == near and (fit is None or fit.frequency == pytest.approx(1.0))

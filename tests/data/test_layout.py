@@ -77,3 +77,48 @@ def test_a_cell_of_a_file_with_one_row_is_located(tmp_path):
     (tmp_path / "run.csv").write_text("0\nx\n\n")
     with pytest.raises(ValueError, match="column '0' of run.csv: must contain numbers, .* got 'x' in data row 1"):
         bp.Recording.from_csv(tmp_path / "run.csv", sampling_rate=2.0, outputs={"c": "0"})
+
+
+def written(folder, *, rows=6, last="1.5"):
+    """Write a file of times, a displacement, a force and the number of a part, and return what names its columns."""
+    lines = ["t [s],x [mm],u [N],part"]
+    lines += [f"{k},{2 * k},{3 * k if k < rows - 1 else last},{k // 3}" for k in range(rows)]
+    (folder / "run.csv").write_text("\n".join(lines) + "\n")
+    return {"time": "t [s]", "outputs": {"x": "x [mm]"}, "inputs": {"u": "u [N]"}}
+
+
+def test_recordings_of_a_file_and_its_parts_have_the_units_of_their_values(tmp_path):
+    names = written(tmp_path)
+    run = bp.Recording.from_file(tmp_path / "run.csv", **names)
+    assert run.units == {"x": "m", "u": "N"}
+    parts = bp.Recording.from_file(tmp_path / "run.csv", **names, split="part")
+    assert [part.units for part in parts] == [run.units] * 2
+    assert [part.name for part in parts] == ["run 1: part 0", "run 2: part 1"]
+    np.testing.assert_allclose(np.concatenate([part.outputs["x"] for part in parts]), run.outputs["x"])
+    assert [part.time.tolist() for part in parts] == [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]
+    given = bp.Recording.from_file(tmp_path / "run.csv", **names, units={"x": "mm", "u": 2.0})
+    assert given.units == {"x": "mm"} and given.inputs["u"][1] == 6.0 and given.outputs["x"][1] == 2.0
+
+
+def test_values_that_are_not_finite_are_named_with_channel_column_and_file(tmp_path):
+    names = written(tmp_path, last="inf")
+    with pytest.raises(ValueError, match=r"^u \(column 'u \[N\]' of run.csv\): must be finite, got inf at index 5"):
+        bp.Recording.from_file(tmp_path / "run.csv", **names)
+
+
+@pytest.mark.parametrize(
+    "changes, reason",
+    [
+        ({"outputs": {}}, "outputs: must have at least one channel, got none"),
+        ({"outputs": ["x [mm]"]}, "outputs: must be a mapping"), ({"inputs": ["x [mm]"]}, "inputs: must be a mapping"),
+        ({"sampling_rate": 10.0}, r"time: must be given or sampling_rate, and not both, got 't \[s\]' and 10.0"),
+        ({"units": {"y": "mm"}}, "units: must be one of 'time', 'x', 'u', got 'y'"),
+        ({"units": {"time": "s"}, "outputs": {"time": "x [mm]"}}, "units: must be those of the times by"),
+        ({"time": None, "sampling_rate": {"y": 10.0}}, "sampling_rate: must be one of 'x', 'u', got 'y'"),
+        ({"time": None}, "time: must be given or sampling_rate"), ({"split": "no"}, "must be one of"),
+    ],
+)  # fmt: skip
+def test_what_names_the_columns_of_a_file_is_checked(tmp_path, changes, reason):
+    names = written(tmp_path)
+    with pytest.raises(ValueError, match=reason):
+        bp.Recording.from_file(tmp_path / "run.csv", **names | changes)

@@ -40,7 +40,8 @@ def example(noise, count=8000, slow=0.0):
     wave = np.array([0.3, 2.0 + 0j, 0.0, 0.4j, 0.0, 0.0, 0.0])
     residuals = noise * generator.standard_normal(count)
     if slow:
-        residuals += slow * np.repeat(generator.standard_normal(80), np.bincount(phase.astype(int), minlength=80))
+        cycles = np.repeat(generator.standard_normal(80), np.bincount(phase.astype(int), minlength=80))
+        residuals += slow * cycles * np.cos(2 * np.pi * phase)
     return saturation.phase_bins(phase), phase, wave, residuals
 
 
@@ -79,6 +80,7 @@ def test_noise_that_differs_from_cycle_to_cycle_widens_the_variances():
     within = sum(r.size * r.var() for r in (residuals[bins.place % number == k] for k in range(number)))
     within /= residuals.size - number
     slower = max(power.mean() / (0.25 * within * (1.0 / bins.count).sum()), 1.0)
+    assert slower > 2.0
     exact = (1e-3 * first.values.std()) ** 2
     np.testing.assert_allclose(1.0 / first.weights, slower * within / bins.count.sum(axis=0) + exact, rtol=1e-9)
 

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic import _fourier
 from bayesperiodic.data import sensors
-from bayesperiodic.data.harmonics import fit_harmonics
+from bayesperiodic.data.faults import ChannelFaults
+from bayesperiodic.data.harmonics import HarmonicFit, fit_harmonics
+from bayesperiodic.data.saturation import means_of, phase_bins, saturation_of
 from bayesperiodic.data.signals import Signals
 
 RATE, CYCLES, NOISE = 50, 60, 0.01
@@ -186,3 +189,106 @@ def test_harmonics_that_are_shown_and_not_determined_are_named_with_share_period
     assert "the others determine 1 harmonic, and 'x' has" in sensors.undetermined(used, one, 9)
     assert sensors.undetermined(used, fit, 2) == ""  # no more are resolved
     assert sensors.undetermined(*example(2), 9) == "" == sensors.undetermined(*example(1), 9)
+
+
+PERIOD, BEFORE = 0.5, 80
+PLACE = np.arange(3000) / 50.0  # in cycles, of a period of half a second
+LEVEL, ORDERS = 0.8, np.array([0.0, 1.0 + 0j, 0.0, 0.2j])
+
+
+def part_used(*channels, faults=None, series=None):
+    """Return faults of channels, signals, a fit with these series (channels, orders), by default of the clean wave."""
+    series = np.stack([ORDERS] * len(channels)) if series is None else series
+    used = Signals("run", 7.0 + PERIOD * PLACE, tuple("abc"[: len(channels)]), np.array(channels), 0)
+    residuals = used.values - _fourier.at_times(series, used.time / PERIOD)
+    return faults or [ChannelFaults() for _ in channels], used, HarmonicFit(1.0 / PERIOD, series, residuals)
+
+
+def wave():
+    return _fourier.at_times(ORDERS[None], PLACE)[0]
+
+
+def limited(seed=3, size=1e-3):
+    """Return a wave between -∞ and the level, with noise, and the amplitudes of the limited wave."""
+    values = np.minimum(wave(), LEVEL)
+    amplitudes = np.fft.rfft(values)[: 20 * 60 : 60] / values.size * np.r_[1.0, np.full(19, 2.0)]
+    return values + noise(seed, size), amplitudes
+
+
+@pytest.mark.parametrize("share", [0.3, 0.89, 0.91])
+def test_flat_tops_are_those_of_the_samples_without_faults(share):
+    """Of all samples, if less than a tenth are sound. Numbers of samples are those of the recording."""
+    values, amplitudes = limited()
+    stuck = [slice(10, 30), slice(BEFORE - 30, BEFORE + 1), slice(BEFORE + 100, BEFORE + 100 + int(3000 * share))]
+    brief, outliers = np.array([5, BEFORE + 2980, BEFORE + 3000]), np.array([BEFORE - 1, BEFORE + 2999])
+    wrong = np.zeros(3000, dtype=bool)
+    wrong[0] = wrong[2980] = wrong[2999] = True
+    wrong[100 : 100 + int(3000 * share)] = True
+    values[wrong] += 3.0
+    other = wave() + noise(4, 1e-3)
+    faults = [ChannelFaults(stuck=stuck, brief=brief), ChannelFaults(outliers=outliers)]
+    faults, used, fit = part_used(values, other, faults=faults, series=np.stack([amplitudes, np.r_[ORDERS, [0] * 16]]))
+    sensors.describe(faults, used, fit, BEFORE)
+    sound = ~wrong if share < 0.9 else np.ones(3000, dtype=bool)
+    phase = used.time / PERIOD
+    means = means_of(phase_bins(phase[sound]), fit.residuals[0][sound], amplitudes, 0.0)
+    expected = saturation_of(means)
+    assert (faults[0].saturation is None) == (expected is None) == (share == 0.89)  # of 330 samples none is seen
+    assert faults[0].saturation_bias == pytest.approx(expected.bias(means.error) if expected else 0.0, rel=1e-9)
+    assert faults[1].saturation is None and faults[1].saturated.size == 0
+    if share > 0.3:
+        return
+    assert faults[0].saturation.high == pytest.approx(LEVEL, abs=1e-3) and faults[0].saturation.low == -np.inf
+    flat = np.flatnonzero(np.abs(wave() - LEVEL) > 0.02)
+    at = np.isin(np.arange(3000) + BEFORE, faults[0].saturated)
+    assert np.array_equal(at[flat], (wave() > LEVEL)[flat])
+
+
+@pytest.mark.parametrize("size, step, noisy", [(1e-2, 0.0, True), (1e-2, 0.018, True), (1e-2, 0.023, False),
+                                               (0.8e-3, 0.0, True), (0.55e-3, 0.0, False)])  # fmt: skip
+def test_clipped_samples_are_beside_noise_that_is_more_than_half_a_step_and_a_thousandth(size, step, noisy):
+    """The standard deviation of the values is 0.67, of which a thousandth is noise; its estimate is 3 % from it."""
+    clean = np.minimum(wave(), LEVEL)
+    values = clean + np.where(clean < LEVEL, noise(5, size), 0.0)
+    high = np.flatnonzero(wave() > LEVEL)
+    outside = np.array([BEFORE - 75, BEFORE - 25])  # at phases of the lowest values, if counted from the end
+    fault = ChannelFaults(step=step, high=high + BEFORE, low=outside)
+    (fault,), used, fit = part_used(values, faults=[fault])
+    sensors.describe([fault], used, fit, BEFORE)
+    assert fault.noisy == noisy
+    number = phase_bins(used.time / PERIOD).centre.size
+    place = np.floor((PLACE + 7.0 / PERIOD + 0.5 / number) % 1.0 * number)
+    assert fault.beside.tolist() == (np.flatnonzero(np.isin(place, place[high])) + BEFORE).tolist()
+
+
+def test_a_level_without_noise_is_that_of_its_clipped_samples():
+    values, amplitudes = limited(size=0.0)
+    high = np.flatnonzero(values == LEVEL)[3:] + BEFORE  # as given, whatever the series has
+    for size, saturated in ((0.0, high.tolist()), (0.01, [])):
+        (fault,), used, fit = part_used(
+            values + np.where(values < LEVEL, noise(6, size), 0.0), faults=[ChannelFaults(high=high)],
+            series=amplitudes[None],
+        )  # fmt: skip
+        sensors.describe([fault], used, fit, BEFORE)
+        assert fault.saturation is not None and fault.noisy == bool(size)
+        assert fault.saturated.tolist() == saturated and (fault.saturation_bias > 10.0) == (not size)
+
+
+def test_impulses_of_random_size_in_the_part_used_are_heavy_tails():
+    """Both signs, sizes from 10 to 60 standard deviations; of channels that are clipped none are told."""
+    places = np.r_[0, np.arange(1, 19) * 150 + 7, 2999]
+    values = wave() + noise(7, 1e-3)
+    values[places] += 1e-3 * np.geomspace(10.0, 60.0, 20) * np.tile([1.0, -1.0], 10)
+    outside = [BEFORE - 1, BEFORE + 3000]
+    given = np.sort([*outside, *(places + BEFORE)])
+    faults = [ChannelFaults(outliers=given), ChannelFaults(outliers=given, high=np.array([BEFORE + 33]))]
+    faults, used, fit = part_used(values, values, faults=faults)
+    sensors.describe(faults, used, fit, BEFORE)
+    assert faults[0].tails.tolist() == (places + BEFORE).tolist() and faults[1].tails.size == 0
+    assert [fault.outliers.tolist() for fault in faults] == [outside] * 2
+    # Values that replace the signal follow it, and are faults.
+    values = wave() + noise(7, 1e-3)
+    values[places] = 0.0
+    (fault,), used, fit = part_used(values, faults=[ChannelFaults(outliers=given)])
+    sensors.describe([fault], used, fit, BEFORE)
+    assert fault.outliers.tolist() == given.tolist() and fault.tails.size == 0

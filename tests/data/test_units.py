@@ -1,5 +1,7 @@
 """Conversions against the factors of NIST SP 811 (2008), appendix B, and the SI Brochure, 9th edition."""
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -111,6 +113,88 @@ def test_logarithmic_units_are_refused_with_the_formula(unit, linear, formula):
 def test_units_that_look_logarithmic_are_converted():
     assert units.convert("p", np.ones(1), ("dbar", "Pa")) == pytest.approx(1e4)
     assert units.convert("l", np.ones(1), ("pH", "H")) == pytest.approx(1e-12)
+
+
+@pytest.mark.parametrize(
+    "stored, unit, expected",
+    [
+        ("", None, 2.0), ("  ", None, 2.0), ("", 3.0, 6.0), ("", ("mm", "m"), 0.002), ("mm", None, 0.002),
+        ("mm", "um", 2000.0), ("mm", 3.0, 6.0), ("mm", ("millimeter", "m"), 0.002), ("deg", None, np.pi / 90),
+        ("C", ("degC", "K"), 275.15), ("C", ("C", "mC"), 2000.0), ("furz", ("m", "mm"), 2000.0), ("furz", 3, 6.0),
+        ("m s-2", None, 2.0), ("Nm", "kN*mm", 2.0), ("kN", None, 2000.0),
+    ],
+)  # fmt: skip
+def test_values_of_a_file_are_in_si_or_in_the_unit_that_is_wanted(stored, unit, expected):
+    assert units.from_file("x", np.full(2, 2.0), unit, stored) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    "stored, unit, reason",
+    [
+        ("", "m", r"must be a factor or a pair such as \('mm', 'm'\), got 'm', and the file does not say the unit"),
+        ("C", None, r"must say what 'C' in the file is, got None; give \('degC', 'K'\) for a temperature"),
+        ("C", "K", r"must say what 'C' in the file is, got 'K'; give \('degC', 'K'\)"),
+        ("furz", None, "must say what 'furz' in the file is, got None; give a pair such as .* or a factor"),
+        ("ms-1", None, "must say what 'ms-1' in the file is"), ("ms⁻¹", None, "must say what 'ms⁻¹' in the file is"),
+        ("mm", ("cm", "m"), r"must begin with the unit 'mm' of the file, got \('cm', 'm'\); give a factor"),
+        ("C", ("F", "K"), "must begin with the unit 'C' of the file"), ("mm", "s", "must be two units of the same"),
+        ("mm", ("mm", "m", "m"), "must be a factor or a pair such as"), ("mm", ("mm",), "must be a factor or"),
+        ("mm", 0.0, "must not be zero"),
+    ],
+)  # fmt: skip
+def test_units_that_the_file_and_the_user_leave_open_are_refused(stored, unit, reason):
+    with pytest.raises(ValueError, match=rf"^units\['x'\]: {reason}"):
+        units.from_file("x", np.ones(2), unit, stored)
+
+
+def test_units_of_values_from_a_file():
+    assert [units.unit_of(None, one) for one in ("mm", "N", " Nm ", "furz", "", "deg")] == [
+        "m", "N", "Nm", "furz", "", "rad",
+    ]  # fmt: skip
+    assert units.unit_of(None, "kN") == units.in_si("N") == "kg * m / s ** 2"
+    assert [units.unit_of(one, "mm") for one in (2.0, np.float64(2), "km", ("mm", "cm"))] == ["", "", "km", "cm"]
+
+
+@pytest.mark.parametrize(
+    "one, other, said",
+    [
+        ("N", "kN", "which is 0.001 of it"), ("kN", "N", "which is 1000 of it"),
+        ("m", "s", "a unit of another quantity"),
+        ("degC", "K", "which has another zero"), ("N·m", "Nm", ""), ("m s-2", "m/s²", ""), ("C", "K", ""),
+        ("m", "furz", ""), ("", "m", ""), ("m", "", ""), ("K", "delta_degC", ""),
+    ],
+)  # fmt: skip
+def test_differences_of_units_are_in_words_if_both_are_certain(one, other, said):
+    assert units.difference(one, other) == said
+
+
+@pytest.mark.parametrize(
+    "stored, kind, asked",
+    [
+        ("mm", "m", ""), ("ms", "s", ""), ("min", "s", ""), ("Hz", "1 / s", ""), ("%", "", ""), ("", "", ""),
+        ("C", "", "('degC', 'K') for"), ("furz", "", "a pair such as"), ("ms-1", "", "a pair such as"),
+        ("rpm", "", "('rpm', 'Hz') for"),
+    ],
+)  # fmt: skip
+def test_kinds_of_units_and_questions_about_those_that_are_not_certain(stored, kind, asked):
+    assert units.kind_of(stored) == kind and units.is_duration(stored) == (kind == "s")
+    question = units.question(stored)
+    assert question.startswith(asked) and bool(question) == bool(asked)
+
+
+@pytest.mark.parametrize(
+    "text, unit",
+    [
+        ("m/s", True), ("(m/s)*kg", True), ("m/(s*kg", False), ("m)", False), ("m/*s", False), ("m*s**-2", True),
+        ("m**-12", False), ("", True), ("kg m", True), ("m·s", True), ("m;s", False), ("m" * 101, False),
+        ("m" * 20, False), ("furz", False),
+    ],
+)  # fmt: skip
+def test_texts_that_are_units(text, unit):
+    assert units.is_known(text) == unit
+    if not unit:
+        with pytest.raises(ValueError, match=f"^'{re.escape(text[:100])}' is no known unit$"):
+            units.in_si(text)
 
 
 def test_channels_of_a_file_are_converted(tmp_path):

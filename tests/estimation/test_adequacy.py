@@ -145,3 +145,44 @@ def test_power_in_one_harmonic_is_found_and_the_harmonic_named(harmonic):
     assert row["harmonics"] < 1e-6 and row["harmonic"] == harmonic and row["size"] < 1e-6 and row["p"] < 1e-5
     assert row["verdict"] == table.loc[adequacy.ALL, "verdict"] == "misspecified"
     assert 0.0 < row["model_error_share"] < 1.0
+
+
+@pytest.mark.parametrize(
+    "white, draws, every",
+    [(False, 1, 1), (False, 5, 1), (False, 39, 1), (False, 40, 2), (False, 65, 3), (True, 5, None)],
+)
+def test_p_of_realised_residuals_are_means_over_about_twenty_draws_of_correlated_noise(
+    monkeypatch, white, draws, every
+):
+    """Of white noise, whose size cancels, the medians of the variances are enough."""
+    noise = np.random.default_rng(1).uniform(0.1, 0.9, (draws, 2))
+
+    class Known:
+        def __init__(self, problem, here, shape):
+            self.shape = shape
+
+        def spectral_tests(self, index):
+            return self.shape[0], self.shape[1], 7.0 * self.shape[0]
+
+        def spectrum(self, index):
+            return None
+
+        def consistency(self):
+            return self.shape.sum() / 2
+
+    monkeypatch.setattr(adequacy, "Whitened", Known)
+    monkeypatch.setattr(adequacy, "_size", lambda problem, here, index, white: (0.5, 0.25))
+    blocks = [replace(block(MeanPeriod, 5, 5.0), channel=channel) for channel in "yz"]
+    blocks.insert(1, SimpleNamespace(counted=False))
+    likelihood = SimpleNamespace(white=white, blocks=blocks)
+    problem = SimpleNamespace(likelihood=likelihood, quantities=(), experiments=[])
+    table = adequacy.adequacy(problem, None, noise, {})
+    shapes = np.median(noise, axis=0)[None] if white else noise[::every]
+    assert [*table.index] == ["run y", "run z", "all"]
+    for row in ("run y", "run z"):
+        assert table.loc[row, ["whiteness", "harmonics"]].tolist() == pytest.approx(shapes.mean(axis=0).tolist())
+        assert table.loc[row, "harmonic"] == pytest.approx(7.0 * shapes[0, 0])
+        assert table.loc[row, ["size", "model_error_share", "spectrum"]].tolist() == [0.5, 0.25, "assumed"]
+    assert table.loc["all", "consistency"] == pytest.approx(shapes.mean())
+    each = adequacy.holm(table[[*adequacy.ADEQUACY_TESTS]].to_numpy(dtype=float).ravel())
+    assert table.loc["all", "p"] == pytest.approx(np.nanmin(each)) and table["verdict"].tolist() == ["adequate"] * 3

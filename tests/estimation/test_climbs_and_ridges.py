@@ -334,3 +334,84 @@ def test_starts_in_wide_tables_are_the_ends_the_best_first_and_then_the_draws_wi
     assert {shown for _, shown in seen} == {progress} and seen[1] == ("wide", progress)
     monkeypatch.setattr(climbs, "first_iterate", lambda problem, theta: None)
     assert climbs.in_wide_tables(None, np.zeros(1), np.array([[1.0]]), progress) == []
+
+
+class Known(Ridge):
+    """A ridge whose maxima are a known function of the parameter, None where no solve converges."""
+
+    def _climbed(self, start, value, known=None):
+        self.objective.climbs.append((float(start.theta[0]), value, known))
+        best = self.objective.best(value)
+        return None if best is None else iterate([value], best)
+
+
+def known_ridge(best, at=0.0, prior=None):
+    prior = bp.Normal(at, 1e6) if prior is None else prior
+    joint = SimpleNamespace(names=("a",), marginals={"a": prior})
+    density = SimpleNamespace(problem=SimpleNamespace(joint_prior=joint))
+    hessian = lambda iterate: (np.array([[1.0]]), None)  # noqa: E731
+    objective = SimpleNamespace(density=density, best=best, climbs=[], hessian_and_gradient=hessian)
+    return Known(objective, 0, iterate([at], best(at)))
+
+
+def outwards(best, step, at=0.0, prior=None):
+    """Return values and objectives of the points that begin with a step, NaN where there is none."""
+    each = known_ridge(best, at, prior)
+    points = each._outwards(profile.Point(at, each.peak), step, best(at))
+    return [one.value for one in points], [one.iterate.objective if one.iterate else np.nan for one in points]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    "first, expected",
+    [(0.5, np.arange(1, 7) / 2), (0.1, [0.1, *(0.4 + 0.5 * np.arange(6))]), (2.0, np.arange(1, 7) / 2),
+     (0.9, 0.9 + 0.5 * np.arange(5)), (1.1, np.arange(1, 7) / 2)],
+)  # fmt: skip
+def test_points_of_a_normal_density_are_half_a_standard_deviation_apart_down_to_a_drop_of_2_8(first, expected, sign):
+    """Steps grow threefold at most, and one of twice the drop or more is shortened to a quarter at least."""
+    values, objectives = outwards(lambda x: 3.0 - 0.5 * x**2, sign * first)
+    np.testing.assert_allclose(values, sign * np.array(expected), rtol=1e-12)
+    np.testing.assert_allclose(objectives, 3.0 - 0.5 * np.square(expected), rtol=1e-12)
+    assert abs(values[-2]) <= 2.8 < abs(values[-1])
+
+
+def test_points_lead_up_to_a_jump_of_the_density_and_go_on_behind_it():
+    """By a root of 2 at 1.04; steps are shortened to a hundredth of the first one, and begin with it again behind."""
+    values, _ = outwards(lambda x: -0.5 * x**2 - 2.0 * (x > 1.04), 0.5)
+    behind = next(k for k, value in enumerate(values) if value > 1.04)
+    assert values[behind] - values[behind - 1] < 0.005 / 0.25 and values[behind + 1] == values[behind] + 0.5
+    np.testing.assert_allclose(values[:2], [0.5, 1.0])
+    assert values[-1] > np.sqrt(2.8**2 - 4.0) >= values[-2]
+
+
+@pytest.mark.parametrize("end, failed", [(1.01, 5), (2.45, 5)])
+def test_profiles_end_at_the_fifth_failure_after_steps_that_are_shorter_each_time(end, failed):
+    values, objectives = outwards(lambda x: None if x > end else -0.5 * x**2, 0.5)
+    missing = np.isnan(objectives)
+    assert missing.sum() == failed and missing[-1]
+    last = max(value for value, none in zip(values, missing, strict=True) if not none)
+    assert last <= end < min(value for value, none in zip(values, missing, strict=True) if none)
+    first = int(np.argmax(missing))
+    assert values[first] - values[first - 1] == pytest.approx(0.5)
+    assert values[first + 1] - values[first - 1] == pytest.approx(0.125)
+
+
+def test_profiles_end_at_the_limit_of_the_prior_or_after_sixty_points():
+    """A flat density between 0 and 10 with its peak at 2: the limits are 8e-6 before 10 and 2e-6 behind 0.
+
+    Steps grow to half of the way to the end at most, and then leave a tenth of it.
+    """
+    flat = bp.Uniform(0.0, 10.0)
+    above, _ = outwards(lambda x: 0.0, 1.0, at=2.0, prior=flat)
+    np.testing.assert_allclose(above, [3.0, 6.0, *(10.0 - 10.0 ** -np.arange(6.0)), 10.0 - 8e-6], atol=1e-9)
+    below, _ = outwards(lambda x: 0.0, -0.5, at=2.0, prior=flat)
+    np.testing.assert_allclose(below, [1.5, *(0.75 * 10.0 ** -np.arange(6.0)), 2e-6], atol=1e-9)
+    rising, _ = outwards(lambda x: x, 1.0)
+    assert len(rising) == 60
+    assert outwards(lambda x: 0.0, 1.0, at=10.0, prior=flat) == ([], [])
+
+
+def test_drops_count_from_the_highest_point():
+    """A density that rises to 4 above the peak, and falls as a normal one."""
+    values, _ = outwards(lambda x: 4.0 - 0.5 * (x - 3.0) ** 2, 0.5)
+    assert values[-1] - 3.0 > 2.8 >= values[-2] - 3.0

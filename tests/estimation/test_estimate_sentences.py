@@ -283,3 +283,22 @@ def test_a_misfit_names_the_grid_where_this_moves_the_estimate(shift, named):
     if named:
         assert text.startswith(f"{wrong}. The error of the grid may be the cause: twice as many points would move 'b' ")
         assert f"by {shift:.2g} of its standard deviation; first take more samples" in text
+
+
+def test_frequencies_that_model_and_data_determine_better_than_the_recording_are_listed_up_to_three():
+    """By less than four fifths of the standard error of the recording."""
+    names = ["one", "two", "three", "four", "five"]
+    columns = {"estimate": 1.0, "sd": [0.079, 0.081, 0.01, 0.02, 0.03], "measured": 1.5, "se": 0.1}
+    table = pd.DataFrame(columns, index=names)
+    fit = SimpleNamespace(frequencies=table, input_errors={"one": None})
+    (text,) = MapEstimate._on_frequencies(fit)
+    assert text == (
+        "Frequencies by data and model: 1 ± 0.079 Hz in 'one' (recording: 1.5 ± 0.1 Hz), 1 ± 0.01 Hz in 'three' "
+        "(recording: 1.5 ± 0.1 Hz), 1 ± 0.02 Hz in 'four' (recording: 1.5 ± 0.1 Hz) and 1 more."
+    )
+    fit.frequencies = table[:4]
+    assert MapEstimate._on_frequencies(fit)[0].endswith("in 'four' (recording: 1.5 ± 0.1 Hz).")
+    for nothing in (table[1:2], None):
+        fit.frequencies = nothing
+        assert MapEstimate._on_frequencies(fit) == []
+    assert MapEstimate._on_frequencies(SimpleNamespace(frequencies=table, input_errors={})) == []

@@ -315,8 +315,6 @@ def _moments(file: Path, sheet: str, place: int, first: int, cells: list[Any], d
             result[k] = np.datetime64(day, "us") - epoch
             continue
         result[k] = np.timedelta64(round(day * MICROSECONDS), "us")
-        if dated and abs((epoch + result[k]) - np.datetime64(cell, "us")) > np.timedelta64(2, "D"):
-            raise ValueError(f"its date in row {first + k + 1} is before March 1900 or of another system")
     result = _on_grid(result)
     return epoch + result if dated else text_cells.rolled(result)[0]
 

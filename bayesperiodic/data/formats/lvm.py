@@ -123,7 +123,7 @@ def _channels(whole: Any, segment: Any, rows: _Segment, group: str, separator: s
     if count < 1 or not needed <= width <= needed + 1 or (width > needed and names[-1] != COMMENT_NAME):
         raise ValueError(f"it has {count} channels by its header, and the names {names} from line {rows.first} on")
     offset = 1 if kind == "No" else 0
-    _check_rows(rows, table[:, :needed], offset, separator, whole.get("Decimal_Separator", "."))
+    _check_rows(rows, table[:, :needed], offset, separator, whole["Decimal_Separator"])
     given = {
         key: _each(segment, key, count)
         for key in ("Samples", "Y_Unit_Label", "X_Dimension", "Delta_X", "X0", "Date", "Time")
@@ -135,7 +135,7 @@ def _channels(whole: Any, segment: Any, rows: _Segment, group: str, separator: s
         x = 2 * k if kind == "Multi" else 0 if kind == "One" else None
         key = (x, lengths[k], *(given[name][k] for name in ("X_Dimension", "Delta_X", "X0", "Date", "Time")))
         if key not in clocks:
-            error = _error(rows.steps[min(k, len(rows.steps) - 1)], whole.get("Decimal_Separator", "."))
+            error = _error(rows.steps[min(k, len(rows.steps) - 1)], whole["Decimal_Separator"])
             clocks[key] = _clock(whole, rows, table[: lengths[k]], key, error, separator)
         unit = str(given["Y_Unit_Label"][k] or "")
         values = partial(np.array, table[: lengths[k], j])
@@ -226,7 +226,7 @@ def _clock(
     if np.isnan(times).any():
         return Clock(refusal=f"some of whose times are missing; {BY_RATE}")
     texts = [row.split(separator)[place] for row in rows.rows[:samples][-LAST_ROWS:]]
-    digit = max(_digit(texts, whole.get("Decimal_Separator", ".")), 4 * np.spacing(np.abs(times).max()))
+    digit = max(_digit(texts, whole["Decimal_Separator"]), 4 * np.spacing(np.abs(times).max()))
     mean = float(times[-1] - times[0]) / (samples - 1)
     if np.abs(times - times[0] - mean * np.arange(samples)).max() > digit:
         return Clock(stored=partial(np.array, times), origin=origin)

@@ -42,6 +42,8 @@ COEFFICIENTS = {4: (1, 2), 3: (0, 6, 9)}
 NUMBERS, FLOATS = {4: (0, 1, 2, 3, 4, 5), 3: (0, 1, 2, 3, *range(9, 17))}, {4: (4, 5), 3: (2, 3, 11, 12, 15, 16)}
 DOUBLE_BITS, NO_CONVERSION = 64, {4: (0,), 3: (65535,)}
 REFUSED = {4: {3: "by a formula"}, 3: {10: "by a formula", 7: "that is exponential", 8: "that is logarithmic"}}
+# Encodings of texts by their type in version 4; those of conversions are in UTF-8.
+TEXT_ENCODINGS = {6: "latin-1", 8: "utf-16-le", 9: "utf-16-be"}
 IN_XML = re.compile(r"<TX[^>]*>(.*?)</TX>", re.DOTALL)
 
 
@@ -199,7 +201,10 @@ def _values(mdf: Any, version: int, k: int, i: int, times: list[np.ndarray] | No
     if len(values) != mdf.groups[k].channel_group.cycles_nr:
         raise ValueError(f"its channel {channel.name!r} has {len(values)} samples and not those that its group says")
     if values.dtype.kind == "S":
-        values = np.char.decode(values, "utf-8" if version == 4 else "latin-1", "replace")
+        encoding = TEXT_ENCODINGS.get(channel.data_type, "utf-8") if version == 4 else "latin-1"
+        size = values.itemsize
+        text = np.frompyfunc(lambda one: one.ljust(size, b"\0").decode(encoding, "replace").partition("\0")[0], 1, 1)
+        values = text(values).astype(str)
     lost = None if invalid is None else np.asarray(invalid, dtype=bool)
     if lost is not None and lost.any() and values.ndim == 1 and values.dtype.kind in "fiub":
         values = np.where(lost, np.nan, values)

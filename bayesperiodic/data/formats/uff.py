@@ -133,7 +133,7 @@ def _sets(reader: Any, blocks: list[tuple[int, list[bytes]]]) -> list[_Set]:
         before = [place for place in known if place < k]
         units = known[before[-1]] if before else next(iter(known.values()), None)
         form, abscissa, ordinate, denominator = (_text(lines[line]) for line in (7, 8, 9, 10))
-        labels = (abscissa[46:66].strip(), ordinate[46:66].strip(), denominator[46:66].strip())
+        labels = (abscissa[47:67].strip(), ordinate[47:67].strip(), denominator[47:67].strip())
         sets.append(_Set(k + 1, head, form[43:56], form[30:43], labels, units))
     return sets
 

@@ -201,6 +201,23 @@ def test_dates_that_are_stored_as_texts_of_iso_8601_are_read(tmp_path, mac):
     assert read(path) == ([0.0, 0.5, 2.0, 4.5, 8.0], [0.0, 1.0, 2.0, 3.0, 4.0])
 
 
+def test_times_of_day_that_are_stored_as_texts_are_refused_with_their_row(tmp_path):
+    """Python has no difference of times of day."""
+    book, path = openpyxl.Workbook(), tmp_path / "run.xlsx"
+    book.iso_dates = True
+    for row in [["t", "x"], *([datetime.time(10, k), k] for k in range(3))]:
+        book.active.append(row)
+    book.save(path)
+    with pytest.raises(ValueError, match=r"cell in row 2 is no date that can be read, datetime.time\(10, 0\)"):
+        read(path)
+
+
+def test_durations_in_the_format_of_dates_are_differences(write):
+    """Spreadsheets show 1.5 days as noon of January 1, 1900, and have a February 29 in that year, day 60."""
+    rows = [["t", "x"], *([(day, 1), day] for day in (1.5, 30.25, 59.0, 61.0, 400.5))]
+    assert read(write(rows))[0] == [0.0, 28.75 * 86_400, 57.5 * 86_400, 59.5 * 86_400, 399.0 * 86_400]
+
+
 def test_row_of_the_names_may_be_given(write):
     rows = [["a", "b"], ["t", "x"], [0, 1.5], [1, 2.5]]
     assert read(write(rows), header=2) == ([0.0, 1.0], [1.5, 2.5])

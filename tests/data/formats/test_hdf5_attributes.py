@@ -239,3 +239,37 @@ def test_zero_start_needs_no_unit_and_other_attributes_say_no_times():
     assert sampling({"dt": np.float32(1 / 48), "dt_unit": "ms"}).error == pytest.approx(
         0.5e-12, rel=1e-3
     )  # 0.020833334
+
+
+@pytest.mark.parametrize(
+    "stored, said",
+    [
+        ({"gain": 0.5}, "gain = 0.5"), ({"gain": 1.0}, ""), ({"offset": 0.0}, ""), ({"offset": 1.0}, "offset = 1.0"),
+        ({"zero_level": 0}, ""), ({"full_scale": 1.0}, "full_scale = 1.0"), ({"resolution": 1.0}, ""),
+        ({"resolution": -1.0}, ""), ({"resolution": 2.0}, "resolution = 2.0"), ({"gain": -1.0}, "gain = -1.0"),
+        ({"gain": (1.0, 1.0)}, ""), ({"gain": (1.0, 2.0)}, "gain = (1.0, 2.0)"), ({"gain": "auto"}, "gain = auto"),
+        ({"my_calib": "yes"}, ""), ({"my_calib": "2.0 V"}, "my_calib = 2.0 V"), ({"scale_factor": 2.0}, ""),
+        ({"calibration_date": 2.0}, ""), ({"wf_start_offset": 2.0}, ""), ({"sensor": 2.0}, ""), ({"factory": 2.0}, ""),
+        ({"name": "x", "add_offset": 2.0, "calibration_date": 1.0, "my_calib": "yes", "slope": 1.0, "gain": 3},
+         "gain = 3"),
+    ],
+)  # fmt: skip
+def test_scales_of_no_convention_are_named_unless_they_change_nothing(stored, said):
+    """A factor of 1 and an offset of 0 do not; a resolution of -1 is unknown in Neurodata Without Borders."""
+    assert hdf5_attributes.unused_scale(stored) == said
+
+
+@pytest.mark.parametrize(
+    "stored, kind, said",
+    [
+        ({"range": 10}, "i2", "range = 10"), ({"range": 10}, "f4", ""),
+        ({"Range": (-5.0, 5.0)}, "i2", "Range = (-5.0, 5.0)"),
+        ({"range": (-32768, 32767)}, "i2", ""), ({"range": (-32767, 32768)}, "i2", ""), ({"range": 65_536}, "i2", ""),
+        ({"range": 65_535}, "i2", "range = 65535"), ({"range": (0, 255)}, "u1", ""), ({"range": 256}, "u1", ""),
+        ({"range": "±10 V"}, "i2", "range = ±10 V"), ({"valid_range": 10}, "i2", ""),
+        ({"adc_counts": 4096}, "i4", "adc_counts = 4096"),
+        ({"range": 0, "name": "x", "fsr": 5}, "i2", "fsr = 5"),
+    ],
+)  # fmt: skip
+def test_ranges_of_a_converter_say_what_integers_mean_and_those_of_their_type_do_not(stored, kind, said):
+    assert hdf5_attributes.meaning_of_integers(stored, np.dtype(kind)) == said

@@ -183,10 +183,16 @@ def test_wrong_decimal_sign_is_refused_and_changed_by_its_argument(tmp_path):
     assert_read(read(tmp_path, text, decimal=","))
 
 
-def test_text_in_place_of_a_number_is_refused(tmp_path):
-    lines = (head() + segment()).split("\n")
-    lines[-5] = lines[-5].replace("\t", "\tx", 1)
-    refused(tmp_path, "\n".join(lines), r"row 47 after line \d+ has 'x-?\d")
+@pytest.mark.parametrize("columns", ["No", "One", "Multi"])
+@pytest.mark.parametrize("channel", [0, 1])
+def test_text_in_place_of_a_number_is_refused(tmp_path, columns, channel):
+    lines = (head(columns) + segment(columns=columns)).split("\n")
+    cells = lines[-5].split("\t")
+    place = 1 + channel * (2 if columns == "Multi" else 1)
+    cells[place] = f"x{cells[place]}"
+    lines[-5] = "\t".join(cells)
+    reason = rf"row 47 after line \d+ has '{cells[place]}', no number with the decimal sign '.', which decimal= changes"
+    refused(tmp_path, "\n".join(lines), reason)
 
 
 def test_empty_cell_is_a_missing_sample(tmp_path):
@@ -415,3 +421,30 @@ def test_the_last_row_is_shorter_by_its_last_number_only(separator):
     rows = [separator.join(["0.1", "0.25"]), separator.join(["0.12345", "0.3"])]
     assert lvm._is_shorter(rows, separator) and not lvm._is_shorter(rows[::-1], separator)
     assert not lvm._is_shorter([rows[0], rows[0]], separator)
+
+
+def test_entries_of_the_header_may_be_missing(tmp_path):
+    """Without them there is one column of times, the decimal sign is a point, and rows are counted."""
+    whole = (head() + segment()).splitlines(keepends=True)
+    for entry in ("X_Columns", "Decimal_Separator", "Multi_Headings", "Time_Pref", "Samples", "X_Dimension", "X0"):
+        fewer = [line for line in whole if not line.startswith(f"{entry}\t")]
+        assert len(fewer) < len(whole)
+        assert_read(read(tmp_path, "".join(fewer)))
+    for separator in ("\t", ","):
+        rest = (head(separator=separator) + segment(separator=separator)).splitlines(keepends=True)
+        assert_read(read(tmp_path, "".join(line for line in rest if not line.startswith("Separator"))))
+    unnamed = [line for line in whole if not line.startswith("Y_Unit_Label\t")]
+    np.testing.assert_allclose(read(tmp_path, "".join(unnamed)).outputs["a"], A, atol=0.6e-6)
+
+
+def test_each_channel_has_its_own_step(tmp_path):
+    text = head("No") + segment(columns="No")
+    for steps, channel, rates in (
+        (f"0.000020\t{STEP}", "a", (50_000, 1000)),
+        (f"{STEP}\t0.000020", "b", (1000, 50_000)),
+    ):
+        other = edited(f"Delta_X\t{STEP}\t{STEP}", f"Delta_X\t{steps}", text)
+        with pytest.warns(UserWarning, match=f"gives the interval of channel '{channel}' with few digits") as seen:
+            run = read(tmp_path, other)
+        assert len(seen) == 1
+        assert [1.0 / run.times[c][1] for c in "ab"] == pytest.approx(rates)

@@ -120,17 +120,59 @@ def test_sparse_matrices_of_version_7_3_are_those_of_scipy(tmp_path, filled):
         assert np.array_equal(channels[name].values(), matrix.toarray())
 
 
+def matrix(name, kind, parts):
+    """Return a variable of one row and one column."""
+    head = element(6, struct.pack("<II", kind, 0)) + element(5, struct.pack("<ii", 1, 1)) + element(1, name)
+    return element(14, head + parts)
+
+
+START = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H2s", 0x0100, b"IM")
+NUMBER = matrix(b"", 6, element(9, struct.pack("<d", 2.5)))
+
+
+@pytest.mark.parametrize(
+    "content, reason",
+    [
+        (matrix(b"s", 2, element(5, struct.pack("<i", 2)) + element(1, b"a\0a\0") + NUMBER + NUMBER),
+         "has two fields of"),
+        (matrix(b"s", 2, element(5, struct.pack("<i", 0)) + element(1, b"a\0") + NUMBER), "has names of 0 characters"),
+        (matrix(b"s", 2, element(5, struct.pack("<i", 2)) + element(1, b"a\0") + element(9, bytes(8))),
+         "a field of type 9"),
+        (element(9, bytes(8)), "contains an element of type 9"),
+        (matrix(b"x", 6, element(9, bytes(16))), "'x' has another size than its header says"),
+        (matrix(b"x", 6, element(9, bytes(8)) * 2), "'x' has another size than its header says"),
+        (2 * matrix(b"x", 6, element(9, bytes(8))), "it has two variables 'x'"),
+    ],
+)  # fmt: skip
+def test_files_that_contradict_their_description_are_refused(tmp_path, content, reason):
+    """Of MathWorks: fields are matrices whose names differ and end with a zero."""
+    (tmp_path / "run.mat").write_bytes(START + content)
+    with pytest.raises(ValueError, match=f"must be a MAT file .*run.mat.*{reason}"):
+        bp.Recording.from_file(tmp_path / "run.mat", sampling_rate=1.0, outputs={"x": "x"})
+
+
+def test_structures_are_searched_eight_deep_and_arrays_of_them_are_not(tmp_path):
+    one = element(5, struct.pack("<i", 2)) + element(1, b"a\0")
+    nested = NUMBER
+    for _ in range(10):
+        nested = matrix(b"", 2, one + nested)
+    several = element(6, struct.pack("<II", 2, 0)) + element(5, struct.pack("<ii", 1, 2)) + element(1, b"m")
+    content = START + matrix(b"s", 2, one + nested) + element(14, several + one + NUMBER + NUMBER)
+    (tmp_path / "run.mat").write_bytes(content)
+    assert {one.name: one.samples for one in mat.contents(tmp_path / "run.mat", []).channels} == {"s": 1, "m": 2}
+    inner = NUMBER
+    for _ in range(7):
+        inner = matrix(b"", 2, one + inner)
+    (tmp_path / "run.mat").write_bytes(START + matrix(b"s", 2, one + inner))
+    _, deepest = mat.contents(tmp_path / "run.mat", []).channels
+    assert (deepest.name, deepest.values().tolist()) == ("s" + ".a" * 8, [[2.5]])
+
+
 def test_an_empty_field_does_not_hide_those_after_it(tmp_path):
     """Of a structure, an empty field is a matrix without content; also as the only member of a structure in it."""
-
-    def matrix(name, kind, parts):
-        head = element(6, struct.pack("<II", kind, 0)) + element(5, struct.pack("<ii", 1, 1)) + element(1, name)
-        return element(14, head + parts)
-
     fields = element(5, struct.pack("<i", 2)) + element(1, b"a\0b\0")
     inner = matrix(b"", 2, fields + element(14, b"") + matrix(b"", 6, element(9, struct.pack("<d", 2.5))))
-    content = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H2s", 0x0100, b"IM")
-    (tmp_path / "run.mat").write_bytes(content + matrix(b"s", 2, fields + element(14, b"") + inner))
+    (tmp_path / "run.mat").write_bytes(START + matrix(b"s", 2, fields + element(14, b"") + inner))
     _, value = mat.contents(tmp_path / "run.mat", []).channels
     assert (value.name, value.samples, value.values().tolist()) == ("s.b.b", 1, [[2.5]])
 
@@ -210,8 +252,8 @@ def test_version_4_is_named_with_its_conversion(tmp_path, order):
     """Written after MathWorks' "MAT-File Format": type, rows, columns, real numbers, length of the name."""
     path = tmp_path / "run.mat"
     head = struct.pack(f"{order}5i", {"<": 0, ">": 1000}[order], 50, 1, 0, 2)
-    path.write_bytes(head + b"x\0" + SWING.astype(f"{order}f8").tobytes())
-    assert np.allclose(scipy.io.loadmat(path)["x"].ravel(), SWING)
+    path.write_bytes(head + b"x\0" + (SWING + np.pi).astype(f"{order}f8").tobytes())
+    assert np.allclose(scipy.io.loadmat(path)["x"].ravel(), SWING + np.pi)
     with pytest.raises(ValueError, match=r"got '.*run.mat', a MAT file of version 4; .*save\('run.mat', '-v7'\)"):
         bp.inspect(path)
 

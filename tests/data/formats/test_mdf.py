@@ -5,6 +5,7 @@ import logging
 import struct
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import asammdf
 import numpy as np
@@ -159,6 +160,40 @@ def test_enumeration_has_texts_and_is_refused_as_numbers(tmp_path):
         outputs={"c": "c"},
     )
     assert "texts, or not only numbers" in str(bp.inspect(tmp_path / "run.mf4"))
+
+
+@pytest.mark.parametrize(
+    "code, encoding, ending",
+    [(6, "latin-1", b"\0z"), (7, "utf-8", b"\0z"), (8, "utf-16-le", b""), (9, "utf-16-be", b"")],
+)
+def test_texts_of_version_4_are_in_the_encoding_of_their_type(tmp_path, code, encoding, ending):
+    """They end with a zero; what follows it does not count. Those of conversions are in UTF-8."""
+    blocks, words = Blocks(), ["1.5 µm", "µ", "µé°"] * 20
+    cells = [word.encode(encoding) + ending for word in words]
+    size = max(map(len, cells))
+    switch = conversion(blocks, TEXTS, [0.0, 300.0], [blocks.text(word) for word in ("off", "on µ", "other")])
+    last = channel(blocks, 0, "c", "", U2, 8 + size, conversion=switch)
+    middle = channel(blocks, last, "words", "", (8 * size, code), 8)
+    first = channel(blocks, middle, "t", "s", F8, 0, master=MASTER, sync=1)
+    kinds = [("t", "<f8"), ("words", f"S{size}"), ("c", "<u2")]
+    table = np.rec.fromarrays([TIME[:60], np.array(cells), COUNTS[:60]], dtype=kinds)
+    header(blocks, group(blocks, 0, first, 10 + size, 60, table.tobytes()))
+    (tmp_path / "run.mf4").write_bytes(blocks.bytes())
+    read_words, states = (one.values() for one in mdf.contents(tmp_path / "run.mf4", []).channels)
+    assert read_words.tolist() == words
+    assert states.tolist() == ["off", "on µ", *["other"] * 58]
+
+
+def test_texts_of_version_3_are_in_latin_1(tmp_path):
+    content = version_3().replace(struct.pack("<HHHH", 128, 16, 0, 0)[:6], struct.pack("<HHH", 128, 16, 7))
+    assert content != version_3()
+    words = np.array(["µ", "é", "a"] * 66 + ["m", "s"])
+    rows = np.rec.fromarrays(
+        [TIME, X, np.char.encode(words, "latin-1")], dtype=[("t", "<f8"), ("x", "<f8"), ("c", "S2")]
+    )
+    (tmp_path / "run.mdf").write_bytes(content[: -rows.nbytes] + rows.tobytes())
+    _, seen = mdf.contents(tmp_path / "run.mdf", []).channels
+    assert seen.values().tolist() == words.tolist()
 
 
 @pytest.mark.parametrize("formula", ["X1*2", "__import__('pathlib').Path('executed').touch()"])
@@ -566,6 +601,7 @@ def test_instants_of_files_are_their_origin(tmp_path):
     ):  # fmt: skip
         path.write_bytes(simple().replace(struct.pack("<Q", 1_769_860_800 * 10**9), struct.pack("<Q", start)))
         assert {one.clock.origin for one in mdf.contents(path, []).channels} == {origin}
+    assert mdf._origin(SimpleNamespace(header=SimpleNamespace())) is None  # before version 3.20
 
 
 @pytest.mark.parametrize("content", [simple(kind=LINEAR, values=[0, 1.0]), invalidated(), version_3()])

@@ -286,7 +286,70 @@ def test_units_at_the_end_of_names_are_said_to_be_unused(name, unit, said):
     [
         (["N/A", "NaN", ""], None), (["N/A", "mm", ""], ["N/A", "mm", ""]), (["(s)", "[mm]"], ["s", "mm"]),
         (["one", "two"], None), (["one", "two", "mm/s"], ["one", "two", "mm/s"]),
+        (["N", "one"], None), (["N", "m", "one"], ["N", "m", "one"]), (["-", "-"], None),
     ],
 )  # fmt: skip
 def test_rows_of_units_have_known_ones_and_not_missing_values_alone(cells, units):
     assert header_units.unit_row(cells) == units
+
+
+def test_texts_are_units_up_to_thirty_characters_that_do_not_begin_with_a_number():
+    assert header_units.known("m*" * 14 + "mm") and not header_units.known("m*" * 15 + "m")
+    assert [header_units.known(text) for text in ("", "N", "1/s", "2 m", "smoots", "dB", "C")] == [
+        False, True, True, False, False, True, True
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "texts, evident, possible",
+    [
+        (["mm", "kN", "rad/s", "Hz"], True, True), (["s"], True, True), (["N", "m", "V"], False, True),
+        (["Sek.", "Minuten"], True, False), (["g", "t"], False, False), (["C", "F"], False, False),
+        (["one/two", "mx", ""], False, False),
+    ],
+)  # fmt: skip
+def test_units_are_evident_if_they_are_no_names_and_possible_if_they_have_one_meaning(texts, evident, possible):
+    """A ton and a gram are letters that are seldom units; C and F are coulomb and degrees."""
+    assert [*map(header_units.is_evident, texts)] == [evident] * len(texts)
+    assert [*map(header_units.is_possible, texts)] == [possible] * len(texts)
+
+
+def test_brackets_around_units_and_titles_of_their_row_are_left_out():
+    given = {
+        " [mm] ": "mm",
+        "(s)": "s",
+        "[mm)": "[mm)",
+        " mm": "mm",
+        "Unit:": "",
+        "EINHEITEN": "",
+        "()": "",
+        "(m": "(m",
+    }
+    assert {text: header_units.unbracketed(text) for text in given} == given
+
+
+@pytest.mark.parametrize(
+    "names, units",
+    [
+        (["Force (N)"], ["N"]), (["F (N)"], ["N"]), (["Fx (N)"], [""]), (["Last links (N)"], ["N"]), (["q (N)"], [""]),
+        (["qa (N)", "qb (m)"], ["N", "m"]), (["q (N)", "qb (m)"], ["", "m"]), (["qa (N)", "qb (N)"], ["", ""]),
+        (["qa (N)", "qb (m)", "qc"], ["", "", ""]), (["qa (N)", "qb (mm)", "qc"], ["N", "mm", ""]),
+        (["U [in]"], ["in?"]), (["F [min]"], ["min?"]), (["time [min]"], ["min"]), (["Dauer [h]"], ["h"]),
+        (["ab {mm}"], ["mm?"]), (["<mm> ab"], ["mm?"]), (["ab <x>"], [""]), (["time_ms"], ["ms?"]),
+        (["t_min"], ["min?"]),
+        (["x_min"], [""]), (["x_mm"], [""]), (["time <min>"], ["min?"]), (["x <min>"], [""]),
+        (["a" * 295 + " [mm]"], ["mm"]), (["a" * 296 + " [mm]"], [""]), (["a" * 297 + "_ms"], ["ms?"]),
+        (["a" * 298 + "_ms"], [""]),
+    ],
+)  # fmt: skip
+def test_units_in_names(names, units):
+    """Letters in parentheses are units of their quantity, or of columns with other units, but no index or argument.
+
+    What may be something else has a question mark; names end with their 300th character.
+    """
+    assert header_units.in_names(names) == (units, {})
+
+
+def test_units_in_an_encoding_that_is_guessed_are_refused_if_they_are_not_known():
+    refused = header_units.in_names(["x [Âµm]", "y [µm]", "z [mx]"], guessed=True)[1]
+    assert refused == {0: "its unit 'Âµm' in an encoding that is not known; give encoding="}

@@ -216,3 +216,23 @@ def test_parts_of_different_kinds_are_read_below_a_preamble(write, monkeypatch, 
     assert channels[0].values().tolist() == [k + 0.5 for k in range(12)]
     assert channels[1].values().tolist() == [10 + k for k in range(12)]
     assert [str(value) for value in channels[2].values()] == [row[2] for row in rows]
+
+
+@pytest.mark.parametrize("columns", [3, 201])
+@pytest.mark.parametrize(
+    "tails, sound",
+    [((0, 0, 0), True), ((1, 1, 1), True), ((1, 2, 0), True), ((0, 1, 0), True), ((2, 1, 0), True), ((0, 2, 0), False),
+     ((1, 3, 1), False)],
+)  # fmt: skip
+def test_rows_may_end_with_one_separator_more_than_the_first_one(tmp_path, columns, tails, sound):
+    """In files of many columns too, of which few are read."""
+    rows = [[str(k), str(1.5 * k), *["7"] * (columns - 2)] for k in range(3)]
+    names = ["t", "x", *(f"c{k}" for k in range(columns - 2))]
+    lines = [",".join(names), *(",".join(row) + "," * tail for row, tail in zip(rows, tails, strict=True))]
+    (tmp_path / "run.csv").write_text("\n".join(lines) + "\n")
+    given = {"time": "t", "outputs": {"x": "x"}}
+    if sound:
+        assert bp.Recording.from_file(tmp_path / "run.csv", **given).outputs["x"].tolist() == [0.0, 1.5, 3.0]
+        return
+    with pytest.raises(ValueError, match=f"{columns} fields in each row.* got {columns + tails[1]} in data row 2 of"):
+        bp.Recording.from_file(tmp_path / "run.csv", **given)

@@ -532,3 +532,9 @@ def test_text_may_have_values_up_to_the_end_of_its_line(saved, spare, read_):
     else:
         with pytest.raises(ValueError, match="has 56 values, and its header says 50; it is cut off or damaged"):
             read(path)
+
+
+def test_labels_of_units_have_twenty_characters(saved):
+    """Of a record in the format I10, 3I5, 2(1X, A20), they are the last ones."""
+    path = saved(function(unit="micrometer/second**2"))
+    assert [channel.unit for channel in bp.inspect(path).channels] == ["micrometer/second**2"]
