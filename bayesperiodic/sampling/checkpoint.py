@@ -1,4 +1,4 @@
-"""Checkpoints of sampling runs: one HDF5 file, always complete, written by emcee's backend."""
+"""Backends of emcee: chains in memory, and checkpoints, one HDF5 file, always complete."""
 
 import io
 import json
@@ -10,6 +10,7 @@ from typing import Any
 
 import emcee
 import h5py
+import numpy as np
 
 from bayesperiodic import _hdf5
 from bayesperiodic._files import in_folder, locked, read_sealed, remove_drafts, write_sealed
@@ -18,6 +19,50 @@ from bayesperiodic.problem.fingerprint import changed_parts, fingerprint
 
 PATIENCE = 20.0
 MARK, RUN = "fingerprint", "run"
+
+
+class ColumnBackend(emcee.backends.Backend):
+    """emcee's backend with an array for each coordinate, so that chains grow without a second copy of them."""
+
+    def reset(self, nwalkers: int, ndim: int) -> None:
+        """Remove all steps."""
+        super().reset(nwalkers, ndim)
+        self.columns = [np.empty((0, nwalkers)) for _ in range(ndim)]
+
+    def grow(self, ngrow: int, blobs: np.ndarray | None) -> None:
+        """Add the space of some steps."""
+        self._check_blobs(blobs)
+        rows = self.iteration + ngrow
+        for k, column in enumerate(self.columns):
+            self.columns[k] = _longer(column, rows)
+        self.log_prob = _longer(self.log_prob, rows)
+        if blobs is not None:
+            self.blobs = _longer(np.empty((0, *blobs.shape)) if self.blobs is None else self.blobs, rows)
+
+    def save_step(self, state: emcee.State, accepted: np.ndarray) -> None:
+        """Add a step."""
+        self._check(state, accepted)
+        for column, values in zip(self.columns, state.coords.T, strict=True):
+            column[self.iteration] = values
+        self.log_prob[self.iteration] = state.log_prob
+        if state.blobs is not None:
+            self.blobs[self.iteration] = state.blobs
+        self.accepted += accepted
+        self.random_state = state.random_state
+        self.iteration += 1
+
+    def get_value(self, name: str, flat: bool = False, thin: int = 1, discard: int = 0) -> np.ndarray:
+        """Return the chain or what belongs to it; the chain (steps, walkers, coordinates) is a copy."""
+        if name != "chain":
+            return super().get_value(name, flat=flat, thin=thin, discard=discard)
+        chain = np.stack([column[discard + thin - 1 : self.iteration : thin] for column in self.columns], axis=-1)
+        return chain.reshape(-1, self.ndim) if flat else chain
+
+
+def _longer(values: np.ndarray, rows: int) -> np.ndarray:
+    longer = np.empty((rows, *values.shape[1:]))
+    longer[: len(values)] = values
+    return longer
 
 
 class MemoryBackend(emcee.backends.HDFBackend):
