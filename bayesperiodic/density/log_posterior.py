@@ -381,7 +381,7 @@ class LogPosterior(SamplingCoordinates):
     def with_variances(
         self, points: Any, log_prob: np.ndarray, moments: np.ndarray, generator: np.random.Generator
     ) -> tuple[list[np.ndarray], np.ndarray]:
-        """Draw the collapsed variances of points (…, dimension), an array or chains, from their conditional distribution.
+        """Draw the collapsed variances of points (…, dimension) from their conditional distribution.
 
         It is InvGamma(n/2, M/2), with the flat prior InvGamma(n/2 − 1, M/2). What is returned are the coordinates (…,)
         of the density with all variances.

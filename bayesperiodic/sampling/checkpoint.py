@@ -27,42 +27,59 @@ class ColumnBackend(emcee.backends.Backend):
     def reset(self, nwalkers: int, ndim: int) -> None:
         """Remove all steps."""
         super().reset(nwalkers, ndim)
-        self.columns = [np.empty((0, nwalkers)) for _ in range(ndim)]
+        self.columns, self.log_prob = [np.empty((0, nwalkers)) for _ in range(ndim)], np.empty((0, nwalkers))
+        self.first = 0
+        self.blobs: np.ndarray | None = None
 
     def grow(self, ngrow: int, blobs: np.ndarray | None) -> None:
         """Add the space of some steps."""
-        self._check_blobs(blobs)
-        rows = self.iteration + ngrow
+        if blobs is not None and self.blobs is None:
+            self.blobs = np.empty((0, *blobs.shape))
+        self._keep(0, self.iteration - self.first + ngrow)
+
+    def forget(self, first: int) -> None:
+        """Give back the memory of the steps before one."""
+        if first > self.first:
+            self._keep(first - self.first, self.iteration - first)
+            self.first = first
+
+    def _keep(self, first: int, count: int) -> None:
+        """Make arrays of so many rows, with what there is from the row `first` on."""
+
+        def moved(values: np.ndarray) -> np.ndarray:
+            result, old = np.empty((count, *values.shape[1:])), values[first : first + count]
+            result[: len(old)] = old
+            return result
+
         for k, column in enumerate(self.columns):
-            self.columns[k] = _longer(column, rows)
-        self.log_prob = _longer(self.log_prob, rows)
-        if blobs is not None:
-            self.blobs = _longer(np.empty((0, *blobs.shape)) if self.blobs is None else self.blobs, rows)
+            self.columns[k] = moved(column)
+        self.log_prob = moved(self.log_prob)
+        if self.blobs is not None:
+            self.blobs = moved(self.blobs)
 
     def save_step(self, state: emcee.State, accepted: np.ndarray) -> None:
         """Add a step."""
         self._check(state, accepted)
+        row = self.iteration - self.first
         for column, values in zip(self.columns, state.coords.T, strict=True):
-            column[self.iteration] = values
-        self.log_prob[self.iteration] = state.log_prob
-        if state.blobs is not None:
-            self.blobs[self.iteration] = state.blobs
+            column[row] = values
+        self.log_prob[row] = state.log_prob
+        if self.blobs is not None:
+            self.blobs[row] = state.blobs
         self.accepted += accepted
         self.random_state = state.random_state
         self.iteration += 1
 
-    def get_value(self, name: str, flat: bool = False, thin: int = 1, discard: int = 0) -> np.ndarray:
-        """Return the chain or what belongs to it; the chain (steps, walkers, coordinates) is a copy."""
-        if name != "chain":
-            return super().get_value(name, flat=flat, thin=thin, discard=discard)
-        chain = np.stack([column[discard + thin - 1 : self.iteration : thin] for column in self.columns], axis=-1)
-        return chain.reshape(-1, self.ndim) if flat else chain
+    def columns_since(self, first: int) -> list[np.ndarray]:
+        """Return the coordinates (steps, walkers) from a step on."""
+        return [column[first - self.first : self.iteration - self.first] for column in self.columns]
 
-
-def _longer(values: np.ndarray, rows: int) -> np.ndarray:
-    longer = np.empty((rows, *values.shape[1:]))
-    longer[: len(values)] = values
-    return longer
+    def get_value(self, name: str, discard: int = 0) -> np.ndarray | None:
+        """Return the chain (steps, walkers, coordinates), a copy, or what belongs to it, from a step on."""
+        if name == "chain":
+            return np.stack(self.columns_since(discard), axis=-1)
+        values = getattr(self, name)
+        return None if values is None else values[discard - self.first : self.iteration - self.first]
 
 
 class MemoryBackend(emcee.backends.HDFBackend):
@@ -82,6 +99,10 @@ class MemoryBackend(emcee.backends.HDFBackend):
     def open(self, mode: str = "r") -> Iterator[h5py.File]:
         """Return the file, which stays open."""
         yield self.file
+
+    def columns_since(self, first: int) -> list[np.ndarray]:
+        """Return the coordinates (steps, walkers) from a step on."""
+        return [np.ascontiguousarray(column) for column in np.moveaxis(self.get_chain(discard=first), -1, 0)]
 
     def content(self) -> memoryview:
         """Return the file as bytes, without the space of steps that were not made."""

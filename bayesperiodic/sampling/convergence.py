@@ -153,9 +153,10 @@ def stop_rule(
 ) -> tuple[np.ndarray, list[str]]:
     """Return autocorrelation times [steps], now, and the criteria of the stop rule that are not met, in words.
 
-    `kept` are chains (ensembles, steps, walkers, coordinates), an array or `StoredChains`, `last` the times at the previous check, empty at the
-    first one. If there are several optima, `modes` (ensembles, steps, walkers) contains that of each draw: the
-    fractions of those that are visited must meet the criteria too, and their times follow those of the coordinates.
+    `kept` are chains (ensembles, steps, walkers, coordinates), an array or `StoredChains`, `last` the times at the
+    previous check, empty at the first one. If there are several optima, `modes` (ensembles, steps, walkers) contains
+    that of each draw: the fractions of those that are visited must meet the criteria too, and their times follow those
+    of the coordinates.
     """
     tau, count = autocorrelation_time(kept), kept.shape[-1]
     missing = unmet_criteria(kept, tau, last[:count] if last.size else np.full(count, np.inf), labels)

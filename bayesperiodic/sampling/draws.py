@@ -491,16 +491,18 @@ def gather(
     """
     names = density.labels
     tau = convergence.autocorrelation_time(kept)
+    columns = density.natural_columns(lambda k: convergence.as_chains(kept[..., k]))
+    ess = {name: convergence.effective_size(np.asarray(columns[name]())) for name in names}
+    rhat = {name: convergence.rhat(np.asarray(columns[name]())) for name in names}
     data = tree(density, kept, log_density, seed, modes)
     data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason, PRIORS: as_text(density.problem.priors)}
-    group = data["posterior"].to_dataset()
     return Posterior(
         tree=data,
         converged=converged,
         reason=reason,
         tau=dict(zip(names, tau.tolist(), strict=True)),
-        ess={name: convergence.effective_size(column(group, name)) for name in names},
-        rhat={name: convergence.rhat(column(group, name)) for name in names},
+        ess=ess,
+        rhat=rhat,
         acceptance=acceptance,
         failures={status: count / calls.points for status, count in calls.failures.items()},
         log_posterior_calls=calls.points,

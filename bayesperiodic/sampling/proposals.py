@@ -99,10 +99,11 @@ def parts(count: int) -> list[slice]:
 def expected_time(mixture: StudentMixture, points: Any, log_density: np.ndarray, fraction: float) -> float:
     """Return the autocorrelation time [steps] of proposals from a mixture, the worst of any coordinate.
 
-    `points` (draws, dimension), an array or `Points`, follow the density, known up to a factor. The probability to leave each of them is the
-    mean acceptance there, from the ratios of both densities (J. S. Liu, Metropolized independent sampling, Statistics
-    and Computing 6 (1996) 113-119), times the fraction of such steps; differential evolution, with a time of four steps
-    a dimension, makes the others. Draws count by their square distance from the mean.
+    `points` (draws, dimension), an array or `Points`, follow the density, known up to a factor. The probability to
+    leave each of them is the mean acceptance there, from the ratios of both densities (J. S. Liu, Metropolized
+    independent sampling, Statistics and Computing 6 (1996) 113-119), times the fraction of such steps; differential
+    evolution, with a time of four steps a dimension, makes the others. Draws count by their square distance from the
+    mean.
     """
     ratios = log_density - mixture.log_density(points)
     order = np.argsort(ratios)
@@ -225,10 +226,12 @@ def normal_mixture(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarr
     for _ in range(FIT_ITERATIONS):
         sizes = members.sum(axis=0) + TINY
         means = members.T @ points / sizes[:, None]
-        away = points - means[:, None]
-        covariances = (members.T[..., None] * away).swapaxes(1, 2) @ away / sizes[:, None, None] + regular
+        # One member after the other, which takes less memory.
+        away = ((k, points - mean) for k, mean in enumerate(means))
+        covariances = np.stack([(members[:, k, None] * x).T @ x / sizes[k] + regular for k, x in away])
         factors = np.linalg.cholesky(covariances)
-        squares = np.sum((away @ np.linalg.inv(factors).swapaxes(1, 2)) ** 2, axis=2)
+        whitening = zip(means, np.linalg.inv(factors), strict=True)
+        squares = np.stack([np.sum(((points - mean) @ inverse.T) ** 2, axis=1) for mean, inverse in whitening])
         roots = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)
         logs = (np.log(sizes / sizes.sum()) - roots)[:, None] - 0.5 * squares
         total = logsumexp(logs, axis=0)

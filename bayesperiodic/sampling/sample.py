@@ -66,10 +66,9 @@ from bayesperiodic.sampling.starts import (
 )
 
 if TYPE_CHECKING:
-    import emcee
     import xarray as xr
 
-    from bayesperiodic.sampling.checkpoint import Checkpoint
+    from bayesperiodic.sampling.checkpoint import Checkpoint, ColumnBackend, MemoryBackend
 
 EMCEE, NUTS = "emcee", "nuts"
 FEWEST_STEPS, FEWEST_KEPT = 50, 10
@@ -289,7 +288,7 @@ class _EnsembleRun:
         seed: int,
         start: str,
         shape: tuple[int, int],
-        backend: emcee.backends.Backend,
+        backend: ColumnBackend | MemoryBackend,
         state: dict[str, Any],
     ):
         import emcee
@@ -374,6 +373,8 @@ class _EnsembleRun:
                     else:
                         self._adapt()
                 self._save(store, now=state["converged"] or until == max_steps)
+                if store is None:
+                    self._forget()
                 if state["converged"]:
                     return
         left = ", ".join(state["missing"]) or "the stop rule passed only once"
@@ -416,13 +417,15 @@ class _EnsembleRun:
                 bar.update(self._done - bar.n)
                 check()
 
+    def _forget(self) -> None:
+        """Give back the memory of the steps that are not used again, whether or not the burn-in starts again."""
+        burnt, steps = self.state["burnt"], self.state["steps"]
+        final = self._settled and steps - burnt >= FEWEST_KEPT
+        self.backend.forget(max(burnt if final else 0, steps // 5))
+
     def _chains(self, first: int, transform: AffineTransform | None = None) -> StoredChains:
         """Return the chains from a step on, without a transform in whitened coordinates."""
-        if hasattr(self.backend, "columns"):
-            columns = [column[first : self.backend.iteration] for column in self.backend.columns]
-        else:
-            columns = [np.ascontiguousarray(c) for c in np.moveaxis(self.backend.get_chain(discard=first), -1, 0)]
-        return StoredChains(columns, self.ensembles, transform)
+        return StoredChains(self.backend.columns_since(first), self.ensembles, transform)
 
     def _by_ensemble(self, values: np.ndarray) -> np.ndarray:
         """Return values (steps, all walkers, …) as (ensembles, steps, walkers, …)."""
@@ -466,9 +469,15 @@ class _EnsembleRun:
         by_surrogate = 2.0 / max(MIXTURE_STEPS * accepted / proposed, np.finfo(float).tiny) - 1.0
         return [0.1, MIXTURE_STEPS] if by_surrogate < by_mixture else [MIXTURE_STEPS - 0.1, 0.1]
 
+    @property
+    def _settled(self) -> bool:
+        """Whether the burn-in is over for good."""
+        state = self.state
+        return state["burnt"] > 0 and bool(state["burnt"] >= MOST_BURN_IN_ROUNDS * ROUND or state["shares"][1])
+
     def _outdated(self) -> bool:
         """Return whether the burn-in ended too early: the draws since then have tails that the mixture lacks."""
-        if self.state["burnt"] >= MOST_BURN_IN_ROUNDS * ROUND or self.state["shares"][1]:
+        if self._settled:
             return False
         mixture = StudentMixture.from_lists(self.state["mixture"])
         return self._expected_time(mixture, self._first_kept) > SLOW_MIXTURE
@@ -521,6 +530,8 @@ class _EnsembleRun:
         """Return the draws, with draws of the variances that were integrated out; the run is over then."""
         import xarray as xr
 
+        from bayesperiodic.sampling.checkpoint import ColumnBackend
+
         kept, first = self._kept(), self._first_kept
         log_density = self._by_ensemble(self.backend.get_log_prob(discard=first))
         modes = self._modes(kept)
@@ -530,7 +541,7 @@ class _EnsembleRun:
             columns, log_density = self.density.with_variances(kept, log_density, moments, self.redraws)
             kept = kept.with_columns(columns)
         acceptance = float(np.mean(self.backend.accepted / self.backend.iteration))
-        if hasattr(self.backend, "columns"):
+        if isinstance(self.backend, ColumnBackend):
             self.backend.reset(*self.walk.coords.shape)  # its memory is given back as `gather` takes the coordinates
         posterior = gather(
             self.density.with_settings(variances=SAMPLED),

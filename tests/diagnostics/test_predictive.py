@@ -7,6 +7,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic import _fourier
 from bayesperiodic.estimation.adequacy import ADEQUACY_TESTS, adequacy
+from bayesperiodic.sampling.chains import StoredChains
 from bayesperiodic.sampling.groups import tree
 from tests.known import LINEAR, NOISES, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors
 from tests.problems import CASES, DUFFING, DUFFING_PRIORS, SAMPLES
@@ -38,7 +39,7 @@ def posterior_of(problem: bp.Problem, theta: np.ndarray, noise: np.ndarray, seed
     density, points = anchored.log_posterior(theta, noise), anchored.density().from_natural(theta, noise)
     names = [*problem.names, *problem.free_noise]
     return bp.Posterior(
-        tree=tree(anchored.density(), points, density, seed),
+        tree=tree(anchored.density(), StoredChains.of(points), density, seed),
         converged=True,
         reason="independent draws",
         tau=dict.fromkeys(names, 1.0),
