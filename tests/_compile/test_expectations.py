@@ -72,13 +72,10 @@ SOLUTION = """
 """
 
 
-def run(folder: Path | None, before: str, more: str = "") -> tuple[np.ndarray, list[str], bool]:
-    """Return values, warnings, and whether the expectations are met in a process that executes a text before.
-
-    The kernels are stored in a folder, without it in the usual cache.
-    """
+def run(folder: Path, before: str, more: str = "") -> tuple[np.ndarray, list[str], bool]:
+    """Return values, warnings, and whether the expectations are met in a process that executes a text before."""
     program = before + VALUES.replace("    MORE\n", more)
-    environment = os.environ | ({} if folder is None else {"BAYESPERIODIC_CACHE": str(folder)})
+    environment = os.environ | {"BAYESPERIODIC_CACHE": str(folder)}
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, env=environment, check=False
     )
@@ -109,5 +106,5 @@ def test_models_have_the_same_values_without_the_internals_and_one_warning(tmp_p
 @pytest.mark.slow
 def test_periodic_solutions_and_simulations_are_the_same_without_the_internals(tmp_path):
     values, _, met = run(tmp_path / "gone", GONE, SOLUTION)
-    expected, _, _ = run(None, "", SOLUTION)  # the usual cache, which usually has its kernels
+    expected, _, _ = run(tmp_path / "expected", "", SOLUTION)
     assert not met and np.allclose(values, expected, rtol=1e-10, atol=1e-12)
