@@ -380,12 +380,12 @@ class LogPosterior(SamplingCoordinates):
         return 0.5 * counts - (1.0 if self.problem.noise.prior == FLAT_PRIOR else 0.0)
 
     def with_variances(
-        self, points: np.ndarray, log_prob: np.ndarray, moments: np.ndarray, generator: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, points: Any, log_prob: np.ndarray, moments: np.ndarray, generator: np.random.Generator
+    ) -> tuple[list[np.ndarray], np.ndarray]:
         """Draw the collapsed variances of points (…, dimension) from their conditional distribution.
 
-        It is InvGamma(n/2, M/2), with the flat prior InvGamma(n/2 − 1, M/2). The points returned are coordinates of the
-        density with all variances, (…, dimension + collapsed).
+        It is InvGamma(n/2, M/2), with the flat prior InvGamma(n/2 − 1, M/2). What is returned are the coordinates (…,)
+        of the density with all variances.
         """
         precisions = generator.gamma(self._shapes, size=moments.shape)  # in units of 2/M
         logarithms = np.log(precisions)
@@ -394,8 +394,7 @@ class LogPosterior(SamplingCoordinates):
         count = len(self.problem.names)
         columns = {name: points[..., count + i] for i, name in enumerate(self.free)}
         columns |= {name: variances[..., i] for i, name in enumerate(self.collapsed)}
-        noise = np.stack([columns[name] for name in self.problem.free_noise], axis=-1)
-        return np.concatenate([points[..., :count], noise], axis=-1), log_prob
+        return [points[..., k] for k in range(count)] + [columns[name] for name in self.problem.free_noise], log_prob
 
 
 def _placed(values: np.ndarray, where: np.ndarray, outside: float) -> np.ndarray:

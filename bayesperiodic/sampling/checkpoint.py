@@ -1,4 +1,4 @@
-"""Checkpoints of sampling runs: one HDF5 file, always complete, written by emcee's backend."""
+"""Backends of emcee: chains in memory, and checkpoints, one HDF5 file, always complete."""
 
 import io
 import json
@@ -10,6 +10,7 @@ from typing import Any
 
 import emcee
 import h5py
+import numpy as np
 
 from bayesperiodic import _hdf5
 from bayesperiodic._files import in_folder, locked, read_sealed, remove_drafts, write_sealed
@@ -18,6 +19,67 @@ from bayesperiodic.problem.fingerprint import changed_parts, fingerprint
 
 PATIENCE = 20.0
 MARK, RUN = "fingerprint", "run"
+
+
+class ColumnBackend(emcee.backends.Backend):
+    """emcee's backend with an array for each coordinate, so that chains grow without a second copy of them."""
+
+    def reset(self, nwalkers: int, ndim: int) -> None:
+        """Remove all steps."""
+        super().reset(nwalkers, ndim)
+        self.columns, self.log_prob = [np.empty((0, nwalkers)) for _ in range(ndim)], np.empty((0, nwalkers))
+        self.first = 0
+        self.blobs: np.ndarray | None = None
+
+    def grow(self, ngrow: int, blobs: np.ndarray | None) -> None:
+        """Add the space of some steps."""
+        if blobs is not None and self.blobs is None:
+            self.blobs = np.empty((0, *blobs.shape))
+        self._keep(0, self.iteration - self.first + ngrow)
+
+    def forget(self, first: int) -> None:
+        """Give back the memory of the steps before one."""
+        if first > self.first:
+            self._keep(first - self.first, self.iteration - first)
+            self.first = first
+
+    def _keep(self, first: int, count: int) -> None:
+        """Make arrays of so many rows, with what there is from the row `first` on."""
+
+        def moved(values: np.ndarray) -> np.ndarray:
+            result, old = np.empty((count, *values.shape[1:])), values[first : first + count]
+            result[: len(old)] = old
+            return result
+
+        for k, column in enumerate(self.columns):
+            self.columns[k] = moved(column)
+        self.log_prob = moved(self.log_prob)
+        if self.blobs is not None:
+            self.blobs = moved(self.blobs)
+
+    def save_step(self, state: emcee.State, accepted: np.ndarray) -> None:
+        """Add a step."""
+        self._check(state, accepted)
+        row = self.iteration - self.first
+        for column, values in zip(self.columns, state.coords.T, strict=True):
+            column[row] = values
+        self.log_prob[row] = state.log_prob
+        if self.blobs is not None:
+            self.blobs[row] = state.blobs
+        self.accepted += accepted
+        self.random_state = state.random_state
+        self.iteration += 1
+
+    def columns_since(self, first: int) -> list[np.ndarray]:
+        """Return the coordinates (steps, walkers) from a step on."""
+        return [column[first - self.first : self.iteration - self.first] for column in self.columns]
+
+    def get_value(self, name: str, discard: int = 0) -> np.ndarray | None:
+        """Return the chain (steps, walkers, coordinates), a copy, or what belongs to it, from a step on."""
+        if name == "chain":
+            return np.stack(self.columns_since(discard), axis=-1)
+        values = getattr(self, name)
+        return None if values is None else values[discard - self.first : self.iteration - self.first]
 
 
 class MemoryBackend(emcee.backends.HDFBackend):
@@ -37,6 +99,10 @@ class MemoryBackend(emcee.backends.HDFBackend):
     def open(self, mode: str = "r") -> Iterator[h5py.File]:
         """Return the file, which stays open."""
         yield self.file
+
+    def columns_since(self, first: int) -> list[np.ndarray]:
+        """Return the coordinates (steps, walkers) from a step on."""
+        return [np.ascontiguousarray(column) for column in np.moveaxis(self.get_chain(discard=first), -1, 0)]
 
     def content(self) -> memoryview:
         """Return the file as bytes, without the space of steps that were not made."""

@@ -81,7 +81,7 @@ def _of_arviz(statistic: str, values: np.ndarray, method: str) -> float:
     return float(getattr(arviz(), statistic)(data, method=method)["x"])
 
 
-def autocorrelation_time(chains: np.ndarray) -> np.ndarray:
+def autocorrelation_time(chains: Any) -> np.ndarray:
     """Return the integrated autocorrelation time of each coordinate in steps, the mean over the ensembles.
 
     emcee subtracts the mean of each walker, which makes its estimate too small, however many walkers there are: by 18 %
@@ -91,12 +91,15 @@ def autocorrelation_time(chains: np.ndarray) -> np.ndarray:
     from emcee.autocorr import integrated_time
 
     with np.errstate(invalid="ignore"):  # a walker that has not moved yet
-        times = [integrated_time(e, c=WINDOW, tol=0, quiet=True, has_walkers=True) for e in chains]
-    mean = np.mean(times, axis=0)
+        times = [
+            [integrated_time(e[..., None], c=WINDOW, tol=0, quiet=True, has_walkers=True)[0] for e in chains[..., k]]
+            for k in range(chains.shape[-1])
+        ]
+    mean = np.mean(times, axis=1)
     return mean * (1.0 + (2.0 * WINDOW * mean + 1.0) / chains.shape[1])
 
 
-def quantile_spread(chains: np.ndarray) -> np.ndarray:
+def quantile_spread(chains: Any) -> np.ndarray:
     """Return the largest difference between ensembles of the 5, 50 and 95 % quantiles, in sds of a normal distribution.
 
     It is that of the fractions of draws up to the pooled quantiles, over the normal density there: between two modes a
@@ -146,13 +149,14 @@ STUCK_DISTANCE = 8.0
 
 
 def stop_rule(
-    kept: np.ndarray, modes: np.ndarray | None, last: np.ndarray, labels: Sequence[str]
+    kept: Any, modes: np.ndarray | None, last: np.ndarray, labels: Sequence[str]
 ) -> tuple[np.ndarray, list[str]]:
     """Return autocorrelation times [steps], now, and the criteria of the stop rule that are not met, in words.
 
-    `kept` are chains (ensembles, steps, walkers, coordinates), `last` the times at the previous check, empty at the
-    first one. If there are several optima, `modes` (ensembles, steps, walkers) contains that of each draw: the
-    fractions of those that are visited must meet the criteria too, and their times follow those of the coordinates.
+    `kept` are chains (ensembles, steps, walkers, coordinates), an array or `StoredChains`, `last` the times at the
+    previous check, empty at the first one. If there are several optima, `modes` (ensembles, steps, walkers) contains
+    that of each draw: the fractions of those that are visited must meet the criteria too, and their times follow those
+    of the coordinates.
     """
     tau, count = autocorrelation_time(kept), kept.shape[-1]
     missing = unmet_criteria(kept, tau, last[:count] if last.size else np.full(count, np.inf), labels)
@@ -166,7 +170,7 @@ def stop_rule(
     return np.concatenate([tau, of_modes]), missing + weights
 
 
-def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: Sequence[str]) -> list[str]:
+def unmet_criteria(kept: Any, tau: np.ndarray, last: np.ndarray, labels: Sequence[str]) -> list[str]:
     """Return the criteria of the stop rule that are not met, in words.
 
     An ensemble of 32 walkers that is 50 autocorrelation times long contains 1600 independent draws, a single walker
@@ -195,8 +199,8 @@ def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: 
     return unmet
 
 
-def _furthest(kept: np.ndarray, tau: np.ndarray) -> float:
+def _furthest(kept: Any, tau: np.ndarray) -> float:
     """Return the largest distance of a walker's mean from the mean of all, in standard errors of such a mean."""
-    off = np.abs(kept.mean(axis=1) - kept.mean(axis=(0, 1, 2)))
-    sd = np.array([kept[..., i].std() for i in range(kept.shape[-1])])
-    return float(np.max(off / (sd * np.sqrt(tau / kept.shape[1]))))
+    columns = (kept[..., i] for i in range(kept.shape[-1]))
+    off = [float(np.max(np.abs(c.mean(axis=1) - c.mean()) / c.std())) for c in columns]
+    return float(np.max(off / np.sqrt(tau / kept.shape[1])))

@@ -30,6 +30,7 @@ from bayesperiodic.problem.parameters import (
     places,
 )
 from bayesperiodic.sampling import convergence
+from bayesperiodic.sampling.chains import StoredChains
 from bayesperiodic.sampling.groups import (
     CAUSED,
     EXPECTED,
@@ -474,7 +475,7 @@ def refuse_robust(posterior: Posterior) -> None:
 
 def gather(
     density: LogPosterior,
-    kept: np.ndarray,
+    kept: StoredChains,
     log_density: np.ndarray,
     calls: CallCount,
     *,
@@ -484,21 +485,24 @@ def gather(
     seed: int,
     modes: np.ndarray | None = None,
 ) -> Posterior:
-    """Return the posterior of chains (ensembles, steps, walkers, coordinates) in sampling coordinates.
+    """Return the posterior of chains in sampling coordinates, which gives back their memory.
 
     `log_density` and `modes`, the optimum to which each draw belongs, are (ensembles, steps, walkers).
     """
     names = density.labels
+    tau = convergence.autocorrelation_time(kept)
+    columns = density.natural_columns(lambda k: convergence.as_chains(kept[..., k]))
+    ess = {name: convergence.effective_size(np.asarray(columns[name]())) for name in names}
+    rhat = {name: convergence.rhat(np.asarray(columns[name]())) for name in names}
     data = tree(density, kept, log_density, seed, modes)
     data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason, PRIORS: as_text(density.problem.priors)}
-    tau, group = convergence.autocorrelation_time(kept), data["posterior"].to_dataset()
     return Posterior(
         tree=data,
         converged=converged,
         reason=reason,
         tau=dict(zip(names, tau.tolist(), strict=True)),
-        ess={name: convergence.effective_size(column(group, name)) for name in names},
-        rhat={name: convergence.rhat(column(group, name)) for name in names},
+        ess=ess,
+        rhat=rhat,
         acceptance=acceptance,
         failures={status: count / calls.points for status, count in calls.failures.items()},
         log_posterior_calls=calls.points,

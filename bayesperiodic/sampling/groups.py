@@ -16,6 +16,7 @@ from bayesperiodic.problem.description import Description
 from bayesperiodic.problem.fingerprint import fingerprint
 from bayesperiodic.problem.parameters import CHAIN, CHANNEL, DRAW, EXPERIMENT, NOISE, column, full_name, pack, squared
 from bayesperiodic.sampling import convergence
+from bayesperiodic.sampling.chains import StoredChains
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -107,18 +108,19 @@ def signals(problem: Description, by_run: Mapping[str, Mapping[str, np.ndarray]]
 
 
 def tree(
-    density: LogPosterior, kept: np.ndarray, log_density: np.ndarray, seed: int, modes: np.ndarray | None = None
+    density: LogPosterior, kept: StoredChains, log_density: np.ndarray, seed: int, modes: np.ndarray | None = None
 ) -> xr.DataTree:
-    """Return draws (ensembles, steps, walkers, coordinates) as the groups of `Posterior.tree`."""
+    """Return draws in sampling coordinates, which are given back, as the groups of `Posterior.tree`."""
     import xarray as xr
 
     problem, lp = density.problem, convergence.as_chains(log_density)
     steps, walkers = log_density.shape[1:]
     moved, same = np.full(log_density.shape, np.nan), np.ones(log_density[:, 1:].shape, dtype=bool)
     for i in range(len(problem.names)):
-        same &= kept[:, 1:, :, i] == kept[:, :-1, :, i]
+        same &= kept[..., i][:, 1:] == kept[..., i][:, :-1]
     moved[:, 1:] = ~same
-    best, _ = density.to_natural(kept[np.unravel_index(np.argmax(log_density), log_density.shape)])
+    largest = np.unravel_index(np.argmax(log_density), log_density.shape)
+    best, _ = density.to_natural(np.array([kept[..., i][largest] for i in range(density.dimension)]))
     step, walker = (convergence.as_chains(index[None])[0] for index in np.indices((steps, walkers)))
     coords = {CHAIN: np.arange(len(lp)), DRAW: np.arange(lp.shape[1]), STEP: (DRAW, step), WALKER: (DRAW, walker)}
     posterior = _variables(density, kept, lp.shape).assign_coords(coords)
@@ -155,12 +157,12 @@ def tree(
     return result
 
 
-def _variables(density: LogPosterior, kept: np.ndarray, shape: tuple[int, ...]) -> xr.Dataset:
+def _variables(density: LogPosterior, kept: StoredChains, shape: tuple[int, ...]) -> xr.Dataset:
     """Return θ and noise parameters of draws as labelled variables (chains, draws, …), one after the other."""
     import xarray as xr
 
     problem = density.problem
-    columns = density.natural_columns(lambda k: convergence.as_chains(kept[..., k])) | _fixed_locals(problem)
+    columns = density.natural_columns(lambda k: convergence.as_chains(kept.pop(k))) | _fixed_locals(problem)
     dims = {plain: (EXPERIMENT,) * (plain != name) for name, plain in problem.plain_names.items()}
     dims |= {name.partition("[")[0]: _noise_dims(problem, name) for name in problem.noise_names}
     channels = [*problem.channels, *problem.quantities, *filter(None, [problem.noise.pooled])]

@@ -16,6 +16,7 @@ from bayesperiodic.density.log_posterior import SAMPLED, LogPosterior
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.problem.parameters import CHAIN, DRAW
 from bayesperiodic.sampling import convergence
+from bayesperiodic.sampling.chains import StoredChains
 from bayesperiodic.sampling.convergence import PASSES, stop_rule
 from bayesperiodic.sampling.draws import Posterior, gather
 from bayesperiodic.sampling.proposals import AffineTransform, CallCount
@@ -216,7 +217,7 @@ class _Chains:
         kept = self.kept(self.steps)
         result = gather(
             self.density,
-            kept,
+            StoredChains.of(kept),
             log_density[:, :, None],
             sum(accounts, CallCount()),
             modes=mode_of(self.density, self.fit, kept),

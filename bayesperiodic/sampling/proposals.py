@@ -77,10 +77,9 @@ class StudentMixture:
             columns.append(np.log(weight) + total - np.log(np.diag(factor)).sum() - tails)
         return np.stack(columns, axis=1)
 
-    def log_density(self, points: np.ndarray) -> np.ndarray:
-        """Return the log-density at points (points, dimension)."""
-        parts = [points[k : k + POINTS_TOGETHER] for k in range(0, max(len(points), 1), POINTS_TOGETHER)]
-        return np.concatenate([logsumexp(self.log_components(part), axis=1) for part in parts])
+    def log_density(self, points: Any) -> np.ndarray:
+        """Return the log-density at points (points, dimension), an array or `Points`."""
+        return np.concatenate([logsumexp(self.log_components(points[p]), axis=1) for p in parts(len(points))])
 
     def draw(self, count: int, random: np.random.RandomState | np.random.Generator) -> np.ndarray:
         """Return draws (count, dimension)."""
@@ -92,13 +91,19 @@ class StudentMixture:
         return self.straightened(drawn, 1.0)
 
 
-def expected_time(mixture: StudentMixture, points: np.ndarray, log_density: np.ndarray, fraction: float) -> float:
+def parts(count: int) -> list[slice]:
+    """Return slices of POINTS_TOGETHER points, at least one."""
+    return [slice(k, k + POINTS_TOGETHER) for k in range(0, max(count, 1), POINTS_TOGETHER)]
+
+
+def expected_time(mixture: StudentMixture, points: Any, log_density: np.ndarray, fraction: float) -> float:
     """Return the autocorrelation time [steps] of proposals from a mixture, the worst of any coordinate.
 
-    `points` (draws, dimension) follow the density, known up to a factor. The probability to leave each of them is the
-    mean acceptance there, from the ratios of both densities (J. S. Liu, Metropolized independent sampling, Statistics
-    and Computing 6 (1996) 113-119), times the fraction of such steps; differential evolution, with a time of four steps
-    a dimension, makes the others. Draws count by their square distance from the mean.
+    `points` (draws, dimension), an array or `Points`, follow the density, known up to a factor. The probability to
+    leave each of them is the mean acceptance there, from the ratios of both densities (J. S. Liu, Metropolized
+    independent sampling, Statistics and Computing 6 (1996) 113-119), times the fraction of such steps; differential
+    evolution, with a time of four steps a dimension, makes the others. Draws count by their square distance from the
+    mean.
     """
     ratios = log_density - mixture.log_density(points)
     order = np.argsort(ratios)
@@ -106,11 +111,14 @@ def expected_time(mixture: StudentMixture, points: np.ndarray, log_density: np.n
     accepted = np.empty(len(order))
     later = inverse.sum() - np.cumsum(inverse)
     accepted[order] = (np.arange(1, len(order) + 1) * inverse + later) / inverse.sum()
-    leaving = fraction * accepted + (1.0 - fraction) * 2.0 / (4.0 * points.shape[1] + 1.0)
-    middle, times, total = points.mean(axis=0), np.zeros(points.shape[1]), np.zeros(points.shape[1])
-    for k in range(0, len(points), POINTS_TOGETHER):
-        squared = (points[k : k + POINTS_TOGETHER] - middle) ** 2
-        times += (2.0 / leaving[k : k + POINTS_TOGETHER] - 1.0) @ squared
+    dimension = mixture.means.shape[1]
+    leaving = fraction * accepted + (1.0 - fraction) * 2.0 / (4.0 * dimension + 1.0)
+    middle, times, total = np.zeros(dimension), np.zeros(dimension), np.zeros(dimension)
+    for part in parts(len(points)):
+        middle += points[part].sum(axis=0) / len(points)
+    for part in parts(len(points)):
+        squared = (points[part] - middle) ** 2
+        times += (2.0 / leaving[part] - 1.0) @ squared
         total += squared.sum(axis=0)
     return float(np.max(times / total))
 
@@ -218,10 +226,12 @@ def normal_mixture(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarr
     for _ in range(FIT_ITERATIONS):
         sizes = members.sum(axis=0) + TINY
         means = members.T @ points / sizes[:, None]
-        away = points - means[:, None]
-        covariances = (members.T[..., None] * away).swapaxes(1, 2) @ away / sizes[:, None, None] + regular
+        # One member after the other, which takes less memory.
+        away = ((k, points - mean) for k, mean in enumerate(means))
+        covariances = np.stack([(members[:, k, None] * x).T @ x / sizes[k] + regular for k, x in away])
         factors = np.linalg.cholesky(covariances)
-        squares = np.sum((away @ np.linalg.inv(factors).swapaxes(1, 2)) ** 2, axis=2)
+        whitening = zip(means, np.linalg.inv(factors), strict=True)
+        squares = np.stack([np.sum(((points - mean) @ inverse.T) ** 2, axis=1) for mean, inverse in whitening])
         roots = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)
         logs = (np.log(sizes / sizes.sum()) - roots)[:, None] - 0.5 * squares
         total = logsumexp(logs, axis=0)

@@ -40,16 +40,19 @@ from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.problem.fingerprint import digest
+from bayesperiodic.sampling.chains import StoredChains
 from bayesperiodic.sampling.convergence import PASSES, stop_rule
 from bayesperiodic.sampling.draws import Posterior, gather
 from bayesperiodic.sampling.nuts import refuse_for_nuts, sample_nuts
 from bayesperiodic.sampling.proposals import (
     MIXTURE_STEPS,
+    MOST_FITTED_DRAWS,
     AffineTransform,
     CallCount,
     StudentMixture,
     expected_time,
     fit_mixture,
+    parts,
 )
 from bayesperiodic.sampling.robust import add_robust
 from bayesperiodic.sampling.starts import (
@@ -63,10 +66,9 @@ from bayesperiodic.sampling.starts import (
 )
 
 if TYPE_CHECKING:
-    import emcee
     import xarray as xr
 
-    from bayesperiodic.sampling.checkpoint import Checkpoint
+    from bayesperiodic.sampling.checkpoint import Checkpoint, ColumnBackend, MemoryBackend
 
 EMCEE, NUTS = "emcee", "nuts"
 FEWEST_STEPS, FEWEST_KEPT = 50, 10
@@ -212,9 +214,7 @@ def sample(
     >>> draws.reason.split(" with ")[0], draws.failures
     ('max_steps = 250 reached', {})
     """
-    import emcee
-
-    from bayesperiodic.sampling.checkpoint import Checkpoint
+    from bayesperiodic.sampling.checkpoint import Checkpoint, ColumnBackend
 
     _checks.instance("problem", problem, Problem)
     _checks.integer("ensembles", ensembles, 2)
@@ -245,7 +245,7 @@ def sample(
         settings += f", input noise {digest([astuple(wave) for wave in fit.input_errors.values()])}"
     opened = nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings)
     with ended_by_termination(), opened as store:
-        backend, saved = (emcee.backends.Backend(), {}) if store is None else store.load()
+        backend, saved = (ColumnBackend(), {}) if store is None else store.load()
         anchor = np.array(saved["anchor"]) if saved else problem.vector(fit.theta)
         guesses = saved["guesses"] if saved else {name: s.states for name, s in fit.solutions.items()}
         density = problem.anchored(anchor, guesses).density(coordinates=coordinates, variances=variances)
@@ -288,7 +288,7 @@ class _EnsembleRun:
         seed: int,
         start: str,
         shape: tuple[int, int],
-        backend: emcee.backends.Backend,
+        backend: ColumnBackend | MemoryBackend,
         state: dict[str, Any],
     ):
         import emcee
@@ -373,6 +373,8 @@ class _EnsembleRun:
                     else:
                         self._adapt()
                 self._save(store, now=state["converged"] or until == max_steps)
+                if store is None:
+                    self._forget()
                 if state["converged"]:
                     return
         left = ", ".join(state["missing"]) or "the stop rule passed only once"
@@ -415,9 +417,15 @@ class _EnsembleRun:
                 bar.update(self._done - bar.n)
                 check()
 
-    def _chains(self, first: int) -> np.ndarray:
-        """Return the chains (ensembles, steps, walkers, coordinates) in whitened coordinates, from a step on."""
-        return self._by_ensemble(self.backend.get_chain(discard=first))
+    def _forget(self) -> None:
+        """Give back the memory of the steps that are not used again, whether or not the burn-in starts again."""
+        burnt, steps = self.state["burnt"], self.state["steps"]
+        final = self._settled and steps - burnt >= FEWEST_KEPT
+        self.backend.forget(max(burnt if final else 0, steps // 5))
+
+    def _chains(self, first: int, transform: AffineTransform | None = None) -> StoredChains:
+        """Return the chains from a step on, without a transform in whitened coordinates."""
+        return StoredChains(self.backend.columns_since(first), self.ensembles, transform)
 
     def _by_ensemble(self, values: np.ndarray) -> np.ndarray:
         """Return values (steps, all walkers, …) as (ensembles, steps, walkers, …)."""
@@ -432,10 +440,10 @@ class _EnsembleRun:
         state = self.state
         half, last, first = state["steps"] // 2, state["steps"] - ROUND, self._first_mixture()
         present = state["mixture"] and StudentMixture.from_lists(state["mixture"])
-        chains = self._chains(half).reshape(self.ensembles, -1, self.density.dimension)
+        chains = self._chains(half)
         new = self._expected_time(present, last) if present else np.inf
-        if chains.std(axis=(0, 1)).min() > 0.0:
-            fitted = fit_mixture(chains, [] if first is None else [first])
+        if min(np.ptp(chains[..., k]) for k in range(self.density.dimension)) > 0.0:
+            fitted = fit_mixture(chains.thinned(MOST_FITTED_DRAWS), [] if first is None else [first])
             if not present or self._expected_time(fitted, half) < self._expected_time(present, half):
                 state["mixture"] = fitted.as_lists()
         rounds, fast = state["steps"] // ROUND, False
@@ -461,23 +469,29 @@ class _EnsembleRun:
         by_surrogate = 2.0 / max(MIXTURE_STEPS * accepted / proposed, np.finfo(float).tiny) - 1.0
         return [0.1, MIXTURE_STEPS] if by_surrogate < by_mixture else [MIXTURE_STEPS - 0.1, 0.1]
 
+    @property
+    def _settled(self) -> bool:
+        """Whether the burn-in is over for good."""
+        state = self.state
+        return state["burnt"] > 0 and bool(state["burnt"] >= MOST_BURN_IN_ROUNDS * ROUND or state["shares"][1])
+
     def _outdated(self) -> bool:
         """Return whether the burn-in ended too early: the draws since then have tails that the mixture lacks."""
-        if self.state["burnt"] >= MOST_BURN_IN_ROUNDS * ROUND or self.state["shares"][1]:
+        if self._settled:
             return False
         mixture = StudentMixture.from_lists(self.state["mixture"])
         return self._expected_time(mixture, self._first_kept) > SLOW_MIXTURE
 
     def _expected_time(self, mixture: StudentMixture, first: int) -> float:
         """Return the autocorrelation time expected of a mixture, from the draws since a step."""
-        points, log_density = self.backend.get_chain(discard=first, flat=True), self.backend.get_log_prob(discard=first)
-        return expected_time(mixture, points, log_density.ravel(), MIXTURE_STEPS)
+        log_density = self.backend.get_log_prob(discard=first)
+        return expected_time(mixture, self._chains(first).points, log_density.ravel(), MIXTURE_STEPS)
 
     def _judge(self) -> str:
         """Apply the stop rule, and return an account of the run."""
         state = self.state
         steps, kept = state["steps"], self._kept()
-        modes = mode_of(self.density, self.fit, kept)
+        modes = self._modes(kept)
         tau, missing = stop_rule(kept, modes, np.array(state["tau"]), self.density.labels)
         passes = 0 if missing else state["passes"] + 1
         ahead = max(CHECKED, (steps - state["burnt"]) // 4 // CHECKED * CHECKED)
@@ -500,24 +514,35 @@ class _EnsembleRun:
         burnt, steps = self.state["burnt"], self.state["steps"]
         return max(burnt if steps - burnt >= FEWEST_KEPT else 0, steps // 5)
 
-    def _kept(self) -> np.ndarray:
-        """Return the kept chains (ensembles, steps, walkers, coordinates)."""
-        return self.transform.unwhiten(self._chains(self._first_kept))
+    def _kept(self) -> StoredChains:
+        """Return the kept chains."""
+        return self._chains(self._first_kept, self.transform)
+
+    def _modes(self, chains: StoredChains) -> np.ndarray | None:
+        """Return the optima of draws (ensembles, steps, walkers), see `mode_of`."""
+        if not self.fit.other_modes:
+            return None
+        modes = [mode_of(self.density, self.fit, chains.unwhitened(part)) for part in parts(len(chains.points))]
+        known = [part for part in modes if part is not None]
+        return chains.by_ensemble(np.concatenate(known)) if known else None
 
     def posterior(self) -> Posterior:
         """Return the draws, with draws of the variances that were integrated out; the run is over then."""
-        import emcee
         import xarray as xr
+
+        from bayesperiodic.sampling.checkpoint import ColumnBackend
 
         kept, first = self._kept(), self._first_kept
         log_density = self._by_ensemble(self.backend.get_log_prob(discard=first))
-        modes = mode_of(self.density, self.fit, kept)
+        modes = self._modes(kept)
+        kept.unwhiten()  # in place, if there is no checkpoint
         if self.density.collapsed:
             moments = self._by_ensemble(self.backend.get_blobs(discard=first)).reshape(*kept.shape[:-1], -1)
-            kept, log_density = self.density.with_variances(kept, log_density, moments, self.redraws)
+            columns, log_density = self.density.with_variances(kept, log_density, moments, self.redraws)
+            kept = kept.with_columns(columns)
         acceptance = float(np.mean(self.backend.accepted / self.backend.iteration))
-        if type(self.backend) is emcee.backends.Backend:  # no checkpoint
-            self.backend.reset(*self.walk.coords.shape)  # as the kept draws are copies
+        if isinstance(self.backend, ColumnBackend):
+            self.backend.reset(*self.walk.coords.shape)  # its memory is given back as `gather` takes the coordinates
         posterior = gather(
             self.density.with_settings(variances=SAMPLED),
             kept,

@@ -34,17 +34,17 @@ def mean_period(angle):
 
 @pytest.mark.slow
 def test_frequency_errors_have_the_stated_standard_error():
-    """400 recordings: z-scores have unit variance or, the larger of two estimates being taken, up to a quarter less.
+    """250 recordings: z-scores have unit variance or, the larger of two estimates being taken, up to a quarter less.
 
     The band is the two-sided 1 % band of χ².
     """
     scores = []
-    for seed in range(400):
+    for seed in range(250):
         e = recording(cycles=30.2, per_cycle=15.7, seed=seed, noise=0.1).fold(64)
         scores.append((e.frequency - FREQUENCY) / e.frequency_se)
-    low, high = stats.chi2.ppf([0.005, 0.995], 400)
+    low, high = stats.chi2.ppf([0.005, 0.995], 250)
     assert 0.75 * low < np.sum(np.square(scores)) < high
-    assert abs(np.mean(scores)) < 2.58 / np.sqrt(400)
+    assert abs(np.mean(scores)) < 2.58 / np.sqrt(250)
 
 
 def test_mean_period_is_exact_on_a_grid_incommensurate_with_the_sampling():
@@ -108,7 +108,7 @@ def test_scatter_is_that_of_one_cycle_within_the_kept_harmonics():
 
 @pytest.mark.slow
 def test_variance_of_the_mean_amplitudes_is_the_observed_one():
-    experiments = [recording(seed=s, cycles=12.1).fold(100, frequency=FREQUENCY, harmonics=5) for s in range(300)]
+    experiments = [recording(seed=s, cycles=12.1).fold(100, frequency=FREQUENCY, harmonics=5) for s in range(200)]
     amplitudes = np.array([np.fft.rfft(e.outputs["y"])[1:6] * 2 / 100 for e in experiments])
     stated = np.mean([e.amplitude_variance["y"][1:] for e in experiments], axis=0)
     actual = np.mean(np.abs(amplitudes - amplitudes.mean(axis=0)) ** 2, axis=0)
@@ -165,12 +165,12 @@ def test_slow_noise_is_extrapolated_to_the_mean_with_few_degrees_of_freedom():
 
 @pytest.mark.slow
 def test_false_alarm_rate_of_kept_harmonics_is_the_nominal_one_under_slow_noise():
-    """1 % false alarms a recording: of 400 at most 11 (binomial, 99.9 %)."""
+    """1 % false alarms a recording: of 250 at most 9 (binomial, 99.9 %)."""
     time, wrong = np.arange(2000) / 100.0, 0
-    for seed in range(400):
+    for seed in range(250):
         y = np.cos(2 * np.pi * time) + 0.1 * autoregressive(0.99)(time, np.random.default_rng(seed))
         wrong += bp.Recording.from_arrays(time, {"y": y}).fold(128, frequency=1.0).harmonics["y"] > 1
-    assert wrong <= stats.binom.ppf(0.999, 400, 0.01)
+    assert wrong <= stats.binom.ppf(0.999, 250, 0.01)
 
 
 def test_origin_shifts_the_phase():
@@ -365,16 +365,16 @@ def test_wrong_frequency_of_a_subharmonic_response_is_refused_in_forcing_periods
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*NOISES])
 def test_right_frequency_is_accepted_and_the_standard_error_holds_under_noise_of_any_spectrum(kind):
-    """120 recordings: no false alarm of 1e-4 each (1 %), and few |z| > 3 (binomial at 0.3 %, 1e-4)."""
+    """60 recordings: no false alarm of 1e-4 each (0.6 %), and few |z| > 3 (binomial at 0.3 %, 1e-4)."""
     scores = []
-    for seed in range(120):
+    for seed in range(60):
         recording = driven(20, 0.3, seed, kind=kind)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*only the last")
             assert recording.fold(64, frequency=FREQUENCY).frequency == FREQUENCY
             e = recording.fold(64)
         scores.append((e.frequency - FREQUENCY) / e.frequency_se)
-    assert np.count_nonzero(np.abs(scores) > 3.0) <= stats.binom.isf(1e-4, 120, 2 * stats.norm.sf(3.0))
+    assert np.count_nonzero(np.abs(scores) > 3.0) <= stats.binom.isf(1e-4, 60, 2 * stats.norm.sf(3.0))
 
 
 def drifting(change, cycles=40, noise=0.03):

@@ -73,12 +73,13 @@ def test_a_collapsed_density_is_the_integral_over_the_variance(prior):
         found = collapsed.evaluate(theta[None])
         assert found.log_prob[0] == pytest.approx(peak + np.log(integral), abs=1e-6)
     # Drawn variances have the conditional distribution, and complete the density.
-    points, log_prob = collapsed.with_variances(
+    columns, log_prob = collapsed.with_variances(
         np.tile(theta, (4000, 1)),
         np.full(4000, found.log_prob[0]),
         np.tile(found.moments, (4000, 1)),
         np.random.default_rng(0),
     )
+    points = np.stack(columns, axis=-1)
     assert log_prob[:5] == pytest.approx(sampled.evaluate(points[:5]).log_prob, abs=1e-9)
     shape = 0.5 * problem.likelihood.counts["variance[force]"] - (prior == "flat")
     gamma = 0.5 * found.moments[0, 0] / np.exp(points[:, 3])

@@ -11,6 +11,7 @@ from scipy import stats
 import bayesperiodic as bp
 from bayesperiodic.diagnostics.comparison import importance_k
 from bayesperiodic.diagnostics.verdicts import Sample, joint_verdict, marginal_verdict
+from bayesperiodic.sampling.chains import StoredChains
 from bayesperiodic.sampling.draws import gather
 from bayesperiodic.sampling.groups import tree
 from bayesperiodic.sampling.proposals import CallCount
@@ -103,7 +104,7 @@ def posterior_of(problem, points):
     """Return the posterior of independent draws in sampling coordinates (4, 80, 20, dimension)."""
     return gather(
         problem.density(),
-        points,
+        StoredChains.of(points),
         points[..., 0],
         CallCount(1),
         converged=True,
@@ -115,7 +116,7 @@ def posterior_of(problem, points):
 
 def redrawn(problem, posterior, points):
     density = problem.density()
-    return replace(posterior, tree=tree(density, points, points[..., 0], 0))
+    return replace(posterior, tree=tree(density, StoredChains.of(points), points[..., 0], 0))
 
 
 def by_inversion(log_density, values, generator):

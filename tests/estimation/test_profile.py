@@ -72,6 +72,23 @@ def test_unknown_variance_gives_the_logarithm_of_the_misfit():
         assert ends == pytest.approx([-half, half], rel=1e-3)
 
 
+def test_variances_stay_within_the_support_of_their_prior_along_a_profile():
+    """−½ (M/v + (n − l) ln v) at the best v within bounds, and with flat priors M = M₀ (1 + z²/(n − l))."""
+    experiment = linear_experiment(TRUTH, 3.0, seed=2, independent=11)
+    design = linear_regressors(0.05, 2.0, grid(40))
+    best, misfit, *_ = np.linalg.lstsq(design, experiment.outputs["force"], rcond=None)
+    least, sd = misfit[0] * 11 / 40, np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * misfit[0] / 8)
+    bounds = 1.05 * least / 8, 1.4 * least / 8
+    problem = bp.Problem(LINEAR, [experiment], priors=WIDE, noise=bp.noise.Independent(prior=bp.LogUniform(*bounds)))
+    profile = bp.profile(problem, fitted(problem))
+    for i, name in enumerate(problem.names):
+        square = least * (1.0 + ((profile.values[name] - best[i]) / sd[i]) ** 2 / 8)
+        variance = np.clip(square / 8, *bounds)
+        assert {*bounds} < {*variance}
+        density = -0.5 * (square / variance + 8 * np.log(variance))
+        assert profile.log_density[name] == pytest.approx(density - density.max(), abs=1e-8)
+
+
 def test_profile_of_a_factor_of_a_determined_product_is_flat():
     """Only a·b is identifiable: the profiles of a and b are flat where their supports allow it."""
     model = formula_model("product", ["a", "b", "c"], lambda p, u, s: {"y": p.a * p.b * u.x + p.c * u.dx})

@@ -9,6 +9,7 @@ from scipy.special import digamma, polygamma
 
 import bayesperiodic as bp
 from bayesperiodic.sampling import convergence
+from bayesperiodic.sampling.chains import StoredChains
 from bayesperiodic.sampling.draws import gather
 from bayesperiodic.sampling.proposals import CallCount
 from tests.known import (
@@ -54,7 +55,14 @@ def drawn(problem, steps=12):
     density = problem.density()
     kept = 0.1 * np.random.default_rng(1).standard_normal((2, steps, 4, density.dimension))
     return gather(
-        density, kept, kept.sum(axis=-1), CallCount(1), converged=True, reason="made up", acceptance=0.5, seed=0
+        density,
+        StoredChains.of(kept),
+        kept.sum(axis=-1),
+        CallCount(1),
+        converged=True,
+        reason="made up",
+        acceptance=0.5,
+        seed=0,
     ), kept
 
 
