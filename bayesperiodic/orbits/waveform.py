@@ -299,7 +299,8 @@ def _group(
         errors += _moved(motion, times, order, at)
     directions = _directions(motion, [part.slopes for part in parts], at, crossed=times is not None)
     independent = INDEPENDENT * len(motion) * motion.shape[1] // (following.count * maps.steps)
-    common, rest = _common(errors, directions, np.std(motion, axis=0), independent)
+    most = 2 * fits.narrow.points.size
+    common, rest = _common(errors, directions, most, np.std(motion, axis=0), independent)
     gains = np.concatenate([np.tile(part.gain[:, None], len(part.values)) for part in parts], axis=1)
     noise = np.sqrt(np.maximum(rest[:, None], following.variance[columns, None] * gains))
     squares = np.concatenate([part.bias**2 for part in parts]).reshape(order.size, following.count, -1)
@@ -457,16 +458,19 @@ def _continuous(motion: np.ndarray, following: Following) -> np.ndarray:
 
 
 def _common(
-    errors: np.ndarray, directions: np.ndarray, size: np.ndarray, independent: int
+    errors: np.ndarray, directions: np.ndarray, most: int, size: np.ndarray, independent: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the part of errors (runs, samples, channels) along directions, and the variance of the rest.
+    """Return the parts of errors (runs, samples, channels) in common, and the variance of the rest.
 
-    The former, (directions, channels, samples), has the same covariance; the latter, (channels,), is noise of single
-    samples, of which so many are independent.
+    The former, (n, channels, samples), are those along the directions, and the largest principal components of what is
+    left: the slopes differ among the neighbours. The latter, (channels,), is noise of single samples, of which so many
+    are independent.
     """
     scale = np.where(size > 0.0, size, 1.0)
     axes = np.linalg.qr((directions / scale).reshape(len(directions), -1).T)[0].T
     flat = (errors / scale).reshape(len(errors), -1)
+    left = flat - (flat @ axes.T) @ axes
+    axes = np.concatenate([axes, np.linalg.svd(left, full_matrices=False)[2][:most]])
     along = flat @ axes.T
     rest = np.sum((flat - along @ axes) ** 2, axis=0).reshape(errors.shape[1:]).mean(axis=0) * scale**2
     rest *= independent / max(independent - len(axes), 1)

@@ -274,7 +274,7 @@ def test_small_errors_in_common_are_not_lost_among_the_noise_of_samples():
     direction = np.stack([np.cos(2 * np.pi * time), time], axis=-1)
     size, noise = np.array([1.0, 3.0]), np.array([0.1, 0.3])
     runs = generator.standard_normal((60, 1, 1)) * 0.1 * direction + noise * generator.standard_normal((60, 32, 2))
-    common, rest = _common(runs, direction[None], size, 64)
+    common, rest = _common(runs, direction[None], 0, size, 64)
     along = (direction / size).ravel() / np.linalg.norm(direction / size)
     variance = np.sum((common.transpose(0, 2, 1) / size).reshape(1, -1) @ along) ** 2
     expected = 60 * (0.1**2 * np.sum((direction / size) ** 2) + 0.1**2)
