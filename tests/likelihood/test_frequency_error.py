@@ -204,7 +204,7 @@ def test_correlated_points_of_a_mask_need_an_exact_frequency():
 
 @pytest.mark.parametrize("error", [-1e-3, np.nan, np.inf])
 def test_an_impossible_standard_error_is_refused(error):
-    with pytest.raises(ValueError, match="frequency_se: must be a finite number, at least 0"):
+    with pytest.raises(ValueError, match="^frequency_se: must be (finite|a finite number, at least 0)"):
         bp.Experiment.from_harmonics("run", 1.0, {"y": [0, 1]}, samples=8, frequency_se=error)
 
 

@@ -244,7 +244,8 @@ def test_a_noisy_channel_is_not_extrapolated_by_coordinates_that_the_attractor_d
 @pytest.mark.parametrize("subtracted", [0.0, 0.3])
 def test_errors_of_the_motion_until_the_next_point_are_the_errors_of_that_point(monkeypatch, subtracted):
     """The motion is the image: its error is that of the regression and of the closed point, times the slopes."""
-    maps, _, _ = find._scaled(map_section(coupled, 4000, 0.001), 32)
+    section = map_section(coupled, 4000, 0.001)
+    maps, _, _ = find._scaled(section, 32)
     increments = maps.increments
     images = SimpleNamespace(
         signals=lambda index, near, columns, phases: (near + increments[index])[:, None],
@@ -253,7 +254,7 @@ def test_errors_of_the_motion_until_the_next_point_are_the_errors_of_that_point(
     monkeypatch.setattr(_Regressions, "subtracted", lambda *given: subtracted)
     regressions = _Regressions(images, maps, [np.zeros(1)] * 2, images.outputs, OF_OUTPUTS)
     checked = 0
-    for _, estimate in find._chained(maps, Atlas(maps, find._search_count(maps, 32)), 2, 32):
+    for _, _, estimate in find._chained(section, maps, Atlas(maps, find._search_count(maps, 32)), 2, 32):
         fits = estimate.fits
         runs = PairRuns.of(maps, *(fit.fit for fit in fits))
         narrow, wide = (errors_by_run(maps, fit.fit, runs) for fit in fits)
