@@ -227,8 +227,6 @@ WITHOUT_RESULTS = {
             "and the recording has 1,000 returns", "with noise of 0.3 % of its range",
             "on 400 points takes 0.26 ms, a posterior of three parameters 10 s of processor time",
             "four such units 58 s", "which takes 0.18 ms there",
-            "are about 1.5 times those stated: of 20 recordings",
-            "the 90 % regions of three parameters, which are known to 0.01 %",
         ),
         SETTING: ("the tests are to find 90 %",),
     },
