@@ -216,7 +216,8 @@ def climbed(
             known = optimum_of(objective, iterate, ends) if size < SEPARATE_SDS else None
             reached.extend([known] if known else [])
             gain, heights[0] = iterate.objective - heights[0], iterate.objective
-            return known is not None or size < least or gain < SMALL_PART * least**2
+            # Exact climbs, of which the least is zero, have their own criteria, and rounding may lower the objective.
+            return known is not None or (least > 0.0 and (size < least or gain < SMALL_PART * least**2))
 
         end = climb(objective, first, report=report, most=most, halvings=halvings)
     return reached[0] if reached else end

@@ -415,3 +415,22 @@ def test_drops_count_from_the_highest_point():
     """A density that rises to 4 above the peak, and falls as a normal one."""
     values, _ = outwards(lambda x: 4.0 - 0.5 * (x - 3.0) ** 2, 0.5)
     assert values[-1] - 3.0 > 2.8 >= values[-2] - 3.0
+
+
+@pytest.mark.parametrize(
+    ("least", "size", "gain", "ended"),
+    [(0.0, 1e-9, -1e-13, False), (0.0, 2.0, 0.0, False), (0.5, 2.0, 0.024, True), (0.5, 2.0, 0.026, False),
+     (0.5, 0.4, 1.0, True)],
+)  # fmt: skip
+def test_only_rough_climbs_end_by_small_steps_and_gains(monkeypatch, least, size, gain, ended):
+    """The objective of an exact climb may become lower by rounding; it ends by its own criteria."""
+    said = []
+
+    def climb(objective, first, report, **_):
+        said.append(report(SimpleNamespace(objective=first.objective + gain, theta=np.zeros(1)), size))
+        return End(first, "converged", np.zeros(0))
+
+    monkeypatch.setattr(climbs, "climb", climb)
+    monkeypatch.setattr(climbs, "optimum_of", lambda *_: None)
+    climbs.climbed(None, SimpleNamespace(objective=3.0), False, least=least)
+    assert said == [ended]
