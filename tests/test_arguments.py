@@ -22,7 +22,8 @@ MAPPINGS = {
     "solve_periodic": ["parameters", "inputs"],
     "recording": ["outputs", "inputs", "units"],
     "response_table": ["outputs", "inputs", "phases", "sd", "phase_sd", "against", "derivatives", "units"],
-    "from_matrices": ["forces", "base", "outputs", "units"],
+    "from_matrices": ["forces", "base", "outputs", "units"], "from_harmonics": ["outputs", "inputs"],
+    "element": ["constants"],
 }  # fmt: skip
 SEQUENCES = {
     "model": ["states", "inputs", "parameters", "angles"], "problem": ["experiments", "local"],
@@ -44,6 +45,10 @@ OTHERS = {
         bp.response_table,
         {"table": {"f": [0.5, 0.6], "a": [1.0, 1.1]}, "outputs": {"x": "a"}, "inputs": {"F": 1.0}, "frequency": "f"},
     ),
+    "from_harmonics": (
+        bp.Experiment.from_harmonics, {"name": "run", "frequency": 1.0, "outputs": {"x": [0, 1]}, "samples": 16},
+    ),
+    "element": (bp.elements.Element, {"name": "stop", "force": bp.elements.gap, "place": 0}),
     "from_matrices": (
         bp.Model.from_matrices,
         {"name": "m", "mass": [[1.0]], "stiffness": [[1.0]], "outputs": {"x": (0, "displacement")}},

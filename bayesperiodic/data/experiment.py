@@ -409,10 +409,11 @@ class Experiment(Result):
         {'x': 2}
         """
         samples = _checks.integer("samples", samples, 4)
-        given = {channel: _without_none(values) for channel, values in outputs.items()}
+        example = "{'displacement': [0, 1 - 0.5j]}"
+        given = {c: _without_none(values) for c, values in _checks.mapping("outputs", outputs, example).items()}
         measured, driven = (
             {channel: _amplitudes(f"{kind}[{channel!r}]", values, samples) for channel, values in values_of.items()}
-            for kind, values_of in (("outputs", given), ("inputs", inputs or {}))
+            for kind, values_of in (("outputs", given), ("inputs", _checks.optional_mapping("inputs", inputs, example)))
         )
         for channel, amplitudes in measured.items():
             if not amplitudes.any():

@@ -66,7 +66,7 @@ class Element(Printed):
         if not callable(self.force):
             raise ValueError(f"force: must be a function, such as elements.gap, got {self.force!r}.")
         arguments = tuple(inspect.signature(self.force).parameters)
-        for constant in self.constants:
+        for constant in _checks.mapping("constants", self.constants, "{'width': 1e-5}"):
             _checks.one_of("constants", constant, [n for n in arguments if n not in OF_THE_MOTION or n == "names"])
         if "names" in arguments and "names" not in self.constants:
             raise ValueError("constants: must have the names of the states, got none; take iwan_states(name, 8).")
