@@ -97,6 +97,12 @@ def test_what_is_no_number_is_refused_by_name(what, argument, wrong):
         call(what, **{argument: wrong})
 
 
+@pytest.mark.parametrize("wrong", [3, True, None, len], ids=str)
+def test_channels_of_a_clock_that_are_no_sequence_are_refused(wrong):
+    with pytest.raises(ValueError, match=r"^clocks\['second'\]: must be a sequence"):
+        bp.Recording(**RECORDING).fold(64, frequency=1.0, clocks={"second": wrong})
+
+
 def test_a_problem_without_priors_is_refused():
     with pytest.raises(ValueError, match="^priors: must have at least one free parameter"):
         call("problem", priors={}, fixed={"k": 1.0})

@@ -56,7 +56,8 @@ def _given(clocks: Mapping[str, Sequence[str]], channels: list[str]) -> dict[str
     _checks.mapping("clocks", clocks, "{'second': ['x']}")
     others = {}
     for name, named in clocks.items():
-        others[_checks.text("clocks", name)] = (named,) if isinstance(named, str) else tuple(named)
+        several = (named,) if isinstance(named, str) else _checks.several(f"clocks[{name!r}]", named)
+        others[_checks.text("clocks", name)] = several
         for channel in others[name]:
             _checks.one_of(f"clocks[{name!r}]", channel, channels)
     every = [channel for named in others.values() for channel in named]

@@ -82,7 +82,7 @@ def checked_local(
     """Return the names of local parameters, the delay of all outputs included; raise a ValueError unless they fit."""
     if isinstance(local, str):
         raise ValueError(f"local: must be a sequence of names, got {local!r}. Give [{local!r}].")
-    names = _checks.several("local", local)
+    names = tuple(local)
     for name in names:
         _checks.one_of("local", name, every)
         if name in tied:

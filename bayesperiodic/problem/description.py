@@ -103,7 +103,7 @@ class Description(Printed):
             self.input_noise = EXACT if self.input_noise == FROM_CYCLES else self.input_noise
         self.channels = tuple(c for c in self.sensors.channels if any(c in e.outputs for e in self.experiments))
         runs = [e.name for e in self.experiments]
-        tied, every = dict(tied), (*model.parameters, *self.sensors.names, SHIFT)
+        every = (*model.parameters, *self.sensors.names, SHIFT)
         priors, fixed = self.sensors.with_entries(priors, fixed)
         self.local = arguments.checked_local(local, every, priors, tied)
         self.fixed = {n: arguments.fixed_values(n, fixed[n], runs, n in self.local) for n in every if n in fixed}

@@ -275,7 +275,7 @@ def test_a_level_without_noise_is_that_of_its_clipped_samples():
 
 
 def test_impulses_of_random_size_in_the_part_used_are_heavy_tails():
-    """Both signs, sizes from 10 to 60 standard deviations; of channels that are clipped none are told."""
+    """Both signs, sizes from 10 to 60 standard deviations; clipped channels have no such finding."""
     places = np.r_[0, np.arange(1, 19) * 150 + 7, 2999]
     values = wave() + noise(7, 1e-3)
     values[places] += 1e-3 * np.geomspace(10.0, 60.0, 20) * np.tile([1.0, -1.0], 10)

@@ -349,8 +349,11 @@ def known_ridge(best, at=0.0, prior=None):
     prior = bp.Normal(at, 1e6) if prior is None else prior
     joint = SimpleNamespace(names=("a",), marginals={"a": prior})
     density = SimpleNamespace(problem=SimpleNamespace(joint_prior=joint))
-    hessian = lambda iterate: (np.array([[1.0]]), None)  # noqa: E731
-    objective = SimpleNamespace(density=density, best=best, climbs=[], hessian_and_gradient=hessian)
+
+    def hessian_and_gradient(iterate):
+        return np.array([[1.0]]), None
+
+    objective = SimpleNamespace(density=density, best=best, climbs=[], hessian_and_gradient=hessian_and_gradient)
     return Known(objective, 0, iterate([at], best(at)))
 
 
