@@ -103,6 +103,11 @@ def test_channels_of_a_clock_that_are_no_sequence_are_refused(wrong):
         bp.Recording(**RECORDING).fold(64, frequency=1.0, clocks={"second": wrong})
 
 
+def test_what_predict_runs_must_be_a_function():
+    with pytest.raises(ValueError, match="^run: must be a function, got 3"):
+        bp.predict(call("problem"), None, run=3)
+
+
 def test_a_problem_without_priors_is_refused():
     with pytest.raises(ValueError, match="^priors: must have at least one free parameter"):
         call("problem", priors={}, fixed={"k": 1.0})

@@ -358,7 +358,7 @@ def missing_terms(
     terms = given(model, candidates or {})
     wanted = [place for place in places(model) if (outputs if place in model.outputs else equations)]
     terms += generated(model, wanted, variable_deviations(stated, fit))
-    left_out = {exclude} if isinstance(exclude, str) else set(exclude)
+    left_out = {exclude} if isinstance(exclude, str) else set(_checks.several("exclude", exclude))
     chosen = {str(t): t for t in terms if not {t.text, t.place, str(t)} & left_out}
     return _Search(problem, list(chosen.values()), false_discovery_rate, keep, lags_to_try(fit)).run(fit, max_terms)
 

@@ -371,6 +371,8 @@ def predict(
     _checks.instance("problem", problem, Problem)
     if tolerance is not None and not 0.0 < _checks.finite_number("tolerance", tolerance) < 1.0:
         raise ValueError(f"tolerance: must be between 0 and 1, got {tolerance!r}; give 0.02 for 2 % of the rms.")
+    if run is not None and not callable(run):
+        raise ValueError(f"run: must be a function, got {_checks.shortened(run)}.")
     count = _checks.integer("draws", draws, 20)
     if experiment is not None and run is None:
         raise ValueError(f"experiment: must be given together with `run`, got {experiment!r} without `run`.")

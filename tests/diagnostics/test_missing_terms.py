@@ -214,7 +214,7 @@ def test_wrong_arguments_are_refused(damped, solved):
             bp.missing_terms(problem, fit, candidates)
     for change, message in (
         ({"max_terms": -1}, "max_terms"), ({"keep": 0}, "keep"), ({"false_discovery_rate": 1.0}, "between 0 and 1"),
-        ({"false_discovery_rate": 0.0}, "false_discovery_rate"),
+        ({"false_discovery_rate": 0.0}, "false_discovery_rate"), ({"exclude": 3}, "exclude: must be a sequence"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
             bp.missing_terms(problem, fit, **change)
