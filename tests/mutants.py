@@ -1,9 +1,10 @@
 """Mutation testing of a random sample of mutants: ``python -m tests.mutants --count 100 --seed 1``.
 
 mutmut writes the mutants of the modules in `pyproject.toml`. A mutant is tested in a process forked from one that has
-collected the tests but run none, by the folder of `tests/` that mirrors its own: first the files that name its
-function, then those that name its module, then the others, and of each file the tests that name the function first,
-until a test fails or `BUDGET` seconds of processor time have passed. Results are in `mutants.md`.
+collected the tests but run none, by the folder of `tests/` that mirrors its own and by the files of other folders that
+name its function: first the files that name the function, then those that name its module, then the others, and of each
+file the tests that name the function first, until a test fails or `BUDGET` seconds of processor time have passed.
+Results are in `mutants.md`.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from pathlib import Path
 
 import pytest
 
-BUDGET, LONGEST = 40.0, 150  # [s] of processor time; a test that has no end is stopped by the longer one
+BUDGET, LONGEST = 80.0, 250  # [s] of processor time; a test that has no end is stopped by the longer one
 SURVIVED, KILLED = 0, 1
 # A function of mutmut's: indentation, name and what follows; a last argument `strict`, or the comma in its place.
 DEFINITION = re.compile(r"^( *)def (\S+__mutmut_\w+)\((.*?)(?=^\1[^\s)]|^[^\s)]|\Z)", re.MULTILINE | re.DOTALL)
@@ -89,13 +90,16 @@ def ordered(mutant: str, items: list[pytest.Item]) -> list[pytest.Item]:
         text = tests_of(path)[0]
         return not named.search(text), f"{(owner or [module])[0]}.{name}" not in text
 
-    def rank(path: Path, test: str) -> tuple[bool, ...]:
-        text, inside = tests_of(path)
-        last = module not in path.name, module not in text
-        return *of_file(path), not named.search(inside.get(test, "")), *last
+    def is_near(item: pytest.Item) -> bool:
+        return item.nodeid.startswith(folder_of(mutant) + "/")
 
-    mine = [item for item in items if item.nodeid.startswith(folder_of(mutant) + "/")]
-    return sorted(mine, key=lambda item: rank(item.path, getattr(item, "originalname", item.name)))
+    def rank(item: pytest.Item) -> tuple[bool, ...]:
+        text, inside = tests_of(item.path)
+        names_it = named.search(inside.get(getattr(item, "originalname", item.name), ""))
+        last = module not in item.path.name, module not in text
+        return not is_near(item), *of_file(item.path), not names_it, *last
+
+    return sorted((item for item in items if is_near(item) or not of_file(item.path)[0]), key=rank)
 
 
 class Tests:
@@ -146,8 +150,8 @@ def run(mutants: list[str]) -> dict[str, int]:
     sys.path.insert(0, os.getcwd())
     sys.modules.pop("tests", None)
     tests = Tests(mutants)
-    arguments = ["-q", "-s", *settings["pytest_add_cli_args"], *sorted({folder_of(mutant) for mutant in mutants})]
-    pytest.main(arguments, plugins=[tests])
+    folders = sorted(str(path.parent) for path in Path("tests").glob("*/__init__.py"))
+    pytest.main(["-q", "-s", *settings["pytest_add_cli_args"], *folders], plugins=[tests])
     return tests.statuses
 
 
