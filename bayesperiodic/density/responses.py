@@ -564,7 +564,7 @@ def orbit_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: n
     if not count:
         return np.empty(0)
     if isinstance(equations, CondensedEquations):
-        return modal_multipliers(equations, parameters, z)[0][:count]
+        return modal_multipliers(equations, parameters, z, error=False)[0][:count]
     easy = None if equations.model.autonomous else _leading_multipliers_directly(equations, parameters, z, count)
     if easy is not None:
         return easy

@@ -149,8 +149,12 @@ def described(
     )
 
 
-def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, float]:
+def modal_multipliers(
+    equations: CondensedEquations, theta: np.ndarray, z: np.ndarray, *, error: bool = True
+) -> tuple[np.ndarray, float]:
     """Return the Floquet multipliers in the lowest modes, largest first, and the error of the largest modulus.
+
+    Without `error` what only estimates it is left out, and it is NaN.
 
     The maps over the period with steps h, h/2, h/4, … are extrapolated in even powers of h ([1]_) until the largest
     modulus does not change any more. With internal states of elements, which have kinks, they are not extrapolated.
@@ -163,14 +167,14 @@ def modal_multipliers(equations: CondensedEquations, theta: np.ndarray, z: np.nd
     """
     motion = _Linearised(equations, theta, harmonics(z), MOST_MODES)
     try:
-        values, error = _of_memory(motion) if equations.model.state_owners else _extrapolated(motion)
+        values, size = _of_memory(motion, error) if equations.model.state_owners else _extrapolated(motion)
     except np.linalg.LinAlgError:  # of a map that overflows
         return np.full(2 * len(motion.modes.stiffness), np.nan, dtype=complex), np.inf
-    if len(motion.modes.stiffness) < len(equations.model.states):
+    if error and len(motion.modes.stiffness) < len(equations.model.states):
         fewer = _Linearised(equations, theta, harmonics(z), MOST_MODES // 2)
         of_fewer, of_all = (np.abs(np.linalg.eigvals(m.monodromy(MODE_ERROR_STEPS))).max() for m in (fewer, motion))
-        error += abs(float(of_fewer - of_all))
-    return values[np.argsort(-np.abs(values), kind="stable")], error
+        size += abs(float(of_fewer - of_all))
+    return values[np.argsort(-np.abs(values), kind="stable")], size if error else np.nan
 
 
 def _extrapolated(motion: _Linearised) -> tuple[np.ndarray, float]:
@@ -188,17 +192,17 @@ def _extrapolated(motion: _Linearised) -> tuple[np.ndarray, float]:
             row.append(row[-1] + (row[-1] - coarse) / (4.0**order - 1.0))
 
 
-def _of_memory(motion: _Linearised) -> tuple[np.ndarray, float]:
+def _of_memory(motion: _Linearised, error: bool) -> tuple[np.ndarray, float]:
     """Return the multipliers with internal states, and the error of the largest modulus.
 
     Elements begin to slide and reverse between two points: the error is of order one and irregular in their number,
     and the larger of the last two changes estimates it.
     """
     largest = []
-    for points in POINTS_OF_MEMORY:
+    for points in POINTS_OF_MEMORY if error else POINTS_OF_MEMORY[-1:]:
         values = np.linalg.eigvals(motion.monodromy(points // POINTS_A_STEP, points)).astype(complex)
         largest.append(float(np.abs(values).max()))
-    return values, float(np.abs(np.diff(largest)).max())
+    return values, float(np.abs(np.diff(largest)).max(initial=0.0))
 
 
 class _Linearised:
@@ -214,7 +218,7 @@ class _Linearised:
         self._diagonal = not any((a - np.diag(np.diag(a))).any() for a in (modes.stiffness, modes.damping))
         self._size, self._elements = size, elements
         self._inner = len(equations.model.state_owners)
-        self._known = self._couplings(max(2 * len(d), MODE_ERROR_STEPS))
+        self._known: tuple[np.ndarray, ...] = ()
 
     def _couplings(self, points: int) -> tuple[np.ndarray, ...]:
         """Return springs and dampers of the elements in series with the other modes, (points, elements, elements).
@@ -269,8 +273,8 @@ class _Linearised:
         .. [1] G. Strang, On the construction and comparison of difference schemes, SIAM Journal on Numerical Analysis 5
            (1968) 506-517.
         """
-        points = points or max(steps, len(self._known[0]))
-        if points != len(self._known[0]):
+        points = points or max(steps, 2 * len(self._d), MODE_ERROR_STEPS)
+        if not self._known or points != len(self._known[0]):
             self._known = self._couplings(points)
         length, means = self._period / steps, [_means(part, steps) for part in self._known]
         result = np.eye(2 * self._size + self._inner)

@@ -329,6 +329,8 @@ def test_multipliers_have_an_error_as_stated():
         motion = condensed_solution._Linearised(equations, theta, harmonics(z), 16)
         fine = np.abs(np.linalg.eigvals(motion.monodromy(32768))).max()
         assert abs(abs(values[0]) - fine) < error < 5e-3
+        alone, missing = condensed_solution.modal_multipliers(equations, theta, z, error=False)
+        assert np.array_equal(alone, values) and np.isnan(missing)
 
 
 def test_modes_left_out_bend_statically(monkeypatch):
