@@ -22,7 +22,7 @@ Value = TypeVar("Value")
 # What overflows or is not defined in an iteration is not finite, and ends it.
 unwarned = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 TINY = np.finfo(float).tiny
-RANK = 1e-6
+RANK, ASYMMETRY = 1e-6, 1e-8
 
 
 def scaled(matrix: np.ndarray, units: np.ndarray) -> np.ndarray:
@@ -68,6 +68,14 @@ def column_space(jacobian: np.ndarray) -> np.ndarray:
     if not rows.size:
         return np.empty((jacobian.shape[1], 0))
     return orth(rows.T, rcond=RANK)
+
+
+def asymmetric_entry(covariance: np.ndarray) -> tuple[int, int] | None:
+    """Return where a covariance (n, n) differs most from its transpose in units of the sds; None if by rounding."""
+    sd = _standard_deviations(covariance)
+    difference = np.abs(covariance - covariance.T) / np.outer(sd, sd)
+    row, column = divmod(int(np.argmax(difference)), len(sd))
+    return (row, column) if difference[row, column] > ASYMMETRY else None
 
 
 def _standard_deviations(covariance: np.ndarray) -> np.ndarray:

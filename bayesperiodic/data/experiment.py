@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result, Storable
-from bayesperiodic._linalg import covariance_cholesky
+from bayesperiodic._linalg import asymmetric_entry, covariance_cholesky
 from bayesperiodic.data import measurements as kinds
 from bayesperiodic.data.measurements import Measurement
 from bayesperiodic.data.recording_check import Finding
@@ -344,8 +344,8 @@ class Experiment(Result):
             )
         if bad := np.count_nonzero(~np.isfinite(matrix)):
             raise ValueError(f"covariance: must be finite and symmetric, got {bad} entries that are not finite.")
-        if not np.allclose(matrix, matrix.T, rtol=1e-8):
-            i, j = np.unravel_index(np.argmax(np.abs(matrix - matrix.T)), matrix.shape)
+        if entry := asymmetric_entry(matrix):
+            i, j = entry
             raise ValueError(
                 f"covariance: must be finite and symmetric, got {matrix[i, j]:g} in entry [{i}, {j}] and "
                 f"{matrix[j, i]:g} in entry [{j}, {i}]."

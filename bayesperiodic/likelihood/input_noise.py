@@ -22,6 +22,7 @@ import sympy as sp
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Storable
+from bayesperiodic._linalg import asymmetric_entry
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.likelihood.noise_spectrum import NoiseSpectrum
 from bayesperiodic.models.model import Model
@@ -101,7 +102,7 @@ def _checked(name: str, value: Any, experiments: Sequence[Experiment]) -> Any:
     matrix = np.array(value, dtype=float)
     for e in experiments:
         size = 2 * kept(e, name) + 1
-        if matrix.shape != (size, size) or not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T):
+        if matrix.shape != (size, size) or not np.isfinite(matrix).all() or asymmetric_entry(matrix):
             raise ValueError(
                 f"{argument}: must be a symmetric covariance ({size}, {size}) of mean, cosines and sines of "
                 f"{kept(e, name)} harmonics for experiment {e.name!r}, got shape {matrix.shape}."

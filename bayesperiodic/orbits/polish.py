@@ -337,7 +337,8 @@ class _Polisher:
         wanted = len(places) if rates else count
         phases = np.einsum("nip,np->ni", inverse, values - offset)
         unique = np.allclose((inverse @ slopes)[:, :wanted], np.eye(len(places))[:wanted], atol=1e-6)
-        if not unique or not np.allclose(outputs(phases), values, rtol=1e-6, atol=1e-9):
+        missed = np.abs(outputs(phases) - values) > 1e-6 * np.abs(values).max(axis=0)
+        if not unique or missed.any():
             what = "states and rates" if rates else "states"
             raise ValueError(
                 f"coordinates: must determine the {what} of {model.name!r}, {list(model.states)}, by linear equations, "

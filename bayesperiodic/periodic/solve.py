@@ -69,7 +69,7 @@ def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndar
 
 PERIODS = 40
 SETTLING_CYCLES = 120
-NUDGE = 0.1
+NUDGES = (0.1, 1e-4, 1e-7, 1e-10)
 REFINEMENTS = (1, 4, 16)  # of the grid, until the integration does not overflow
 
 
@@ -121,14 +121,27 @@ def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: 
 def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Return z (points, states) and frequency [Hz] of the cycle that an autonomous model approaches; None without one.
 
-    The integration starts near the equilibrium; the cycle lies between the last two upward passages of the state of
-    largest relative range through the middle of its range.
+    The integration starts near the equilibrium, at first within a tenth of it or of the unit of a state, then nearer:
+    far outside a cycle that is small in its unit a motion may creep or overflow.
     """
-    grid, count, model = equations.grid, equations.count, equations.model
     equilibrium = equations.static_guess(parameters)[0]
-    rates = sum(model.orders.values()) - count
-    start = np.concatenate([equilibrium + NUDGE * np.maximum(np.abs(equilibrium), 1.0), np.zeros(rates)])
-    path = None
+    cycles = (
+        _cycle_from(equations, parameters, equilibrium + nudge * np.maximum(np.abs(equilibrium), 1.0))
+        for nudge in NUDGES
+    )
+    return next((cycle for cycle in cycles if cycle is not None), None)
+
+
+def _cycle_from(
+    equations: PeriodicEquations, parameters: np.ndarray, states: np.ndarray
+) -> tuple[np.ndarray, float] | None:
+    """Return the same from states at rest.
+
+    The cycle lies between the last two upward passages of the state of largest relative range through the middle of its
+    range.
+    """
+    grid, count, orders = equations.grid, equations.count, equations.model.orders.values()
+    start, path = np.concatenate([states, np.zeros(sum(orders) - count)]), None
     for finer in REFINEMENTS:  # stiff equations need shorter steps than the orbit
         samples = grid.samples * finer
         steps = SETTLING_CYCLES * samples

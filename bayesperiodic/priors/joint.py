@@ -11,7 +11,7 @@ from scipy import special
 from scipy.linalg import solve_triangular
 
 from bayesperiodic import _checks
-from bayesperiodic._linalg import covariance_cholesky
+from bayesperiodic._linalg import asymmetric_entry, covariance_cholesky
 from bayesperiodic.priors.single import LOG_ROOT_TWO_PI, LogDensity, Normal, Prior, Univariate
 
 
@@ -131,7 +131,7 @@ def _covariance(argument: str, value: Any, size: int) -> np.ndarray:
     variances = np.diag(matrix)
     if size and np.all(variances > 0.0):
         scale = np.outer(np.sqrt(variances), np.sqrt(variances))
-        if np.any(np.abs(matrix - matrix.T) > 1e-8 * scale):
+        if asymmetric_entry(matrix):
             raise ValueError(f"{argument}: must be symmetric, got {matrix.tolist()}.")
         matrix = 0.5 * (matrix + matrix.T)
         if np.linalg.eigvalsh(matrix / scale).min() > size * np.finfo(float).eps:

@@ -354,6 +354,10 @@ def test_data_without_information_are_rejected():
             {"covariance": np.triu(np.ones((3, 3)))},
             r"covariance: must be finite and symmetric, got 1 in entry \[0, 1\] and 0 in entry \[1, 0\]",
         ),
+        (
+            {"covariance": [[1e-18, 5e-19, 0.0], [4e-19, 1e-18, 0.0], [0.0, 0.0, 1e6]]},
+            r"covariance: must be finite and symmetric, got 5e-19 in entry \[0, 1\] and 4e-19 in entry \[1, 0\]",
+        ),
         ({"covariance": np.full((3, 3), np.nan)}, "covariance: must be finite and symmetric, got 9 entries"),
         ({"multipliers": [0.0]}, r"multipliers: must be real, not zero, .*got \[0.0\]"),
         ({"multipliers": [1.0, -2.0]}, r"multipliers: must be .* ordered by descending modulus, got \[1.0, -2.0\]"),

@@ -1,10 +1,13 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.orbits import polish as polish_module
 from bayesperiodic.orbits.orbit import Orbits
+from bayesperiodic.periodic.equations import PeriodicEquations
 from studies import shooting
 from tests.known import LINEAR
 from tests.pendulum import GENTLE, PENDULUM, at_rest, measured, mirrored, repeated, shifted, wrapped
@@ -155,6 +158,22 @@ def test_polished_orbits_are_saved_and_read_back(tmp_path):
 def test_invalid_arguments_raise(changes, message):
     with pytest.raises(ValueError, match=message):
         polish(measured(GENTLE[0]), **changes)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-12])
+def test_curved_coordinates_are_refused_in_any_unit(unit):
+    """Of x and ẋ + 100·x²/unit the second is not linear; the first determines x alone."""
+    model = bp.Model(
+        "curved", states=["x"], inputs=["u"], parameters=["c"],
+        equations=["ddx + c*dx + x - u"], outputs={"x": "x", "bent": f"dx + 100*x**2/{unit!r}"},
+    )  # fmt: skip
+    tau = np.arange(20) / 20
+    values = unit * np.stack([np.cos(2 * np.pi * tau), np.sin(2 * np.pi * tau)], axis=-1)
+    equations = PeriodicEquations.build(model, {"u": np.zeros(20)}, frequency=1.0, samples=20, scheme="fourier")
+    polisher = SimpleNamespace(model=model, samples=1, theta=np.array([0.1]))
+    orbit = SimpleNamespace(coordinates=("x", "bent"))
+    with pytest.raises(ValueError, match="must determine the states and rates of 'curved', .*, by linear equations"):
+        polish_module._Polisher._phases(polisher, orbit, equations, values, rates=True)
 
 
 def test_models_that_do_not_match_the_section_raise():

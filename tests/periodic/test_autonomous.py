@@ -92,6 +92,23 @@ def test_omega_only_scales_the_time():
     assert fast.frequency_sensitivities["omega"] == pytest.approx(fast.frequency / 2.5, rel=1e-10)
 
 
+SIZED = bp.Model(
+    "sized_van_der_pol", states=["x"], parameters=["mu", "omega", "a"], outputs={"y": "x"},
+    equations=["ddx - mu*omega*(1 - (x/a)**2)*dx + omega**2*x"],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e-6, 1e-3, 1e6])
+def test_cycle_does_not_depend_on_the_unit_of_its_state(unit):
+    """A motion of millimetres in metres; far outside of its cycle van der Pol's oscillator only creeps."""
+    how = {"frequency": 1.0, "samples": 200, "scheme": "fourier"}
+    solution = bp.solve_periodic(SIZED, {"mu": 0.5, "omega": 6.0, "a": unit}, **how)
+    plain = bp.solve_periodic(VAN_DER_POL, {"mu": 0.5, "omega": 6.0}, **how)
+    assert solution.converged and solution.frequency == pytest.approx(plain.frequency, rel=1e-9)
+    assert np.ptp(solution.states["x"]) == pytest.approx(unit * np.ptp(plain.states["x"]), rel=1e-3)
+    assert solution.multipliers == pytest.approx(plain.multipliers, abs=1e-4)
+
+
 def test_guess_as_array_or_as_solution_leads_to_the_same_cycle():
     settled = cycle(0.5)
     assert settled.found_by == "time integration"
