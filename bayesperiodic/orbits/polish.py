@@ -331,8 +331,8 @@ class _Polisher:
             states[:, places] = phase
             return model.kernels.evaluate("outputs", states, here, self.theta, tau, equations.frequency)[:, columns]
 
-        offset = outputs(np.zeros(len(places)))
-        slopes = np.stack([outputs(unit) - offset for unit in np.eye(len(places))], axis=-1)
+        step, offset = np.abs(values).max() or 1.0, outputs(np.zeros(len(places)))
+        slopes = np.stack([outputs(unit) - offset for unit in step * np.eye(len(places))], axis=-1) / step
         inverse = np.linalg.pinv(slopes)
         wanted = len(places) if rates else count
         phases = np.einsum("nip,np->ni", inverse, values - offset)

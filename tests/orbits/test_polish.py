@@ -160,20 +160,32 @@ def test_invalid_arguments_raise(changes, message):
         polish(measured(GENTLE[0]), **changes)
 
 
-@pytest.mark.parametrize("unit", [1.0, 1e-12])
-def test_curved_coordinates_are_refused_in_any_unit(unit):
-    """Of x and ẋ + 100·x²/unit the second is not linear; the first determines x alone."""
+def phases_of(unit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return states and rates from coordinates x and ẋ + 1000·x², and those of a circle of the size `unit`."""
     model = bp.Model(
-        "curved", states=["x"], inputs=["u"], parameters=["c"],
-        equations=["ddx + c*dx + x - u"], outputs={"x": "x", "bent": f"dx + 100*x**2/{unit!r}"},
+        "curved", states=["x"], inputs=["u"], parameters=["c"], outputs={"x": "x", "bent": "dx + 1000*x**2"},
+        equations=["ddx + c*dx + x - u"],
     )  # fmt: skip
     tau = np.arange(20) / 20
-    values = unit * np.stack([np.cos(2 * np.pi * tau), np.sin(2 * np.pi * tau)], axis=-1)
+    phases = unit * np.stack([np.cos(2 * np.pi * tau), np.sin(2 * np.pi * tau)], axis=-1)
+    values = phases + 1000.0 * phases[:, :1] ** 2 * [0.0, 1.0]
     equations = PeriodicEquations.build(model, {"u": np.zeros(20)}, frequency=1.0, samples=20, scheme="fourier")
     polisher = SimpleNamespace(model=model, samples=1, theta=np.array([0.1]))
     orbit = SimpleNamespace(coordinates=("x", "bent"))
+    return polish_module._Polisher._phases(polisher, orbit, equations, values, rates=True), phases
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_curved_coordinates_are_refused(unit):
     with pytest.raises(ValueError, match="must determine the states and rates of 'curved', .*, by linear equations"):
-        polish_module._Polisher._phases(polisher, orbit, equations, values, rates=True)
+        phases_of(unit)
+
+
+@pytest.mark.parametrize("unit", [1e-10, 1e-13])
+def test_coordinates_that_are_not_curved_at_the_size_of_the_orbit_determine_it(unit):
+    """The curvature is 1000·unit of them."""
+    phases, exact = phases_of(unit)
+    assert phases == pytest.approx(exact, abs=3e3 * unit**2)
 
 
 def test_models_that_do_not_match_the_section_raise():
