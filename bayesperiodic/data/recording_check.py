@@ -401,7 +401,7 @@ def _moves(effect: Effect, part: slice, step: float, used: slice) -> bool:
     """Return whether the mean period changes where the values do not; unknown outside of the part used."""
     if not effect.predicted.size or part.start < used.start or part.stop > used.stop:
         return True
-    return bool(np.ptp(effect.predicted[part]) > max(4.0 * effect.noise, 3.0 * step, 1e-9))
+    return bool(np.ptp(effect.predicted[part]) > max(4.0 * effect.noise, 3.0 * step))
 
 
 def _beyond(effect: Effect, values: np.ndarray, samples: np.ndarray, sign: float) -> bool:

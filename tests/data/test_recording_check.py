@@ -185,6 +185,28 @@ def test_wraps_are_refused_and_the_cure_gives_the_amplitudes(turn):
     assert found[1:] == pytest.approx(EXACT[1:], abs=5e-4)
 
 
+FAULTS = {
+    "stuck": lambda y: np.where((TIME >= 14.0) & (TIME < 15.2), y[700], y),
+    "clipped": lambda y: np.minimum(y, 0.36),
+    "outliers": lambda y: y + 0.5 * (np.arange(TIME.size) == 777),
+    "coarse": lambda y: np.round(y * 16) / 16,
+    "drift": lambda y: y + 0.002 * TIME,
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_findings_do_not_depend_on_the_unit_of_a_channel(fault):
+    """Powers of two only change exponents."""
+    angle = FAULTS[fault](measured(noise=0.0005 if fault == "coarse" else 0.002))
+    checks = {size: recorded(angle * 2.0**size).check(1.0) for size in (-60, -40, 0, 60)}
+    findings = {
+        size: [(one.kind, one.severity, one.count, round(one.bias, 6)) for one in check.findings]
+        for size, check in checks.items()
+    }
+    assert fault in [kind for kind, *_ in findings[0]]
+    assert findings[-60] == findings[-40] == findings[60] == findings[0]
+
+
 def test_other_channels_of_cured_recordings_are_unchanged():
     angle = np.r_[measured()]
     force = np.cos(2 * np.pi * TIME)
