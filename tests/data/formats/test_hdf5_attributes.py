@@ -229,6 +229,37 @@ def test_times_that_attributes_leave_open_are_refused_with_the_attributes(stored
     assert sampling(stored).refusal == what
 
 
+@pytest.mark.parametrize(
+    "more, start",
+    [({"fs": -1.0}, 2.5), ({"fs_unit": "mHz", "t0": 0.0}, 0.0), ({"sampling_unit": "ms"}, 0.0025), ({"dt": 1.0}, 2.5)],
+)
+def test_start_and_origin_remain_where_attributes_leave_the_rate_open(more, start):
+    """They are used with a rate that the user gives."""
+    clock = sampling({"fs": 100.0, "t0": 2.5, "start_time": "2026-01-31T12:00:00"} | more)
+    assert clock.refusal and np.isnan(clock.step)
+    assert (clock.start, clock.origin) == (start, np.datetime64("2026-01-31T12:00:00", "ns"))
+    clock = sampling({"fs": 100.0, "t0": 2.5, "start_time": "now"} | more)
+    assert clock.refusal and (clock.start, clock.origin) == (0.0, None)
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_first_and_last_dates_of_nanoseconds(place):
+    """From 1 - 2**63 to 2**63 - 1, as the number before them is no date."""
+    for origin, low, high in ((0, 1 - 2**63, 2**63 - 1), (-5, 6 - 2**63, 2**63 - 1), (5, 1 - 2**63, 2**63 - 6)):
+        since = Since(1, np.datetime64(origin, "ns"))
+        for end, inside in ((low, 1), (high, -1)):
+            values = [0, 0]
+            for values[place], sound in ((end, True), (end + inside, True), (end - inside, False)):
+                if not -(2**63) <= values[place] < 2**63:
+                    continue
+                if sound:
+                    dates = since.dates(np.array(values, np.int64))
+                    assert dates.astype(np.int64).tolist() == [origin + value for value in values]
+                    continue
+                with pytest.raises(ValueError, match="its dates are outside of the years from 1678 to 2261"):
+                    since.dates(np.array(values, np.int64))
+
+
 def test_zero_start_needs_no_unit_and_other_attributes_say_no_times():
     clock = sampling({"dt": 1.0, "dt_unit": "ms", "t0": 0.0})
     assert (clock.refusal, clock.start) == ("", 0.0)
