@@ -260,6 +260,27 @@ def test_first_and_last_dates_of_nanoseconds(place):
                     since.dates(np.array(values, np.int64))
 
 
+@pytest.mark.parametrize(
+    "stored, unit, expected",
+    [
+        ({}, 10**9, (0.0, None, "")), ({"t0": 2.5}, 10**9, (2.5, None, "")), ({"t0": 2.5}, 10**6, (0.0025, None, "")),
+        ({"t0": 2.5, "wf_start_offset": 2.5}, 10**9, (2.5, None, "")), ({"t0": 0}, None, (0.0, None, "")),
+        ({"t0": 2.5}, None, (0.0, None, "whose attribute t0 = 2.5 has no unit")),
+        ({"t0": 2.5, "t_start": 3.5}, 10**9, (0.0, None,
+         "whose attributes t0 = 2.5, t_start = 3.5 contradict each other")),
+        ({"t0": 2.5, "start_time": "2026-01-31"}, 10**9, (2.5, np.datetime64("2026-01-31", "ns"), "")),
+        ({"start_time": "2026-01-31", "t0": "2026-01-30", "t_start": 1}, 10**9,
+         (0.0, None, "whose attributes start_time = 2026-01-31, t0 = 2026-01-30 contradict each other")),
+        ({"t0": 2.5, "start_time": "noon"}, 10**9,
+         (0.0, None, "whose attribute start_time = noon is no start in seconds or after ISO 8601")),
+        ({"gain": 2.0, "t0": np.float32(0.1)}, 10**9, (0.1, None, "")),
+    ],
+)  # fmt: skip
+def test_start_and_origin_of_attributes(stored, unit, expected):
+    """Equal ones count once; of single precision, the decimal number is meant."""
+    assert hdf5_attributes._start(stored, unit) == expected
+
+
 def test_zero_start_needs_no_unit_and_other_attributes_say_no_times():
     clock = sampling({"dt": 1.0, "dt_unit": "ms", "t0": 0.0})
     assert (clock.refusal, clock.start) == ("", 0.0)

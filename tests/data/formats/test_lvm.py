@@ -465,3 +465,10 @@ def test_channels_of_any_separator_have_units_and_one_clock(tmp_path, mark, name
     assert a.clock is b.clock and a.clock.step == pytest.approx(1e-3, rel=1e-12)
     np.testing.assert_allclose(a.values(), A, atol=0.6e-6)
     np.testing.assert_allclose(b.values(), B, atol=0.6e-6)
+
+
+@pytest.mark.parametrize("columns", ["No", "One", "Multi"])
+def test_one_step_may_be_that_of_all_channels(tmp_path, columns):
+    gap = "\t" if columns == "Multi" else ""
+    text = edited(f"Delta_X\t{STEP}\t{gap}{STEP}", f"Delta_X\t{STEP}", head(columns) + segment(columns=columns))
+    assert_read(read(tmp_path, text))

@@ -123,6 +123,18 @@ AS_LINE = "header: must be given, got None, as line "
          AS_LINE + "2 may be names or units, ['t', 'F', 'V']; give the number of the line of"),
         (["Time,b,c", "t,F,V"], None, (["t", "F", "V"], [])),
         (["a,b,c", "t,F,mm"], None, (["a", "b", "c"], ["t", "F", "mm"])),
+        (["one,two,three", "V,worte,impulse"], None,
+         AS_LINE + "2 may be names or units, ['V', 'worte', 'impulse']; give"),
+        (["N,two,three", "V,worte,impulse"], None, (["V", "worte", "impulse"], [])),
+        (["one,two,three", "V,,impulse"], None, (["V", "", "impulse"], [])),
+        (["one,two", "V,worte,impulse"], None, (["V", "worte", "impulse"], [])),
+        (["5,two,three", "V,worte,impulse"], None, (["V", "worte", "impulse"], [])),
+        (["one,two,three", "V,worte,impulse"], 2, (["V", "worte", "impulse"], [])),
+        (["Zeit,two,three", "worte,impulse,a"], None, AS_LINE + "2 may be names or units, ['worte', 'impulse', 'a'];"),
+        (["Zeit,N,three", "worte,impulse,a"], None, AS_LINE + "2 may be names or units, ['worte', 'impulse', 'a'];"),
+        (["Zeit,two,three", "t,impulse,a"], None, (["t", "impulse", "a"], [])),
+        (["one,two,three", "worte,impulse,a"], None, (["worte", "impulse", "a"], [])),
+        (["one,two,three", "[V],worte,impulse"], None, AS_LINE + "2 may be names or units, ['[V]', 'worte', 'impul"),
         (["t,x,y", "one,two,three"], 1, "header: must be the number of the line above the data, or of one above units, "
          "got 1, and line 2 is ['one', 'two', 'three'], which are neither numbers nor known units."),
         (["Rig", "a", "V,N,V", "t,x,y"], None, AS_LINE + "3 may be units, ['V', 'N', 'V'], and it is not the one below "

@@ -1,5 +1,6 @@
 """Rules for whole texts of columns: signs of numbers, times, summaries, numbers of fields, and wide files."""
 
+import csv
 import re
 
 import numpy as np
@@ -350,3 +351,23 @@ def test_columns_of_times_are_durations(form):
     cells = np.array(["10:00:00", "10:00:01"], dtype=object)
     values, said, refusal = text._converted(cells, ".", False, _Notation(None, None, form), HEAD)
     assert np.diff(values) == np.timedelta64(1, "s") and said.startswith("times of day, in seconds") and refusal == ""
+
+
+@pytest.mark.parametrize(
+    "rows, expected",
+    [
+        ([["1", "2", "3"], ["4", "5", "6", " "]], [["3", "1"], ["6", "4"]]), ([["1", "2", "é\n"]], [["é\n", "1"]]),
+        ([["", " "], ["1", "2", "3"]], [["", ""], ["3", "1"]]), ([["1", "2", ""]], [["", "1"]]),
+        ([[], [" "], ["1", "2", "3"]], [["3", "1"]]), ([["1", "2"]], None), ([["1"]], None),
+        ([["1", "2", "3", "4"]], None),
+        ([["1", "2", "3", "", ""]], None), ([["1", "2", "3", "", "5"]], None), ([], []),
+    ],
+)  # fmt: skip
+def test_wanted_fields_of_rows_have_a_column_of_zeros_behind_them(rows, expected):
+    """Lines of blanks alone are none; a row of fewer fields has none but blanks."""
+    if expected is None:
+        with pytest.raises(text._OtherFields, match="^rows have different numbers of fields$"):
+            text._narrowed(rows, [2, 0], 3, 4)
+        return
+    with text._narrowed(rows, [2, 0], 3, 4) as narrow:
+        assert [*csv.reader(narrow, delimiter="\x1f")] == [[*row, "0"] for row in expected]
