@@ -382,15 +382,3 @@ def test_workbook_without_numbers_and_other_headers_are_refused(write):
     for header in (-1, 1.5, "one"):
         with pytest.raises(ValueError, match="^header: must be "):
             excel.contents(write([[1, 2]]), [], header=header)
-
-
-@pytest.mark.parametrize(
-    "cells, usable",
-    [
-        ([0, 1], True), ([1, 0], True), ([0, 1, 0], False), ([0], False), ([0, None, 1], True), ([0, "", 1], True),
-        ([0, "x", 1], False), ([None, 1], False), ([], False), (["a", "b"], False),
-    ],
-)  # fmt: skip
-def test_times_may_be_columns_without_texts_that_end_with_another_value(cells, usable):
-    table = excel._Sheet(["x", "t"], ["", ""], 1, [("x", "t"), *((5, cell) for cell in cells), (5,)], "")
-    assert excel._may_be_times(table, 1) is usable and not excel._may_be_times(table, 0)
