@@ -472,3 +472,11 @@ def test_one_step_may_be_that_of_all_channels(tmp_path, columns):
     gap = "\t" if columns == "Multi" else ""
     text = edited(f"Delta_X\t{STEP}\t{gap}{STEP}", f"Delta_X\t{STEP}", head(columns) + segment(columns=columns))
     assert_read(read(tmp_path, text))
+
+
+@pytest.mark.parametrize("separator", [",", "\t"])
+@pytest.mark.parametrize("count", [1, 3])
+def test_lines_of_separators_between_segments_are_no_rows(tmp_path, separator, count):
+    text = head(separator=separator) + segment(separator=separator) + separator * count + "\n"
+    run = read(tmp_path, text + segment(separator=separator), outputs={c: ("segment 1", c) for c in "ab"})
+    assert_read(run)
