@@ -59,11 +59,60 @@ def test_other_signs_and_formats_are_refused(given, message):
         ("t;x\n0;1,5\n1;2\n", "separator ';', names in line 1, decimal comma"),
         ("t;x\n0;1.5\n1;2\n", "line 1, decimal point"),
         ("t,x\n0,1.500\n1,2.500\n", "separator ',', names in line 1, decimal point"),
+        ("t;x\n0;1'234\n1;2'345\n", "names in line 1"), ("t;x\n0;1,234\n1;2,345\n", "names in line 1"),
+        ("t;x\n0;1,234,567\n1;2\n", "names in line 1, decimal point"), ("t;x\n0;1.234.567\n1;2\n", "decimal comma"),
+        ("t;x\n0;a\n1;b\n", "names in line 1"), ("t;x\n0;12.03.2026\n1;13.03.2026\n", "names in line 1"),
+        ("t,x\n0,1.500\n1,2\n", "names in line 1, decimal point"),
     ],
 )  # fmt: skip
 def test_decimal_sign_that_was_recognised_is_remarked(write, content, remark):
     shown = bp.inspect(write(content)).remarks[0]
     assert shown.endswith(remark)
+
+
+@pytest.mark.parametrize(
+    "cells, given, values, remark",
+    [
+        (["1,5", "2"], ",", [1.5, 2.0], ", decimal comma"), (["1", "2"], ",", [1, 2], ""),
+        (["1.5", "2"], ".", [1.5, 2.0],
+        ", decimal point"), (["1.234", "2"], ",", [1234.0, 2.0], ", decimal comma"),
+        (["1.234", "2.500"], ".", [1.234, 2.5],
+        ", decimal point"), (["1,234", "2"], ".", [1234.0, 2.0], ", decimal point"),
+    ],
+)  # fmt: skip
+def test_decimal_sign_that_is_given_is_used_and_remarked_where_it_occurs(write, cells, given, values, remark):
+    path = write("n;x\n" + "".join(f"{k};{cell}\n" for k, cell in enumerate(cells)))
+    whole = text.contents(path, [], decimal=given)
+    assert whole.channels[1].values().tolist() == values
+    assert whole.remarks == (f"separator ';', names in line 1{remark}",)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-32", "cp1252"])
+@pytest.mark.parametrize("rows", [4, 4000])
+def test_summaries_at_the_end_of_texts_of_any_encoding_are_refused(tmp_path, encoding, rows):
+    path = tmp_path / "run.csv"
+    body = "t,größe,state\n" + "".join(f"{k},{k}.5,max\n" for k in range(rows))
+    assert (len(body) > text.TAIL_BYTES) == (rows > 1000)
+    path.write_text(body, encoding)
+    assert text.contents(path, ["t"]).channels[0].samples == rows  # of a column of texts the words are values
+    for row in ("Mean,2.5,max", "7,Mittelwert,max", "  min ,1.5", "end of test,1,"):
+        path.write_text(body + row + "\n", encoding)
+        with pytest.raises(
+            ValueError, match=f"whose row .*{row.split(',')[0].strip()}.* seems to be a summary; remove it"
+        ):
+            text.contents(path, ["t"])
+
+
+@pytest.mark.parametrize("numbers, refused", [(0, False), (1, False), (2, True), (3, True), (4, True)])
+def test_summaries_stand_in_columns_half_of_which_are_numbers(write, numbers, refused):
+    """Of the first rows, to which the last one belongs here."""
+    cells = [*(f"{k}.5" for k in range(numbers)), *["sum"] * (4 - numbers)]
+    path = write("t,x\n" + "".join(f"{k},{cell}\n" for k, cell in enumerate([*cells[::-1]][:4])))
+    if refused and numbers < 4:
+        with pytest.raises(ValueError, match="seems to be a summary"):
+            text.contents(path, ["t"])
+    else:
+        assert text.contents(path, ["t"]).channels[0].samples == 4
 
 
 @pytest.mark.parametrize(

@@ -505,6 +505,8 @@ def sets(*heads):
         ([{"id1": "a", "rsp_node": 1}, {"id1": "a"}], ["a", "a"], ["1", ""]),
         ([{"id1": "a"}, {"id1": "a"}, {"id1": "b"}], ["a", "a (2)", "b"], ["", "", ""]),
         ([{"id1": "a"}, {"rsp_node": 2}, {}], ["a", "2", "set 3"], ["", "", ""]),
+        ([{"id1": name, "rsp_node": node} for name, node in (("a", 1), ("b", 2), ("c", 1), ("b", 2), ("a", 1))],
+         ["a", "b", "c", "b (2)", "a (2)"], ["1", "2", "1", "2", "1"]),
     ],
 )  # fmt: skip
 def test_names_are_the_first_lines_and_groups_the_places(heads, names, groups):
