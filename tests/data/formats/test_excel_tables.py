@@ -247,9 +247,7 @@ def test_rows_of_the_table_above_the_data_are_not_lost(first, line, columns, row
     if row is None:
         excel._refuse_lost(ABOVE, first, line, columns)
         return
-    with pytest.raises(
-        ValueError, match=f"^{re.escape(BESIDE.format(line, row))} beside numbers; correct the cell, or"
-    ):
+    with pytest.raises(ValueError, match=f"^{re.escape(BESIDE.format(line, row))}beside numbers; correct the cell, or"):
         excel._refuse_lost(ABOVE, first, line, columns)
 
 
