@@ -76,7 +76,7 @@ def _prepared(text: str, separator: str, decimal: str | None) -> tuple[list[str]
     segments: list[_Segment] = []
     at, opened, data, special, complete, steps = -1, False, False, False, text.endswith("\n"), [""]
     for number, line in enumerate(text.replace("\r\n", "\n").split("\n"), 1):
-        if data and (line[:1] in ROW_START or (line[:1] == separator and line.strip(separator))):
+        if data and (line[:1] in ROW_START or line[:1] == separator) and line.strip(separator):
             segments[-1].rows.append(line)
             lines.append(line)
         elif special or line.startswith(SPECIAL_START):

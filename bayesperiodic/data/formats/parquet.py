@@ -58,7 +58,8 @@ def contents(file: Path, wanted: list[Key]) -> Contents:
 
 
 def _is_time(kind: Any) -> bool:
-    types = package("pyarrow.types", "PyArrow", "Parquet files")
+    from pyarrow import types
+
     return bool(types.is_timestamp(kind) or types.is_duration(kind) or types.is_time(kind))
 
 
@@ -100,7 +101,8 @@ def _ranges(metadata: dict[bytes, bytes] | None) -> list[str]:
 
 def _remarks(kind: Any) -> tuple[str, ...]:
     """Return what a user would not guess about a column."""
-    types = package("pyarrow.types", "PyArrow", "Parquet files")
+    from pyarrow import types
+
     if types.is_timestamp(kind):
         return (f"dates in {kind.unit}, {f'stored in UTC, shown in {kind.tz}' if kind.tz else 'without a time zone'}",)
     if types.is_decimal(kind):
@@ -112,7 +114,8 @@ def _remarks(kind: Any) -> tuple[str, ...]:
 
 def _refusal(kind: Any) -> str:
     """Return why a column cannot be used."""
-    types = package("pyarrow.types", "PyArrow", "Parquet files")
+    from pyarrow import types
+
     if type(kind).__name__.endswith("ExtensionType") or types.is_nested(kind):
         return f"values of type {kind}; read it by pyarrow.parquet for from_arrays, one array for each channel"
     if (
@@ -127,8 +130,9 @@ def _refusal(kind: Any) -> str:
 
 def _values(file: Path, place: int) -> np.ndarray:
     """Return a column as numbers, dates, durations or texts; nulls are missing values."""
-    arrow, parquet = (package(name, "PyArrow", "Parquet files") for name in ("pyarrow", "pyarrow.parquet"))
-    types, compute = (package(f"pyarrow.{name}", "PyArrow", "Parquet files") for name in ("types", "compute"))
+    import pyarrow as arrow
+    from pyarrow import compute, parquet, types
+
     content = parquet.ParquetFile(file, memory_map=False)
     groups = content.metadata.num_row_groups
     parts = [content.metadata.row_group(k) for k in range(groups)]

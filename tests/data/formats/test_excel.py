@@ -344,3 +344,41 @@ def test_second_row_of_texts_that_may_be_units_is_refused_without_its_meaning(wr
     with pytest.raises(ValueError, match="header: must be given, got None, as row 2 may be names or units"):
         bp.inspect(path)
     assert bp.inspect(path, header=2).channels[0].name.startswith(lower[0])
+
+
+def test_columns_of_all_sheets_have_units_and_remarks(write):
+    """Two names of one sheet that are equal are told apart; a time is suggested if there is one table."""
+    one = [
+        ["t", "x", "x", "v_mm_s", "when"],
+        ["s", "mm", "N"],
+        [0, 1.5, 2, 5, (46_000.5, 1)],
+        [1, 2.5, 3, 7, (46_001, 1)],
+    ]
+    whole = excel.contents(write({"A": one, "B": [["only", "texts"]]}), [])
+    assert (whole.kind, whole.word, whole.suggested_time) == ("Excel workbook", "column", "t")
+    assert whole.remarks == ("sheet 'A': names in row 1", "sheet 'B' has no table of numbers")
+    assert [(c.group, c.name, c.unit, c.samples) for c in whole.channels] == [
+        ("A", "t", "s", 2), ("A", "x (1)", "mm", 2), ("A", "x (2)", "N", 2), ("A", "v_mm_s", "", 2),
+        ("A", "when", "", 2)
+    ]  # fmt: skip
+    assert [c.remarks for c in whole.channels] == [
+        (), (), (), ("the name may say the unit 'mm/s', which is not used; units= converts",),
+        ("dates, to the microsecond",),
+    ]  # fmt: skip
+    assert [c.values().tolist() for c in whole.channels[:4]] == [[0.0, 1.0], [1.5, 2.5], [2.0, 3.0], [5.0, 7.0]]
+    # 46000 days after 1899-12-30.
+    assert whole.channels[4].values().astype(str).tolist() == [
+        "2025-12-09T12:00:00.000000",
+        "2025-12-10T00:00:00.000000",
+    ]
+    assert excel.contents(write({"A": one, "B": one}), []).suggested_time == ""
+    given = excel.contents(write(one), [], header=0)
+    assert [c.name for c in given.channels] == [f"column {k}" for k in range(1, 6)] and given.suggested_time == ""
+
+
+def test_workbook_without_numbers_and_other_headers_are_refused(write):
+    with pytest.raises(ValueError, match="^none of its sheets has a table of numbers$"):
+        excel.contents(write({"A": [["only", "texts"]], "B": []}), [])
+    for header in (-1, 1.5, "one"):
+        with pytest.raises(ValueError, match="^header: must be "):
+            excel.contents(write([[1, 2]]), [], header=header)

@@ -2,6 +2,7 @@
 
 import datetime
 import re
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -204,3 +205,115 @@ def test_sheets_have_the_size_of_those_of_excel_at_most(monkeypatch):
         with pytest.raises(ValueError, match="its sheet 'one' has more rows or columns than Excel allows"):
             excel._rows(Sheet(rows))
     assert excel._rows(Sheet([(None,), ()])) == []
+
+
+@pytest.mark.parametrize(
+    "row, columns, data",
+    [
+        ((1, 2), [0, 1], True), ((1, None), [0, 1], True), ((1,), [0, 1], True), ((None, "#N/A"), [0, 1], False),
+        ((1, "x"), [0, 1], False), ((1, "x"), [0], True), ((DATE, CLOCK), [0, 1], True), ((), [0], False),
+        ((1, 2), [], False),
+        ((True, " "), [0, 1], True), (("x", 1), [1], True), (("x", "y"), [0, 1], False),
+    ],
+)  # fmt: skip
+def test_rows_of_data_have_values_and_nothing_else_in_the_columns_of_values(row, columns, data):
+    assert excel._is_data(row, columns) is data
+
+
+def test_cells_of_a_row_are_texts_without_blanks_around_them():
+    assert excel._texts((" a ", None, 5, 1.5, "b"), 4) == ["a", "", "5", "1.5"]
+    assert excel._texts(("a",), 3) == ["a", "", ""] and excel._texts((), 0) == []
+    assert excel._given((" ", None, "#N/A", "#N/A N/A", 0, "x", False)) == [0, "x", False]
+
+
+ABOVE = [("t", "x"), (1, "OL"), ("s", "mm"), ("OL", 2), (3, 4)]
+BESIDE = (
+    "header: must be the number of a row with only rows of numbers below it, got {!r}, and row {} has the cell 'OL' "
+)
+
+
+@pytest.mark.parametrize(
+    "first, line, columns, row",
+    [
+        (4, None, [0, 1], 4), (4, 0, [0, 1], 4), (4, 1, [0, 1], 2), (4, 2, [0, 1], 4), (4, 3, [0, 1], 4),
+        (3, None, [0, 1], None),
+        (2, None, [0, 1], 2), (2, None, [0], None), (2, None, [1], None), (2, 1, [0, 1], 2), (3, 2, [0, 1], None),
+        (0, None, [0, 1], None), (1, None, [0, 1], None), (0, 0, [0, 1], None), (4, 1, [1], None), (4, None, [1], None),
+        (4, None, [0, 1, 2], 4),
+    ],
+)  # fmt: skip
+def test_rows_of_the_table_above_the_data_are_not_lost(first, line, columns, row):
+    """Below the names that are given all rows are looked at, else that next to the data."""
+    if row is None:
+        excel._refuse_lost(ABOVE, first, line, columns)
+        return
+    with pytest.raises(ValueError, match=f"^{re.escape(BESIDE.format(line, row))}beside numbers; correct the cell, or"):
+        excel._refuse_lost(ABOVE, first, line, columns)
+
+
+ROWS = [
+    ("Rig", None, None),
+    ("s", "mm", "N"),
+    ("t", "x", "y"),
+    ("Unit:", "m", "kN"),
+    ("one", "two", "three"),
+    ("t", "x"),
+]
+
+
+@pytest.mark.parametrize(
+    "above, between, line, expected",
+    [
+        ([2], [], None, ["", "", ""]), ([1, 2], [], None, ["s", "mm", "N"]), ([0, 1, 2], [], None, ["s", "mm", "N"]),
+        ([2], [3], 3, ["", "m", "kN"]), ([2], [4, 3], 3, ["", "m", "kN"]), ([2], [3, 1], 3, ["", "m", "kN"]),
+        ([1, 2], [3], 3, ["", "m", "kN"]), ([4, 2], [], None, ["", "", ""]), ([0, 2], [], None, ["", "", ""]),
+        ([1, 5], [], None, ["s", "mm", "N"]), ([4, 1, 2], [], 3, ["s", "mm", "N"]), ([], [], None, ["", "", ""]),
+        ([4, 1, 2], [], None,
+         "got None, as row 2 may be units, and it is not the one below the names; give the number of"),
+        ([2, 4], [], None, ["", "", ""]), ([5, 1, 2], [], None, ["s", "mm", "N"]),
+        ([2], [4], 3, "got 3, and row 5 has neither numbers nor known units."),
+        ([2], [4, 0], 3, "got 3, and row 1 has neither numbers nor known units."),
+    ],
+)  # fmt: skip
+def test_units_are_below_the_names_or_above_them(above, between, line, expected):
+    if isinstance(expected, list):
+        assert excel._units_around(ROWS, above, between, 3, line) == expected
+        return
+    with pytest.raises(ValueError, match=f"^header: must be .*{re.escape(expected)}"):
+        excel._units_around(ROWS, above, between, 3, line)
+
+
+@pytest.mark.parametrize(
+    "upper, lower, refused",
+    [
+        (["t", "x"], ["s", "mm"], False), (["t", "x"], ["one", "two"], True), (["a", "x"], ["one", "two"], False),
+        (["a", "x"], ["a", "x"], True), (["a", "x"], ["t", "N"], True), (["t", "x"], ["t", "N"], False),
+        (["a", "x"], ["t", "mm"], False), (["t", "x"], ["time", "two"], False), (["t", ""], ["one", "two"], False),
+        (["t", "x"], ["one", ""], False), (["a", "x"], ["N", "m"], False),
+    ],
+)  # fmt: skip
+def test_rows_of_texts_that_may_be_names_or_units_are_refused(upper, lower, refused):
+    if not refused:
+        excel._refuse_doubtful(upper, lower, 7)
+        return
+    message = f"header: must be given, got None, as row 7 may be names or units, {lower}; give the number of the row of"
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
+        excel._refuse_doubtful(upper, lower, 7)
+
+
+@pytest.mark.parametrize(
+    "size, packed, refused", [(100, True, False), (101, True, True), (101, False, False), (1000, False, False),
+                              (1001, False, True)]
+)  # fmt: skip
+def test_members_that_unpack_to_much_more_than_sheets_are_refused(tmp_path, monkeypatch, size, packed, refused):
+    """Zeros are packed to fewer than 50 bytes."""
+    for name, value in {"SMALL_MEMBER": 100, "LARGEST_RATIO": 2, "LARGEST_ARRAY": 1000}.items():
+        monkeypatch.setattr(excel, name, value)
+    with zipfile.ZipFile(tmp_path / "a", "w") as archive:
+        archive.writestr("small", "1")
+        archive.writestr("b", bytes(size), zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED)
+    if not refused:
+        excel._refuse_bombs(tmp_path / "a")
+        return
+    with pytest.raises(ValueError, match=f"^its member 'b' unpacks to {size / 1e9:.3g} GB$"):
+        excel._refuse_bombs(tmp_path / "a")

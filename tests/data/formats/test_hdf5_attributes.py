@@ -229,6 +229,58 @@ def test_times_that_attributes_leave_open_are_refused_with_the_attributes(stored
     assert sampling(stored).refusal == what
 
 
+@pytest.mark.parametrize(
+    "more, start",
+    [({"fs": -1.0}, 2.5), ({"fs_unit": "mHz", "t0": 0.0}, 0.0), ({"sampling_unit": "ms"}, 0.0025), ({"dt": 1.0}, 2.5)],
+)
+def test_start_and_origin_remain_where_attributes_leave_the_rate_open(more, start):
+    """They are used with a rate that the user gives."""
+    clock = sampling({"fs": 100.0, "t0": 2.5, "start_time": "2026-01-31T12:00:00"} | more)
+    assert clock.refusal and np.isnan(clock.step)
+    assert (clock.start, clock.origin) == (start, np.datetime64("2026-01-31T12:00:00", "ns"))
+    clock = sampling({"fs": 100.0, "t0": 2.5, "start_time": "now"} | more)
+    assert clock.refusal and (clock.start, clock.origin) == (0.0, None)
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_first_and_last_dates_of_nanoseconds(place):
+    """From 1 - 2**63 to 2**63 - 1, as the number before them is no date."""
+    for origin, low, high in ((0, 1 - 2**63, 2**63 - 1), (-5, 6 - 2**63, 2**63 - 1), (5, 1 - 2**63, 2**63 - 6)):
+        since = Since(1, np.datetime64(origin, "ns"))
+        for end, inside in ((low, 1), (high, -1)):
+            values = [0, 0]
+            for values[place], sound in ((end, True), (end + inside, True), (end - inside, False)):
+                if not -(2**63) <= values[place] < 2**63:
+                    continue
+                if sound:
+                    dates = since.dates(np.array(values, np.int64))
+                    assert dates.astype(np.int64).tolist() == [origin + value for value in values]
+                    continue
+                with pytest.raises(ValueError, match="its dates are outside of the years from 1678 to 2261"):
+                    since.dates(np.array(values, np.int64))
+
+
+@pytest.mark.parametrize(
+    "stored, unit, expected",
+    [
+        ({}, 10**9, (0.0, None, "")), ({"t0": 2.5}, 10**9, (2.5, None, "")), ({"t0": 2.5}, 10**6, (0.0025, None, "")),
+        ({"t0": 2.5, "wf_start_offset": 2.5}, 10**9, (2.5, None, "")), ({"t0": 0}, None, (0.0, None, "")),
+        ({"t0": 2.5}, None, (0.0, None, "whose attribute t0 = 2.5 has no unit")),
+        ({"t0": 2.5, "t_start": 3.5}, 10**9, (0.0, None,
+         "whose attributes t0 = 2.5, t_start = 3.5 contradict each other")),
+        ({"t0": 2.5, "start_time": "2026-01-31"}, 10**9, (2.5, np.datetime64("2026-01-31", "ns"), "")),
+        ({"start_time": "2026-01-31", "t0": "2026-01-30", "t_start": 1}, 10**9,
+         (0.0, None, "whose attributes start_time = 2026-01-31, t0 = 2026-01-30 contradict each other")),
+        ({"t0": 2.5, "start_time": "noon"}, 10**9,
+         (0.0, None, "whose attribute start_time = noon is no start in seconds or after ISO 8601")),
+        ({"gain": 2.0, "t0": np.float32(0.1)}, 10**9, (0.1, None, "")),
+    ],
+)  # fmt: skip
+def test_start_and_origin_of_attributes(stored, unit, expected):
+    """Equal ones count once; of single precision, the decimal number is meant."""
+    assert hdf5_attributes._start(stored, unit) == expected
+
+
 def test_zero_start_needs_no_unit_and_other_attributes_say_no_times():
     clock = sampling({"dt": 1.0, "dt_unit": "ms", "t0": 0.0})
     assert (clock.refusal, clock.start) == ("", 0.0)

@@ -189,3 +189,20 @@ def test_coordinate_of_the_length_of_a_variable_is_its_time(tmp_path):
     assert "dates with an attribute gain = 2.0, which is not applied" in coordinates(path, gain=2.0)["x"].clock.refusal
     assert "of calendar 'noleap'" in coordinates(path, calendar="noleap")["x"].clock.refusal
     assert bp.inspect(path).channels
+
+
+def test_arrays_of_a_file_are_channels_with_clocks_and_remarks(make):
+    sets = {
+        "a/x": (np.arange(5.0), {"units": "mm", "dt": 0.5}), "a/y": (np.arange(5), {"dt": 0.5}),
+        "b/x": (np.arange(7.0), {"dt": 0.25}), "rate": 5.0, "b/count": 7, "text": "none", "z": np.arange(3.0),
+    }  # fmt: skip
+    whole = hdf5.contents(make(sets), [])
+    assert (whole.kind, whole.word, whole.suggested_time, whole.numbered) == ("HDF5 file", "channel", "", True)
+    assert [(one.group, one.name, one.samples, one.unit) for one in whole.channels] == [
+        ("", "z", 3, ""), ("a", "x", 5, "mm"), ("a", "y", 5, ""), ("b", "x", 7, "")
+    ]  # fmt: skip
+    first, second, third, fourth = (one.clock for one in whole.channels)
+    assert second is third and (first, second.step, fourth.step) == (None, 0.5, 0.25)
+    assert [one.values().tolist() for one in whole.channels] == [[0, 1, 2], [*range(5)], [*range(5)], [*range(7)]]
+    (remark,) = whole.remarks
+    assert "rate" in remark and "b/count" in remark and "text" not in remark

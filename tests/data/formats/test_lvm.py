@@ -448,3 +448,35 @@ def test_each_channel_has_its_own_step(tmp_path):
             run = read(tmp_path, other)
         assert len(seen) == 1
         assert [1.0 / run.times[c][1] for c in "ab"] == pytest.approx(rates)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+@pytest.mark.parametrize("mark, name", [(";", "Semicolon"), ("\t", "Tab"), (",", "Comma")])
+def test_channels_of_any_separator_have_units_and_one_clock(tmp_path, mark, name, encoding):
+    text = (head() + segment(units=("µm", "N"))).replace("Separator\tTab", f"Separator\t{name}").replace("\t", mark)
+    (tmp_path / "run").write_text(text, encoding)
+    whole = lvm.contents(tmp_path / "run", [])
+    assert (whole.kind, whole.word) == ("LabVIEW measurement file", "channel")
+    assert whole.remarks == (f"in {encoding.removesuffix('-sig')}",)
+    a, b = whole.channels
+    assert (a.group, a.name, a.unit, a.samples, b.group, b.name, b.unit, b.samples) == (
+        "", "a", "µm", 50, "", "b", "N", 50
+    )  # fmt: skip
+    assert a.clock is b.clock and a.clock.step == pytest.approx(1e-3, rel=1e-12)
+    np.testing.assert_allclose(a.values(), A, atol=0.6e-6)
+    np.testing.assert_allclose(b.values(), B, atol=0.6e-6)
+
+
+@pytest.mark.parametrize("columns", ["No", "One", "Multi"])
+def test_one_step_may_be_that_of_all_channels(tmp_path, columns):
+    gap = "\t" if columns == "Multi" else ""
+    text = edited(f"Delta_X\t{STEP}\t{gap}{STEP}", f"Delta_X\t{STEP}", head(columns) + segment(columns=columns))
+    assert_read(read(tmp_path, text))
+
+
+@pytest.mark.parametrize("separator", [",", "\t"])
+@pytest.mark.parametrize("count", [1, 3])
+def test_lines_of_separators_between_segments_are_no_rows(tmp_path, separator, count):
+    text = head(separator=separator) + segment(separator=separator) + separator * count + "\n"
+    run = read(tmp_path, text + segment(separator=separator), outputs={c: ("segment 1", c) for c in "ab"})
+    assert_read(run)

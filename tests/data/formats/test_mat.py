@@ -4,6 +4,7 @@ import io
 import pathlib
 import pickle
 import struct
+import tracemalloc
 import warnings
 
 import h5py
@@ -347,3 +348,66 @@ def test_other_variables_are_refused_with_their_class(tmp_path, value, what):
     scipy.io.savemat(path, {"t": TIME, "v": value})
     with pytest.raises(ValueError, match=f"its variable 'v' is no array of real numbers, but {what}"):
         bp.Recording.from_mat(path, time="t", outputs={"x": "v"})
+
+
+@pytest.mark.parametrize(
+    "places, starts, values, reason",
+    [
+        ([0, 3], [0, 1, 2], [1.0, 2.0], "its matrix 'A' has rows beyond its size"),
+        ([0, 2], [0, 1], [1.0, 2.0], "its matrix 'A' has other starts of columns than its size"), ([0, 2], [0, 1, 2],
+        [1.0, 2.0], None),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_sparse_matrices_of_version_5_have_rows_starts_and_values(places, starts, values, reason, order):
+    """In this order, of any type of numbers, after MathWorks' description."""
+    kinds = (5, f"{order}i4", places), (12, f"{order}i8", starts), (9, f"{order}f8", values)
+    parts = [(kind, memoryview(np.array(numbers, form).tobytes())) for kind, form, numbers in kinds]
+    if reason:
+        with pytest.raises(ValueError, match=f"^{reason}$"):
+            mat._array("A", 5, [3, 2], iter(parts), order)
+        return
+    assert mat._array("A", 5, [3, 2], iter(parts), order).tolist() == [[1.0, 0.0], [0.0, 0.0], [0.0, 2.0]]
+    with pytest.raises(ValueError, match="its variable 'A' is no array of real numbers, but complex"):
+        mat._array("A", 5 | 0x800, [3, 2], iter(parts), order)
+
+
+@pytest.mark.parametrize("shape", [(2, 3), (6, 1), (1, 6), (1, 2, 3), (0, 3), (-2, -3), (2, 2), (7,)])
+def test_arrays_have_the_size_of_their_header_and_their_columns_in_turn(shape):
+    given = np.arange(6.0)[: max(int(np.prod(shape)), 0)]
+    parts = [(9, memoryview(given.tobytes()))]
+    if shape in ((-2, -3), (7,)):
+        with pytest.raises(ValueError, match="^its variable 'x' has another size than its header says$"):
+            mat._array("x", 6, [*shape], iter(parts), "<")
+        return
+    assert np.array_equal(mat._array("x", 6, [*shape], iter(parts), "<"), given.reshape(shape, order="F"))
+    with pytest.raises(ValueError, match="^its variable 'x' has another size than its header says$"):
+        mat._array("x", 6, [*shape], iter(2 * parts), "<")
+
+
+def test_variables_are_listed_without_unpacking_them(saved):
+    """Of 8 MB of zeros, 4 kB are unpacked for the name and the size."""
+    path = saved({"t": np.zeros(10**6), "x": np.ones((2, 5))}, compressed=True)
+    tracemalloc.start()
+    try:
+        channels = mat.contents(path, []).channels
+        assert tracemalloc.get_traced_memory()[1] < 10**6
+    finally:
+        tracemalloc.stop()
+    assert [(one.name, one.samples) for one in channels] == [("t", 10**6), ("x", 10)]
+    assert channels[1].values().tolist() == [[1.0] * 5] * 2 and not channels[0].values().any()
+
+
+def test_compressed_variables_up_to_the_limit_are_read(saved, monkeypatch):
+    """The first 4 kB, and as much as the limit says after them."""
+    path = saved({"x": np.arange(1000.0)}, compressed=True)
+    # Heads of the element and of the values, flags, shape and name, after MathWorks' description.
+    size = 8 + 16 + 16 + 8 + 8 + 8 * 1000 - mat.HEADER_BYTES
+    for limit, read in ((size, True), (size - 1, False)):
+        monkeypatch.setattr(mat, "LARGEST_ARRAY", limit)
+        (channel,) = mat.contents(path, []).channels
+        if read:
+            assert channel.values().ravel().tolist() == [*range(1000)]
+        else:
+            with pytest.raises(ValueError, match="its variable 'x' is cut off or has more than 3.96e-06 GB; read the"):
+                channel.values()

@@ -407,3 +407,29 @@ def test_row_groups_are_joined_and_columns_too_large_named(path, monkeypatch):
         else:
             with pytest.raises(ValueError, match="its column 3 has .* GB, more than .* GB"):
                 parquet._values(path, 2)
+
+
+def test_columns_have_units_of_fields_of_pandas_or_in_names_and_remarks(path):
+    schema = pa.schema(
+        [
+            pa.field("t [ms]", pa.float64(), metadata={"unit": "s"}), pa.field("x", pa.float64()),
+            pa.field("F [kN]", pa.float64()), pa.field("x", pa.int8()), pa.field("when", pa.timestamp("ms")),
+            pa.field("v_mm_s", pa.float64()), pa.field("list", pa.list_(pa.int8())), pa.field("k", pa.int64()),
+        ],
+        metadata={"pandas": json.dumps({"index_columns": ["k"], "attributes": {"units": {"x": "mm", "F [kN]": "N"}}})},
+    )  # fmt: skip
+    columns = [[0.0, 1.0]] * 3 + [[1, 2]] * 2 + [[0.5, 1.5], [[1], [2]], [5, 7]]
+    pq.write_table(pa.Table.from_arrays([*map(pa.array, columns, schema.types)], schema=schema), path)
+    whole = parquet.contents(path, [])
+    assert (whole.kind, whole.word, whole.remarks, whole.suggested_time) == ("Parquet file", "column", (), "when")
+    names = ["t [ms]", "x (1)", "F [kN]", "x (2)", "when", "v_mm_s", "list", "k"]
+    assert [(one.name, one.samples, one.group) for one in whole.channels] == [(name, 2, "") for name in names]
+    assert [one.unit for one in whole.channels] == ["s", "mm", "N", "mm", "", "", "", ""]
+    said = {one.name: one.remarks for one in whole.channels if one.remarks}
+    assert said == {
+        "when": ("dates in ms, without a time zone",), "k": ("the index of the table in pandas",),
+        "v_mm_s": ("the name may say the unit 'mm/s', which is not used; units= converts",),
+    }  # fmt: skip
+    assert [one.name for one in whole.channels if one.refusal] == ["list"]
+    assert [one.values().tolist() for one in whole.channels[:4]] == columns[:4]
+    assert parquet.contents(path, ["x (1)"]).suggested_time == ""

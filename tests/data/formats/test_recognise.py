@@ -34,6 +34,7 @@ def zipped(*names):
         ("a.mat", HDF5, "mat"), ("a.MAT", bytes(512) + HDF5, "mat"), ("a", bytes(1024) + HDF5, "hdf5"),
         ("a", bytes(2048) + HDF5, "hdf5"), ("a", bytes(256) + HDF5, "csv"), ("a", b"    -1\n    58\n", "uff"),
         ("a", b"\r\n\r\n    -1  \r\n    58", "uff"), ("a", b"   -1\n", "csv"), ("a", b"    -1 2\n", "csv"),
+        ("a", b"\n" * 4090 + b"    -1\n", "uff"), ("a", b"\n" * 4091 + b"    -1\n", "csv"),
         ("a", zipped("a.npy", "b.npy"), "npz"), ("a", zipped("xl/workbook.xml", "b"), "excel"), ("a", b"t,x\n", "csv"),
         ("a.dat", MAT4, "csv"), ("a.mat", b"t,x\n0,1\n", "csv"), ("a.mat", MAT4[:19], "csv"),
         ("a.mat", struct.pack("<5i", 0, 2, 3, 0, 2) + b"xy", "csv"),

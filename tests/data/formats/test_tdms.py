@@ -426,3 +426,23 @@ def test_damaged_file_is_read_or_refused_by_one_error(tmp_path, capfd):
             except ValueError as error:
                 assert "run.tdms" in str(error)
     assert capfd.readouterr() == ("", "") and logging.getLogger("nptdms").level == levels
+
+
+def test_channels_of_groups_have_units_and_share_equal_clocks(tmp_path):
+    """Of equal rates and starts there is one clock, of others each its own."""
+    parts = [
+        channel(X, "x", "g", wf_increment=0.5, unit_string="mm"), channel(X[:9], "y", "g", wf_increment=0.5),
+        channel(X[:5], "x", "h", wf_increment=0.25, NI_UnitDescription="N"), channel(X[:5], "z", "h"),
+        channel(X[:5], "w", "h", wf_increment=0.5, wf_start_offset=1.0, unit_string="A", NI_UnitDescription="V"),
+    ]  # fmt: skip
+    (tmp_path / "run").write_bytes(b"".join(parts))
+    whole = tdms.contents(tmp_path / "run", [])
+    assert (whole.kind, whole.word, whole.remarks, whole.suggested_time) == ("TDMS file", "channel", (), "")
+    assert [(one.group, one.name, one.samples, one.unit) for one in whole.channels] == [
+        ("g", "x", 300, "mm"), ("g", "y", 9, ""), ("h", "x", 5, "N"), ("h", "z", 5, ""), ("h", "w", 5, "A")
+    ]  # fmt: skip
+    first, second, third, fourth, fifth = (one.clock for one in whole.channels)
+    assert first is second and first is not third and fourth is None and first is not fifth
+    assert [(clock.start, clock.step) for clock in (first, third, fifth)] == [(0.0, 0.5), (0.0, 0.25), (1.0, 0.5)]
+    assert all(one.values().tolist() == X[: one.samples].tolist() for one in whole.channels)
+    assert not any(one.refusal or one.remarks for one in whole.channels)

@@ -207,12 +207,19 @@ def test_times_of_several_meanings_are_refused_with_the_formats(cells, reason, h
         (["12.03.26 10:00:00", "12.03.26 10:00:02"], "%d.%m.%y %H:%M:%S", 2.0), (["10h05", "10h06"], "%Hh%M", 60.0),
         (["71 10:00", "72 10:00"], "%j %H:%M", 86_400.0), (["23:59", "00:01"], "%H:%M", 120.0),
         (["2026-03-12 10:00 +0100", "2026-03-12 10:00 +0000"], "%Y-%m-%d %H:%M %z", 3600.0),
+        (["03/12/26 10:00", "03/13/26 10:00"], "%x %H:%M", 86_400.0),
+        (["W05-3 2026", "W05-4 2026"], "W%V-%u %G", 86_400.0),
+        (["Thu Mar 12 10:00:00 2026", "Thu Mar 12 10:00:01 2026"], "%c", 1.0),
+        (["Mar 26", "Apr 26"], "%b %y", 31 * 86_400.0),
+        (["12 1900", "01 1901"], "%m %Y", 31 * 86_400.0), (["18:00 -0500", "20:00 -0500"], "%H:%M %z", 7200.0),
+        (["00:30 +1200", "00:31 +1200"], "%H:%M %z", 60.0),
     ],
 )  # fmt: skip
 def test_dates_in_a_format_that_is_given(cells, form, step):
     values, remark, refusal = text_cells.times(column(*cells), form)
     assert seconds_of(values) == [0.0, step] and refusal == "" and values.dtype.kind in "mM"
-    assert (values.dtype.kind == "m") == ("times of day" in remark) == (not any(c in form for c in "jdy"))
+    assert (values.dtype.kind == "m") == ("times of day" in remark) == (not any(c in form for c in "jdyxcGY"))
+    assert np.isnat(text_cells.times(column(cells[0], None, cells[1]), form)[0]).tolist() == [False, True, False]
     assert text_cells.times(column(*cells), "%S") == text_cells.times(column("x", *cells), form) == (None, "", "")
 
 

@@ -505,6 +505,8 @@ def sets(*heads):
         ([{"id1": "a", "rsp_node": 1}, {"id1": "a"}], ["a", "a"], ["1", ""]),
         ([{"id1": "a"}, {"id1": "a"}, {"id1": "b"}], ["a", "a (2)", "b"], ["", "", ""]),
         ([{"id1": "a"}, {"rsp_node": 2}, {}], ["a", "2", "set 3"], ["", "", ""]),
+        ([{"id1": name, "rsp_node": node} for name, node in (("a", 1), ("b", 2), ("c", 1), ("b", 2), ("a", 1))],
+         ["a", "b", "c", "b (2)", "a (2)"], ["1", "2", "1", "2", "1"]),
     ],
 )  # fmt: skip
 def test_names_are_the_first_lines_and_groups_the_places(heads, names, groups):
@@ -538,3 +540,18 @@ def test_labels_of_units_have_twenty_characters(saved):
     """Of a record in the format I10, 3I5, 2(1X, A20), they are the last ones."""
     path = saved(function(unit="micrometer/second**2"))
     assert [channel.unit for channel in bp.inspect(path).channels] == ["micrometer/second**2"]
+
+
+def test_functions_are_channels_with_units_and_clocks(saved):
+    path = saved(
+        function(title="a", step=0.5), function(title="b", step=0.5, unit="mm", values=SWING[:20]),
+        function(title="c", function=2), function(title="a", node=7, step=0.25, kind=13, unit="N"),
+    )  # fmt: skip
+    whole = uff.contents(path, [])
+    assert (whole.kind, whole.word, whole.remarks) == ("universal file", "channel", ())
+    assert [(one.name, one.samples) for one in whole.channels] == [("a", 50), ("b", 20), ("c", 50), ("a", 50)]
+    assert len({one.label for one in whole.channels if one.name == "a"}) == 2
+    assert [one.unit for one in whole.channels if not one.refusal] == ["m", "mm", "N"]
+    assert [bool(one.refusal) for one in whole.channels] == [False, False, True, False]
+    assert [one.clock.step for one in whole.channels if not one.refusal] == [0.5, 0.5, 0.25]
+    np.testing.assert_allclose(whole.channels[1].values(), SWING[:20], atol=1e-10)

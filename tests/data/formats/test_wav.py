@@ -208,3 +208,42 @@ def test_formats_of_samples(arguments, given, expected, order):
 def test_other_formats_are_refused_with_their_numbers(arguments, given, reason):
     with pytest.raises(ValueError, match=f"^{reason}"):
         form(*arguments, **given)
+
+
+@pytest.mark.parametrize(
+    "kind, bits, channels", [(1, 8, 1), (1, 16, 2), (1, 24, 3), (1, 32, 2), (3, 32, 2), (3, 64, 1)]
+)
+def test_channels_share_the_clock_of_their_rate(tmp_path, kind, bits, channels):
+    """What `wav.contents` returns: samples of all channels in turn, with one remark on their scale."""
+    table = np.transpose([FRACTIONS / 2**k for k in range(channels)])
+    (tmp_path / "run").write_bytes(wav(table, kind, bits, channels=channels, rate=8000))
+    whole = reader.contents(tmp_path / "run", [])
+    given = "as stored" if kind == 3 else "as a fraction of the full scale"
+    remark = f"values are {given}: give the full scale in the unit of the sensor as a factor, units={{'x': 10.0}}"
+    assert (whole.kind, whole.word, whole.remarks, len(whole.channels)) == ("WAV file", "channel", (remark,), channels)
+    for k, channel in enumerate(whole.channels):
+        assert (channel.name, channel.samples, channel.unit) == (f"channel {k + 1}", 6, "")
+        assert channel.values().tolist() == (FRACTIONS / 2**k).tolist()
+        assert channel.clock is whole.channels[0].clock and (channel.clock.start, channel.clock.step) == (0.0, 1 / 8000)
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        (b"RIFX\0\0\0\0WAVX", "it does not begin as a WAV file"),
+        (b"RIFZ\0\0\0\0WAVE", "it does not begin as a WAV file"),
+        (b"RIFF\0\0\0\0WAVE", "it has 0 chunks of samples and no format"),
+        (b"RIFF\0\0\0\0WAVE" + chunk(b"data", b""), "it has 1 chunks of samples and no format"),
+        (wav()[:36], "it has 0 chunks of samples and a format"),
+        (wav()[:40], "it has 0 chunks of samples and a format"),
+        (wav() + wav()[36:], "it has 2 chunks of samples and a format"),
+        (wav(extra=wav()[12:36]), "it has two chunks 'fmt '"), (wav() + wav()[36:-1], "it is cut off"),
+        (wav(data_size=11), "its samples end within one"), (wav()[:-6] + b"\0", "it is cut off"),
+        (wav(data_size=2**32 - 1), "the size of its samples is not stated, as in a file from a pipe; save it anew"),
+        (wav() + b"\0\0\0\1", "it has bytes after its last chunk"),
+    ],
+)  # fmt: skip
+def test_structure_of_other_files_is_named(tmp_path, content, message):
+    (tmp_path / "run").write_bytes(content)
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        reader._structure(tmp_path / "run")
