@@ -109,7 +109,7 @@ def fold_signals(
         "cycles": cycles,
         "averaged": min(size.values()),
         "scatter": {channel: float(np.sqrt(_power(one_cycle[channel][part]))) for channel, part in used.items()},
-        "independent": {channel: min(2 * kept[channel] + 1, size[channel]) for channel in outputs},
+        "independent": {channel: 2 * kept[channel] + 1 for channel in outputs},
         "harmonics": kept,
         "amplitude_variance": {channel: noise[channel].variance[part] for channel, part in used.items()},
         "amplitude_freedom": {channel: noise[channel].freedom[part] for channel, part in used.items()},

@@ -251,7 +251,7 @@ def test_a_frequency_that_leaves_four_times_the_variance_is_refused(ratio, diffe
     two = SimpleNamespace(frequency=1.0 + difference, variances=np.array([ratio, ratio]), each=())
     pace_never = SimpleNamespace(se=1e-3, differs=lambda *_: False)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(folding, "explains_more", lambda *_: True)
+        patch.setattr(folding, "explains_more", lambda *given: given == (one, two))
         if refused:
             with pytest.raises(
                 ValueError, match="^frequency: must be that of the recording, which is estimated as 2 Hz"
@@ -264,7 +264,9 @@ def test_a_frequency_that_leaves_four_times_the_variance_is_refused(ratio, diffe
         else:
             folding._refuse_frequency(one, two, pace_never, 10.0, 2, error)
         with pytest.raises(ValueError, match="^frequency: must be that of the recording"):
-            folding._refuse_frequency(one, two, SimpleNamespace(se=1e-3, differs=lambda *_: True), 10.0, 2, error)
+            compared = (two.frequency - 1.0, 10.0, error)
+            always = SimpleNamespace(se=1e-3, differs=lambda *given: given == compared)
+            folding._refuse_frequency(one, two, always, 10.0, 2, error)
         patch.setattr(folding, "explains_more", lambda *_: False)
         if not refused:
             folding._refuse_frequency(one, two, SimpleNamespace(se=1e-3, differs=lambda *_: True), 10.0, 2, error)
