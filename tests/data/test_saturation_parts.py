@@ -296,3 +296,13 @@ def test_best_of_all_series_is_clearly_better_than_the_mean_period():
         few = Means(means.phase, means.values, means.weights, means.error, order, means.misfit)
         seen = saturation.saturation_of(few)
         assert (seen is not None and seen.order == 3) == known
+
+
+@pytest.mark.parametrize("chunk", [1, 37, 200, 1000])
+def test_intervals_do_not_depend_on_how_many_samples_are_counted_at_once(chunk, monkeypatch):
+    phase = np.sort(np.random.default_rng(1).uniform(-3.0, 20.0, 200))
+    expected = saturation.phase_bins(phase)
+    monkeypatch.setattr(_fourier, "CHUNK", chunk)
+    bins = saturation.phase_bins(phase)
+    assert np.array_equal(bins.place, expected.place) and np.array_equal(bins.count, expected.count)
+    np.testing.assert_allclose(bins.centre, expected.centre, atol=1e-12)
