@@ -253,10 +253,10 @@ def steady_part(every: Windows, driven: bool) -> Steady | None:
     part = part.chosen(slice(first, None))
     enough = len(part.first) >= FEWEST_FOR_CHANGES
     later = changes(components[first:], POSSIBLE, longest) if first and enough else effects
-    squares, slow = effects.squares[first], later if enough else effects
+    squares = effects.squares[first]
     # What noise alone would show is in the variance already.
-    if slow.slow:
-        squares = squares + slow.lasting[0 if enough else first]
+    if later.slow:
+        squares = squares + later.lasting[0 if enough else first]
     by_part = squares.reshape(change.shape[1], -1)
     count = part.amplitudes.shape[2]
     by_harmonic = by_part[:, :count].copy()
