@@ -156,9 +156,7 @@ def _windows_of(
     amplitudes[:, 1:] *= 2.0
     first, last = edges[: count - fine + 1].copy(), stops[fine - 1 :]
     # Whole cycles before the first of many windows of several cycles are in it; its amplitudes are without them.
-    first[0] -= np.count_nonzero(
-        ((time[-1] - time[: first[0]]) * fundamental + 1e-9).astype(int) < int(duration * fundamental)
-    )
+    first[0] -= np.count_nonzero((time[-1] - time[: first[0]]) * fundamental + 1e-9 < int(duration * fundamental))
     slip = jump = np.zeros(len(values))
     if enough.size and per_cycle(time, fundamental) >= SLOW:
         number = np.median(last[enough] - first[enough])
