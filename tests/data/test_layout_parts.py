@@ -208,7 +208,7 @@ def test_round_rates_within_the_error_of_the_step(step, error, said):
 
 
 def test_labels_of_parts_are_compared_with_all_columns_and_the_times():
-    """layout._label"""
+    """layout._label: each has one value per sample."""
     layout_of, contents = made([1, 1, 2, 2])
     columns = {"x": SimpleNamespace(stored=SimpleNamespace(label="x"), values=np.arange(4.0))}
     assert layout._label(layout_of, contents, "t", columns, np.arange(4.0)).tolist() == [1, 1, 2, 2]
@@ -221,7 +221,7 @@ def test_labels_of_parts_are_compared_with_all_columns_and_the_times():
 
 @pytest.mark.parametrize("factor", [np.nan, np.inf, 0.0, np.float64(0.0)])
 def test_factors_of_units_are_finite_numbers_other_than_zero(factor):
-    """units.convert"""
+    """Of units.convert."""
     with pytest.raises(ValueError, match=r"^units\['x'\]: must "):
         units.convert("x", np.ones(2), factor)
     assert units.convert("x", np.ones(2), np.int64(-3)).tolist() == [-3.0, -3.0]
