@@ -266,7 +266,6 @@ def _warn(name: str, pace: Pace, cycles: int, seen: Inspection, estimated: bool)
             f"{name}: the period changes by {-pace.drift:+.2%} over the {cycles} cycles used (of {total}). The mean "
             "period and its frequency assume a constant one, and their stated errors do not contain the change; select "
             "a steadier part with `between`.",
-            UserWarning,
             stacklevel=4,
         )
     elif pace.wander:
@@ -281,7 +280,6 @@ def _warn(name: str, pace: Pace, cycles: int, seen: Inspection, estimated: bool)
                 else "The mean period assumes a constant frequency: its higher harmonics are smeared. Fold shorter "
                 "parts with `between`, or measure with a steadier drive or clock."
             ),
-            UserWarning,
             stacklevel=4,
         )
     elif cycles <= total // 2:
@@ -291,7 +289,6 @@ def _warn(name: str, pace: Pace, cycles: int, seen: Inspection, estimated: bool)
             f"{name}: only {which}{cycles} of {total} cycles are used, because {others} differ from them: a long "
             "transient, a drift, or several records in one. Check the recording, and select a part with `between` or "
             "`split`.",
-            UserWarning,
             stacklevel=4,
         )
 

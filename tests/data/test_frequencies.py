@@ -182,9 +182,9 @@ def test_normal_equation_weighs_channels_by_their_residual_variances():
     """normal_equation: 1/variance, at most 1e24 over the power of the signal; no weight of what is not counted."""
     time = np.arange(400) / 10.0
     noise = 0.1 * np.random.default_rng(1).standard_normal(400)
-    values = np.stack([7.0 + 2.0 * np.cos(2 * np.pi * time), 3.0 * np.sin(2 * np.pi * time) + noise])
+    values = np.stack([7.0 + 3.0 * np.cos(2 * np.pi * time), 3.0 * np.sin(2 * np.pi * time) + noise])
     fit, clear, weights, gradient, information = harmonics.normal_equation(time, values, 1.0, 2)
-    assert weights == pytest.approx([1e24 / 2.0, 1.0 / fit.variances[1]], rel=1e-6)
+    assert weights == pytest.approx([1e24 / 4.5, 1.0 / fit.variances[1]], rel=1e-6)
     np.testing.assert_array_equal(clear, harmonics._clear(fit))
     assert (gradient, information) == harmonics._slopes(time, fit, clear, weights)
     counted = harmonics.normal_equation(time, values, 1.0, 2, np.array([0.0, 1.0]))
