@@ -15,12 +15,6 @@ def test_runs_are_those_of_a_loop(seed):
     assert [one.tolist() for one in faults.runs(values[:1])] == [[0], [1]]
 
 
-def wrapped(steps, turn=1.0, start=0.02):
-    """Return values from their steps, within one turn."""
-    whole = start + np.concatenate([[0.0], np.cumsum(steps)])
-    return whole % turn
-
-
 def _by_definition(values, turn, step):
     """Return whether values wrap at a turn."""
     change = np.diff(values)
@@ -38,10 +32,11 @@ def _by_definition(values, turn, step):
 @pytest.mark.parametrize("turn", [2.0 * np.pi, 360.0, 1.0])
 @pytest.mark.parametrize("seed", range(30))
 def test_wraps_are_those_of_their_definition(turn, seed):
-    """wrap_of: random walks, slow and fast, of which some jump by other steps than a turn."""
+    """wrap_of: slow motions with noise about an end of the range, of which some jump by other steps than a turn."""
     generator = np.random.default_rng(seed)
-    steps = generator.uniform(0.005, 0.2) * (generator.standard_normal(200) + generator.choice([0.0, 1.0]))
-    values = wrapped(steps) * generator.choice([1.0, 1.0, 0.97, 0.93, 0.91])
+    slow, fast = generator.uniform(0.05, 0.4), generator.uniform(0.01, 0.2)
+    whole = slow * np.sin(np.arange(200) / 15.0) + fast * generator.standard_normal(200)
+    values = whole % 1.0 * generator.choice([1.0, 1.0, 0.97, 0.91, 0.89])
     if seed % 3 == 0:
         values[generator.integers(0, 200, 3)] = generator.choice([0.0, 1.0], 3)
     found, jumps = faults.wrap_of(turn * values, 0.0)
