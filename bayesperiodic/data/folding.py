@@ -200,12 +200,13 @@ def automatic_periods(groups: list[Signals], frequency: float | None) -> "tuple[
         time = even_times(driven.time, driven.values, tracked)
         highest = resolved_harmonics(time, tracked, time.size)
         drive = refine_frequency(time, driven.values, tracked, highest)[0].frequency
-    each = [_response_period(group, drive) for group in groups]
-    for chosen, evidence in each:
+    each = []
+    for group in groups:
+        chosen, evidence = _response_period(group, drive)
         if chosen is None:
             raise aperiodic(first.name, drive, evidence)
-    chosen, evidence = max(each, key=lambda one: one[0] or 0)
-    return math.lcm(*(one or 1 for one, _ in each)), evidence
+        each.append((chosen, evidence))
+    return math.lcm(*(chosen for chosen, _ in each)), max(each, key=lambda one: one[0])[1]
 
 
 def _response_period(signals: Signals, drive: float) -> "tuple[int | None, pd.DataFrame]":

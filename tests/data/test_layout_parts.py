@@ -294,3 +294,25 @@ def test_spellings_of_one_unit(one, other, same):
     assert (
         units._spelled(" Volts ") == "V" and units._spelled("m/s2") == "m/s**2" and units._spelled("kNmm") == "(kN*mm)"
     )
+
+
+@pytest.mark.parametrize(
+    "stored, given, unit, factor",
+    [("mm", {}, "m", 1e-3), ("mm", {"x": "mm"}, "mm", 1.0), ("mm", {"x": 2.0}, None, 2.0), ("", {}, None, 1.0),
+     ("", {"x": ("mm", "m")}, "m", 1e-3), ("mm", {"time": 60.0}, "m", 1e-3)],
+)  # fmt: skip
+@pytest.mark.parametrize("split", [None, "step"])
+def test_recordings_and_their_parts_have_the_units_of_their_values(stored, given, unit, factor, split):
+    """layout.recordings: of each channel by its own name."""
+    channels = [StoredChannel(name, 4, lambda: np.arange(4.0), "", stored if name == "x" else "") for name in "xty"]
+    channels.append(StoredChannel("step", 4, lambda: np.array([1, 1, 2, 2])))
+    made_of = Layout("run.x", {"x": "x"}, {"u": "y"}, "t", None, given, None)
+    contents = Contents("a file", tuple(channels))
+    seen = layout.recordings(lambda *fields, units: (*fields, units), made_of, contents, split, "r")
+    parts = [seen] if split is None else seen
+    names = ["r"] if split is None else ["r 1: step 1", "r 2: step 2"]
+    assert [part[3] for part in parts] == names
+    assert [part[4] for part in parts] == [{"x": unit} if unit else {}] * len(parts)
+    np.testing.assert_allclose(np.concatenate([part[1]["x"] for part in parts]), factor * np.arange(4.0))
+    np.testing.assert_allclose(np.concatenate([part[2]["u"] for part in parts]), np.arange(4.0))
+    np.testing.assert_allclose(np.concatenate([part[0] for part in parts]), given.get("time", 1.0) * np.arange(4.0))

@@ -306,3 +306,44 @@ def test_intervals_do_not_depend_on_how_many_samples_are_counted_at_once(chunk, 
     bins = saturation.phase_bins(phase)
     assert np.array_equal(bins.place, expected.place) and np.array_equal(bins.count, expected.count)
     np.testing.assert_allclose(bins.centre, expected.centre, atol=1e-12)
+
+
+@pytest.mark.parametrize("size, step", [(0.0, 0.0), (0.0, 0.3), (1e-13, 0.0), (0.2, 0.1)])
+def test_means_of_intervals_that_have_samples(size, step):
+    """means_of: of 0.6 of the cycle; without noise errors are a thousandth of the means, and of rounding alone."""
+    generator = np.random.default_rng(2)
+    phase = np.sort(np.floor(40 * generator.uniform(0.0, 1.0, 900)) + generator.uniform(0.0, 0.6, 900))
+    bins = saturation.phase_bins(phase)
+    wave = np.array([0.5, 1.0 - 0.3j, 0.2j])
+    residuals = size * generator.standard_normal(900)
+    means = saturation.means_of(bins, residuals, wave, step)
+    number = bins.centre.size
+    some = [k for k in range(number) if np.any(bins.place % number == k)]
+    each = [residuals[bins.place % number == k] for k in some]
+    assert len(some) < number and np.array_equal(means.phase, bins.centre[some])
+    turned = np.real(np.exp(2j * np.pi * np.outer(means.phase, np.arange(3))) @ wave)
+    np.testing.assert_allclose(means.values, turned + [one.mean() for one in each], atol=1e-12)
+    variance = sum(np.sum((one - one.mean()) ** 2) for one in each) / (900 - len(some))
+    exact = (1e-3 * means.values.std()) ** 2 + step**2 / 12.0
+    both = [k for k in range(number) if np.all(bins.count[:, k])]
+    half = [0.5 * (residuals[bins.place == k + number].mean() - residuals[bins.place == k].mean()) for k in both]
+    power = np.abs(np.exp(-2j * np.pi * np.outer(np.arange(1, 9), bins.centre[both])) @ half) ** 2
+    usual = 0.25 * variance * np.sum(1.0 / bins.count[:, both])
+    slower = max(power.mean() / usual, 1.0) if size else 1.0
+    np.testing.assert_allclose(1.0 / means.weights, slower * variance / [one.size for one in each] + exact, rtol=1e-6)
+    least = 1e-9 * np.abs(means.values).max()
+    assert means.error == pytest.approx(max(np.sqrt(variance), least) / 30.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("beyond, order", [(0, 2), (1, 3)])
+def test_order_counts_harmonics_whose_power_is_more_than_their_parameters(beyond, order):
+    """means_of: of a third harmonic whose χ² is above or below 2 + 2 ln n, beside two clear ones."""
+    phase = np.arange(4000) / 40.0 + 1e-6
+    bins, residuals = saturation.phase_bins(phase), 0.1 * np.resize([1.0, -1.0, -1.0, 1.0, 1.0, -1.0, 1.0], 4000)
+    wave = np.array([0.5, 1.0, 0.5j, 0.0])
+    first = saturation.means_of(bins, residuals, wave, 0.0)
+    needed = 2.0 + 2.0 * np.log(first.weights.size)
+    wave[3] = np.sqrt(2.0 * (needed + (0.5 if beyond else -0.5)) / first.weights.sum())
+    assert saturation.means_of(bins, residuals, wave, 0.0).order == order == 2 + beyond
+    rest = first.values - _fourier.at_times(wave[None, :3], first.phase)[0]
+    assert first.misfit == pytest.approx(first.weights @ rest**2 + 5.0 * np.log(first.weights.size))
