@@ -166,3 +166,12 @@ def test_single_runs_are_kept_and_repeated_ones_are_not(distance, left):
     # Neighbouring samples belong to one run, which is kept as a whole.
     both = np.sort(np.append(many, [60, 61]))
     assert faults.single(both, phase).tolist() == sorted([*left, 60, 61])
+
+
+@pytest.mark.parametrize("count, kept", [(15, True), (14, False)])
+def test_many_single_runs_are_kept_in_few_cycles(count, kept):
+    """single: of 1.5 cycles, each run is in one; three times the share n/1.5·3/64 expected by chance is twice of it."""
+    assert (1.0 / 1.5 < 0.5 * 3.0 * count / 1.5 * 3.0 / 64.0) == kept
+    phase = np.linspace(0.0, 1.5, 6000)
+    samples = np.searchsorted(phase, np.arange(count) * 0.06 + 0.001)
+    assert faults.single(samples, phase).tolist() == samples.tolist() * kept
