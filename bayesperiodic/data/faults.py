@@ -123,7 +123,7 @@ def brief_of(values: np.ndarray, step: float) -> np.ndarray:
     pairs. Runs at the largest and smallest value are clipped, if anything. Signals without noise have none.
     """
     first, length = runs(values)
-    if length.size < 2 or length.max() < FEWEST_HELD:
+    if length.max() < FEWEST_HELD:
         return NO_SAMPLES
     noise, step = fast_noise(values), step or _spacing(values[first])
     if not noise > max(NO_NOISE * float(np.ptp(values)), 0.5 * step):

@@ -109,7 +109,7 @@ def fold_signals(
         "cycles": cycles,
         "averaged": min(size.values()),
         "scatter": {channel: float(np.sqrt(_power(one_cycle[channel][part]))) for channel, part in used.items()},
-        "independent": {channel: min(2 * kept[channel] + 1, size[channel]) for channel in outputs},
+        "independent": {channel: 2 * kept[channel] + 1 for channel in outputs},
         "harmonics": kept,
         "amplitude_variance": {channel: noise[channel].variance[part] for channel, part in used.items()},
         "amplitude_freedom": {channel: noise[channel].freedom[part] for channel, part in used.items()},
@@ -200,12 +200,13 @@ def automatic_periods(groups: list[Signals], frequency: float | None) -> "tuple[
         time = even_times(driven.time, driven.values, tracked)
         highest = resolved_harmonics(time, tracked, time.size)
         drive = refine_frequency(time, driven.values, tracked, highest)[0].frequency
-    each = [_response_period(group, drive) for group in groups]
-    for chosen, evidence in each:
+    each = []
+    for group in groups:
+        chosen, evidence = _response_period(group, drive)
         if chosen is None:
             raise aperiodic(first.name, drive, evidence)
-    chosen, evidence = max(each, key=lambda one: one[0] or 0)
-    return math.lcm(*(one or 1 for one, _ in each)), evidence
+        each.append((chosen, evidence))
+    return math.lcm(*(chosen for chosen, _ in each)), max(each, key=lambda one: one[0])[1]
 
 
 def _response_period(signals: Signals, drive: float) -> "tuple[int | None, pd.DataFrame]":
@@ -266,7 +267,6 @@ def _warn(name: str, pace: Pace, cycles: int, seen: Inspection, estimated: bool)
             f"{name}: the period changes by {-pace.drift:+.2%} over the {cycles} cycles used (of {total}). The mean "
             "period and its frequency assume a constant one, and their stated errors do not contain the change; select "
             "a steadier part with `between`.",
-            UserWarning,
             stacklevel=4,
         )
     elif pace.wander:
@@ -281,7 +281,6 @@ def _warn(name: str, pace: Pace, cycles: int, seen: Inspection, estimated: bool)
                 else "The mean period assumes a constant frequency: its higher harmonics are smeared. Fold shorter "
                 "parts with `between`, or measure with a steadier drive or clock."
             ),
-            UserWarning,
             stacklevel=4,
         )
     elif cycles <= total // 2:
@@ -291,7 +290,6 @@ def _warn(name: str, pace: Pace, cycles: int, seen: Inspection, estimated: bool)
             f"{name}: only {which}{cycles} of {total} cycles are used, because {others} differ from them: a long "
             "transient, a drift, or several records in one. Check the recording, and select a part with `between` or "
             "`split`.",
-            UserWarning,
             stacklevel=4,
         )
 

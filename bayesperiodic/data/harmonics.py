@@ -258,7 +258,7 @@ def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
     from scipy.fft import next_fast_len
 
     samples = time.size
-    lags = min(samples // 3 + 2, samples)
+    lags = samples // 3 + 2
     length = next_fast_len(samples + lags, real=True)
     step = (time[-1] - time[0]) / (samples - 1)
     correlation = np.zeros(lags)

@@ -182,9 +182,8 @@ def saturation_of(means: Means) -> Saturation | None:
         count = int(share * rank.size)
         ends = np.zeros((2, rank.size), dtype=bool)
         ends[0, rank[:count]] = ends[1, rank[rank.size - count :]] = True
-        for i in (0, 1):
-            if not _level(means, ends[i]):
-                ends[i] = False
+        for end in ends:
+            end &= _level(means, end)
         if not ends.any():
             continue
         for harmonics in SERIES:

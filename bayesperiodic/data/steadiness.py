@@ -28,8 +28,8 @@ SMALL_RANGE, NOISE_RANGE = 0.08, 14.0
 LEAST_LEVEL = 0.5
 # Largest distance of a window from the middle of the steady part, relative to usual ones, in harmonics and mean value.
 DISTANT, DISTANT_MEAN = 3.0, 12.0
-# Windows, in cycles, from which the median of their distances is taken, the largest one of fewer.
-FEWEST_FOR_MEDIAN = 9
+# Windows, in cycles, of whose middle half the median distance is taken, the largest one of fewer.
+FEWEST_FOR_MEDIAN = 18
 # Windows from which changes are searched for, and false-alarm rate of a significant slope.
 FEWEST_FOR_CHANGES, SLOPE_FALSE_ALARM = 5, 1e-4
 # Probability of a transient from which the start is left out; more than half of the cycles are left out, and those of
@@ -156,9 +156,7 @@ def _windows_of(
     amplitudes[:, 1:] *= 2.0
     first, last = edges[: count - fine + 1].copy(), stops[fine - 1 :]
     # Whole cycles before the first of many windows of several cycles are in it; its amplitudes are without them.
-    first[0] -= np.count_nonzero(
-        ((time[-1] - time[: first[0]]) * fundamental + 1e-9).astype(int) < int(duration * fundamental)
-    )
+    first[0] -= np.count_nonzero((time[-1] - time[: first[0]]) * fundamental + 1e-9 < int(duration * fundamental))
     slip = jump = np.zeros(len(values))
     if enough.size and per_cycle(time, fundamental) >= SLOW:
         number = np.median(last[enough] - first[enough])
@@ -253,10 +251,10 @@ def steady_part(every: Windows, driven: bool) -> Steady | None:
     part = part.chosen(slice(first, None))
     enough = len(part.first) >= FEWEST_FOR_CHANGES
     later = changes(components[first:], POSSIBLE, longest) if first and enough else effects
-    squares, slow = effects.squares[first], later if enough else effects
+    squares = effects.squares[first]
     # What noise alone would show is in the variance already.
-    if slow.slow:
-        squares = squares + slow.lasting[0 if enough else first]
+    if later.slow:
+        squares = squares + later.lasting[0 if enough else first]
     by_part = squares.reshape(change.shape[1], -1)
     count = part.amplitudes.shape[2]
     by_harmonic = by_part[:, :count].copy()
@@ -343,7 +341,7 @@ def _trimmed(part: Windows, usual: Callable[..., Any] | None = None) -> tuple[in
     middle = np.median(shape[inner].real, axis=0) + 1j * np.median(shape[inner].imag, axis=0)
     away, near = np.abs(shape - middle) ** 2, np.ones(count, dtype=bool)
     # The median of few windows is one of them in every component, and the median distance from it is no scale.
-    usual = usual or (np.max if count // 2 < FEWEST_FOR_MEDIAN * reach else np.median)
+    usual = usual or (np.max if count < FEWEST_FOR_MEDIAN * reach else np.median)
     for squares, factor in ((away[:, :, 1:].sum(axis=2), DISTANT), (away[:, :, 0], DISTANT_MEAN)):
         distance = np.sqrt(squares)
         near &= (distance <= factor * usual(distance[inner], axis=0) + part.slip + SMALLEST_DISTANCE).all(axis=1)

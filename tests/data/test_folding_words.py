@@ -1,6 +1,7 @@
 """Refusals and warnings of folding, with the numbers in them, and small rules of it."""
 
 import re
+import sys
 import warnings
 from types import SimpleNamespace
 
@@ -61,6 +62,23 @@ def test_drifts_and_wandering_phases_are_warned_of_with_their_size():
     assert "The mean period follows the phase, and the standard error of the frequency contains its random walk" in text
     for other in (warned(followed, 40, seen(), False), warned(followed, 40, seen(inputs=1))):
         assert "smeared" in other[0]
+
+
+@pytest.mark.parametrize(
+    "pace, cycles", [(Pace(1e-4, 10, 0.012, True), 90), (Pace(1e-4, 10, 0.0, False, 0.05), 90), (STEADY, 40)]
+)
+def test_warnings_are_those_of_the_line_that_folds(pace, cycles):
+    """Of a method that calls `fold_signals`, which calls `_warn`."""
+
+    def fold_signals():
+        folding._warn("run", pace, cycles, seen(), True)
+
+    def fold():
+        fold_signals()
+
+    with pytest.warns(UserWarning, match="^run: ") as raised:
+        _, line = fold(), sys._getframe().f_lineno
+    assert [(one.filename, one.lineno, one.category) for one in raised] == [(__file__, line, UserWarning)]
 
 
 def test_growth_of_amplitudes_is_the_slope_of_a_straight_line():
@@ -251,7 +269,7 @@ def test_a_frequency_that_leaves_four_times_the_variance_is_refused(ratio, diffe
     two = SimpleNamespace(frequency=1.0 + difference, variances=np.array([ratio, ratio]), each=())
     pace_never = SimpleNamespace(se=1e-3, differs=lambda *_: False)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(folding, "explains_more", lambda *_: True)
+        patch.setattr(folding, "explains_more", lambda *given: given == (one, two))
         if refused:
             with pytest.raises(
                 ValueError, match="^frequency: must be that of the recording, which is estimated as 2 Hz"
@@ -264,7 +282,9 @@ def test_a_frequency_that_leaves_four_times_the_variance_is_refused(ratio, diffe
         else:
             folding._refuse_frequency(one, two, pace_never, 10.0, 2, error)
         with pytest.raises(ValueError, match="^frequency: must be that of the recording"):
-            folding._refuse_frequency(one, two, SimpleNamespace(se=1e-3, differs=lambda *_: True), 10.0, 2, error)
+            compared = (two.frequency - 1.0, 10.0, error)
+            always = SimpleNamespace(se=1e-3, differs=lambda *given: given == compared)
+            folding._refuse_frequency(one, two, always, 10.0, 2, error)
         patch.setattr(folding, "explains_more", lambda *_: False)
         if not refused:
             folding._refuse_frequency(one, two, SimpleNamespace(se=1e-3, differs=lambda *_: True), 10.0, 2, error)

@@ -79,3 +79,45 @@ def test_harmonics_of_repeated_errors_are_not_kept():
         for tau, y, recorded in (ten_tones(100, 0.0, seed) for seed in range(20))
     ]
     assert kept.count(10) >= 18
+
+
+@pytest.mark.parametrize("away, step", [(0.0099, 0.5), (0.0101, 0.0), (-0.0099, 0.5), (-0.0101, 0.0)])
+def test_levels_are_multiples_of_the_step_up_to_a_hundredth(away, step):
+    """step_of: eight levels at least; the step is the smallest difference, of the first hundred thousand values."""
+    values = 0.5 * np.array([7.0, 0.0, 1.0, 3.0, 4.0, 9.0, 12.0, 20.0 + away])
+    assert step_of(values) == pytest.approx(step) and step_of(values[:-1]) == 0.0
+    assert step_of(values[:-1], fewest=7) == 0.5
+    long = np.concatenate([np.resize(values, 100_000), [0.123]])
+    assert step_of(long) == pytest.approx(step) and step_of(long[1:]) == 0.0
+
+
+@pytest.mark.parametrize("cycles", [5, 20])
+@pytest.mark.parametrize("wrong", [1, 3])
+def test_changes_of_two_levels_are_moved_by_noise(cycles, wrong):
+    """rounded_step: more than 1.5 changes in order of phase for each one in a cycle.
+
+    A lone wrong sample of many cycles with two changes each makes two more. Three levels are rounded in any case.
+    """
+    phase = np.arange(cycles * 40) / 40.0 + 1e-6
+    values = np.where(phase % 1.0 < 0.5, 1.0, -1.0)
+    assert rounded_step(values, phase) == 0.0
+    values[[5 + 7 * k for k in range(wrong)]] = -1.0
+    assert rounded_step(values, phase) == 2.0
+    values[2] = 3.0
+    assert rounded_step(values, phase) == 2.0
+
+
+@pytest.mark.parametrize("scatter, residual", [(0.04, None), (None, 0.12)])
+def test_errors_that_repeat_are_independent_between_levels_and_phases(scatter, residual):
+    """repeated_variance: of the fewer of the phases and of the steps that the mean period passes, at least one."""
+    given = {"scatter": scatter} if residual is None else {"residual": residual}
+    one = repeated_variance(1.0, np.zeros(4), 9, **given)
+    assert one > 0.0 and repeated_variance(1.0, np.array([0.0, 0.4]), 9, **given) == pytest.approx(one)
+    assert repeated_variance(1.0, np.array([0.0, 3.0, 1.0]), 9, **given) == pytest.approx(one / 6)
+    assert repeated_variance(1.0, np.array([0.0, 3.0, 1.0]), 5, **given) == pytest.approx(one / 5)
+    large = {name: 9.0 * value for name, value in given.items()}
+    assert repeated_variance(3.0, 3.0 * np.array([0.0, 3.0, 1.0]), 9, **large) == pytest.approx(9.0 * one / 6)
+    beyond = {name: 1.2 for name in given}
+    assert repeated_variance(1.0, np.zeros(4), 9, **beyond) == 0.0
+    assert repeated_variance(1.0, np.zeros(4), 9, scatter=0.0) == pytest.approx(1.0 / 12.0, rel=1e-3)
+    assert repeated_variance(1.0, np.zeros(4), 9) == pytest.approx(1.0 / 12.0, rel=1e-3)

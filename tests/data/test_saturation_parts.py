@@ -184,3 +184,166 @@ def test_sensors_cut_few_harmonics_by_little_at_no_zero(changes, sensor):
     flat = np.zeros((2, 6), dtype=bool)
     flat[1, 3] = True
     assert seen(flat, values, beyond, **changes).like_a_sensor == sensor
+
+
+@pytest.mark.parametrize("chi, level", [(29.9, True), (30.1, False)])
+@pytest.mark.parametrize("count", [2, 10])
+def test_means_are_level_up_to_thirty_for_each(chi, level, count):
+    """saturation._level: their weighted squares about the weighted mean; one interval is no level."""
+    values = np.resize([0.0, 1.0], count)
+    weights = np.resize([1.0, 3.0], count)
+    weights *= chi * count / (weights @ (values - np.average(values, weights=weights)) ** 2)
+    inside = np.arange(40) >= 40 - count
+    other = np.arange(40.0 - count)
+    means = Means(np.arange(40) / 40, np.append(other, values), np.append(other + 1.0, weights), 0.1, 3, 0.0)
+    assert saturation._level(means, inside) == level
+    assert not saturation._level(means, np.arange(40) == 39) and not saturation._level(means, np.arange(40) > 40)
+
+
+def searched(count=64, low=None, high=0.6, noise=0.001, share=0.1, misfit=1.0):
+    """Return means of a cosine that levels cut with noise of known weight, its basis, and first flat tops."""
+    phase = np.arange(count) / count
+    basis = np.column_stack([np.ones(count), np.cos(2 * np.pi * phase), np.sin(2 * np.pi * phase)])
+    series = 0.1 + np.cos(2 * np.pi * phase + 0.3)
+    values = np.clip(series, low, high) + noise * np.resize([1.0, -1.0, -1.0, 1.0, 1.0], count)
+    weights = (1.0 + 0.5 * np.cos(np.arange(count))) / (misfit * noise) ** 2
+    rank = np.argsort(values)
+    ends = np.zeros((2, count), dtype=bool)
+    ends[0, rank[: int(share * count)]] = low is not None
+    ends[1, rank[count - int(share * count) :]] = high is not None
+    return Means(phase, values, weights, 0.1, 9, 0.0), basis, ends, series
+
+
+@pytest.mark.parametrize("low, high", [(None, 0.6), (-0.4, None), (-0.4, 0.6)])
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_search_for_levels_ends_at_weighted_least_squares_of_the_others(low, high, share):
+    """saturation._saturated: each end is where the series exceeds the weighted mean of the values there."""
+    means, basis, ends, series = searched(low=low, high=high, share=share)
+    given = ends.copy()
+    seen = saturation._saturated(means, basis, ends)
+    assert np.array_equal(ends, given)
+    free = ~seen.flat.any(axis=0)
+    root = np.sqrt(means.weights[free])
+    size = np.linalg.lstsq(basis[free] * root[:, None], means.values[free] * root, rcond=None)[0]
+    np.testing.assert_allclose(seen.beyond, basis @ size, rtol=1e-9)
+    np.testing.assert_allclose(seen.beyond, series, atol=0.02)
+    levels = [
+        np.average(means.values[end], weights=means.weights[end]) if limit is not None else infinite
+        for end, limit, infinite in zip(seen.flat, (low, high), (-np.inf, np.inf), strict=True)
+    ]
+    assert [seen.low, seen.high] == pytest.approx(levels)
+    assert np.array_equal(seen.flat, [seen.beyond < seen.low, seen.beyond > seen.high])
+    model = np.minimum(np.maximum(seen.beyond, seen.low), seen.high)
+    np.testing.assert_allclose(seen.excess, seen.beyond - model, atol=1e-12)
+    parameters = 3 + 2 * (low is not None) + 2 * (high is not None)
+    square = np.sum(means.weights * (means.values - model) ** 2)
+    assert seen.misfit == pytest.approx(square + parameters * np.log(64)) and seen.order == 1
+    assert seen.phase is means.phase
+
+
+@pytest.mark.parametrize("factor, good", [(1.02, True), (0.98, False)])
+@pytest.mark.parametrize("low, parameters", [(None, 5), (-0.4, 7)])
+def test_a_saturated_series_fits_up_to_four_standard_deviations(factor, good, low, parameters):
+    """saturation._saturated: χ² at most f + 4 √(2 f) for f values beyond the parameters."""
+    means, basis, ends, _ = searched(low=low)
+    seen = saturation._saturated(means, basis, ends)
+    square = seen.misfit - parameters * np.log(64)
+    freedom = 64 - parameters
+    scale = (freedom + 4.0 * np.sqrt(2.0 * freedom)) / square / factor
+    other = Means(means.phase, means.values, scale * means.weights, 0.1, 9, 0.0)
+    assert (saturation._saturated(other, basis, ends) is not None) == good
+
+
+def test_a_series_needs_twice_as_many_free_means_as_unknowns_and_all_phases():
+    """saturation._saturated: six of them here; without free ones about half of the cycle the series is not known."""
+    means, basis, ends, _ = searched(count=20, high=0.6)
+    for free, known in ((6, True), (5, False)):
+        most = np.zeros((2, 20), dtype=bool)
+        most[1] = np.arange(20) >= free
+        calls = []
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(saturation, "MOST_SEARCHES", 1)
+            patch.setattr(saturation, "LARGEST_SERIES_CONDITION", 1e12)
+            patch.setattr(np.linalg, "eigvalsh", lambda m, c=calls: c.append(m) or np.ones(3))
+            saturation._saturated(means, basis, most)
+        assert bool(calls) == known
+    # The condition number of the normal equations is 1e4 at most.
+    for largest, known in ((0.99e4, True), (1.01e4, False)):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(np.linalg, "eigvalsh", lambda _, largest=largest: np.array([1.0, 5.0, largest]))
+            assert (saturation._saturated(means, basis, ends) is not None) == known
+
+
+def test_a_search_that_finds_no_level_has_no_series():
+    """saturation._saturated: the first flat tops are above all of the series, and then there are none."""
+    phase = np.arange(64) / 64
+    basis = np.column_stack([np.ones(64), np.cos(2 * np.pi * phase), np.sin(2 * np.pi * phase)])
+    means = Means(phase, np.where(np.arange(64) < 2, 3.0, basis[:, 1]), np.ones(64), 0.1, 9, 0.0)
+    ends = np.zeros((2, 64), dtype=bool)
+    ends[1, :2] = True  # a level of 3 that the series does not reach
+    assert saturation._saturated(means, basis, ends) is None
+
+
+def test_best_of_all_series_is_clearly_better_than_the_mean_period():
+    """saturation_of: by 25 of χ², parameters included."""
+    means, _ = cut(0.6, harmonics=3)
+    best = saturation.saturation_of(means)
+    for margin, known in ((25.1, True), (24.9, False)):
+        other = Means(means.phase, means.values, means.weights, means.error, 39, best.misfit + margin)
+        assert (saturation.saturation_of(other) is not None) == known
+    # Only series of fewer harmonics than the mean period.
+    for order, known in ((3, False), (4, True)):
+        few = Means(means.phase, means.values, means.weights, means.error, order, means.misfit)
+        seen = saturation.saturation_of(few)
+        assert (seen is not None and seen.order == 3) == known
+
+
+@pytest.mark.parametrize("chunk", [1, 37, 200, 1000])
+def test_intervals_do_not_depend_on_how_many_samples_are_counted_at_once(chunk, monkeypatch):
+    phase = np.sort(np.random.default_rng(1).uniform(-3.0, 20.0, 200))
+    expected = saturation.phase_bins(phase)
+    monkeypatch.setattr(_fourier, "CHUNK", chunk)
+    bins = saturation.phase_bins(phase)
+    assert np.array_equal(bins.place, expected.place) and np.array_equal(bins.count, expected.count)
+    np.testing.assert_allclose(bins.centre, expected.centre, atol=1e-12)
+
+
+@pytest.mark.parametrize("size, step", [(0.0, 0.0), (0.0, 0.3), (1e-13, 0.0), (0.2, 0.1)])
+def test_means_of_intervals_that_have_samples(size, step):
+    """means_of: of 0.6 of the cycle; without noise errors are a thousandth of the means, and of rounding alone."""
+    generator = np.random.default_rng(2)
+    phase = np.sort(np.floor(40 * generator.uniform(0.0, 1.0, 900)) + generator.uniform(0.0, 0.6, 900))
+    bins = saturation.phase_bins(phase)
+    wave = np.array([0.5, 1.0 - 0.3j, 0.2j])
+    residuals = size * generator.standard_normal(900)
+    means = saturation.means_of(bins, residuals, wave, step)
+    number = bins.centre.size
+    some = [k for k in range(number) if np.any(bins.place % number == k)]
+    each = [residuals[bins.place % number == k] for k in some]
+    assert len(some) < number and np.array_equal(means.phase, bins.centre[some])
+    turned = np.real(np.exp(2j * np.pi * np.outer(means.phase, np.arange(3))) @ wave)
+    np.testing.assert_allclose(means.values, turned + [one.mean() for one in each], atol=1e-12)
+    variance = sum(np.sum((one - one.mean()) ** 2) for one in each) / (900 - len(some))
+    exact = (1e-3 * means.values.std()) ** 2 + step**2 / 12.0
+    both = [k for k in range(number) if np.all(bins.count[:, k])]
+    half = [0.5 * (residuals[bins.place == k + number].mean() - residuals[bins.place == k].mean()) for k in both]
+    power = np.abs(np.exp(-2j * np.pi * np.outer(np.arange(1, 9), bins.centre[both])) @ half) ** 2
+    usual = 0.25 * variance * np.sum(1.0 / bins.count[:, both])
+    slower = max(power.mean() / usual, 1.0) if size else 1.0
+    np.testing.assert_allclose(1.0 / means.weights, slower * variance / [one.size for one in each] + exact, rtol=1e-6)
+    least = 1e-9 * np.abs(means.values).max()
+    assert means.error == pytest.approx(max(np.sqrt(variance), least) / 30.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("beyond, order", [(0, 2), (1, 3)])
+def test_order_counts_harmonics_whose_power_is_more_than_their_parameters(beyond, order):
+    """means_of: of a third harmonic whose χ² is above or below 2 + 2 ln n, beside two clear ones."""
+    phase = np.arange(4000) / 40.0 + 1e-6
+    bins, residuals = saturation.phase_bins(phase), 0.1 * np.resize([1.0, -1.0, -1.0, 1.0, 1.0, -1.0, 1.0], 4000)
+    wave = np.array([0.5, 1.0, 0.5j, 0.0])
+    first = saturation.means_of(bins, residuals, wave, 0.0)
+    needed = 2.0 + 2.0 * np.log(first.weights.size)
+    wave[3] = np.sqrt(2.0 * (needed + (0.5 if beyond else -0.5)) / first.weights.sum())
+    assert saturation.means_of(bins, residuals, wave, 0.0).order == order == 2 + beyond
+    rest = first.values - _fourier.at_times(wave[None, :3], first.phase)[0]
+    assert first.misfit == pytest.approx(first.weights @ rest**2 + 5.0 * np.log(first.weights.size))
