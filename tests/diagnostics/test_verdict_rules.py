@@ -136,6 +136,14 @@ def test_a_valley_is_deep_below_seven_tenths_of_the_lower_peak(size):
     assert has_other_mode(exact(draws(limit + 0.06), size), 0.0)
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("place", [4.5, 6.0, 7.5])
+def test_a_point_in_an_empty_valley_is_separated_from_the_modes_on_both_sides(side, place):
+    """The smaller mode, at 12, has 4 %; the larger one, at 0, is beyond the valley for each point within it."""
+    draws = side * np.concatenate([0.5 * NORMAL[:7680], 12.0 + 0.5 * NORMAL[:320]])
+    assert has_other_mode(exact(draws), side * place)
+
+
 def test_a_constant_has_no_other_mode():
     assert has_other_mode(exact(np.full(800, 3.0)), 3.0) is False
 
