@@ -64,7 +64,11 @@ def test_unknown_shapes_of_the_spectrum_add_what_their_mixtures_do(monkeypatch):
 
     monkeypatch.setattr(covariance, "_mixture", mixture)
     monkeypatch.setattr(covariance, "_with_errors", lambda *_: SimpleNamespace(scale=scale))
-    parts = {"variance[y]": part(0.1 * C, 4.0, 3.5), "variance[z]": part(0.0 * C, 8.0, 2.5), "variance[w]": part(0.0 * C)}
+    parts = {
+        "variance[y]": part(0.1 * C, 4.0, 3.5),
+        "variance[z]": part(0.0 * C, 8.0, 2.5),
+        "variance[w]": part(0.0 * C),
+    }
     found = covariance.with_uncertain_noise(problem, "estimate", C, parts)
     each = [m * np.outer(scale, scale) - C for m in mixtures.values()]
     assert found == pytest.approx(C + 4.0 / 4.0 * 0.1 * C + sum(each))

@@ -28,9 +28,9 @@ def test_deviations_follow_the_gradient_by_free_parameters(fit):
     """Of k + c = 1.05 k, and of a ratio by its two parts; in one run the local parameter has its plain name."""
     assert [*fit.theta] == ["k", "coulomb[a]", "coulomb[b]"]
     covariance, k = fit.covariance.to_numpy(), fit.theta["k"]
-    table = fit.derive({"total": "k + c", "twice": "c*2", "seven": "7"})
-    assert table["value"].tolist() == pytest.approx([1.05 * k, 0.1 * k, 7.0])
-    assert table["sd"].tolist() == pytest.approx([1.05 * fit.sd["k"], 0.1 * fit.sd["k"], 0.0])
+    table = fit.derive({"total": "k + c", "twice": "c*2", "seven": "7", "again": "3*c + k"})
+    assert table["value"].tolist() == pytest.approx([1.05 * k, 0.1 * k, 7.0, 1.15 * k])
+    assert table["sd"].tolist() == pytest.approx([1.05 * fit.sd["k"], 0.1 * fit.sd["k"], 0.0, 1.15 * fit.sd["k"]])
     for run, place in (("a", 1), ("b", 2)):
         f = fit.theta[f"coulomb[{run}]"]
         table = fit.derive({"ratio": "coulomb/k", "sum": "coulomb + k"}, experiment=run)
@@ -83,8 +83,9 @@ def test_part_of_the_covariance_is_a_prior(fit):
 def test_a_prior_needs_a_converged_estimate_and_finite_deviations(fit):
     with pytest.warns(
         UserWarning, match=r"The estimate has not converged \(max_steps\), and the prior is unreliable. Try"
-    ):
+    ) as caught:
         replace(fit, status="max_steps").as_prior(("k", "coulomb[a]"))
+    assert caught[0].filename == __file__
     lost = fit.covariance.copy()
     lost.loc["k", "k"] = np.inf
     with pytest.raises(
