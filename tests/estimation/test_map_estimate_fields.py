@@ -148,6 +148,7 @@ def linearised(monkeypatch, reached, finite=lambda count: True):
     calls = []
 
     def estimated_inputs(problem, now, loadings):
+        assert isinstance(problem, WithErrors)
         calls.append(("about", float(now.theta[0]), loadings))
         expected = np.array([reached(len(calls))[1]])
         return SimpleNamespace(errors={"run": SimpleNamespace(expected=expected)})
@@ -157,13 +158,19 @@ def linearised(monkeypatch, reached, finite=lambda count: True):
         return end([reached(len(calls))[0]])
 
     curved = SimpleNamespace(hessian_and_gradient=lambda iterate: (np.array([[4.0]]), None))
-    monkeypatch.setattr(
-        map_estimate, "input_loadings", lambda problem, theta, orbits, noise: (float(theta[0]), orbits, noise)
-    )
+
+    def input_loadings(problem, theta, orbits, noise):
+        assert isinstance(problem, WithErrors)
+        return float(theta[0]), orbits, noise
+
+    monkeypatch.setattr(map_estimate, "input_loadings", input_loadings)
     monkeypatch.setattr(map_estimate, "estimated_inputs", estimated_inputs)
-    monkeypatch.setattr(
-        map_estimate, "of_problem", lambda problem, now: (curved, "first" if finite(len(calls)) else None)
-    )
+
+    def of_problem(problem, now):
+        assert problem.input_errors["run"].expected[0] == reached(len(calls))[1] and now.theta[0] == calls[-1][1]
+        return curved, "first" if finite(len(calls)) else None
+
+    monkeypatch.setattr(map_estimate, "of_problem", of_problem)
     monkeypatch.setattr(map_estimate, "climbed", climbed)
     monkeypatch.setattr(map_estimate, "resumed", lambda objective, one: None)
     return calls
