@@ -158,6 +158,15 @@ def test_a_second_mode_must_exceed_three_standard_errors_of_the_batches():
 
 
 @pytest.mark.parametrize(
+    ("values", "expected"),
+    [([0.0, 0.0], False), ([1.0, 1.0], True), ([-1.0, -1.0], False), ([2.01, 4.0], True), ([1.99, 4.0], False)],
+)
+def test_a_mean_is_above_zero_by_more_than_three_standard_errors(values, expected):
+    """Of two values a and b the mean is (a + b)/2 and its error (b − a)/2: b = 2 a is the limit."""
+    assert verdicts._beyond_errors(np.array(values)) is expected
+
+
+@pytest.mark.parametrize(
     ("factor", "expected"),
     [(1.157, "too narrow"), (1.147, "fine"), (1.0, "fine"), (1 / 1.147, "fine"), (1 / 1.157, "too wide")],
 )

@@ -313,6 +313,56 @@ def test_verdicts_of_rows_without_tests_with_faults_and_of_a_misfit(monkeypatch)
     assert adequacy.adequacy(problem, None, np.ones((1, 1)), {}).loc["all", "verdict"] == "adequate"
 
 
+@pytest.mark.parametrize("correlated", [True, False])
+def test_quantities_have_a_row_each_and_their_blocks_none(monkeypatch, correlated):
+    """After those of channels; with the noise of the first of the draws, or the medians of white noise."""
+    shapes, asked = [], []
+
+    class Known:
+        def __init__(self, problem, here, shape):
+            assert (problem.quantities, here) == (("size", "phase"), "here")
+            shapes.append(self)
+            self.shape = shape.tolist()
+
+        def spectral_tests(self, index):
+            assert index == 1
+            return 0.5, 0.5, 2.0
+
+        def spectrum(self, index):
+            return None
+
+        def consistency(self):
+            return 0.3
+
+    def table_row(problem, quantity, white):
+        asked.append((problem.quantities, white.shape))
+        return {"experiment": "all", "channel": quantity, "whiteness": 1e-9, "size": 0.25, "spectrum": ""}
+
+    def size(problem, here, index, white):
+        assert (problem.quantities, here, index, white) == (("size", "phase"), "here", 1, shapes[0])
+        return 0.5, 0.25
+
+    def amplitude(problem, one, replicates):
+        assert (problem.quantities, one.channel, replicates) == (("size", "phase"), "y", "replicates")
+        return 0.75
+
+    for name, function in {"Whitened": Known, "_table_row": table_row, "_size": size, "_amplitude": amplitude}.items():
+        monkeypatch.setattr(adequacy, name, function)
+    blocks = [block("size"), block("y"), block("phase")]
+    likelihood = SimpleNamespace(white=not correlated, blocks=blocks)
+    problem = SimpleNamespace(likelihood=likelihood, quantities=("size", "phase"), experiments=[])
+    table = adequacy.adequacy(problem, "here", np.array([[1.0], [7.0], [3.0]]), "replicates")
+    assert [*table.index] == ["run y", "size", "phase", "all"]
+    assert asked == [(("size", "phase"), [1.0 if correlated else 3.0])] * 2 and len(shapes) == (3 if correlated else 1)
+    assert table["size"].tolist() == pytest.approx([0.5, 0.25, 0.25, np.nan], nan_ok=True)
+    assert table["amplitude"].tolist() == pytest.approx([0.75, np.nan, np.nan, np.nan], nan_ok=True)
+    assert table["harmonic"].tolist() == pytest.approx([2.0, np.nan, np.nan, np.nan], nan_ok=True)
+    assert table["verdict"].tolist() == ["adequate", "misspecified", "misspecified", "misspecified"]
+    assert table.loc["all", "consistency"] == pytest.approx(0.3)
+    # Nine tests: of three rows, and of all of them together.
+    assert table["p"].tolist() == pytest.approx([1.0, 9e-9, 9e-9, 9e-9])
+
+
 def test_advice_on_other_orbits_names_them():
     assert orbit_advice(SimpleNamespace(other_orbits={"a": "", "b": ""})) == (
         "first fit the measured orbit of 'a', 'b', see fit.other_orbits"

@@ -171,6 +171,63 @@ def test_points_of_tables_are_put_on_their_best_sheets(monkeypatch):
     assert climbs._on_sheets({"table": 1}, here) == ({"table": 1}, ("best", "theta"), "theta")
 
 
+class Sheets:
+    """A solver on a sheet of a table's branch; the best one for θ is given by θ."""
+
+    def __init__(self, sheet):
+        self.sheet = sheet
+
+    def on_best_sheets(self, theta):
+        """Return the solver on the best sheet."""
+        return Sheets(int(theta[0]))
+
+    def on_same_orbits(self, other):
+        """Return whether the sheets are the same."""
+        return self.sheet == other.sheet
+
+
+@pytest.mark.parametrize(
+    ("better", "finite", "ends"),
+    [(True, True, [3, 3]), (True, False, []), (False, True, [1]), ("always", True, [1, 2, 3, 4, 5])],
+)
+@pytest.mark.parametrize("progress", [True, False])
+def test_tables_are_climbed_again_on_better_sheets(monkeypatch, better, finite, ends, progress):
+    """Until the sheets do not change, or the density is not finite or not higher; five times at most.
+
+    Climbs end on sheet 3 with a higher density, or, if this is `always` so, on sheets with ever higher numbers.
+    """
+    climbs_to = []
+
+    def climbed(objective, first, shown):
+        assert shown is progress and objective.near.sheet == first[0].sheet and first[1] == "guess"
+        climbs_to.append(3 if better is True else len(climbs_to) + 1)
+        height = float(len(climbs_to)) if better else -1.0
+        return End(iterate([climbs_to[-1]], height, solver=first[0]), "converged", None)
+
+    def objective_near(problem, near):
+        return SimpleNamespace(near=near, iterate=lambda here, noise: (here, noise) if finite else None)
+
+    stand_ins(
+        monkeypatch, tables=lambda problem: problem.tables, climbed=climbed, objective_near=objective_near,
+        LogPosterior=lambda problem, solver: SimpleNamespace(linearise=lambda theta: problem.solved(solver, theta)),
+    )  # fmt: skip
+
+    def solved(solver, theta):
+        assert solver.sheet == theta[0]
+        return solver
+
+    likelihood = SimpleNamespace(guess=lambda: "guess")
+    problem = SimpleNamespace(tables={"t": 1}, solved=solved, likelihood=likelihood)
+    first = End(iterate([1.0], 0.0, solver=Sheets(0)), "converged", None)
+    found = climbs.on_best_sheets(problem, first, progress)
+    assert climbs_to == ends
+    assert (found is first) == (not better or not finite)
+    if better and finite:
+        assert found.iterate.objective == len(ends)
+    problem.tables = {}
+    assert climbs.on_best_sheets(problem, first, progress) is first and climbs_to == ends
+
+
 class Draws:
     """An objective whose iterates at draws are finite for positive θ."""
 
