@@ -129,6 +129,46 @@ def test_common_parameters_are_not_tested_without_all_derivatives():
     assert np.isnan(white.consistency())
 
 
+def left(r, j):
+    """Return the sum of squares of what the parameters leave."""
+    rest = r - j.T @ np.linalg.lstsq(j.T, r, rcond=None)[0]
+    return rest @ rest
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_common_parameters_are_tested_by_chow(scale):
+    """F of two parameters that two blocks of 9 values have in common against two of each, or χ² of known variances."""
+    y, z = scale * R[0], scale * (R[1] + J[1].T @ [0.7, 0.3])
+    both, slopes = np.concatenate([y, z]), np.concatenate([J[0], J[1]], axis=1)
+    apart = left(y, J[0]) + left(z, J[1])
+    more = left(both, slopes) - apart
+    same = adequacy.consistency([(y, J[0], "v"), (z, J[1], "v")], frozenset())
+    assert same == pytest.approx(stats.f.sf(more / 2 / (apart / 14), 2, 14))
+    known = adequacy.consistency([(y, J[0], "v"), (z, J[1], "v")], frozenset({"v"}))
+    assert known == pytest.approx(stats.chi2.sf(more, 2))
+    # Each with a variance of its own, in whose units both are compared; the fewest degrees of freedom count.
+    units = [np.sqrt(left(r, j) / 7) for r, j in ((y, J[0]), (z, J[1]))]
+    both = np.concatenate([y / units[0], z / units[1]])
+    slopes = np.concatenate([J[0] / units[0], J[1] / units[1]], axis=1)
+    own = adequacy.consistency([(y, J[0], "v"), (z, J[1], "w")], frozenset())
+    assert own == pytest.approx(stats.f.sf((left(both, slopes) - 14) / 2, 2, 7))
+    mixed = adequacy.consistency([(y, J[0], "v"), (z, J[1], "w")], frozenset({"w"}))
+    both, slopes = np.concatenate([y / units[0], z]), np.concatenate([J[0] / units[0], J[1]], axis=1)
+    assert mixed == pytest.approx(stats.f.sf((left(both, slopes) - 7 - left(z, J[1])) / 2, 2, 7))
+
+
+def test_blocks_that_cannot_be_compared_are_left_out_of_the_test_of_common_parameters():
+    """Exact ones of unknown variance, or without degrees of freedom; a single one has nothing in common."""
+    exact = (np.zeros(9), J[2], "w")
+    two = [(R[0], J[0], "v"), (R[1], J[1], "v")]
+    expected = adequacy.consistency(two, frozenset())
+    assert adequacy.consistency([*two, exact], frozenset()) == pytest.approx(expected)
+    full = (R[2][:2], J[2][:, :2], "u")
+    assert adequacy.consistency([*two, full], frozenset()) == pytest.approx(expected)
+    assert np.isnan(adequacy.consistency([exact, full], frozenset()))
+    assert np.isnan(adequacy.consistency(two[:1], frozenset())) and np.isnan(adequacy.consistency([], frozenset()))
+
+
 @pytest.mark.parametrize("factor", [0.5, 4.0])
 def test_size_of_a_residual_against_a_known_variance_is_a_chi_square(factor):
     problem, here, white = whitened(
