@@ -123,7 +123,7 @@ def has_other_mode(sample: Sample, point: float) -> bool:
     mass = counts.reshape(batches, MODE_GRID) / inside.shape[1]
     density = gaussian_filter1d(mass, bandwidth / width, mode="constant")
     slope = np.diff(density.mean(axis=0))
-    valleys = np.flatnonzero((slope[:-1] < 0.0) & (slope[1:] >= 0.0)) + 1
+    valleys = np.flatnonzero((slope[:-1] <= 0.0) & (slope[1:] >= 0.0)) + 1  # all points of a flat one
     return any(_separates(density, mass, int(at), point > edges[at] + 0.5 * width) for at in valleys)
 
 
@@ -189,7 +189,7 @@ def _unconverged(sample: Sample, mean: float) -> str:
 
 
 def _end(sample: Sample, mean: float, sd: float, draws_sd: float) -> str:
-    """Return the verdict on the lower end of the 90 % interval; `own` is the sd of the draws."""
+    """Return the verdict on the lower end of the 90 % interval."""
     end = mean - END * sd
     beyond, error = sample.below(end - END_SHIFT * draws_sd, END_PROBABILITY)
     if beyond > END_PROBABILITY + ERRORS * error:

@@ -136,6 +136,14 @@ def test_a_valley_is_deep_below_seven_tenths_of_the_lower_peak(size):
     assert has_other_mode(exact(draws(limit + 0.06), size), 0.0)
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("place", [4.5, 6.0, 7.5])
+def test_a_point_in_an_empty_valley_is_separated_from_the_modes_on_both_sides(side, place):
+    """The smaller mode, at 12, has 4 %; the larger one, at 0, is beyond the valley for each point within it."""
+    draws = side * np.concatenate([0.5 * NORMAL[:7680], 12.0 + 0.5 * NORMAL[:320]])
+    assert has_other_mode(exact(draws), side * place)
+
+
 def test_a_constant_has_no_other_mode():
     assert has_other_mode(exact(np.full(800, 3.0)), 3.0) is False
 
@@ -147,6 +155,15 @@ def test_a_second_mode_must_exceed_three_standard_errors_of_the_batches():
         parts = [np.where(MIDPOINTS < share, 12.0, NORMAL) for share in shares]
         sample = Sample(np.concatenate(parts), np.array(parts), 1e4, 1)
         assert has_other_mode(sample, 0.0) == found
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [([0.0, 0.0], False), ([1.0, 1.0], True), ([-1.0, -1.0], False), ([2.01, 4.0], True), ([1.99, 4.0], False)],
+)
+def test_a_mean_is_above_zero_by_more_than_three_standard_errors(values, expected):
+    """Of two values a and b the mean is (a + b)/2 and its error (b − a)/2: b = 2 a is the limit."""
+    assert verdicts._beyond_errors(np.array(values)) is expected
 
 
 @pytest.mark.parametrize(

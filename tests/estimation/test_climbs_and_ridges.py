@@ -332,6 +332,7 @@ def test_starts_in_wide_tables_are_the_ends_the_best_first_and_then_the_draws_wi
     starts = climbs.in_wide_tables(None, np.zeros(1), np.array([[1.0], [2.0], [3.0]]), progress)
     assert [float(theta[0]) for theta in starts] == [3.0, 1.0, 0.0, 2.0]
     assert {shown for _, shown in seen} == {progress} and seen[1] == ("wide", progress)
+    assert {first for first, _ in seen} == {"objective", "wide"}
     monkeypatch.setattr(climbs, "first_iterate", lambda problem, theta: None)
     assert climbs.in_wide_tables(None, np.zeros(1), np.array([[1.0]]), progress) == []
 

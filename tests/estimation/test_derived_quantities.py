@@ -1,6 +1,7 @@
 """Quantities derived from an estimate, and its normal approximation as a prior, against the delta method by hand."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,9 +29,9 @@ def test_deviations_follow_the_gradient_by_free_parameters(fit):
     """Of k + c = 1.05 k, and of a ratio by its two parts; in one run the local parameter has its plain name."""
     assert [*fit.theta] == ["k", "coulomb[a]", "coulomb[b]"]
     covariance, k = fit.covariance.to_numpy(), fit.theta["k"]
-    table = fit.derive({"total": "k + c", "twice": "c*2", "seven": "7"})
-    assert table["value"].tolist() == pytest.approx([1.05 * k, 0.1 * k, 7.0])
-    assert table["sd"].tolist() == pytest.approx([1.05 * fit.sd["k"], 0.1 * fit.sd["k"], 0.0])
+    table = fit.derive({"total": "k + c", "twice": "c*2", "seven": "7", "again": "3*c + k"})
+    assert table["value"].tolist() == pytest.approx([1.05 * k, 0.1 * k, 7.0, 1.15 * k])
+    assert table["sd"].tolist() == pytest.approx([1.05 * fit.sd["k"], 0.1 * fit.sd["k"], 0.0, 1.15 * fit.sd["k"]])
     for run, place in (("a", 1), ("b", 2)):
         f = fit.theta[f"coulomb[{run}]"]
         table = fit.derive({"ratio": "coulomb/k", "sum": "coulomb + k"}, experiment=run)
@@ -43,6 +44,15 @@ def test_deviations_follow_the_gradient_by_free_parameters(fit):
         joint = table.attrs["covariance"]
         assert [[joint[x][y] for y in ("ratio", "sum")] for x in ("ratio", "sum")] == pytest.approx(expected)
         assert [*joint] == [*joint["ratio"]] == ["ratio", "sum"] and table.columns.tolist() == ["value", "sd"]
+
+
+def test_a_gradient_adds_what_goes_through_tied_parameters():
+    """Of a quantity with slopes 2 by c and 3 by a, where c depends on a and on b; d is fixed, e tied to b alone."""
+    slopes = {"c": 2.0, "a": 3.0, "d": 7.0, "e": 5.0}
+    quantity = SimpleNamespace(gradient=lambda values: slopes if values == "values" else None)
+    fit = SimpleNamespace(theta={"a[run]": 1.0, "b": 2.0}, tied={"c": {"a[run]": 10.0, "b": 0.5}, "e": {"b": 4.0}})
+    found = bp.MapEstimate._gradient(fit, quantity, "values", {"a": "a[run]", "b": "b"})
+    assert found.tolist() == [2.0 * 10.0 + 3.0, 2.0 * 0.5 + 5.0 * 4.0]
 
 
 def test_names_that_are_not_shared_need_the_experiment(fit):
@@ -83,8 +93,9 @@ def test_part_of_the_covariance_is_a_prior(fit):
 def test_a_prior_needs_a_converged_estimate_and_finite_deviations(fit):
     with pytest.warns(
         UserWarning, match=r"The estimate has not converged \(max_steps\), and the prior is unreliable. Try"
-    ):
+    ) as caught:
         replace(fit, status="max_steps").as_prior(("k", "coulomb[a]"))
+    assert caught[0].filename == __file__
     lost = fit.covariance.copy()
     lost.loc["k", "k"] = np.inf
     with pytest.raises(
