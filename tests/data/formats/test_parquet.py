@@ -433,3 +433,14 @@ def test_columns_have_units_of_fields_of_pandas_or_in_names_and_remarks(path):
     assert [one.name for one in whole.channels if one.refusal] == ["list"]
     assert [one.values().tolist() for one in whole.channels[:4]] == columns[:4]
     assert parquet.contents(path, ["x (1)"]).suggested_time == ""
+
+
+@pytest.mark.parametrize(
+    "metadata, unit",
+    [
+        (None, ""), ({}, ""), ({b"unit": b"mm"}, "mm"), ({b"UNITS": b' "kN" '}, "kN"), ({b"uom": b"\xb5m"}, "\ufffdm"),
+        ({b"other": b"m", b"unit_string": "\u00b5m".encode(), b"unit": b"s"}, "\u00b5m"), ({b"other": b"m"}, ""),
+    ],
+)  # fmt: skip
+def test_unit_is_the_first_of_its_names_in_the_metadata_of_a_field(metadata, unit):
+    assert parquet._unit(metadata) == unit
