@@ -444,3 +444,32 @@ def test_columns_have_units_of_fields_of_pandas_or_in_names_and_remarks(path):
 )  # fmt: skip
 def test_unit_is_the_first_of_its_names_in_the_metadata_of_a_field(metadata, unit):
     assert parquet._unit(metadata) == unit
+
+
+@pytest.mark.parametrize(
+    "column, kind, values",
+    [
+        (pa.array([decimal.Decimal("1.5"), None]), "f8", [1.5, np.nan]),
+        (pa.array([1.5, 2.0], pa.float16()), "f8", [1.5, 2.0]),
+        (pa.array([1.5, 2.0], pa.float32()), "f4", [1.5, 2.0]), (pa.array([1, None], pa.int8()), "f8", [1.0, np.nan]),
+        (pa.array([1, 2], pa.int8()), "i1", [1, 2]), (pa.array([True, None]), "f8", [1.0, np.nan]),
+        (pa.array([True, False]), "?", [True, False]), (pa.array([2**53, None]), "f8", [2.0**53, np.nan]),
+        (pa.array([1.5, 1.5]).dictionary_encode(), "f8", [1.5, 1.5]),
+        (pa.array([7, None], pa.int32()).dictionary_encode(), "f8", [7.0, np.nan]),
+        (pa.array([datetime.date(1970, 1, 2), None]), "M8[ms]", [86_400_000, None]),
+        (pa.array([5, None], pa.duration("us")), "m8[us]", [5, None]), (pa.array(["a", None]), "O", ["a", None]),
+    ],
+)  # fmt: skip
+def test_values_of_each_type_are_numbers_dates_or_texts(path, column, kind, values):
+    write(path, t=pa.array([0, 1]), x=column)
+    seen = parquet._values(path, 1)
+    assert seen.dtype == np.dtype(kind)
+    shown = (
+        [None if np.isnat(one) else one.astype(int) for one in read_] if read_.dtype.kind in "mM" else read_.tolist()
+    )
+    np.testing.assert_equal(shown, values)
+    with pytest.raises(
+        ValueError, match="^its column 2 has integers beyond 2..53 and missing values; store it as floats$"
+    ):
+        write(path, t=pa.array([0, 1]), x=pa.array([-(2**53) - 1, None]))
+        parquet._values(path, 1)
