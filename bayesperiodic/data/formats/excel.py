@@ -303,7 +303,7 @@ def _moments(file: Path, sheet: str, place: int, first: int, cells: list[Any], d
     """Return dates or times of day by the days that are stored, as openpyxl 3.1 rounds them to milliseconds."""
     with _opened(file, raw=True) as book:
         rows = _rows(book[sheet])[first:]
-        epoch = np.datetime64(book.epoch, "us") if book.epoch.year == 1904 else np.datetime64("1899-12-30", "us")
+        epoch = np.datetime64(book.epoch)
     days = [row[place] if place < len(row) else None for row in rows]
     result = np.full(len(cells), np.timedelta64("NaT", "us"), "timedelta64[us]")
     for k, (day, cell) in enumerate(zip(days, cells, strict=True)):

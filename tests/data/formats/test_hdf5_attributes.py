@@ -16,7 +16,7 @@ from bayesperiodic.data.formats.hdf5_attributes import Packing, Since, sampling
         (0.5, 0.5), (np.int16(7), 7), ("mm", "mm"), (b"mm", "mm"), (np.bytes_("\u00b5m".encode()), "µm"),
         (np.array([5]), 5), (np.array([[5.0]]), 5.0), (np.arange(3), (0, 1, 2)), (np.zeros(64), (0.0,) * 64),
         (np.zeros(65), "65 values"), (["a", "b"], "2 values"), (np.array(["a"], dtype=object), "a"),
-        (h5py.Empty("f8"), None), (np.zeros(0), None), (1j, None), (True, None),
+        (np.bytes_(b"\xb5m"), "\ufffdm"), (h5py.Empty("f8"), None), (np.zeros(0), None), (1j, None), (True, None),
     ],
 )  # fmt: skip
 def test_attributes_are_numbers_texts_or_how_many_there_are(tmp_path, value, expected):
@@ -325,3 +325,68 @@ def test_scales_of_no_convention_are_named_unless_they_change_nothing(stored, sa
 )  # fmt: skip
 def test_ranges_of_a_converter_say_what_integers_mean_and_those_of_their_type_do_not(stored, kind, said):
     assert hdf5_attributes.meaning_of_integers(stored, np.dtype(kind)) == said
+
+
+@pytest.mark.parametrize(
+    "key, of",
+    [
+        ("fs_unit", "rate"), ("Sampling Rate Units", "rate"), ("rate_unit", "rate"), ("unit_freq", "rate"),
+        ("dt_units", "step"),
+        ("increment unit string", "step"), ("wf_increment_unit_label", "step"), ("period_unit_name", "step"),
+        ("t0_unit", "start"),
+        ("start unit", "start"), ("time_unit", ""), ("x-unit", ""), ("wf_xunit_string", ""), ("sampling_unit", ""),
+        ("unit", None), ("units", None), ("fs", None), ("y_unit", None), ("time", None), ("temperature_unit", None),
+    ],
+)  # fmt: skip
+def test_attributes_of_units_say_of_what(key, of):
+    assert hdf5_attributes._unit_of(key) == of
+
+
+@pytest.mark.parametrize(
+    "units, factors",
+    [
+        ({}, (1.0, 10**9, 10**9, "")), ({"fs_unit": "kHz"}, (1e3, 10**9, 10**9, "")),
+        ({"fs_unit": " GHz "}, (1e9, 10**9, 10**9, "")),
+        ({"dt_unit": "ms"}, (1.0, 10**6, None, "")), ({"dt_unit": "ms", "t0_unit": "us"}, (1.0, 10**6, 10**3, "")),
+        ({"t0_unit": "ms"}, (1.0, 10**9, 10**6, "")), ({"time_unit": "ms"}, (1.0, 10**6, 10**6, "step")),
+        ({"time_unit": "s"}, (1.0, 10**9, 10**9, "")), ({"sampling_unit": "Hz"}, (1.0, 10**9, 10**9, "")),
+        ({"sampling_unit": "MHz"}, (1e6, 10**9, 10**9, "rate")),
+        ({"x_unit": "ms", "dt_unit": "ms"}, (1.0, 10**6, 10**6, "step")),
+        ({"x_unit": "ms", "t_unit": "s"}, None), ({"fs_unit": "kHz", "rate_unit": "Hz"}, None),
+        ({"fs_unit": "ms"}, None),
+        ({"dt_unit": "Hz"}, None), ({"dt_unit": "mm"}, None), ({"time_unit": "mm"}, None),
+        ({"dt_unit": "ms since 2026-01-31"}, None),
+        ({"x_unit": "ms", "sampling_unit": "s"}, None),
+        ({"sampling_unit": "kHz", "time_unit": "s"}, (1e3, 10**9, 10**9, "rate")),
+    ],
+)  # fmt: skip
+def test_factors_of_units_of_rates_steps_and_starts(units, factors):
+    """In hertz and nanoseconds; the unit of a start is not known beside a step in another one than seconds."""
+    seen = hdf5_attributes._factors(units)
+    assert seen == (factors and dict(zip(("rate", "step", "start", "other"), factors, strict=True)))
+
+
+@pytest.mark.parametrize(
+    "value, numbers",
+    [
+        (5, [5.0]), (np.float32(0.5), [0.5]), ((1, 2.5), [1.0, 2.5]), ("NaN", [np.nan]), (" nan ", [np.nan]),
+        ("5", None),
+        ((1, "a"), None), ((), []), ("65 values", None),
+    ],
+)  # fmt: skip
+def test_numbers_of_attributes(value, numbers):
+    np.testing.assert_equal(hdf5_attributes._numbers(value), numbers)
+
+
+@pytest.mark.parametrize(
+    "stored, step, error",
+    [
+        ({"dt": np.float32(0.033333)}, 0.033333, 5e-7), ({"dt": np.float32(33.333), "dt_unit": "ms"}, 0.033333, 5e-7),
+        ({"dt": 0.033333}, 0.033333, 0.0), ({"fs": np.float32(30.0003)}, 1 / 30.0003, 0.0),
+        ({"dt": np.float32(0.25)}, 0.25, 0.0),
+        ({"dt": np.float16(0.1)}, 0.1, 0.0),
+    ],
+)  # fmt: skip
+def test_step_of_single_precision_has_the_error_of_its_digits(stored, step, error):
+    clock = sampling(stored)
+    assert clock.step == pytest.approx(step, rel=1e-12) and clock.error == pytest.approx(error, rel=0.01)

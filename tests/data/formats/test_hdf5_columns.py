@@ -81,7 +81,9 @@ def test_fields_of_structures_are_columns(make):
     "stored, units",
     [
         ({"units": "mm"}, ["mm", "mm"]), ({"units": np.array(["mm", "N"], dtype=h5py.string_dtype())}, ["mm", "N"]),
-        ({"unit": np.array([b"mm", b"N"])}, ["mm", "N"]), ({"units": np.array([b"mm", b"N", b"s"])}, ["", ""]),
+        ({"unit": np.array([b"mm", b"N"])}, ["mm", "N"]),
+        ({"units": np.array([b"\xb5m", "\u00b5m".encode()])}, ["\ufffdm", "\u00b5m"]),
+        ({"units": np.array([b"mm", b"N", b"s"])}, ["", ""]),
         ({"units": np.array([1.0, 2.0])}, ["", ""]), ({"units": 5}, ["", ""]), ({}, ["", ""]),
         ({"Units": "s"}, ["s", "s"]),
         ({"units": np.array(["mm"], dtype=h5py.string_dtype())}, ["mm", "mm"]),

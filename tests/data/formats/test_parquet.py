@@ -433,3 +433,44 @@ def test_columns_have_units_of_fields_of_pandas_or_in_names_and_remarks(path):
     assert [one.name for one in whole.channels if one.refusal] == ["list"]
     assert [one.values().tolist() for one in whole.channels[:4]] == columns[:4]
     assert parquet.contents(path, ["x (1)"]).suggested_time == ""
+
+
+@pytest.mark.parametrize(
+    "metadata, unit",
+    [
+        (None, ""), ({}, ""), ({b"unit": b"mm"}, "mm"), ({b"UNITS": b' "kN" '}, "kN"), ({b"uom": b"\xb5m"}, "\ufffdm"),
+        ({b"other": b"m", b"unit_string": "\u00b5m".encode(), b"unit": b"s"}, "\u00b5m"), ({b"other": b"m"}, ""),
+    ],
+)  # fmt: skip
+def test_unit_is_the_first_of_its_names_in_the_metadata_of_a_field(metadata, unit):
+    assert parquet._unit(metadata) == unit
+
+
+@pytest.mark.parametrize(
+    "column, kind, values",
+    [
+        (pa.array([decimal.Decimal("1.5"), None]), "f8", [1.5, np.nan]),
+        (pa.array([1.5, 2.0], pa.float16()), "f8", [1.5, 2.0]),
+        (pa.array([1.5, 2.0], pa.float32()), "f4", [1.5, 2.0]), (pa.array([1, None], pa.int8()), "f8", [1.0, np.nan]),
+        (pa.array([1, 2], pa.int8()), "i1", [1, 2]), (pa.array([True, None]), "f8", [1.0, np.nan]),
+        (pa.array([True, False]), "?", [True, False]), (pa.array([2**53, None]), "f8", [2.0**53, np.nan]),
+        (pa.array([1.5, 1.5]).dictionary_encode(), "f8", [1.5, 1.5]),
+        (pa.array([7, None], pa.int32()).dictionary_encode(), "f8", [7.0, np.nan]),
+        (pa.array([datetime.date(1970, 1, 2), None]), "M8[ms]", [86_400_000, None]),
+        (pa.array([5, None], pa.duration("us")), "m8[us]", [5, None]), (pa.array(["a", None]), "O", ["a", None]),
+    ],
+)  # fmt: skip
+def test_values_of_each_type_are_numbers_dates_or_texts(path, column, kind, values):
+    write(path, t=pa.array([0, 1]), x=column)
+    seen = parquet._values(path, 1)
+    assert seen.dtype == np.dtype(kind)
+    times = seen.dtype.kind in "mM"
+    np.testing.assert_equal([None if np.isnat(x) else x.astype(int) for x in seen] if times else seen.tolist(), values)
+
+
+def test_integers_beyond_those_of_floats_have_no_missing_values(path):
+    write(path, t=pa.array([0, 1]), x=pa.array([-(2**53) - 1, None]))
+    with pytest.raises(
+        ValueError, match="^its column 2 has integers beyond .* and missing values; store it as floats$"
+    ):
+        parquet._values(path, 1)

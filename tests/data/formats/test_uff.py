@@ -555,3 +555,7 @@ def test_functions_are_channels_with_units_and_clocks(saved):
     assert [bool(one.refusal) for one in whole.channels] == [False, False, True, False]
     assert [one.clock.step for one in whole.channels if not one.refusal] == [0.5, 0.5, 0.25]
     np.testing.assert_allclose(whole.channels[1].values(), SWING[:20], atol=1e-10)
+
+
+def test_lines_are_in_utf_8_or_else_in_the_encoding_of_windows():
+    assert [uff._text(line) for line in ("µm".encode(), "µm".encode("cp1252"), b"\x81m")] == ["µm", "µm", "\ufffdm"]
