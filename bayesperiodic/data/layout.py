@@ -184,7 +184,8 @@ def _times(layout: Layout, contents: Contents, columns: Mapping[str, _Column]) -
         times[channel] = known[key]
     if len(known) == 1:
         return next(iter(known.values()))
-    if all(clock is None for clock in clocks.values()):  # one rate, different lengths: refused by `Recording`
+    by_channel = isinstance(layout.sampling_rate, Mapping)
+    if not (by_channel or any(clocks.values())):  # one rate, different lengths: refused by `Recording`
         return max(known.values(), key=len)
     return times
 

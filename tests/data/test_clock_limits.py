@@ -236,3 +236,20 @@ def test_clocks_that_differ_by_a_thousandth_may_be_a_chaotic_response(rate, free
     assert found.text.endswith("two clocks, or a system that changes" + chaotic * free)
     assert found.cure.endswith("bp.PoincareSection and bp.find_orbits" if free else "with recording.between")
     assert found.share == 1.0 and np.isnan(found.bias)
+
+
+@pytest.mark.parametrize("left, seen", [(0.095, 0), (0.105, 1)])
+def test_a_tenth_of_a_drift_is_beside_changes_of_the_drive(left, seen):
+    """drifts: of the frequency of the first channel, x + a x², which the second one may follow by its delay.
+
+    Orthogonal to it, sin θ of a linear drift is left, with tan θ = a |x² − mean|/|x|.
+    """
+    x = np.linspace(-1.0, 1.0, 48)
+    bent = x**2 - np.mean(x**2)
+    a = left / np.sqrt(1.0 - left**2) * np.linalg.norm(x) / np.linalg.norm(bent)
+    drive = 0.5 * x**2 + a * x**3 / 3.0
+    given = phases(np.column_stack([drive, drive + 0.02 * np.arange(48.0)]))
+    listed = [*clocks.drifts(given, np.ones(48, dtype=bool), [NOTHING])]
+    assert len(listed) == seen
+    if seen:
+        assert listed[0].rate == pytest.approx(0.02) and listed[0].turns == pytest.approx(0.02 * 48)

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import bayesperiodic as bp
 from bayesperiodic.data import layout, units
 from bayesperiodic.data.formats.contents import Clock, Contents, StoredChannel
 from bayesperiodic.data.layout import Layout
@@ -316,3 +317,45 @@ def test_recordings_and_their_parts_have_the_units_of_their_values(stored, given
     np.testing.assert_allclose(np.concatenate([part[1]["x"] for part in parts]), factor * np.arange(4.0))
     np.testing.assert_allclose(np.concatenate([part[2]["u"] for part in parts]), np.arange(4.0))
     np.testing.assert_allclose(np.concatenate([part[0] for part in parts]), given.get("time", 1.0) * np.arange(4.0))
+
+
+ORIGIN = np.datetime64("2026-01-31T12:00:00", "ns")
+CLOCK, EARLY = Clock(1.0, 0.5), Clock(0.0, 0.5, origin=ORIGIN)
+LATE = Clock(0.0, 0.25, origin=ORIGIN + np.timedelta64(2, "s"))
+
+
+@pytest.mark.parametrize(
+    "clocks, sizes, rate, expected",
+    [
+        ((None, None), (3, 3), 2.0, [0.0, 0.5, 1.0]), ((None, None), (2, 4), 2.0, [0.0, 0.5, 1.0, 1.5]),
+        ((None, None), (4, 2), 2.0, [0.0, 0.5, 1.0, 1.5]), ((CLOCK, CLOCK), (3, 3), None, [1.0, 1.5, 2.0]),
+        ((CLOCK, CLOCK), (3, 2), None, {"x": [1.0, 1.5, 2.0], "y": [1.0, 1.5]}),
+        ((CLOCK, None), (2, 2), 4.0, {"x": [1.0, 1.25], "y": [0.0, 0.25]}),
+        ((CLOCK, Clock(1.0, 0.5)), (2, 2), 4.0, {"x": [1.0, 1.25], "y": [1.0, 1.25]}),
+        ((CLOCK, None), (2, 2), {"y": 4.0}, {"x": [1.0, 1.5], "y": [0.0, 0.25]}),
+        ((None, None), (2, 2), {"x": 2.0, "y": 4.0}, {"x": [0.0, 0.5], "y": [0.0, 0.25]}),
+        ((None, None), (2, 3), {"x": 2.0, "y": 2.0}, {"x": [0.0, 0.5], "y": [0.0, 0.5, 1.0]}),
+        ((LATE, EARLY), (2, 2), None, {"x": [2.0, 2.25], "y": [0.0, 0.5]}),
+        ((LATE, EARLY), (2, 2), {"x": 1.0}, {"x": [2.0, 3.0], "y": [0.0, 0.5]}),
+    ],
+)  # fmt: skip
+def test_times_are_one_array_or_those_of_each_channel(clocks, sizes, rate, expected):
+    """layout._times: of one rate and different lengths those of the longest channel."""
+    layout_of = Layout("run.x", {"x": "x", "y": "y"}, {}, None, rate, {}, None)
+    contents = Contents("a file", ())
+    columns = {
+        name: layout._Column(StoredChannel(name, size, None, clock=clock), np.zeros(size))
+        for name, clock, size in zip("xy", clocks, sizes, strict=True)
+    }
+    seen = layout._times(layout_of, contents, columns)
+    if isinstance(expected, dict):
+        assert {name: time.tolist() for name, time in seen.items()} == expected
+    else:
+        assert seen.tolist() == expected
+
+
+def test_channels_of_a_text_without_times_have_the_rates_that_are_given(tmp_path):
+    (tmp_path / "run.csv").write_text("x,y\n1,2\n3,4\n5,6\n")
+    names = {"outputs": {"x": "x"}, "inputs": {"y": "y"}}
+    run = bp.Recording.from_csv(tmp_path / "run.csv", **names, sampling_rate={"x": 2.0, "y": 4.0})
+    assert run.times["x"].tolist() == [0.0, 0.5, 1.0] and run.times["y"].tolist() == [0.0, 0.25, 0.5]
