@@ -11,6 +11,7 @@ from scipy.integrate import quad
 
 import bayesperiodic as bp
 from bayesperiodic import noise
+from bayesperiodic.density import log_posterior
 from bayesperiodic.density.log_posterior import LogPosterior, SamplingCoordinates, collapsible
 from bayesperiodic.likelihood.likelihood import Residuals
 from bayesperiodic.likelihood.mean_period import MeanPeriod
@@ -202,3 +203,32 @@ def test_points_beside_failed_solves_have_their_own_values():
             2 * np.pi
         )
         assert found[i] == pytest.approx(expected, rel=1e-8)
+
+
+def test_densities_start_at_anchors_or_where_orbits_and_parameters_fit_together(monkeypatch):
+    """Those of `LogPosterior.start`."""
+    made = []
+
+    class Solver:
+        def __init__(self, problem, anchors):
+            made.append(("anchors", anchors))
+
+        @classmethod
+        def start(cls, problem, theta, states=None):
+            """Note from where the solves start."""
+            made.append((theta, states))
+
+    class Density(LogPosterior):
+        def __init__(self, problem, solver):
+            pass
+
+    monkeypatch.setattr(log_posterior, "ResponseSolver", Solver)
+    answers = iter([SimpleNamespace(theta="fitted", states={"run": 1}), SimpleNamespace(theta="f", states={}), None])
+    monkeypatch.setattr(log_posterior, "simultaneous_fit", lambda problem, theta: next(answers))
+    problem = SimpleNamespace(anchors={}, median=lambda: "median")
+    for expected in (("fitted", {"run": 1}), ("median", None), ("median", None)):
+        Density.start(problem)
+        assert made.pop() == expected
+    problem.anchors = {"run": "orbit"}
+    Density.start(problem)
+    assert made == [("anchors", {"run": "orbit"})]

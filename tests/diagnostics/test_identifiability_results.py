@@ -1,4 +1,4 @@
-"""What `identifiability` takes from estimates and draws, and how `Identifiability` is printed: values by hand."""
+"""What `identifiability` takes from estimates and draws, and what `Identifiability.__repr__` prints, by hand."""
 
 from types import SimpleNamespace
 

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bayesperiodic.density.log_posterior import LogPosterior
 from bayesperiodic.estimation import climbs
 from bayesperiodic.estimation.gauss_newton import MAX_STEP_HALVINGS, MAX_STEPS, End
 from bayesperiodic.periodic.batch import Anchor
@@ -330,32 +329,3 @@ def test_the_best_climb_from_measured_orbits_is_taken_until_it_is_not_doubtful(m
     assert climbs.on_measured_orbits(problem, None, good, progress) is good and len(shown) == 2
     stand_ins(monkeypatch, _near_measured_orbits=lambda problem, end, start: iter([9.0]))
     assert climbs.on_measured_orbits(problem, None, first, progress) is first
-
-
-def test_densities_start_at_anchors_or_where_orbits_and_parameters_fit_together(monkeypatch):
-    made = []
-    from bayesperiodic.density import log_posterior
-
-    class Solver:
-        def __init__(self, problem, anchors):
-            made.append(("anchors", anchors))
-
-        @classmethod
-        def start(cls, problem, theta, states=None):
-            """Note from where the solves start."""
-            made.append((theta, states))
-
-    class Density(LogPosterior):
-        def __init__(self, problem, solver):
-            pass
-
-    monkeypatch.setattr(log_posterior, "ResponseSolver", Solver)
-    answers = iter([SimpleNamespace(theta="fitted", states={"run": 1}), SimpleNamespace(theta="f", states={}), None])
-    monkeypatch.setattr(log_posterior, "simultaneous_fit", lambda problem, theta: next(answers))
-    problem = SimpleNamespace(anchors={}, median=lambda: "median")
-    for expected in (("fitted", {"run": 1}), ("median", None), ("median", None)):
-        Density.start(problem)
-        assert made.pop() == expected
-    problem.anchors = {"run": "orbit"}
-    Density.start(problem)
-    assert made == [("anchors", {"run": "orbit"})]

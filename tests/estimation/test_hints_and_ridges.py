@@ -124,6 +124,8 @@ def test_points_beyond_a_fold_are_listed_up_to_four(monkeypatch):
         "'b', 'c', 'd' and 2 more; the branch of 'a' ends at a fold at 0.9 Hz. The model may lack a term, or sweep and "
         "resolution may not be those of the measurement."
     )
+    listed = table_orbits._listed
+    assert (listed([*"abcde"]), listed([*"abcd"])) == ("'a', 'b', 'c', 'd' and 1 more", "'a', 'b', 'c', 'd'")
     (text,) = warned(monkeypatch, {"a": orbit(), "b": orbit(frequency=1.1)})
     assert text.startswith("1 points of response tables were measured where") and ": 'b'; the branch of 'b'" in text
 

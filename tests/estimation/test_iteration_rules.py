@@ -107,6 +107,14 @@ def test_a_step_that_gains_nothing_is_the_end_if_it_is_small():
     assert climb(resting, resting.start(0.0, 0.0)).status == "converged" and len(resting.tried) == 1
 
 
+@pytest.mark.parametrize(("slope", "status", "steps"), [(2.1e-8, "converged", 1), (2.3e-8, "iterations", 3)])
+def test_a_small_step_that_gains_less_than_1e_12_is_the_last(slope, status, steps):
+    """Steps of 0.9e-4 standard deviations of ½, along which a line of this slope gains 0.945e-12 or 1.035e-12."""
+    rising = Fake(lambda x: slope * x[0], lambda x: (np.diag([4.0, 1.0]), np.array([2.0 * 0.9e-4, 0.0])))
+    _, ended, history = gauss_newton._ascend(rising, rising.start(0.0, 0.0), np.zeros(2, dtype=bool), None, 3, 10)
+    assert ended == status and len(history) == steps
+
+
 def test_what_the_climb_reports_to_ends_it():
     """Each report has the step in standard deviations, here the root of the sum of squares."""
     sizes = []
