@@ -14,7 +14,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -64,7 +64,8 @@ def simultaneous_fit(problem: Description, theta: np.ndarray, guesses: Guesses |
     """Return θ and orbits near the MAP point; None for autonomous and condensed models, or without guesses.
 
     The fit starts at θ (names,) and at guesses, by default the experiments' own, ignores multipliers, and moves
-    positive parameters in their logarithms.
+    positive parameters in their logarithms. Where the guesses are the orbits at θ, there is nothing to fit: the
+    result is θ with the guesses.
     """
     if (
         problem.model.autonomous
@@ -73,6 +74,8 @@ def simultaneous_fit(problem: Description, theta: np.ndarray, guesses: Guesses |
     ):
         return None
     fit = _SimultaneousFit(problem, guesses or experiments_guesses(problem, theta))
+    if all(fit.solves(name, z, theta) for name, z in fit.guess.items()):
+        return InitialEstimate(theta, {name: fit.states(name, z) for name, z in fit.guess.items()}, "")
     return fit.iterate(fit.parameters_along_guesses(theta))
 
 
@@ -84,15 +87,12 @@ def experiments_guesses(problem: Description, theta: np.ndarray) -> dict[str, An
     wanted = [name for name, guess in guesses.items() if guess == DATA]
     if not wanted:
         return guesses
-    fit = _SimultaneousFit(problem, {})
-    near = {
-        name: fit.states(name, equations.static_guess(problem.parameters(theta[None], name)[0]))
-        for name, equations in problem.equations.items()
-    }
+    near = {name: _states_of(problem, name, theta, guess) for name, guess in guesses.items()}
+    seen = [name for name, guess in guesses.items() if not guess or guess == DATA]
     fit = _SimultaneousFit(problem, near)
     near |= {name: fit.states(name, fit.orbit_of_any_mean(name, theta)) for name in wanted}
-    measured = measured_orbits(problem, theta, near, FEW_TURNS).states
-    for name, states in measured.items():
+    measured = measured_orbits(problem, theta, near, FEW_TURNS, seen).states
+    for name, states in ((name, measured[name]) for name in wanted):
         if lost := [state for state, values in states.items() if not np.isfinite(values).all()]:
             raise ValueError(
                 f"guess of experiment {name!r}: must be finite, got nan for {lost[0]!r} from the data; give the states "
@@ -101,17 +101,29 @@ def experiments_guesses(problem: Description, theta: np.ndarray) -> dict[str, An
     return guesses | {name: measured[name] for name in wanted}
 
 
+def _states_of(problem: Description, name: str, theta: np.ndarray, guess: Any) -> Any:
+    """Return the states of an experiment's guess, of the equilibrium at θ (names,) where it has none."""
+    if guess and guess != DATA:
+        return guess
+    equations = problem.equations[name]
+    z = equations.static_guess(problem.parameters(theta[None], name)[0])
+    turning = z + equations.drift * equations.grid.tau[:, None]
+    return dict(zip(problem.model.states, turning.T.copy(), strict=True))
+
+
 @unwarned
-def measured_orbits(problem: Description, theta: np.ndarray, near: Guesses, most: int = TURNS) -> InitialEstimate:
+def measured_orbits(
+    problem: Description, theta: np.ndarray, near: Guesses, most: int = TURNS, seen: Iterable[str] | None = None
+) -> InitialEstimate:
     """Return orbits of a driven model that give the measured outputs, and the θ that fits them, in turns from a θ.
 
     The orbits solve the equations only as far as the outputs leave them free; `near` are the states of other orbits
-    from which they start.
+    from which they start. Orbits that are not `seen`, by default all are, stay as they are.
     """
-    fit = _SimultaneousFit(problem, near)
+    fit, names = _SimultaneousFit(problem, near), list(near if seen is None else seen)
     misfit, before, turns = np.inf, np.inf, 0
     while turns < most and not before - misfit < SMALL_TURN:
-        fit.guess = {name: fit.measured_orbit(name, theta) for name in fit.guess}
+        fit.guess |= {name: fit.measured_orbit(name, theta) for name in names}
         theta = fit.parameters_along_guesses(theta)
         misfit, before, turns = fit._misfit(theta), misfit, turns + 1
     return InitialEstimate(theta, {name: fit.states(name, z) for name, z in fit.guess.items()}, "")
@@ -171,6 +183,15 @@ class _SimultaneousFit:
                 break
             theta, now = there, trial
         return theta
+
+    def solves(self, name: str, z: np.ndarray, theta: np.ndarray) -> bool:
+        """Return whether an orbit (points, states) solves the equations at θ."""
+        equations, at = self.equations[name], self.problem.parameters(theta[None], name)[0]
+        columns = equations.residual_jacobian(z, at)
+        factors = equations.factors(columns)
+        if not np.isfinite(columns).all() or not factors.regular:
+            return False
+        return _size(factors.solve(-columns[None, :, : equations.count])[0], z) < ON_ORBIT
 
     def measured_orbit(self, name: str, theta: np.ndarray) -> np.ndarray:
         """Return the orbit (points, states) near the guess that fits the outputs and, as far as it can, the equations.

@@ -15,10 +15,11 @@ from bayesperiodic.density.initial_orbits import experiments_guesses
 from bayesperiodic.density.orbit_check import MOST_UNEXPLAINED
 from bayesperiodic.density.problem import Problem
 from bayesperiodic.estimation.climbs import first_iterate
-from bayesperiodic.estimation.map_estimate import map_estimate
+from bayesperiodic.estimation.map_estimate import end_from, map_estimate
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.likelihood.section_points import SCALE
 from bayesperiodic.orbits.polish import REAL
+from bayesperiodic.periodic.solution import PeriodicSolution
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -159,6 +160,16 @@ def estimate_orbits(
     return OrbitsEstimate(used, fit, reached.dropped)
 
 
+class _Fitted(NamedTuple):
+    """Those attributes of a `MapEstimate` that are needed while orbits are included."""
+
+    theta: Mapping[str, float]
+    status: str
+    other_orbits: Mapping[str, str]
+    residuals: Mapping[str, Mapping[str, np.ndarray]]
+    solutions: Mapping[str, PeriodicSolution]
+
+
 class _Reached(NamedTuple):
     """Parameters by name, experiments that start at their solutions, and those left out, with the reason."""
 
@@ -230,28 +241,43 @@ def _fewest(problem: Problem) -> int:
     return len(problem.experiments)
 
 
-def _with_more(problem: Problem, experiments: list[Experiment], theta: Mapping[str, float] | None) -> MapEstimate | str:
+def _with_more(problem: Problem, experiments: list[Experiment], theta: Mapping[str, float] | None) -> _Fitted | str:
     """Return the estimate from these experiments, or why there is none with the last ones."""
     try:
         used = problem.with_experiments(experiments)
     except ValueError as error:
         return str(error)
-    start = _of(used, {} if theta is None else theta)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        used = _with_guesses(used, used.vector(start))
-        if first_iterate(used, used.vector(start)) is None:
-            return "the model has no such orbit near the estimate from the others"
-        fit = map_estimate(used, start=None if theta is None else start, checks=False, progress=False)
+        fit = _fitted(used, theta)
+    if fit is None:
+        return "the model has no such orbit near the estimate from the others"
     if fit.other_orbits:
         name, reason = next(iter(fit.other_orbits.items()))
         return f"{name!r} turns into another orbit ({reason})"
-    if not fit.converged:
+    if fit.status != "converged":
         return f"the estimate with it ends {fit.status!r}"
     for one in experiments:
-        if (share := _unexplained(one, fit)) > MOST_UNEXPLAINED:
+        if (share := _unexplained(one, fit.residuals[one.name])) > MOST_UNEXPLAINED:
             return f"{one.name!r} turns into another orbit, which leaves {share:.0%} of the measured one unexplained"
     return fit
+
+
+def _fitted(problem: Problem, theta: Mapping[str, float] | None) -> _Fitted | None:
+    """Return the estimate from parameters near it, without other optima, or from the priors; None without orbits."""
+    start = problem.vector(_of(problem, theta or {}))
+    problem = _with_guesses(problem, start)
+    if theta is not None:
+        end = end_from(problem, start)
+        if end is None:
+            return None
+        here, values = end.iterate.here, dict(zip(problem.names, end.iterate.theta.tolist(), strict=True))
+        solutions = here.solver.solutions(end.iterate.theta, sensitivities=False)
+        return _Fitted(values, end.status, here.other_orbits, here.compared(), solutions)
+    if first_iterate(problem, start) is None:
+        return None
+    fit = map_estimate(problem, checks=False, progress=False)
+    return _Fitted(fit.theta, fit.status, fit.other_orbits, fit.residuals, fit.solutions)
 
 
 def _compared(experiment: Experiment) -> np.ndarray:
@@ -267,11 +293,11 @@ def _in_standard_errors(experiment: Experiment, residuals: Mapping[str, np.ndarr
     return float(np.sqrt(values @ np.linalg.solve(covariance, values) / values.size))
 
 
-def _unexplained(experiment: Experiment, fit: MapEstimate) -> float:
+def _unexplained(experiment: Experiment, residuals: Mapping[str, np.ndarray]) -> float:
     """Return the largest fraction of the variance of an output over the orbit that is not explained."""
     values = _compared(experiment)
     shares = [0.0]
-    for name, residual in fit.residuals[experiment.name].items():
+    for name, residual in residuals.items():
         seen = experiment.outputs[name][values]
         if seen.size >= FEWEST_JUDGED and np.ptp(seen) > 0.0 and not experiment.winding:
             shares.append(float(np.mean(residual[values] ** 2) / np.var(seen)))
@@ -291,6 +317,6 @@ def _with_guesses(problem: Problem, theta: np.ndarray) -> Problem:
     return problem.with_experiments([replace(one, guess=guesses[one.name]) for one in problem.experiments])
 
 
-def _at_solutions(experiments: list[Experiment], fit: MapEstimate) -> list[Experiment]:
+def _at_solutions(experiments: list[Experiment], fit: _Fitted) -> list[Experiment]:
     """Return experiments whose first solve starts from their solutions."""
     return [replace(one, guess=dict(fit.solutions[one.name].states)) for one in experiments]

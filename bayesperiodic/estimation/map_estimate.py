@@ -228,6 +228,24 @@ def map_estimate(
 
 
 @in_one_thread
+def end_from(problem: Problem, theta: np.ndarray) -> End | None:
+    """Return the end of the climb from a start (names,); None if the density is not finite.
+
+    It is near the estimate: without the bias correction of the variances, and without other optima.
+    """
+    coarse, precise = on_fewer_points(problem, theta)
+    near_optimum = coarsely(problem, coarse, theta, False)
+    first = near_optimum or precise or first_iterate(problem, theta)
+    if first is None:
+        return None
+    end = _first_end(objective_near(problem, first.here), first, near_optimum is not None, 1, False)
+    end = on_measured_orbits(problem, theta, end, False)
+    if near_optimum:
+        end = climbed(objective_near(problem, end.iterate.here), end.iterate, False)
+    return _with_noisy_inputs(problem, end, False)[1]
+
+
+@in_one_thread
 def nearest_optimum(
     problem: Problem, theta: np.ndarray, guesses: Mapping[str, Mapping[str, np.ndarray]]
 ) -> tuple[Objective, End] | None:

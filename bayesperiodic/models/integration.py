@@ -17,6 +17,7 @@ def dense_kernels(path: Path | None = None) -> ModuleType:
     return load(text, shared=dense_kernels() if path else None)
 
 
+@cache
 def integration_kernels() -> ModuleType:
     """Return the compiled functions of time integration."""
     return dense_kernels(Path(__file__).with_name("_kernels") / "integrate.py")

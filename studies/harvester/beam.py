@@ -25,6 +25,7 @@ HIGHEST, PHASES = 16, 64
 # Grid points a period, relative spread of priors, and random starts of the regression.
 SAMPLES, SPREAD, STARTS = 128, 0.5, 6
 POSITIVE = ("damping", "cubic_damping", "back", "drive_gain", "decay", "laser_gain")
+DIFFERENCE = 1.5e-8  # of derivatives by gain and delays
 SMALLEST = 0.1  # of priors' standard deviations, as a fraction of the term's size
 
 
@@ -125,7 +126,7 @@ def start_from(orbits: list[bp.Orbit], degree: int, coupling: int, *, delays: bo
     for attempt in range(STARTS):
         means = generator.normal(0.0, size, len(waves)) if attempt else np.zeros(len(waves))
         first = np.concatenate([means / size, [0.5], [0.0, 0.0] if delays else []])
-        ends.append(least_squares(_residuals, first, args=(waves, degree, coupling, scale)))
+        ends.append(least_squares(_residuals, first, _jacobian, args=(waves, degree, coupling, scale)))
     best = min(ends, key=lambda end: float(end.cost))
     return _as_start(best.x, waves, degree, coupling, scale)
 
@@ -134,10 +135,44 @@ def _residuals(z: np.ndarray, *problem: Any) -> np.ndarray:
     return np.concatenate(_equations(z, *problem)[2])
 
 
+def _jacobian(z: np.ndarray, waves: list[_Waves], *others: Any) -> np.ndarray:
+    """Return the derivatives of the residuals by z: by means in Kaufman's approximation, by others by differences.
+
+    The approximation leaves out what is orthogonal to the residuals, so that the gradient is exact.
+    """
+    degree, coupling, scale = others
+    left, acceleration, right, change, x = _terms(z, waves, *others)
+    force, piezo, residuals, _ = _equations(z, waves, *others)
+    spring = np.polynomial.Polynomial(force[: degree + 1]).deriv()(x)
+    element = np.polynomial.Polynomial(piezo[2:]).deriv()(x) * right[:, 2]
+    orbit = np.repeat(np.arange(len(waves)), [w.samples for w in waves])
+    moved = scale[0] * (np.eye(len(waves)) - 1.0 / len(waves))[orbit]
+    parts = []
+    for terms, slope, target in ((left, spring, acceleration), (right, element, change)):
+        q, _ = np.linalg.qr(terms)
+        by_means = slope[:, None] * moved
+        parts.append((q @ (q.T @ by_means) - by_means) / target.std())
+    here, columns = np.concatenate(residuals), [np.concatenate(parts)]
+    for k in range(len(waves), z.size):
+        step = DIFFERENCE * max(1.0, abs(z[k])) * (np.arange(z.size) == k)
+        columns.append((_residuals(z + step, waves, *others) - here)[:, None] / step[k])
+    return np.hstack(columns)
+
+
 def _equations(
     z: np.ndarray, waves: list[_Waves], degree: int, coupling: int, scale: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]:
     """Return the coefficients of both equations, the relative residuals, and the displacements."""
+    left, acceleration, right, change, x = _terms(z, waves, degree, coupling, scale)
+    force, piezo = (np.linalg.lstsq(m, t, rcond=None)[0] for m, t in ((left, acceleration), (right, change)))
+    residuals = [(t - m @ c) / t.std() for m, c, t in ((left, force, acceleration), (right, piezo, change))]
+    return force, piezo, residuals, x
+
+
+def _terms(
+    z: np.ndarray, waves: list[_Waves], degree: int, coupling: int, scale: tuple[float, float]
+) -> tuple[np.ndarray, ...]:
+    """Return terms and left-hand side of the equation of x, of that of v, and the displacements."""
     count = len(waves)
     means, gain = scale[0] * (z[:count] - z[:count].mean()), scale[1] * z[count]
     late, later = 1e-3 * z[count + 1 :] if z.size > count + 1 else (0.0, 0.0)
@@ -149,10 +184,7 @@ def _equations(
         left = np.column_stack([powers[:, : degree + 1], rate, v, drive])
         right = np.column_stack([v, np.ones(v.size), rate[:, None] * powers[:, : coupling + 1]])
         blocks.append((left, acceleration, right, change, x))
-    left, acceleration, right, change, x = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    force, piezo = (np.linalg.lstsq(m, t, rcond=None)[0] for m, t in ((left, acceleration), (right, change)))
-    residuals = [(t - m @ c) / t.std() for m, c, t in ((left, force, acceleration), (right, piezo, change))]
-    return force, piezo, residuals, x
+    return tuple(np.concatenate(parts) for parts in zip(*blocks, strict=True))
 
 
 def _as_start(z: np.ndarray, waves: list[_Waves], degree: int, coupling: int, scale: tuple[float, float]) -> Start:

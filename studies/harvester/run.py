@@ -75,8 +75,8 @@ def run(options: argparse.Namespace) -> None:
     problem, fit = best.estimate.problem, best.estimate.fit
     print(f"{best.estimate}\n  the force of degree {best.degree} is used")
     with watch.part("posterior", "sampling the posterior with emcee"):
-        posterior = bp.sample(problem, fit, seed=options.seed, max_steps=100 if options.quick else 5000,
-                              progress=False)  # fmt: skip
+        posterior = bp.sample(problem, fit, seed=options.seed, ensembles=2,
+                              max_steps=100 if options.quick else 5000, progress=False)  # fmt: skip
     print(posterior)
     with watch.part("prediction", "free runs against the last third of the recording"):
         predicted = bp.predict_attractor(problem, posterior, sections[1], runs=RUNS, periods=RETURNS,
@@ -231,11 +231,12 @@ def fit_of(
 
 def alone_of(estimate: bp.OrbitsEstimate) -> dict[str, dict[str, float]]:
     """Return the unexplained variance of each orbit by the estimate from the others; 1 if there is no such orbit."""
-    shares = {}
-    for one in estimate.problem.experiments:
+    shares, solutions = {}, estimate.fit.solutions
+    runs = [replace(e, guess=dict(solutions[e.name].states)) for e in estimate.problem.experiments]
+    for one in runs:
         explained: dict[str, np.ndarray] = {}
         try:
-            others = estimate.problem.with_experiments([e for e in estimate.problem.experiments if e is not one])
+            others = estimate.problem.with_experiments([e for e in runs if e is not one])
             fit = bp.map_estimate(others, start=estimate.fit.theta, checks=False, progress=False)
             solution = estimate.problem.solve(fit.theta)[one.name]
             if fit.converged and solution.status == "converged":

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.density.initial_orbits import simultaneous_fit
+from bayesperiodic.density import initial_orbits
+from bayesperiodic.density.initial_orbits import experiments_guesses, simultaneous_fit
 from tests.known import LINEAR, linear_experiment
 from tests.pendulum import FREQUENCY, GENTLE, PENDULUM, measured, section_problem
 from tests.problems import cycle_run
@@ -143,3 +144,53 @@ def test_simultaneous_fit_needs_guesses_and_a_forced_model():
         bp.models.van_der_pol, [cycle_run()], priors={"mu": bp.LogNormal(1, 1), "omega": bp.Normal(1, 1)}
     )
     assert simultaneous_fit(cycle, cycle.median()) is None
+
+
+OSCILLATOR = bp.Model(
+    "oscillator", states=["x"], inputs=["F"], parameters=["c", "k"], equations=["ddx + c*dx + k*x - F"],
+    outputs={"x": "x"},
+)  # fmt: skip
+
+
+def motion(frequency, k):
+    """Return x (32,) under a cosine of this frequency [Hz] for c = 0.3, by its closed form."""
+    w, phase = 2.0 * np.pi * frequency, 2.0 * np.pi * np.arange(32) / 32
+    return (np.exp(1j * phase) / (k - w**2 + 0.3j * w)).real
+
+
+def oscillators(k, guesses):
+    """Return the problem of measured motions of a stiffness k at several frequencies, from guesses of the states."""
+    generator, drive, runs = np.random.default_rng(1), np.cos(2.0 * np.pi * np.arange(32) / 32), []
+    for frequency, guess in guesses.items():
+        x = motion(frequency, k) + 1e-4 * generator.standard_normal(32)
+        runs.append(bp.Experiment(f"{frequency} Hz", frequency, {"x": x}, {"F": drive}, samples=32, guess=guess))
+    priors = {"c": bp.LogNormal(0.3, 0.5), "k": bp.LogNormal(4.0, 0.5)}
+    return bp.Problem(OSCILLATOR, runs, priors=priors, scheme="fourier")
+
+
+def test_orbits_that_solve_the_equations_at_a_start_are_left_there():
+    """The data have k = 5, and the guesses, by the closed form, k = 4. Guesses one percent off are fitted with θ."""
+    exact = {frequency: {"x": motion(frequency, 4.0)} for frequency in (0.2, 0.25)}
+    start = np.array([0.3, 4.0])
+    fit = simultaneous_fit(oscillators(5.0, exact), start)
+    assert fit.theta.tolist() == start.tolist()
+    for frequency, guess in exact.items():
+        np.testing.assert_allclose(fit.states[f"{frequency} Hz"]["x"], guess["x"], atol=1e-12)
+    off = {frequency: {"x": 1.01 * guess["x"]} for frequency, guess in exact.items()}
+    assert simultaneous_fit(oscillators(5.0, off), start).theta == pytest.approx([0.3, 5.0], rel=1e-2)
+
+
+def test_an_orbit_is_found_from_the_data_without_finding_known_ones_again(monkeypatch):
+    """Of three experiments one has known states, one those found from its data, and one none."""
+    sought, measured_orbit = [], initial_orbits._SimultaneousFit.measured_orbit
+    monkeypatch.setattr(
+        initial_orbits._SimultaneousFit,
+        "measured_orbit",
+        lambda fit, name, theta: sought.append(name) or measured_orbit(fit, name, theta),
+    )
+    given = oscillators(4.0, {0.2: {"x": motion(0.2, 4.0)}, 0.25: "data", 0.3: {}})
+    guesses = experiments_guesses(given, np.array([0.3, 4.0]))
+    assert {*sought} == {"0.25 Hz", "0.3 Hz"}
+    assert guesses["0.3 Hz"] == {}
+    np.testing.assert_array_equal(guesses["0.2 Hz"]["x"], motion(0.2, 4.0))
+    np.testing.assert_allclose(guesses["0.25 Hz"]["x"], motion(0.25, 4.0), atol=1e-3)

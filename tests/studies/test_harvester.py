@@ -114,6 +114,21 @@ def test_regression_of_the_equations_gives_their_coefficients():
     np.testing.assert_allclose(given, drive, atol=1e-9)
 
 
+def test_regression_has_the_derivatives_of_its_residuals():
+    """Two motions about the wells: the gradient, exact in Kaufman's approximation, by central differences."""
+    motion, tau = periodic_motion(), np.arange(64) / 64
+    drive = 2.0 * np.cos(2.0 * np.pi * tau)
+    each = [waves(scale * motion[1], motion[2] + 0.01 * motion[1] ** 2, drive) for scale in (1.0, -0.8)]
+    z, given = np.array([0.3, -0.2, 1.1, 2.0, -1.0]), (each, 3, 2, (0.1, 5.0))
+    costs = [
+        [0.5 * np.sum(beam._residuals(z + step, *given) ** 2) for step in (1e-5 * one, -1e-5 * one)]
+        for one in np.eye(5)
+    ]
+    gradient = beam._jacobian(z, *given).T @ beam._residuals(z, *given)
+    expected = np.subtract(*np.transpose(costs)) / 2e-5
+    np.testing.assert_allclose(gradient, expected, atol=1e-5 * np.abs(expected).max())
+
+
 def test_delays_are_removed_and_derivatives_are_exact():
     """Two periods of sines, of which velocity and voltage are late."""
     time, late, later = np.arange(128) / (64 * recording.FREQUENCY), 0.01, 0.02
