@@ -109,7 +109,9 @@ class Tests:
         self.mutants, self.statuses, self._failed = mutants, dict[str, int](), False
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Note that a test of this process has failed."""
+        """Note that a test of this process has failed, and print the first one."""
+        if report.failed and not self._failed:
+            print(f"\n{report.nodeid} fails", file=sys.stderr, flush=True)
         self._failed |= report.failed
 
     @pytest.hookimpl(tryfirst=True)

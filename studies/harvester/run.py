@@ -75,8 +75,8 @@ def run(options: argparse.Namespace) -> None:
     problem, fit = best.estimate.problem, best.estimate.fit
     print(f"{best.estimate}\n  the force of degree {best.degree} is used")
     with watch.part("posterior", "sampling the posterior with emcee"):
-        posterior = bp.sample(problem, fit, seed=options.seed, ensembles=2,
-                              max_steps=100 if options.quick else 5000, progress=False)  # fmt: skip
+        posterior = bp.sample(problem, fit, seed=options.seed, max_steps=100 if options.quick else 5000,
+                              progress=False)  # fmt: skip
     print(posterior)
     with watch.part("prediction", "free runs against the last third of the recording"):
         predicted = bp.predict_attractor(problem, posterior, sections[1], runs=RUNS, periods=RETURNS,

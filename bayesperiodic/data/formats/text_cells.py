@@ -15,6 +15,7 @@ PLAIN_POINT = re.compile(rf"[+-]?(?:[0-9]+\.[0-9]*|\.[0-9]+){EXPONENT}")
 EITHER = re.compile(r"[+-]?[1-9][0-9]{0,2}[.,][0-9]{3}")
 TIME, DATED = re.compile(TIME_OF_DAY), re.compile(DATE)
 DATE_PARTS = re.compile(r"([0-9]{1,4})([-./])([0-9]{1,2})\2([0-9]{1,4})([T ]+.*)?")
+OF_DATES = re.compile("%[bBcdDeFgGhjmsVxyY]")  # in a format; without one, pandas takes 1 January 1900
 DURATION = r"[0-9]+:[0-5][0-9](?::[0-5][0-9])?(?:[.,][0-9]+)?"
 HALF_DAY, DAY = np.timedelta64(12, "h"), np.timedelta64(24, "h")
 MOST_DECIMALS = 9  # of a second, which nanoseconds hold
@@ -136,9 +137,8 @@ def _formatted(texts: Any, date_format: str) -> tuple[np.ndarray | None, str, st
         return None, "", ""
     values = (read.dt.tz_convert(None) if "%z" in date_format else read).to_numpy()
     remark = f"dates in the format {date_format!r}, as given"
-    passed = values - np.datetime64("1900-01-01")  # the date of a format without one, of any time zone
-    if (np.abs(passed[~np.isnat(passed)]) < 2 * DAY).all():
-        return *rolled(passed), ""
+    if not OF_DATES.search(date_format):
+        return *rolled(values - np.datetime64("1900-01-01")), ""
     return values, remark, ""
 
 
