@@ -78,7 +78,8 @@ def unit_of(head: Mapping[str, Any], label: str, stored: Units164 | None) -> str
         return derived if not stored.problem else f"{stored.problem} (unknown)"
     if not stored.problem and (label == derived or _is_same(label, derived)):
         return label
-    return f"{label} (label) or {stored.problem or derived + ' (data set 164)'}"
+    other = stored.problem or f"{derived or 'no unit'} (data set 164)"
+    return f"{label} (label) or {other}"
 
 
 def quotient(label: str, denominator: str, stored: Units164 | None) -> str:

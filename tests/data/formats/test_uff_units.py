@@ -60,8 +60,8 @@ def test_units_of_quantities_by_their_direction(kind, way, expected):
         (1, 1, "", METRES, ""), (3, 1, "", MM, ""), (8, 1, "", UNCLEAR, f"{UNCLEAR.problem} (unknown)"),
         (1, 1, "", UNCLEAR, f"{UNCLEAR.problem} (unknown)"), (8, 1, "mm", UNCLEAR, f"mm (label) or {UNCLEAR.problem}"),
         (2, 5, "", MM, "mm, mN (unknown)"), (18, 0, "Hz", MM, "Hz"),
-        (3, 1, "m/m", MM, "m/m"), (3, 1, "%", MM, "% (label) or  (data set 164)"),
-        (3, 1, "no unit", MM, "no unit (label) or  (data set 164)"),
+        (3, 1, "m/m", MM, "m/m"), (3, 1, "%", MM, "% (label) or no unit (data set 164)"),
+        (3, 1, "no unit", MM, "no unit (label) or no unit (data set 164)"),
     ],
 )  # fmt: skip
 def test_units_of_label_and_data_set(kind, way, label, units, expected):
