@@ -102,27 +102,44 @@ def test_the_fewest_orbits_are_those_with_enough_values(monkeypatch):
         ({"converged": False, "status": "stalled"}, "the estimate with it ends 'stalled'"),
     ],
 )
-@pytest.mark.parametrize("theta", [None, {"c": 3.0}])
-def test_an_estimate_with_more_orbits_must_converge_on_the_measured_ones(monkeypatch, changes, said, theta):
-    result, calls = fit(**changes), []
-    monkeypatch.setattr(many_orbits, "_with_guesses", lambda problem, start: calls.append(start.tolist()) or problem)
-    monkeypatch.setattr(many_orbits, "first_iterate", lambda problem, start: None if blocked else start)
-    monkeypatch.setattr(many_orbits, "map_estimate", lambda problem, **given: calls.append(given) or result)
-    monkeypatch.setattr(many_orbits, "_unexplained", lambda one, estimate: shares[one.name])
-    runs, shares, blocked = [SimpleNamespace(name=name) for name in "ab"], {"a": 0.1, "b": 0.5}, False
-    found = many_orbits._with_more(Few(), runs, theta)
-    assert found is result if said is None else found == said
-    start = {"k": 10.0, "c": 20.0} | (theta or {})
-    assert calls == [[*start.values()], {"start": start if theta else None, "checks": False, "progress": False}]
+def test_an_estimate_with_more_orbits_must_converge_on_the_measured_ones(monkeypatch, changes, said):
+    result, theta, calls = fit(**({"residuals": {"a": "of a", "b": "of b"}} | changes)), {"c": 3.0}, []
+    monkeypatch.setattr(many_orbits, "_fitted", lambda problem, start: calls.append((problem.given, start)) or result)
+    monkeypatch.setattr(many_orbits, "_unexplained", lambda one, residual: shares[one.name, residual])
+    runs, shares = [SimpleNamespace(name=name) for name in "ab"], {("a", "of a"): 0.1, ("b", "of b"): 0.5}
+    reached = many_orbits._with_more(Few(), runs, theta)
+    assert reached is result if said is None else reached == said
+    assert calls == [(runs, theta)]
     if said is None:
-        shares["b"] = 0.51
+        shares["b", "of b"] = 0.51
         assert many_orbits._with_more(Few(), runs, theta) == (
             "'b' turns into another orbit, which leaves 51% of the measured one unexplained"
         )
-    blocked = True
+    result = None
     lost = "the model has no such orbit near the estimate from the others"
     assert many_orbits._with_more(Few(), runs, theta) == lost
     assert many_orbits._with_more(Few(), runs[:1], theta) == "too few values"
+
+
+def test_further_orbits_are_fitted_from_the_estimate_and_the_first_ones_from_the_priors(monkeypatch):
+    calls, problem, iterate = [], Few(), SimpleNamespace(theta=np.array([1.0, 2.0]))
+    solver = SimpleNamespace(solutions=lambda theta, sensitivities: ("solutions", theta.tolist(), sensitivities))
+    iterate.here = SimpleNamespace(solver=solver, other_orbits={"a": "half"}, compared=lambda: "residuals")
+    end = SimpleNamespace(iterate=iterate, status="stalled")
+    monkeypatch.setattr(many_orbits, "_with_guesses", lambda one, start: calls.append(start.tolist()) or one)
+    monkeypatch.setattr(many_orbits, "end_from", lambda one, start: calls.append(start.tolist()) or end)
+    monkeypatch.setattr(many_orbits, "first_iterate", lambda one, start: first)
+    monkeypatch.setattr(many_orbits, "map_estimate", lambda one, **given: calls.append(given) or fit(solutions="s"))
+    assert many_orbits._fitted(problem, {"c": 3.0}) == (
+        {"k": 1.0, "c": 2.0}, "stalled", {"a": "half"}, "residuals", ("solutions", [1.0, 2.0], False)
+    )  # fmt: skip
+    assert calls == [[10.0, 3.0], [10.0, 3.0]]
+    end = first = None
+    assert many_orbits._fitted(problem, {"c": 3.0}) is None and many_orbits._fitted(problem, None) is None
+    calls.clear()
+    first = "an iterate"
+    assert many_orbits._fitted(problem, None) == ({"k": 1.0}, "converged", {}, {}, "s")
+    assert calls == [[10.0, 20.0], {"checks": False, "progress": False}]
 
 
 def test_values_over_an_orbit_that_are_not_explained_are_relative_to_their_variance():
@@ -133,14 +150,14 @@ def test_values_over_an_orbit_that_are_not_explained_are_relative_to_their_varia
     run = SimpleNamespace(name="run", samples=points, periods=1, mask=mask, winding={},
                           outputs={"y": y, "flat": np.full(points, 3.0)})  # fmt: skip
     residual = np.where(mask, 0.3, 55.0)
-    estimate = SimpleNamespace(residuals={"run": {"y": residual, "flat": residual}})
-    assert many_orbits._unexplained(run, estimate) == pytest.approx(0.09 / np.var(y[mask]))
+    residuals = {"y": residual, "flat": residual}
+    assert many_orbits._unexplained(run, residuals) == pytest.approx(0.09 / np.var(y[mask]))
     run.winding = {"y": 1}
-    assert many_orbits._unexplained(run, estimate) == 0.0
+    assert many_orbits._unexplained(run, residuals) == 0.0
     run.winding, run.mask = {}, mask & (np.arange(points) < points - 2)
-    assert many_orbits._unexplained(run, estimate) == 0.0
+    assert many_orbits._unexplained(run, residuals) == 0.0
     run.mask = None
-    assert many_orbits._unexplained(run, estimate) == pytest.approx(np.mean(residual**2) / np.var(y))
+    assert many_orbits._unexplained(run, residuals) == pytest.approx(np.mean(residual**2) / np.var(y))
 
 
 def test_residuals_in_standard_errors_are_whitened_by_the_covariance_of_the_values():
