@@ -138,7 +138,7 @@ def _formatted(texts: Any, date_format: str) -> tuple[np.ndarray | None, str, st
     values = (read.dt.tz_convert(None) if "%z" in date_format else read).to_numpy()
     remark = f"dates in the format {date_format!r}, as given"
     if not OF_DATES.search(date_format):
-        return *rolled(values - np.datetime64("1900-01-01")), ""
+        return *rolled((values - np.datetime64("1900-01-01")) % DAY), ""  # in UTC where the format has a zone
     return values, remark, ""
 
 

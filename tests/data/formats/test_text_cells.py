@@ -214,7 +214,7 @@ def test_times_of_several_meanings_are_refused_with_the_formats(cells, reason, h
         (["Thu Mar 12 10:00:00 2026", "Thu Mar 12 10:00:01 2026"], "%c", 1.0),
         (["Mar 26", "Apr 26"], "%b %y", 31 * 86_400.0),
         (["12 1900", "01 1901"], "%m %Y", 31 * 86_400.0), (["18:00 -0500", "20:00 -0500"], "%H:%M %z", 7200.0),
-        (["00:30 +1200", "00:31 +1200"], "%H:%M %z", 60.0),
+        (["00:30 +1200", "00:31 +1200"], "%H:%M %z", 60.0), (["23:59 -0500", "00:01 -0500"], "%H:%M %z", 120.0),
     ],
 )  # fmt: skip
 def test_dates_in_a_format_that_is_given(cells, form, step):
