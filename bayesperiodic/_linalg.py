@@ -70,6 +70,7 @@ def column_space(jacobian: np.ndarray) -> np.ndarray:
     return orth(rows.T, rcond=RANK)
 
 
+@unwarned
 def asymmetric_entry(covariance: np.ndarray) -> tuple[int, int] | None:
     """Return where a covariance (n, n) differs most from its transpose in units of the sds; None if by rounding."""
     sd = _standard_deviations(covariance)

@@ -279,6 +279,7 @@ def test_results_carry_the_errors_of_their_inputs(tmp_path):
         ({"x": -1.0}, r"input_noise\['x'\]: must be at least 0, got -1"),
         ({"x": np.eye(3)}, r"input_noise\['x'\]: must be a symmetric covariance \(21, 21\)"),
         ({"x": 1e-18 * (np.eye(21) + np.eye(21, k=1))}, r"input_noise\['x'\]: must be a symmetric covariance"),
+        ({"x": 1e3 * np.eye(21, k=1)}, r"input_noise\['x'\]: must be a symmetric covariance"),
         ({"x": -np.eye(21)}, r"input_noise\['x'\]: must be positive semidefinite"),
     ],
 )

@@ -347,7 +347,7 @@ def test_second_row_of_texts_that_may_be_units_is_refused_without_its_meaning(wr
 
 
 def test_columns_of_all_sheets_have_units_and_remarks(write):
-    """Two names of one sheet that are equal are told apart; a time is suggested if there is one table."""
+    """Equal names of one sheet differ in what is listed; a time is suggested if there is one table."""
     one = [
         ["t", "x", "x", "v_mm_s", "when"],
         ["s", "mm", "N"],

@@ -5,24 +5,12 @@ import re
 import pytest
 
 from bayesperiodic.data.formats import text_header
-from bayesperiodic.data.formats.encodings import opened
 
 ROWS = ["0.5,1.5,2", "1.5,2.5,3", "2.5,3.5,4"]
 
 
 def block(lines, separator=",", start=0):
     return text_header._block([line + "\n" for line in lines], separator, start)
-
-
-@pytest.fixture
-def text(tmp_path):
-    """Return a function that opens a text."""
-
-    def written(*lines):
-        (tmp_path / "run.csv").write_text("".join(line + "\n" for line in lines))
-        return opened(tmp_path / "run.csv", None)
-
-    return written
 
 
 @pytest.mark.parametrize(

@@ -5,19 +5,7 @@ import csv
 import pytest
 
 from bayesperiodic.data.formats import text_header
-from bayesperiodic.data.formats.encodings import opened
 from bayesperiodic.data.formats.text_header import Head
-
-
-@pytest.fixture
-def text(tmp_path):
-    """Return a function that opens a text."""
-
-    def written(*lines):
-        (tmp_path / "run.csv").write_text("".join(line + "\n" for line in lines))
-        return opened(tmp_path / "run.csv", None)
-
-    return written
 
 
 @pytest.mark.parametrize(
