@@ -41,7 +41,7 @@ from bayesperiodic.estimation.check import with_joint
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.problem.fingerprint import digest
 from bayesperiodic.sampling.chains import StoredChains
-from bayesperiodic.sampling.convergence import PASSES, stop_rule
+from bayesperiodic.sampling.convergence import LENGTHS, PASSES, stop_rule
 from bayesperiodic.sampling.draws import Posterior, gather
 from bayesperiodic.sampling.nuts import refuse_for_nuts, sample_nuts
 from bayesperiodic.sampling.proposals import (
@@ -74,17 +74,17 @@ EMCEE, NUTS = "emcee", "nuts"
 FEWEST_STEPS, FEWEST_KEPT = 50, 10
 # Steps between fits of the mixture, and at least between checks of the stop rule.
 ROUND, CHECKED = 25, 50
-# Burn-in ends when the autocorrelation time [steps] expected of the mixture is FAST_MIXTURE, or after
-# MOST_BURN_IN_ROUNDS.
+# Burn-in ends when the autocorrelation time [steps] expected of the mixture is FAST_MIXTURE, when it is as long as the
+# chain that the stop rule needs at that time, or after MOST_BURN_IN_ROUNDS.
 FAST_MIXTURE, MOST_BURN_IN_ROUNDS = 3.0, 40
 # A surrogate is tried after SURROGATE_ROUNDS, at these fractions of the steps from the mixture and by it, if the time
 # expected of the mixture is then USELESS_MIXTURE.
 SURROGATE_ROUNDS, TRIED, USELESS_MIXTURE = 10, [0.4, 0.4], 50.0
-# Both fractions at first, and numbers of proposals by the surrogate that were accepted, and made.
-SHARES_AT_FIRST: dict[str, Any] = {"shares": [MIXTURE_STEPS, 0.0], "moved": [0, 0]}
-# It starts again, before MOST_BURN_IN_ROUNDS, if SLOW_MIXTURE is expected at the draws that are kept: their tails were
-# not known yet.
-SLOW_MIXTURE = 6.0
+# Both fractions at first, numbers of proposals by the surrogate that were accepted, and made, and the expected time.
+AT_FIRST: dict[str, Any] = {"shares": [MIXTURE_STEPS, 0.0], "moved": [0, 0], "expected": FAST_MIXTURE}
+# It starts again, before MOST_BURN_IN_ROUNDS, if this times the time that was expected at its end is expected at the
+# draws that are kept: their tails were not known yet.
+SLOWER_THAN_EXPECTED = 2.0
 ADAPTED = "proposals that are still adapted"
 # Points of a task for an executor.
 PIECE = 16
@@ -117,10 +117,10 @@ def sample(
     from a mixture of Student t distributions, independently of the walkers; the others are differential-evolution [2]_
     and stretch moves within each ensemble, for what the mixture misses. The narrow axes of the mixture follow quadratic
     forms of the wider ones, where ridges are curved. It is fitted to the draws of all ensembles every 25 steps of the
-    burn-in, which is removed; that ends when a tau of at most 3 is expected, or after 1000 steps, and the mixture is
-    fixed. Before 1000 steps the burn-in starts again if later draws let a tau above 6 be expected. On the posterior of
-    the damper, in six dimensions, tau is 2, with moves within the ensembles alone 23; on that of the landing gear's 15
-    parameters and two variances 2.6 and 82.
+    burn-in, which is removed; that ends when a tau of at most 3 is expected, when it is 50 times as long as the
+    expected tau, or after 1000 steps, and the mixture is fixed. Before 1000 steps the burn-in starts again if later
+    draws let twice that tau be expected. On the posterior of the damper, in six dimensions, tau is 2, with moves within
+    the ensembles alone 23; on that of the landing gear's 15 parameters and two variances 2.6 and 82.
 
     Where a tau above 50 is expected after 250 steps, as with many positive parameters of which the data determine sums,
     trajectories on a surrogate are tried: the prior times a normal likelihood, without periodic solves [4]_. They make
@@ -299,7 +299,7 @@ class _EnsembleRun:
         first, redraws, axes = np.random.SeedSequence(seed).spawn(3)
         self.redraws = np.random.default_rng(redraws)
         if "axes" in state:
-            self.state = SHARES_AT_FIRST | state  # which checkpoints of earlier versions lack
+            self.state = AT_FIRST | state  # which checkpoints of earlier versions lack
             self.transform = AffineTransform(np.array(state["origin"]), np.array(state["axes"]))
             self.calls = CallCount(state["calls"], Counter(state["failures"]))
             self.walk = backend.get_last_sample()
@@ -310,7 +310,7 @@ class _EnsembleRun:
         starts = [start_points(density, fit, start, self.walkers, generator, self.calls) for _ in range(shape[0])]
         self.walk = emcee.State(self.transform.whiten(np.concatenate(starts)), random_state=random.get_state())
         first_mixture = self._first_mixture()
-        self.state = SHARES_AT_FIRST | state | {
+        self.state = AT_FIRST | state | {
             "origin": self.transform.origin.tolist(), "axes": self.transform.axes.tolist(),
             "mixture": first_mixture and first_mixture.as_lists(), "burnt": 0, "tries": [0, 0],
             "steps": 0, "next": ROUND, "passes": 0, "missing": [ADAPTED], "tau": [],
@@ -432,10 +432,11 @@ class _EnsembleRun:
         return values.reshape(len(values), self.ensembles, self.walkers, *values.shape[2:]).swapaxes(0, 1)
 
     def _adapt(self) -> None:
-        """Fit the mixture to the later half of the steps, and end the burn-in when it is fast.
+        """Fit the mixture to the later half of the steps, and end the burn-in when it is fast enough.
 
         It must be fast at the draws of the last round, which it was not fitted to, and at the later half. The mixture
-        before stays if it is expected to be faster there.
+        before stays if it is expected to be faster there. A burn-in as long as the chain that follows costs at most
+        twice what a known best end would.
         """
         state = self.state
         half, last, first = state["steps"] // 2, state["steps"] - ROUND, self._first_mixture()
@@ -446,14 +447,16 @@ class _EnsembleRun:
             fitted = fit_mixture(chains.thinned(MOST_FITTED_DRAWS), [] if first is None else [first])
             if not present or self._expected_time(fitted, half) < self._expected_time(present, half):
                 state["mixture"] = fitted.as_lists()
-        rounds, fast = state["steps"] // ROUND, False
-        if present and rounds > 1 and new <= FAST_MIXTURE:
-            fast = self._expected_time(StudentMixture.from_lists(state["mixture"]), half) <= FAST_MIXTURE
+        rounds, expected, enough = state["steps"] // ROUND, np.inf, max(FAST_MIXTURE, state["steps"] / LENGTHS)
+        if present and rounds > 1 and new <= enough:
+            expected = max(new, self._expected_time(StudentMixture.from_lists(state["mixture"]), half))
+        fast = expected <= enough
         state["shares"] = [MIXTURE_STEPS, 0.0] if fast else self._shares(half)
         led = state["shares"][1] == MIXTURE_STEPS and rounds >= 2 * SURROGATE_ROUNDS
         done = fast or led or rounds >= MOST_BURN_IN_ROUNDS
         state |= {"moved": [0, 0], "tries": [0, 0], "next": state["steps"] + (CHECKED if done else ROUND)}
         state |= {"burnt": state["steps"] if done else 0, "missing": [] if done else [ADAPTED], "tau": [], "passes": 0}
+        state["expected"] = max(expected, FAST_MIXTURE) if fast else FAST_MIXTURE
 
     def _shares(self, first: int) -> list[float]:
         """Return the fractions of the steps that propose from a slow mixture, and by the surrogate."""
@@ -480,7 +483,7 @@ class _EnsembleRun:
         if self._settled:
             return False
         mixture = StudentMixture.from_lists(self.state["mixture"])
-        return self._expected_time(mixture, self._first_kept) > SLOW_MIXTURE
+        return self._expected_time(mixture, self._first_kept) > SLOWER_THAN_EXPECTED * self.state["expected"]
 
     def _expected_time(self, mixture: StudentMixture, first: int) -> float:
         """Return the autocorrelation time expected of a mixture, from the draws since a step."""

@@ -269,3 +269,31 @@ def test_burn_in_starts_again_if_slow_moves_are_expected_at_the_draws_kept(known
     posterior = bp.sample(*known_variance, seed=1, **(SHORT | {"max_steps": 350}))
     assert posterior.tree["proposal"].attrs["burn_in"] == burn_in
     assert posterior.by_step(posterior.draws("k")).shape[1] == 350 - max(burn_in, 350 // 5)
+
+
+@pytest.mark.parametrize(("expected", "burn_in"), [(3.0, 50), (3.1, 175), (6.0, 300)])
+def test_burn_in_ends_when_it_is_as_long_as_the_chain_that_follows(known_variance, monkeypatch, expected, burn_in):
+    """The stop rule needs 50 autocorrelation times; a round has 25 steps."""
+    monkeypatch.setattr(sample_module, "expected_time", lambda *_: expected)
+    monkeypatch.setattr(sample_module, "PASSES", 100)
+    posterior = bp.sample(*known_variance, seed=1, **(SHORT | {"max_steps": 350}))
+    assert posterior.tree["proposal"].attrs["burn_in"] == burn_in
+
+
+@pytest.mark.parametrize(("later", "burn_in"), [(11.9, 300), (12.1, 375)])
+def test_burn_in_starts_again_at_twice_the_time_that_was_expected_at_its_end(
+    known_variance, monkeypatch, later, burn_in
+):
+    """A time of 6 is expected until the burn-in ends at 300 steps, another one while it is over, and 6 again."""
+    run, ends = sample_module._EnsembleRun, [0]
+    adapted = run._adapt
+
+    def adapt(self):
+        adapted(self)
+        ends.append(self.state["burnt"])
+
+    monkeypatch.setattr(run, "_adapt", adapt)
+    monkeypatch.setattr(sample_module, "expected_time", lambda *_: later if ends[-1] else 6.0)
+    monkeypatch.setattr(sample_module, "PASSES", 100)
+    posterior = bp.sample(*known_variance, seed=1, **(SHORT | {"max_steps": 400}))
+    assert posterior.tree["proposal"].attrs["burn_in"] == burn_in
